@@ -1,0 +1,3 @@
+"""LiDAR scans in, tokens between, new scans out."""
+
+__version__ = "0.1.0"

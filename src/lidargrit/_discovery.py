@@ -1,0 +1,65 @@
+"""The file name is the public name: a package's folder → the names in it, and the one object that a file defines."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import importlib.util
+import pkgutil
+from pathlib import Path
+from typing import Any, TypeVar
+
+from lidargrit.errors import UnknownNameError, nearest_names
+
+T = TypeVar("T")
+
+
+def names(package: str) -> list[str]:
+    """List the public names of one of our folders, e.g. "datasets", without importing what they name."""
+    return sorted(m.name for m in pkgutil.iter_modules([str(_folder(package))]) if not m.name.startswith("_"))
+
+
+def summary(package: str, name: str) -> str:
+    """Return the first line of a file's docstring, without importing it."""
+    docstring = ast.get_docstring(ast.parse((_folder(package) / f"{name}.py").read_text(encoding="utf-8")))
+    return (docstring or "").partition("\n")[0]
+
+
+def load_class(package: str, name: str, base: type[T]) -> type[T]:
+    """Import the one subclass of ``base`` that the file ``package/name.py`` defines.
+
+    Raises:
+        UnknownNameError: no such file; names its nearest neighbours.
+    """
+    return _the_one(
+        package, name, lambda v, module: isinstance(v, type) and issubclass(v, base) and v.__module__ == module
+    )
+
+
+def load_instance(package: str, name: str, base: type[T]) -> T:
+    """Import the one object of type ``base`` that the file ``package/name.py`` defines.
+
+    Raises:
+        UnknownNameError: no such file; names its nearest neighbours.
+    """
+    return _the_one(package, name, lambda v, module: isinstance(v, base))
+
+
+def _folder(package: str) -> Path:
+    spec = importlib.util.find_spec(f"lidargrit.{package}")
+    assert spec is not None and spec.submodule_search_locations, package
+    return Path(spec.submodule_search_locations[0])
+
+
+def _the_one(package: str, name: str, fits: Any) -> Any:
+    known = names(package)
+    if name not in known:
+        raise UnknownNameError(
+            f"{name!r}, which is not among the {package}",
+            f"one of {nearest_names(name, known)}",
+            f"see all with: lidargrit list {package}",
+        )
+    module = importlib.import_module(f"lidargrit.{package}.{name}")
+    found = {id(v): v for k, v in vars(module).items() if not k.startswith("_") and fits(v, module.__name__)}
+    assert len(found) == 1, f"{module.__name__} must define exactly one public object of its kind, has {len(found)}"
+    return next(iter(found.values()))

@@ -1,0 +1,62 @@
+"""One exception tree; every message says what was got, what was wanted, and the cure.
+
+    LidarGritError (ValueError)
+    ├── ScanError         a scan file, or the points in it, cannot be used
+    ├── DataError         a folder or a data source is not what was asked for
+    ├── UnknownNameError  no sensor, recipe, metric, ... of that name
+    ├── ConfigError       a recipe's setting is unknown or out of its bounds
+    ├── CheckpointError   weights or a run that are damaged or of another configuration
+    ├── OutputError       a place to write to is taken, or could not be written
+    └── TrainingError     training cannot go on: the loss is not a number, the codebook collapsed
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class LidarGritError(ValueError):
+    """A user's mistake, told in one line: what was got, what was wanted, the cure."""
+
+    def __init__(self, got: str, wanted: str, cure: str) -> None:
+        super().__init__(f"got {got}; wanted {wanted}; {cure}")
+        self.got, self.wanted, self.cure = got, wanted, cure
+
+    def __reduce__(self) -> tuple[type[LidarGritError], tuple[str, str, str]]:
+        return type(self), (self.got, self.wanted, self.cure)
+
+
+class ScanError(LidarGritError):
+    """A scan file, or the points in it, cannot be used."""
+
+
+class DataError(LidarGritError):
+    """A folder or a data source is not what was asked for."""
+
+
+class UnknownNameError(LidarGritError):
+    """No sensor, recipe, metric, ... of that name."""
+
+
+class ConfigError(LidarGritError):
+    """A recipe's setting is unknown or out of its bounds."""
+
+
+class CheckpointError(LidarGritError):
+    """Weights or a run that are damaged or of another configuration."""
+
+
+class OutputError(LidarGritError):
+    """A place to write to is taken, or could not be written."""
+
+
+class TrainingError(LidarGritError):
+    """Training cannot go on."""
+
+
+def nearest_names(name: str, known: Iterable[str], at_most: int = 3) -> str:
+    """Name the known names that look most like one, for a message: "a, b or c"."""
+    names = sorted(set(known))
+    close = difflib.get_close_matches(name, names, n=at_most, cutoff=0.4) or names
+    return close[0] if len(close) == 1 else ", ".join(close[:-1]) + " or " + close[-1]

@@ -1,0 +1,137 @@
+"""What looks: the ray table of a sensor, name → :class:`SensorModel`."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidargrit import _discovery
+from lidargrit.errors import ConfigError
+
+ProjectionName = Literal["spherical", "unfolding"]
+
+
+@dataclass(frozen=True, eq=False)
+class SensorModel:
+    """The ray directions of a range image and the limits of the sensor that fills it.
+
+    Args:
+        name: what the sensor is called.
+        elevation_rad: of every row (H, 1), or of every pixel (H, W); falls from row 0 down; up is positive.
+        azimuth_rad: of every column (1, W), or of every pixel (H, W); falls from near +pi at column 0 to near -pi;
+            counter-clockwise from +x is positive.
+        range_min_m: a shorter range is no return.
+        range_max_m: a longer range is no return.
+        projection: how this sensor's scans become range images unless told otherwise.
+        column_stride: the image keeps every n-th of ``W * n`` fine columns (the paper's 64x2048 -> 64x256 keeps every 8th).
+        source: where the numbers come from.
+    """
+
+    name: str
+    elevation_rad: Float[Tensor, "H #W"]
+    azimuth_rad: Float[Tensor, "#H W"]
+    range_min_m: float
+    range_max_m: float
+    projection: ProjectionName
+    column_stride: int = 1
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.range_min_m < self.range_max_m:
+            raise ConfigError(
+                f"range limits {self.range_min_m} to {self.range_max_m} m for the sensor {self.name!r}",
+                "0 < range_min_m < range_max_m",
+                "correct the sensor's limits",
+            )
+        if not bool((self.elevation_rad.diff(dim=0) < 0).all()):
+            raise ConfigError(
+                f"elevations of the sensor {self.name!r} that do not fall from row to row",
+                "row 0 the highest ray, every next row lower",
+                "sort the rows of the sensor",
+            )
+
+    @property
+    def height(self) -> int:
+        """Number of rows, H."""
+        return self.elevation_rad.shape[0]
+
+    @property
+    def width(self) -> int:
+        """Number of columns, W."""
+        return self.azimuth_rad.shape[1]
+
+    def ray_directions(self) -> Float[Tensor, "H W 3"]:
+        """Return the unit vector of every pixel's ray (x forward, y left, z up)."""
+        elevation, azimuth = torch.broadcast_tensors(self.elevation_rad, self.azimuth_rad)
+        horizontal = elevation.cos()
+        return torch.stack((horizontal * azimuth.cos(), horizontal * azimuth.sin(), elevation.sin()), dim=-1)
+
+    def with_columns(self, columns: int, stride: int = 1) -> SensorModel:
+        """Return this sensor with ``columns // stride`` columns: every ``stride``-th of ``columns`` equal ones.
+
+        The azimuth of a kept column is that of its own centre, pi - 2 pi (stride j + 1/2) / columns.
+        """
+        if columns < 1 or stride < 1 or columns % stride:
+            raise ConfigError(
+                f"{columns} columns, every {stride}th kept", "a positive multiple of the stride", "change one of the two"
+            )
+        return replace(self, azimuth_rad=column_azimuths_rad(columns, stride), column_stride=stride)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the sensor as plain numbers and words, for a file."""
+        return {
+            "name": self.name,
+            "elevation_rad": self.elevation_rad.tolist(),
+            "azimuth_rad": self.azimuth_rad.tolist(),
+            "range_min_m": self.range_min_m,
+            "range_max_m": self.range_max_m,
+            "projection": self.projection,
+            "column_stride": self.column_stride,
+            "source": self.source,
+        }
+
+    @classmethod
+    def from_json(cls, data: dict[str, Any]) -> SensorModel:
+        """Rebuild a sensor from what :meth:`to_json` returned."""
+        tables = {key: torch.tensor(data[key], dtype=torch.float32) for key in ("elevation_rad", "azimuth_rad")}
+        return cls(**{**data, **tables})
+
+    def same_rays(self, other: SensorModel) -> bool:
+        """Tell whether two sensors look along the same rays, within a hundredth of a degree."""
+        if (self.height, self.width) != (other.height, other.width):
+            return False
+        tolerance = math.radians(0.01)
+        return torch.allclose(self.elevation_rad, other.elevation_rad, rtol=0, atol=tolerance) and torch.allclose(
+            self.azimuth_rad, other.azimuth_rad, rtol=0, atol=tolerance
+        )
+
+
+def column_azimuths_rad(columns: int, stride: int = 1) -> Float[Tensor, "1 W"]:
+    """Return the azimuths of the centres of every ``stride``-th of ``columns`` equal columns, from +pi down to -pi."""
+    index = torch.arange(0, columns, stride, dtype=torch.float64)
+    return (math.pi - 2 * math.pi * (index + 0.5) / columns).float()[None]
+
+
+def load_sensor(name: str) -> SensorModel:
+    """Return a sensor by its name ("hdl64e_kitti_360", ...) or from a ``.json`` file.
+
+    Raises:
+        UnknownNameError: no sensor of that name; names its nearest neighbours.
+    """
+    if name.endswith(".json"):
+        try:
+            return SensorModel.from_json(json.loads(Path(name).read_text(encoding="utf-8")))
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ConfigError(
+                f"the sensor file {name}, which cannot be read ({error})",
+                "the JSON of a sensor",
+                "write one with SensorModel.to_json",
+            ) from None
+    return _discovery.load_instance("sensors", name, SensorModel)

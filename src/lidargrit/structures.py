@@ -1,0 +1,185 @@
+"""The four nouns that cross folder borders: scan, range image, token grid, metric result; each valid once it exists.
+
+Ranges are always metres and the return mask is always True = a return. Normalised tensors live inside one model.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from lidargrit.errors import ConfigError, ScanError
+from lidargrit.sensors import SensorModel
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """The points of one revolution, in the sensor's frame (x forward, y left, z up).
+
+    Args:
+        points_xyz_m: metres.
+        reflectance: in [0, 1].
+        ring: laser of every point, 0 = the highest.
+        source: where the scan comes from, for messages.
+
+    Raises:
+        ScanError: no point, a coordinate that is not finite, a point at the origin, or a reflectance outside [0, 1].
+    """
+
+    points_xyz_m: Float[Tensor, "n 3"]
+    reflectance: Float[Tensor, "n"] | None = None
+    ring: Int[Tensor, "n"] | None = None
+    source: str = "a scan"
+
+    def __post_init__(self) -> None:
+        if len(self) == 0:
+            raise ScanError(f"no point in {self.source}", "a full revolution", "remove the file")
+        bad = ~self.points_xyz_m.isfinite().all(dim=1)
+        self._refuse(bad, "NaN or infinite coordinates")
+        self._refuse((self.points_xyz_m == 0).all(dim=1), "at the origin (placeholders for no return)")
+        if self.reflectance is not None:
+            low, high = (float(v) for v in self.reflectance.aminmax())
+            if not (low >= 0 and high <= 1):  # also refuses NaN
+                raise ScanError(
+                    f"reflectance from {low:g} to {high:g} in {self.source}",
+                    "values in [0, 1]",
+                    "scale the fourth column, e.g. divide an intensity of 0..255 by 255",
+                )
+
+    def _refuse(self, bad: Bool[Tensor, "n"], what: str) -> None:
+        if bool(bad.any()):
+            raise ScanError(
+                f"{int(bad.sum())} of {len(self)} points {what} in {self.source}",
+                "finite coordinates away from the origin",
+                "remove these points, or let the reader do so with --set data.bad_points=drop",
+            )
+
+    def __len__(self) -> int:
+        return self.points_xyz_m.shape[0]
+
+
+@dataclass(frozen=True, eq=False)
+class RangeImage:
+    """One range image or a batch of them: row 0 is the highest elevation, column 0 the azimuth +pi, falling to the right.
+
+    Args:
+        range_m: Euclidean distance to the return in metres; 0 where there is none.
+        return_mask: True = the beam came back.
+        sensor: the rays of the pixels.
+        reflectance: in [0, 1]; 0 where there is no return.
+
+    Raises:
+        ScanError: a range that is not finite, not positive on a return, or not 0 elsewhere.
+        ConfigError: an image whose size is not the sensor's.
+    """
+
+    range_m: Float[Tensor, "*batch H W"]
+    return_mask: Bool[Tensor, "*batch H W"]
+    sensor: SensorModel
+    reflectance: Float[Tensor, "*batch H W"] | None = None
+
+    def __post_init__(self) -> None:
+        size = tuple(self.range_m.shape[-2:])
+        if size != (self.sensor.height, self.sensor.width):
+            raise ConfigError(
+                f"a range image of {size[0]}x{size[1]}",
+                f"the {self.sensor.height}x{self.sensor.width} of the sensor {self.sensor.name!r}",
+                "use the sensor's own size, or sensor.with_columns(...)",
+            )
+        valid = torch.where(self.return_mask, (self.range_m > 0) & self.range_m.isfinite(), self.range_m == 0)
+        if not bool(valid.all()):
+            raise ScanError(
+                f"{int((~valid).sum())} pixels whose range contradicts their return mask",
+                "a positive finite range on every return and 0 elsewhere",
+                "build the image with RangeImage.masked",
+            )
+
+    @classmethod
+    def masked(
+        cls, range_m: Float[Tensor, "*batch H W"], return_mask: Bool[Tensor, "*batch H W"], sensor: SensorModel
+    ) -> RangeImage:
+        """Make a range image of a clean range and a mask: the range is set to 0 where nothing returned."""
+        return cls(torch.where(return_mask, range_m, 0.0), return_mask, sensor)
+
+    @classmethod
+    def stack(cls, images: list[RangeImage]) -> RangeImage:
+        """Make one batch of images of one sensor; reflectance is kept where every image has it."""
+        reflectance = [image.reflectance for image in images if image.reflectance is not None]
+        return cls(
+            torch.stack([image.range_m for image in images]),
+            torch.stack([image.return_mask for image in images]),
+            images[0].sensor,
+            torch.stack(reflectance) if len(reflectance) == len(images) else None,
+        )
+
+    def __len__(self) -> int:
+        return self.range_m.shape[0] if self.range_m.ndim > 2 else 1
+
+    def __getitem__(self, index: int | slice) -> RangeImage:
+        """Return one image, or a slice of images, of a batch."""
+        return replace(
+            self,
+            range_m=self.range_m[index],
+            return_mask=self.return_mask[index],
+            reflectance=None if self.reflectance is None else self.reflectance[index],
+        )
+
+    def to(self, device: torch.device | str) -> RangeImage:
+        """Return the image with its pixels on another device."""
+        return replace(
+            self,
+            range_m=self.range_m.to(device),
+            return_mask=self.return_mask.to(device),
+            reflectance=None if self.reflectance is None else self.reflectance.to(device),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class TokenGrid:
+    """The discrete tokens of a batch of range images, in the layout of the latent grid.
+
+    Args:
+        tokens: indices of codes.
+        num_codes: size of the codebook; every token is below it.
+
+    Raises:
+        ConfigError: a token outside [0, num_codes).
+    """
+
+    tokens: Int[Tensor, "*batch h w"]
+    num_codes: int
+
+    def __post_init__(self) -> None:
+        if self.tokens.numel() and not (0 <= int(self.tokens.min()) and int(self.tokens.max()) < self.num_codes):
+            raise ConfigError(
+                f"tokens from {int(self.tokens.min())} to {int(self.tokens.max())}",
+                f"tokens of a codebook of {self.num_codes} codes",
+                "use the tokenizer that wrote them",
+            )
+
+
+@dataclass(frozen=True)
+class MetricResult:
+    """A number with everything needed to read it.
+
+    Args:
+        metric: the metric's name.
+        value: the number.
+        higher_is_better: its direction.
+        num_generated: how many generated scans went in.
+        num_reference: how many real ones.
+        variant: which definition was used, e.g. ``exact`` or ``reference``.
+        details: further numbers, such as the value at every level.
+    """
+
+    metric: str
+    value: float
+    higher_is_better: bool
+    num_generated: int
+    num_reference: int
+    variant: str
+    details: dict[str, Any] = field(default_factory=dict)

@@ -1,0 +1,30 @@
+"""What tests share: where the reference numbers and the real scans lie, if they lie beside the project."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+SHARED = Path(os.environ.get("LIDARGRIT_SHARED", Path(__file__).resolve().parents[2] / "shared"))
+
+torch.set_num_threads(1)  # two threads while another process runs can be many times slower
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    if not SHARED.is_dir():
+        pytest.skip("needs the reference numbers and real scans, which do not travel with the project")
+    return SHARED
+
+
+@pytest.fixture(scope="session")
+def golden(shared):
+    """Return a function that loads one file of reference numbers."""
+    return lambda name: dict(np.load(shared / "goldens" / f"{name}.npz", allow_pickle=False))
+
+
+@pytest.fixture(scope="session")
+def real(shared) -> Path:
+    return shared / "data" / "real"
