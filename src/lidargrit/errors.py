@@ -1,13 +1,13 @@
 """One exception tree; every message says what was got, what was wanted, and the cure.
 
-    LidarGritError (ValueError)
-    ├── ScanError         a scan file, or the points in it, cannot be used
-    ├── DataError         a folder or a data source is not what was asked for
-    ├── UnknownNameError  no sensor, recipe, metric, ... of that name
-    ├── ConfigError       a recipe's setting is unknown or out of its bounds
-    ├── CheckpointError   weights or a run that are damaged or of another configuration
-    ├── OutputError       a place to write to is taken, or could not be written
-    └── TrainingError     training cannot go on: the loss is not a number, the codebook collapsed
+LidarGritError (ValueError)
+├── ScanError         a scan file, or the points in it, cannot be used
+├── DataError         a folder or a data source is not what was asked for
+├── UnknownNameError  no sensor, recipe, metric, ... of that name
+├── ConfigError       a recipe's setting is unknown or out of its bounds
+├── CheckpointError   weights or a run that are damaged or of another configuration
+├── OutputError       a place to write to is taken, or could not be written
+└── TrainingError     training cannot go on: the loss is not a number, the codebook collapsed
 """
 
 from __future__ import annotations

@@ -31,8 +31,8 @@ class Scan:
     """
 
     points_xyz_m: Float[Tensor, "n 3"]
-    reflectance: Float[Tensor, "n"] | None = None
-    ring: Int[Tensor, "n"] | None = None
+    reflectance: Float[Tensor, n] | None = None
+    ring: Int[Tensor, n] | None = None
     source: str = "a scan"
 
     def __post_init__(self) -> None:
@@ -50,7 +50,7 @@ class Scan:
                     "scale the fourth column, e.g. divide an intensity of 0..255 by 255",
                 )
 
-    def _refuse(self, bad: Bool[Tensor, "n"], what: str) -> None:
+    def _refuse(self, bad: Bool[Tensor, n], what: str) -> None:
         if bool(bad.any()):
             raise ScanError(
                 f"{int(bad.sum())} of {len(self)} points {what} in {self.source}",
@@ -154,7 +154,7 @@ class TokenGrid:
     num_codes: int
 
     def __post_init__(self) -> None:
-        if self.tokens.numel() and not (0 <= int(self.tokens.min()) and int(self.tokens.max()) < self.num_codes):
+        if self.tokens.numel() and not (int(self.tokens.min()) >= 0 and int(self.tokens.max()) < self.num_codes):
             raise ConfigError(
                 f"tokens from {int(self.tokens.min())} to {int(self.tokens.max())}",
                 f"tokens of a codebook of {self.num_codes} codes",

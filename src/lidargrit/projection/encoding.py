@@ -26,9 +26,7 @@ class RangeEncoding:
     range_min_m: float
     range_max_m: float
 
-    def encode(
-        self, range_m: Float[Tensor, "*shape"], return_mask: Bool[Tensor, "*shape"]
-    ) -> Float[Tensor, "*shape"]:
+    def encode(self, range_m: Float[Tensor, "*shape"], return_mask: Bool[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
         """Map metres to [-1, 1]; pixels without a return become -1."""
         low, high = self._curve(self.range_min_m), self._curve(self.range_max_m)
         curve = self._curve_of(range_m.clamp(self.range_min_m, self.range_max_m))

@@ -90,7 +90,9 @@ def index_map(
     far_to_near = np.argsort(-range_m, kind="stable")
     far_to_near = far_to_near[eligible[far_to_near]]
     winner = np.full((height, width), -1, dtype=np.int32)
-    winner[row[far_to_near], column[far_to_near]] = far_to_near  # of several points the last written, the nearest, stays
+    winner[row[far_to_near], column[far_to_near]] = (
+        far_to_near  # of several points the last written, the nearest, stays
+    )
     return winner
 
 

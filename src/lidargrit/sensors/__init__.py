@@ -35,7 +35,8 @@ class SensorModel:
     """
 
     name: str
-    elevation_rad: Float[Tensor, "H #W"]
+    elevation_rad: Float[Tensor, (H #W
+)]
     azimuth_rad: Float[Tensor, "#H W"]
     range_min_m: float
     range_max_m: float
@@ -80,7 +81,9 @@ class SensorModel:
         """
         if columns < 1 or stride < 1 or columns % stride:
             raise ConfigError(
-                f"{columns} columns, every {stride}th kept", "a positive multiple of the stride", "change one of the two"
+                f"{columns} columns, every {stride}th kept",
+                "a positive multiple of the stride",
+                "change one of the two",
             )
         return replace(self, azimuth_rad=column_azimuths_rad(columns, stride), column_stride=stride)
 
