@@ -1,0 +1,155 @@
+"""Scans with a car, and without: "NAME:ROOT:SPLIT" → :class:`ScanDataset`."""
+
+from __future__ import annotations
+
+import re
+from abc import ABC, abstractmethod
+from pathlib import Path
+from typing import ClassVar, Literal
+
+from lidargrit import _discovery
+from lidargrit.errors import DataError
+from lidargrit.structures import Scan
+
+BadPoints = Literal["refuse", "drop"]
+
+
+class ScanDataset(ABC):
+    """An ordered collection of scans that one sensor made.
+
+    A split is ``all``, a named one, or sequences (drives) joined by "+", as in ``00+03``. A share in brackets takes one
+    contiguous block of the scans in order: ``all[:90%]`` and ``all[90%:]`` have no scan in common. Blocks keep
+    neighbours in time together, but where one ends within a drive, the same street is seen from both sides of the cut:
+    scans near it leak from one share to the other. Whole drives leak least.
+
+    A named split takes those of its sequences that are on disk, so that part of a data set can be used.
+
+    Args:
+        root: the folder that ``tree`` starts from.
+        split: which scans.
+        bad_points: ``refuse`` a scan with NaN, infinite or all-zero coordinates, or ``drop`` such points.
+
+    Raises:
+        DataError: the folder does not hold the tree, no scan, or not the split.
+    """
+
+    title: ClassVar[str]
+    """What the data set calls itself."""
+    licence: ClassVar[str]
+    """Under what terms its scans may be used."""
+    tree: ClassVar[str]
+    """How its files lie below the root."""
+    sensor: ClassVar[str]
+    """Name of the sensor that made the scans."""
+    splits: ClassVar[dict[str, tuple[str, ...]]] = {}
+    """The sequences of every named split."""
+
+    def __init__(self, root: Path, split: str = "all", bad_points: BadPoints = "refuse") -> None:
+        self.root, self.split = root, split
+        self.bad_points: BadPoints = bad_points
+        self.paths: list[Path] = []
+
+    @classmethod
+    def public_name(cls) -> str:
+        """Return the name that a user types: the file that defines the class."""
+        return cls.__module__.rpartition(".")[2]
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """Count the scans."""
+
+    @abstractmethod
+    def scan(self, index: int) -> Scan:
+        """Read one scan.
+
+        Raises:
+            ScanError: the file cannot be used.
+        """
+
+    @abstractmethod
+    def name(self, index: int) -> str:
+        """Name one scan, the same on every machine and in every split: "00/000012"."""
+
+    @classmethod
+    @abstractmethod
+    def matches(cls, root: Path) -> bool:
+        """Tell whether a folder looks like this tree."""
+
+    @classmethod
+    @abstractmethod
+    def write_example(cls, root: Path, num_scans: int) -> None:
+        """Write simulated scans as a small tree of this layout.
+
+        Raises:
+            OutputError: a file of it exists already.
+        """
+
+
+def open_dataset(source: str, bad_points: BadPoints = "refuse") -> ScanDataset:
+    """Open a data set by a name and a place.
+
+    Args:
+        source: "NAME:ROOT" or "NAME:ROOT:SPLIT"; "ROOT" or "ROOT:SPLIT" to have the layout recognised;
+            "simulated:COUNT" or "simulated:COUNT:SPLIT" for scans of procedural streets.
+        bad_points: as for :class:`ScanDataset`.
+
+    Raises:
+        UnknownNameError: no data set of that name; names its nearest neighbours.
+        DataError: the folder does not hold the tree, no scan, or not the split.
+
+    Example:
+        >>> open_dataset("simulated:100:val").name(0)
+        'seed_1000000'
+    """
+    head, colon, rest = source.partition(":")
+    is_place = "/" in head or _is_there(head)
+    if head in _discovery.names("datasets") and (colon or not is_place):
+        if not rest:
+            raise DataError(
+                f"the source {source!r} alone",
+                f"{head}: followed by {load(head).tree}",
+                "type NAME:ROOT, such as kitti_raw:/data/kitti_raw, or simulated:1000",
+            )
+        root, split = _root_and_split(rest)
+        return load(head)(root, split, bad_points)
+    if colon and not is_place:
+        load(head)  # raises: no such name
+    root, split = _root_and_split(source)
+    name = recognise(root)
+    if name is None:
+        raise DataError(
+            f"{root}, which {'holds no layout we know' if root.is_dir() else 'is not a folder'}",
+            "the root of a data set",
+            "check the path, or see the layouts with: lidargrit list datasets",
+        )
+    return load(name)(root, split, bad_points)
+
+
+def load(name: str) -> type[ScanDataset]:
+    """Return a data set's class by its name, or raise UnknownNameError."""
+    return _discovery.load_class("datasets", name, ScanDataset)
+
+
+def recognise(root: Path) -> str | None:
+    """Name the data set whose layout a folder has: the most specific that matches, None if none does."""
+    trees = {name: load(name).tree for name in _discovery.names("datasets")}
+    most_specific_first = sorted(trees, key=lambda name: ("**" in trees[name], -trees[name].count("/"), name))
+    return next((name for name in most_specific_first if load(name).matches(root)), None)
+
+
+def _is_there(text: str) -> bool:
+    try:
+        return Path(text).expanduser().exists()
+    except OSError:  # a name longer than names can be
+        return False
+
+
+def _root_and_split(text: str) -> tuple[Path, str]:
+    if _is_there(text):  # colons and brackets of a folder that exists are its own
+        return Path(text).expanduser(), "all"
+    share = re.search(r"\[[^\]/]*\]$", text)
+    before = text[: share.start()] if share else text
+    root, colon, split = before.rpartition(":")
+    if not colon:
+        root, split = before, "all"
+    return Path(root).expanduser(), split + (share[0] if share else "")

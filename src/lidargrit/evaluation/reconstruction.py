@@ -1,0 +1,169 @@
+"""How well a tokenizer gives back what it was shown: pairs of real and decoded range images → errors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Float64
+from torch import Tensor
+
+from lidargrit.errors import ConfigError, DataError, ScanError
+from lidargrit.structures import RangeImage
+
+
+@dataclass(frozen=True)
+class ReconstructionErrors:
+    """Errors of decoded against real range images, every pixel of every scan counting the same.
+
+    Range errors are those of the decoder's clean range, before any ray is dropped, where the real scan has a return.
+    The mask is scored as a search for rays without a return ("drop"): a share of nothing, such as the precision where
+    no ray was dropped, is 1.
+
+    Args:
+        range_mae_m: mean absolute range error in metres; lower is better.
+        range_rmse_m: root of the mean squared range error in metres; lower is better.
+        mask_accuracy: share of pixels whose return or ray drop is decoded as it was; higher is better, as below.
+        drop_precision: share of the decoded ray drops that are real ones.
+        drop_recall: share of the real ray drops that are decoded as such.
+        drop_iou: ray drops common to both by those of either.
+        num_scans: how many pairs went in.
+    """
+
+    range_mae_m: float
+    range_rmse_m: float
+    mask_accuracy: float
+    drop_precision: float
+    drop_recall: float
+    drop_iou: float
+    num_scans: int
+
+
+class ReconstructionScore:
+    """Gathers the errors of pairs batch by batch; the result does not depend on how they were batched or ordered."""
+
+    def __init__(self) -> None:
+        self._num_scans = 0
+        # Counts of pixels: real and decoded ray drops as (real, decoded) = TT, FT, TF, FF.
+        self._both = self._only_decoded = self._only_real = self._neither = 0
+        self._absolute_m, self._squared_m2 = 0.0, 0.0
+
+    def update(
+        self, real: RangeImage, clean_range_m: Float[Tensor, "B H W"], return_mask: Bool[Tensor, "B H W"]
+    ) -> None:
+        """Take in a batch of pairs.
+
+        Args:
+            real: what the tokenizer was shown, a batch.
+            clean_range_m: what its decoder gave for every pixel, in metres, no ray dropped.
+            return_mask: which pixels it decoded as a return.
+
+        Raises:
+            ConfigError: the two sides differ in shape.
+            ScanError: a decoded range is not a number where the real scan has a return.
+        """
+        if not real.range_m.shape == clean_range_m.shape == return_mask.shape:
+            raise ConfigError(
+                f"decoded ranges {tuple(clean_range_m.shape)} and masks {tuple(return_mask.shape)}",
+                f"the shape of the real range images, {tuple(real.range_m.shape)}",
+                "decode the batch that was encoded",
+            )
+        returned = real.return_mask
+        error_m = (clean_range_m.detach()[returned].double() - real.range_m[returned].double()).abs()
+        if not bool(error_m.isfinite().all()):
+            raise ScanError(
+                f"{int((~error_m.isfinite()).sum())} decoded ranges that are NaN or infinite",
+                "finite metres",
+                "check the weights of the tokenizer",
+            )
+        self._absolute_m += float(error_m.sum())
+        self._squared_m2 += float(error_m.square().sum())
+        self._both += int((~returned & ~return_mask).sum())
+        self._only_decoded += int((returned & ~return_mask).sum())
+        self._only_real += int((~returned & return_mask).sum())
+        self._neither += int((returned & return_mask).sum())
+        self._num_scans += len(real)
+
+    def merge(self, other: ReconstructionScore) -> None:
+        """Take in what another process has gathered."""
+        for key, value in vars(other).items():
+            setattr(self, key, getattr(self, key) + value)
+
+    def compute(self) -> ReconstructionErrors:
+        """Return the errors over all pairs so far.
+
+        Raises:
+            DataError: no pair, or not one return in the real scans.
+        """
+        num_returns = self._only_decoded + self._neither
+        if not num_returns:
+            raise DataError(
+                f"{self._num_scans} pairs of range images without one real return",
+                "at least one pair with returns",
+                "check the folder of real scans",
+            )
+        num_pixels = num_returns + self._both + self._only_real
+        return ReconstructionErrors(
+            range_mae_m=self._absolute_m / num_returns,
+            range_rmse_m=(self._squared_m2 / num_returns) ** 0.5,
+            mask_accuracy=(self._both + self._neither) / num_pixels,
+            drop_precision=_share(self._both, self._both + self._only_decoded),
+            drop_recall=_share(self._both, self._both + self._only_real),
+            drop_iou=_share(self._both, self._both + self._only_decoded + self._only_real),
+            num_scans=self._num_scans,
+        )
+
+
+def _share(part: int, whole: int) -> float:
+    return part / whole if whole else 1.0
+
+
+# The measures of monocular depth estimation (Eigen et al., Depth map prediction from a single image, NeurIPS 2014,
+# section 4), as LidarGRIT reports them for its first stage: in metres, and image by image.
+
+
+def abs_rel(
+    real_range_m: Float[Tensor, "B H W"], decoded_range_m: Float[Tensor, "B H W"], return_mask: Bool[Tensor, "B H W"]
+) -> Float64[Tensor, " B"]:
+    """Return the mean of |decoded - real| / real over the returns of each image; NaN where it has none."""
+    return _mean_over_returns((decoded_range_m.double() - real_range_m).abs() / real_range_m, return_mask)
+
+
+def sq_rel(
+    real_range_m: Float[Tensor, "B H W"], decoded_range_m: Float[Tensor, "B H W"], return_mask: Bool[Tensor, "B H W"]
+) -> Float64[Tensor, " B"]:
+    """Return the mean of (decoded - real)^2 / real (metres) over the returns of each image; NaN where it has none."""
+    return _mean_over_returns((decoded_range_m.double() - real_range_m).square() / real_range_m, return_mask)
+
+
+def rmse(
+    real_range_m: Float[Tensor, "B H W"], decoded_range_m: Float[Tensor, "B H W"], return_mask: Bool[Tensor, "B H W"]
+) -> Float64[Tensor, " B"]:
+    """Return the root of the mean squared error, in metres, over the returns of each image; NaN where it has none."""
+    return _mean_over_returns((decoded_range_m.double() - real_range_m).square(), return_mask).sqrt()
+
+
+def rmse_log(
+    real_range_m: Float[Tensor, "B H W"], decoded_range_m: Float[Tensor, "B H W"], return_mask: Bool[Tensor, "B H W"]
+) -> Float64[Tensor, " B"]:
+    """Return the root of the mean squared error of ln(range) over the returns of each image; NaN where it has none."""
+    log_ratio = decoded_range_m.double().log() - real_range_m.double().log()
+    return _mean_over_returns(log_ratio.square(), return_mask).sqrt()
+
+
+def accuracy(
+    real_range_m: Float[Tensor, "B H W"],
+    decoded_range_m: Float[Tensor, "B H W"],
+    return_mask: Bool[Tensor, "B H W"],
+    power: int = 1,
+) -> Float64[Tensor, " B"]:
+    """Return the share of returns with max(decoded / real, real / decoded) < 1.25^power; NaN where there are none.
+
+    The program counts all pixels while it trains and, as here, returns only when it reports.
+    """
+    ratio = decoded_range_m.double() / real_range_m
+    return _mean_over_returns((torch.maximum(ratio, 1 / ratio) < 1.25**power).double(), return_mask)
+
+
+def _mean_over_returns(value: Float64[Tensor, "B H W"], return_mask: Bool[Tensor, "B H W"]) -> Float64[Tensor, " B"]:
+    return torch.where(return_mask, value, 0.0).sum((1, 2)) / return_mask.sum((1, 2))

@@ -1,0 +1,201 @@
+"""Data sources → batches of range images: projected once, cached on disk, drawn and augmented by seed."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import accumulate
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+
+from lidargrit import __version__
+from lidargrit.augmentation import Augmentation, augment
+from lidargrit.datasets import BadPoints, ScanDataset, open_dataset
+from lidargrit.errors import ConfigError, DataError, ScanError
+from lidargrit.files import atomic_path, read_json, write_json
+from lidargrit.projection import Variant, project
+from lidargrit.reporting import Reporter
+from lidargrit.sensors import SensorModel, load_sensor
+from lidargrit.structures import RangeImage
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """Which scans, and how they become range images.
+
+    Args:
+        train: sources to learn from, each "NAME:ROOT:SPLIT", "FOLDER" or "simulated:COUNT".
+        val: sources to watch, never learned from.
+        sensor: name of a sensor, or a sensor's ``.json`` file.
+        columns: fine columns of the circle; 0 for the sensor's own.
+        column_stride: keep every n-th of them.
+        projection: ``sensor`` for the sensor's own, ``spherical`` or ``unfolding``.
+        variant: ``exact``, or ``reference`` to repeat the released program's projection.
+        bad_points: ``refuse`` scans with NaN, infinite or origin points, or ``drop`` these points.
+        bad_scans: ``refuse`` to go on after a scan that cannot be used, or ``skip`` it and say so.
+    """
+
+    train: tuple[str, ...]
+    val: tuple[str, ...]
+    sensor: str = "hdl64e_kitti_odometry"
+    columns: int = 0
+    column_stride: int = 1
+    projection: Literal["sensor", "spherical", "unfolding"] = "sensor"
+    variant: Variant = "exact"
+    bad_points: BadPoints = "refuse"
+    bad_scans: Literal["refuse", "skip"] = "refuse"
+
+    def load_sensor(self) -> SensorModel:
+        """Return the sensor at the wanted number of columns."""
+        sensor = load_sensor(self.sensor)
+        return sensor.with_columns(self.columns, self.column_stride) if self.columns else sensor
+
+
+class RangeImages:
+    """Range images on disk that read like a list; only those asked for are in memory."""
+
+    def __init__(self, sensor: SensorModel, parts: Sequence[np.ndarray], names: Sequence[str]) -> None:
+        self.sensor, self.names = sensor, list(names)
+        self._parts = [part for part in parts if len(part)]
+        self._ends = list(accumulate(len(part) for part in self._parts))
+
+    def __len__(self) -> int:
+        return self._ends[-1] if self._ends else 0
+
+    def batch(self, indices: Sequence[int]) -> RangeImage:
+        """Return the images of these indices, as one batch."""
+        range_m = torch.from_numpy(np.stack([self._pixels(index) for index in indices]))
+        return RangeImage(range_m, range_m > 0, self.sensor)
+
+    def _pixels(self, index: int) -> np.ndarray:
+        part = bisect_right(self._ends, index)
+        return self._parts[part][index - (self._ends[part - 1] if part else 0)]
+
+
+class Batches:
+    """Training batches as a function of how many scans were seen before, so that a stopped run goes on as if it had not.
+
+    Args:
+        images: what to draw from; every scan once per epoch, in an order of the seed.
+        batch_size: over all processes.
+        augmentations: applied in turn.
+        seed: of order and augmentation.
+        rank: this process, of
+        world_size: this many; each takes its share of every batch.
+    """
+
+    def __init__(
+        self,
+        images: RangeImages,
+        batch_size: int,
+        augmentations: Sequence[Augmentation],
+        seed: int,
+        rank: int = 0,
+        world_size: int = 1,
+    ) -> None:
+        if batch_size % world_size:
+            raise ConfigError(
+                f"batch_size={batch_size} on {world_size} processes", "a multiple of the processes", "change one of them"
+            )
+        self.images, self.batch_size, self.augmentations = images, batch_size, tuple(augmentations)
+        self.seed, self.rank, self.world_size = seed, rank, world_size
+        self._epoch, self._order = -1, torch.empty(0)
+
+    def at(self, scans_seen: int) -> RangeImage:
+        """Return this process's share of the batch that follows ``scans_seen`` scans."""
+        share = self.batch_size // self.world_size
+        first = scans_seen + self.rank * share
+        images = self.images.batch([self._draw(position) for position in range(first, first + share)])
+        return augment(images, self.augmentations, torch.Generator().manual_seed(seed_of(self.seed, 1, first)))
+
+    def _draw(self, position: int) -> int:
+        epoch, place = divmod(position, len(self.images))
+        if epoch != self._epoch:
+            rng = torch.Generator().manual_seed(seed_of(self.seed, 0, epoch))
+            self._epoch, self._order = epoch, torch.randperm(len(self.images), generator=rng)
+        return int(self._order[place])
+
+
+def seed_of(*parts: int) -> int:
+    """Mix whole numbers into one seed: near numbers give seeds that have nothing in common."""
+    return int(np.random.SeedSequence(parts).generate_state(1, np.uint64)[0] >> np.uint64(1))
+
+
+def load_range_images(sources: Sequence[str], config: DataConfig, reporter: Reporter | None = None) -> RangeImages:
+    """Project every scan of the sources, or find them projected in the cache.
+
+    The cache is ``$LIDARGRIT_CACHE``, else ``lidargrit`` in the user's cache folder. It may be deleted at any time.
+
+    Raises:
+        DataError: no source, or a source without a scan.
+        ScanError: a scan that cannot be used; ``bad_scans=skip`` leaves it out.
+    """
+    if not sources:
+        raise DataError("no source of scans", "at least one", "name one with --set data.train=[FOLDER]")
+    reporter, sensor = reporter or Reporter(), config.load_sensor()
+    parts: list[np.ndarray] = []
+    names: list[str] = []
+    for source in sources:
+        dataset = open_dataset(source, config.bad_points)
+        stem = _cache_folder() / _digest(source, dataset, sensor, config)
+        if not stem.with_suffix(".json").exists():
+            _project_all(source, dataset, sensor, config, stem, reporter)
+        kept = read_json(stem.with_suffix(".json"))["names"]
+        parts.append(np.load(stem.with_suffix(".npy"), mmap_mode="r", allow_pickle=False)[: len(kept)])
+        names += kept
+    images = RangeImages(sensor, parts, names)
+    if not len(images):
+        raise DataError(f"no usable scan in {', '.join(sources)}", "at least one", "see the messages above")
+    return images
+
+
+def _project_all(
+    source: str, dataset: ScanDataset, sensor: SensorModel, config: DataConfig, stem: Path, reporter: Reporter
+) -> None:
+    method = None if config.projection == "sensor" else config.projection
+    kept: list[str] = []
+    shape = (len(dataset), sensor.height, sensor.width)
+    with atomic_path(stem.with_suffix(".npy")) as temporary:
+        pixels = np.lib.format.open_memmap(temporary, mode="w+", dtype=np.float32, shape=shape)
+        with reporter.progress("projecting scans", len(dataset)) as progress:
+            for index in range(len(dataset)):
+                try:
+                    image = project(dataset.scan(index), sensor, method, config.variant)
+                except ScanError as error:
+                    if config.bad_scans == "refuse":
+                        raise ScanError(
+                            error.got, error.wanted, f"{error.cure}; --set data.bad_scans=skip leaves such scans out"
+                        ) from None
+                    reporter.message(f"left out: {error}")
+                else:
+                    pixels[len(kept)] = image.range_m.numpy()
+                    kept.append(dataset.name(index))
+                progress.advance(1)
+        pixels.flush()
+    write_json(stem.with_suffix(".json"), {"source": source, "names": kept})  # written last: it says "complete"
+
+
+def _cache_folder() -> Path:
+    if "LIDARGRIT_CACHE" in os.environ:
+        return Path(os.environ["LIDARGRIT_CACHE"])
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "lidargrit"
+
+
+def _digest(source: str, dataset: ScanDataset, sensor: SensorModel, config: DataConfig) -> str:
+    """Name a cache by everything that its pixels depend on."""
+    files = [(str(path.resolve()), path.stat().st_size, path.stat().st_mtime_ns) for path in dataset.paths]
+    facts = [
+        __version__,
+        files or source,
+        len(dataset),
+        sensor.to_json(),
+        [config.projection, config.variant, config.bad_points, config.bad_scans],
+    ]
+    return hashlib.sha256(json.dumps(facts).encode()).hexdigest()[:24]

@@ -1,0 +1,300 @@
+"""Sliced Wasserstein distance between local patches of range images, scale by scale: two sets → mean over scales."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from typing import Any, Literal
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Float32, Int
+from torch import Tensor
+
+from lidargrit.errors import ConfigError
+from lidargrit.metrics import Metric
+from lidargrit.projection import RangeEncoding
+from lidargrit.structures import MetricResult, RangeImage
+
+# All from Karras et al. 2018, whose values LidarGRIT's program keeps.
+_COARSEST = 16  # rows or columns, whichever are fewer, of the last level of the pyramid
+_PATCH = 7  # pixels; 7 * 7 = 49 numbers per descriptor
+_PATCHES = 128  # per image and level
+_BATCH = 128  # images; those of one batch share their patch positions in ``reference``
+_REPEATS, _DIRECTIONS = 4, 128
+
+_MAX_PROJECTED = 2**23  # projections held at once: 32 MB per set, and as much again while they are sorted
+
+ShapeKey = tuple[int, int, float, float]  # rows, columns, shortest and longest range
+
+
+class SlicedWasserstein(Metric):
+    """Compare the distributions of 7x7 patches of the encoded range at 3 scales (2 for 32 rows) by random projections.
+
+    The range is encoded linearly onto [-1, 1] between the sensor's limits, -1 for no return, and split into a
+    Laplacian pyramid. Patches of a level are standardised by the mean and deviation of their own set, so a common
+    offset or scale goes unseen. The value is the mean over levels, unscaled (the paper prints it times 100); the levels
+    themselves are in the details by their number of rows, ``rows_64`` the finest. LidarGRIT's program names them the
+    other way round: its "swd-16" is the finest, our ``rows_64``, and its "swd-64" our ``rows_16``.
+
+    Neither variant is 0 for a set against itself: the two sides draw their own patches. The floor falls as sets grow,
+    so only values of equally large sets can be compared. Of sets of unequal size the first n of the larger one are
+    used, n being the size of the smaller; ``num_compared`` in the details tells n.
+
+    Args:
+        variant: ``reference`` repeats LidarGRIT's program, draw for draw with generated images as its first set:
+            directions divided by their standard deviation instead of their length (values about 7 times larger), the
+            upsampled level shifted by one pixel, patch positions shared by the 128 images of a batch. It depends on the
+            order of images only through the batch into which each falls. Parts that are merged each count batches from
+            their own start: for more than 128 images the value is then that of another equally good draw.
+            ``textbook`` is Karras et al.: directions of unit length, an aligned pyramid, positions drawn for every
+            image. They are drawn from the image itself, its set and the seed, so that neither the order of images nor
+            the number of processes matters; equal images of one set give equal patches.
+        seed: of patch positions and directions.
+
+    Raises:
+        ConfigError: images of fewer than 16 rows or columns, of a size that cannot be halved, or of two kinds.
+
+    Source:
+        Karras et al., Progressive growing of GANs, ICLR 2018, section 5; behaviour of hamedhaghighi/LidarGRIT@a3f86e7.
+    """
+
+    title = "Sliced Wasserstein distance between patches of range images"
+    higher_is_better = False
+    variants = ("reference", "textbook")
+
+    def __init__(self, *, variant: Literal["reference", "textbook"] = "reference", seed: int = 0) -> None:
+        super().__init__(variant=variant, seed=seed)
+        self._kind: ShapeKey | None = None
+        self._shared: SharedPositions | None = None
+        # Per set, a list of blocks of images; of every block its levels, each (images, patches, 49).
+        self._blocks: dict[bool, list[list[Tensor]]] = {False: [], True: []}
+
+    def update(self, images: RangeImage, *, real: bool) -> None:
+        """Cut the patches of a batch of images; only they are kept, 75 kB per image."""
+        sensor = images.sensor
+        self._require_kind((sensor.height, sensor.width, sensor.range_min_m, sensor.range_max_m))
+        range_m = images.range_m.detach().reshape(-1, sensor.height, sensor.width)
+        return_mask = images.return_mask.reshape(range_m.shape)
+        encoding = RangeEncoding("linear", sensor.range_min_m, sensor.range_max_m)
+        start = 0
+        while start < len(range_m):
+            batch, place = divmod(self._count(real), _BATCH)
+            stop = min(len(range_m), start + _BATCH - place)  # a block never crosses the border of two batches
+            encoded = encoding.encode(range_m[start:stop].float(), return_mask[start:stop])
+            pyramid = laplacian_pyramid(encoded, shifted=self.variant == "reference")
+            if self._shared is not None:
+                positions = self._shared.of_batch(batch, real)
+            else:
+                positions = own_positions(range_m[start:stop], pyramid, self.seed, real)
+            self._blocks[real].append([descriptors(*pair).cpu() for pair in zip(pyramid, positions, strict=True)])
+            start = stop
+
+    def compute(self) -> MetricResult:
+        """Return the mean over levels, and every level in the details."""
+        num_generated, num_reference = self._count(False), self._count(True)
+        self.require_images(num_generated, num_reference, at_least=2)
+        n = min(num_generated, num_reference)
+        assert self._kind is not None
+        reference = self._shared is not None
+        rng = torch.Generator().manual_seed(self.seed)
+        if self._shared is not None:  # the program draws its directions after the patches of all batches
+            rng = self._shared.after_batches(math.ceil(n / _BATCH))
+        details: dict[str, Any] = {}
+        for level in range(num_levels(*self._kind[:2])):
+            generated, real = (standardised(self._level(which, level, n), int(reference)) for which in (False, True))
+            repeats = [
+                sliced_distance(generated, real, random_directions(rng, unit_length=not reference))
+                for _ in range(_REPEATS)
+            ]
+            details[f"rows_{self._kind[0] >> level}"] = sum(repeats) / len(repeats)
+        value = sum(details.values()) / len(details)
+        details["num_compared"] = n
+        return MetricResult(
+            self.name, value, self.higher_is_better, num_generated, num_reference, self.variant, details
+        )
+
+    def merge(self, other: Metric) -> None:
+        """Append the patches that another process has cut."""
+        self.require_same_options(other)
+        assert isinstance(other, SlicedWasserstein)
+        if other._kind is None:
+            return
+        self._require_kind(other._kind)
+        for real, blocks in other._blocks.items():
+            self._blocks[real] += blocks
+
+    def _count(self, real: bool) -> int:
+        return sum(len(block[0]) for block in self._blocks[real])
+
+    def _level(self, real: bool, level: int, n: int) -> Float32[Tensor, "descriptors 49"]:
+        return torch.cat([block[level] for block in self._blocks[real]])[:n].flatten(0, 1)
+
+    def _require_kind(self, kind: ShapeKey) -> None:
+        if self._kind is None:
+            level_sizes = [num_positions(kind[0] >> k, kind[1] >> k) for k in range(num_levels(*kind[:2]))]
+            if self.variant == "reference":
+                self._shared = SharedPositions(self.seed, level_sizes)
+            self._kind = kind
+        if self._kind != kind:
+            raise ConfigError(
+                "range images of {}x{} between {:g} and {:g} m".format(*kind),
+                "{}x{} between {:g} and {:g} m, as the images before".format(*self._kind),
+                "project both sets with one sensor",
+            )
+
+
+class SharedPositions:
+    """The patch positions of ``reference``: those of any batch, drawn in the order in which the program draws.
+
+    That order is, batch by batch, the levels of the generated set and then those of the real set, whatever the order in
+    which the sets arrive here.
+    """
+
+    def __init__(self, seed: int, level_sizes: list[int]) -> None:
+        self._level_sizes = level_sizes
+        self._drawn: list[dict[bool, list[Tensor]]] = []
+        self._states = [torch.Generator().manual_seed(seed).get_state()]  # before the first batch, after it, ...
+
+    def of_batch(self, batch: int, real: bool) -> list[Int[Tensor, "1 patches"]]:
+        """Return the positions for every level of a batch, shared by its images."""
+        while len(self._drawn) <= batch:
+            rng = self._source(len(self._drawn))
+            self._drawn.append(
+                {which: [shared_positions(size, rng) for size in self._level_sizes] for which in (False, True)}
+            )
+            self._states.append(rng.get_state())
+        return self._drawn[batch][real]
+
+    def after_batches(self, batches: int) -> torch.Generator:
+        """Return a random source in the state of the program's after so many batches."""
+        self.of_batch(batches - 1, False)
+        return self._source(batches)
+
+    def _source(self, batches: int) -> torch.Generator:
+        rng = torch.Generator()
+        rng.set_state(self._states[batches])
+        return rng
+
+
+def num_levels(rows: int, columns: int) -> int:
+    """Return how many levels the pyramid has: halved for as long as 16 rows and columns are left.
+
+    Raises:
+        ConfigError: fewer than 16 rows or columns, or a size that cannot be halved as often.
+    """
+    if min(rows, columns) < _COARSEST:
+        raise ConfigError(
+            f"range images of {rows}x{columns}",
+            f"at least {_COARSEST} rows and columns, for {_PATCH}x{_PATCH} patches at every scale",
+            "use another metric, or a sensor with more rows and columns",
+        )
+    levels = int(math.log2(min(rows, columns) // _COARSEST)) + 1
+    step = 2 ** (levels - 1)
+    if rows % step or columns % step:
+        raise ConfigError(
+            f"range images of {rows}x{columns}",
+            f"rows and columns that are multiples of {step}, to be halved {levels - 1} times",
+            "project with another number of columns: sensor.with_columns(...)",
+        )
+    return levels
+
+
+def laplacian_pyramid(images: Float[Tensor, "B H W"], *, shifted: bool) -> list[Float[Tensor, "B _ _"]]:
+    """Split images into what each scale adds to the next coarser one, finest first; the last is the coarsest image.
+
+    Azimuth is not treated as circular: borders are mirrored, as in both sources.
+
+    Args:
+        images: encoded, in [-1, 1].
+        shifted: True repeats LidarGRIT's program, where a coarse pixel lands one pixel down and right of where it came
+            from; False keeps it in its place.
+    """
+    levels = []
+    for _ in range(num_levels(*images.shape[1:]) - 1):
+        coarse = _blurred(images)[:, ::2, ::2]
+        levels.append(images - _upsampled(coarse, shifted))
+        images = coarse
+    return [*levels, images]
+
+
+def _upsampled(coarse: Float[Tensor, "B h w"], shifted: bool) -> Float[Tensor, "B 2*h 2*w"]:
+    batch, rows, columns = coarse.shape
+    fine = coarse.new_zeros(batch, 2 * rows, 2 * columns)
+    fine[:, int(shifted) :: 2, int(shifted) :: 2] = coarse
+    return _blurred(fine) * 4  # three of four pixels were zeros
+
+
+def _blurred(images: Float[Tensor, "B H W"]) -> Float[Tensor, "B H W"]:
+    # Burt and Adelson, The Laplacian pyramid as a compact image code, 1983: the binomial kernel.
+    row = images.new_tensor([1.0, 4.0, 6.0, 4.0, 1.0]) / 16
+    padded = F.pad(images[:, None], (2, 2, 2, 2), mode="reflect")
+    return F.conv2d(padded, torch.outer(row, row)[None, None])[:, 0]
+
+
+def num_positions(rows: int, columns: int) -> int:
+    """Return how many places a patch has in an image; place p is that of the corner (p // k, p % k), k per row."""
+    return (rows - _PATCH + 1) * (columns - _PATCH + 1)
+
+
+def shared_positions(num: int, rng: torch.Generator) -> Int[Tensor, "1 patches"]:
+    """Draw 128 of ``num`` places without replacement, or all in random order if there are fewer."""
+    return torch.randperm(num, generator=rng)[None, :_PATCHES]
+
+
+def own_positions(
+    range_m: Float[Tensor, "B H W"], pyramid: list[Float[Tensor, "B _ _"]], seed: int, real: bool
+) -> list[Int[Tensor, "B patches"]]:
+    """Draw 128 places per image and level, with replacement, by a seed made of the image, its set and ``seed``."""
+    positions = [torch.empty(len(level), _PATCHES, dtype=torch.int64) for level in pyramid]
+    for index, image in enumerate(range_m.float().cpu().contiguous().numpy()):
+        content = hashlib.blake2b(image.tobytes(), digest_size=8, key=f"{seed} {int(real)}".encode())
+        rng = torch.Generator().manual_seed(int.from_bytes(content.digest(), "big", signed=True))
+        for level, place in zip(pyramid, positions, strict=True):
+            place[index] = torch.randint(num_positions(*level.shape[1:]), (_PATCHES,), generator=rng)
+    return positions
+
+
+def descriptors(images: Float[Tensor, "B h w"], positions: Int[Tensor, "#B patches"]) -> Float[Tensor, "B patches 49"]:
+    """Cut the 7x7 patches whose corners lie at the given places, the same in every image or others in each."""
+    columns = images.shape[2]
+    per_row = columns - _PATCH + 1
+    positions = positions.to(images.device)
+    corner = positions // per_row * columns + positions % per_row
+    offset = torch.arange(_PATCH, device=images.device)
+    pixel = corner[..., None] + (offset[:, None] * columns + offset).flatten()  # (B or 1, patches, 49)
+    pixel = pixel.expand(len(images), -1, -1)
+    return images.flatten(1).gather(1, pixel.flatten(1)).view(pixel.shape)
+
+
+def standardised(patches: Float[Tensor, "n 49"], correction: int) -> Float[Tensor, "n 49"]:
+    """Bring all numbers of a set together to mean 0 and deviation 1.
+
+    Args:
+        patches: of one set at one level.
+        correction: 1 for the unbiased deviation, 0 for that of the set itself.
+    """
+    deviation, mean = torch.std_mean(patches, correction=correction)
+    return (patches - mean) / (deviation + 1e-8)  # a set of constant images becomes 0, not NaN
+
+
+def random_directions(rng: torch.Generator, *, unit_length: bool) -> Float[Tensor, "49 directions"]:
+    """Draw 128 normally distributed directions, divided by their length or, as LidarGRIT does, their deviation."""
+    directions = torch.randn(_PATCH**2, _DIRECTIONS, generator=rng)
+    return directions / (directions.norm(dim=0) if unit_length else directions.std(dim=0))
+
+
+def sliced_distance(
+    first: Float[Tensor, "n 49"], second: Float[Tensor, "n 49"], directions: Float[Tensor, "49 directions"]
+) -> float:
+    """Return the mean over directions of the 1-D Wasserstein distance of the projected sets.
+
+    Between equally large sets on a line that is the mean difference of their sorted members.
+    """
+    total = 0.0
+    for some in directions.T.split(max(1, _MAX_PROJECTED // len(first))):
+        # numpy sorts in place and without indices, several times faster than torch on a CPU
+        sides = [np.sort((some @ side.T).numpy(), axis=1) for side in (first, second)]
+        total += float(np.abs(sides[0] - sides[1]).mean(dtype=np.float64, axis=1).sum())
+    return total / directions.shape[1]

@@ -1,0 +1,1 @@
+"""Parts without opinions: blocks that models share, tensors → tensors."""

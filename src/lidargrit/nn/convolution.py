@@ -1,0 +1,82 @@
+"""Convolutions and residual blocks over range images, whose azimuth may wrap: feature maps → feature maps.
+
+Parameter names follow the reference's state dict, so that published weights load.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+Padding = Literal["zero", "wrap"]
+
+
+class Convolution(nn.Conv2d):
+    """A 3x3 convolution that keeps the size; rows are padded with zeros, columns with zeros or around the circle."""
+
+    def __init__(self, inputs: int, outputs: int, padding: Padding) -> None:
+        super().__init__(inputs, outputs, 3, padding=(1, 0) if padding == "wrap" else 1)
+        self.wraps = padding == "wrap"
+
+    def forward(self, x: Float[Tensor, "B C H W"]) -> Float[Tensor, "B D H W"]:
+        """Convolve."""
+        return super().forward(F.pad(x, (1, 1, 0, 0), mode="circular") if self.wraps else x)
+
+
+class Downsample(nn.Module):
+    """Halve both axes by a 3x3 convolution of stride 2, with one padded row below and one padded column to the right."""
+
+    def __init__(self, channels: int, padding: Padding) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(channels, channels, 3, stride=2)
+        self.wraps = padding == "wrap"
+
+    def forward(self, x: Float[Tensor, "B C H W"]) -> Float[Tensor, "B C h w"]:
+        """Halve the rows and the columns."""
+        if self.wraps:
+            return self.conv(F.pad(F.pad(x, (0, 1, 0, 0), mode="circular"), (0, 0, 0, 1)))
+        return self.conv(F.pad(x, (0, 1, 0, 1)))
+
+
+class Upsample(nn.Module):
+    """Double both axes by repeating pixels, then convolve."""
+
+    def __init__(self, channels: int, padding: Padding) -> None:
+        super().__init__()
+        self.conv = Convolution(channels, channels, padding)
+
+    def forward(self, x: Float[Tensor, "B C h w"]) -> Float[Tensor, "B C H W"]:
+        """Double the rows and the columns."""
+        return self.conv(F.interpolate(x, scale_factor=2.0, mode="nearest"))
+
+
+def group_norm(channels: int) -> nn.GroupNorm:
+    """Return the reference's normalisation: 32 groups, epsilon 1e-6."""
+    return nn.GroupNorm(32, channels, eps=1e-6)
+
+
+class ResidualBlock(nn.Module):
+    """Norm, swish, convolution, twice, plus the input (through a 1x1 convolution if the channels change).
+
+    Source:
+        The block of the reference's first stage, hamedhaghighi/LidarGRIT@a3f86e7, without its time embedding.
+    """
+
+    def __init__(self, inputs: int, outputs: int, dropout: float, padding: Padding) -> None:
+        super().__init__()
+        self.norm1 = group_norm(inputs)
+        self.conv1 = Convolution(inputs, outputs, padding)
+        self.norm2 = group_norm(outputs)
+        self.dropout = nn.Dropout(dropout)
+        self.conv2 = Convolution(outputs, outputs, padding)
+        if inputs != outputs:
+            self.nin_shortcut = nn.Conv2d(inputs, outputs, 1)
+
+    def forward(self, x: Float[Tensor, "B C H W"]) -> Float[Tensor, "B D H W"]:
+        """Add what the two convolutions find to the input."""
+        h = self.conv1(F.silu(self.norm1(x)))
+        h = self.conv2(self.dropout(F.silu(self.norm2(h))))
+        return (self.nin_shortcut(x) if self.conv1.in_channels != self.conv1.out_channels else x) + h

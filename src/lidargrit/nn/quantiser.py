@@ -1,0 +1,115 @@
+"""Vector quantisation: latents → the nearest codes of a learned codebook, with straight-through gradients."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import torch
+import torch.distributed as distributed
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+CodebookLoss = Literal["paper", "reference", "vqvae", "ema"]
+
+# Weights of (commitment: move the latent, codebook: move the code). The paper gives both weight 1; the program, by a bug
+# of an ancestor, puts its beta of 0.25 on the codebook; van den Oord et al., 2017, put it on the commitment. With "ema"
+# the codes follow the mean of their latents instead of a gradient (same paper, appendix A.1).
+_LOSS_WEIGHTS = {"paper": (1.0, 1.0), "reference": (1.0, 0.25), "vqvae": (0.25, 1.0), "ema": (0.25, 0.0)}
+_EMA_DECAY = 0.99
+_DEAD_BELOW = 0.1  # a code that is chosen less often than this share of an even use is dead
+
+
+class Quantised(NamedTuple):
+    """Latents snapped to codes, which codes, and the loss that pulls the two together."""
+
+    latents: Float[Tensor, "B D h w"]
+    tokens: Int[Tensor, "B h w"]
+    loss: Float[Tensor, ""]
+
+
+class VectorQuantiser(nn.Module):
+    """A codebook.
+
+    Args:
+        num_codes: its size.
+        code_dim: length of a code.
+        loss: which terms move codes and latents towards each other; see ``_LOSS_WEIGHTS``.
+        restart_dead: while training, replace codes that are hardly ever chosen by latents of the batch: the remedy
+            against a collapsed codebook. The reference has none.
+    """
+
+    usage: Tensor
+    code_sums: Tensor
+
+    def __init__(self, num_codes: int, code_dim: int, loss: CodebookLoss, restart_dead: bool) -> None:
+        super().__init__()
+        self.loss, self.restart_dead = loss, restart_dead
+        self.embedding = nn.Embedding(num_codes, code_dim)
+        nn.init.uniform_(self.embedding.weight, -1 / num_codes, 1 / num_codes)
+        self.embedding.weight.requires_grad_(loss != "ema")
+        self.register_buffer("usage", torch.zeros(num_codes))  # running number of latents a batch brings to each code
+        self.register_buffer("code_sums", torch.zeros(num_codes, code_dim))
+
+    def forward(self, z: Float[Tensor, "B D h w"], rng: torch.Generator | None = None) -> Quantised:
+        """Replace every latent by its nearest code; ``rng`` draws the latents that dead codes restart from."""
+        z = z.float()  # distances of nearby codes need single precision, whatever the network runs in
+        flat = z.movedim(1, -1).flatten(0, -2)
+        tokens = self.nearest(flat)
+        if self.training:
+            self._follow(flat.detach(), tokens, rng)
+        codes = self.lookup(tokens.unflatten(0, (z.shape[0], *z.shape[2:])))
+        commitment_weight, codebook_weight = _LOSS_WEIGHTS[self.loss]
+        loss = commitment_weight * F.mse_loss(z, codes.detach()) + codebook_weight * F.mse_loss(codes, z.detach())
+        return Quantised(z + (codes - z).detach(), tokens.unflatten(0, (z.shape[0], *z.shape[2:])), loss)
+
+    def nearest(self, flat: Float[Tensor, "n D"]) -> Int[Tensor, "n"]:
+        """Return the index of the nearest code, the first among equals."""
+        codes = self.embedding.weight
+        return (flat.square().sum(1, keepdim=True) + codes.square().sum(1) - 2 * flat @ codes.T).argmin(dim=1)
+
+    def lookup(self, tokens: Int[Tensor, "B h w"]) -> Float[Tensor, "B D h w"]:
+        """Return the codes of tokens."""
+        return self.embedding(tokens).movedim(-1, 1)
+
+    def perplexity(self) -> float:
+        """Return exp(entropy) of the running use of the codes: how many of them are in effect used."""
+        share = self.usage / self.usage.sum().clamp(min=1e-9)
+        return float(torch.special.entr(share).sum().exp())
+
+    def used_share(self) -> float:
+        """Return the share of the codes that are alive."""
+        return float((self.usage > self._dead_below()).float().mean())
+
+    @torch.no_grad()
+    def _follow(self, flat: Tensor, tokens: Tensor, rng: torch.Generator | None) -> None:
+        """Update how often codes are used, move them if they follow means, restart the dead."""
+        num_codes = self.embedding.num_embeddings
+        counts = torch.bincount(tokens, minlength=num_codes).to(flat.dtype)
+        sums = torch.zeros_like(self.code_sums).index_add_(0, tokens, flat)
+        if distributed.is_available() and distributed.is_initialized():
+            distributed.all_reduce(counts)
+            distributed.all_reduce(sums)
+        fresh = bool(self.usage.sum() == 0)
+        self.usage.copy_(counts if fresh else torch.lerp(counts, self.usage, _EMA_DECAY))
+        self.code_sums.copy_(sums if fresh else torch.lerp(sums, self.code_sums, _EMA_DECAY))
+        if self.loss == "ema":
+            smoothed = (self.usage + 1e-5).unsqueeze(1)
+            alive = (self.usage > 1e-3).unsqueeze(1)
+            self.embedding.weight.copy_(torch.where(alive, self.code_sums / smoothed, self.embedding.weight))
+        if self.restart_dead:
+            self._restart(flat, rng)
+
+    def _restart(self, flat: Tensor, rng: torch.Generator | None) -> None:
+        dead = self.usage < self._dead_below()
+        picked = torch.randint(len(flat), (len(dead),), generator=rng, device=flat.device)
+        candidates = flat[picked]
+        if distributed.is_available() and distributed.is_initialized():
+            distributed.broadcast(candidates, src=0)
+        even_use = self.usage.mean().expand_as(self.usage)
+        self.embedding.weight.copy_(torch.where(dead.unsqueeze(1), candidates, self.embedding.weight))
+        self.usage.copy_(torch.where(dead, even_use, self.usage))
+        self.code_sums.copy_(torch.where(dead.unsqueeze(1), candidates * even_use.unsqueeze(1), self.code_sums))
+
+    def _dead_below(self) -> Tensor:
+        return _DEAD_BELOW * self.usage.mean()

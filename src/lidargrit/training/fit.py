@@ -1,0 +1,145 @@
+"""One training loop whatever the model: (objective, batches, configuration) → trained weights in a folder."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from lidargrit.errors import OutputError, TrainingError
+from lidargrit.loading import Batches, RangeImages, seed_of
+from lidargrit.reporting import Reporter
+from lidargrit.training.checkpoint import load_checkpoint, save_checkpoint
+from lidargrit.training.engine import Engine
+from lidargrit.training.optimiser import WeightAverage, learning_rate_at, make_optimiser
+from lidargrit.training.settings import FitConfig
+
+_LOG_EVERY_STEPS = 20
+
+
+@dataclass
+class Fit:
+    """The state of one stage of a run.
+
+    Args:
+        objective: a module that turns (range image, random generator) into terms, one of them ``loss``; it has a
+            ``sensor`` and may have ``warnings()``, lines that a person should see.
+        config: how it learns.
+        folder: where ``checkpoint.safetensors`` and ``log.jsonl`` lie.
+        seed: of order, augmentation, dropout and draws.
+    """
+
+    objective: nn.Module
+    config: FitConfig
+    folder: Path
+    seed: int
+    reporter: Reporter
+
+    def __post_init__(self) -> None:
+        self.engine = Engine(self.config.precision)
+        self.optimiser = make_optimiser(self.objective, self.config)
+        self.engine.set_up(self.objective, self.optimiser)
+        self.average = WeightAverage(self.objective, self.config.average_over_scans)
+        self.scans_seen = 0
+        if self.checkpoint.exists():
+            self.scans_seen = load_checkpoint(self.checkpoint, self.objective, self.average, self.optimiser)
+        self._trim_log()
+
+    @property
+    def checkpoint(self) -> Path:
+        """The one file from which the stage goes on."""
+        return self.folder / "checkpoint.safetensors"
+
+    def run(self, train: RangeImages, val: RangeImages, what: str) -> nn.Module:
+        """Learn until the budget is spent and return the objective with its averaged weights.
+
+        Raises:
+            TrainingError: the loss is not finite; names the step and the last good checkpoint.
+            OutputError: a checkpoint could not be written; the last one still stands.
+        """
+        config = self.config
+        batches = Batches(
+            train, config.batch_size, config.augmentations, self.seed, self.engine.rank, self.engine.world_size
+        )
+        begun, step = time.monotonic(), 0
+        with self.reporter.progress(what, config.scans, self.scans_seen) as progress:
+            while self.scans_seen < config.scans:
+                terms = self._step(batches)
+                progress.advance(config.batch_size, f"loss {float(terms['loss']):.4f}")
+                step += 1
+                if step % _LOG_EVERY_STEPS == 0:
+                    self._log("train", {name: float(term) for name, term in terms.items()}, time.monotonic() - begun)
+                if self._passed(config.validate_every) or self.scans_seen >= config.scans:
+                    self._log("val", self.validate(val), time.monotonic() - begun)
+                if self._passed(config.checkpoint_every) or self.scans_seen >= config.scans:
+                    self._save()
+        return self.average.objective.eval()
+
+    def validate(self, images: RangeImages) -> dict[str, float]:
+        """Return the mean terms of the averaged objective over the first validation scans."""
+        count = min(len(images), self.config.validation_scans)
+        totals: dict[str, float] = {}
+        for first in range(0, count, self.config.batch_size):
+            indices = range(first, min(first + self.config.batch_size, count))
+            terms = self.engine.evaluate(self.average.objective, images.batch(indices), seed_of(self.seed, 3, first))
+            for name, value in terms.items():
+                totals[name] = totals.get(name, 0.0) + value * len(indices) / count
+        return totals
+
+    def _step(self, batches: Batches) -> dict[str, Tensor]:
+        for group in self.optimiser.param_groups:
+            group["lr"] = learning_rate_at(self.config, self.scans_seen)
+        seed = seed_of(self.seed, 2, self.scans_seen, self.engine.rank)
+        torch.manual_seed(seed)  # dropout draws from the global generator
+        terms = self.engine.step(batches.at(self.scans_seen).to(self.engine.device), seed, self.config.gradient_clip)
+        if not bool(terms["loss"].isfinite()):
+            raise TrainingError(
+                f"a loss of {float(terms['loss'].detach())} after {self.scans_seen} scans",
+                "a finite number",
+                f"lower training.*.learning_rate; the last good state is {self.checkpoint}",
+            )
+        self.scans_seen += self.config.batch_size
+        self.average.update(self.objective, self.scans_seen, self.config.batch_size)
+        return terms
+
+    def _passed(self, every: int) -> bool:
+        return self.scans_seen // every > (self.scans_seen - self.config.batch_size) // every
+
+    def _save(self) -> None:
+        if self.engine.rank == 0:
+            save_checkpoint(self.checkpoint, self.objective, self.average, self.optimiser, self.scans_seen)
+
+    def _log(self, split: str, terms: dict[str, float], seconds: float) -> None:
+        if self.engine.rank:
+            return
+        line = {"scans_seen": self.scans_seen, "split": split, "seconds": round(seconds, 1), **terms}
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with (self.folder / "log.jsonl").open("a", encoding="utf-8") as log:
+                log.write(json.dumps(line) + "\n")
+        except OSError as error:
+            raise OutputError(
+                f"'{error.strerror}' while writing {log.name}", "a folder with room", "free some space and go on"
+            ) from error
+        if split == "val":
+            told = "  ".join(f"{name} {value:.4g}" for name, value in terms.items())
+            self.reporter.message(f"  after {self.scans_seen} scans, on val: {told}")
+            for warning in getattr(self.objective, "warnings", list)():
+                self.reporter.message(f"  WARNING: {warning}")
+
+    def _trim_log(self) -> None:
+        """Forget what was logged after the checkpoint that the stage goes on from: it will be logged again."""
+        log = self.folder / "log.jsonl"
+        if log.exists():
+            kept = []
+            for line in log.read_text(encoding="utf-8").splitlines():
+                try:
+                    if json.loads(line)["scans_seen"] <= self.scans_seen:
+                        kept.append(line)
+                except ValueError:
+                    continue  # the line that was being written when the process was killed
+            log.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")

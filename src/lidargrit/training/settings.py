@@ -1,0 +1,78 @@
+"""What an experiment is: data, model, and how long and how each of its stages learns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from lidargrit.augmentation import Augmentation
+from lidargrit.errors import ConfigError
+from lidargrit.loading import DataConfig
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """How one stage of a model learns; every duration is counted in scans seen.
+
+    Args:
+        scans: the budget.
+        batch_size: over all processes.
+        learning_rate: at its highest.
+        schedule: ``constant``; ``cosine`` falls to 0 over the budget; ``linear_second_half`` is constant for the first
+            half and then falls to 0 (the reference's for its KITTI-360 transformer).
+        warmup_scans: the rate rises linearly over this many scans.
+        betas: of Adam.
+        weight_decay: on the weights of linear layers only, as in the reference.
+        gradient_clip: largest norm of the gradient; 0 for none.
+        average_over_scans: half-life of the moving average of the weights that is sampled and scored; 0 for none.
+        precision: ``bf16`` runs convolutions and products in 16 bits, sums and losses in 32.
+        augmentations: see lidargrit.augmentation.
+        validate_every: scans between two validations, which take at most ``validation_scans`` scans.
+        validation_scans: see above.
+        checkpoint_every: scans between two checkpoints.
+    """
+
+    scans: int
+    batch_size: int
+    learning_rate: float
+    schedule: Literal["constant", "cosine", "linear_second_half"] = "constant"
+    warmup_scans: int = 0
+    betas: tuple[float, float] = (0.9, 0.95)
+    weight_decay: float = 0.0
+    gradient_clip: float = 1.0
+    average_over_scans: int = 1000
+    precision: Literal["fp32", "bf16"] = "fp32"
+    augmentations: tuple[Augmentation, ...] = ()
+    validate_every: int = 1000
+    validation_scans: int = 64
+    checkpoint_every: int = 1000
+
+    def __post_init__(self) -> None:
+        for name in ("scans", "batch_size", "validate_every", "validation_scans", "checkpoint_every"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"{name}={getattr(self, name)}", "at least 1", "raise it")
+        if not self.learning_rate > 0:
+            raise ConfigError(f"learning_rate={self.learning_rate}", "a positive number", "raise it")
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """One experiment.
+
+    Args:
+        title: one line.
+        generator: name of the generator in lidargrit.generators.
+        model: the generator's own configuration.
+        data: which scans.
+        training: how each stage of the generator learns.
+        seed: of everything random.
+        published: what the paper reports for it, for the reader; empty if this is not an experiment of the paper.
+    """
+
+    title: str
+    generator: str
+    model: Any
+    data: DataConfig
+    training: dict[str, FitConfig]
+    seed: int = 0
+    published: str = ""

@@ -1,0 +1,207 @@
+"""Range images side by side as a picture: groups of range images → one PNG."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Colormap, ListedColormap, LogNorm, Normalize
+from matplotlib.figure import Figure
+
+from lidargrit.errors import ConfigError, OutputError
+from lidargrit.projection import points_of_pixels
+from lidargrit.structures import RangeImage
+
+_AT_MOST = 8  # scans of a group; more make a picture that no viewer shows well
+_DOTS_PER_INCH = 100  # 1400 pixels across: a laptop shows the picture without shrinking it
+_WIDTH, _ROW, _HEAD, _FOOT = 14.0, 2.95, 0.75, 0.95  # inches: the picture, one scan of one group, title, colour bars
+_NO_RETURN = "#e4e4e4"  # near white: no colour of the range scale comes near it
+
+
+def draw_comparison(
+    groups: dict[str, RangeImage],
+    path: Path,
+    max_range_m: float | None = None,
+    title: str = "",
+    labels: list[str] | None = None,
+) -> None:
+    """Draw groups of range images below one another: range, return mask and bird's-eye view of every scan.
+
+    All groups share one scale of range, one of height, and the limits of the bird's-eye view. The i-th scans of the
+    groups stand together.
+
+    Args:
+        groups: a name ("real", "reconstructed", ...) and an image or a batch of 1 to 8; sensors may differ.
+        path: of the PNG; an older picture there is replaced, in one step.
+        max_range_m: end of the range scale and of the bird's-eye view; what the images reach if not given.
+        title: above everything.
+        labels: names of the scans; "scan 1", ... if not given.
+
+    Raises:
+        ConfigError: no group, no or too many images in one, a limit of range that is not positive, or fewer labels
+            than scans.
+        OutputError: the picture cannot be written.
+    """
+    _check(groups, max_range_m)
+    rows = [(index, name) for index in range(max(map(len, groups.values()))) for name in groups]
+    rows = [(index, name) for index, name in rows if index < len(groups[name])]
+    labels = labels or [f"scan {index + 1}" for index in range(rows[-1][0] + 1)]
+    if len(labels) <= rows[-1][0]:
+        raise ConfigError(f"{len(labels)} labels", f"one for each of {rows[-1][0] + 1} scans", "give more labels")
+    panels = [_panel(groups[name], index, f"{labels[index]}: {name}") for index, name in rows]
+    scales = _Scales.of(panels, max_range_m)
+    height = _HEAD * bool(title) + _ROW * len(panels) + _FOOT
+    figure = Figure(figsize=(_WIDTH, height), dpi=_DOTS_PER_INCH)
+    FigureCanvasAgg(figure)
+    if title:
+        figure.text(0.5, 1 - 0.42 / height, title, ha="center", va="center", fontsize=17)
+    for row, panel in enumerate(panels):
+        _draw_row(figure, height, _FOOT + _ROW * (len(panels) - 1 - row), panel, scales)
+    _draw_scales(figure, height, scales)
+    _save(figure, path)
+
+
+@dataclass(frozen=True, eq=False)
+class _Panel:
+    """One scan of one group, as arrays to draw."""
+
+    title: str
+    range_m: Float[np.ndarray, "H W"]
+    return_mask: Bool[np.ndarray, "H W"]
+    points_xyz_m: Float[np.ndarray, "n 3"]
+    elevation_deg: tuple[float, float]  # of the top and the bottom row
+
+
+@dataclass(frozen=True, eq=False)
+class _Scales:
+    """What all panels share."""
+
+    range_norm: LogNorm
+    height_norm: Normalize
+    half_view_m: float
+    range_colours: Colormap
+    height_colours: Colormap
+
+    @classmethod
+    def of(cls, panels: list[_Panel], max_range_m: float | None) -> _Scales:
+        """Find scales that hold all but the outermost returns of all panels."""
+        ranges = np.concatenate([panel.range_m[panel.return_mask] for panel in panels] + [np.array([1.0])])
+        points = np.concatenate([panel.points_xyz_m for panel in panels] + [np.zeros((1, 3))])
+        far = max_range_m or float(ranges.max())
+        near = min(float(np.quantile(ranges, 0.005)), far / 2)
+        away = np.hypot(points[:, 0], points[:, 1])
+        low, high = np.quantile(points[:, 2], (0.01, 0.99))
+        return cls(
+            LogNorm(near, far),
+            Normalize(float(low), float(max(high, low + 0.1))),
+            max_range_m or max(float(np.quantile(away, 0.99)), 1.0),
+            # Yellow is near and violet far; near-white is left to the rays without a return.
+            _with_bad("viridis_r", _NO_RETURN),
+            _with_bad("turbo", _NO_RETURN),
+        )
+
+
+def _with_bad(name: str, colour: str) -> Colormap:
+    return colormaps[name].with_extremes(bad=colour)
+
+
+def _check(groups: dict[str, RangeImage], max_range_m: float | None) -> None:
+    if not groups:
+        raise ConfigError("no group of range images to draw", "one or more", "pass for instance {'real': images}")
+    for name, images in groups.items():
+        if not 1 <= len(images) <= _AT_MOST or images.range_m.ndim > 3:
+            raise ConfigError(
+                f"range images of shape {tuple(images.range_m.shape)} in the group {name!r}",
+                f"one image (H, W), or a batch (B, H, W) of 1 to {_AT_MOST}",
+                f"pass a part of them: images[:{_AT_MOST}]",
+            )
+    if max_range_m is not None and not max_range_m > 0:
+        raise ConfigError(f"a largest range of {max_range_m:g} m", "more than 0 m", "leave max_range_m out")
+
+
+def _panel(images: RangeImage, index: int, title: str) -> _Panel:
+    image = (images[index] if images.range_m.ndim == 3 else images).to("cpu")
+    elevation_deg = image.sensor.elevation_rad.mean(dim=1).rad2deg()
+    return _Panel(
+        title,
+        image.range_m.detach().numpy(),
+        image.return_mask.numpy(),
+        points_of_pixels(image).detach()[image.return_mask].numpy(),
+        (float(elevation_deg[0]), float(elevation_deg[-1])),
+    )
+
+
+def _draw_row(figure: Figure, height: float, bottom: float, panel: _Panel, scales: _Scales) -> None:
+    """Draw the range image above the mask, and the bird's-eye view to their right; places in inches."""
+
+    def axes(left: float, up: float, wide: float, tall: float) -> Axes:
+        return figure.add_axes((left / _WIDTH, (bottom + up) / height, wide / _WIDTH, tall / height))
+
+    # A revolution is 13 times as wide as the rows are high; rows are drawn about twice as tall, to be seen.
+    extent = (180.0, -180.0, panel.elevation_deg[1], panel.elevation_deg[0])
+    ranges = axes(0.75, 1.55, 9.9, 1.05)
+    shown = np.ma.masked_where(~panel.return_mask, panel.range_m)
+    colours, norm = scales.range_colours, scales.range_norm
+    ranges.imshow(shown, cmap=colours, norm=norm, aspect="auto", interpolation="nearest", extent=extent)
+    share = panel.return_mask.mean()
+    size = "x".join(map(str, panel.range_m.shape))
+    ranges.set_title(f"{panel.title}  ({size}, {share:.0%} of rays returned)", loc="left", fontsize=12)
+    ranges.set_xticks([])
+    mask = axes(0.75, 0.45, 9.9, 1.05)
+    two = ListedColormap([_NO_RETURN, "#26323c"])
+    mask.imshow(panel.return_mask, cmap=two, vmin=0, vmax=1, aspect="auto", interpolation="nearest", extent=extent)
+    mask.set_xlabel("azimuth, counter-clockwise from forward", fontsize=10, labelpad=0)
+    mask.set_xticks(np.arange(180, -181, -45), [f"{d}°" for d in range(180, -181, -45)], fontsize=9)
+    for axis, name in ((ranges, "range"), (mask, "return mask")):
+        axis.set_yticks([0, -10, -20], ["0°", "−10°", "−20°"], fontsize=9)
+        axis.set_ylabel(name, fontsize=10)
+    view = axes(11.3, 0.45, 2.25, 2.25)
+    x, y, z = panel.points_xyz_m.T
+    order = np.argsort(z)  # the highest on top, as seen from above
+    norm, colours = scales.height_norm, scales.height_colours
+    view.scatter(y[order], x[order], c=z[order], s=0.6, linewidths=0, norm=norm, cmap=colours)
+    view.plot(0, 0, marker="+", color="black", markersize=7)
+    half = scales.half_view_m
+    view.set(xlim=(half, -half), ylim=(-half, half), aspect="equal", facecolor="white")  # left is to the left
+    view.tick_params(labelsize=9)
+    view.set_ylabel("forward [m]", fontsize=10, labelpad=0)
+    view.set_xlabel("left [m]", fontsize=10, labelpad=0)
+
+
+def _draw_scales(figure: Figure, height: float, scales: _Scales) -> None:
+    """Draw the two colour bars, and what the flat colour means, along the foot."""
+    at = 0.55 / height, 0.14 / height
+    bar = figure.add_axes((0.75 / _WIDTH, at[0], 6.6 / _WIDTH, at[1]))
+    ticks = [t for t in (1, 2, 5, 10, 20, 50, 100) if scales.range_norm(t) >= 0 and scales.range_norm(t) <= 1]
+    drawn = figure.colorbar(ScalarMappable(scales.range_norm, scales.range_colours), bar, orientation="horizontal")
+    drawn.set_ticks(ticks, labels=[str(t) for t in ticks])
+    drawn.minorticks_off()
+    drawn.set_label("range [m]", fontsize=10, labelpad=1)
+    note = "light grey = no return"
+    figure.text(7.6 / _WIDTH, at[0] + at[1] / 2, note, fontsize=10, va="center")
+    bar = figure.add_axes((11.3 / _WIDTH, at[0], 2.25 / _WIDTH, at[1]))
+    drawn = figure.colorbar(ScalarMappable(scales.height_norm, scales.height_colours), bar, orientation="horizontal")
+    drawn.set_label("from above: height over the sensor [m]", fontsize=10, labelpad=1)
+
+
+def _save(figure: Figure, path: Path) -> None:
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(unfinished, format="png", dpi=_DOTS_PER_INCH)
+        os.replace(unfinished, path)
+    except OSError as error:
+        raise OutputError(
+            f"{path}, which cannot be written ({error.strerror or error})",
+            "a place for a PNG file",
+            "choose another path",
+        ) from None
+    finally:
+        unfinished.unlink(missing_ok=True)

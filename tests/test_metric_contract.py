@@ -1,0 +1,163 @@
+"""What every metric promises, asked of every file in ``metrics/`` and each of its variants."""
+
+import pickle
+
+import numpy as np
+import pytest
+import torch
+
+from lidargrit import _discovery
+from lidargrit.errors import ConfigError, DataError, UnknownNameError
+from lidargrit.metrics import Metric, load_metric
+from lidargrit.sensors import load_sensor
+from lidargrit.structures import MetricResult, RangeImage
+
+CASES = [(name, variant) for name in _discovery.names("metrics") for variant in load_metric(name).variants]
+SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(128)
+
+pytestmark = [pytest.mark.parametrize(("name", "variant"), CASES)]
+
+
+def scenes(seed, count=16, walls=6, drop_share=0.1, noise_m=0.0):
+    """Ground and walls of random distance: fewer walls, wider ones; the noise comes from another seed."""
+    rng = torch.Generator().manual_seed(seed)
+    ground_m = 1.7 / torch.sin(-SENSOR.elevation_rad.clamp(max=-0.01))  # (H, 1)
+    wall_m = (5 + 60 * torch.rand(count, walls, generator=rng)).repeat_interleave(128 // walls + 1, dim=1)[
+        :, None, :128
+    ]
+    shift = int(torch.randint(128, (1,), generator=rng))
+    range_m = torch.minimum(ground_m, wall_m).roll(shift, dims=2)
+    mask = torch.rand(range_m.shape, generator=rng) > drop_share
+    noise = torch.randn(range_m.shape, generator=torch.Generator().manual_seed(seed + 1000)) * noise_m
+    return RangeImage.masked((range_m + noise).clamp(SENSOR.range_min_m, SENSOR.range_max_m), mask, SENSOR)
+
+
+def score(name, variant, generated, real, **options):
+    metric = load_metric(name)(variant=variant, **options)
+    metric.update(generated, real=False)
+    metric.update(real, real=True)
+    return metric.compute()
+
+
+def close(first: MetricResult, second: MetricResult):
+    return np.isclose(first.value, second.value, rtol=1e-4, atol=1e-7)
+
+
+def test_result_describes_itself(name, variant):
+    result = score(name, variant, scenes(0), scenes(1, count=12))
+    metric = load_metric(name)
+    assert (result.metric, result.variant) == (name, variant)
+    assert (result.num_generated, result.num_reference) == (16, 12)
+    assert result.higher_is_better is metric.higher_is_better
+    assert np.isfinite(result.value)
+    assert metric.title
+    assert "\n" not in metric.title
+    assert metric().variant == metric.variants[0]
+
+
+def test_a_set_is_nearer_to_itself_than_to_another_kind(name, variant):
+    same = score(name, variant, scenes(0), scenes(0)).value
+    other = score(name, variant, scenes(0), scenes(1, walls=40, drop_share=0.5)).value
+    assert same > other if load_metric(name).higher_is_better else same < other
+
+
+def test_grows_with_noise(name, variant):
+    real = scenes(1)
+    values = [score(name, variant, scenes(0, noise_m=noise_m), real).value for noise_m in (0.0, 3.0, 15.0)]
+    if load_metric(name).higher_is_better:
+        values = values[::-1]
+    assert values == sorted(values)
+    assert len(set(values)) == 3
+
+
+def test_order_of_images_does_not_matter(name, variant):
+    generated, real = scenes(0), scenes(1)
+    order = torch.randperm(16, generator=torch.Generator().manual_seed(0))
+    shuffled = RangeImage(real.range_m[order], real.return_mask[order], SENSOR)
+    assert close(score(name, variant, generated, real), score(name, variant, generated, shuffled))
+
+
+def test_fed_in_pieces_is_fed_at_once(name, variant):
+    generated, real = scenes(0), scenes(1)
+    pieces = load_metric(name)(variant=variant)
+    for start, stop in ((0, 1), (1, 10), (10, 16)):
+        pieces.update(real[start:stop], real=True)
+        pieces.update(generated[start:stop], real=False)
+    assert close(pieces.compute(), score(name, variant, generated, real))
+
+
+def test_one_image_without_a_batch_axis_is_a_batch_of_one(name, variant):
+    metric = load_metric(name)(variant=variant)
+    generated, real = scenes(0, count=3), scenes(1, count=3)
+    metric.update(real, real=True)
+    for index in range(3):
+        metric.update(generated[index], real=False)
+    assert close(metric.compute(), score(name, variant, generated, real))
+
+
+def test_several_processes_are_one(name, variant):
+    generated, real = scenes(0), scenes(1)
+    parts = []
+    for start, stop in ((0, 5), (5, 5), (5, 16)):  # the second process got nothing to do
+        part = load_metric(name)(variant=variant)
+        if start < stop:
+            part.update(generated[start:stop], real=False)
+            part.update(real[start:stop], real=True)
+        parts.append(pickle.loads(pickle.dumps(part)))
+    whole = load_metric(name)(variant=variant)
+    for part in parts:
+        whole.merge(part)
+    assert close(whole.compute(), score(name, variant, generated, real))
+    parts[0].update(generated[5:], real=False)  # merging has left the parts their own
+    assert close(whole.compute(), score(name, variant, generated, real))
+
+
+def test_computing_again_gives_the_same_and_updates_go_on(name, variant):
+    metric = load_metric(name)(variant=variant)
+    generated, real = scenes(0), scenes(1)
+    metric.update(generated[:8], real=False)
+    metric.update(real[:8], real=True)
+    assert metric.compute() == metric.compute()
+    metric.update(generated[8:], real=False)
+    metric.update(real[8:], real=True)
+    assert close(metric.compute(), score(name, variant, generated, real))
+
+
+def test_the_same_seed_gives_the_same_value(name, variant):
+    first, second = (score(name, variant, scenes(0), scenes(1), seed=5) for _ in range(2))
+    assert first == second
+
+
+def test_leaves_inputs_and_the_global_random_state_alone(name, variant):
+    generated, real = scenes(0), scenes(1)
+    before = [image.clone() for image in (generated.range_m, generated.return_mask, real.range_m, real.return_mask)]
+    torch_state, numpy_state = torch.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
+    score(name, variant, generated, real)
+    after = (generated.range_m, generated.return_mask, real.range_m, real.return_mask)
+    assert all(torch.equal(x, y) for x, y in zip(before, after, strict=True))
+    assert torch.equal(torch.get_rng_state(), torch_state)
+    assert np.array_equal(np.random.get_state()[1], numpy_state)  # noqa: NPY002
+
+
+def test_too_few_images_are_refused_by_name(name, variant):
+    metric = load_metric(name)(variant=variant)
+    metric.update(scenes(0, count=2), real=False)
+    with pytest.raises(DataError, match=f"2 generated and 0 real range images for '{name}'"):
+        metric.compute()
+
+
+def test_other_options_are_not_merged(name, variant):
+    with pytest.raises(ConfigError, match="make the metric with the same options in every process"):
+        load_metric(name)(variant=variant).merge(load_metric(name)(variant=variant, seed=1))
+
+
+def test_unknown_names_are_refused_with_neighbours(name, variant):
+    with pytest.raises(UnknownNameError, match=f"wanted one of .*{name}"):
+        load_metric(name + "x")
+
+    class Known(Metric):
+        title, higher_is_better, variants = "", False, (variant,)
+        update = compute = merge = lambda self: None
+
+    with pytest.raises(ConfigError, match=f"got variant 'nonsense'.*wanted '{variant}'"):
+        Known(variant="nonsense")
