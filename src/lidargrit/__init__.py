@@ -1,3 +1,20 @@
 """LiDAR scans in, tokens between, new scans out."""
 
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from lidargrit.api import evaluate, load, load_scan, load_sensor, project, simulate, unproject
+
+__all__ = ["evaluate", "load", "load_scan", "load_sensor", "project", "simulate", "unproject"]
+
+
+def __getattr__(name: str) -> Any:
+    """Load the functions on first use, so that ``lidargrit --help`` need not wait for torch."""
+    if name not in __all__:
+        raise AttributeError(f"module 'lidargrit' has no attribute {name!r}")
+    return getattr(importlib.import_module("lidargrit.api"), name)

@@ -47,8 +47,9 @@ def load_instance(package: str, name: str, base: type[T]) -> T:
 
 def _folder(package: str) -> Path:
     spec = importlib.util.find_spec(f"lidargrit.{package}")
-    assert spec is not None and spec.submodule_search_locations, package
-    return Path(spec.submodule_search_locations[0])
+    folders = spec.submodule_search_locations if spec else None
+    assert folders, package
+    return Path(folders[0])
 
 
 def _the_one(package: str, name: str, fits: Any) -> Any:

@@ -28,9 +28,9 @@ def augment(images: RangeImage, kinds: Sequence[Augmentation], rng: torch.Genera
     Args:
         images: (B, H, W).
         kinds: ``flip`` mirrors left and right with probability 1/2. ``roll`` turns the car by a random whole number of
-            columns. ``geometric`` is the paper's geometric preservation: with probability 1/2, an affine map and flips of
-            both axes of range and mask together; what comes in from outside is *no return*. ``geometric_reference`` is
-            the same with the program's larger rotation and its fill, a wall at the longest range.
+            columns. ``geometric`` is the paper's geometric preservation: with probability 1/2, an affine map and flips
+            of both axes, of range and mask together; what comes in from outside is *no return*.
+            ``geometric_reference`` is the same with the program's larger rotation and its fill, a far wall.
         rng: source of all randomness, on the CPU.
 
     Source:
@@ -104,7 +104,7 @@ def _distort(images: RangeImage, rng: torch.Generator, extra_rotation_rad: float
     return _pick(_coin(images, rng), warped, images)
 
 
-def _map(images: RangeImage, change) -> RangeImage:  # noqa: ANN001
+def _map(images: RangeImage, change) -> RangeImage:
     return replace(
         images,
         range_m=change(images.range_m),
@@ -114,10 +114,12 @@ def _map(images: RangeImage, change) -> RangeImage:  # noqa: ANN001
 
 
 def _pick(chosen: Tensor, changed: RangeImage, images: RangeImage) -> RangeImage:
-    both_have_it = changed.reflectance is not None and images.reflectance is not None
+    reflectance = None
+    if changed.reflectance is not None and images.reflectance is not None:
+        reflectance = torch.where(chosen, changed.reflectance, images.reflectance)
     return replace(
         images,
         range_m=torch.where(chosen, changed.range_m, images.range_m),
         return_mask=torch.where(chosen, changed.return_mask, images.return_mask),
-        reflectance=torch.where(chosen, changed.reflectance, images.reflectance) if both_have_it else None,
+        reflectance=reflectance,
     )

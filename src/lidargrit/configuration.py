@@ -38,7 +38,9 @@ def from_json(cls: type[T], data: Any, source: str) -> T:
 
 
 def override(config: T, settings: Iterable[str]) -> T:
-    """Return the configuration with settings of the form ``a.b=value`` changed; the value is read as YAML.
+    """Return the configuration with settings of the form ``a.b=value`` changed.
+
+    A value is read as YAML. Words for a list need no brackets: ``data.train=/data/one,/data/two``.
 
     Raises:
         ConfigError: an unknown name (names its nearest neighbours) or a value of another type.
@@ -76,6 +78,8 @@ def _replaced(node: Any, path: str, keys: list[str], text: str, whole: Any) -> A
 
 
 def _parsed(hint: Any, path: str, text: str) -> Any:
+    if hint == tuple[str, ...] and not text.startswith("["):
+        return tuple(text.split(","))
     parser = _parser()
     parser.add_argument("--value", type=hint)
     try:

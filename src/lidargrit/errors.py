@@ -58,5 +58,5 @@ class TrainingError(LidarGritError):
 def nearest_names(name: str, known: Iterable[str], at_most: int = 3) -> str:
     """Name the known names that look most like one, for a message: "a, b or c"."""
     names = sorted(set(known))
-    close = difflib.get_close_matches(name, names, n=at_most, cutoff=0.4) or names
+    close = difflib.get_close_matches(name, names, n=at_most, cutoff=0.4) or names[:at_most]
     return close[0] if len(close) == 1 else ", ".join(close[:-1]) + " or " + close[-1]

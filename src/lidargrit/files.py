@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor
+from torch import Tensor, nn
 
 from lidargrit.errors import CheckpointError, OutputError
 
@@ -106,3 +106,26 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
             "a complete safetensors file",
             "restore the file, or remove it and train again",
         ) from None
+
+
+def load_exactly(module: nn.Module, weights: dict[str, Tensor], source: Path) -> None:
+    """Load weights into a module of the very same layout.
+
+    Raises:
+        CheckpointError: a name or a size differs; names the first.
+    """
+    wanted = module.state_dict()
+    cure = "load them with the configuration that they were trained with"
+    for name in sorted(wanted.keys() | weights.keys()):
+        if name not in weights or name not in wanted:
+            side = "lacks" if name in wanted else "has besides"
+            raise CheckpointError(
+                f"weights in {source} of another configuration (the file {side} {name!r})", "those of this model", cure
+            )
+        if weights[name].shape != wanted[name].shape:
+            raise CheckpointError(
+                f"weights in {source} of another configuration ({name!r} is {tuple(weights[name].shape)})",
+                f"{tuple(wanted[name].shape)}",
+                cure,
+            )
+    module.load_state_dict(weights)

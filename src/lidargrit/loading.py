@@ -7,10 +7,10 @@ import json
 import os
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import accumulate
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -38,6 +38,7 @@ class DataConfig:
         column_stride: keep every n-th of them.
         projection: ``sensor`` for the sensor's own, ``spherical`` or ``unfolding``.
         variant: ``exact``, or ``reference`` to repeat the released program's projection.
+        max_scans: of each source, evenly spaced over it; 0 for all.
         bad_points: ``refuse`` scans with NaN, infinite or origin points, or ``drop`` these points.
         bad_scans: ``refuse`` to go on after a scan that cannot be used, or ``skip`` it and say so.
     """
@@ -49,19 +50,37 @@ class DataConfig:
     column_stride: int = 1
     projection: Literal["sensor", "spherical", "unfolding"] = "sensor"
     variant: Variant = "exact"
+    max_scans: int = 0
     bad_points: BadPoints = "refuse"
     bad_scans: Literal["refuse", "skip"] = "refuse"
 
     def load_sensor(self) -> SensorModel:
-        """Return the sensor at the wanted number of columns."""
+        """Return the sensor at the wanted number of columns and with the wanted projection."""
         sensor = load_sensor(self.sensor)
-        return sensor.with_columns(self.columns, self.column_stride) if self.columns else sensor
+        if self.columns:
+            sensor = sensor.with_columns(self.columns, self.column_stride)
+        return sensor if self.projection == "sensor" else replace(sensor, projection=self.projection)
+
+
+@runtime_checkable
+class ImageStore(Protocol):
+    """What holds the ranges of many images: an array, or files that read like one."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int, /) -> np.ndarray: ...
 
 
 class RangeImages:
-    """Range images on disk that read like a list; only those asked for are in memory."""
+    """Range images on disk that read like a list; only those asked for are in memory.
 
-    def __init__(self, sensor: SensorModel, parts: Sequence[np.ndarray], names: Sequence[str]) -> None:
+    Args:
+        sensor: of the images that are read.
+        parts: images as wide as the sensor's, or with all the fine columns of which the sensor keeps some.
+        names: of the images.
+    """
+
+    def __init__(self, sensor: SensorModel, parts: Sequence[ImageStore], names: Sequence[str]) -> None:
         self.sensor, self.names = sensor, list(names)
         self._parts = [part for part in parts if len(part)]
         self._ends = list(accumulate(len(part) for part in self._parts))
@@ -69,23 +88,27 @@ class RangeImages:
     def __len__(self) -> int:
         return self._ends[-1] if self._ends else 0
 
-    def batch(self, indices: Sequence[int]) -> RangeImage:
-        """Return the images of these indices, as one batch."""
-        range_m = torch.from_numpy(np.stack([self._pixels(index) for index in indices]))
+    def batch(self, indices: Sequence[int], first_columns: Sequence[int] | None = None) -> RangeImage:
+        """Return the images of these indices as one batch; ``first_columns`` are the first fine columns kept of each."""
+        first_columns = first_columns or [0] * len(indices)
+        pixels = [self._pixels(index, first) for index, first in zip(indices, first_columns, strict=True)]
+        range_m = torch.from_numpy(np.stack(pixels))
         return RangeImage(range_m, range_m > 0, self.sensor)
 
-    def _pixels(self, index: int) -> np.ndarray:
+    def _pixels(self, index: int, first_column: int) -> np.ndarray:
         part = bisect_right(self._ends, index)
-        return self._parts[part][index - (self._ends[part - 1] if part else 0)]
+        fine = self._parts[part][index - (self._ends[part - 1] if part else 0)]
+        return fine[:, first_column :: fine.shape[1] // self.sensor.width]
 
 
 class Batches:
-    """Training batches as a function of how many scans were seen before, so that a stopped run goes on as if it had not.
+    """Training batches as a function of the scans seen before, so that a stopped run goes on as if never stopped.
 
     Args:
         images: what to draw from; every scan once per epoch, in an order of the seed.
         batch_size: over all processes.
         augmentations: applied in turn.
+        any_columns: of the fine columns keep others every time a scan is seen; see :class:`FitConfig`.
         seed: of order and augmentation.
         rank: this process, of
         world_size: this many; each takes its share of every batch.
@@ -96,24 +119,30 @@ class Batches:
         images: RangeImages,
         batch_size: int,
         augmentations: Sequence[Augmentation],
+        any_columns: bool,
         seed: int,
         rank: int = 0,
         world_size: int = 1,
     ) -> None:
         if batch_size % world_size:
             raise ConfigError(
-                f"batch_size={batch_size} on {world_size} processes", "a multiple of the processes", "change one of them"
+                f"batch_size={batch_size} on {world_size} processes",
+                "a multiple of the processes",
+                "change one of them",
             )
         self.images, self.batch_size, self.augmentations = images, batch_size, tuple(augmentations)
-        self.seed, self.rank, self.world_size = seed, rank, world_size
+        self.any_columns, self.seed, self.rank, self.world_size = any_columns, seed, rank, world_size
         self._epoch, self._order = -1, torch.empty(0)
 
     def at(self, scans_seen: int) -> RangeImage:
         """Return this process's share of the batch that follows ``scans_seen`` scans."""
         share = self.batch_size // self.world_size
         first = scans_seen + self.rank * share
-        images = self.images.batch([self._draw(position) for position in range(first, first + share)])
-        return augment(images, self.augmentations, torch.Generator().manual_seed(seed_of(self.seed, 1, first)))
+        rng = torch.Generator().manual_seed(seed_of(self.seed, 1, first))
+        columns = torch.randint(self.images.sensor.column_stride, (share,), generator=rng).tolist()
+        indices = [self._draw(position) for position in range(first, first + share)]
+        images = self.images.batch(indices, columns if self.any_columns else None)
+        return augment(images, self.augmentations, rng)
 
     def _draw(self, position: int) -> int:
         epoch, place = divmod(position, len(self.images))
@@ -128,8 +157,10 @@ def seed_of(*parts: int) -> int:
     return int(np.random.SeedSequence(parts).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 
-def load_range_images(sources: Sequence[str], config: DataConfig, reporter: Reporter | None = None) -> RangeImages:
-    """Project every scan of the sources, or find them projected in the cache.
+def load_range_images(
+    sources: Sequence[str], config: DataConfig, reporter: Reporter | None = None, sensor: SensorModel | None = None
+) -> RangeImages:
+    """Project every scan of the sources, or find them projected in the cache; ``sensor`` stands in for the config's.
 
     The cache is ``$LIDARGRIT_CACHE``, else ``lidargrit`` in the user's cache folder. It may be deleted at any time.
 
@@ -138,13 +169,13 @@ def load_range_images(sources: Sequence[str], config: DataConfig, reporter: Repo
         ScanError: a scan that cannot be used; ``bad_scans=skip`` leaves it out.
     """
     if not sources:
-        raise DataError("no source of scans", "at least one", "name one with --set data.train=[FOLDER]")
-    reporter, sensor = reporter or Reporter(), config.load_sensor()
+        raise DataError("no source of scans", "at least one", "name one with --set data.train=FOLDER")
+    reporter, sensor = reporter or Reporter(), sensor or config.load_sensor()
     parts: list[np.ndarray] = []
     names: list[str] = []
     for source in sources:
         dataset = open_dataset(source, config.bad_points)
-        stem = _cache_folder() / _digest(source, dataset, sensor, config)
+        stem = cache_folder() / _digest(source, dataset, sensor, config)
         if not stem.with_suffix(".json").exists():
             _project_all(source, dataset, sensor, config, stem, reporter)
         kept = read_json(stem.with_suffix(".json"))["names"]
@@ -159,15 +190,17 @@ def load_range_images(sources: Sequence[str], config: DataConfig, reporter: Repo
 def _project_all(
     source: str, dataset: ScanDataset, sensor: SensorModel, config: DataConfig, stem: Path, reporter: Reporter
 ) -> None:
-    method = None if config.projection == "sensor" else config.projection
     kept: list[str] = []
-    shape = (len(dataset), sensor.height, sensor.width)
+    fine = sensor.fine()
+    count = min(len(dataset), config.max_scans or len(dataset))
+    wanted = [index * len(dataset) // count for index in range(count)]
+    shape = (count, fine.height, fine.width)
     with atomic_path(stem.with_suffix(".npy")) as temporary:
         pixels = np.lib.format.open_memmap(temporary, mode="w+", dtype=np.float32, shape=shape)
-        with reporter.progress("projecting scans", len(dataset)) as progress:
-            for index in range(len(dataset)):
+        with reporter.progress("projecting scans", count) as progress:
+            for index in wanted:
                 try:
-                    image = project(dataset.scan(index), sensor, method, config.variant)
+                    image = project(dataset.scan(index), fine, variant=config.variant)
                 except ScanError as error:
                     if config.bad_scans == "refuse":
                         raise ScanError(
@@ -182,7 +215,8 @@ def _project_all(
     write_json(stem.with_suffix(".json"), {"source": source, "names": kept})  # written last: it says "complete"
 
 
-def _cache_folder() -> Path:
+def cache_folder() -> Path:
+    """Return where projected scans are kept."""
     if "LIDARGRIT_CACHE" in os.environ:
         return Path(os.environ["LIDARGRIT_CACHE"])
     return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "lidargrit"
@@ -195,7 +229,7 @@ def _digest(source: str, dataset: ScanDataset, sensor: SensorModel, config: Data
         __version__,
         files or source,
         len(dataset),
-        sensor.to_json(),
-        [config.projection, config.variant, config.bad_points, config.bad_scans],
+        sensor.fine().to_json(),
+        [config.variant, config.bad_points, config.bad_scans, config.max_scans],
     ]
     return hashlib.sha256(json.dumps(facts).encode()).hexdigest()[:24]

@@ -31,8 +31,8 @@ class Scan:
     """
 
     points_xyz_m: Float[Tensor, "n 3"]
-    reflectance: Float[Tensor, n] | None = None
-    ring: Int[Tensor, n] | None = None
+    reflectance: Float[Tensor, "n"] | None = None
+    ring: Int[Tensor, "n"] | None = None
     source: str = "a scan"
 
     def __post_init__(self) -> None:
@@ -50,7 +50,7 @@ class Scan:
                     "scale the fourth column, e.g. divide an intensity of 0..255 by 255",
                 )
 
-    def _refuse(self, bad: Bool[Tensor, n], what: str) -> None:
+    def _refuse(self, bad: Bool[Tensor, "n"], what: str) -> None:
         if bool(bad.any()):
             raise ScanError(
                 f"{int(bad.sum())} of {len(self)} points {what} in {self.source}",
@@ -64,7 +64,7 @@ class Scan:
 
 @dataclass(frozen=True, eq=False)
 class RangeImage:
-    """One range image or a batch of them: row 0 is the highest elevation, column 0 the azimuth +pi, falling to the right.
+    """One range image or a batch: row 0 is the highest elevation, column 0 the azimuth +pi, falling to the right.
 
     Args:
         range_m: Euclidean distance to the return in metres; 0 where there is none.

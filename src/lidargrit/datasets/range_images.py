@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-import zlib
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -88,15 +88,18 @@ def _rays(columns: int) -> SensorModel:
 
 
 def _pixels(path: Path) -> UInt16[np.ndarray, "64 W"]:
-    _check_header(path)  # before pixels are unpacked: a hostile header could ask for gigabytes
+    size = (_check_header(path), _ROWS)  # before pixels are unpacked: a hostile header could ask for gigabytes
     try:
-        with Image.open(path, formats=("PNG",)) as image:
+        with warnings.catch_warnings(action="ignore"), Image.open(path, formats=("PNG",)) as image:
+            if (image.mode, image.size) != ("I;16", size):  # a later chunk can contradict the header
+                raise ValueError(f"{image.mode} pixels, {image.size}")
             return np.array(image, dtype=np.uint16)
-    except (OSError, SyntaxError, ValueError, zlib.error) as error:
+    except Exception as error:  # the decoder meets a damaged file with whatever its chunks make it stumble over
         raise ScanError(f"{path}, a damaged PNG ({error})", _FORMAT, "download it again, or remove it") from None
 
 
-def _check_header(path: Path) -> None:
+def _check_header(path: Path) -> int:
+    """Return the number of columns that the header states."""
     try:
         if not path.is_file():
             raise ScanError(f"{path}, which is not a file", _FORMAT, "check the path")
@@ -113,3 +116,4 @@ def _check_header(path: Path) -> None:
             _FORMAT,
             "give the images of a 64-beam sensor, or convert them",
         )
+    return columns

@@ -21,13 +21,13 @@ class Convolution(nn.Conv2d):
         super().__init__(inputs, outputs, 3, padding=(1, 0) if padding == "wrap" else 1)
         self.wraps = padding == "wrap"
 
-    def forward(self, x: Float[Tensor, "B C H W"]) -> Float[Tensor, "B D H W"]:
+    def forward(self, input: Float[Tensor, "B C H W"]) -> Float[Tensor, "B D H W"]:
         """Convolve."""
-        return super().forward(F.pad(x, (1, 1, 0, 0), mode="circular") if self.wraps else x)
+        return super().forward(F.pad(input, (1, 1, 0, 0), mode="circular") if self.wraps else input)
 
 
 class Downsample(nn.Module):
-    """Halve both axes by a 3x3 convolution of stride 2, with one padded row below and one padded column to the right."""
+    """Halve both axes by a 3x3 convolution of stride 2, one row padded below and one column to the right."""
 
     def __init__(self, channels: int, padding: Padding) -> None:
         super().__init__()

@@ -5,16 +5,15 @@ from __future__ import annotations
 from typing import Literal, NamedTuple
 
 import torch
-import torch.distributed as distributed
 import torch.nn.functional as F
 from jaxtyping import Float, Int
-from torch import Tensor, nn
+from torch import Tensor, distributed, nn
 
 CodebookLoss = Literal["paper", "reference", "vqvae", "ema"]
 
-# Weights of (commitment: move the latent, codebook: move the code). The paper gives both weight 1; the program, by a bug
-# of an ancestor, puts its beta of 0.25 on the codebook; van den Oord et al., 2017, put it on the commitment. With "ema"
-# the codes follow the mean of their latents instead of a gradient (same paper, appendix A.1).
+# Weights of (commitment: move the latent, codebook: move the code). The paper gives both weight 1; the program, by a
+# bug of an ancestor, puts its beta of 0.25 on the codebook; van den Oord et al., 2017, put it on the commitment. With
+# "ema" the codes follow the mean of their latents instead of a gradient (same paper, appendix A.1).
 _LOSS_WEIGHTS = {"paper": (1.0, 1.0), "reference": (1.0, 0.25), "vqvae": (0.25, 1.0), "ema": (0.25, 0.0)}
 _EMA_DECAY = 0.99
 _DEAD_BELOW = 0.1  # a code that is chosen less often than this share of an even use is dead

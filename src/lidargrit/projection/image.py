@@ -17,7 +17,8 @@ from lidargrit.structures import RangeImage, Scan
 Variant = Literal["exact", "reference"]
 
 _OUTSIDE_AT_MOST = 0.25  # KITTI leaves up to 8 % of its points above +3 degrees; a wrong sensor leaves far more
-_AZIMUTH_AT_LEAST = 0.75  # share of the circle's degrees with a return: KITTI's scans have all, a camera crop a quarter
+_SECTORS = 36  # of 10 degrees: the coarsest sensor has several columns in each
+_SECTORS_AT_LEAST = 27  # with a return: KITTI's scans have all, a crop to the camera's view a quarter
 
 
 def project(
@@ -128,10 +129,10 @@ def _exact_unfolding_rows(scan: Scan, sensor: SensorModel) -> np.ndarray:
 
 
 def _check_full_circle(scan: Scan, xyz_m: Float32[np.ndarray, "n 3"]) -> None:
-    degrees_seen = len(np.unique(np.floor(np.degrees(unfolding.azimuths_rad(xyz_m)))))
-    if len(xyz_m) > 360 and degrees_seen < _AZIMUTH_AT_LEAST * 360:
+    sectors = len(np.unique(np.floor(unfolding.azimuths_rad(xyz_m) * (_SECTORS / (2 * np.pi)))))
+    if len(xyz_m) > _SECTORS and sectors < _SECTORS_AT_LEAST:
         raise ScanError(
-            f"returns in only {degrees_seen} of 360 degrees of azimuth in {scan.source}",
+            f"returns in only {sectors * 360 // _SECTORS} of 360 degrees of azimuth in {scan.source}",
             "a full revolution",
             "use the uncropped scan",
         )

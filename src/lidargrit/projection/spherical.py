@@ -10,7 +10,7 @@ from jaxtyping import Float32, Float64, Int64
 _REFERENCE_TOP_DEG, _REFERENCE_BOTTOM_DEG = 3.0, -25.0  # the field of view that LidarGRIT fixes for KITTI-360
 
 
-def rows(xyz_m: Float32[np.ndarray, "n 3"], elevation_rad: Float64[np.ndarray, H]) -> Int64[np.ndarray, n]:
+def rows(xyz_m: Float32[np.ndarray, "n 3"], elevation_rad: Float64[np.ndarray, "H"]) -> Int64[np.ndarray, "n"]:
     """Return the row whose elevation lies nearest to each point, -1 for points above or below the sensor's span.
 
     The span of a row ends midway to its neighbours; the first and the last reach as far out as in. For equal rows these
@@ -23,7 +23,7 @@ def rows(xyz_m: Float32[np.ndarray, "n 3"], elevation_rad: Float64[np.ndarray, H
     return np.where(row < len(elevation_rad), row, -1)
 
 
-def row_edges_rad(elevation_rad: Float64[np.ndarray, H]) -> Float64[np.ndarray, H+1]:
+def row_edges_rad(elevation_rad: Float64[np.ndarray, "H"]) -> Float64[np.ndarray, "H + 1"]:
     """Return the elevations between which each row lies, falling."""
     middles = (elevation_rad[1:] + elevation_rad[:-1]) / 2
     top = 2 * elevation_rad[0] - middles[0]
@@ -31,7 +31,7 @@ def row_edges_rad(elevation_rad: Float64[np.ndarray, H]) -> Float64[np.ndarray, 
     return np.concatenate(([top], middles, [bottom]))
 
 
-def reference_rows(xyz_m: Float32[np.ndarray, "n 3"], height: int) -> Int64[np.ndarray, n]:
+def reference_rows(xyz_m: Float32[np.ndarray, "n 3"], height: int) -> Int64[np.ndarray, "n"]:
     """Return each point's row as LidarGRIT does: rounded in single precision, then clipped, nothing left out.
 
     Row 0 is half a bin wide and takes all above, the last row one and a half and takes all below.

@@ -8,7 +8,7 @@ from jaxtyping import Float32, Float64, Int, Int64
 _STRAY_SHARE = 0.01  # a "ring" with fewer points than this share of a common one is a stray point at the seam
 
 
-def rings_from_firing_order(xyz_m: Float32[np.ndarray, "n 3"]) -> Int64[np.ndarray, n]:
+def rings_from_firing_order(xyz_m: Float32[np.ndarray, "n 3"]) -> Int64[np.ndarray, "n"]:
     """Number the rings of points that are stored ring by ring, each counter-clockwise from straight ahead.
 
     A ring begins where the azimuth, counted from 0 to 2 pi, falls by more than pi. A stray point beyond the seam, which
@@ -25,7 +25,7 @@ def rings_from_firing_order(xyz_m: Float32[np.ndarray, "n 3"]) -> Int64[np.ndarr
     return np.repeat(number, lengths)
 
 
-def reference_rings(xyz_m: Float32[np.ndarray, "n 3"], height: int) -> Int64[np.ndarray, n]:
+def reference_rings(xyz_m: Float32[np.ndarray, "n 3"], height: int) -> Int64[np.ndarray, "n"]:
     """Number the rings as the reference programs do: by quadrants, and rows counted from the bottom.
 
     Points before the first ring start keep row 0; with more than ``height`` rings the next one wraps to the last row
@@ -47,17 +47,17 @@ def reference_rings(xyz_m: Float32[np.ndarray, "n 3"], height: int) -> Int64[np.
     return row
 
 
-def azimuths_rad(xyz_m: Float32[np.ndarray, "n 3"]) -> Float64[np.ndarray, n]:
+def azimuths_rad(xyz_m: Float32[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
     """Return the azimuth of points in (-pi, pi], counter-clockwise from +x, in double precision."""
     return np.arctan2(xyz_m[:, 1].astype(np.float64), xyz_m[:, 0].astype(np.float64))
 
 
-def columns(xyz_m: Float32[np.ndarray, "n 3"], width: int) -> Int64[np.ndarray, n]:
-    """Return the column whose span [pi - 2 pi w/W, pi - 2 pi (w+1)/W) holds each point's azimuth; the last wraps to 0."""
+def columns(xyz_m: Float32[np.ndarray, "n 3"], width: int) -> Int64[np.ndarray, "n"]:
+    """Return the column whose span [pi - 2 pi w/W, pi - 2 pi (w+1)/W) holds each point's azimuth, around the circle."""
     return np.floor((np.pi - azimuths_rad(xyz_m)) * (width / (2 * np.pi))).astype(np.int64) % width
 
 
-def reference_columns(xyz_m: Float32[np.ndarray, "n 3"], width: int) -> Int[np.ndarray, n]:
+def reference_columns(xyz_m: Float32[np.ndarray, "n 3"], width: int) -> Int[np.ndarray, "n"]:
     """Return each point's column as LidarGRIT does: rounded in single precision, then clipped.
 
     The first column is half as wide as the others, the last half as wide again.

@@ -30,13 +30,12 @@ class SensorModel:
         range_min_m: a shorter range is no return.
         range_max_m: a longer range is no return.
         projection: how this sensor's scans become range images unless told otherwise.
-        column_stride: the image keeps every n-th of ``W * n`` fine columns (the paper's 64x2048 -> 64x256 keeps every 8th).
+        column_stride: the image keeps every n-th of ``W * n`` fine columns (the paper's 64x256: every 8th of 2048).
         source: where the numbers come from.
     """
 
     name: str
-    elevation_rad: Float[Tensor, (H #W
-)]
+    elevation_rad: Float[Tensor, "H #W"]
     azimuth_rad: Float[Tensor, "#H W"]
     range_min_m: float
     range_max_m: float
@@ -86,6 +85,10 @@ class SensorModel:
                 "change one of the two",
             )
         return replace(self, azimuth_rad=column_azimuths_rad(columns, stride), column_stride=stride)
+
+    def fine(self) -> SensorModel:
+        """Return this sensor with every fine column that it fires."""
+        return self if self.column_stride == 1 else self.with_columns(self.width * self.column_stride)
 
     def to_json(self) -> dict[str, Any]:
         """Return the sensor as plain numbers and words, for a file."""

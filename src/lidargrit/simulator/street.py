@@ -91,11 +91,11 @@ class _Builder:
             front = line + rng.uniform(0, 1.0) + (rng.uniform(2, 10) if rng.random() < 0.2 else 0)
             height = rng.uniform(2.4, 3.2) if rng.random() < 0.12 else rng.uniform(6, 16)
             surface = Surface(float(np.clip(wall * rng.uniform(0.6, 1.4), 0.1, 0.8)), windows="house")
-            self._box(along + length / 2, side * (front + depth / 2), length, depth, 0, height, surface)
+            self._box(along + length / 2, side * (front + depth / 2), length, depth, 0.0, height, surface)
             for step in np.arange(2, length, 5.0):  # bays and stairs break the plane of some houses
                 if rng.random() < 0.15:
                     offset = side * (front - rng.uniform(0.1, 0.8))
-                    self._box(along + step, offset, rng.uniform(0.8, 3), 1.0, 0, rng.uniform(1, 8), Surface(0.3))
+                    self._box(along + step, offset, rng.uniform(0.8, 3), 1.0, 0.0, rng.uniform(1, 8), Surface(0.3))
             along += length
             if rng.random() < 0.55:
                 gap = rng.uniform(2.5, 16)
@@ -110,7 +110,7 @@ class _Builder:
         if rng.random() < 0.5:
             self._hedge(along_m, side * (line_m + 0.6), length_m, rng.uniform(1.0, 2.2))
         elif rng.random() < 0.5:
-            self._box(along_m, side * (line_m + 0.3), length_m, 0.3, 0, rng.uniform(0.8, 2.4), Surface(0.35))
+            self._box(along_m, side * (line_m + 0.3), length_m, 0.3, 0.0, rng.uniform(0.8, 2.4), Surface(0.35))
         for _ in range(rng.integers(0, 4)):
             self._tree(along_m + rng.uniform(-3, 3), side * (line_m + rng.uniform(3, 20)), low=True)
 
@@ -122,7 +122,7 @@ class _Builder:
             if rng.random() < 0.35 + 0.3 * self.green:
                 self._hedge(along + length / 2, side * offset_m, length, rng.uniform(0.7, 1.7))
             elif rng.random() < 0.5:
-                self._box(along + length / 2, side * offset_m, length, 0.25, 0, rng.uniform(0.4, 1.3), Surface(0.35))
+                self._box(along + length / 2, side * offset_m, length, 0.25, 0.0, rng.uniform(0.4, 1.3), Surface(0.35))
             if self.gardens_m > 3 and rng.random() < self.green:
                 self._tree(along + length / 2, side * (offset_m + 1.8), low=bool(rng.random() < 0.6))
             along += length + rng.uniform(0.5, 4)
@@ -135,12 +135,12 @@ class _Builder:
             if what < 0.15 + 0.5 * self.green:
                 self._tree(float(along), offset, low=False)
             elif what < 0.8:
-                self._round(float(along), offset, rng.uniform(0.04, 0.13), 0, rng.uniform(3, 9), Surface(0.25))
+                self._round(float(along), offset, rng.uniform(0.04, 0.13), 0.0, rng.uniform(3, 9), Surface(0.25))
                 if rng.random() < 0.4:  # a sign, whose foil throws the beam back
                     self._box(float(along), offset, 0.05, 0.65, rng.uniform(1.5, 2.3), 2.9, Surface(0.95))
         for _ in range(rng.poisson(1.0)):
             offset = side * (edge + rng.uniform(0.5, self.pavement_m))
-            self._round(rng.uniform(-30, 30), offset, 0.24, 0, rng.uniform(1.5, 1.9), Surface(rng.uniform(0.05, 0.4)))
+            self._round(rng.uniform(-30, 30), offset, 0.24, 0.0, rng.uniform(1.5, 1.9), Surface(rng.uniform(0.05, 0.4)))
 
     def parked_cars(self, side: int) -> None:
         """Park cars along the kerb."""
@@ -208,7 +208,7 @@ class _Builder:
             self.solids.append(Solid("ellipsoid", x, y, yaw, radius, radius, -0.2 * top, top, leaves, 0.35))
             return
         radius, clear, top = rng.uniform(1.2, 3.2), rng.uniform(1.8, 3.0), rng.uniform(5, 10)
-        self._round(along_m, offset_m, rng.uniform(0.08, 0.25), 0, clear + 1, Surface(0.2))
+        self._round(along_m, offset_m, rng.uniform(0.08, 0.25), 0.0, clear + 1, Surface(0.2))
         self.solids.append(Solid("ellipsoid", x, y, yaw, radius, radius, clear, top, leaves, 0.8))
 
     def _hedge(self, along_m: float, offset_m: float, length_m: float, height_m: float) -> None:

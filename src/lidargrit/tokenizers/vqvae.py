@@ -208,7 +208,9 @@ class Vqvae(Tokenizer):
             loss = terms["reconstruction"] + z.loss
         else:
             kind = self.config.reconstruction
-            drawn = torch.bernoulli(return_logits.detach().sigmoid(), generator=rng) > 0.5 if kind == "reference" else mask
+            drawn = (
+                torch.bernoulli(return_logits.detach().sigmoid(), generator=rng) > 0.5 if kind == "reference" else mask
+            )
             terms["reconstruction"] = reconstruction_loss(encoded, target, mask, drawn, kind)
             terms["raydrop"] = F.binary_cross_entropy_with_logits(return_logits, mask.to(return_logits.dtype))
             loss = terms["reconstruction"] + self.config.raydrop_weight * terms["raydrop"] + z.loss
@@ -236,8 +238,8 @@ def reconstruction_loss(
     """Return the masked absolute error of the encoded range on the pixels that truly returned.
 
     Source:
-        ``paper``: eq. 2, clean range over all pixels. ``reference``: hamedhaghighi/LidarGRIT@a3f86e7, range composed with
-        a drawn mask, over each scan's returns.
+        ``paper``: eq. 2, clean range over all pixels. ``reference``: hamedhaghighi/LidarGRIT@a3f86e7, range composed
+        with a drawn mask, over each scan's returns.
     """
     if kind == "reference":
         encoded = torch.where(drawn_mask, encoded, -1.0)

@@ -1,0 +1,6 @@
+"""One loop, one optimiser, one checkpoint, whatever the model: recipe → run folder."""
+
+from lidargrit.training.run import plan, train
+from lidargrit.training.settings import FitConfig, Recipe
+
+__all__ = ["FitConfig", "Recipe", "plan", "train"]

@@ -7,8 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from lidargrit.errors import CheckpointError
-from lidargrit.files import read_tensors, write_tensors
+from lidargrit.files import load_exactly, read_tensors, write_tensors
 from lidargrit.training.optimiser import WeightAverage
 
 
@@ -33,8 +32,8 @@ def load_checkpoint(
         CheckpointError: a damaged file, or one of another configuration.
     """
     tensors, about = read_tensors(path)
-    load_weights(objective, _below(tensors, "objective."), path)
-    load_weights(average.objective, _below(tensors, "average."), path)
+    load_exactly(objective, _below(tensors, "objective."), path)
+    load_exactly(average.objective, _below(tensors, "average."), path)
     if optimiser is not None:
         state: dict[int, dict[str, Tensor]] = {}
         for name, tensor in _below(tensors, "optimiser.").items():
@@ -42,31 +41,6 @@ def load_checkpoint(
             state.setdefault(int(index), {})[key] = tensor
         optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
     return int(about["scans_seen"])
-
-
-def load_weights(module: nn.Module, tensors: dict[str, Tensor], source: Path) -> None:
-    """Load weights into a module of the very same layout.
-
-    Raises:
-        CheckpointError: a name or a size differs; names the first.
-    """
-    wanted = module.state_dict()
-    differing = sorted(wanted.keys() ^ tensors.keys())
-    if differing:
-        side = "lacks" if differing[0] in wanted else "has besides"
-        raise CheckpointError(
-            f"weights in {source} of another configuration (the file {side} {differing[0]!r})",
-            "the weights of this model",
-            "load them with the configuration that they were trained with",
-        )
-    for name, tensor in tensors.items():
-        if tensor.shape != wanted[name].shape:
-            raise CheckpointError(
-                f"weights in {source} of another configuration ({name!r} is {tuple(tensor.shape)})",
-                f"{tuple(wanted[name].shape)}",
-                "load them with the configuration that they were trained with",
-            )
-    module.load_state_dict(tensors)
 
 
 def _below(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:

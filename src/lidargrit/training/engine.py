@@ -21,7 +21,7 @@ class Engine:
     def __init__(self, precision: Literal["fp32", "bf16"]) -> None:
         from lightning_fabric import Fabric  # noqa: PLC0415  takes a second, and only training needs it
 
-        self._fabric: Any = Fabric(precision={"fp32": "32-true", "bf16": "bf16-mixed"}[precision])
+        self._fabric: Any = Fabric(precision="bf16-mixed" if precision == "bf16" else "32-true")
         self._fabric.launch()
         self.device, self.rank, self.world_size = self._fabric.device, self._fabric.global_rank, self._fabric.world_size
 
@@ -30,7 +30,7 @@ class Engine:
         self._objective, self._optimiser = self._fabric.setup(_TensorDoor(objective), optimiser)
 
     def step(self, images: RangeImage, seed: int, gradient_clip: float) -> dict[str, Tensor]:
-        """Take one step of the optimiser and return the objective's terms; nothing changes if the loss is not finite."""
+        """Take one step and return the objective's terms; no weight changes if the loss is not finite."""
         self._objective.train()
         terms = self._objective(images.range_m, images.return_mask, seed)
         if not bool(terms["loss"].isfinite()):
@@ -58,9 +58,10 @@ class _TensorDoor(nn.Module):
     def __init__(self, objective: nn.Module) -> None:
         super().__init__()
         self.objective = objective
+        self._sensor: Any = objective.sensor
 
     def forward(
         self, range_m: Float[Tensor, "B H W"], return_mask: Bool[Tensor, "B H W"], seed: int
     ) -> dict[str, Tensor]:
         rng = torch.Generator(range_m.device).manual_seed(seed)
-        return self.objective(RangeImage(range_m, return_mask, self.objective.sensor), rng)
+        return self.objective(RangeImage(range_m, return_mask, self._sensor), rng)

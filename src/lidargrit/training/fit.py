@@ -63,7 +63,13 @@ class Fit:
         """
         config = self.config
         batches = Batches(
-            train, config.batch_size, config.augmentations, self.seed, self.engine.rank, self.engine.world_size
+            train,
+            config.batch_size,
+            config.augmentations,
+            config.any_columns,
+            self.seed,
+            self.engine.rank,
+            self.engine.world_size,
         )
         begun, step = time.monotonic(), 0
         with self.reporter.progress(what, config.scans, self.scans_seen) as progress:
@@ -117,13 +123,14 @@ class Fit:
         if self.engine.rank:
             return
         line = {"scans_seen": self.scans_seen, "split": split, "seconds": round(seconds, 1), **terms}
+        path = self.folder / "log.jsonl"
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            with (self.folder / "log.jsonl").open("a", encoding="utf-8") as log:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with path.open("a", encoding="utf-8") as log:
                 log.write(json.dumps(line) + "\n")
         except OSError as error:
             raise OutputError(
-                f"'{error.strerror}' while writing {log.name}", "a folder with room", "free some space and go on"
+                f"'{error.strerror}' while writing {path}", "a folder with room", "free some space and go on"
             ) from error
         if split == "val":
             told = "  ".join(f"{name} {value:.4g}" for name, value in terms.items())

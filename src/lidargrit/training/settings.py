@@ -27,6 +27,8 @@ class FitConfig:
         average_over_scans: half-life of the moving average of the weights that is sampled and scored; 0 for none.
         precision: ``bf16`` runs convolutions and products in 16 bits, sums and losses in 32.
         augmentations: see lidargrit.augmentation.
+        any_columns: where the sensor keeps every n-th column, begin at any of the first n each time a scan is seen: n
+            times as many images of the same scans. The reference always keeps the first.
         validate_every: scans between two validations, which take at most ``validation_scans`` scans.
         validation_scans: see above.
         checkpoint_every: scans between two checkpoints.
@@ -43,6 +45,7 @@ class FitConfig:
     average_over_scans: int = 1000
     precision: Literal["fp32", "bf16"] = "fp32"
     augmentations: tuple[Augmentation, ...] = ()
+    any_columns: bool = False
     validate_every: int = 1000
     validation_scans: int = 64
     checkpoint_every: int = 1000

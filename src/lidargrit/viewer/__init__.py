@@ -1,5 +1,6 @@
 """Pictures of scans: range images → PNG."""
 
 from lidargrit.viewer.pictures import draw_comparison
+from lidargrit.viewer.side_by_side import view
 
-__all__ = ["draw_comparison"]
+__all__ = ["draw_comparison", "view"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -166,7 +167,9 @@ def _draw_row(figure: Figure, height: float, bottom: float, panel: _Panel, scale
     x, y, z = panel.points_xyz_m.T
     order = np.argsort(z)  # the highest on top, as seen from above
     norm, colours = scales.height_norm, scales.height_colours
-    view.scatter(y[order], x[order], c=z[order], s=0.6, linewidths=0, norm=norm, cmap=colours)
+    view.scatter(
+        y[order], x[order], c=z[order], s=min(2.5, 30_000 / max(len(z), 1)), linewidths=0, norm=norm, cmap=colours
+    )
     view.plot(0, 0, marker="+", color="black", markersize=7)
     half = scales.half_view_m
     view.set(xlim=(half, -half), ylim=(-half, half), aspect="equal", facecolor="white")  # left is to the left
@@ -204,4 +207,5 @@ def _save(figure: Figure, path: Path) -> None:
             "choose another path",
         ) from None
     finally:
-        unfinished.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # gone already, or its folder never was
+            unfinished.unlink()

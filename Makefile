@@ -1,0 +1,27 @@
+# Two commands do everything on a fresh machine: `make demo` and `make test`.
+#   make demo              the main job on simulated streets, about 8 minutes on two cores
+#   make demo DATA=FOLDER  the same on your own KITTI-style scans
+#   make test              all checks and all tests
+
+PYTHON ?= python3
+BIN := .venv/bin
+
+.PHONY: demo test check
+
+demo: .venv/.complete
+	$(BIN)/lidargrit demo $(if $(DATA),--data "$(DATA)") $(if $(OUT),--out "$(OUT)")
+
+test: check
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile
+
+check: .venv/.complete
+	$(BIN)/ruff check src tests benchmarks
+	$(BIN)/ruff format --check src tests benchmarks
+	$(BIN)/pyright
+	$(BIN)/lint-imports
+
+# The mark is made last: an interrupted installation is taken up again.
+.venv/.complete: pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
+	touch $@

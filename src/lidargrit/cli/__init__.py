@@ -1,0 +1,64 @@
+"""What a user types: words → one function of the library, its result, and an exit code."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+
+from lidargrit import __version__, _discovery
+from lidargrit.errors import LidarGritError
+
+_EXAMPLES = """\
+examples:
+  lidargrit demo                                    the whole story in minutes, no data needed
+  lidargrit demo --data /data/kitti_odometry        the same on your own scans
+  lidargrit train small runs/mine --set data.train=/data/scans data.val=/data/held_out
+  lidargrit sample runs/mine samples -n 100
+  lidargrit evaluate samples /data/held_out
+  lidargrit view /data/held_out runs/mine -o side_by_side.png
+
+a verb's own examples: lidargrit VERB --help
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one verb; 0 = done, 2 = the user's mistake, told in one line, 130 = interrupted."""
+    parser = argparse.ArgumentParser(
+        prog="lidargrit",
+        usage="lidargrit VERB ...",
+        description=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"lidargrit {__version__}")
+    verbs = parser.add_subparsers(title="verbs", metavar="", dest="verb")
+    for name in _discovery.names("cli"):
+        verb = importlib.import_module(f"lidargrit.cli.{name}")
+        sub = verbs.add_parser(
+            name.removesuffix("_"),
+            help=_discovery.summary("cli", name),
+            description=f"examples:\n{verb.EXAMPLES}",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        sub.add_argument("--debug", action="store_true", help="show a full traceback of an error")
+        verb.add_arguments(sub)
+        sub.set_defaults(run=verb.run)
+    options = parser.parse_args(arguments)
+    if options.verb is None:
+        parser.print_help()
+        return 0
+    try:
+        options.run(options)
+    except LidarGritError as error:
+        if options.debug:
+            raise
+        print(f"lidargrit {options.verb}: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"\nlidargrit {options.verb}: interrupted; the same command goes on", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # the reader of our output, such as head, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 0

@@ -1,0 +1,28 @@
+"""Do everything once: scans, training, new scans, scores, pictures."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+EXAMPLES = """\
+  lidargrit demo                                simulated streets, about 8 minutes on two cores
+  lidargrit demo --data /data/kitti_odometry    your own scans: a KITTI tree, or any folder of .bin
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Name the options."""
+    parser.add_argument("--data", help="a folder of scans; simulated ones if not given")
+    parser.add_argument("--out", type=Path, help="run folder (default: runs/demo, or runs/demo-FOLDER)")
+    parser.add_argument("--set", nargs="+", default=[], metavar="NAME=VALUE", help="change settings of the recipe")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run the demo and say where its results lie."""
+    from lidargrit.demo import demo
+    from lidargrit.reporting import TerminalReporter
+
+    out = options.out or Path("runs") / ("demo" if not options.data else f"demo-{Path(options.data).name}")
+    folder = demo(options.data, out, options.set, TerminalReporter())
+    print(f"done: look at {folder / 'real_reconstructed_generated.png'}; everything lies in {folder}")

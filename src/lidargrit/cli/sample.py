@@ -1,0 +1,47 @@
+"""Write new scans with a trained run; the same command goes on where it stopped."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+EXAMPLES = """\
+  lidargrit sample runs/demo samples -n 100
+  lidargrit sample runs/demo bolder -n 100 --temperature 1.1 --top-k 0 --mask threshold
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Name the options."""
+    parser.add_argument("run_folder", type=Path, metavar="RUN", help="folder of a finished run")
+    parser.add_argument("out", type=Path, help="folder for the samples")
+    parser.add_argument("-n", "--count", type=int, default=16, help="number of scans (default: 16)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the first; the next have the next seeds")
+    parser.add_argument("--batch-size", type=int, default=8, help="scans drawn at once (default: 8)")
+    parser.add_argument("--temperature", type=float, default=1.0, help="0 takes the likeliest token (default: 1)")
+    parser.add_argument("--top-k", type=int, default=100, help="among the k likeliest; 0 for all (default: 100)")
+    parser.add_argument("--top-p", type=float, default=1.0, help="among those that hold this probability (default: 1)")
+    parser.add_argument("--mask", choices=["bernoulli", "threshold"], default="bernoulli", help="how rays are dropped")
+    parser.add_argument("--device", help="cpu or cuda (default: cuda if there is one)")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Sample to disk."""
+    import torch
+
+    from lidargrit.errors import ConfigError
+    from lidargrit.evaluation.samples import write_samples
+    from lidargrit.generators import SamplingConfig, load
+    from lidargrit.reporting import TerminalReporter
+
+    if options.count < 1 or options.batch_size < 1 or options.seed < 0:
+        raise ConfigError(
+            f"-n {options.count}, --batch-size {options.batch_size}, --seed {options.seed}",
+            "at least one scan, at least one at once, and no negative seed",
+            "correct the number",
+        )
+    sampling = SamplingConfig(options.temperature, options.top_k, options.top_p, options.mask)
+    generator = load(options.run_folder).to(options.device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    seeds = range(options.seed, options.seed + options.count)
+    write_samples(generator, options.run_folder, options.out, seeds, sampling, options.batch_size, TerminalReporter())
+    print(f"done: {options.count} scans lie in {options.out}; look at them with: lidargrit view {options.out}")

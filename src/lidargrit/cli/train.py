@@ -1,0 +1,34 @@
+"""Train a recipe; the same command goes on where it stopped."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+EXAMPLES = """\
+  lidargrit train small runs/mine
+  lidargrit train small runs/mine --set data.train=/data/scans data.val=/data/held_out
+  lidargrit train lidargrit_kitti_360 runs/k360 --set data.train=kitti_360:/data/kitti_360:train_without_val --dry-run
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Name the options."""
+    parser.add_argument("recipe", help="name of a recipe; see: lidargrit list recipes")
+    parser.add_argument("out", type=Path, help="run folder")
+    parser.add_argument("--set", nargs="+", default=[], metavar="NAME=VALUE", help="change settings of the recipe")
+    parser.add_argument("--dry-run", action="store_true", help="say what would be done, with every setting, and stop")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Train, or tell the plan."""
+    from lidargrit.recipes import load_recipe
+    from lidargrit.reporting import TerminalReporter
+    from lidargrit.training import plan, train
+
+    recipe = load_recipe(options.recipe, options.set)
+    if options.dry_run:
+        print(plan(recipe))
+        return
+    train(recipe, options.out, TerminalReporter())
+    print(f"done: the model lies in {options.out}; sample it with: lidargrit sample {options.out} samples -n 16")

@@ -1,0 +1,27 @@
+"""Draw scans, samples and runs side by side on one scale, as a PNG."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+EXAMPLES = """\
+  lidargrit view /data/scans                           range image, return mask and bird's-eye view
+  lidargrit view /data/held_out runs/demo -o all.png   real, reconstructed and generated
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Name the options."""
+    parser.add_argument("places", nargs="+", metavar="PATH", help="a run, a folder of samples, a scan, or other scans")
+    parser.add_argument("-o", "--out", type=Path, default=Path("view.png"), help="the picture (default: view.png)")
+    parser.add_argument("-n", "--count", type=int, default=3, help="scans of each (default: 3)")
+    parser.add_argument("--seed", type=int, default=0, help="of the first generated scan")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Draw the picture."""
+    from lidargrit.viewer import view
+
+    view(options.places, options.out, options.count, options.seed)
+    print(f"done: look at {options.out}")

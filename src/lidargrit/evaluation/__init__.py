@@ -1,0 +1,1 @@
+"""Sample to disk, compare with real scans, score: a trained run → numbers."""

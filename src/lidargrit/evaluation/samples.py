@@ -1,0 +1,117 @@
+"""Generated scans on disk: (generator, seeds) → a folder of one file a scan, and back."""
+
+from __future__ import annotations
+
+import hashlib
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidargrit import configuration
+from lidargrit.errors import DataError, OutputError, ScanError
+from lidargrit.files import atomic_path, read_json, write_json
+from lidargrit.generators import WEIGHTS_FILE, Generator, SamplingConfig
+from lidargrit.loading import RangeImages
+from lidargrit.reporting import Reporter
+from lidargrit.sensors import SensorModel
+
+MANIFEST = "samples.json"
+
+
+def write_samples(
+    generator: Generator,
+    run_folder: Path,
+    folder: Path,
+    seeds: Sequence[int],
+    sampling: SamplingConfig,
+    batch_size: int = 8,
+    reporter: Reporter | None = None,
+) -> None:
+    """Write one file for each seed; seeds that are there already are not drawn again.
+
+    Args:
+        generator: what to sample from, as loaded from
+        run_folder: whose weights identify it.
+        folder: gets ``samples.json`` and ``SEED.npz`` with ``range_m`` (H, W) in metres, 0 where nothing returned.
+        seeds: one a scan.
+        sampling: temperature and the like.
+        batch_size: scans drawn at once; the scans do not depend on it.
+        reporter: hears of the progress.
+
+    Raises:
+        OutputError: the folder holds samples of another model or setting, something else, or cannot be written.
+    """
+    manifest: dict[str, Any] = {
+        "weights_sha256": hashlib.sha256((run_folder / WEIGHTS_FILE).read_bytes()).hexdigest(),
+        "sampling": configuration.to_json(sampling),
+        "sensor": generator.sensor.to_json(),
+    }
+    if (folder / MANIFEST).exists():
+        if read_json(folder / MANIFEST) != manifest:
+            raise OutputError(
+                f"{folder}, which holds samples of another model or drawn in another way",
+                "an empty folder, or one that this very command began",
+                "choose another folder",
+            )
+    elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise OutputError(f"{folder}, which is not empty and holds no samples", "an empty folder", "choose another one")
+    else:
+        write_json(folder / MANIFEST, manifest)
+    missing = [seed for seed in seeds if not _file(folder, seed).exists()]
+    with (reporter or Reporter()).progress("sampling", len(seeds), len(seeds) - len(missing)) as progress:
+        for first in range(0, len(missing), batch_size):
+            some = missing[first : first + batch_size]
+            images = generator.sample(some, sampling)
+            for seed, range_m in zip(some, images.range_m.cpu().numpy(), strict=True):
+                with atomic_path(_file(folder, seed)) as temporary:
+                    np.savez_compressed(temporary, range_m=range_m)
+            progress.advance(len(some))
+
+
+def read_samples(folder: Path, count: int | None = None) -> RangeImages:
+    """Return the samples of a folder in the order of their seeds, at most ``count`` of them; read when asked for.
+
+    Raises:
+        DataError: no samples in the folder.
+    """
+    sensor = SensorModel.from_json(read_json(folder / MANIFEST)["sensor"])
+    paths = sorted(folder.glob("*.npz"))[:count]
+    if not paths:
+        raise DataError(f"no sample in {folder}", "at least one", "draw some with: lidargrit sample RUN " + str(folder))
+    return RangeImages(sensor, [_Files(paths, sensor)], [path.stem for path in paths])
+
+
+def is_sample_folder(folder: Path) -> bool:
+    """Tell whether a folder holds samples that lidargrit wrote."""
+    return (folder / MANIFEST).is_file()
+
+
+class _Files:
+    """Sample files that read like an array."""
+
+    def __init__(self, paths: list[Path], sensor: SensorModel) -> None:
+        self._paths, self._shape = paths, (sensor.height, sensor.width)
+
+    def __len__(self) -> int:
+        return len(self._paths)
+
+    def __getitem__(self, index: int) -> np.ndarray:
+        path = self._paths[index]
+        cure = "remove the file and sample again"
+        try:
+            with np.load(path, allow_pickle=False) as opened:
+                range_m = opened["range_m"]
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            raise ScanError(f"{path}, which cannot be read ({error})", "an .npz with range_m", cure) from None
+        if range_m.shape != self._shape or range_m.dtype != np.float32:
+            raise ScanError(
+                f"{range_m.dtype} {range_m.shape} in {path}", f"float32 {self._shape}, as samples.json says", cure
+            )
+        return range_m
+
+
+def _file(folder: Path, seed: int) -> Path:
+    return folder / f"{seed:08d}.npz"

@@ -1,0 +1,138 @@
+"""LidarGRIT: a transformer writes the tokens of a VQ-VAE one by one; seeds → range images."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from lidargrit.generators import Generator, SamplingConfig
+from lidargrit.nn.transformer import CausalTransformer, TransformerConfig
+from lidargrit.sensors import SensorModel
+from lidargrit.structures import RangeImage, TokenGrid
+from lidargrit.tokenizers import Tokenizer
+from lidargrit.tokenizers.vqvae import Vqvae, VqvaeConfig
+
+START_TOKEN = 0  # the reference prepends an ordinary token, shared with the first code, not one of its own
+
+
+@dataclass(frozen=True)
+class LidarGritConfig:
+    """The two networks of the paper."""
+
+    tokenizer: VqvaeConfig = field(default_factory=VqvaeConfig)
+    transformer: TransformerConfig = field(default_factory=TransformerConfig)
+
+
+class LidarGrit(Generator):
+    """The paper's system.
+
+    Source:
+        Haghighi et al., Taming Transformers for Realistic Lidar Point Cloud Generation, 2024.
+    """
+
+    Config = LidarGritConfig
+    stages = ("tokenizer", "transformer")
+
+    def __init__(self, config: LidarGritConfig, sensor: SensorModel) -> None:
+        super().__init__(config, sensor)
+        self.config, self.sensor = config, sensor
+        self.tokenizer = Vqvae(config.tokenizer, sensor)
+        height, width = self.tokenizer.grid_size
+        self.transformer = CausalTransformer(config.transformer, config.tokenizer.num_codes, height * width)
+
+    def objective(self, stage: str) -> nn.Module:
+        """Return the VQ-VAE itself, or the transformer's objective over the frozen VQ-VAE."""
+        return self.tokenizer if stage == "tokenizer" else NextToken(self.tokenizer, self.transformer)
+
+    def finish(self, stage: str, objective: nn.Module) -> None:
+        """Take over a stage's trained weights."""
+        if stage == "tokenizer":
+            self.tokenizer.load_state_dict(objective.state_dict())
+        else:
+            assert isinstance(objective, NextToken)
+            self.transformer.load_state_dict(objective.transformer.state_dict())
+
+    @torch.no_grad()
+    def sample(self, seeds: Sequence[int], sampling: SamplingConfig | None = None) -> RangeImage:
+        """Write one scan for each seed; a seed gives the same scan whatever the others are."""
+        sampling = sampling or SamplingConfig()
+        self.eval()
+        device = self.transformer.head.weight.device
+        rngs = [torch.Generator().manual_seed(seed) for seed in seeds]  # on the CPU: the same numbers on every device
+        uniform = torch.stack([torch.rand(self.transformer.context_length, generator=rng) for rng in rngs])
+        tokens = sample_tokens(self.transformer, uniform.to(device), sampling)
+        grid = TokenGrid(tokens.unflatten(1, self.tokenizer.grid_size), self.tokenizer.num_codes)
+        size = (self.sensor.height, self.sensor.width)
+        return self.tokenizer.decode(
+            grid, sampling.mask, torch.stack([torch.rand(size, generator=rng) for rng in rngs]).to(device)
+        )
+
+
+class NextToken(nn.Module):
+    """The transformer's objective: negative log-likelihood of each token after those before it, in nats per token."""
+
+    token_counts: Tensor
+
+    def __init__(self, tokenizer: Tokenizer, transformer: CausalTransformer) -> None:
+        super().__init__()
+        self.transformer, self.sensor = transformer, tokenizer.sensor
+        self._frozen = [tokenizer.eval().requires_grad_(False)]  # in a list: its weights are not this stage's
+        self.register_buffer("token_counts", torch.ones(transformer.num_tokens))
+
+    def forward(self, images: RangeImage, rng: torch.Generator) -> dict[str, Tensor]:
+        """Return eq. 6 of the paper per token, beside it that of a model which knows only how often tokens occur."""
+        with torch.no_grad():
+            self._frozen[0].to(images.range_m.device)
+            tokens = self._frozen[0].encode(images).tokens.flatten(1)
+            if self.training:
+                self.token_counts += torch.bincount(tokens.flatten(), minlength=len(self.token_counts))
+            unigram = -(self.token_counts / self.token_counts.sum()).log()[tokens].mean()
+        logits = self.transformer(after_start(tokens[:, :-1]))
+        loss = F.cross_entropy(logits.float().flatten(0, 1), tokens.flatten())
+        return {"loss": loss, "unigram_nll": unigram}
+
+
+def after_start(tokens: Int[Tensor, "B T"]) -> Int[Tensor, "B T+1"]:
+    """Prepend the start token."""
+    return F.pad(tokens, (1, 0), value=START_TOKEN)
+
+
+def sample_tokens(
+    transformer: CausalTransformer, uniform: Float[Tensor, "B T"], sampling: SamplingConfig, use_cache: bool = True
+) -> Int[Tensor, "B T"]:
+    """Draw token sequences in raster order, one uniform number a token.
+
+    Args:
+        transformer: what to draw from.
+        uniform: random numbers in [0, 1); the token is where the distribution function first exceeds its number.
+        sampling: temperature, top-k and top-p.
+        use_cache: off, every step reads the whole prefix again, as the released program does: for comparison.
+    """
+    tokens = torch.full((len(uniform), 1), START_TOKEN, dtype=torch.long, device=uniform.device)
+    cache = transformer.new_cache(len(uniform)) if use_cache else None
+    for step in range(uniform.shape[1]):
+        logits = transformer.next_logits(tokens[:, -1], cache) if cache else transformer(tokens)[:, -1]
+        tokens = torch.cat((tokens, choose(logits, uniform[:, step], sampling)[:, None]), dim=1)
+    return tokens[:, 1:]
+
+
+def choose(logits: Float[Tensor, "B K"], uniform: Float[Tensor, "B"], sampling: SamplingConfig) -> Int[Tensor, "B"]:
+    """Choose one token for each row of logits by its uniform number."""
+    if sampling.temperature == 0:
+        return logits.argmax(dim=1)
+    logits = logits.double() / sampling.temperature
+    if 0 < sampling.top_k < logits.shape[1]:
+        weakest = logits.topk(sampling.top_k, dim=1).values[:, -1:]
+        logits = logits.masked_fill(logits < weakest, -torch.inf)  # ties with the weakest are kept, as in the program
+    if sampling.top_p < 1:
+        ordered, order = logits.softmax(dim=1).sort(dim=1, descending=True)
+        spare = ordered.cumsum(dim=1) - ordered >= sampling.top_p  # those before it already hold enough
+        logits = logits.masked_fill(torch.zeros_like(spare).scatter(1, order, spare), -torch.inf)
+    distribution = logits.softmax(dim=1).cumsum(dim=1)
+    threshold = (uniform.double() * distribution[:, -1])[:, None]  # the sum may miss 1 by a rounding error
+    return torch.searchsorted(distribution, threshold, right=True)[:, 0].clamp(max=logits.shape[1] - 1)

@@ -1,0 +1,150 @@
+"""A causal transformer over tokens, with a key/value cache: tokens so far → logits of the next.
+
+Parameter names follow the reference's state dict (a minGPT), so that published weights load.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from lidargrit.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class TransformerConfig:
+    """Sizes of the transformer; the defaults are the paper's for KITTI odometry.
+
+    Args:
+        layers: number of blocks.
+        heads: of attention in each.
+        width: length of a token's vector.
+        embedding_dropout: on the input.
+        residual_dropout: on what a block adds.
+        attention_dropout: on attention weights.
+    """
+
+    layers: int = 6
+    heads: int = 8
+    width: int = 256
+    embedding_dropout: float = 0.2
+    residual_dropout: float = 0.0
+    attention_dropout: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.layers < 1 or self.heads < 1 or self.width < 1 or self.width % self.heads:
+            raise ConfigError(
+                f"layers={self.layers}, heads={self.heads}, width={self.width}",
+                "positive numbers, the width a multiple of the heads",
+                "change the width or the heads",
+            )
+
+
+@dataclass
+class KeyValueCache:
+    """Keys and values of the tokens so far, in memory taken once: one pair of tensors a layer."""
+
+    keys: list[Float[Tensor, "B heads T d"]]
+    values: list[Float[Tensor, "B heads T d"]]
+    length: int = 0
+
+
+class CausalTransformer(nn.Module):
+    """Pre-norm blocks, learned positions, exact GELU, an untied head without bias.
+
+    Args:
+        config: sizes.
+        num_tokens: size of the vocabulary.
+        context_length: longest sequence.
+
+    Source:
+        Haghighi et al., LidarGRIT, 2024, section 3.3; layers as in hamedhaghighi/LidarGRIT@a3f86e7.
+    """
+
+    def __init__(self, config: TransformerConfig, num_tokens: int, context_length: int) -> None:
+        super().__init__()
+        self.config, self.num_tokens, self.context_length = config, num_tokens, context_length
+        self.tok_emb = nn.Embedding(num_tokens, config.width)
+        self.pos_emb = nn.Parameter(torch.zeros(1, context_length, config.width))
+        self.drop = nn.Dropout(config.embedding_dropout)
+        self.blocks = nn.ModuleList(_Block(config) for _ in range(config.layers))
+        self.ln_f = nn.LayerNorm(config.width)
+        self.head = nn.Linear(config.width, num_tokens, bias=False)
+        self.apply(_initialise)
+
+    def forward(self, tokens: Int[Tensor, "B T"]) -> Float[Tensor, "B T K"]:
+        """Return the logits of the token after each one."""
+        x = self.drop(self.tok_emb(tokens) + self.pos_emb[:, : tokens.shape[1]])
+        for block in self.blocks:
+            x = block(x)
+        return self.head(self.ln_f(x))
+
+    def new_cache(self, batch_size: int) -> KeyValueCache:
+        """Return an empty cache for ``batch_size`` sequences of the longest length."""
+        heads = self.config.heads
+        shape = (batch_size, heads, self.context_length, self.config.width // heads)
+        weight = self.head.weight
+        empty = [torch.zeros(shape, device=weight.device, dtype=weight.dtype) for _ in range(2 * len(self.blocks))]
+        return KeyValueCache(empty[::2], empty[1::2])
+
+    def next_logits(self, tokens: Int[Tensor, "B"], cache: KeyValueCache) -> Float[Tensor, "B K"]:
+        """Return the logits that follow one more token, remembering its keys and values in the cache."""
+        x = (self.tok_emb(tokens) + self.pos_emb[0, cache.length])[:, None]
+        for block, keys, values in zip(self.blocks, cache.keys, cache.values, strict=True):
+            x = block(x, keys, values, cache.length)
+        cache.length += 1
+        return self.head(self.ln_f(x[:, 0]))
+
+
+class _Attention(nn.Module):
+    def __init__(self, config: TransformerConfig) -> None:
+        super().__init__()
+        self.heads, self.dropout = config.heads, config.attention_dropout
+        self.key = nn.Linear(config.width, config.width)
+        self.query = nn.Linear(config.width, config.width)
+        self.value = nn.Linear(config.width, config.width)
+        self.proj = nn.Linear(config.width, config.width)
+
+    def forward(
+        self, x: Tensor, past_keys: Tensor | None = None, past_values: Tensor | None = None, length: int = 0
+    ) -> Tensor:
+        q, k, v = (
+            linear(x).unflatten(-1, (self.heads, -1)).transpose(1, 2) for linear in (self.query, self.key, self.value)
+        )  # (B, heads, T, d)
+        if past_keys is None or past_values is None:
+            dropout = self.dropout if self.training else 0.0
+            mixed = F.scaled_dot_product_attention(q, k, v, dropout_p=dropout, is_causal=True)
+        else:
+            past_keys[:, :, length], past_values[:, :, length] = k[:, :, 0], v[:, :, 0]
+            keys, values = past_keys[:, :, : length + 1], past_values[:, :, : length + 1]
+            # For a single query two products beat the fused kernel on CPUs.
+            weights = (q @ keys.transpose(2, 3) / math.sqrt(q.shape[-1])).softmax(dim=-1)
+            mixed = weights @ values
+        return self.proj(mixed.transpose(1, 2).flatten(-2))
+
+
+class _Block(nn.Module):
+    def __init__(self, config: TransformerConfig) -> None:
+        super().__init__()
+        self.ln1, self.ln2 = nn.LayerNorm(config.width), nn.LayerNorm(config.width)
+        self.attn = _Attention(config)
+        self.mlp = nn.Sequential(
+            nn.Linear(config.width, 4 * config.width), nn.GELU(), nn.Linear(4 * config.width, config.width)
+        )
+        self.drop = nn.Dropout(config.residual_dropout)
+
+    def forward(self, x: Tensor, *past: Tensor | int) -> Tensor:
+        x = x + self.drop(self.attn(self.ln1(x), *past))
+        return x + self.drop(self.mlp(self.ln2(x)))
+
+
+def _initialise(module: nn.Module) -> None:
+    if isinstance(module, nn.Linear | nn.Embedding):
+        nn.init.normal_(module.weight, std=0.02)
+    if isinstance(module, nn.Linear) and module.bias is not None:
+        nn.init.zeros_(module.bias)

@@ -1,0 +1,115 @@
+"""A run from its recipe to its finished model: every stage in turn, each going on where it stopped."""
+
+from __future__ import annotations
+
+import platform
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from lidargrit import __version__, configuration
+from lidargrit.errors import OutputError
+from lidargrit.files import read_json, write_json
+from lidargrit.generators import CONFIG_FILE, Generator, load_class
+from lidargrit.loading import RangeImages, load_range_images, seed_of
+from lidargrit.reporting import Reporter
+from lidargrit.training.fit import Fit
+from lidargrit.training.settings import Recipe
+
+RUN_FILE = "run.json"
+
+
+def train(recipe: Recipe, folder: Path, reporter: Reporter | None = None) -> Generator:
+    """Train every stage of a recipe in a run folder and return the finished generator.
+
+    The same call goes on where a stopped one was. The folder holds ``run.json`` (recipe, command, versions) before the
+    first step, a folder for each stage (checkpoint, log), and at the end ``config.json`` and ``model.safetensors``.
+
+    Raises:
+        OutputError: the folder holds something else, or cannot be written.
+        DataError, ScanError: the data cannot be used.
+        TrainingError: the loss is not finite.
+    """
+    reporter = reporter or Reporter()
+    _claim(folder, recipe)
+    train_images = load_range_images(recipe.data.train, recipe.data, reporter)
+    val_images = load_range_images(recipe.data.val, recipe.data, reporter)
+    _warn_of_overlap(train_images, val_images, reporter)
+    torch.manual_seed(seed_of(recipe.seed, 9))
+    generator = load_class(recipe.generator)(recipe.model, recipe.data.load_sensor())
+    for number, stage in enumerate(generator.stages):
+        fit = Fit(
+            generator.objective(stage), recipe.training[stage], folder / stage, seed_of(recipe.seed, number), reporter
+        )
+        generator.finish(stage, fit.run(train_images, val_images, f"training {stage}"))
+    generator.save(folder)
+    return generator.eval()
+
+
+def plan(recipe: Recipe) -> str:
+    """Return what a recipe would do, as lines for a person: every setting by its name, sizes and budgets."""
+    sensor = recipe.data.load_sensor()
+    generator = load_class(recipe.generator)(recipe.model, sensor)
+    lines = [recipe.title, f"published: {recipe.published}" if recipe.published else "published: no figure", ""]
+    lines += [f"  {name} = {value}" for name, value in configuration.leaves(recipe).items()]
+    lines += ["", f"range images of {sensor.height}x{sensor.width}, {sensor.range_min_m:g} to {sensor.range_max_m:g} m"]
+    for stage in generator.stages:
+        count = sum(p.numel() for p in generator.objective(stage).parameters())
+        budget = recipe.training[stage]
+        lines.append(f"{stage}: {count:,} parameters, {budget.scans:,} scans in batches of {budget.batch_size}")
+    return "\n".join(lines)
+
+
+def _claim(folder: Path, recipe: Recipe) -> None:
+    """Make the folder this recipe's, or find that it already is."""
+    described: dict[str, Any] = {
+        "recipe": configuration.to_json(recipe),
+        "command": sys.argv,
+        "lidargrit": __version__,
+        "commit": _commit(),
+        "torch": torch.__version__,
+        "python": platform.python_version(),
+    }
+    if (folder / RUN_FILE).exists():
+        theirs, ours = read_json(folder / RUN_FILE)["recipe"], described["recipe"]
+        mine, other = configuration.leaves(ours), configuration.leaves(theirs)
+        differing = [name for name in mine.keys() | other.keys() if mine.get(name) != other.get(name)]
+        if differing:
+            name = sorted(differing)[0]
+            raise OutputError(
+                f"{folder}, which holds another run (there {name}={other.get(name)}, here {mine.get(name)})",
+                "an empty folder, or the folder of this very recipe",
+                "choose another folder, or use the settings that the run began with",
+            )
+        return
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise OutputError(
+            f"{folder}, which is not empty and holds no run",
+            "an empty folder, or one that this recipe began",
+            "choose another folder",
+        )
+    write_json(folder / RUN_FILE, described)
+
+
+def is_finished(folder: Path) -> bool:
+    """Tell whether a run folder holds a finished model."""
+    return (folder / CONFIG_FILE).exists()
+
+
+def _warn_of_overlap(train_images: RangeImages, val_images: RangeImages, reporter: Reporter) -> None:
+    shared = set(train_images.names) & set(val_images.names)
+    if shared:
+        reporter.message(
+            f"WARNING: {len(shared)} scans are in both train and val, e.g. {min(shared)}: val figures mean little"
+        )
+
+
+def _commit() -> str:
+    try:
+        command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=5).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"

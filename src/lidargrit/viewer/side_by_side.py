@@ -1,0 +1,51 @@
+"""Anything that holds scans, drawn side by side on one scale: paths → PNG."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from lidargrit.errors import ConfigError
+from lidargrit.evaluation.score import open_images
+from lidargrit.generators import CONFIG_FILE, SamplingConfig, load
+from lidargrit.generators.lidargrit import LidarGrit
+from lidargrit.sensors import SensorModel
+from lidargrit.structures import RangeImage
+from lidargrit.viewer.pictures import draw_comparison
+
+
+def view(places: Sequence[str], picture: Path, count: int = 3, seed: int = 0) -> None:
+    """Draw scans, samples and what a run makes of them.
+
+    Args:
+        places: each a run's folder (drawn as *generated*, and as *reconstructed* if there are scans beside it), a
+            folder of samples, or a source of scans.
+        picture: the PNG.
+        count: scans of each, evenly spaced.
+        seed: of the first generated scan.
+    """
+    runs = [place for place in places if (Path(place) / CONFIG_FILE).exists()]
+    generators = {place: load(place) for place in runs}
+    sensor: SensorModel | None = next((generator.sensor for generator in generators.values()), None)
+    groups: dict[str, RangeImage] = {}
+    for place in places:
+        if place not in runs:
+            images = open_images(place, sensor)
+            chosen = min(count, len(images))
+            groups[_short(place)] = images.batch([index * len(images) // chosen for index in range(chosen)])
+    scans = dict(groups)
+    for place, generator in generators.items():
+        if scans and isinstance(generator, LidarGrit):
+            with torch.no_grad():
+                real = next(iter(scans.values()))
+                groups[f"{_short(place)}: reconstructed"] = generator.tokenizer.decode(generator.tokenizer.encode(real))
+        groups[f"{_short(place)}: generated"] = generator.sample(range(seed, seed + count), SamplingConfig())
+    if not groups:
+        raise ConfigError("nothing to draw", "a scan, a folder or a run", "name at least one")
+    draw_comparison(groups, picture)
+
+
+def _short(place: str) -> str:
+    return place if len(place) < 40 else "..." + place[-37:]

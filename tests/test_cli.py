@@ -1,0 +1,285 @@
+"""Every verb from end to end, as a user types it, on a model of the smallest size."""
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import lidargrit
+from lidargrit import _discovery
+from lidargrit.cli import main
+from lidargrit.datasets import load
+from lidargrit.datasets._files import read_bin
+from lidargrit.evaluation.samples import read_samples
+
+TINY = [  # 64x64 range images, 8x8 tokens
+    "data.train=[simulated:6:train]",
+    "data.val=[simulated:2:val]",
+    "data.columns=512",
+    "data.column_stride=8",
+    "model.tokenizer.channel_multipliers=[1,1,1,1]",
+    "model.tokenizer.code_dim=8",
+    "model.tokenizer.num_codes=32",
+    "model.transformer.layers=1",
+    "model.transformer.heads=2",
+    "model.transformer.width=16",
+    "training.tokenizer.scans=8",
+    "training.transformer.scans=8",
+]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _cache(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("LIDARGRIT_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture
+def typed(capsys):
+    """Return a function that runs a command and returns what it prints, having checked that it went well."""
+
+    def run(*words: object) -> str:
+        capsys.readouterr()
+        code = main([str(word) for word in words])
+        captured = capsys.readouterr()
+        assert code == 0, captured.err
+        return captured.out
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory) -> Path:
+    """Return a finished run, in a folder whose name has a space."""
+    folder = tmp_path_factory.mktemp("runs") / "my run"
+    assert main(["train", "demo", str(folder), "--set", *TINY]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def samples(run_folder) -> Path:
+    folder = run_folder.parent / "samples"
+    assert main(["sample", str(run_folder), str(folder), "-n", "3"]) == 0
+    return folder
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_train_leaves_a_run_that_says_what_it_is(run_folder):
+    assert set(contents(run_folder)) == {
+        "run.json",
+        "config.json",
+        "model.safetensors",
+        *(
+            f"{stage}/{file}"
+            for stage in ("tokenizer", "transformer")
+            for file in ("checkpoint.safetensors", "log.jsonl")
+        ),
+    }
+    about = json.loads((run_folder / "run.json").read_text())
+    assert about["recipe"]["data"]["train"] == ["simulated:6:train"]
+    assert about["recipe"]["training"]["tokenizer"]["scans"] == 8
+    assert about["lidargrit"] == lidargrit.__version__
+    assert about["torch"] == torch.__version__
+    log = [json.loads(line) for line in (run_folder / "tokenizer" / "log.jsonl").read_text().splitlines()]
+    assert log[-1]["scans_seen"] == 8
+    assert log[-1]["split"] == "val"
+    assert np.isfinite(log[-1]["loss"])
+
+
+def test_the_same_train_command_again_changes_nothing(run_folder, typed):
+    before = contents(run_folder)
+    assert "done: the model lies in" in typed("train", "demo", run_folder, "--set", *TINY)
+    assert contents(run_folder) == before
+
+
+def test_settings_may_come_before_the_names(run_folder, typed):
+    before = contents(run_folder)
+    assert "done" in typed("train", "--set", *TINY, "--", "demo", run_folder)
+    assert contents(run_folder) == before
+
+
+def test_dry_run_tells_the_plan_and_writes_nothing(tmp_path, typed):
+    told = typed("train", "demo", tmp_path / "none", "--dry-run", "--set", *TINY)
+    for line in ("training.tokenizer.scans = 8", "range images of 64x64, 0.", "transformer: ", "8 scans in batches of"):
+        assert line in told
+    assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.parametrize("recipe", _discovery.names("recipes"))
+def test_every_recipe_has_a_plan(recipe, tmp_path, typed):
+    told = typed("train", recipe, tmp_path / "none", "--dry-run")
+    assert "published: " in told
+    assert " parameters, " in told
+
+
+def test_sample_writes_one_file_a_seed_and_draws_no_seed_twice(run_folder, samples, typed, monkeypatch):
+    before = contents(samples)
+    assert set(before) == {"samples.json", "00000000.npz", "00000001.npz", "00000002.npz"}
+    with np.load(samples / "00000000.npz", allow_pickle=False) as opened:
+        assert opened["range_m"].shape == (64, 64)
+        assert opened["range_m"].dtype == np.float32
+
+    def draws_nothing(*_):
+        raise AssertionError("drew what was there")
+
+    monkeypatch.setattr("lidargrit.generators.lidargrit.LidarGrit.sample", draws_nothing)
+    assert "done: 3 scans lie in" in typed("sample", run_folder, samples, "-n", 3)
+    assert contents(samples) == before
+
+
+def test_a_seed_gives_the_same_sample_whatever_is_drawn_beside_it(run_folder, samples, tmp_path, typed):
+    typed("sample", run_folder, tmp_path / "later", "--seed", 1, "-n", 3, "--batch-size", 2)
+    earlier, later = read_samples(samples), read_samples(tmp_path / "later")
+    assert later.names == ["00000001", "00000002", "00000003"]
+    assert torch.allclose(later.batch([0, 1]).range_m, earlier.batch([1, 2]).range_m, atol=1e-3)
+    typed("sample", run_folder, tmp_path / "later", "--seed", 0, "-n", 5)
+    assert len(read_samples(tmp_path / "later")) == 5
+
+
+def test_sampling_options_reach_the_model(run_folder, tmp_path, typed):
+    typed("sample", run_folder, tmp_path, "-n", 2, "--temperature", 0, "--mask", "threshold", "--device", "cpu")
+    images = read_samples(tmp_path).batch([0, 1])
+    assert torch.equal(images.range_m[0], images.range_m[1]), "the likeliest tokens do not depend on the seed"
+    manifest = json.loads((tmp_path / "samples.json").read_text())
+    assert manifest["sampling"] == {"temperature": 0.0, "top_k": 100, "top_p": 1.0, "mask": "threshold"}
+
+
+def test_evaluate_prints_a_table_and_writes_json(samples, tmp_path, typed):
+    told = typed("evaluate", samples, "simulated:3:test", "--json", tmp_path / "deep" / "scores.json").splitlines()
+    assert told[0].split() == ["metric", "variant", "value", "better", "scans"]
+    scores = json.loads((tmp_path / "deep" / "scores.json").read_text())
+    assert scores["reference"] == "simulated:3:test"
+    assert [score["variant"] for score in scores["scores"]] == [line.split()[1] for line in told[1:]]
+    for score, line in zip(scores["scores"], told[1:], strict=True):
+        assert score["num_generated"] == score["num_reference"] == 3
+        assert f"{score['value']:.4f}" in line
+        assert "lower" in line
+
+
+def test_evaluate_one_variant_of_some_scans_twice_gives_the_same(samples, typed):
+    words = ("evaluate", samples, "simulated:3:test", "--variant", "textbook", "-n", 2, "--seed", 5)
+    told = typed(*words)
+    assert told.splitlines()[1].split()[-3:] == ["2", "v", "2"]
+    assert typed(*words) == told
+
+
+def test_evaluate_real_against_real(typed):
+    assert "3 v 3" in typed("evaluate", "simulated:3:train", "simulated:3:test", "--projection-variant", "reference")
+
+
+def test_view_draws_runs_samples_and_scans(run_folder, samples, tmp_path, typed):
+    assert "done: look at" in typed("view", "simulated:2:val", run_folder, samples, "-o", tmp_path / "all.png", "-n", 1)
+    with Image.open(tmp_path / "all.png") as picture:
+        picture.verify()
+        assert picture.format == "PNG"
+        four_rows = picture.height
+    typed("view", run_folder, "-o", tmp_path / "run.png", "-n", 1)
+    with Image.open(tmp_path / "run.png") as picture:
+        assert picture.height < four_rows
+
+
+def test_list_names_everything_there_is(typed):
+    told = typed("list")
+    for kind in ("datasets", "sensors", "tokenizers", "generators", "metrics", "recipes"):
+        assert typed("list", kind).splitlines()[0] == kind
+        for name in _discovery.names(kind):
+            assert f"  {name} " in told
+            assert f"  {name} " in typed("list", kind)
+    assert "licence: " in typed("list", "datasets")
+
+
+def test_doctor_tells_versions_and_room(typed):
+    told = typed("doctor")
+    assert lidargrit.__version__ in told
+    assert torch.__version__ in told
+    assert os.environ["LIDARGRIT_CACHE"] in told
+
+
+def test_demo_tells_the_whole_story_and_tells_it_again(tmp_path, typed):
+    words = ("demo", "--out", tmp_path / "demo", "--set", *TINY)
+    assert f"done: look at {tmp_path / 'demo'}" in typed(*words)
+    before = contents(tmp_path / "demo")
+    for name in ("real_reconstructed_generated.png", "generated.png", "samples/00000015.npz", "model.safetensors"):
+        assert name in before
+    evaluation = json.loads(before["evaluation.json"])
+    assert evaluation["reconstruction_on_val"]["num_scans"] == 2
+    assert evaluation["generated_against_train"]
+    typed(*words)
+    assert contents(tmp_path / "demo") == before
+
+
+def test_demo_on_a_users_own_drives(tmp_path, typed, monkeypatch):
+    load("kitti_odometry").write_example(tmp_path / "own scans", 4)
+    monkeypatch.chdir(tmp_path)
+    typed("demo", "--data", tmp_path / "own scans", "--set", *TINY[2:])
+    recipe = json.loads((tmp_path / "runs" / "demo-own scans" / "run.json").read_text())["recipe"]
+    assert recipe["data"]["train"] == [f"kitti_odometry:{tmp_path / 'own scans'}:00"]
+    assert recipe["data"]["val"] == [f"kitti_odometry:{tmp_path / 'own scans'}:08"]
+    assert recipe["data"]["sensor"] == "hdl64e_kitti_odometry"
+
+
+def test_demo_on_one_drive_holds_its_last_scans_out_and_warns(tmp_path, capsys):
+    load("kitti_odometry").write_example(tmp_path / "tree", 8)
+    words = ["demo", "--data", str(tmp_path / "tree" / "sequences" / "00"), "--out", str(tmp_path / "run")]
+    assert main([*words, "--set", *TINY[2:]]) == 0
+    assert "WARNING: one drive only" in capsys.readouterr().err
+    recipe = json.loads((tmp_path / "run" / "run.json").read_text())["recipe"]
+    assert recipe["data"]["val"][0].endswith("[85%:]")
+
+
+def test_python_and_the_command_line_do_the_same(run_folder, samples):
+    drawn = lidargrit.load(run_folder).sample([0, 1, 2])
+    assert torch.allclose(drawn.range_m, read_samples(samples).batch([0, 1, 2]).range_m, atol=1e-3)
+    assert len(lidargrit.evaluate(str(samples), "simulated:3:test")) == 2
+
+
+def test_load_scan_reads_what_the_example_wrote(tmp_path):
+    load("folder").write_example(tmp_path, 1)
+    assert len(lidargrit.load_scan(tmp_path / "000000.bin")) == len(read_bin(tmp_path / "000000.bin"))
+
+
+def python(program: str, *words: object, **options) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", program, *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, **options)
+
+
+def test_help_of_every_verb_loads_no_torch_and_opens_with_examples():
+    program = """
+import contextlib, sys
+from lidargrit.cli import main
+for words in ([], *([word] for word in sys.argv[1:])):
+    with contextlib.suppress(SystemExit):
+        main([*words, "--help"])
+main([])
+main(["list"])
+sys.exit(" ".join(name for name in ("torch", "numpy", "matplotlib", "rich", "jsonargparse") if name in sys.modules))
+"""
+    verbs = _discovery.names("cli")
+    done = python(program, *verbs)
+    assert (done.returncode, done.stderr) == (1, "\n"), done.stderr
+    assert done.stdout.count("examples:\n  lidargrit ") == len(verbs) + 2
+
+
+def test_the_version_is_told():
+    done = subprocess.run([sys.executable, "-m", "lidargrit", "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == f"lidargrit {lidargrit.__version__}"
+
+
+def test_a_reader_that_has_seen_enough_is_no_error():
+    reading, writing = os.pipe()
+    os.close(reading)
+    with contextlib.closing(os.fdopen(writing, "w")) as pipe:
+        command = [sys.executable, "-m", "lidargrit", "list"]
+        done = subprocess.run(command, stdout=pipe, stderr=subprocess.PIPE, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (0, "")

@@ -1,0 +1,173 @@
+"""Recipes ⇄ JSON, and single settings changed by name."""
+
+import dataclasses
+import json
+from dataclasses import dataclass, field
+from typing import Literal
+
+import pytest
+
+from lidargrit import _discovery
+from lidargrit.configuration import from_json, leaves, override, to_json
+from lidargrit.errors import ConfigError
+from lidargrit.generators import load_class
+from lidargrit.loading import DataConfig
+from lidargrit.nn.transformer import TransformerConfig
+from lidargrit.recipes import load_recipe
+from lidargrit.tokenizers.vqvae import VqvaeConfig
+from lidargrit.training import FitConfig, Recipe
+
+RECIPES = _discovery.names("recipes")
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Every kind of setting in one place."""
+
+    scans: int = 1
+    rate: float = 0.5
+    pair: tuple[float, float] = (0.9, 0.95)
+    names: tuple[str, ...] = ()
+    kind: Literal["constant", "cosine"] = "constant"
+    loud: bool = False
+
+    def __post_init__(self) -> None:
+        if self.scans < 1:
+            raise ConfigError(f"scans={self.scans}", "at least 1", "raise it")
+
+
+@dataclass(frozen=True)
+class Whole:
+    """Settings in a dictionary below."""
+
+    seed: int = 0
+    stages: dict[str, Stage] = field(default_factory=lambda: {"first": Stage(), "second": Stage(scans=2)})
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_a_recipe_is_complete_and_survives_json(name):
+    recipe = load_recipe(name)
+    written = json.loads(json.dumps(to_json(recipe)))
+    generator = load_class(recipe.generator)
+    assert tuple(recipe.training) == generator.stages
+    assert from_json(generator.Config, written["model"], "run.json") == recipe.model
+    assert from_json(DataConfig, written["data"], "run.json") == recipe.data
+    for stage, config in recipe.training.items():
+        assert from_json(FitConfig, written["training"][stage], "run.json") == config
+    assert leaves(written).keys() == leaves(recipe).keys()
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_every_setting_of_a_recipe_can_be_set_to_what_it_is(name):
+    recipe = load_recipe(name)
+    for path, value in leaves(recipe).items():
+        text = value if isinstance(value, str) else json.dumps(value)  # words are taken as they are
+        assert override(recipe, [f"{path}={text}"]) == recipe, path
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_a_changed_recipe_differs_in_that_setting_only_and_the_recipe_itself_stays(name):
+    recipe = load_recipe(name)
+    before = leaves(recipe)
+    changed = override(recipe, ["training.transformer.scans=123", "data.train=[/a b, 'simulated:3:train']", "seed=7"])
+    now = leaves(changed)
+    assert {path for path in now if now[path] != before[path]} == {"training.transformer.scans", "data.train", "seed"}
+    assert now["data.train"] == ("/a b", "simulated:3:train")
+    assert leaves(load_recipe(name)) == before
+    assert isinstance(changed, Recipe)
+
+
+@pytest.mark.parametrize(
+    ("setting", "wanted"),
+    [
+        ("stages.first.scans=8", {"scans": 8}),
+        ("stages.first.rate=1e-3", {"rate": 0.001}),
+        ("stages.first.rate=2", {"rate": 2.0}),
+        ("stages.first.pair=[0.5, 0.9]", {"pair": (0.5, 0.9)}),
+        ("stages.first.names=[a, b]", {"names": ("a", "b")}),
+        ("stages.first.names=[]", {"names": ()}),
+        ("stages.first.names=['kitti_raw:/data/a=b:train+val']", {"names": ("kitti_raw:/data/a=b:train+val",)}),
+        ("stages.first.kind=cosine", {"kind": "cosine"}),
+        ("stages.first.loud=true", {"loud": True}),
+        (" stages.first.scans =3", {"scans": 3}),
+    ],
+)
+def test_a_setting_is_read_as_its_type(setting, wanted):
+    changed = override(Whole(), [setting])
+    assert changed == Whole(stages={"first": dataclasses.replace(Stage(), **wanted), "second": Stage(scans=2)})
+    for name, value in wanted.items():
+        assert type(getattr(changed.stages["first"], name)) is type(value)
+
+
+def test_the_last_of_two_settings_of_one_name_counts():
+    assert override(Whole(), ["seed=1", "seed=2"]).seed == 2
+
+
+@pytest.mark.parametrize(
+    ("setting", "text"),
+    [
+        ("seed", r"got the setting 'seed'; wanted NAME=VALUE; e\.g\. --set seed="),
+        ("", r"got the setting ''; wanted NAME=VALUE"),
+        ("=1", r"got the setting '', which this recipe does not have; wanted one such as"),
+        ("sed=1", r"got the setting 'sed', which .*; wanted one such as seed.*; see all with --dry-run"),
+        ("stages.first.scan=1", r"wanted one such as stages\.first\.scans"),
+        ("stages.frist.scans=1", r"wanted one such as stages\.first\.scans"),
+        ("stages.first=1", r"got the setting 'stages\.first', which"),
+        ("stages=1", r"got the setting 'stages', which"),
+        ("seed.deeper=1", r"got the setting 'seed\.deeper', which"),
+        ("seed=many", r"got seed=many; wanted a value of the type int"),
+        ("seed=1.5", r"got seed=1\.5; wanted a value of the type int"),
+        ("seed=", r"got seed=; wanted a value of the type int"),
+        ("seed=null", r"got seed=null; wanted a value of the type int"),
+        ("seed=true", r"got seed=true; wanted a value of the type int"),
+        ("stages.first.rate=fast", r"rate=fast; wanted a value of the type float"),
+        ("stages.first.pair=[1]", r"pair=\[1\]; wanted a value of the type tuple\[float, float\]"),
+        ("stages.first.pair=[1, 2, 3]", r"wanted a value of the type tuple\[float, float\]"),
+        ("stages.first.names=[[a]]", r"wanted a value of the type tuple\[str, \.\.\.\]"),
+        ("stages.first.names=[a", r"wanted a value of the type tuple\[str, \.\.\.\]"),
+        ("stages.first.kind=cosin", r"wanted a value of the type Literal\['constant', 'cosine'\]"),
+        ("stages.first.loud=perhaps", r"wanted a value of the type bool"),
+        ("stages.first.scans=0", r"^got scans=0; wanted at least 1; raise it$"),
+    ],
+)
+def test_a_setting_that_does_not_fit_is_told_in_one_line(setting, text):
+    with pytest.raises(ConfigError, match=text) as refusal:
+        override(Whole(), [setting])
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("cls", "change", "text"),
+    [
+        (VqvaeConfig, {"channels": 33}, r"^got channels=33; wanted a positive multiple of 32; .* round it up$"),
+        (
+            VqvaeConfig,
+            {"channel_multipliers": []},
+            r"^got channel_multipliers=\(\); wanted one positive number a level",
+        ),
+        (TransformerConfig, {"width": 30}, r"^got layers=6, heads=8, width=30; wanted positive numbers"),
+        (VqvaeConfig, {"channels": "many"}, r"^got a configuration in run\.json that does not fit \(.*channels"),
+        (VqvaeConfig, {"padding": "mirror"}, r"^got a configuration in run\.json that does not fit \(.*padding"),
+        (VqvaeConfig, {"colour": 1}, r"^got a configuration in run\.json that does not fit \(.*colour"),
+        (VqvaeConfig, {"channel_multipliers": [1, "x"]}, r"does not fit \(.*channel_multipliers"),
+    ],
+)
+def test_json_that_does_not_fit_is_told_in_one_line(cls, change, text):
+    with pytest.raises(ConfigError, match=text) as refusal:
+        from_json(cls, to_json(cls()) | change, "run.json")
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("data", [None, 3, "words", [1], {}])
+def test_json_that_is_no_configuration_at_all(data):
+    with pytest.raises(ConfigError, match=r"a configuration in run\.json that does not fit"):
+        from_json(FitConfig, data, "run.json")
+
+
+def test_settings_of_a_recipe_are_checked_with_the_words_of_their_class():
+    with pytest.raises(ConfigError, match=r"^got channels=40; wanted a positive multiple of 32"):
+        load_recipe("small", ["model.tokenizer.channels=40"])
+    with pytest.raises(ConfigError, match=r"^got batch_size=0; wanted at least 1; raise it$"):
+        load_recipe("small", ["training.tokenizer.batch_size=0"])
+    with pytest.raises(ConfigError, match=r"^got learning_rate=nan; wanted a positive number"):
+        load_recipe("small", ["training.tokenizer.learning_rate=.nan"])

@@ -1,0 +1,57 @@
+"""The rules of the house: sizes of files and functions, one public object per file, one version, honest exports."""
+
+import ast
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import lidargrit
+from lidargrit import _discovery, api
+
+ROOT = Path(__file__).resolve().parents[1]
+SOURCES = sorted((ROOT / "src").rglob("*.py"))
+
+
+@pytest.mark.parametrize("path", SOURCES + sorted((ROOT / "tests").glob("*.py")), ids=lambda p: p.name)
+def test_files_and_functions_stay_short(path):
+    text = path.read_text(encoding="utf-8")
+    assert text.count("\n") <= 400
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef):
+            assert (node.end_lineno or 0) - node.lineno + 1 <= 60, f"{path.name}: {node.name}"
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "src" / "lidargrit" / "cli").glob("[!_]*.py")), ids=lambda p: p.name)
+def test_verbs_stay_thin(path):
+    assert path.read_text(encoding="utf-8").count("\n") <= 60
+
+
+def test_the_version_is_said_once():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    changelog = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    newest = re.search(r"^## \[?(\d+\.\d+\.\d+)", changelog, re.MULTILINE)
+    assert newest is not None
+    assert project["version"] == lidargrit.__version__ == newest[1]
+
+
+def test_what_is_exported_is_there():
+    assert sorted(lidargrit.__all__) == sorted(api.__all__)
+    for name in lidargrit.__all__:
+        assert callable(getattr(lidargrit, name))
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = lidargrit.nothing
+
+
+@pytest.mark.parametrize("kind", ["datasets", "sensors", "tokenizers", "generators", "metrics", "recipes", "cli"])
+def test_every_public_file_says_what_it_is(kind):
+    assert _discovery.names(kind)
+    for name in _discovery.names(kind):
+        assert 20 < len(_discovery.summary(kind, name)) < 180
+
+
+def test_nothing_of_this_machine_is_in_the_project():
+    for path in [*SOURCES, *(ROOT / "docs").rglob("*.md"), *ROOT.glob("*.md"), ROOT / "Makefile"]:
+        text = path.read_text(encoding="utf-8")
+        assert not re.search(r"/(home|root|Users)/|file://", text), path

@@ -1,0 +1,129 @@
+"""The transformer against the reference program; its cache and its sampling."""
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from lidargrit.generators import SamplingConfig
+from lidargrit.generators.lidargrit import START_TOKEN, after_start, choose, sample_tokens
+from lidargrit.nn.transformer import CausalTransformer, TransformerConfig
+from reference_weights import seeded_weights
+
+GREEDY = SamplingConfig(temperature=0.0)
+
+
+@pytest.fixture
+def transformer():
+    torch.manual_seed(0)
+    small = CausalTransformer(TransformerConfig(layers=2, heads=4, width=32), num_tokens=20, context_length=24).eval()
+    torch.nn.init.normal_(small.head.weight, std=0.5)  # far from uniform, so that a mistake shows
+    torch.nn.init.normal_(small.pos_emb, std=0.5)
+    return small
+
+
+@pytest.fixture
+def golden_transformer(golden):
+    data = golden("gpt_small")
+    config = TransformerConfig(layers=2, heads=4, width=32)
+    model = CausalTransformer(config, num_tokens=32, context_length=64).eval()
+    model.load_state_dict(seeded_weights(data))  # strict: the layout is the program's
+    return model, data
+
+
+@pytest.mark.parametrize(
+    ("recipe", "parameters"), [("lidargrit_kitti_360", 10_264_064), ("lidargrit_kitti_odometry", 5_263_360)]
+)
+def test_published_sizes(recipe, parameters):
+    from lidargrit.generators.lidargrit import LidarGrit
+    from lidargrit.recipes import load_recipe
+
+    recipe = load_recipe(recipe)
+    generator = LidarGrit(recipe.model, recipe.data.load_sensor())
+    assert sum(p.numel() for p in generator.transformer.parameters()) == parameters
+    assert generator.transformer.context_length == 1024
+
+
+@pytest.mark.shared
+def test_logits_and_loss_are_the_programs(golden_transformer):
+    model, data = golden_transformer
+    tokens = torch.from_numpy(data["tokens"])
+    with torch.no_grad():
+        logits = model(tokens[:, :-1])
+    assert np.allclose(logits.numpy(), data["logits"], atol=1e-4)
+    loss = torch.nn.functional.cross_entropy(logits.flatten(0, 1), tokens[:, 1:].flatten())
+    assert float(loss) == pytest.approx(float(data["loss"]), abs=1e-4)
+
+
+@pytest.mark.shared
+def test_greedy_steps_with_the_cache_are_the_programs(golden_transformer):
+    model, data = golden_transformer
+    cache = model.new_cache(2)
+    tokens, chosen = torch.tensor([0, 3]), []
+    with torch.no_grad():
+        for _ in range(30):
+            tokens = choose(model.next_logits(tokens, cache), torch.zeros(2), GREEDY)
+            chosen.append(tokens)
+    assert np.array_equal(torch.stack(chosen, 1).numpy(), data["greedy_from_sos_0_and_3"])
+
+
+@pytest.mark.shared
+def test_top_k_keeps_what_the_program_keeps(golden_transformer):
+    _, data = golden_transformer
+    logits = torch.from_numpy(data["logits"][0])
+    kept = torch.zeros_like(logits, dtype=torch.bool)
+    for uniform in torch.linspace(0, 0.9999, 4000):
+        kept.scatter_(1, choose(logits, uniform.expand(len(logits)), SamplingConfig(top_k=5))[:, None], True)
+    theirs = torch.from_numpy(data["topk5_of_logits0"])
+    # Every token that can be drawn is among the program's; one too unlikely for 4,000 steps may be missing.
+    assert bool((~kept | theirs.isfinite()).all())
+    assert int(kept.sum()) > 0.9 * int(theirs.isfinite().sum())
+
+
+def test_the_cache_gives_the_logits_of_the_whole_prefix(transformer):
+    tokens = torch.randint(20, (3, 24), generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        whole, cache = transformer(tokens), transformer.new_cache(3)
+        stepwise = torch.stack([transformer.next_logits(tokens[:, i], cache) for i in range(24)], dim=1)
+    assert torch.allclose(whole, stepwise, atol=1e-5)
+
+
+def test_a_token_never_sees_what_follows(transformer):
+    tokens = torch.randint(20, (1, 24), generator=torch.Generator().manual_seed(0))
+    changed = tokens.clone()
+    changed[0, 12] = (changed[0, 12] + 1) % 20
+    with torch.no_grad():
+        before, after = transformer(tokens), transformer(changed)
+    assert torch.equal(before[:, :12], after[:, :12])
+    assert not torch.allclose(before[:, 12:], after[:, 12:])
+
+
+@pytest.mark.parametrize("sampling", [SamplingConfig(), SamplingConfig(0.7, 5), SamplingConfig(1.2, 0, 0.8), GREEDY])
+def test_sampling_is_the_same_with_and_without_cache_and_in_any_batch(transformer, sampling):
+    uniform = torch.rand((4, 24), generator=torch.Generator().manual_seed(1))
+    with torch.no_grad():
+        together = sample_tokens(transformer, uniform, sampling)
+        recomputed = sample_tokens(transformer, uniform, sampling, use_cache=False)
+        alone = torch.cat([sample_tokens(transformer, uniform[i : i + 1], sampling) for i in range(4)])
+    assert torch.equal(together, recomputed)
+    assert torch.equal(together, alone)
+
+
+def test_tokens_are_drawn_with_their_probability():
+    logits = torch.tensor([[0.0, 1.0, 2.0, -1.0, 0.5]])
+    uniform = torch.rand(20_000, generator=torch.Generator().manual_seed(0))
+    drawn = choose(logits.expand(20_000, -1), uniform, SamplingConfig(top_k=0))
+    expected = logits[0].double().softmax(0).numpy() * 20_000
+    assert stats.chisquare(torch.bincount(drawn, minlength=5).numpy(), expected).pvalue > 1e-3
+
+
+def test_top_p_keeps_the_smallest_set_that_holds_the_share():
+    logits = torch.tensor([[0.5, 0.3, 0.15, 0.05]]).log()
+    uniform = torch.linspace(0, 0.9999, 1000)
+    for top_p, kept in ((0.4, {0}), (0.5, {0}), (0.6, {0, 1}), (0.81, {0, 1, 2}), (1.0, {0, 1, 2, 3})):
+        drawn = choose(logits.expand(1000, -1), uniform, SamplingConfig(top_k=0, top_p=top_p))
+        assert set(drawn.tolist()) == kept
+
+
+def test_the_start_token_is_an_ordinary_one():
+    assert after_start(torch.tensor([[5, 6]])).tolist() == [[START_TOKEN, 5, 6]]

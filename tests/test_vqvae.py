@@ -1,0 +1,160 @@
+"""The VQ-VAE against the reference program, its parameter counts, its losses, its circle."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from lidargrit.errors import ConfigError
+from lidargrit.sensors import load_sensor
+from lidargrit.structures import RangeImage, TokenGrid
+from lidargrit.tokenizers.vqvae import Vqvae, VqvaeConfig, reconstruction_loss
+from reference_weights import seeded_weights
+
+SMALL = VqvaeConfig(channels=32, channel_multipliers=(1, 1), code_dim=8, num_codes=16, dropout=0.0)
+
+
+def sensor_of(height, width):
+    sensor = load_sensor("hdl64e_kitti_odometry")
+    return replace(sensor.with_columns(width), elevation_rad=sensor.elevation_rad[:height])
+
+
+def images_of(sensor, batch=2, seed=0):
+    rng = torch.Generator().manual_seed(seed)
+    size = (batch, sensor.height, sensor.width)
+    return RangeImage.masked(torch.rand(size, generator=rng) * 50 + 1, torch.rand(size, generator=rng) < 0.8, sensor)
+
+
+@pytest.mark.parametrize(
+    ("recipe", "parameters", "grid"),
+    [("lidargrit_kitti_360", 17_295_618, (8, 128)), ("lidargrit_kitti_odometry", 3_148_418, (16, 64))],
+)
+def test_published_sizes(recipe, parameters, grid):
+    from lidargrit.recipes import load_recipe
+
+    recipe = load_recipe(recipe)
+    vqvae = Vqvae(recipe.model.tokenizer, recipe.data.load_sensor())
+    assert sum(p.numel() for p in vqvae.parameters() if p.requires_grad) == parameters
+    assert vqvae.grid_size == grid
+
+
+@pytest.mark.shared
+def test_layers_layout_and_numbers_are_the_programs(golden):
+    data = golden("vqvae_small")
+    theirs = json.loads(str(data["config"]))
+    config = VqvaeConfig(
+        channels=theirs["ch"],
+        channel_multipliers=tuple(theirs["ch_mult"]),
+        residual_blocks=theirs["num_res_blocks"],
+        code_dim=theirs["embed_dim"],
+        num_codes=theirs["n_embed"],
+        codebook_loss="reference",
+    )
+    vqvae = Vqvae(config, sensor_of(*data["x"].shape[2:])).eval()
+    weights = {k: v for k, v in seeded_weights(data).items() if not k.startswith("loss.")}
+    missing, unexpected = vqvae.load_state_dict(weights, strict=False)
+    assert not unexpected
+    assert set(missing) == {"quantize.usage", "quantize.code_sums"}  # our own bookkeeping, not weights
+    with torch.no_grad():
+        z = vqvae.quant_conv(vqvae.encoder(torch.from_numpy(data["x"])))
+        assert np.allclose(z.numpy(), data["pre_quant"], atol=1e-4)
+        quantised = vqvae.quantize(z)
+        assert np.array_equal(quantised.tokens.numpy(), data["indices"])
+        assert float(quantised.loss) == pytest.approx(float(data["quant_loss"]), abs=1e-4)
+        raw = vqvae.decoder(vqvae.post_quant_conv(quantised.latents))
+        assert np.allclose(raw.numpy(), data["decoder_raw"], atol=1e-4)
+
+
+@pytest.mark.shared
+def test_reference_reconstruction_and_raydrop_loss_are_the_programs(golden):
+    data = {name: torch.as_tensor(value) for name, value in golden("heads_losses").items()}
+    target, recon, mask = data["target"][:, 0], data["recon"][:, 0], data["mask"][:, 0] > 0
+    ours = reconstruction_loss(recon, target, mask, torch.ones_like(mask), "reference")
+    assert float(ours) == pytest.approx(float(data["loss_rec"]), abs=1e-5)
+    bce = torch.nn.functional.binary_cross_entropy_with_logits(data["mask_logits"][:, 0], mask.float())
+    assert float(bce) == pytest.approx(float(data["loss_mask"]), abs=1e-5)
+    total = ours + 0.1 * bce + float(data["codebook_loss"])
+    # The program's total also holds its neighbour-direction term, which the paper does not have.
+    assert float(total + data["lambda_nd"] * data["loss_nd"]) == pytest.approx(float(data["loss_total"]), abs=1e-4)
+
+
+@pytest.mark.shared
+def test_heads_and_bernoulli_composition_are_the_programs(golden):
+    data = {name: torch.as_tensor(value) for name, value in golden("heads_losses").items()}
+    raw = data["decoder_out"]
+    encoded = raw[:, :1].tanh()
+    assert torch.allclose(encoded, data["depth_orig"], atol=1e-6)
+    torch.manual_seed(3)
+    drawn = torch.bernoulli(raw[:, 1:].sigmoid())
+    assert torch.equal(drawn, data["bernoulli_mask"])
+    assert torch.allclose(torch.where(drawn > 0, encoded, -1.0), data["depth_composed"], atol=1e-6)
+
+
+def test_losses_of_the_paper_by_a_slow_loop():
+    rng = torch.Generator().manual_seed(0)
+    encoded, target = (torch.rand((2, 3, 4), generator=rng) * 2 - 1 for _ in range(2))
+    mask, drawn = (torch.rand((2, 3, 4), generator=rng) < 0.6 for _ in range(2))
+    paper = returns = reference = 0.0
+    for b in range(2):
+        returned = int(mask[b].sum())
+        for i in range(3):
+            for j in range(4):
+                if mask[b, i, j]:
+                    error = abs(float(encoded[b, i, j] - target[b, i, j]))
+                    paper += error / 12 / 2
+                    returns += error / returned / 2
+                    composed = float(encoded[b, i, j]) if drawn[b, i, j] else -1.0
+                    reference += abs(composed - float(target[b, i, j])) / returned / 2
+    for kind, slow in (("paper", paper), ("returns", returns), ("reference", reference)):
+        assert float(reconstruction_loss(encoded, target, mask, drawn, kind)) == pytest.approx(slow, rel=1e-5)
+
+
+@pytest.mark.parametrize("reconstruction", ["paper", "reference", "returns"])
+@pytest.mark.parametrize("raydrop_loss", [True, False])
+def test_every_objective_is_finite_and_reaches_every_weight(reconstruction, raydrop_loss):
+    sensor = sensor_of(16, 32)
+    config = replace(SMALL, reconstruction=reconstruction, raydrop_loss=raydrop_loss)
+    vqvae = Vqvae(config, sensor).train()
+    terms = vqvae(images_of(sensor), torch.Generator().manual_seed(0))
+    terms["loss"].backward()
+    assert bool(terms["loss"].isfinite())
+    assert ("raydrop" in terms) == raydrop_loss
+    assert all(p.grad is not None and bool(p.grad.isfinite().all()) for p in vqvae.parameters())
+
+
+def test_padding_around_the_circle_commutes_with_turning_the_car():
+    torch.manual_seed(0)
+    sensor = sensor_of(16, 32)
+    images = images_of(sensor)
+    turned = RangeImage(images.range_m.roll(8, -1), images.return_mask.roll(8, -1), sensor)
+    with torch.no_grad():
+        for padding, commutes in (("wrap", True), ("zero", False)):
+            vqvae = Vqvae(replace(SMALL, padding=padding), sensor).eval()
+            tokens, turned_tokens = vqvae.encode(images).tokens, vqvae.encode(turned).tokens
+            decoded = vqvae.decode_parts(TokenGrid(tokens, 16)).range_m
+            again = vqvae.decode_parts(TokenGrid(tokens.roll(4, -1), 16)).range_m
+            assert torch.allclose(decoded.roll(8, -1), again, atol=1e-3) == commutes
+            if commutes:
+                assert float((tokens.roll(4, -1) == turned_tokens).float().mean()) > 0.99
+
+
+def test_threshold_and_bernoulli_masks():
+    sensor = sensor_of(16, 32)
+    vqvae = Vqvae(SMALL, sensor).eval()
+    with torch.no_grad():
+        tokens = vqvae.encode(images_of(sensor))
+        probability = vqvae.decode_parts(tokens).return_logits.sigmoid()
+        threshold = vqvae.decode(tokens).return_mask
+        draws = torch.stack([vqvae.decode(tokens, "bernoulli").return_mask for _ in range(300)]).float().mean(0)
+    assert torch.equal(threshold, probability >= 0.5)
+    assert float((draws - probability).abs().max()) < 0.2  # five standard errors of 300 draws are 0.14
+    assert float((draws - probability).mean()) == pytest.approx(0, abs=0.01)
+
+
+def test_sizes_that_cannot_be_halved_are_refused():
+    with pytest.raises(ConfigError, match=r"16x30; wanted both sizes divisible by 4"):
+        Vqvae(replace(SMALL, channel_multipliers=(1, 1, 1)), sensor_of(16, 30))
+    with pytest.raises(ConfigError, match="multiple of 32"):
+        replace(SMALL, channels=20)
