@@ -240,12 +240,24 @@ def test_a_sensor_that_does_not_fit_the_scan(refused, tmp_path):
     [
         (["train", "smal", "OUT"], r"'smal', which is not among the recipes; wanted one of small.*list recipes"),
         (["train", "demo", "OUT", "--set", "seed"], r"the setting 'seed'; wanted NAME=VALUE; e\.g\. --set title="),
-        (["train", "demo", "OUT", "--set", "model.tokenizer.chanels=32"], r"'model\.tokenizer\.chanels', which .*channels"),
-        (["train", "demo", "OUT", "--set", "training.tokeniser.scans=4"], r"wanted one such as training\.tokenizer\.scans"),
+        (
+            ["train", "demo", "OUT", "--set", "model.tokenizer.chanels=32"],
+            r"'model\.tokenizer\.chanels', which .*channels",
+        ),
+        (
+            ["train", "demo", "OUT", "--set", "training.tokeniser.scans=4"],
+            r"wanted one such as training\.tokenizer\.scans",
+        ),
         (["train", "demo", "OUT", "--set", "seed=many"], r"seed=many; wanted a value of the type int"),
         (["train", "demo", "OUT", "--set", "data.train=[]"], r"no source of scans; .*data\.train=\[FOLDER\]"),
-        (["train", "demo", "OUT", "--set", "data.train=[kiti_odometry:/d]"], r"'kiti_odometry', which .*kitti_odometry"),
-        (["train", "demo", "OUT", "--set", "data.train=[simulated]"], r"the source 'simulated' alone; .*simulated:1000"),
+        (
+            ["train", "demo", "OUT", "--set", "data.train=[kiti_odometry:/d]"],
+            r"'kiti_odometry', which .*kitti_odometry",
+        ),
+        (
+            ["train", "demo", "OUT", "--set", "data.train=[simulated]"],
+            r"the source 'simulated' alone; .*simulated:1000",
+        ),
         (["train", "demo", "OUT", "--set", "data.sensor=hdl64"], r"'hdl64', which is not among the sensors; .*hdl64e_"),
         (["train", "demo", "OUT", "--set", "data.sensor=no.json"], r"the sensor file no\.json, which cannot be read"),
         (["train", "demo", "OUT", "--set", "data.columns=100", "data.column_stride=8"], r"100 columns, every 8th kept"),
@@ -257,15 +269,24 @@ def test_a_sensor_that_does_not_fit_the_scan(refused, tmp_path):
         (["train", "demo", "OUT", "--set", "training.tokenizer.betas=[2.0,3.0]"], r"betas=\(2\.0, 3\.0\); wanted"),
         (["train", "demo", "OUT", "--set", "training.tokenizer.weight_decay=-1"], r"weight_decay=-1\.0; wanted"),
         (["train", "demo", "OUT", "--set", "model.transformer.residual_dropout=2"], r"residual_dropout=2\.0; wanted"),
-        (["train", "demo", "OUT", "--set", "training.tokenizer.average_over_scans=-1"], r"average_over_scans=-1; wanted"),
+        (
+            ["train", "demo", "OUT", "--set", "training.tokenizer.average_over_scans=-1"],
+            r"average_over_scans=-1; wanted",
+        ),
         (["sample", "RUN", "OUT", "-n", "0"], r"-n 0, .*; wanted at least one scan"),
         (["sample", "RUN", "OUT", "--seed", "-1"], r"--seed -1; wanted"),
         (["sample", "RUN", "OUT", "--top-p", "0"], r"top_p=0\.0; wanted"),
         (["sample", "RUN", "OUT", "--temperature", "nan"], r"temperature=nan, .*; wanted temperature >= 0"),
         (["sample", "RUN", "OUT", "--device", "gpu"], r"--device gpu; wanted"),
         (["sample", "nowhere", "OUT"], r"nowhere, which holds no finished model; .*finish the training"),
-        (["evaluate", "simulated:1", "simulated:1", "--metrics", "slice"], r"'slice', which .*metrics; .*sliced_wasserstein"),
-        (["evaluate", "simulated:1", "simulated:1", "--variant", "best"], r"variant 'best' of .*; wanted 'reference' or"),
+        (
+            ["evaluate", "simulated:1", "simulated:1", "--metrics", "slice"],
+            r"'slice', which .*metrics; .*sliced_wasserstein",
+        ),
+        (
+            ["evaluate", "simulated:1", "simulated:1", "--variant", "best"],
+            r"variant 'best' of .*; wanted 'reference' or",
+        ),
         (["evaluate", "simulated:1", "simulated:1", "-n", "-1"], r"-n -1; wanted|max_scans=-1; wanted"),
         (["evaluate", "simulated:1", "simulated:1", "--seed", "-1"], r"seed.*-1; wanted"),
         (["evaluate", "SAMPLES", "SAMPLES", "-n", "-1"], r"-n -1; wanted|max_scans=-1; wanted"),
@@ -280,6 +301,8 @@ def test_a_sensor_that_does_not_fit_the_scan(refused, tmp_path):
 def test_wrong_words(refused, finished, tmp_path, words, text):
     for word, place in (("OUT", tmp_path / "out"), ("RUN", finished["run"]), ("SAMPLES", finished["samples"])):
         words = [re.sub(f"^{word}\\b", str(place), each) for each in words]
+    if words[0] == "train":
+        words = [*words, "--set", *MODEL, *SIMULATED, *SHORT, *words[4:]] if "--set" in words else words
     assert re.search(text, refused(*words))
 
 
@@ -418,7 +441,8 @@ def zipped(path: Path, **arrays: np.ndarray) -> bytes:
 
 
 @pytest.mark.parametrize(
-    "damage", ["empty", "cut short", "garbage", "flipped bytes", "not zipped", "other", "size", "type", "nan", "negative"]
+    "damage",
+    ["empty", "cut short", "garbage", "flipped bytes", "not zipped", "other", "size", "type", "nan", "negative"],
 )
 def test_a_broken_sample(refused, finished, samples, tmp_path, damage):
     path = samples / "00000001.npz"

@@ -42,8 +42,7 @@ def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter
     seeds = range(_NUM_SAMPLES)
     write_samples(generator, folder, folder / "samples", seeds, SamplingConfig(), reporter=reporter)
     samples = read_samples(folder / "samples", _NUM_SAMPLES)
-    with torch.no_grad():
-        reconstruction = score_reconstruction(generator.tokenizer, val)
+    reconstruction = score_reconstruction(generator.tokenizer, val)
     scores = evaluate(samples, real, ["sliced_wasserstein"])
     write_json(
         folder / "evaluation.json",
@@ -68,9 +67,9 @@ def split_sources(data: str, reporter: Reporter) -> list[str]:
     dataset = open_dataset(data)
     drives = sorted({dataset.name(index).rpartition("/")[0] for index in range(len(dataset))})
     place = f"{dataset.public_name()}:{dataset.root}"
-    if len(drives) > 1 and dataset.split == "all":
-        names = [drive.rpartition("/")[2] for drive in drives]
-        train, val = f"{place}:{'+'.join(names[:-1])}", f"{place}:{names[-1]}"
+    has_drives = dataset.public_name() != "folder" and all(drive and "/" not in drive for drive in drives)
+    if has_drives and len(drives) > 1 and dataset.split == "all":
+        train, val = f"{place}:{'+'.join(drives[:-1])}", f"{place}:{drives[-1]}"
     else:
         reporter.message(
             "WARNING: one drive only: its last scans are held out, but they show the streets of the others"

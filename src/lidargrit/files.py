@@ -47,6 +47,13 @@ def atomic_path(path: Path) -> Iterator[Path]:
                 temporary.unlink(missing_ok=True)
 
 
+def is_taken(folder: Path, first_file: str) -> bool:
+    """Tell whether something lies in a folder's place that is more than what a killed write of its first file left."""
+    if not folder.is_dir():
+        return folder.exists()
+    return any(not path.name.startswith(f".{first_file}.") for path in folder.iterdir())
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a text file atomically."""
     with atomic_path(path) as temporary:

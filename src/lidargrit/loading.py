@@ -54,6 +54,10 @@ class DataConfig:
     bad_points: BadPoints = "refuse"
     bad_scans: Literal["refuse", "skip"] = "refuse"
 
+    def __post_init__(self) -> None:
+        if self.max_scans < 0:
+            raise ConfigError(f"max_scans={self.max_scans}", "at least 1, or 0 for all", "raise it")
+
     def load_sensor(self) -> SensorModel:
         """Return the sensor at the wanted number of columns and with the wanted projection."""
         sensor = load_sensor(self.sensor)
@@ -77,7 +81,7 @@ class RangeImages:
     Args:
         sensor: of the images that are read.
         parts: images as wide as the sensor's, or with all the fine columns of which the sensor keeps some.
-        names: of the images.
+        names: of the images: the file of a scan, or what else identifies it.
     """
 
     def __init__(self, sensor: SensorModel, parts: Sequence[ImageStore], names: Sequence[str]) -> None:
@@ -89,7 +93,7 @@ class RangeImages:
         return self._ends[-1] if self._ends else 0
 
     def batch(self, indices: Sequence[int], first_columns: Sequence[int] | None = None) -> RangeImage:
-        """Return the images of these indices as one batch; ``first_columns`` are the first fine columns kept of each."""
+        """Return the images of these indices as one batch, each from its own first fine column on."""
         first_columns = first_columns or [0] * len(indices)
         pixels = [self._pixels(index, first) for index, first in zip(indices, first_columns, strict=True)]
         range_m = torch.from_numpy(np.stack(pixels))
@@ -175,6 +179,8 @@ def load_range_images(
     names: list[str] = []
     for source in sources:
         dataset = open_dataset(source, config.bad_points)
+        if dataset.sensor not in (sensor.name, config.sensor) and not sensor.name.endswith(".json"):
+            reporter.message(f"WARNING: {source} was made by {dataset.sensor}, and is imaged as {sensor.name}")
         stem = cache_folder() / _digest(source, dataset, sensor, config)
         if not stem.with_suffix(".json").exists():
             _project_all(source, dataset, sensor, config, stem, reporter)
@@ -209,7 +215,7 @@ def _project_all(
                     reporter.message(f"left out: {error}")
                 else:
                     pixels[len(kept)] = image.range_m.numpy()
-                    kept.append(dataset.name(index))
+                    kept.append(str(dataset.paths[index].resolve()) if dataset.paths else dataset.name(index))
                 progress.advance(1)
         pixels.flush()
     write_json(stem.with_suffix(".json"), {"source": source, "names": kept})  # written last: it says "complete"

@@ -33,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"lidargrit {__version__}")
-    verbs = parser.add_subparsers(title="verbs", metavar="", dest="verb")
+    verbs = parser.add_subparsers(title="verbs", metavar="", dest="verb", prog="lidargrit")
     for name in _discovery.names("cli"):
         verb = importlib.import_module(f"lidargrit.cli.{name}")
         sub = verbs.add_parser(

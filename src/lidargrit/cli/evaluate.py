@@ -1,4 +1,4 @@
-"""Score any scans against any others."""
+"""Score any scans against any others, or what a run keeps of scans."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ from pathlib import Path
 
 EXAMPLES = """\
   lidargrit evaluate samples /data/held_out
+  lidargrit evaluate runs/mine /data/held_out          errors of reconstruction, for a run instead of samples
   lidargrit evaluate samples kitti_odometry:/data/kitti_odometry:test --metrics sliced_wasserstein --json scores.json
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
-    parser.add_argument("samples", help="a folder of samples, or a source of scans")
+    parser.add_argument("samples", help="a folder of samples, a source of scans, or a run")
     parser.add_argument("reference", help="likewise; projected with the sensor of the samples")
     parser.add_argument("--metrics", nargs="+", default=["sliced_wasserstein"], help="see: lidargrit list metrics")
     parser.add_argument("--variant", help="one definition only, such as reference (default: all that a metric has)")
@@ -25,15 +26,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Score and print a table."""
-    from lidargrit.evaluation.score import as_json, as_table, evaluate, open_images
+    from lidargrit.errors import ConfigError
+    from lidargrit.evaluation.score import as_json, as_table, evaluate, evaluate_run, open_images
     from lidargrit.files import write_json
+    from lidargrit.generators import is_run
     from lidargrit.reporting import TerminalReporter
 
+    if options.max_scans < 0 or options.seed < 0:
+        raise ConfigError(f"-n {options.max_scans}, --seed {options.seed}", "0 or more", "correct the number")
     reporter, road = TerminalReporter(), options.projection_variant
+    about = {"samples": options.samples, "reference": options.reference, "projection_variant": road}
+    if is_run(Path(options.samples)):
+        errors = evaluate_run(Path(options.samples), options.reference, options.max_scans, road, reporter)
+        print("\n".join(f"{name:<20}{value:>10.4g}" for name, value in errors.items()))
+        if options.json:
+            write_json(options.json, {**about, "reconstruction": errors})
+        return
     samples = open_images(options.samples, None, options.max_scans, road, reporter)
     reference = open_images(options.reference, samples.sensor, options.max_scans, road, reporter)
     results = evaluate(samples, reference, options.metrics, options.variant, options.seed)
     print(as_table(results))
     if options.json:
-        about = {"samples": options.samples, "reference": options.reference, "projection_variant": road}
         write_json(options.json, {**about, "seed": options.seed, "scores": as_json(results)})

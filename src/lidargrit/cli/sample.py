@@ -41,7 +41,12 @@ def run(options: argparse.Namespace) -> None:
             "correct the number",
         )
     sampling = SamplingConfig(options.temperature, options.top_k, options.top_p, options.mask)
-    generator = load(options.run_folder).to(options.device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    generator = load(options.run_folder)
+    try:
+        generator.to(options.device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    except (RuntimeError, AssertionError) as error:  # torch's ways to say: no such device, or not in this build
+        told = str(error).partition("\n")[0]
+        raise ConfigError(f"--device {options.device}", f"cpu or cuda ({told})", "leave it out") from None
     seeds = range(options.seed, options.seed + options.count)
     write_samples(generator, options.run_folder, options.out, seeds, sampling, options.batch_size, TerminalReporter())
     print(f"done: {options.count} scans lie in {options.out}; look at them with: lidargrit view {options.out}")

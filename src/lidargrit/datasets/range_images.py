@@ -25,7 +25,7 @@ _TOP_DEG, _BOTTOM_DEG = 1.94, -25.0
 _FORMAT = "a 16-bit grey PNG of 64 rows: value / 500 = metres, 0 = no return"
 
 
-class RangeImages(FileDataset):
+class RangeImageFiles(FileDataset):
     """Velodyne range images as recorded in Karlsruhe (KIT/MRT, F. Moosmann), and others of their kind.
 
     Row 0 is the highest laser, columns fall in azimuth from +180 to -180 degrees, there is no reflectance. The images
@@ -70,7 +70,7 @@ class RangeImages(FileDataset):
     @staticmethod
     def write(path: Path, scan: Scan) -> None:
         """Write a scan as an image of 870 columns, as the Karlsruhe recordings have."""
-        image = project(scan, load_sensor(RangeImages.sensor).with_columns(870))
+        image = project(scan, load_sensor(RangeImageFiles.sensor).with_columns(870))
         values = (image.range_m * _VALUES_PER_M).round().clamp(max=65_535)
         Image.fromarray(values.numpy().astype(np.uint16)).save(path)
 

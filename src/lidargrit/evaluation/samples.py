@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import zipfile
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,14 +12,19 @@ from typing import Any
 import numpy as np
 
 from lidargrit import configuration
-from lidargrit.errors import DataError, OutputError, ScanError
-from lidargrit.files import atomic_path, read_json, write_json
+from lidargrit.errors import CheckpointError, DataError, OutputError, ScanError
+from lidargrit.files import atomic_path, is_taken, read_json, write_json
 from lidargrit.generators import WEIGHTS_FILE, Generator, SamplingConfig
 from lidargrit.loading import RangeImages
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel
 
 MANIFEST = "samples.json"
+
+_UNREADABLE = (  # what numpy and zipfile raise on damaged bytes, RuntimeError also where a bit says "encrypted"
+    *(OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, RuntimeError),
+    *(zipfile.BadZipFile, zlib.error),
+)
 
 
 def write_samples(
@@ -56,7 +62,7 @@ def write_samples(
                 "an empty folder, or one that this very command began",
                 "choose another folder",
             )
-    elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    elif is_taken(folder, MANIFEST):
         raise OutputError(f"{folder}, which is not empty and holds no samples", "an empty folder", "choose another one")
     else:
         write_json(folder / MANIFEST, manifest)
@@ -77,8 +83,11 @@ def read_samples(folder: Path, count: int | None = None) -> RangeImages:
     Raises:
         DataError: no samples in the folder.
     """
-    sensor = SensorModel.from_json(read_json(folder / MANIFEST)["sensor"])
-    paths = sorted(folder.glob("*.npz"))[:count]
+    try:
+        sensor = SensorModel.from_json(read_json(folder / MANIFEST)["sensor"])
+    except (KeyError, TypeError) as error:
+        raise CheckpointError(f"{folder / MANIFEST}, in which {error}", "what lidargrit wrote", "sample anew") from None
+    paths = sorted(folder.glob("[!.]*.npz"))[:count]  # not what a killed process left half-written
     if not paths:
         raise DataError(f"no sample in {folder}", "at least one", "draw some with: lidargrit sample RUN " + str(folder))
     return RangeImages(sensor, [_Files(paths, sensor)], [path.stem for path in paths])
@@ -104,12 +113,14 @@ class _Files:
         try:
             with np.load(path, allow_pickle=False) as opened:
                 range_m = opened["range_m"]
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        except _UNREADABLE as error:
             raise ScanError(f"{path}, which cannot be read ({error})", "an .npz with range_m", cure) from None
         if range_m.shape != self._shape or range_m.dtype != np.float32:
             raise ScanError(
                 f"{range_m.dtype} {range_m.shape} in {path}", f"float32 {self._shape}, as samples.json says", cure
             )
+        if not ((range_m >= 0) & np.isfinite(range_m)).all():
+            raise ScanError(f"ranges that are negative or no number in {path}", "metres, 0 for no return", cure)
         return range_m
 
 

@@ -7,15 +7,21 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from lidargrit.datasets import open_dataset
+from lidargrit.datasets._files import read_bin
+from lidargrit.datasets.folder import Folder
 from lidargrit.errors import ConfigError
 from lidargrit.evaluation.reconstruction import ReconstructionErrors, ReconstructionScore
 from lidargrit.evaluation.samples import is_sample_folder, read_samples
+from lidargrit.generators import load
+from lidargrit.generators.lidargrit import LidarGrit
 from lidargrit.loading import DataConfig, RangeImages, load_range_images
 from lidargrit.metrics import load_metric
-from lidargrit.projection import Variant
+from lidargrit.projection import Variant, project
 from lidargrit.reporting import Reporter
-from lidargrit.sensors import SensorModel
+from lidargrit.sensors import SensorModel, load_sensor
 from lidargrit.structures import MetricResult
 from lidargrit.tokenizers import Tokenizer
 
@@ -38,8 +44,12 @@ def open_images(
         variant: of the projection of scans.
         reporter: hears of the projection.
     """
-    if is_sample_folder(Path(source)):
-        return read_samples(Path(source), max_scans or None)
+    place = Path(source)
+    if is_sample_folder(place):
+        return read_samples(place, max_scans or None)
+    if place.is_file() and place.suffix == ".bin":
+        image = project(read_bin(place), sensor or load_sensor(Folder.sensor), variant=variant)
+        return RangeImages(image.sensor, [image.range_m[None].numpy()], [str(place)])
     dataset = open_dataset(source)
     config = DataConfig(train=(source,), val=(), sensor=dataset.sensor, max_scans=max_scans, variant=variant)
     return load_range_images((source,), config, reporter, sensor)
@@ -79,6 +89,7 @@ def evaluate(
     return [metric.compute() for metric in running]
 
 
+@torch.no_grad()
 def score_reconstruction(tokenizer: Tokenizer, images: RangeImages) -> ReconstructionErrors:
     """Return how well a tokenizer gives back every scan of a set, its mask decoded by threshold."""
     score = ReconstructionScore()
@@ -87,6 +98,21 @@ def score_reconstruction(tokenizer: Tokenizer, images: RangeImages) -> Reconstru
         clean = tokenizer.decode_parts(tokenizer.encode(batch))
         score.update(batch, clean.range_m, clean.return_logits >= 0)
     return score.compute()
+
+
+def evaluate_run(
+    run_folder: Path, source: str, max_scans: int, variant: Variant, reporter: Reporter
+) -> dict[str, float]:
+    """Return how well the tokenizer of a finished run gives back scans, by the name of each error.
+
+    Raises:
+        ConfigError: a run whose generator has no tokenizer.
+    """
+    generator = load(run_folder)
+    if not isinstance(generator, LidarGrit):
+        raise ConfigError(f"a run of {type(generator).__name__}", "a generator with a tokenizer", "sample and score it")
+    images = open_images(source, generator.sensor, max_scans, variant, reporter)
+    return asdict(score_reconstruction(generator.tokenizer, images))
 
 
 def as_json(results: Sequence[MetricResult]) -> list[dict[str, Any]]:

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 from torch import Tensor, nn
 
 from lidargrit import _discovery, configuration
-from lidargrit.errors import CheckpointError, ConfigError
+from lidargrit.errors import CheckpointError, ConfigError, LidarGritError
 from lidargrit.files import load_exactly, read_json, read_tensors, write_json, write_tensors
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
@@ -97,6 +97,11 @@ class Generator(nn.Module, ABC):
         return generator.eval()
 
 
+def is_run(folder: Path) -> bool:
+    """Tell whether a folder is that of a finished run."""
+    return (folder / CONFIG_FILE).is_file()
+
+
 def load(folder: str | Path) -> Generator:
     """Read a trained generator from a run's folder.
 
@@ -104,7 +109,7 @@ def load(folder: str | Path) -> Generator:
         CheckpointError: no finished model in the folder, a damaged file, or weights of another configuration.
     """
     folder = Path(folder)
-    if not (folder / CONFIG_FILE).exists():
+    if not is_run(folder):
         raise CheckpointError(
             f"{folder}, which holds no finished model",
             f"a run's folder with {CONFIG_FILE} and {WEIGHTS_FILE}",
@@ -112,12 +117,15 @@ def load(folder: str | Path) -> Generator:
         )
     about = read_json(folder / CONFIG_FILE)
     try:
-        cls, sensor = load_class(about["generator"]), SensorModel.from_json(about["sensor"])
-    except (KeyError, TypeError) as error:
+        config, sensor = about["config"], SensorModel.from_json(about["sensor"])
+        cls = load_class(str(about["generator"]))
+    except LidarGritError:
+        raise
+    except (KeyError, TypeError, ValueError) as error:  # the last from tables that are not rectangular
         raise CheckpointError(
-            f"{folder / CONFIG_FILE}, in which {error} is missing", "what lidargrit wrote", "restore the file"
+            f"{folder / CONFIG_FILE}, which cannot be used ({error})", "what lidargrit wrote", "restore the file"
         ) from None
-    config = configuration.from_json(cls.Config, about["config"], str(folder / CONFIG_FILE))
+    config = configuration.from_json(cls.Config, config, str(folder / CONFIG_FILE))
     return cls.from_weights(config, sensor, read_tensors(folder / WEIGHTS_FILE)[0], folder / WEIGHTS_FILE)
 
 

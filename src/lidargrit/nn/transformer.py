@@ -43,6 +43,9 @@ class TransformerConfig:
                 "positive numbers, the width a multiple of the heads",
                 "change the width or the heads",
             )
+        for name in ("embedding_dropout", "residual_dropout", "attention_dropout"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ConfigError(f"{name}={getattr(self, name)}", "a share in [0, 1)", "lower it")
 
 
 @dataclass

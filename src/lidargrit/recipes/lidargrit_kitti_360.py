@@ -12,7 +12,9 @@ RECIPE = Recipe(
     title="LidarGRIT on KITTI-360 (set data.train and data.val to kitti_360:ROOT:SPLIT)",
     generator="lidargrit",
     model=LidarGritConfig(
-        tokenizer=VqvaeConfig(channels=128, channel_multipliers=(1, 1, 2, 2), code_dim=256, num_codes=1024),
+        tokenizer=VqvaeConfig(
+            channels=128, channel_multipliers=(1, 1, 2, 2), code_dim=256, num_codes=1024, restart_dead_codes=False
+        ),
         transformer=TransformerConfig(layers=12, heads=8, width=256, embedding_dropout=0.0),
     ),
     data=DataConfig(

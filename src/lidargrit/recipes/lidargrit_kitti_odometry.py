@@ -12,7 +12,9 @@ RECIPE = Recipe(
     title="LidarGRIT on KITTI odometry (set data.train and data.val to kitti_odometry:ROOT:SPLIT)",
     generator="lidargrit",
     model=LidarGritConfig(
-        tokenizer=VqvaeConfig(channels=64, channel_multipliers=(1, 1, 2), code_dim=128, num_codes=512),
+        tokenizer=VqvaeConfig(
+            channels=64, channel_multipliers=(1, 1, 2), code_dim=128, num_codes=512, restart_dead_codes=False
+        ),
         transformer=TransformerConfig(layers=6, heads=8, width=256, embedding_dropout=0.2),
     ),
     data=DataConfig(

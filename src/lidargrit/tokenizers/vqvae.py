@@ -19,6 +19,7 @@ from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage, TokenGrid
 from lidargrit.tokenizers import Decoded, Tokenizer
 
+_COLLAPSED_BELOW = 0.05  # of the codes in effect used; healthy codebooks of ours keep above half
 _NO_RETURN_BELOW = -0.9  # without a raydrop head, an encoded range below this is read as no return (the program's rule)
 
 
@@ -41,6 +42,9 @@ class VqvaeConfig:
         reconstruction: ``paper`` takes the clean range and divides by all pixels; ``reference`` draws the mask first,
             which lets only kept pixels learn, and divides by the returns of each scan; ``returns`` takes the clean
             range and divides by the returns of each scan.
+        error_unit: ``encoded`` takes the error between encodings, as the paper does; ``metres`` between ranges, scaled
+            so that for the linear encoding the two are the same. With the logarithmic encoding the first cares for near
+            surfaces, the second for far ones.
         codebook_loss: ``paper``, ``reference``, ``vqvae`` or ``ema``; see lidargrit.nn.quantiser.
         restart_dead_codes: the remedy against a collapsing codebook; the reference has none.
     """
@@ -56,6 +60,7 @@ class VqvaeConfig:
     raydrop_loss: bool = True
     raydrop_weight: float = 0.1
     reconstruction: Literal["paper", "reference", "returns"] = "paper"
+    error_unit: Literal["encoded", "metres"] = "encoded"
     codebook_loss: CodebookLoss = "paper"
     restart_dead_codes: bool = True
 
@@ -183,6 +188,8 @@ class Vqvae(Tokenizer):
 
     def latents(self, images: RangeImage) -> Float[Tensor, "B D h w"]:
         """Return the continuous latents of a batch, before quantisation."""
+        if images.range_m.ndim != 3:
+            raise ConfigError("a single range image", "a batch", "make one with RangeImage.stack([image])")
         encoded = self.range_encoding.encode(images.range_m, images.return_mask)
         return self.quant_conv(self.encoder(encoded[:, None]))
 
@@ -202,7 +209,7 @@ class Vqvae(Tokenizer):
         z = self.quantize(self.latents(images), rng)
         encoded, return_logits = self._heads(z.latents)
         target, mask = self.range_encoding.encode(images.range_m, images.return_mask), images.return_mask
-        terms = {"commitment": z.loss}
+        terms = {"commitment": z.loss, "codebook_perplexity": torch.tensor(self.quantize.perplexity())}
         if not self.config.raydrop_loss:
             terms["reconstruction"] = (encoded - target).abs().mean()  # holes are learned as range -1
             loss = terms["reconstruction"] + z.loss
@@ -211,7 +218,10 @@ class Vqvae(Tokenizer):
             drawn = (
                 torch.bernoulli(return_logits.detach().sigmoid(), generator=rng) > 0.5 if kind == "reference" else mask
             )
-            terms["reconstruction"] = reconstruction_loss(encoded, target, mask, drawn, kind)
+            pair = (encoded, target)
+            if self.config.error_unit == "metres":
+                pair = (self.range_encoding.unit_range(encoded), self.range_encoding.unit_range(target))
+            terms["reconstruction"] = reconstruction_loss(*pair, mask, drawn, kind)
             terms["raydrop"] = F.binary_cross_entropy_with_logits(return_logits, mask.to(return_logits.dtype))
             loss = terms["reconstruction"] + self.config.raydrop_weight * terms["raydrop"] + z.loss
         with torch.no_grad():
@@ -219,6 +229,21 @@ class Vqvae(Tokenizer):
             terms["range_mae_m"] = (error_m * mask).sum() / mask.sum().clamp(min=1)
             terms["mask_accuracy"] = ((return_logits >= 0) == mask).float().mean()
         return {"loss": loss, **terms}
+
+    def warnings(self) -> list[str]:
+        """Return what a person should know of the codebook: nothing, or that it has collapsed, and the remedy."""
+        perplexity, used = self.quantize.perplexity(), self.quantize.used_share()
+        if perplexity >= _COLLAPSED_BELOW * self.num_codes:
+            return []
+        remedy = (
+            "raise the budget or lower model.tokenizer.num_codes"
+            if self.config.restart_dead_codes
+            else "--set model.tokenizer.restart_dead_codes=true model.tokenizer.codebook_loss=ema"
+        )
+        return [
+            f"the codebook has collapsed: {perplexity:.1f} of {self.num_codes} codes in effect, {used:.0%} alive; "
+            f"the remedy: {remedy}"
+        ]
 
     def _heads(self, latents: Float[Tensor, "B D h w"]) -> tuple[Float[Tensor, "B H W"], Float[Tensor, "B H W"]]:
         raw = self.decoder(self.post_quant_conv(latents)).float()

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from lidargrit.errors import OutputError, TrainingError
+from lidargrit.files import write_text
 from lidargrit.loading import Batches, RangeImages, seed_of
 from lidargrit.reporting import Reporter
 from lidargrit.training.checkpoint import load_checkpoint, save_checkpoint
@@ -141,7 +142,7 @@ class Fit:
     def _trim_log(self) -> None:
         """Forget what was logged after the checkpoint that the stage goes on from: it will be logged again."""
         log = self.folder / "log.jsonl"
-        if log.exists():
+        if log.is_file():
             kept = []
             for line in log.read_text(encoding="utf-8").splitlines():
                 try:
@@ -149,4 +150,4 @@ class Fit:
                         kept.append(line)
                 except ValueError:
                     continue  # the line that was being written when the process was killed
-            log.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
+            write_text(log, "".join(f"{line}\n" for line in kept))

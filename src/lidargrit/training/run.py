@@ -11,9 +11,9 @@ from typing import Any
 import torch
 
 from lidargrit import __version__, configuration
-from lidargrit.errors import OutputError
-from lidargrit.files import read_json, write_json
-from lidargrit.generators import CONFIG_FILE, Generator, load_class
+from lidargrit.errors import CheckpointError, OutputError
+from lidargrit.files import is_taken, read_json, write_json
+from lidargrit.generators import Generator, load_class
 from lidargrit.loading import RangeImages, load_range_images, seed_of
 from lidargrit.reporting import Reporter
 from lidargrit.training.fit import Fit
@@ -34,12 +34,14 @@ def train(recipe: Recipe, folder: Path, reporter: Reporter | None = None) -> Gen
         TrainingError: the loss is not finite.
     """
     reporter = reporter or Reporter()
-    _claim(folder, recipe)
+    described = _described(folder, recipe)
     train_images = load_range_images(recipe.data.train, recipe.data, reporter)
     val_images = load_range_images(recipe.data.val, recipe.data, reporter)
     _warn_of_overlap(train_images, val_images, reporter)
     torch.manual_seed(seed_of(recipe.seed, 9))
     generator = load_class(recipe.generator)(recipe.model, recipe.data.load_sensor())
+    if not (folder / RUN_FILE).exists():  # only now: a recipe that cannot be used takes no folder
+        write_json(folder / RUN_FILE, described)
     for number, stage in enumerate(generator.stages):
         fit = Fit(
             generator.objective(stage), recipe.training[stage], folder / stage, seed_of(recipe.seed, number), reporter
@@ -63,8 +65,8 @@ def plan(recipe: Recipe) -> str:
     return "\n".join(lines)
 
 
-def _claim(folder: Path, recipe: Recipe) -> None:
-    """Make the folder this recipe's, or find that it already is."""
+def _described(folder: Path, recipe: Recipe) -> dict[str, Any]:
+    """Return what run.json says of a run, having checked that the folder is free, or this recipe's already."""
     described: dict[str, Any] = {
         "recipe": configuration.to_json(recipe),
         "command": sys.argv,
@@ -74,7 +76,10 @@ def _claim(folder: Path, recipe: Recipe) -> None:
         "python": platform.python_version(),
     }
     if (folder / RUN_FILE).exists():
-        theirs, ours = read_json(folder / RUN_FILE)["recipe"], described["recipe"]
+        about, ours = read_json(folder / RUN_FILE), described["recipe"]
+        theirs = about.get("recipe") if isinstance(about, dict) else None
+        if not isinstance(theirs, dict):
+            raise CheckpointError(f"{folder / RUN_FILE} without a recipe", "what lidargrit wrote", "restore the file")
         mine, other = configuration.leaves(ours), configuration.leaves(theirs)
         differing = [name for name in mine.keys() | other.keys() if mine.get(name) != other.get(name)]
         if differing:
@@ -84,19 +89,14 @@ def _claim(folder: Path, recipe: Recipe) -> None:
                 "an empty folder, or the folder of this very recipe",
                 "choose another folder, or use the settings that the run began with",
             )
-        return
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        return described
+    if is_taken(folder, RUN_FILE):
         raise OutputError(
             f"{folder}, which is not empty and holds no run",
             "an empty folder, or one that this recipe began",
             "choose another folder",
         )
-    write_json(folder / RUN_FILE, described)
-
-
-def is_finished(folder: Path) -> bool:
-    """Tell whether a run folder holds a finished model."""
-    return (folder / CONFIG_FILE).exists()
+    return described
 
 
 def _warn_of_overlap(train_images: RangeImages, val_images: RangeImages, reporter: Reporter) -> None:

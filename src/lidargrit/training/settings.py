@@ -54,6 +54,11 @@ class FitConfig:
         for name in ("scans", "batch_size", "validate_every", "validation_scans", "checkpoint_every"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name}={getattr(self, name)}", "at least 1", "raise it")
+        for name in ("warmup_scans", "weight_decay", "gradient_clip", "average_over_scans"):
+            if not getattr(self, name) >= 0:
+                raise ConfigError(f"{name}={getattr(self, name)}", "0 or more", "raise it")
+        if not all(0 <= beta < 1 for beta in self.betas):
+            raise ConfigError(f"betas={self.betas}", "two numbers in [0, 1)", "e.g. [0.9,0.95]")
         if not self.learning_rate > 0:
             raise ConfigError(f"learning_rate={self.learning_rate}", "a positive number", "raise it")
 
@@ -79,3 +84,7 @@ class Recipe:
     training: dict[str, FitConfig]
     seed: int = 0
     published: str = ""
+
+    def __post_init__(self) -> None:
+        if self.seed < 0:
+            raise ConfigError(f"seed={self.seed}", "0 or more", "choose another seed")

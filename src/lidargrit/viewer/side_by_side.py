@@ -9,7 +9,7 @@ import torch
 
 from lidargrit.errors import ConfigError
 from lidargrit.evaluation.score import open_images
-from lidargrit.generators import CONFIG_FILE, SamplingConfig, load
+from lidargrit.generators import SamplingConfig, is_run, load
 from lidargrit.generators.lidargrit import LidarGrit
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
@@ -26,7 +26,9 @@ def view(places: Sequence[str], picture: Path, count: int = 3, seed: int = 0) ->
         count: scans of each, evenly spaced.
         seed: of the first generated scan.
     """
-    runs = [place for place in places if (Path(place) / CONFIG_FILE).exists()]
+    if count < 1:
+        raise ConfigError(f"{count} scans to draw", "1 to 8", "correct the number")
+    runs = [place for place in places if is_run(Path(place))]
     generators = {place: load(place) for place in runs}
     sensor: SensorModel | None = next((generator.sensor for generator in generators.values()), None)
     groups: dict[str, RangeImage] = {}
