@@ -182,11 +182,12 @@ def load_range_images(
         if dataset.sensor not in (sensor.name, config.sensor) and not sensor.name.endswith(".json"):
             reporter.message(f"WARNING: {source} was made by {dataset.sensor}, and is imaged as {sensor.name}")
         stem = cache_folder() / _digest(source, dataset, sensor, config)
-        if not stem.with_suffix(".json").exists():
+        if (cached := _read_cache(stem)) is None:
             _project_all(source, dataset, sensor, config, stem, reporter)
-        kept = read_json(stem.with_suffix(".json"))["names"]
-        parts.append(np.load(stem.with_suffix(".npy"), mmap_mode="r", allow_pickle=False)[: len(kept)])
-        names += kept
+            cached = _read_cache(stem)
+        assert cached is not None, stem
+        parts.append(cached[0])
+        names += cached[1]
     images = RangeImages(sensor, parts, names)
     if not len(images):
         raise DataError(f"no usable scan in {', '.join(sources)}", "at least one", "see the messages above")
@@ -203,6 +204,9 @@ def _project_all(
     shape = (count, fine.height, fine.width)
     with atomic_path(stem.with_suffix(".npy")) as temporary:
         pixels = np.lib.format.open_memmap(temporary, mode="w+", dtype=np.float32, shape=shape)
+        if hasattr(os, "posix_fallocate"):  # a full disk is an OSError here; while pixels are set it is a bus error
+            with temporary.open("r+b") as file:
+                os.posix_fallocate(file.fileno(), 0, temporary.stat().st_size)
         with reporter.progress("projecting scans", count) as progress:
             for index in wanted:
                 try:
@@ -219,6 +223,15 @@ def _project_all(
                 progress.advance(1)
         pixels.flush()
     write_json(stem.with_suffix(".json"), {"source": source, "names": kept})  # written last: it says "complete"
+
+
+def _read_cache(stem: Path) -> tuple[np.ndarray, list[str]] | None:
+    """Return the images of a cache and their names; None if it is not there, not complete or damaged."""
+    try:
+        kept = read_json(stem.with_suffix(".json"))["names"]
+        return np.load(stem.with_suffix(".npy"), mmap_mode="r", allow_pickle=False)[: len(kept)], kept
+    except (OSError, ValueError, EOFError, KeyError, TypeError):  # ValueError: also what read_json raises
+        return None
 
 
 def cache_folder() -> Path:

@@ -111,7 +111,7 @@ class _Files:
         path = self._paths[index]
         cure = "remove the file and sample again"
         try:
-            with np.load(path, allow_pickle=False) as opened:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as opened:
                 range_m = opened["range_m"]
         except _UNREADABLE as error:
             raise ScanError(f"{path}, which cannot be read ({error})", "an .npz with range_m", cure) from None

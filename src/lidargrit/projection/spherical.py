@@ -23,7 +23,7 @@ def rows(xyz_m: Float32[np.ndarray, "n 3"], elevation_rad: Float64[np.ndarray, "
     return np.where(row < len(elevation_rad), row, -1)
 
 
-def row_edges_rad(elevation_rad: Float64[np.ndarray, "H"]) -> Float64[np.ndarray, "H + 1"]:
+def row_edges_rad(elevation_rad: Float64[np.ndarray, "H"]) -> Float64[np.ndarray, "H+1"]:
     """Return the elevations between which each row lies, falling."""
     middles = (elevation_rad[1:] + elevation_rad[:-1]) / 2
     top = 2 * elevation_rad[0] - middles[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import Any, Literal
 
 import torch
@@ -21,6 +22,7 @@ class Engine:
     def __init__(self, precision: Literal["fp32", "bf16"]) -> None:
         from lightning_fabric import Fabric  # noqa: PLC0415  takes a second, and only training needs it
 
+        logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # it tells the precision at every start
         self._fabric: Any = Fabric(precision="bf16-mixed" if precision == "bf16" else "32-true")
         self._fabric.launch()
         self.device, self.rank, self.world_size = self._fabric.device, self._fabric.global_rank, self._fabric.world_size

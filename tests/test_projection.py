@@ -1,0 +1,131 @@
+"""The exact projection as mathematics: round trips, turns of the car, who wins a pixel, which scans are refused."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidargrit import _discovery
+from lidargrit.errors import ConfigError, ScanError
+from lidargrit.projection import RangeEncoding, project, unproject
+from lidargrit.sensors import SensorModel, load_sensor
+from lidargrit.simulator import simulate
+from lidargrit.structures import RangeImage, Scan
+
+SENSORS = _discovery.names("sensors")
+
+
+def random_image(sensor, seed, share=0.7):
+    rng = torch.Generator().manual_seed(seed)
+    size = (sensor.height, sensor.width)
+    span = sensor.range_max_m - sensor.range_min_m
+    range_m = torch.rand(size, generator=rng) * (span - 0.02) + sensor.range_min_m + 0.01
+    return RangeImage.masked(range_m, torch.rand(size, generator=rng) < share, sensor)
+
+
+def scan_at(points):
+    return Scan(torch.tensor(points, dtype=torch.float32))
+
+
+@pytest.mark.parametrize("name", SENSORS)
+@pytest.mark.parametrize("method", ["spherical", "unfolding"])
+def test_projecting_an_unprojected_image_gives_it_back(name, method):
+    image = random_image(load_sensor(name).fine().with_columns(512), seed=0)
+    again = project(unproject(image), image.sensor, method)
+    assert torch.equal(again.return_mask, image.return_mask)
+    assert torch.allclose(again.range_m, image.range_m, rtol=1e-6, atol=0)
+
+
+@given(seed=st.integers(0, 10_000), columns=st.integers(0, 255), method=st.sampled_from(["spherical", "unfolding"]))
+@settings(max_examples=25, deadline=None)
+def test_turning_the_car_by_whole_columns_rolls_the_image(seed, columns, method):
+    sensor = load_sensor("hdl64e_kitti_odometry").with_columns(256)
+    image = random_image(sensor, seed)
+    scan = unproject(image)
+    angle = 2 * math.pi * columns / 256
+    turn = torch.tensor([[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1]])
+    turned = project(Scan(scan.points_xyz_m @ turn.T, ring=scan.ring), sensor, method)
+    assert torch.equal(turned.return_mask, image.return_mask.roll(-columns, -1))
+    assert torch.allclose(turned.range_m, image.range_m.roll(-columns, -1), rtol=1e-5, atol=0)
+
+
+def test_no_range_appears_that_was_not_there_and_the_nearest_wins():
+    scan = simulate(seed=1)
+    sensor = load_sensor("hdl64e_kitti_odometry")
+    image = project(scan, sensor.fine())
+    ranges = set(np.linalg.norm(scan.points_xyz_m.numpy(), axis=1).tolist())
+    assert {float(r) for r in image.range_m[image.return_mask]} <= ranges
+    kept = project(scan, sensor)
+    assert torch.equal(kept.range_m, image.range_m[:, ::8])
+    two = project(scan_at([[10.0, 0, 0], [5.0, 0, 0], [7.0, 0, 0]]), load_sensor("hdl64e_kitti_360"))
+    assert two.range_m[two.return_mask].tolist() == [5.0]
+
+
+def test_a_near_point_beyond_the_limits_does_not_hide_a_good_one():
+    scan, sensor = scan_at([[10.0, 0, 0], [0.5, 0, 0]]), load_sensor("hdl64e_kitti_360")
+    exact, reference = (
+        project(scan, sensor),
+        project(scan_at([[10.0, 0, 0], [0.5, 0, 0], [5, 5, 0]]), sensor, variant="reference"),
+    )
+    assert exact.range_m[exact.return_mask].tolist() == [10.0]
+    assert 10.0 not in reference.range_m  # the released program loses it
+
+
+def test_rows_and_columns_are_where_the_conventions_say():
+    sensor = load_sensor("hdl64e_kitti_360")
+    for (x, y), column in (((-1, 1e-3), 0), ((0, 1), 256), ((1, 0), 512), ((0, -1), 768), ((-1, -1e-3), 1023)):
+        image = project(scan_at([[10.0 * x, 10.0 * y, 0]]), sensor)
+        assert image.return_mask.nonzero()[0, 1] == column
+    high, low = (project(scan_at([[10.0, 0, z]]), sensor).return_mask.nonzero()[0, 0] for z in (0.5, -4.5))
+    assert (int(high), int(low)) == (0, 62)
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_rays_are_unit_vectors_and_rows_descend(name):
+    sensor = load_sensor(name)
+    assert torch.allclose(sensor.ray_directions().norm(dim=-1), torch.ones(sensor.height, sensor.width), atol=1e-6)
+    assert bool((sensor.elevation_rad.diff(dim=0) < 0).all())
+    assert bool((sensor.azimuth_rad.diff(dim=1) < 0).all())
+    assert SensorModel.from_json(sensor.to_json()).same_rays(sensor)
+    assert not sensor.with_columns(128).same_rays(sensor)
+
+
+@pytest.mark.parametrize("kind", ["linear", "log", "inverse"])
+@given(seed=st.integers(0, 10_000))
+@settings(max_examples=20, deadline=None)
+def test_encodings_are_monotone_round_trips_onto_the_interval(kind, seed):
+    encoding = RangeEncoding(kind, 0.9, 120.0)
+    range_m = torch.rand(64, generator=torch.Generator().manual_seed(seed)).sort().values * 119.1 + 0.9
+    encoded = encoding.encode(range_m, torch.ones(64, dtype=torch.bool))
+    assert bool((encoded.diff() >= 0).all())
+    assert float(encoded.min()) >= -1
+    assert float(encoded.max()) <= 1 + 1e-6
+    assert torch.allclose(encoding.decode(encoded), range_m, rtol=1e-3)
+    assert encoding.encode(range_m, torch.zeros(64, dtype=torch.bool)).unique().tolist() == [-1.0]
+
+
+def test_a_sensor_that_does_not_fit_is_told_with_those_that_would():
+    elevation = np.radians(np.linspace(15, -15, 16)).repeat(100)
+    azimuth = np.tile(np.linspace(-3, 3, 100), 16)
+    points = 10 * np.stack(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], 1
+    )
+    scan = Scan(torch.from_numpy(points.astype(np.float32)))
+    with pytest.raises(ScanError, match=r"outside the sensor's elevations .* none of ours does"):
+        project(scan, load_sensor("hdl64e_kitti_360"))
+    with pytest.raises(ScanError, match=r"16 rings|\d+ rings"):
+        project(scan, load_sensor("hdl64e_kitti_odometry"))
+
+
+def test_images_that_contradict_themselves_are_refused():
+    sensor = load_sensor("hdl64e_kitti_360").with_columns(4)
+    good = torch.full((64, 4), 5.0)
+    with pytest.raises(ScanError, match="256 pixels whose range contradicts"):
+        RangeImage(good, torch.zeros_like(good, dtype=torch.bool), sensor)
+    with pytest.raises(ConfigError, match="64x3; wanted the 64x4"):
+        RangeImage(good[:, :3], good[:, :3] > 0, sensor)
+    with pytest.raises(ScanError, match="one by one"):
+        unproject(RangeImage.stack([RangeImage(good, good > 0, sensor)]))
