@@ -26,6 +26,8 @@ def from_json(cls: type[T], data: Any, source: str) -> T:
     parser = _parser()
     parser.add_argument("--config", type=cls)
     try:
+        if not isinstance(data, dict):  # the parser would take the defaults
+            raise TypeError(f"{str(data)[:40]!r} in place of settings by name")
         return parser.instantiate(parser.parse_object({"config": data})).config
     except (Exception, SystemExit) as error:  # the parser raises many kinds, for one cause: the file is not a cls
         if isinstance(error, ConfigError):

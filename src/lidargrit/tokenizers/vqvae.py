@@ -210,20 +210,18 @@ class Vqvae(Tokenizer):
         encoded, return_logits = self._heads(z.latents)
         target, mask = self.range_encoding.encode(images.range_m, images.return_mask), images.return_mask
         terms = {"commitment": z.loss, "codebook_perplexity": torch.tensor(self.quantize.perplexity())}
-        if not self.config.raydrop_loss:
-            terms["reconstruction"] = (encoded - target).abs().mean()  # holes are learned as range -1
-            loss = terms["reconstruction"] + z.loss
-        else:
+        pair = (encoded, target)
+        if self.config.error_unit == "metres":
+            pair = (self.range_encoding.unit_range(encoded), self.range_encoding.unit_range(target))
+        if self.config.raydrop_loss:
             kind = self.config.reconstruction
-            drawn = (
-                torch.bernoulli(return_logits.detach().sigmoid(), generator=rng) > 0.5 if kind == "reference" else mask
-            )
-            pair = (encoded, target)
-            if self.config.error_unit == "metres":
-                pair = (self.range_encoding.unit_range(encoded), self.range_encoding.unit_range(target))
-            terms["reconstruction"] = reconstruction_loss(*pair, mask, drawn, kind)
+            kept = torch.bernoulli(return_logits.detach().sigmoid(), generator=rng) > 0 if kind == "reference" else mask
+            terms["reconstruction"] = reconstruction_loss(*pair, mask, kept, kind)
             terms["raydrop"] = F.binary_cross_entropy_with_logits(return_logits, mask.to(return_logits.dtype))
             loss = terms["reconstruction"] + self.config.raydrop_weight * terms["raydrop"] + z.loss
+        else:
+            terms["reconstruction"] = (pair[0] - pair[1]).abs().mean()  # holes are learned as the range -1
+            loss = terms["reconstruction"] + z.loss
         with torch.no_grad():
             error_m = (self.range_encoding.decode(encoded) - images.range_m).abs()
             terms["range_mae_m"] = (error_m * mask).sum() / mask.sum().clamp(min=1)
