@@ -1,0 +1,229 @@
+"""Interruptions, full disks and kills: the same command goes on, and ends as if nothing had happened."""
+
+import json
+import os
+import re
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from tiny_runs import LONG, contents, the_one_line, train_words
+
+from lidargrit import reporting
+from lidargrit.cli import main
+from lidargrit.evaluation.samples import read_samples
+from lidargrit.files import read_tensors
+
+
+class Interrupted(reporting.TerminalReporter):
+    """Presses Ctrl-C after some steps of training."""
+
+    steps = 0
+
+    @contextmanager
+    def progress(self, what: str, total: int, done: int = 0) -> Iterator[reporting.Progress]:
+        left = iter(range(self.steps - 1)) if what.startswith("training") else iter(range(1 << 30))
+
+        class Pressed(reporting.Progress):
+            def advance(self, amount: int, note: str = "") -> None:
+                if next(left, None) is None:
+                    raise KeyboardInterrupt
+
+        yield Pressed()
+
+
+@pytest.fixture
+def interrupt(monkeypatch):
+    """Return a function that runs a command and interrupts it at a step of its training."""
+
+    def run(steps: int, words: list[str]) -> int:
+        with monkeypatch.context() as patch:
+            patch.setattr(Interrupted, "steps", steps)
+            patch.setattr(reporting, "TerminalReporter", Interrupted)
+            return main(words)
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory) -> bytes:
+    """Return the weights of a run that nothing happened to."""
+    folder = tmp_path_factory.mktemp("uninterrupted") / "run"
+    assert main(train_words(folder, *LONG)) == 0
+    return (folder / "model.safetensors").read_bytes()
+
+
+def hidden(folder: Path) -> list[Path]:
+    return [path for path in folder.rglob(".*") if path.is_file()]
+
+
+def test_interrupted_runs_say_so_and_go_on_to_the_same_weights(interrupt, uninterrupted, tmp_path, capsys):
+    words = train_words(tmp_path / "run", *LONG)
+    for steps in (1, 5, 1, 4, 6):  # the last in the second stage
+        assert interrupt(steps, words) == 130
+        told = capsys.readouterr().err.strip().splitlines()
+        assert told[-1] == "lidargrit train: interrupted; the same command goes on"
+        assert "Traceback" not in "".join(told)
+    assert not (tmp_path / "run" / "config.json").exists()
+    assert main(["sample", str(tmp_path / "run"), str(tmp_path / "new")]) == 2
+    assert "which holds no finished model" in capsys.readouterr().err
+    assert main(words) == 0
+    assert (tmp_path / "run" / "model.safetensors").read_bytes() == uninterrupted
+    assert hidden(tmp_path) == []
+
+
+def lidargrit(words: list[str], **options) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "lidargrit", *words]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
+
+
+def limited_to(size: int):
+    """Return what a new process does first: files may not grow beyond a size, as on a disk that is full."""
+
+    def limit() -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+
+    return limit
+
+
+def test_a_real_interrupt_from_the_keyboard(interrupt, tmp_path):
+    words = train_words(tmp_path / "run", *LONG, "training.tokenizer.scans=1000000")
+    process = lidargrit(words)
+    checkpoint = tmp_path / "run" / "tokenizer" / "checkpoint.safetensors"
+    deadline = time.monotonic() + 60
+    while not checkpoint.exists() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    _, told = process.communicate(timeout=60)
+    assert process.returncode == 130, told
+    assert told.endswith("\nlidargrit train: interrupted; the same command goes on\n")
+    assert "Traceback" not in told
+    seen = read_tensors(checkpoint)[1]["scans_seen"]
+    assert hidden(tmp_path) == []
+    assert interrupt(3, words) == 130
+    assert read_tensors(checkpoint)[1]["scans_seen"] == seen + 8, "two more steps, and the third not to its end"
+
+
+def test_a_full_disk_during_a_save(interrupt, uninterrupted, tmp_path):
+    words = train_words(tmp_path / "run", *LONG)
+    assert interrupt(4, words) == 130
+    before = contents(tmp_path)
+    process = lidargrit(words, preexec_fn=limited_to(100_000))
+    _, told = process.communicate(timeout=60)
+    assert process.returncode == 2, told
+    line = the_one_line(told, "train")
+    assert re.search(r"got '.*' while writing .*checkpoint\.safetensors; .*free some space", line)
+    name = "run/tokenizer/checkpoint.safetensors"
+    assert contents(tmp_path)[name] == before[name]
+    assert hidden(tmp_path) == []
+    assert main(words) == 0
+    assert (tmp_path / "run" / "model.safetensors").read_bytes() == uninterrupted
+
+
+def test_a_full_disk_while_sampling(run_folder, samples, tmp_path):
+    before = contents(tmp_path)
+    process = lidargrit(["sample", str(run_folder), str(samples), "-n", "3"], preexec_fn=limited_to(1000))
+    _, told = process.communicate(timeout=60)
+    assert process.returncode == 2, told
+    assert re.search(r"got '.*' while writing .*00000002\.npz; .*free some space", the_one_line(told, "sample"))
+    assert contents(tmp_path) == before
+
+
+def test_a_full_disk_before_the_first_step_and_while_projecting(tmp_path):
+    for size, wanted in ((0, "run.json"), (8_000, r"\.npy")):
+        process = lidargrit(
+            train_words(tmp_path / "run"),
+            preexec_fn=limited_to(size),
+            env=os.environ | {"LIDARGRIT_CACHE": str(tmp_path / "cache")} if size else None,
+        )
+        _, told = process.communicate(timeout=60)
+        assert process.returncode == 2, told
+        assert re.search(rf"got '.*' while writing .*{wanted}; ", the_one_line(told, "train"))
+        assert hidden(tmp_path) == []
+    assert main(train_words(tmp_path / "run")) == 0
+
+
+def test_a_full_disk_while_logging(tmp_path, interrupt):
+    words = train_words(tmp_path / "run", *LONG)
+    assert interrupt(4, words) == 130
+    log = tmp_path / "run" / "tokenizer" / "log.jsonl"
+    log.mkdir()  # stands for anything that keeps the file from being opened
+    process = lidargrit(words)
+    _, told = process.communicate(timeout=60)
+    assert process.returncode == 2, told
+    assert "log.jsonl" in the_one_line(told, "train")
+
+
+KILLER = """
+import os, random, signal, sys, time
+import lightning_fabric, safetensors.torch
+import lidargrit.cli, lidargrit.evaluation.samples, lidargrit.generators.lidargrit
+import lidargrit.recipes, lidargrit.training
+
+rng = random.Random(int(sys.argv[1]))
+for _ in range(int(sys.argv[2])):
+    child = os.fork()
+    if not child:
+        os._exit(lidargrit.cli.main(sys.argv[4:]))
+    time.sleep(rng.uniform(0, float(sys.argv[3])))
+    os.kill(child, signal.SIGKILL)
+    if os.waitpid(child, 0)[1] not in (0, signal.SIGKILL):
+        sys.exit("a killed command left something that the next could not go on from")
+"""
+
+
+def killed_often(times: int, longest_s: float, words: list[str]) -> None:
+    command = [sys.executable, "-c", KILLER, "5", str(times), str(longest_s), *words]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_run_that_is_killed_again_and_again_ends_with_the_same_weights(uninterrupted, tmp_path):
+    words = train_words(tmp_path / "run", *LONG)
+    killed_often(6, 1.0, words)
+    assert main(words) == 0
+    assert (tmp_path / "run" / "model.safetensors").read_bytes() == uninterrupted
+    for stage in ("tokenizer", "transformer"):
+        seen = [
+            json.loads(line)["scans_seen"] for line in (tmp_path / "run" / stage / "log.jsonl").read_text().splitlines()
+        ]
+        assert seen == sorted(set(seen)), "every line once"
+
+
+def test_sampling_that_is_killed_again_and_again_ends_with_the_same_scans(finished, tmp_path):
+    words = ["sample", str(finished["run"]), str(tmp_path / "new"), "-n", "24", "--batch-size", "1"]
+    killed_often(5, 0.4, words)
+    assert main(words) == 0
+    assert main(["sample", str(finished["run"]), str(tmp_path / "one"), "-n", "24", "--batch-size", "1"]) == 0
+    new, one = read_samples(tmp_path / "new"), read_samples(tmp_path / "one")
+    assert new.names == one.names
+    assert (new.batch(range(24)).range_m == one.batch(range(24)).range_m).all()
+
+
+def test_what_a_killed_process_leaves_half_written_breaks_nothing(refused, run_folder, samples, tmp_path):
+    for path in (*samples.iterdir(), *run_folder.rglob("*.*")):
+        if path.is_file():
+            path.with_name(f".{path.name}.abc12345{path.suffix}").write_bytes(b"half")
+    assert len(read_samples(samples)) == 2
+    for words in (
+        train_words(run_folder),
+        ["sample", str(run_folder), str(samples), "-n", "3"],
+        ["evaluate", str(samples), "simulated:2:test"],
+        ["view", str(samples), str(run_folder), "-o", str(tmp_path / "picture.png"), "-n", "1"],
+    ):
+        assert main(words) == 0
+
+
+@pytest.mark.parametrize("name", ["run.json", "samples.json"])
+def test_a_process_killed_while_it_wrote_its_very_first_file(run_folder, tmp_path, name):
+    folder = tmp_path / "new"
+    folder.mkdir()
+    (folder / f".{name}.abc12345.json").write_bytes(b"half")
+    assert main(train_words(folder) if name == "run.json" else ["sample", str(run_folder), str(folder), "-n", "1"]) == 0

@@ -1,0 +1,198 @@
+"""Scans, folders and words that cannot be used: one line that says what to do, and nothing lost."""
+
+import re
+import shutil
+
+import numpy as np
+import pytest
+from tiny_runs import MODEL, SHORT, SIMULATED, train_words
+
+from lidargrit.cli import main
+
+
+def changed(rows: np.ndarray, name: str) -> bytes:
+    """Return a damaged scan as the bytes of a file."""
+    bad = rows.copy()
+    if name == "NaN":
+        bad[7, 0] = np.nan
+    elif name == "infinite":
+        bad[7:9, 2] = -np.inf
+    elif name == "origin":
+        bad[7, :3] = 0
+    elif name == "reflectance":
+        bad[:, 3] *= 255
+    return {"cut short": bad.tobytes()[:-3], "empty": b""}.get(name, bad.tobytes())
+
+
+DAMAGE = {
+    "cut short": r"got \d+ bytes in .*BAD.*, 13 more than whole points; wanted .*16 bytes a point; download it again",
+    "empty": r"got an empty file, .*BAD.*; wanted float32 rows .*; download it again, or remove it",
+    "NaN": r"got 1 of \d+ points NaN or infinite coordinates in .*BAD.*; --?.*|.*bad_points=drop",
+    "infinite": r"got 2 of \d+ points NaN or infinite coordinates in .*BAD.*; .*--set data\.bad_points=drop",
+    "origin": r"got 1 of \d+ points at the origin .* in .*BAD.*; .*--set data\.bad_points=drop",
+    "reflectance": r"got reflectance from 0 to \d+.* in .*BAD.*; wanted values in \[0, 1\]; .*divide",
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+@pytest.mark.parametrize("verb", ["train", "view", "evaluate", "demo"])
+def test_a_damaged_scan(refused, rows, tmp_path, verb, damage):
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    for index in range(8):
+        (folder / f"{index:06d}.bin").write_bytes(changed(rows, "not at all"))
+    (folder / "000001.bin").write_bytes(changed(rows, damage))
+    words = {
+        "train": [*train_words(tmp_path / "run"), f"data.train=[{folder}]"],
+        "view": ["view", folder, "-o", tmp_path / "picture.png", "-n", 8],
+        "evaluate": ["evaluate", folder, "simulated:1:test", "--json", tmp_path / "scores.json"],
+        "demo": ["demo", "--data", folder, "--out", tmp_path / "run", "--set", *MODEL, *SHORT],
+    }[verb]
+    assert re.search(DAMAGE[damage].replace("BAD", re.escape("scans/000001.bin")), refused(*words))
+
+
+@pytest.mark.parametrize("damage", ["NaN", "infinite", "origin"])
+def test_bad_points_are_dropped_by_the_setting_that_the_message_names(refused, rows, tmp_path, damage):
+    (tmp_path / "scans").mkdir()
+    (tmp_path / "scans" / "000001.bin").write_bytes(changed(rows, damage))
+    words = [*train_words(tmp_path / "run"), f"data.train=[{tmp_path / 'scans'}]", f"data.val=[{tmp_path / 'scans'}]"]
+    setting = re.search(r"--set (data\.bad_points=\w+)", refused(*words))
+    assert setting
+    assert main([*words, setting[1]]) == 0, "the same folder can be used: nothing had begun"
+    assert (tmp_path / "run" / "model.safetensors").exists()
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_bad_scans_are_left_out_by_the_setting_that_the_message_names(refused, rows, tmp_path, capsys, damage):
+    (tmp_path / "scans").mkdir()
+    for index, name in enumerate(("not at all", damage, "not at all")):
+        (tmp_path / "scans" / f"{index:06d}.bin").write_bytes(changed(rows, name))
+    words = [*train_words(tmp_path / "run"), f"data.train=[{tmp_path / 'scans'}]"]
+    setting = re.search(r"--set (data\.bad_scans=\w+)", refused(*words))
+    assert setting
+    assert main([*words, setting[1]]) == 0
+    told = capsys.readouterr().err
+    assert told.count("left out: got ") == 1
+    assert "000001.bin" in told
+    (tmp_path / "scans" / "000000.bin").unlink()
+    (tmp_path / "scans" / "000002.bin").unlink()
+    assert "no usable scan in" in refused(*train_words(tmp_path / "none"), *words[-1:], setting[1])
+
+
+REAL_DAMAGE = {
+    "incomplete_sweep_39_rings": r"got 39 rings in .*; wanted the 64 rings .*; remove the file if the sweep was cut",
+    "cropped_to_camera": r"got returns in only .* of 360 degrees of azimuth in .*; wanted a full revolution",
+    "all_columns_times_1p1_plus_0p1": r"got reflectance from .* to 1.* in .*; wanted values in \[0, 1\]",
+}
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize("name", REAL_DAMAGE)
+def test_a_real_damaged_scan(refused, real, rows, tmp_path, capsys, name):
+    (tmp_path / "scans").mkdir()
+    shutil.copy(real / "damaged" / f"{name}.bin", tmp_path / "scans")
+    assert re.search(REAL_DAMAGE[name], refused("view", tmp_path / "scans", "-o", tmp_path / "picture.png"))
+    words = [*train_words(tmp_path / "run"), f"data.train=[{tmp_path / 'scans'}]"]
+    assert re.search(REAL_DAMAGE[name], refused(*words))
+    (tmp_path / "scans" / "good.bin").write_bytes(rows.tobytes())
+    assert main([*words, "data.bad_scans=skip"]) == 0
+    assert re.search(f"left out: {REAL_DAMAGE[name]}", capsys.readouterr().err)
+
+
+def test_a_folder_with_no_scan_in_it(refused, tmp_path):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "notes.txt").write_text("no scan")
+    for folder, what in (("empty", "holds no layout we know"), ("other", "holds"), ("none", "is not a folder")):
+        place = tmp_path / folder
+        for words in (
+            [*train_words(tmp_path / "run"), f"data.train=[{place}]"],
+            ["demo", "--data", place, "--out", tmp_path / "run"],
+            ["evaluate", place, "simulated:1:test"],
+            ["view", place, "-o", tmp_path / "picture.png"],
+        ):
+            assert re.search(f"{folder}, which {what}.*lidargrit list datasets", refused(*words))
+    assert "no scan where this data set has them" in refused("view", f"kitti_raw:{tmp_path / 'other'}")
+
+
+def test_a_sensor_that_does_not_fit_the_scan(refused, tmp_path):
+    azimuth, elevation = np.meshgrid(
+        np.linspace(0, 2 * np.pi, 900, endpoint=False), np.radians(np.linspace(15, -15, 16))
+    )
+    flat = np.cos(elevation)
+    xyz_m = 10 * np.stack((flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)), axis=-1).reshape(-1, 3)
+    (tmp_path / "puck").mkdir()
+    np.column_stack((xyz_m, np.full(len(xyz_m), 0.5))).astype("<f4").tofile(tmp_path / "puck" / "0.bin")
+    settings = [f"data.train=[{tmp_path / 'puck'}]", "data.sensor=hdl64e_kitti_360", "data.projection=spherical"]
+    told = refused(*train_words(tmp_path / "run", *settings))
+    assert re.search(r"got \d\d% of the points of .*puck/0\.bin outside the sensor's elevations .*-15.0 to 15.0", told)
+    assert re.search(r"wanted -2\d\.\d to \d\.\d degrees for 'hdl64e_kitti_360'; choose the sensor that made", told)
+    told = refused(*train_words(tmp_path / "run", *settings[:1]))
+    assert re.search(r"got 16 rings in .*puck/0\.bin; wanted the 64 rings of the sensor 'hdl64e_kitti_odometry'", told)
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["train", "smal", "OUT"], r"'smal', which is not among the recipes; wanted one of small.*list recipes"),
+        (["train", "demo", "OUT", "--set", "seed"], r"the setting 'seed'; wanted NAME=VALUE; e\.g\. --set title="),
+        (
+            ["train", "demo", "OUT", "--set", "model.tokenizer.chanels=32"],
+            r"'model\.tokenizer\.chanels', which .*channels",
+        ),
+        (
+            ["train", "demo", "OUT", "--set", "training.tokeniser.scans=4"],
+            r"wanted one such as training\.tokenizer\.scans",
+        ),
+        (["train", "demo", "OUT", "--set", "seed=many"], r"seed=many; wanted a value of the type int"),
+        (["train", "demo", "OUT", "--set", "data.train=[]"], r"no source of scans; .*data\.train="),
+        (
+            ["train", "demo", "OUT", "--set", "data.train=[kiti_odometry:/d]"],
+            r"'kiti_odometry', which .*kitti_odometry",
+        ),
+        (
+            ["train", "demo", "OUT", "--set", "data.train=[simulated]"],
+            r"the source 'simulated' alone; .*simulated:1000",
+        ),
+        (["train", "demo", "OUT", "--set", "data.sensor=hdl64"], r"'hdl64', which is not among the sensors; .*hdl64e_"),
+        (["train", "demo", "OUT", "--set", "data.sensor=no.json"], r"the sensor file no\.json, which cannot be read"),
+        (["train", "demo", "OUT", "--set", "data.columns=100", "data.column_stride=8"], r"100 columns, every 8th kept"),
+        (["train", "demo", "OUT", "--set", "data.columns=80"], r"range images of 64x10; .*divisible by 8"),
+        (["train", "demo", "OUT", "--set", "generator=lidargri"], r"'lidargri', which is not among the generators"),
+        (["train", "demo", "OUT", "--set", "model.tokenizer.channels=40"], r"channels=40; .* multiple of 32"),
+        (["train", "demo", "OUT", "--set", "data.max_scans=-1"], r"max_scans=-1; wanted"),
+        (["train", "demo", "OUT", "--set", "seed=-1"], r"seed=-1; wanted"),
+        (["train", "demo", "OUT", "--set", "training.tokenizer.betas=[2.0,3.0]"], r"betas=\(2\.0, 3\.0\); wanted"),
+        (["train", "demo", "OUT", "--set", "training.tokenizer.weight_decay=-1"], r"weight_decay=-1\.0; wanted"),
+        (["train", "demo", "OUT", "--set", "model.transformer.residual_dropout=2"], r"residual_dropout=2\.0; wanted"),
+        (
+            ["train", "demo", "OUT", "--set", "training.tokenizer.average_over_scans=-1"],
+            r"average_over_scans=-1; wanted",
+        ),
+        (["sample", "RUN", "OUT", "-n", "0"], r"-n 0, .*; wanted at least one scan"),
+        (["sample", "RUN", "OUT", "--seed", "-1"], r"--seed -1; wanted"),
+        (["sample", "RUN", "OUT", "--top-p", "0"], r"top_p=0\.0; wanted"),
+        (["sample", "RUN", "OUT", "--temperature", "nan"], r"temperature=nan, .*; wanted temperature >= 0"),
+        (["sample", "RUN", "OUT", "--device", "gpu"], r"--device gpu; wanted"),
+        (["sample", "nowhere", "OUT"], r"nowhere, which holds no finished model; .*finish the training"),
+        (
+            ["evaluate", "simulated:1", "simulated:1", "--metrics", "slice"],
+            r"'slice', which .*metrics; .*sliced_wasserstein",
+        ),
+        (["evaluate", "simulated:1", "simulated:1", "-n", "-1"], r"-n -1, --seed 0; wanted 0 or more"),
+        (["evaluate", "simulated:1", "simulated:1", "--seed", "-1"], r"seed.*-1; wanted"),
+        (["evaluate", "SAMPLES", "SAMPLES", "-n", "-1"], r"-n -1, --seed 0; wanted 0 or more"),
+        (["evaluate", "simulated:1:val", "SAMPLES"], r"64x\d+.*; wanted the rays of .*give the samples first"),
+        (["view", "simulated:1", "-o", "OUT", "-n", "0"], r"-n 0.*; wanted|0 scans.*; wanted"),
+        (["view", "simulated:9", "-o", "OUT", "-n", "9"], r"; wanted .*1 to 8"),
+        (["view", "RUN", "-o", "OUT", "-n", "9"], r"; wanted .*1 to 8"),
+        (["view", "simulated:1", "-o", "RUN/run.json/x.png"], r"x\.png, which cannot be written"),
+        (["demo", "--data", "simulated:many", "--out", "OUT"], r"'many' where a count belongs"),
+    ],
+)
+def test_wrong_words(refused, finished, tmp_path, words, text):
+    for word, place in (("OUT", tmp_path / "out"), ("RUN", finished["run"]), ("SAMPLES", finished["samples"])):
+        words = [re.sub(f"^{word}\\b", str(place), each) for each in words]
+    if words[0] == "train":
+        words = [*words, "--set", *MODEL, *SIMULATED, *SHORT, *words[4:]] if "--set" in words else words
+    assert re.search(text, refused(*words))

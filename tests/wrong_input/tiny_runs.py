@@ -1,0 +1,45 @@
+"""Runs that train within a second, and what is read from a command's answer."""
+
+import re
+from pathlib import Path
+
+MODEL = [  # 64x64 range images, 8x8 tokens
+    "data.columns=512",
+    "data.column_stride=8",
+    "model.tokenizer.channel_multipliers=[1,1,1,1]",
+    "model.tokenizer.code_dim=8",
+    "model.tokenizer.num_codes=32",
+    "model.transformer.layers=1",
+    "model.transformer.heads=2",
+    "model.transformer.width=16",
+    "training.tokenizer.batch_size=4",
+    "training.transformer.batch_size=8",
+]
+SIMULATED = ["data.train=[simulated:4:train]", "data.val=[simulated:1:val]"]
+SHORT = ["training.tokenizer.scans=4", "training.transformer.scans=8"]
+LONG = [  # 12 and 6 steps, a checkpoint after each
+    "training.tokenizer.scans=48",
+    "training.tokenizer.checkpoint_every=4",
+    "training.transformer.scans=48",
+    "training.transformer.checkpoint_every=8",
+]
+PROGRESS = re.compile(
+    r"(projecting scans|training \w+|sampling): \d+/\d+|  after \d+ scans|\s*WARNING: |left out: |lidargrit demo: "
+    r"about "
+)
+
+
+def train_words(folder: Path, *settings: str) -> list[str]:
+    return ["train", "demo", str(folder), "--set", *MODEL, *SIMULATED, *SHORT, *settings]
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def the_one_line(stderr: str, verb: str) -> str:
+    """Return the error among the lines on stderr, having checked that it is one line with its three parts."""
+    lines = [line for line in stderr.splitlines() if not PROGRESS.match(line)]
+    assert len(lines) == 1, stderr
+    assert re.fullmatch(rf"lidargrit {verb}: got \S.*; wanted \S.*; \S.*", lines[0]), stderr
+    return lines[0]
