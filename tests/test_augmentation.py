@@ -51,3 +51,18 @@ def test_geometric_fills_with_no_return_and_the_programs_with_a_far_wall():
     assert bool(program.return_mask.all())
     untouched = (ours.range_m == 9).flatten(1).all(1)
     assert 16 < int(untouched.sum()) < 48  # probability one half
+
+
+def test_a_rotation_keeps_shapes_in_pixels():
+    """A square stays a square of about the same size, though the image is four times as wide as high."""
+    square = torch.zeros(200, 64, 256)
+    square[:, 24:40, 120:136] = 7.0
+    images = RangeImage(square, square > 0, SENSOR)
+    turned = augment(images, ("geometric",), torch.Generator().manual_seed(0)).return_mask
+    area = turned.sum((1, 2)) / 256
+    assert float(area.min()) > 0.7
+    assert float(area.max()) < 1.3
+    rows, columns = turned.any(2).sum(1), turned.any(1).sum(1)
+    assert float((rows / columns).max()) < 1.25  # a squeezed map would make it up to four times longer one way
+    assert float((rows / columns).min()) > 0.8
+    assert len({(int(r), int(c)) for r, c in zip(rows, columns, strict=True)}) > 5

@@ -210,7 +210,7 @@ def test_demo_tells_the_whole_story_and_tells_it_again(tmp_path, typed):
     words = ("demo", "--out", tmp_path / "demo", "--set", *TINY)
     assert f"done: look at {tmp_path / 'demo'}" in typed(*words)
     before = contents(tmp_path / "demo")
-    for name in ("real_reconstructed_generated.png", "generated.png", "samples/00000015.npz", "model.safetensors"):
+    for name in ("scans_reconstructed_generated.png", "generated.png", "samples/00000015.npz", "model.safetensors"):
         assert name in before
     evaluation = json.loads(before["evaluation.json"])
     assert evaluation["reconstruction_on_val"]["num_scans"] == 2
@@ -233,7 +233,7 @@ def test_demo_on_one_drive_holds_its_last_scans_out_and_warns(tmp_path, capsys):
     load("kitti_odometry").write_example(tmp_path / "tree", 8)
     words = ["demo", "--data", str(tmp_path / "tree" / "sequences" / "00"), "--out", str(tmp_path / "run")]
     assert main([*words, "--set", *TINY[2:]]) == 0
-    assert "WARNING: one drive only" in capsys.readouterr().err
+    assert "WARNING: the last scans are held out" in capsys.readouterr().err
     recipe = json.loads((tmp_path / "run" / "run.json").read_text())["recipe"]
     assert recipe["data"]["val"][0].endswith("[85%:]")
 

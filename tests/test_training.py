@@ -147,7 +147,7 @@ def test_a_loss_that_is_not_finite_stops_with_the_step(tmp_path, images):
     vqvae = Vqvae(load_recipe("demo", TINY).model.tokenizer, images.sensor)
     vqvae.encoder.conv_in.weight.data.fill_(torch.nan)
     fit = Fit(vqvae, FitConfig(scans=4, batch_size=2, learning_rate=1e-3), tmp_path, 0, Reporter())
-    with pytest.raises(TrainingError, match=r"a loss of nan after 0 scans"):
+    with pytest.raises(TrainingError, match=r"a loss or gradient of nan after 0 scans"):
         fit.run(images, images, "training")
 
 

@@ -74,7 +74,7 @@ def test_older_picture_is_replaced_in_one_step(images, tmp_path, monkeypatch):
 
 def test_place_below_a_file_is_refused(images, tmp_path):
     (tmp_path / "file").write_text("taken")
-    with pytest.raises(OutputError, match="cannot be written"):
+    with pytest.raises(OutputError, match="while writing"):
         draw_comparison({"real": images[0]}, tmp_path / "file" / "a.png")
 
 

@@ -147,7 +147,11 @@ def test_threshold_and_bernoulli_masks():
         tokens = vqvae.encode(images_of(sensor))
         probability = vqvae.decode_parts(tokens).return_logits.sigmoid()
         threshold = vqvae.decode(tokens).return_mask
-        draws = torch.stack([vqvae.decode(tokens, "bernoulli").return_mask for _ in range(300)]).float().mean(0)
+        rng = torch.Generator().manual_seed(0)
+        uniforms = [torch.rand(probability.shape, generator=rng) for _ in range(300)]
+        draws = torch.stack([vqvae.decode(tokens, "bernoulli", u).return_mask for u in uniforms]).float().mean(0)
+    with pytest.raises(ConfigError, match="without random numbers"):
+        vqvae.decode(tokens, "bernoulli")
     assert torch.equal(threshold, probability >= 0.5)
     assert float((draws - probability).abs().max()) < 0.2  # five standard errors of 300 draws are 0.14
     assert float((draws - probability).mean()) == pytest.approx(0, abs=0.01)

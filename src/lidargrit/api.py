@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from lidargrit.datasets import BadPoints
 from lidargrit.datasets._files import read_bin
 from lidargrit.evaluation import score
 from lidargrit.generators import load
+from lidargrit.loading import DataConfig
 from lidargrit.projection import project, unproject
 from lidargrit.sensors import load_sensor
 from lidargrit.simulator import simulate
@@ -16,13 +18,17 @@ from lidargrit.structures import MetricResult, Scan
 __all__ = ["evaluate", "load", "load_scan", "load_sensor", "project", "simulate", "unproject"]
 
 
-def load_scan(path: str | Path) -> Scan:
+def load_scan(path: str | Path, bad_points: BadPoints = "refuse") -> Scan:
     """Read one scan from a KITTI-style ``.bin`` file: float32 rows of x, y, z in metres and reflectance.
+
+    Args:
+        path: of the file.
+        bad_points: ``drop`` removes points with NaN or infinite coordinates and points at the origin.
 
     Raises:
         ScanError: the file cannot be used; says what is wrong and what to do.
     """
-    return read_bin(Path(path))
+    return read_bin(Path(path), bad_points)
 
 
 def evaluate(
@@ -36,5 +42,6 @@ def evaluate(
         metrics: names, each computed in all its variants.
         max_scans: of each; 0 for all.
     """
-    samples = score.open_images(generated, max_scans=max_scans)
-    return score.evaluate(samples, score.open_images(reference, samples.sensor, max_scans), metrics)
+    config = DataConfig(max_scans=max_scans)
+    samples = score.open_images(generated, None, config)
+    return score.evaluate(samples, score.open_images(reference, samples.sensor, config), metrics)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Iterable
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, TypeVar, get_origin, get_type_hints
 
 from lidargrit.errors import ConfigError, nearest_names
 
@@ -42,17 +42,25 @@ def from_json(cls: type[T], data: Any, source: str) -> T:
 def override(config: T, settings: Iterable[str]) -> T:
     """Return the configuration with settings of the form ``a.b=value`` changed.
 
-    A value is read as YAML. Words for a list need no brackets: ``data.train=/data/one,/data/two``.
+    A value is read as YAML. A list needs no brackets: ``data.train=/data/one,/data/two``.
 
     Raises:
         ConfigError: an unknown name (names its nearest neighbours) or a value of another type.
     """
+    values: dict[str, Any] = {}
     for setting in settings:
         path, equals, text = setting.partition("=")
         if not equals:
             raise ConfigError(f"the setting {setting!r}", "NAME=VALUE", f"e.g. --set {next(iter(leaves(config)))}=...")
-        config = _replaced(config, path.strip(), path.strip().split("."), text, config)
-    return config
+        values[path.strip()] = text
+    unknown = [path for path in values if path not in leaves(config)]
+    if unknown:
+        raise ConfigError(
+            f"the setting {unknown[0]!r}, which this recipe does not have",
+            f"one such as {nearest_names(unknown[0], leaves(config))}",
+            "see all with --dry-run",
+        )
+    return _replaced(config, "", values)
 
 
 def leaves(config: Any, prefix: str = "") -> dict[str, Any]:
@@ -64,24 +72,23 @@ def leaves(config: Any, prefix: str = "") -> dict[str, Any]:
     return found
 
 
-def _replaced(node: Any, path: str, keys: list[str], text: str, whole: Any) -> Any:
-    children = _children(node)
-    if keys[0] not in children or (len(keys) == 1 and _children(children[keys[0]])):
-        raise ConfigError(
-            f"the setting {path!r}, which this recipe does not have",
-            f"one such as {nearest_names(path, leaves(whole))}",
-            "see all with --dry-run",
-        )
-    if len(keys) > 1:
-        value = _replaced(children[keys[0]], path, keys[1:], text, whole)
-    else:
-        value = _parsed(get_type_hints(type(node))[keys[0]], path, text)
-    return {**node, keys[0]: value} if isinstance(node, dict) else dataclasses.replace(node, **{keys[0]: value})
+def _replaced(node: Any, prefix: str, values: dict[str, Any]) -> Any:
+    """Change all settings below a node at once, for a setting may be valid only together with another."""
+    changed: dict[str, Any] = {}
+    for key, child in _children(node).items():
+        path = prefix + key
+        if path in values:
+            changed[key] = _parsed(get_type_hints(type(node))[key], path, values[path])
+        elif any(name.startswith(f"{path}.") for name in values):
+            changed[key] = _replaced(child, f"{path}.", values)
+    return {**node, **changed} if isinstance(node, dict) else dataclasses.replace(node, **changed)
 
 
 def _parsed(hint: Any, path: str, text: str) -> Any:
     if hint == tuple[str, ...] and not text.startswith("["):
         return tuple(text.split(","))
+    if get_origin(hint) is tuple and not text.startswith("["):
+        text = f"[{text}]"
     parser = _parser()
     parser.add_argument("--value", type=hint)
     try:

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import torch
 
+from lidargrit.configuration import override
 from lidargrit.datasets import open_dataset
+from lidargrit.errors import DataError
 from lidargrit.evaluation.samples import read_samples, write_samples
 from lidargrit.evaluation.score import as_json, as_table, evaluate, score_reconstruction
 from lidargrit.files import write_json
 from lidargrit.generators import SamplingConfig
 from lidargrit.generators.lidargrit import LidarGrit
-from lidargrit.loading import RangeImages, load_range_images
+from lidargrit.loading import DataConfig, RangeImages, load_range_images, spread
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
 from lidargrit.training import train
 from lidargrit.viewer import draw_comparison
 
+PICTURE = "scans_reconstructed_generated.png"
 _NUM_SAMPLES = 16
 _MAX_SCANS = 400  # of the user's: more would not be seen in the demo's few minutes
 
@@ -32,8 +35,10 @@ def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter
         settings: of the recipe, as ``--set`` takes them.
         reporter: hears of the progress.
     """
-    sources = [] if data is None else split_sources(data, reporter)
-    recipe = load_recipe("demo", [*sources, *settings])
+    recipe = load_recipe("demo")
+    if data is not None:
+        recipe = replace(recipe, data=divided(data, reporter))
+    recipe = override(recipe, settings)
     reporter.message("lidargrit demo: about 8 minutes on two cores; stop it at any time, the same command goes on")
     generator = train(recipe, folder, reporter)
     assert isinstance(generator, LidarGrit)
@@ -55,42 +60,46 @@ def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter
     )
     reporter.message(as_table(scores))
     reporter.message("(figures of a few minutes on little data; they do not compare with published tables)")
-    _draw(generator, val, samples, folder)
+    _draw(generator, "real" if data else "simulated", val, samples, folder)
     return folder
 
 
-def split_sources(data: str, reporter: Reporter) -> list[str]:
-    """Divide a user's scans into train and val, as settings: by whole drives where there are several.
+def divided(data: str, reporter: Reporter) -> DataConfig:
+    """Divide a user's scans into train and val: by whole drives where there are several.
 
     One drive in both would leak; where there is only one, its last scans are held out, and that is said.
+
+    Raises:
+        DataError: too few scans to hold any out.
     """
     dataset = open_dataset(data)
+    if len(dataset) < 4:
+        raise DataError(f"{len(dataset)} scans in {data}", "at least 4, to hold one out", "add scans")
+    place, split = f"{dataset.public_name()}:{dataset.root}", dataset.split
     drives = sorted({dataset.name(index).rpartition("/")[0] for index in range(len(dataset))})
-    place = f"{dataset.public_name()}:{dataset.root}"
     has_drives = dataset.public_name() != "folder" and all(drive and "/" not in drive for drive in drives)
-    if has_drives and len(drives) > 1 and dataset.split == "all":
+    if has_drives and len(drives) > 1 and "[" not in split:
         train, val = f"{place}:{'+'.join(drives[:-1])}", f"{place}:{drives[-1]}"
+    elif "[" in split:
+        raise DataError(
+            f"{data} with a share", "whole drives, or a folder", "leave the brackets out: demo divides the scans"
+        )
     else:
         reporter.message(
-            "WARNING: one drive only: its last scans are held out, but they show the streets of the others"
+            "WARNING: the last scans are held out; if they are of the same drive, they show the same streets"
         )
-        train, val = f"{place}:{dataset.split}[:85%]", f"{place}:{dataset.split}[85%:]"
-    return [
-        f"data.train={train}",
-        f"data.val={val}",
-        f"data.sensor={dataset.sensor}",
-        f"data.max_scans={_MAX_SCANS}",
-    ]
+        train, val = f"{place}:{split}[:85%]", f"{place}:{split}[85%:]"
+    return DataConfig(train=(train,), val=(val,), sensor=dataset.sensor, max_scans=_MAX_SCANS)
 
 
-def _draw(generator: LidarGrit, val: RangeImages, samples: RangeImages, folder: Path) -> None:
-    real = val.batch([index * len(val) // 3 for index in range(3)])
+def _draw(generator: LidarGrit, kind: str, val: RangeImages, samples: RangeImages, folder: Path) -> None:
+    real = val.batch(spread(3, len(val)))
     with torch.no_grad():
         reconstructed = generator.tokenizer.decode(generator.tokenizer.encode(real))
-    title = "real scans never trained on, what the tokens keep of them, and new scans"
+    title = f"{kind} scans never trained on, what the tokens keep of them, and new scans"
     draw_comparison(
-        {"real": real, "reconstructed": reconstructed, "generated": samples.batch(range(3))},
-        folder / "real_reconstructed_generated.png",
+        {kind: real, "reconstructed": reconstructed, "generated": samples.batch(range(3))},
+        folder / PICTURE,
         title=title,
     )
     draw_comparison({"generated": samples.batch(range(3, 11))}, folder / "generated.png", title="generated scans")

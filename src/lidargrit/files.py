@@ -54,6 +54,12 @@ def is_taken(folder: Path, first_file: str) -> bool:
     return any(not path.name.startswith(f".{first_file}.") for path in folder.iterdir())
 
 
+def refuse_to_overwrite(path: Path | None, overwrite: bool) -> None:
+    """Raise OutputError if something stands where a user's result is to be written, unless that is allowed."""
+    if path is not None and path.exists() and not overwrite:
+        raise OutputError(f"{path}, which is there already", "a new name", "choose another, or add --overwrite")
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a text file atomically."""
     with atomic_path(path) as temporary:

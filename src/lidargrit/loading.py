@@ -25,6 +25,8 @@ from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel, load_sensor
 from lidargrit.structures import RangeImage
 
+_CACHE_FORMAT = 1  # to be raised whenever projection or simulation give other pixels for the same scan
+
 
 @dataclass(frozen=True)
 class DataConfig:
@@ -43,8 +45,8 @@ class DataConfig:
         bad_scans: ``refuse`` to go on after a scan that cannot be used, or ``skip`` it and say so.
     """
 
-    train: tuple[str, ...]
-    val: tuple[str, ...]
+    train: tuple[str, ...] = ()
+    val: tuple[str, ...] = ()
     sensor: str = "hdl64e_kitti_odometry"
     columns: int = 0
     column_stride: int = 1
@@ -161,6 +163,12 @@ def seed_of(*parts: int) -> int:
     return int(np.random.SeedSequence(parts).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 
+def spread(count: int, total: int) -> list[int]:
+    """Return at most ``count`` of ``total`` indices, evenly spaced: neighbours in time are nearly the same scan."""
+    count = min(count, total)
+    return [index * total // count for index in range(count)]
+
+
 def load_range_images(
     sources: Sequence[str], config: DataConfig, reporter: Reporter | None = None, sensor: SensorModel | None = None
 ) -> RangeImages:
@@ -179,7 +187,7 @@ def load_range_images(
     names: list[str] = []
     for source in sources:
         dataset = open_dataset(source, config.bad_points)
-        if dataset.sensor not in (sensor.name, config.sensor) and not sensor.name.endswith(".json"):
+        if dataset.sensor != sensor.name and not config.sensor.endswith(".json"):
             reporter.message(f"WARNING: {source} was made by {dataset.sensor}, and is imaged as {sensor.name}")
         stem = cache_folder() / _digest(source, dataset, sensor, config)
         if (cached := _read_cache(stem)) is None:
@@ -199,23 +207,21 @@ def _project_all(
 ) -> None:
     kept: list[str] = []
     fine = sensor.fine()
-    count = min(len(dataset), config.max_scans or len(dataset))
-    wanted = [index * len(dataset) // count for index in range(count)]
-    shape = (count, fine.height, fine.width)
+    wanted = spread(config.max_scans or len(dataset), len(dataset))
+    shape = (len(wanted), fine.height, fine.width)
     with atomic_path(stem.with_suffix(".npy")) as temporary:
         pixels = np.lib.format.open_memmap(temporary, mode="w+", dtype=np.float32, shape=shape)
         if hasattr(os, "posix_fallocate"):  # a full disk is an OSError here; while pixels are set it is a bus error
             with temporary.open("r+b") as file:
                 os.posix_fallocate(file.fileno(), 0, temporary.stat().st_size)
-        with reporter.progress("projecting scans", count) as progress:
+        with reporter.progress("projecting scans", len(wanted)) as progress:
             for index in wanted:
                 try:
                     image = project(dataset.scan(index), fine, variant=config.variant)
                 except ScanError as error:
                     if config.bad_scans == "refuse":
-                        raise ScanError(
-                            error.got, error.wanted, f"{error.cure}; --set data.bad_scans=skip leaves such scans out"
-                        ) from None
+                        cure = "--set data.bad_scans=skip (in training, else --bad-scans skip) leaves such scans out"
+                        raise ScanError(error.got, error.wanted, f"{error.cure}; {cure}") from None
                     reporter.message(f"left out: {error}")
                 else:
                     pixels[len(kept)] = image.range_m.numpy()
@@ -243,8 +249,12 @@ def cache_folder() -> Path:
 
 def _digest(source: str, dataset: ScanDataset, sensor: SensorModel, config: DataConfig) -> str:
     """Name a cache by everything that its pixels depend on."""
-    files = [(str(path.resolve()), path.stat().st_size, path.stat().st_mtime_ns) for path in dataset.paths]
+    try:
+        files = [(str(path.resolve()), path.stat().st_size, path.stat().st_mtime_ns) for path in dataset.paths]
+    except OSError as error:
+        raise DataError(f"{error.filename}, which cannot be read", "files that are there", "remove the link") from None
     facts = [
+        _CACHE_FORMAT,
         __version__,
         files or source,
         len(dataset),

@@ -38,6 +38,14 @@ class Scan:
     def __post_init__(self) -> None:
         if len(self) == 0:
             raise ScanError(f"no point in {self.source}", "a full revolution", "remove the file")
+        for name in ("reflectance", "ring"):
+            values: Tensor | None = getattr(self, name)
+            if values is not None and values.shape != (len(self),):
+                raise ScanError(
+                    f"{name} of shape {tuple(values.shape)} in {self.source}",
+                    f"one for each of {len(self)} points",
+                    "fix it",
+                )
         bad = ~self.points_xyz_m.isfinite().all(dim=1)
         self._refuse(bad, "NaN or infinite coordinates")
         self._refuse((self.points_xyz_m == 0).all(dim=1), "at the origin (placeholders for no return)")
@@ -55,7 +63,7 @@ class Scan:
             raise ScanError(
                 f"{int(bad.sum())} of {len(self)} points {what} in {self.source}",
                 "finite coordinates away from the origin",
-                "remove these points, or let the reader do so with --set data.bad_points=drop",
+                "remove these points, or drop them: --set data.bad_points=drop in training, else --bad-points drop",
             )
 
     def __len__(self) -> int:
@@ -90,6 +98,14 @@ class RangeImage:
                 f"the {self.sensor.height}x{self.sensor.width} of the sensor {self.sensor.name!r}",
                 "use the sensor's own size, or sensor.with_columns(...)",
             )
+        for name in ("return_mask", "reflectance"):
+            pixels: Tensor | None = getattr(self, name)
+            if pixels is not None and pixels.shape != self.range_m.shape:
+                raise ConfigError(
+                    f"{name} of {tuple(pixels.shape)}",
+                    f"the {tuple(self.range_m.shape)} of range_m",
+                    "give all one shape",
+                )
         valid = torch.where(self.return_mask, (self.range_m > 0) & self.range_m.isfinite(), self.range_m == 0)
         if not bool(valid.all()):
             raise ScanError(

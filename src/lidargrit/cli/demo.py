@@ -20,9 +20,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run the demo and say where its results lie."""
-    from lidargrit.demo import demo
+    from lidargrit.demo import PICTURE, demo
     from lidargrit.reporting import TerminalReporter
 
-    out = options.out or Path("runs") / ("demo" if not options.data else f"demo-{Path(options.data).name}")
+    out = options.out or Path("runs") / (
+        "demo" if not options.data else f"demo-{Path(options.data.rpartition(':')[0] or options.data).resolve().name}"
+    )
     folder = demo(options.data, out, options.set, TerminalReporter())
-    print(f"done: look at {folder / 'real_reconstructed_generated.png'}; everything lies in {folder}")
+    print(f"done: look at {folder / PICTURE}; everything lies in {folder}")

@@ -17,11 +17,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--out", type=Path, default=Path("view.png"), help="the picture (default: view.png)")
     parser.add_argument("-n", "--count", type=int, default=3, help="scans of each (default: 3)")
     parser.add_argument("--seed", type=int, default=0, help="of the first generated scan")
+    parser.add_argument("--bad-points", choices=["refuse", "drop"], default="refuse", help="NaN, infinite or at 0")
+    parser.add_argument("--bad-scans", choices=["refuse", "skip"], default="refuse", help="that cannot be used")
+    parser.add_argument("--overwrite", action="store_true", help="replace a picture that is there already")
 
 
 def run(options: argparse.Namespace) -> None:
     """Draw the picture."""
+    from lidargrit.files import refuse_to_overwrite
+    from lidargrit.loading import DataConfig
     from lidargrit.viewer import view
 
-    view(options.places, options.out, options.count, options.seed)
+    refuse_to_overwrite(options.out, options.overwrite)
+    config = DataConfig(bad_points=options.bad_points, bad_scans=options.bad_scans)
+    view(options.places, options.out, options.count, options.seed, config)
     print(f"done: look at {options.out}")

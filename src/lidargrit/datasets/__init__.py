@@ -101,6 +101,8 @@ def open_dataset(source: str, bad_points: BadPoints = "refuse") -> ScanDataset:
         >>> open_dataset("simulated:100:val").name(0)
         'seed_1000000'
     """
+    if not source.strip():
+        raise DataError("an empty source", "a folder, or NAME:ROOT", "name one; a comma at the end leaves an empty one")
     head, colon, rest = source.partition(":")
     is_place = "/" in head or _is_there(head)
     if head in _discovery.names("datasets") and (colon or not is_place):

@@ -17,6 +17,19 @@ class Folder(BinDataset):
     patterns = ("**/*.bin",)
     examples = ("{index:06d}.bin", "more/{index:06d}.bin")
 
+    @classmethod
+    def matches(cls, root: Path) -> bool:
+        """Tell whether this is a folder with such a file in it, or the file itself."""
+        return cls._is_scan(root) or super().matches(root)
+
+    @classmethod
+    def _find(cls, root: Path) -> list[Path]:
+        return [root] if cls._is_scan(root) else super()._find(root)
+
+    @staticmethod
+    def _is_scan(root: Path) -> bool:
+        return root.suffix == ".bin" and root.is_file()
+
     @staticmethod
     def sequence_of(relative: Path) -> str:
         """Name the folder of a file."""

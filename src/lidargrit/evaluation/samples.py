@@ -78,7 +78,11 @@ def write_samples(
 
 
 def read_samples(folder: Path, count: int | None = None) -> RangeImages:
-    """Return the samples of a folder in the order of their seeds, at most ``count`` of them; read when asked for.
+    """Return the samples of a folder in the order of their seeds; read when asked for.
+
+    Args:
+        folder: that :func:`write_samples` wrote.
+        count: at most so many, those of the first seeds: seeds have no order that would favour any.
 
     Raises:
         DataError: no samples in the folder.

@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from lidargrit.datasets import open_dataset
-from lidargrit.datasets._files import read_bin
-from lidargrit.datasets.folder import Folder
 from lidargrit.errors import ConfigError
 from lidargrit.evaluation.reconstruction import ReconstructionErrors, ReconstructionScore
 from lidargrit.evaluation.samples import is_sample_folder, read_samples
 from lidargrit.generators import load
 from lidargrit.generators.lidargrit import LidarGrit
-from lidargrit.loading import DataConfig, RangeImages, load_range_images
+from lidargrit.loading import DataConfig, RangeImages, load_range_images, spread
 from lidargrit.metrics import load_metric
-from lidargrit.projection import Variant, project
 from lidargrit.reporting import Reporter
-from lidargrit.sensors import SensorModel, load_sensor
+from lidargrit.sensors import SensorModel
 from lidargrit.structures import MetricResult
 from lidargrit.tokenizers import Tokenizer
 
@@ -31,8 +28,7 @@ _BATCH = 16
 def open_images(
     source: str,
     sensor: SensorModel | None = None,
-    max_scans: int = 0,
-    variant: Variant = "exact",
+    config: DataConfig | None = None,
     reporter: Reporter | None = None,
 ) -> RangeImages:
     """Open a folder of samples, or any source of scans as range images of a sensor.
@@ -40,19 +36,14 @@ def open_images(
     Args:
         source: a folder of samples, or what data sets are opened by ("kitti_raw:ROOT:SPLIT", "FOLDER", ...).
         sensor: of scans; the data set's own if not given. Samples have theirs.
-        max_scans: at most so many; 0 for all.
-        variant: of the projection of scans.
+        config: how scans are read and projected, and how many at most; its sources and its sensor are not looked at.
         reporter: hears of the projection.
     """
-    place = Path(source)
-    if is_sample_folder(place):
-        return read_samples(place, max_scans or None)
-    if place.is_file() and place.suffix == ".bin":
-        image = project(read_bin(place), sensor or load_sensor(Folder.sensor), variant=variant)
-        return RangeImages(image.sensor, [image.range_m[None].numpy()], [str(place)])
-    dataset = open_dataset(source)
-    config = DataConfig(train=(source,), val=(), sensor=dataset.sensor, max_scans=max_scans, variant=variant)
-    return load_range_images((source,), config, reporter, sensor)
+    config = config or DataConfig()
+    if is_sample_folder(Path(source)):
+        return read_samples(Path(source), config.max_scans or None)
+    dataset = open_dataset(source, config.bad_points)
+    return load_range_images((source,), replace(config, sensor=dataset.sensor), reporter, sensor)
 
 
 def evaluate(
@@ -61,7 +52,7 @@ def evaluate(
     """Score generated range images against real ones; equal numbers of both are compared.
 
     Args:
-        generated: the first ones are taken if there are more of them than of
+        generated: where there are more of them than of the others, they are taken evenly spaced.
         reference: likewise.
         metrics: names of metrics; each is computed in every variant it has, or in
         variant: this one.
@@ -80,9 +71,11 @@ def evaluate(
     count = min(len(generated), len(reference))
     classes = [load_metric(name) for name in metrics]
     running = [cls(variant=each, seed=seed) for cls in classes for each in ([variant] if variant else cls.variants)]
+    taken, real = spread(count, len(generated)), spread(count, len(reference))
     for first in range(0, count, _BATCH):
-        indices = range(first, min(first + _BATCH, count))
-        generated_batch, real_batch = generated.batch(indices), reference.batch(indices)
+        generated_batch, real_batch = (
+            images.batch(chosen[first : first + _BATCH]) for images, chosen in ((generated, taken), (reference, real))
+        )
         for metric in running:
             metric.update(generated_batch, real=False)
             metric.update(real_batch, real=True)
@@ -100,9 +93,7 @@ def score_reconstruction(tokenizer: Tokenizer, images: RangeImages) -> Reconstru
     return score.compute()
 
 
-def evaluate_run(
-    run_folder: Path, source: str, max_scans: int, variant: Variant, reporter: Reporter
-) -> dict[str, float]:
+def evaluate_run(run_folder: Path, source: str, config: DataConfig, reporter: Reporter) -> dict[str, float]:
     """Return how well the tokenizer of a finished run gives back scans, by the name of each error.
 
     Raises:
@@ -111,7 +102,7 @@ def evaluate_run(
     generator = load(run_folder)
     if not isinstance(generator, LidarGrit):
         raise ConfigError(f"a run of {type(generator).__name__}", "a generator with a tokenizer", "sample and score it")
-    images = open_images(source, generator.sensor, max_scans, variant, reporter)
+    images = open_images(source, generator.sensor, config, reporter)
     return asdict(score_reconstruction(generator.tokenizer, images))
 
 

@@ -86,7 +86,8 @@ class NextToken(nn.Module):
 
     def forward(self, images: RangeImage, rng: torch.Generator) -> dict[str, Tensor]:
         """Return eq. 6 of the paper per token, beside it that of a model which knows only how often tokens occur."""
-        with torch.no_grad():
+        # Tokens are made in full precision, as they are when a scan is encoded outside of training.
+        with torch.no_grad(), torch.autocast(images.range_m.device.type, enabled=False):
             self._frozen[0].to(images.range_m.device)
             tokens = self._frozen[0].encode(images).tokens.flatten(1)
             if self.training:

@@ -52,7 +52,10 @@ class VectorQuantiser(nn.Module):
 
     def forward(self, z: Float[Tensor, "B D h w"], rng: torch.Generator | None = None) -> Quantised:
         """Replace every latent by its nearest code; ``rng`` draws the latents that dead codes restart from."""
-        z = z.float()  # distances of nearby codes need single precision, whatever the network runs in
+        with torch.autocast(z.device.type, enabled=False):  # codes lie too close together for 16 bits
+            return self._quantise(z.float(), rng)
+
+    def _quantise(self, z: Tensor, rng: torch.Generator | None) -> Quantised:
         flat = z.movedim(1, -1).flatten(0, -2)
         tokens = self.nearest(flat)
         if self.training:

@@ -116,10 +116,12 @@ def _exact_spherical_rows(scan: Scan, sensor: SensorModel) -> np.ndarray:
 def _exact_unfolding_rows(scan: Scan, sensor: SensorModel) -> np.ndarray:
     if scan.ring is not None:
         ring = scan.ring.numpy().astype(np.int64)
+        fits = int(ring.min()) >= 0 and int(ring.max()) < sensor.height  # a ring without any return is no fault
     else:
         ring = unfolding.rings_from_firing_order(scan.points_xyz_m.numpy())
-    rings = int(ring.max()) + 1
-    if rings != sensor.height:
+        fits = int(ring.max()) + 1 == sensor.height
+    if not fits:
+        rings = int(ring.max()) + 1
         raise ScanError(
             f"{rings} rings in {scan.source}",
             f"the {sensor.height} rings of the sensor {sensor.name!r}, in firing order",

@@ -44,6 +44,15 @@ class SensorModel:
     source: str = ""
 
     def __post_init__(self) -> None:
+        elevation, azimuth = self.elevation_rad.shape, self.azimuth_rad.shape
+        if not (
+            len(elevation) == len(azimuth) == 2 and azimuth[0] in (1, elevation[0]) and elevation[1] in (1, azimuth[1])
+        ):
+            raise ConfigError(
+                f"elevations of shape {tuple(elevation)} and azimuths of {tuple(azimuth)} for the sensor {self.name!r}",
+                "(H, 1) and (1, W), or (H, W)",
+                "put each elevation into a row of its own and all azimuths into one row",
+            )
         if not 0 < self.range_min_m < self.range_max_m:
             raise ConfigError(
                 f"range limits {self.range_min_m} to {self.range_max_m} m for the sensor {self.name!r}",
@@ -83,6 +92,12 @@ class SensorModel:
                 f"{columns} columns, every {stride}th kept",
                 "a positive multiple of the stride",
                 "change one of the two",
+            )
+        if self.elevation_rad.shape[1] > 1 or self.azimuth_rad.shape[0] > 1:
+            raise ConfigError(
+                f"another number of columns for {self.name!r}, which has angles for every pixel",
+                "a sensor with one elevation a row and one azimuth a column",
+                "use the sensor as it is",
             )
         return replace(self, azimuth_rad=column_azimuths_rad(columns, stride), column_stride=stride)
 
@@ -134,6 +149,8 @@ def load_sensor(name: str) -> SensorModel:
     if name.endswith(".json"):
         try:
             return SensorModel.from_json(json.loads(Path(name).read_text(encoding="utf-8")))
+        except ConfigError:
+            raise
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ConfigError(
                 f"the sensor file {name}, which cannot be read ({error})",

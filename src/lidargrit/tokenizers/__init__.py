@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from lidargrit import _discovery
+from lidargrit.errors import ConfigError
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage, TokenGrid
 
@@ -51,13 +52,21 @@ class Tokenizer(nn.Module, ABC):
             tokens: (B, h, w).
             mask: ``threshold`` keeps a pixel whose P(return) is at least 0.5 (the paper); ``bernoulli`` draws it with
                 that probability (the authors' program).
-            uniform: the random numbers in [0, 1) that ``bernoulli`` compares with; drawn anew if not given.
+            uniform: the random numbers in [0, 1) that ``bernoulli`` compares with.
+
+        Raises:
+            ConfigError: ``bernoulli`` without random numbers.
         """
         range_m, return_logits = self.decode_parts(tokens)
         if mask == "threshold":
             return_mask = return_logits >= 0
+        elif uniform is None:
+            raise ConfigError(
+                "a Bernoulli mask without random numbers",
+                "uniform (B, H, W) in [0, 1)",
+                "e.g. torch.rand(size, generator=rng)",
+            )
         else:
-            uniform = torch.rand_like(return_logits) if uniform is None else uniform
             return_mask = uniform < return_logits.sigmoid()
         return RangeImage.masked(range_m, return_mask, self.sensor)
 

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
+from lidargrit.errors import CheckpointError
 from lidargrit.files import load_exactly, read_tensors, write_tensors
 from lidargrit.training.optimiser import WeightAverage
 
 
 def save_checkpoint(
-    path: Path, objective: nn.Module, average: WeightAverage, optimiser: torch.optim.Optimizer, scans_seen: int
+    path: Path,
+    objective: nn.Module,
+    average: WeightAverage,
+    optimiser: torch.optim.Optimizer,
+    scans_seen: int,
+    built_on: str,
 ) -> None:
     """Write everything that the next step depends on, atomically: an interrupted save leaves the file before it."""
     tensors: dict[str, Tensor] = {}
@@ -20,28 +27,42 @@ def save_checkpoint(
     tensors |= {f"average.{name}": tensor for name, tensor in average.objective.state_dict().items()}
     for index, state in optimiser.state_dict()["state"].items():
         tensors |= {f"optimiser.{index}.{name}": torch.as_tensor(value) for name, value in state.items()}
-    write_tensors(path, tensors, {"scans_seen": scans_seen})
+    write_tensors(path, tensors, {"scans_seen": scans_seen, "built_on": built_on})
 
 
 def load_checkpoint(
-    path: Path, objective: nn.Module, average: WeightAverage, optimiser: torch.optim.Optimizer | None
+    path: Path, objective: nn.Module, average: WeightAverage, optimiser: torch.optim.Optimizer, built_on: str
 ) -> int:
-    """Load what :func:`save_checkpoint` wrote and return the scans seen; without an optimiser, weights only.
+    """Load what :func:`save_checkpoint` wrote and return the scans seen.
 
     Raises:
-        CheckpointError: a damaged file, or one of another configuration.
+        CheckpointError: a damaged file, one of another configuration, or of a stage that was built on other weights.
     """
     tensors, about = read_tensors(path)
+    if about.get("built_on", "") != built_on:
+        raise CheckpointError(
+            f"{path}, which was trained on top of another earlier stage",
+            "the stage that this run's earlier stages led to",
+            "remove the file, and the stage is trained again",
+        )
     load_exactly(objective, _below(tensors, "objective."), path)
     load_exactly(average.objective, _below(tensors, "average."), path)
-    if optimiser is not None:
-        state: dict[int, dict[str, Tensor]] = {}
-        for name, tensor in _below(tensors, "optimiser.").items():
-            index, _, key = name.partition(".")
-            state.setdefault(int(index), {})[key] = tensor
-        optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
+    state: dict[int, dict[str, Tensor]] = {}
+    for name, tensor in _below(tensors, "optimiser.").items():
+        index, _, key = name.partition(".")
+        state.setdefault(int(index), {})[key] = tensor
+    optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
     return int(about["scans_seen"])
 
 
 def _below(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
+
+
+def fingerprint(module: nn.Module) -> str:
+    """Return a hash of a module's weights."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(module.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import logging
+import os
+from collections.abc import Callable
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from lidargrit.structures import RangeImage
@@ -16,30 +17,37 @@ class Engine:
     """Runs an objective on this machine's device, in one process or in each of several under a launcher.
 
     Args:
-        precision: ``fp32`` or ``bf16``.
+        precision: ``fp32``, ``bf16``, or ``auto`` for the second where the machine has instructions for it.
     """
 
-    def __init__(self, precision: Literal["fp32", "bf16"]) -> None:
+    def __init__(self, precision: Literal["fp32", "bf16", "auto"]) -> None:
         from lightning_fabric import Fabric  # noqa: PLC0415  takes a second, and only training needs it
 
         logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # it tells the precision at every start
-        self._fabric: Any = Fabric(precision="bf16-mixed" if precision == "bf16" else "32-true")
+        # One device, unless a launcher such as torchrun began this process as one of several.
+        launched = "LOCAL_RANK" in os.environ
+        short = precision == "bf16" or (precision == "auto" and has_bf16())
+        self._fabric: Any = Fabric(precision="bf16-mixed" if short else "32-true", devices="auto" if launched else 1)
         self._fabric.launch()
         self.device, self.rank, self.world_size = self._fabric.device, self._fabric.global_rank, self._fabric.world_size
 
     def set_up(self, objective: nn.Module, optimiser: torch.optim.Optimizer) -> None:
         """Place an objective on the device and spread it over the processes."""
-        self._objective, self._optimiser = self._fabric.setup(_TensorDoor(objective), optimiser)
+        self._objective, self._optimiser = self._fabric.setup(_Door(objective), optimiser)
 
     def step(self, images: RangeImage, seed: int, gradient_clip: float) -> dict[str, Tensor]:
-        """Take one step and return the objective's terms; no weight changes if the loss is not finite."""
+        """Take one step and return the objective's terms; no weight changes if loss or gradient are not finite."""
         self._objective.train()
-        terms = self._objective(images.range_m, images.return_mask, seed)
+        terms = self._objective(lambda: images, seed)
         if not bool(terms["loss"].isfinite()):
             return terms
         self._fabric.backward(terms["loss"])
         if gradient_clip:
-            self._fabric.clip_gradients(self._objective, self._optimiser, max_norm=gradient_clip)
+            norm = self._fabric.clip_gradients(
+                self._objective, self._optimiser, max_norm=gradient_clip, error_if_nonfinite=False
+            )
+            if not bool(norm.isfinite()):
+                return {**terms, "loss": norm}
         self._optimiser.step()
         self._optimiser.zero_grad()
         return {name: term.detach() for name, term in terms.items()}
@@ -54,16 +62,21 @@ class Engine:
         return {name: float(term) for name, term in terms.items()}
 
 
-class _TensorDoor(nn.Module):
-    """Takes tensors and makes the range image inside, for the engine converts and scatters tensors only."""
+def has_bf16() -> bool:
+    """Tell whether this machine computes in bfloat16 natively."""
+    if torch.cuda.is_available():
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    # Torch has no public question for this yet; a torch without this one is taken for a machine without bfloat16.
+    return bool(getattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)())
+
+
+class _Door(nn.Module):
+    """Takes a function that returns the images: the engine would round tensors, and so all ranges, to its precision."""
 
     def __init__(self, objective: nn.Module) -> None:
         super().__init__()
         self.objective = objective
-        self._sensor: Any = objective.sensor
 
-    def forward(
-        self, range_m: Float[Tensor, "B H W"], return_mask: Bool[Tensor, "B H W"], seed: int
-    ) -> dict[str, Tensor]:
-        rng = torch.Generator(range_m.device).manual_seed(seed)
-        return self.objective(RangeImage(range_m, return_mask, self._sensor), rng)
+    def forward(self, images: Callable[[], RangeImage], seed: int) -> dict[str, Tensor]:
+        device = next(self.objective.parameters()).device
+        return self.objective(images(), torch.Generator(device).manual_seed(seed))

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from lidargrit.errors import OutputError, TrainingError
 from lidargrit.files import write_text
-from lidargrit.loading import Batches, RangeImages, seed_of
+from lidargrit.loading import Batches, RangeImages, seed_of, spread
 from lidargrit.reporting import Reporter
 from lidargrit.training.checkpoint import load_checkpoint, save_checkpoint
 from lidargrit.training.engine import Engine
@@ -32,6 +32,8 @@ class Fit:
         config: how it learns.
         folder: where ``checkpoint.safetensors`` and ``log.jsonl`` lie.
         seed: of order, augmentation, dropout and draws.
+        reporter: hears of the progress.
+        built_on: fingerprint of the earlier stages' weights, which a checkpoint must share.
     """
 
     objective: nn.Module
@@ -39,6 +41,7 @@ class Fit:
     folder: Path
     seed: int
     reporter: Reporter
+    built_on: str = ""
 
     def __post_init__(self) -> None:
         self.engine = Engine(self.config.precision)
@@ -47,7 +50,9 @@ class Fit:
         self.average = WeightAverage(self.objective, self.config.average_over_scans)
         self.scans_seen = 0
         if self.checkpoint.exists():
-            self.scans_seen = load_checkpoint(self.checkpoint, self.objective, self.average, self.optimiser)
+            self.scans_seen = load_checkpoint(
+                self.checkpoint, self.objective, self.average, self.optimiser, self.built_on
+            )
         self._trim_log()
 
     @property
@@ -72,13 +77,12 @@ class Fit:
             self.engine.rank,
             self.engine.world_size,
         )
-        begun, step = time.monotonic(), 0
+        begun = time.monotonic()
         with self.reporter.progress(what, config.scans, self.scans_seen) as progress:
             while self.scans_seen < config.scans:
                 terms = self._step(batches)
                 progress.advance(config.batch_size, f"loss {float(terms['loss']):.4f}")
-                step += 1
-                if step % _LOG_EVERY_STEPS == 0:
+                if self._passed(_LOG_EVERY_STEPS * config.batch_size):
                     self._log("train", {name: float(term) for name, term in terms.items()}, time.monotonic() - begun)
                 if self._passed(config.validate_every) or self.scans_seen >= config.scans:
                     self._log("val", self.validate(val), time.monotonic() - begun)
@@ -87,14 +91,14 @@ class Fit:
         return self.average.objective.eval()
 
     def validate(self, images: RangeImages) -> dict[str, float]:
-        """Return the mean terms of the averaged objective over the first validation scans."""
-        count = min(len(images), self.config.validation_scans)
+        """Return the mean terms of the averaged objective over validation scans, evenly spaced."""
+        chosen = spread(self.config.validation_scans, len(images))
         totals: dict[str, float] = {}
-        for first in range(0, count, self.config.batch_size):
-            indices = range(first, min(first + self.config.batch_size, count))
+        for first in range(0, len(chosen), self.config.batch_size):
+            indices = chosen[first : first + self.config.batch_size]
             terms = self.engine.evaluate(self.average.objective, images.batch(indices), seed_of(self.seed, 3, first))
             for name, value in terms.items():
-                totals[name] = totals.get(name, 0.0) + value * len(indices) / count
+                totals[name] = totals.get(name, 0.0) + value * len(indices) / len(chosen)
         return totals
 
     def _step(self, batches: Batches) -> dict[str, Tensor]:
@@ -105,9 +109,9 @@ class Fit:
         terms = self.engine.step(batches.at(self.scans_seen).to(self.engine.device), seed, self.config.gradient_clip)
         if not bool(terms["loss"].isfinite()):
             raise TrainingError(
-                f"a loss of {float(terms['loss'].detach())} after {self.scans_seen} scans",
-                "a finite number",
-                f"lower training.*.learning_rate; the last good state is {self.checkpoint}",
+                f"a loss or gradient of {float(terms['loss'].detach())} after {self.scans_seen} scans",
+                "finite numbers",
+                f"use a new folder and a lower training.*.learning_rate; the last checkpoint is {self.checkpoint}",
             )
         self.scans_seen += self.config.batch_size
         self.average.update(self.objective, self.scans_seen, self.config.batch_size)
@@ -118,7 +122,9 @@ class Fit:
 
     def _save(self) -> None:
         if self.engine.rank == 0:
-            save_checkpoint(self.checkpoint, self.objective, self.average, self.optimiser, self.scans_seen)
+            save_checkpoint(
+                self.checkpoint, self.objective, self.average, self.optimiser, self.scans_seen, self.built_on
+            )
 
     def _log(self, split: str, terms: dict[str, float], seconds: float) -> None:
         if self.engine.rank:
@@ -142,7 +148,7 @@ class Fit:
     def _trim_log(self) -> None:
         """Forget what was logged after the checkpoint that the stage goes on from: it will be logged again."""
         log = self.folder / "log.jsonl"
-        if log.is_file():
+        if log.is_file() and self.engine.rank == 0:
             kept = []
             for line in log.read_text(encoding="utf-8").splitlines():
                 try:

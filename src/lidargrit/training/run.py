@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import platform
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from lidargrit.files import is_taken, read_json, write_json
 from lidargrit.generators import Generator, load_class
 from lidargrit.loading import RangeImages, load_range_images, seed_of
 from lidargrit.reporting import Reporter
+from lidargrit.training.checkpoint import fingerprint
 from lidargrit.training.fit import Fit
 from lidargrit.training.settings import Recipe
 
@@ -34,21 +36,23 @@ def train(recipe: Recipe, folder: Path, reporter: Reporter | None = None) -> Gen
         TrainingError: the loss is not finite.
     """
     reporter = reporter or Reporter()
-    described = _described(folder, recipe)
+    _check_folder(folder, recipe)
     train_images = load_range_images(recipe.data.train, recipe.data, reporter)
     val_images = load_range_images(recipe.data.val, recipe.data, reporter)
     _warn_of_overlap(train_images, val_images, reporter)
-    torch.manual_seed(seed_of(recipe.seed, 9))
-    generator = load_class(recipe.generator)(recipe.model, recipe.data.load_sensor())
-    if not (folder / RUN_FILE).exists():  # only now: a recipe that cannot be used takes no folder
-        write_json(folder / RUN_FILE, described)
-    for number, stage in enumerate(generator.stages):
-        fit = Fit(
-            generator.objective(stage), recipe.training[stage], folder / stage, seed_of(recipe.seed, number), reporter
-        )
-        generator.finish(stage, fit.run(train_images, val_images, f"training {stage}"))
+    with torch.random.fork_rng(range(torch.cuda.device_count())):  # the caller's random numbers are the caller's
+        torch.manual_seed(seed_of(recipe.seed, 9))
+        generator = load_class(recipe.generator)(recipe.model, recipe.data.load_sensor())
+        _claim(folder, recipe, train_images, val_images)
+        built_on = ""
+        for number, stage in enumerate(generator.stages):
+            seed, objective = seed_of(recipe.seed, number), generator.objective(stage)
+            fit = Fit(objective, recipe.training[stage], folder / stage, seed, reporter, built_on)
+            trained = fit.run(train_images, val_images, f"training {stage}")
+            generator.finish(stage, trained)
+            built_on = fingerprint(trained)
     generator.save(folder)
-    return generator.eval()
+    return generator.cpu().eval()
 
 
 def plan(recipe: Recipe) -> str:
@@ -65,18 +69,10 @@ def plan(recipe: Recipe) -> str:
     return "\n".join(lines)
 
 
-def _described(folder: Path, recipe: Recipe) -> dict[str, Any]:
-    """Return what run.json says of a run, having checked that the folder is free, or this recipe's already."""
-    described: dict[str, Any] = {
-        "recipe": configuration.to_json(recipe),
-        "command": sys.argv,
-        "lidargrit": __version__,
-        "commit": _commit(),
-        "torch": torch.__version__,
-        "python": platform.python_version(),
-    }
+def _check_folder(folder: Path, recipe: Recipe) -> None:
+    """Refuse a folder that is neither free nor this recipe's already."""
     if (folder / RUN_FILE).exists():
-        about, ours = read_json(folder / RUN_FILE), described["recipe"]
+        about, ours = read_json(folder / RUN_FILE), configuration.to_json(recipe)
         theirs = about.get("recipe") if isinstance(about, dict) else None
         if not isinstance(theirs, dict):
             raise CheckpointError(f"{folder / RUN_FILE} without a recipe", "what lidargrit wrote", "restore the file")
@@ -89,14 +85,41 @@ def _described(folder: Path, recipe: Recipe) -> dict[str, Any]:
                 "an empty folder, or the folder of this very recipe",
                 "choose another folder, or use the settings that the run began with",
             )
-        return described
-    if is_taken(folder, RUN_FILE):
+    elif is_taken(folder, RUN_FILE):
         raise OutputError(
             f"{folder}, which is not empty and holds no run",
             "an empty folder, or one that this recipe began",
             "choose another folder",
         )
-    return described
+
+
+def _claim(folder: Path, recipe: Recipe, train_images: RangeImages, val_images: RangeImages) -> None:
+    """Write what the run is, once all of it is known to be usable; or find that its data are still the same."""
+    data = {
+        "sensor": train_images.sensor.to_json(),
+        "train": hashlib.sha256("\n".join(train_images.names).encode()).hexdigest(),
+        "val": hashlib.sha256("\n".join(val_images.names).encode()).hexdigest(),
+    }
+    if (folder / RUN_FILE).exists():
+        before = read_json(folder / RUN_FILE).get("data", data)
+        for name, value in data.items():
+            if before.get(name) != value:
+                raise OutputError(
+                    f"{folder}, whose run began with {'another sensor' if name == 'sensor' else f'other {name} scans'}",
+                    "what it began with",
+                    "restore it, or choose another folder",
+                )
+        return
+    about: dict[str, Any] = {
+        "recipe": configuration.to_json(recipe),
+        "data": data,
+        "command": sys.argv,
+        "lidargrit": __version__,
+        "commit": _commit(),
+        "torch": torch.__version__,
+        "python": platform.python_version(),
+    }
+    write_json(folder / RUN_FILE, about)
 
 
 def _warn_of_overlap(train_images: RangeImages, val_images: RangeImages, reporter: Reporter) -> None:

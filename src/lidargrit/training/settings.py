@@ -25,7 +25,8 @@ class FitConfig:
         weight_decay: on the weights of linear layers only, as in the reference.
         gradient_clip: largest norm of the gradient; 0 for none.
         average_over_scans: half-life of the moving average of the weights that is sampled and scored; 0 for none.
-        precision: ``bf16`` runs convolutions and products in 16 bits, sums and losses in 32.
+        precision: ``bf16`` runs convolutions and products in 16 bits, sums and losses in 32; ``auto`` does so where the
+            machine has instructions for it, for elsewhere it is many times slower.
         augmentations: see lidargrit.augmentation.
         any_columns: where the sensor keeps every n-th column, begin at any of the first n each time a scan is seen: n
             times as many images of the same scans. The reference always keeps the first.
@@ -43,7 +44,7 @@ class FitConfig:
     weight_decay: float = 0.0
     gradient_clip: float = 1.0
     average_over_scans: int = 1000
-    precision: Literal["fp32", "bf16"] = "fp32"
+    precision: Literal["fp32", "bf16", "auto"] = "fp32"
     augmentations: tuple[Augmentation, ...] = ()
     any_columns: bool = False
     validate_every: int = 1000

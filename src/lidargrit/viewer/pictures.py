@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +14,8 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, ListedColormap, LogNorm, Normalize
 from matplotlib.figure import Figure
 
-from lidargrit.errors import ConfigError, OutputError
+from lidargrit.errors import ConfigError
+from lidargrit.files import atomic_path
 from lidargrit.projection import points_of_pixels
 from lidargrit.structures import RangeImage
 
@@ -66,7 +65,8 @@ def draw_comparison(
     for row, panel in enumerate(panels):
         _draw_row(figure, height, _FOOT + _ROW * (len(panels) - 1 - row), panel, scales)
     _draw_scales(figure, height, scales)
-    _save(figure, path)
+    with atomic_path(path) as unfinished:
+        figure.savefig(unfinished, format="png", dpi=_DOTS_PER_INCH)
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,20 +192,3 @@ def _draw_scales(figure: Figure, height: float, scales: _Scales) -> None:
     bar = figure.add_axes((11.3 / _WIDTH, at[0], 2.25 / _WIDTH, at[1]))
     drawn = figure.colorbar(ScalarMappable(scales.height_norm, scales.height_colours), bar, orientation="horizontal")
     drawn.set_label("from above: height over the sensor [m]", fontsize=10, labelpad=1)
-
-
-def _save(figure: Figure, path: Path) -> None:
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(unfinished, format="png", dpi=_DOTS_PER_INCH)
-        os.replace(unfinished, path)
-    except OSError as error:
-        raise OutputError(
-            f"{path}, which cannot be written ({error.strerror or error})",
-            "a place for a PNG file",
-            "choose another path",
-        ) from None
-    finally:
-        with contextlib.suppress(OSError):  # gone already, or its folder never was
-            unfinished.unlink()

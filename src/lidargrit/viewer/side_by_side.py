@@ -11,12 +11,13 @@ from lidargrit.errors import ConfigError
 from lidargrit.evaluation.score import open_images
 from lidargrit.generators import SamplingConfig, is_run, load
 from lidargrit.generators.lidargrit import LidarGrit
+from lidargrit.loading import DataConfig, spread
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 from lidargrit.viewer.pictures import draw_comparison
 
 
-def view(places: Sequence[str], picture: Path, count: int = 3, seed: int = 0) -> None:
+def view(places: Sequence[str], picture: Path, count: int = 3, seed: int = 0, config: DataConfig | None = None) -> None:
     """Draw scans, samples and what a run makes of them.
 
     Args:
@@ -25,6 +26,7 @@ def view(places: Sequence[str], picture: Path, count: int = 3, seed: int = 0) ->
         picture: the PNG.
         count: scans of each, evenly spaced.
         seed: of the first generated scan.
+        config: how scans are read and projected.
     """
     if count < 1:
         raise ConfigError(f"{count} scans to draw", "1 to 8", "correct the number")
@@ -34,9 +36,8 @@ def view(places: Sequence[str], picture: Path, count: int = 3, seed: int = 0) ->
     groups: dict[str, RangeImage] = {}
     for place in places:
         if place not in runs:
-            images = open_images(place, sensor)
-            chosen = min(count, len(images))
-            groups[_short(place)] = images.batch([index * len(images) // chosen for index in range(chosen)])
+            images = open_images(place, sensor, config)
+            groups[_short(place)] = images.batch(spread(count, len(images)))
     scans = dict(groups)
     for place, generator in generators.items():
         if scans and isinstance(generator, LidarGrit):
