@@ -18,18 +18,12 @@ from lidargrit.cli import main
 from lidargrit.datasets import load
 from lidargrit.datasets._files import read_bin
 from lidargrit.evaluation.samples import read_samples
+from tiny_runs import MODEL
 
-TINY = [  # 64x64 range images, 8x8 tokens
+TINY = [
     "data.train=[simulated:6:train]",
     "data.val=[simulated:2:val]",
-    "data.columns=512",
-    "data.column_stride=8",
-    "model.tokenizer.channel_multipliers=[1,1,1,1]",
-    "model.tokenizer.code_dim=8",
-    "model.tokenizer.num_codes=32",
-    "model.transformer.layers=1",
-    "model.transformer.heads=2",
-    "model.transformer.width=16",
+    *MODEL,
     "training.tokenizer.scans=8",
     "training.transformer.scans=8",
 ]

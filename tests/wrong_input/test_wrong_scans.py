@@ -5,9 +5,9 @@ import shutil
 
 import numpy as np
 import pytest
-from tiny_runs import MODEL, SHORT, SIMULATED, train_words
 
 from lidargrit.cli import main
+from tiny_runs import MODEL, SHORT, SIMULATED, train_words
 
 
 def changed(rows: np.ndarray, name: str) -> bytes:
