@@ -66,7 +66,7 @@ def test_the_cache_is_used_and_knows_when_it_is_stale(tree, monkeypatch):
 
 def test_a_failed_projection_leaves_no_cache_behind(tree, cache):
     KittiOdometry(tree).paths[3].write_bytes(b"")
-    with pytest.raises(ScanError, match=r"bad_scans=skip .* leaves such scans out"):
+    with pytest.raises(ScanError, match=r"leave such scans out by --set data.bad_scans=skip"):
         load(tree)
     assert not [path for path in cache.iterdir() if path.suffix in (".npy", ".json")]
     images, _ = load(tree, bad_scans="skip")

@@ -220,8 +220,8 @@ def _project_all(
                     image = project(dataset.scan(index), fine, variant=config.variant)
                 except ScanError as error:
                     if config.bad_scans == "refuse":
-                        cure = "--set data.bad_scans=skip (in training, else --bad-scans skip) leaves such scans out"
-                        raise ScanError(error.got, error.wanted, f"{error.cure}; {cure}") from None
+                        leave_out = "leave such scans out by --set data.bad_scans=skip (train) or --bad-scans skip"
+                        raise ScanError(error.got, error.wanted, f"{error.cure}, or {leave_out}") from None
                     reporter.message(f"left out: {error}")
                 else:
                     pixels[len(kept)] = image.range_m.numpy()

@@ -55,7 +55,9 @@ class Scan:
                 raise ScanError(
                     f"reflectance from {low:g} to {high:g} in {self.source}",
                     "values in [0, 1]",
-                    "scale the fourth column, e.g. divide an intensity of 0..255 by 255",
+                    "scale the fourth column, e.g. divide an intensity of 0..255 by 255"
+                    if low >= 0
+                    else "check the layout: the file may have three or five columns, not x, y, z, reflectance",
                 )
 
     def _refuse(self, bad: Bool[Tensor, "n"], what: str) -> None:
@@ -63,7 +65,7 @@ class Scan:
             raise ScanError(
                 f"{int(bad.sum())} of {len(self)} points {what} in {self.source}",
                 "finite coordinates away from the origin",
-                "remove these points, or drop them: --set data.bad_points=drop in training, else --bad-points drop",
+                "remove these points, or drop them by --set data.bad_points=drop (train) or --bad-points drop",
             )
 
     def __len__(self) -> int:
