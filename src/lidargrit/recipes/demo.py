@@ -11,7 +11,7 @@ RECIPE = replace(
     training={
         "tokenizer": replace(small.RECIPE.training["tokenizer"], scans=2400, validate_every=800, checkpoint_every=400),
         "transformer": replace(
-            small.RECIPE.training["transformer"], scans=3600, validate_every=1200, checkpoint_every=400
+            small.RECIPE.training["transformer"], scans=4800, validate_every=1600, checkpoint_every=400
         ),
     },
 )
