@@ -39,7 +39,7 @@ def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter
     if data is not None:
         recipe = replace(recipe, data=divided(data, reporter))
     recipe = override(recipe, settings)
-    reporter.message("lidargrit demo: about 8 minutes on two cores; stop it at any time, the same command goes on")
+    reporter.message("lidargrit demo: about 9 minutes on two cores; stop it at any time, the same command goes on")
     generator = train(recipe, folder, reporter)
     assert isinstance(generator, LidarGrit)
     val = load_range_images(recipe.data.val, recipe.data, reporter)
