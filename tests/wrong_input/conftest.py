@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_runs import contents, the_one_line, train_words
 
 from lidargrit.cli import main
 from lidargrit.datasets import load
+from tiny_runs import contents, the_one_line, train_words
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -13,12 +13,12 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from tiny_runs import LONG, contents, the_one_line, train_words
 
 from lidargrit import reporting
 from lidargrit.cli import main
 from lidargrit.evaluation.samples import read_samples
 from lidargrit.files import read_tensors
+from tiny_runs import LONG, contents, the_one_line, train_words
 
 
 class Interrupted(reporting.TerminalReporter):

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tiny_runs import the_one_line, train_words
 
 from lidargrit.cli import main
 from lidargrit.evaluation.samples import read_samples
 from lidargrit.loading import DataConfig, load_range_images
+from tiny_runs import the_one_line, train_words
 
 
 def test_a_folder_that_holds_another_run(refused, run_folder):
