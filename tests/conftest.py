@@ -9,6 +9,8 @@ import torch
 
 SHARED = Path(os.environ.get("LIDARGRIT_SHARED", Path(__file__).resolve().parents[2] / "shared"))
 
+# Commands that tests kill, or let run out of disk, would leave cut bytecode behind for all that follow.
+os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
 torch.set_num_threads(1)  # two threads while another process runs can be many times slower
 
 

@@ -51,6 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     try:
         options.run(options)
+        sys.stdout.flush()  # here, where a closed pipe is caught, and not when Python ends
     except LidarGritError as error:
         if options.debug:
             raise
