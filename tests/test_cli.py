@@ -146,7 +146,7 @@ def test_sampling_options_reach_the_model(run_folder, tmp_path, typed):
     images = read_samples(tmp_path).batch([0, 1])
     assert torch.equal(images.range_m[0], images.range_m[1]), "the likeliest tokens do not depend on the seed"
     manifest = json.loads((tmp_path / "samples.json").read_text())
-    assert manifest["sampling"] == {"temperature": 0.0, "top_k": 100, "top_p": 1.0, "mask": "threshold"}
+    assert manifest["sampling"] == {"temperature": 0.0, "top_k": 0, "top_p": 1.0, "mask": "threshold"}
 
 
 def test_evaluate_prints_a_table_and_writes_json(samples, tmp_path, typed):

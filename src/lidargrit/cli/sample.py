@@ -7,7 +7,8 @@ from pathlib import Path
 
 EXAMPLES = """\
   lidargrit sample runs/demo samples -n 100
-  lidargrit sample runs/demo bolder -n 100 --temperature 1.1 --top-k 0 --mask threshold
+  lidargrit sample runs/demo bolder -n 100 --temperature 1.1 --mask threshold
+  lidargrit sample runs/demo as_released -n 100 --top-k 100
 """
 
 
@@ -19,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, help="seed of the first; the next have the next seeds")
     parser.add_argument("--batch-size", type=int, default=8, help="scans drawn at once (default: 8)")
     parser.add_argument("--temperature", type=float, default=1.0, help="0 takes the likeliest token (default: 1)")
-    parser.add_argument("--top-k", type=int, default=100, help="among the k likeliest; 0 for all (default: 100)")
+    parser.add_argument("--top-k", type=int, default=0, help="among the k likeliest; 0 for all (default: 0)")
     parser.add_argument("--top-p", type=float, default=1.0, help="among those that hold this probability (default: 1)")
     parser.add_argument("--mask", choices=["bernoulli", "threshold"], default="bernoulli", help="how rays are dropped")
     parser.add_argument("--device", help="cpu or cuda (default: cuda if there is one)")

@@ -26,14 +26,15 @@ class SamplingConfig:
 
     Args:
         temperature: above 1 bolder, below 1 safer than the model's own probabilities; 0 takes the likeliest token.
-        top_k: draw among the k likeliest tokens only; 0 for all. The released program's is 100.
+        top_k: draw among the k likeliest tokens only; 0 for all, the model's own distribution, for the
+            paper names no other. The released program's is 100: a barely trained model gets blander by it.
         top_p: draw among the likeliest tokens that together hold this probability; 1 for all.
         mask: ``bernoulli`` draws each return with its probability (the released program, so what the paper's scores
             were computed with); ``threshold`` keeps what is at least as likely as not (the paper's eq. 1).
     """
 
     temperature: float = 1.0
-    top_k: int = 100
+    top_k: int = 0
     top_p: float = 1.0
     mask: MaskDecoding = "bernoulli"
 
