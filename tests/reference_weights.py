@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 
-def seeded_weights(data, keep=()):
+def seeded_weights(data):
     """Draw every tensor of a layout, in sorted order of its names."""
     rng = np.random.default_rng(int(data["weight_seed"]))
     weights = {}

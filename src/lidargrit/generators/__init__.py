@@ -26,8 +26,8 @@ class SamplingConfig:
 
     Args:
         temperature: above 1 bolder, below 1 safer than the model's own probabilities; 0 takes the likeliest token.
-        top_k: draw among the k likeliest tokens only; 0 for all, the model's own distribution, for the
-            paper names no other. The released program's is 100: a barely trained model gets blander by it.
+        top_k: draw among the k likeliest tokens only; 0 for all, the model's own distribution, since the paper names no
+            other. The released program's is 100, which makes a barely trained model bland.
         top_p: draw among the likeliest tokens that together hold this probability; 1 for all.
         mask: ``bernoulli`` draws each return with its probability (the released program, so what the paper's scores
             were computed with); ``threshold`` keeps what is at least as likely as not (the paper's eq. 1).
