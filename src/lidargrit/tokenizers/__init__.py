@@ -1,4 +1,4 @@
-"""Range image ⇄ tokens: the contract of a tokenizer, name → class."""
+"""Range image ⇄ tokens: the contract of a tokenizer."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from lidargrit import _discovery
 from lidargrit.errors import ConfigError
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage, TokenGrid
@@ -69,12 +68,3 @@ class Tokenizer(nn.Module, ABC):
         else:
             return_mask = uniform < return_logits.sigmoid()
         return RangeImage.masked(range_m, return_mask, self.sensor)
-
-
-def load_tokenizer(name: str) -> type[Tokenizer]:
-    """Return the tokenizer class of a name.
-
-    Raises:
-        UnknownNameError: no such tokenizer.
-    """
-    return _discovery.load_class("tokenizers", name, Tokenizer)
