@@ -6,9 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hypothesis import settings
 
 SHARED = Path(os.environ.get("LIDARGRIT_SHARED", Path(__file__).resolve().parents[2] / "shared"))
 
+# How long an example takes says nothing: other tests run beside it.
+settings.register_profile("unhurried", deadline=None)
+settings.load_profile("unhurried")
 # Commands that tests kill, or let run out of disk, would leave cut bytecode behind for all that follow.
 os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
 torch.set_num_threads(1)  # two threads while another process runs can be many times slower

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -16,8 +17,10 @@ import lidargrit
 from lidargrit import _discovery
 from lidargrit.cli import main
 from lidargrit.datasets import load
-from lidargrit.datasets._files import read_bin
 from lidargrit.evaluation.samples import read_samples
+from lidargrit.evaluation.scorecard import figure
+from lidargrit.formats import read_scan as read_bin
+from lidargrit.recipes import load_recipe
 from tiny_runs import MODEL
 
 TINY = [
@@ -72,6 +75,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 def test_train_leaves_a_run_that_says_what_it_is(run_folder):
     assert set(contents(run_folder)) == {
         "run.json",
+        "trained_on.json",
         "config.json",
         "model.safetensors",
         *(
@@ -114,12 +118,12 @@ def test_dry_run_tells_the_plan_and_writes_nothing(tmp_path, typed):
 def test_every_recipe_has_a_plan(recipe, tmp_path, typed):
     told = typed("train", recipe, tmp_path / "none", "--dry-run")
     assert "published: " in told
-    assert " parameters, " in told
+    assert (" parameters, " in told) == bool(load_recipe(recipe).training)
 
 
 def test_sample_writes_one_file_a_seed_and_draws_no_seed_twice(run_folder, samples, typed, monkeypatch):
     before = contents(samples)
-    assert set(before) == {"samples.json", "00000000.npz", "00000001.npz", "00000002.npz"}
+    assert set(before) == {"samples.json", "trained_on.json", "00000000.npz", "00000001.npz", "00000002.npz"}
     with np.load(samples / "00000000.npz", allow_pickle=False) as opened:
         assert opened["range_m"].shape == (64, 64)
         assert opened["range_m"].dtype == np.float32
@@ -135,7 +139,8 @@ def test_sample_writes_one_file_a_seed_and_draws_no_seed_twice(run_folder, sampl
 def test_a_seed_gives_the_same_sample_whatever_is_drawn_beside_it(run_folder, samples, tmp_path, typed):
     typed("sample", run_folder, tmp_path / "later", "--seed", 1, "-n", 3, "--batch-size", 2)
     earlier, later = read_samples(samples), read_samples(tmp_path / "later")
-    assert later.names == ["00000001", "00000002", "00000003"]
+    assert later.provenance.names[:2] == earlier.provenance.names[1:]
+    assert later.provenance.names[2].endswith("/sample 00000003")
     assert torch.allclose(later.batch([0, 1]).range_m, earlier.batch([1, 2]).range_m, atol=1e-3)
     typed("sample", run_folder, tmp_path / "later", "--seed", 0, "-n", 5)
     assert len(read_samples(tmp_path / "later")) == 5
@@ -151,13 +156,13 @@ def test_sampling_options_reach_the_model(run_folder, tmp_path, typed):
 
 def test_evaluate_prints_a_table_and_writes_json(samples, tmp_path, typed):
     told = typed("evaluate", samples, "simulated:3:test", "--json", tmp_path / "deep" / "scores.json").splitlines()
-    assert told[0].split() == ["metric", "variant", "value", "better", "scans"]
+    assert told[0].split() == ["metric", "variant", "score", "95", "%", "interval", "floor", "better", "scans"]
     scores = json.loads((tmp_path / "deep" / "scores.json").read_text())
     assert scores["reference"] == "simulated:3:test"
     assert [score["variant"] for score in scores["scores"]] == [line.split()[1] for line in told[1:]]
     for score, line in zip(scores["scores"], told[1:], strict=True):
         assert score["num_generated"] == score["num_reference"] == 3
-        assert f"{score['value']:.4f}" in line
+        assert f" {figure(score['value'])} " in line
         assert "lower" in line
 
 
@@ -185,12 +190,14 @@ def test_view_draws_runs_samples_and_scans(run_folder, samples, tmp_path, typed)
 
 def test_list_names_everything_there_is(typed):
     told = typed("list")
-    for kind in ("datasets", "sensors", "tokenizers", "generators", "metrics", "recipes"):
+    for kind in ("datasets", "formats", "sensors", "tokenizers", "generators", "metrics", "recipes"):
         assert typed("list", kind).splitlines()[0] == kind
         for name in _discovery.names(kind):
             assert f"  {name} " in told
             assert f"  {name} " in typed("list", kind)
     assert "licence: " in typed("list", "datasets")
+    assert "  lidargrit-kitti-360 " in typed("list", "protocols")
+    assert "  lidargen " in typed("list", "dialects")
 
 
 def test_doctor_tells_versions_and_room(typed):
@@ -210,7 +217,10 @@ def test_demo_tells_the_whole_story_and_tells_it_again(tmp_path, typed):
     assert evaluation["reconstruction_on_val"]["num_scans"] == 2
     assert evaluation["generated_against_train"]
     typed(*words)
-    assert contents(tmp_path / "demo") == before
+    again = contents(tmp_path / "demo")
+    for content in (before, again):  # all but how long it took
+        content["evaluation.json"] = re.sub(rb'"seconds": [0-9.]+', b"", content["evaluation.json"])
+    assert again == before
 
 
 def test_demo_on_a_users_own_drives(tmp_path, typed, monkeypatch):
@@ -235,7 +245,8 @@ def test_demo_on_one_drive_holds_its_last_scans_out_and_warns(tmp_path, capsys):
 def test_python_and_the_command_line_do_the_same(run_folder, samples):
     drawn = lidargrit.load(run_folder).sample([0, 1, 2])
     assert torch.allclose(drawn.range_m, read_samples(samples).batch([0, 1, 2]).range_m, atol=1e-3)
-    assert len(lidargrit.evaluate(str(samples), "simulated:3:test")) == 2
+    card = lidargrit.evaluate(str(samples), "simulated:3:test", metrics=["sliced_wasserstein"])
+    assert [score.result.variant for score in card.scores] == ["reference", "textbook"]
 
 
 def test_load_scan_reads_what_the_example_wrote(tmp_path):
@@ -259,7 +270,7 @@ main([])
 main(["list"])
 sys.exit(" ".join(name for name in ("torch", "numpy", "matplotlib", "rich", "jsonargparse") if name in sys.modules))
 """
-    verbs = _discovery.names("cli")
+    verbs = [name.replace("_", "-") for name in _discovery.names("cli")]
     done = python(program, *verbs)
     assert (done.returncode, done.stderr) == (1, "\n"), done.stderr
     assert done.stdout.count("examples:\n  lidargrit ") == len(verbs) + 2

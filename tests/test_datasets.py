@@ -1,23 +1,21 @@
-"""The readers of scans: what they refuse, their splits, and the real trees."""
+"""The trees of scans: their splits, folders of mixed formats, and the real trees."""
 
-import os
 from collections import Counter
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 from PIL import Image
 
+from format_examples import NAMES, can_write, written
+from lidargrit import formats
 from lidargrit.datasets import ScanDataset, load, open_dataset
-from lidargrit.datasets._files import read_bin
 from lidargrit.errors import DataError, OutputError, ScanError
+from lidargrit.loading import DataConfig, load_range_images
 from lidargrit.projection import project
 from lidargrit.projection.unfolding import rings_from_firing_order
+from lidargrit.reporting import Reporter
 from lidargrit.sensors import load_sensor
-from lidargrit.structures import Scan
 
 ROWS = np.array([[1, 2, 3, 0.5], [4, 5, 6, 0.25], [7, 8, 9, 1]], dtype="<f4")
 
@@ -41,94 +39,6 @@ def with_cell(row: int, column: int | slice, value: float) -> np.ndarray:
     return rows
 
 
-def test_read_bin_keeps_rows_and_their_order(bin_file):
-    path = bin_file(ROWS)
-    scan = read_bin(str(path))
-    assert np.array_equal(scan.points_xyz_m.numpy(), ROWS[:, :3])
-    assert scan.reflectance is not None
-    assert np.array_equal(scan.reflectance.numpy(), ROWS[:, 3])
-    assert (scan.ring, scan.source) == (None, str(path))
-
-
-@pytest.mark.parametrize(
-    ("content", "text"),
-    [
-        (b"", "got an empty file, .*; wanted float32 rows x, y, z, reflectance, 16 bytes a point; download it again"),
-        (bytes(33), "got 33 bytes in .*, 1 more than whole points; .*; download it again: the file was cut short"),
-        (bytes(36), "got 36 bytes in .*, 4 more than .*; if its rows are x, y, z alone, add a fourth column"),
-        (bytes(20), "got 20 bytes in .*, 4 more than .*; if its rows have 5 columns, as nuScenes writes them"),
-        (bytes(60), "12 more than .*; if its rows are x, y, z alone.* or if its rows have 5 columns"),
-        (with_cell(1, 0, np.nan), "got 1 of 3 points NaN or infinite coordinates in .*bad_points=drop"),
-        (with_cell(1, 2, np.inf), "got 1 of 3 points NaN or infinite coordinates in .*bad_points=drop"),
-        (with_cell(1, slice(0, 3), 0), "got 1 of 3 points at the origin .* in .*bad_points=drop"),
-        (with_cell(1, 3, 200), "got reflectance from 0.5 to 200 in .*; wanted values in .*divide an intensity"),
-        (with_cell(1, 3, np.nan), "got reflectance from nan to nan in "),
-    ],
-)
-def test_read_bin_refuses_in_one_line_that_names_the_file(bin_file, content, text):
-    path = bin_file(content)
-    with pytest.raises(ScanError, match=text) as refusal:
-        read_bin(path)
-    assert str(path) in refusal.value.got
-    assert "\n" not in str(refusal.value)
-
-
-def test_read_bin_drops_bad_points_but_no_bad_reflectance(bin_file):
-    bad = np.array([[np.nan, 1, 1, 0], [1, -np.inf, 1, 0], [0, 0, 0, 0], [0, -0.0, 0, 9]])
-    scan = read_bin(bin_file(np.concatenate((bad, ROWS, bad))), "drop")
-    assert np.array_equal(scan.points_xyz_m.numpy(), ROWS[:, :3])
-    with pytest.raises(ScanError, match=r"reflectance from 0\.25 to 2 in"):
-        read_bin(bin_file(with_cell(0, 3, 2)), "drop")
-    with pytest.raises(ScanError, match="got no point in"):
-        read_bin(bin_file(bad), "drop")
-
-
-def test_read_bin_refuses_what_is_no_file_and_does_not_hang(tmp_path):
-    os.mkfifo(tmp_path / "pipe.bin")
-    (tmp_path / "folder.bin").mkdir()
-    (tmp_path / "dangling.bin").symlink_to(tmp_path / "nowhere")
-    for name, what in [
-        ("pipe", "not a file"),
-        ("folder", "not a file"),
-        ("dangling", "not there"),
-        ("no", "not there"),
-    ]:
-        with pytest.raises(ScanError, match=f"{name}.bin, which is {what}"):
-            read_bin(tmp_path / f"{name}.bin")
-
-
-def test_read_bin_refuses_a_huge_file_without_reading_it(tmp_path):
-    with (tmp_path / "huge.bin").open("wb") as file:
-        file.truncate(1 << 40)  # sparse: a terabyte that takes no room
-    with pytest.raises(ScanError, match=r"over 4000000 points in .*huge\.bin"):
-        read_bin(tmp_path / "huge.bin")
-
-
-def scan_or_refusal(read) -> Scan | ScanError:
-    try:
-        return read()
-    except ScanError as refusal:
-        return refusal
-
-
-ANY_ROWS = hnp.arrays("<f4", (7, 4), elements=st.floats(width=32))
-
-
-@settings(max_examples=200, deadline=None)
-@given(
-    content=st.binary(max_size=400) | ANY_ROWS.map(lambda rows: rows.tobytes()),
-    bad_points=st.sampled_from(["refuse", "drop"]),
-)
-def test_read_bin_of_any_bytes_is_a_scan_or_a_scan_error(tmp_path_factory, content, bad_points):
-    path = tmp_path_factory.getbasetemp() / "fuzz.bin"
-    path.write_bytes(content)
-    scan = scan_or_refusal(lambda: read_bin(path, bad_points))
-    if isinstance(scan, Scan):
-        assert 0 < len(scan) <= len(content) // 16
-    else:
-        assert str(path) in scan.got
-
-
 @pytest.mark.parametrize("sequences", ["sequences", "dataset/sequences"])
 def test_kitti_odometry_splits(bin_file, tmp_path, sequences):
     for sequence in range(22):
@@ -149,7 +59,8 @@ def test_kitti_odometry_splits(bin_file, tmp_path, sequences):
 def test_kitti_360_val_is_in_train_but_not_in_train_without_val(bin_file, tmp_path):
     for drive in (0, 2, 3, 4, 5, 6, 7, 9, 10):
         bin_file(ROWS, f"data_3d_raw/2013_05_28_drive_{drive:04d}_sync/velodyne_points/data/0000000000.bin")
-    names = {split: set(names_of(open_dataset(f"kitti_360:{tmp_path}:{split}"))) for split in load("kitti_360").splits}
+    parts = load("kitti_360").schemes["paper"].parts
+    names = {part: set(names_of(open_dataset(f"kitti_360:{tmp_path}:{part}"))) for part in parts}
     assert names["test"] == {"0000/0000000000", "0002/0000000000"}
     assert names["train"] - names["train_without_val"] == names["val"] == {"0005/0000000000"}
     assert not names["train"] & names["test"]
@@ -189,10 +100,69 @@ def test_the_wish_to_drop_points_reaches_the_reader(bin_file):
     assert len(open_dataset(str(folder), bad_points="drop").scan(0)) == 2
 
 
-def test_a_folder_of_another_format_is_opened_and_told_what_it_holds(bin_file):
-    folder = bin_file(bytes(20), "sweep.pcd.bin").parent
+def test_a_file_of_another_format_is_told_what_it_holds(bin_file):
+    bin_file(ROWS, "0.bin")
+    folder = bin_file(bytes(20), "sweep.bin").parent
     with pytest.raises(ScanError, match="5 columns, as nuScenes"):
-        open_dataset(str(folder)).scan(0)
+        open_dataset(str(folder)).scan(1)
+
+
+@pytest.fixture
+def mixed(tmp_path):
+    """Return a folder with a scan in every way in which we write them, one format below the other's folder."""
+    for number, name in enumerate(one for one in NAMES if can_write(formats.load(one))):
+        for suffix in formats.load(name).suffixes:
+            folder = tmp_path / "mixed" / (name if number % 2 else "")
+            folder.mkdir(parents=True, exist_ok=True)
+            path = written(formats.load(name), folder, suffix)
+            path.rename(path.with_name(f"{number}_{suffix.replace('.', '')}{suffix}"))
+    (tmp_path / "mixed" / "README.txt").write_text("no scan")
+    (tmp_path / "mixed" / ".hidden.bin").write_bytes(bytes(3))
+    return tmp_path / "mixed"
+
+
+def test_a_folder_of_all_formats_is_listed_and_read(mixed):
+    dataset = open_dataset(f"folder:{mixed}")
+    expected = {
+        (one.public_name(), suffix, index)
+        for one in map(formats.load, NAMES)
+        if can_write(one)
+        for suffix in one.suffixes
+        for index in range(2 if one.several else 1)
+    }
+    assert len(dataset) == len(expected)
+    got = [formats.recognise(dataset.path(index)).public_name() for index in range(len(dataset))]
+    assert Counter(got) == Counter(name for name, _, _ in expected)
+    assert len(set(names_of(dataset))) == len(dataset)
+    for index in range(len(dataset)):
+        if not formats.recognise(dataset.path(index)).several:  # whose second scan may be of a sensor that saw nothing
+            assert len(dataset.scan(index)) > 1000
+
+
+class Told(Reporter):
+    def __init__(self) -> None:
+        self.messages: list[str] = []
+
+    def message(self, text: str) -> None:
+        self.messages.append(text)
+
+
+def test_one_bad_file_among_others_is_told_by_its_name_and_left_out(tmp_path, monkeypatch):
+    monkeypatch.setenv("LIDARGRIT_CACHE", str(tmp_path / "cache"))
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    for name in ("kitti_bin", "pcd", "ply", "numpy_array", "xyz_bin"):
+        path = written(formats.load(name), folder)
+        path.rename(folder / f"{name}{path.suffix}")
+    good = (folder / "ply.ply").read_bytes()
+    (folder / "bad.ply").write_bytes(good[: len(good) // 2])
+    with pytest.raises(ScanError, match=r"bad\.ply.*data\.bad_scans=skip"):
+        load_range_images([str(folder)], DataConfig())
+    told = Told()
+    images = load_range_images([str(folder)], DataConfig(bad_scans="skip"), told)
+    assert len(images) == 5
+    assert [message for message in told.messages if str(folder / "bad.ply") in message] == told.messages
+    assert len(told.messages) == 1
 
 
 def test_an_example_overwrites_nothing(bin_file, tmp_path):
@@ -212,60 +182,6 @@ def test_simulated_splits_share_no_seed():
     for count in ("0", "-1", "1e3", "1000001", "９" * 5000, "/data"):
         with pytest.raises(DataError, match="where a count belongs; wanted COUNT"):
             open_dataset(f"simulated:{count}")
-
-
-def png(path, pixels: np.ndarray):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(pixels).save(path)
-    return path
-
-
-def test_range_images_put_points_on_column_centres(tmp_path):
-    pixels = np.zeros((64, 870), dtype=np.uint16)
-    pixels[0, 0], pixels[63, 434] = 5000, 65_535
-    png(tmp_path / "drive" / "0.png", pixels)
-    scan = open_dataset(str(tmp_path)).scan(0)
-    assert scan.ring is not None
-    assert scan.ring.tolist() == [0, 63]
-    assert scan.reflectance is None
-    x, y, z = scan.points_xyz_m.double().numpy().T
-    assert torch.allclose(scan.points_xyz_m.norm(dim=1), torch.tensor([10.0, 131.07]))
-    assert np.allclose(np.degrees(np.arctan2(y, x)), [180 - 180 / 870, 180 / 870], atol=1e-3)
-    assert np.allclose(np.degrees(np.arctan2(z, np.hypot(x, y))), [1.94, -25], atol=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("pixels", "text"),
-    [
-        (
-            np.ones((32, 870), np.uint16),
-            "a PNG of 32 rows and 870 columns with 16 bits; wanted a 16-bit grey PNG of 64",
-        ),
-        (np.ones((64, 870), np.uint8), "a PNG of 64 rows and 870 columns with 8 bits;"),
-        (np.ones((64, 870, 3), np.uint8), "with 8 bits in colour;"),
-        (np.zeros((64, 870), np.uint16), "no return in"),
-    ],
-)
-def test_range_images_refuse_other_images(tmp_path, pixels, text):
-    path = png(tmp_path / "drive" / "0.png", pixels)
-    with pytest.raises(ScanError, match=text) as refusal:
-        load("range_images")(tmp_path).scan(0)
-    assert str(path) in str(refusal.value)
-
-
-@settings(max_examples=100, deadline=None)
-@given(st.data())
-def test_range_images_of_damaged_bytes_are_a_scan_or_a_scan_error(tmp_path_factory, data):
-    path = tmp_path_factory.getbasetemp() / "fuzz_png" / "0.png"
-    content = bytearray(png(path, np.arange(64 * 87, dtype=np.uint16).reshape(64, 87)).read_bytes())
-    for _ in range(data.draw(st.integers(1, 3))):
-        content[data.draw(st.integers(0, len(content) - 1) | st.integers(0, 64))] = data.draw(st.integers(0, 255))
-    path.write_bytes(content[: data.draw(st.integers(0, len(content)) | st.just(len(content)))])
-    scan = scan_or_refusal(lambda: load("range_images")(path.parent).scan(0))
-    if isinstance(scan, Scan):
-        assert scan.ring is not None
-    else:
-        assert str(path) in scan.got
 
 
 def names_of(dataset: ScanDataset) -> list[str]:
@@ -305,7 +221,7 @@ def test_every_real_scan_has_64_rings_and_projects(real_root, name):
     sensor = load_sensor(dataset.sensor)
     for index in range(len(dataset)):
         scan = dataset.scan(index)
-        assert int(rings_from_firing_order(scan.points_xyz_m.numpy()).max()) + 1 == 64, scan.source
+        assert int(rings_from_firing_order(scan.points_xyz_m.numpy().T).max()) + 1 == 64, scan.source
         image = project(scan, sensor)
         assert image.return_mask.float().mean() > 0.6, scan.source
         assert image.reflectance is not None
@@ -318,33 +234,8 @@ def test_every_real_range_image_projects_back_to_its_file(real_root):
     as_stored = sensor.with_columns(870)
     for index in range(0, len(dataset), 7):
         scan = dataset.scan(index)
-        with Image.open(dataset.paths[index]) as image:
+        with Image.open(dataset.path(index)) as image:
             stored_m = torch.from_numpy(np.array(image, dtype=np.float32) / 500)
         stored_m[(stored_m < sensor.range_min_m) | (stored_m > sensor.range_max_m)] = 0
         assert torch.allclose(project(scan, as_stored).range_m, stored_m, atol=1e-4), scan.source
         assert project(scan, sensor).return_mask.any()
-
-
-@pytest.mark.shared
-@pytest.mark.parametrize(
-    ("file", "text"),
-    [
-        ("incomplete_sweep_39_rings", "got 39 rings in .*; wanted the 64 rings .*remove the file if the sweep was cut"),
-        ("cropped_to_camera", "got returns in only .* of 360 degrees of azimuth in .*; wanted a full revolution"),
-        ("all_columns_times_1p1_plus_0p1", "got reflectance from .* to 1.* in .*; wanted values in"),
-    ],
-)
-def test_real_damaged_scans_are_refused(real, file, text):
-    path = real / "damaged" / f"{file}.bin"
-    with pytest.raises(ScanError, match=text) as refusal:
-        project(read_bin(path), load_sensor("hdl64e_kitti_odometry"))
-    assert str(path) in refusal.value.got
-
-
-@pytest.mark.shared
-def test_real_files_of_other_formats_are_refused(real):
-    files = sorted((real / "formats" / "xyz_only_bin").glob("*")) + sorted((real / "other_sensors").glob("nu*/*"))
-    assert len(files) == 5
-    for path in files:
-        with pytest.raises(ScanError, match=r"x, y, z alone|5 columns|reflectance from|coordinates"):
-            read_bin(path)

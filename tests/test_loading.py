@@ -1,15 +1,40 @@
-"""The cache of projected scans: same pixels as projecting, found again, never stale, never half."""
+"""Prepared range images: pixels of projecting, found again, never stale, never half, whoever made which part."""
 
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import fsspec
 import numpy as np
 import pytest
 import torch
 
-from lidargrit import loading
+from lidargrit.datasets import open_dataset
 from lidargrit.datasets.kitti_odometry import KittiOdometry
-from lidargrit.errors import DataError, ScanError
-from lidargrit.loading import DataConfig, load_range_images
+from lidargrit.errors import ConfigError, DataError, OutputError, ScanError
+from lidargrit.loading import (
+    Batches,
+    DataConfig,
+    PreparedImages,
+    Provenance,
+    RangeImages,
+    damaged_shards,
+    load_range_images,
+    prepare,
+    shards,
+    workers,
+)
+from lidargrit.loading import prepare as prepare_function
 from lidargrit.projection import project
 from lidargrit.reporting import Reporter
+from lidargrit.sensors import load_sensor
+
+prepare_module = sys.modules[prepare_function.__module__]
+SIMULATED = DataConfig(workers=1)
 
 
 class Listener(Reporter):
@@ -32,19 +57,61 @@ def tree(tmp_path):
     return tmp_path / "tree"
 
 
+@pytest.fixture
+def small_shards(monkeypatch):
+    monkeypatch.setattr(prepare_module, "_SHARD_SCANS", 2)
+
+
 def load(tree, **settings):
     config = DataConfig(train=(str(tree),), val=(), **settings)
     return load_range_images(config.train, config), config
 
 
-def test_cached_pixels_are_those_of_projecting(tree):
+def pixels_of(folder):
+    store = PreparedImages(str(folder))
+    return [store.read(index) for index in range(len(store))]
+
+
+def same(one, other):
+    """Tell whether two prepared folders hold the same; blocks may be compressed in another order."""
+    assert damaged_shards(one) == damaged_shards(other) == []
+    stores = [PreparedImages(str(folder)) for folder in (one, other)]
+    return stores[0].provenance == stores[1].provenance
+
+
+def test_prepared_pixels_are_those_of_projecting_to_a_millimetre(tree):
     images, config = load(tree)
     dataset = KittiOdometry(tree)
     assert len(images) == len(dataset) == 5
-    direct = [project(dataset.scan(index), config.load_sensor()).range_m for index in range(5)]
-    assert torch.equal(images.batch(range(5)).range_m, torch.stack(direct))
-    shifted = images.batch([2], [3]).range_m[0]
-    assert torch.equal(shifted, project(dataset.scan(2), config.load_sensor().fine()).range_m[:, 3::8])
+    direct = [project(dataset.scan(index), config.load_sensor()) for index in range(5)]
+    batch = images.batch(range(5))
+    assert torch.equal(batch.return_mask, torch.stack([image.return_mask for image in direct]))
+    assert (batch.range_m - torch.stack([image.range_m for image in direct])).abs().max() <= 0.00101
+    assert batch.reflectance is not None
+    expected = torch.stack([image.reflectance for image in direct if image.reflectance is not None])
+    assert (batch.reflectance - expected).abs().max() <= 0.5 / 255 + 1e-6
+    fine = project(dataset.scan(2), config.load_sensor().fine())
+    assert (images.batch([2], [3]).range_m[0] - fine.range_m[:, 3::8]).abs().max() <= 0.00101
+
+
+@pytest.mark.parametrize(("reach_m", "step_m"), [(80.0, 0.002), (131.0, 0.002), (131.1, 0.004), (300.0, 0.006)])
+def test_steps_are_2_mm_as_far_as_16_bits_reach(reach_m, step_m):
+    from dataclasses import replace
+
+    sensor = replace(load_sensor("hdl64e_kitti_360"), range_max_m=reach_m)
+    assert shards.range_step_m(sensor) == pytest.approx(step_m)
+    assert reach_m / shards.range_step_m(sensor) <= 65535
+
+
+def test_an_image_takes_at_most_160_kilobytes(real):
+    images = load_range_images(
+        (f"kitti_odometry:{real / 'kitti_odometry'}",),
+        DataConfig(sensor="hdl64e_kitti_360", projection="spherical", max_scans=4),
+    )
+    store = images._stores[0]
+    assert isinstance(store, PreparedImages)
+    sizes = [entry.range_bytes + entry.reflectance_bytes for _, entry in store._entries]
+    assert 0 < max(sizes) < 160_000
 
 
 def test_the_cache_is_used_and_knows_when_it_is_stale(tree, monkeypatch):
@@ -54,9 +121,11 @@ def test_the_cache_is_used_and_knows_when_it_is_stale(tree, monkeypatch):
         raise AssertionError("projected again")
 
     with monkeypatch.context() as patch:
-        patch.setattr(loading, "project", must_not)
+        patch.setattr(workers, "project", must_not)
         load(tree)
-    changed = KittiOdometry(tree).paths[0]
+        with pytest.raises(AssertionError, match="projected again"):
+            load(tree, columns=1024)
+    changed = KittiOdometry(tree).path(0)
     rows = np.fromfile(changed, dtype="<f4").reshape(-1, 4)
     rows[:, :3] *= 0.5
     before = load(tree)[0].batch([0]).range_m
@@ -64,19 +133,38 @@ def test_the_cache_is_used_and_knows_when_it_is_stale(tree, monkeypatch):
     assert not torch.equal(load(tree)[0].batch([0]).range_m, before)
 
 
-def test_a_failed_projection_leaves_no_cache_behind(tree, cache):
-    KittiOdometry(tree).paths[3].write_bytes(b"")
+def test_a_folder_prepared_from_what_has_changed_is_called_stale(tree, tmp_path):
+    config = DataConfig()
+    folder = prepare(str(tree), config, tmp_path / "out")
+    assert prepare(str(tree), config, folder) == folder, "again: nothing to do"
+    os.utime(KittiOdometry(tree).path(0))
+    with pytest.raises(OutputError, match=r"which is stale: prepared with another digest"):
+        prepare(str(tree), config, folder)
+    with pytest.raises(OutputError, match="which is stale: prepared with another sensor"):
+        prepare("simulated:5", DataConfig(columns=512), prepare("simulated:5", config, tmp_path / "other"))
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "letter.txt").write_text("dear")
+    with pytest.raises(OutputError, match="holds something else"):
+        prepare(str(tree), config, tmp_path / "mine")
+
+
+def test_a_failed_projection_leaves_nothing_that_looks_whole(tree, cache):
+    bad = KittiOdometry(tree).path(3)
+    bad.write_bytes(b"")
     with pytest.raises(ScanError, match=r"leave such scans out by --set data.bad_scans=skip"):
         load(tree)
-    assert not [path for path in cache.iterdir() if path.suffix in (".npy", ".json")]
-    images, _ = load(tree, bad_scans="skip")
+    assert not list(cache.rglob("*.shard"))
+    listener = Listener()
+    config = DataConfig(bad_scans="skip")
+    images = load_range_images((str(tree),), config, listener)
     assert len(images) == 4
-    assert not any(str(KittiOdometry(tree).paths[3]) in name for name in images.names)
+    assert str(bad) not in images.provenance.names
+    assert [line for line in listener.lines if "left out" in line and str(bad) in line]
 
 
 def test_max_scans_are_spread_evenly(tree):
     images, _ = load(tree, max_scans=2)
-    assert [name[-10:] for name in images.names] == ["000000.bin", KittiOdometry(tree).paths[2].name]
+    assert [name[-10:] for name in images.provenance.names] == ["000000.bin", KittiOdometry(tree).path(2).name]
 
 
 def test_a_sensor_of_another_data_set_is_warned_of(tree):
@@ -86,3 +174,178 @@ def test_a_sensor_of_another_data_set_is_warned_of(tree):
     assert any("WARNING" in line and "imaged as hdl64e_kitti_360" in line for line in listener.lines)
     with pytest.raises(DataError, match="no source of scans"):
         load_range_images((), config)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_processes_make_the_same_shards(tmp_path, small_shards, count):
+    alone = prepare("simulated:7", SIMULATED, tmp_path / "alone")
+    together = prepare("simulated:7", DataConfig(workers=count), tmp_path / "together")
+    names = sorted(path.name for path in alone.glob("*.shard"))
+    assert len(names) == 4
+    assert names == sorted(path.name for path in together.glob("*.shard"))
+    assert same(alone, together)
+
+
+def test_machines_share_the_work_and_wait_for_one_another(tmp_path, small_shards):
+    def machine(rank: int) -> None:
+        prepare("simulated:7", SIMULATED, tmp_path / "shared_disk", rank=rank, world_size=2)
+
+    threads = [threading.Thread(target=machine, args=(rank,)) for rank in (0, 1)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    ours, alone = (pixels_of(folder) for folder in (tmp_path / "shared_disk", prepare("simulated:7", SIMULATED)))
+    assert all(np.array_equal(one[0], other[0]) for one, other in zip(ours, alone, strict=True))
+    with pytest.raises(ConfigError, match="rank 2 of 2"):
+        prepare("simulated:7", SIMULATED, rank=2, world_size=2)
+
+
+def test_a_bad_scan_met_by_another_process_is_told_here(tree, small_shards):
+    KittiOdometry(tree).path(4).write_bytes(bytes(33))
+    with pytest.raises(ScanError, match=r"got 33 bytes in .*data.bad_scans=skip"):
+        load(tree, workers=2)
+
+
+def test_killed_at_any_moment_it_goes_on_and_ends_the_same(tmp_path):
+    script = (
+        "import sys, lidargrit.loading as l; from pathlib import Path;"
+        "sys.modules[l.prepare.__module__]._SHARD_SCANS = 2;"
+        "l.prepare('simulated:16', l.DataConfig(workers=1), Path(sys.argv[1]))"
+    )
+    killed = 0
+    for delay_s in (0.1, 0.4, 0.7, 1.0):
+        process = subprocess.Popen([sys.executable, "-c", script, str(tmp_path / "killed")])
+        started = time.monotonic()
+        while time.monotonic() - started < 30 and not (tmp_path / "killed" / "plan.json").exists():
+            time.sleep(0.01)
+        time.sleep(delay_s)
+        process.send_signal(signal.SIGKILL)
+        killed += process.wait() == -signal.SIGKILL
+    assert killed > 0
+    subprocess.run([sys.executable, "-c", script, str(tmp_path / "killed")], check=True)
+    subprocess.run([sys.executable, "-c", script, str(tmp_path / "whole")], check=True)
+    shard_files = sorted(path.name for path in (tmp_path / "whole").glob("*.shard"))
+    assert len(shard_files) == 8
+    assert same(tmp_path / "killed", tmp_path / "whole")
+
+
+def test_damage_is_found_and_made_good(tmp_path, small_shards):
+    folder = prepare("simulated:6", SIMULATED, tmp_path / "out")
+    good = pixels_of(folder)
+    second = folder / "000001.shard"
+    content = bytearray(second.read_bytes())
+    content[5000] ^= 255  # within the compressed pixels
+    second.write_bytes(content)
+    assert damaged_shards(folder) == [1]
+    for damage in (b"", content[:-1], content[: len(content) // 2], b"noise" * 99):
+        second.write_bytes(damage)
+        with pytest.raises(DataError, match=r"000001.shard"):
+            PreparedImages(str(folder))
+        prepare("simulated:6", SIMULATED, folder)
+        assert all(np.array_equal(one[0], other[0]) for one, other in zip(pixels_of(folder), good, strict=True))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"offset": -1},
+        {"offset": 10**9},
+        {"range_bytes": 10**12},
+        {"range_bytes": "many"},
+        {"scan": 77},
+        {"reflectance_bytes": 3},
+    ],
+)
+def test_an_index_that_lies_is_refused(tmp_path, change):
+    folder = prepare("simulated:1", SIMULATED, tmp_path / "out")
+    path = folder / "000000.shard"
+    content = path.read_bytes()
+    length = int.from_bytes(content[-16:-8], "little")
+    index = json.loads(content[-16 - length : -16])
+    index["entries"][0] |= change
+    told = json.dumps(index).encode()
+    path.write_bytes(content[: -16 - length] + told + len(told).to_bytes(8, "little") + content[-8:])
+    with pytest.raises(DataError, match="shard"):
+        PreparedImages(str(folder)).read(0)
+
+
+def test_a_blob_that_claims_to_be_gigabytes_is_refused_before_they_are_allocated(tmp_path):
+    folder = prepare("simulated:1", SIMULATED, tmp_path / "out")
+    path = folder / "000000.shard"
+    content = bytearray(path.read_bytes())
+    content[8 + 4 : 8 + 8] = (1 << 31).to_bytes(4, "little")  # the size in the header of the first blob
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=r"2147483648 bytes of pixels for an image of 262144"):
+        PreparedImages(str(folder)).read(0)
+
+
+def test_prepared_images_are_a_source_here_and_by_url(tmp_path):
+    folder = prepare("simulated:4", SIMULATED, tmp_path / "out")
+    here = load_range_images((str(folder),), SIMULATED)
+    memory = fsspec.filesystem("memory")
+    memory.put(str(folder), "/bucket/scans", recursive=True)
+    away = load_range_images(("memory://bucket/scans",), SIMULATED)
+    assert torch.equal(here.batch([3, 0]).range_m, away.batch([3, 0]).range_m)
+    with pytest.raises(DataError, match=r"prepared for 'hdl64e_kitti_odometry' \(64x2048\); wanted the rays of"):
+        load_range_images((str(folder),), DataConfig(sensor="hdl64e_kitti_360"))
+    with pytest.raises(DataError, match=r"memory://bucket/nothing/plan.json, which cannot be read"):
+        load_range_images(("memory://bucket/nothing",), SIMULATED)
+    with pytest.raises(DataError, match="a URL that fsspec can open"):
+        load_range_images(("gopher://somewhere",), SIMULATED)
+
+
+def test_batches_come_in_one_order_whatever_reads_them():
+    images = load_range_images(("simulated:9",), SIMULATED)
+
+    def stream(workers_count, first=0, **place):
+        batches = Batches(images, 4, ("flip", "roll"), True, 3, workers=workers_count, **place)
+        return [batch.range_m for batch in batches.stream(first, 24)]
+
+    alone = stream(1)
+    assert len(alone) == 6
+    assert all(torch.equal(one, other) for one, other in zip(alone, stream(4), strict=True))
+    assert all(torch.equal(one, other) for one, other in zip(alone[2:], stream(3, first=8), strict=True))
+    shares = zip(stream(2, rank=0, world_size=2), stream(1, rank=1, world_size=2), strict=True)
+    ordered = Batches(images, 4, (), False, 3)
+    whole = [ordered.at(seen).range_m for seen in range(0, 24, 4)]
+    plain = [Batches(images, 4, (), False, 3, rank, 2) for rank in (0, 1)]
+    for seen, both in zip(range(0, 24, 4), whole, strict=True):
+        assert torch.equal(torch.cat([batches.at(seen).range_m for batches in plain]), both)
+    assert all(len(one) == len(other) == 2 for one, other in shares)
+
+
+def test_an_error_while_reading_ahead_reaches_the_reader():
+    images = load_range_images(("simulated:2",), SIMULATED)
+
+    class Broken:
+        provenance = Provenance()
+
+        def __len__(self):
+            return 2
+
+        def read(self, index):
+            raise ScanError("a broken file", "a whole one", "mend it")
+
+    broken = Batches(RangeImages(images.sensor, [Broken()]), 2, (), False, 0, workers=2)
+    with pytest.raises(ScanError, match="a broken file"):
+        list(broken.stream(0, 8))
+
+
+def overlap_of(one, other):
+    return one.provenance.overlap(other.provenance)
+
+
+def test_overlap_is_told_by_file_by_pixels_and_by_drive(tmp_path):
+    KittiOdometry.write_example(tmp_path / "tree", 6)
+    everything, first, last = (
+        load_range_images((f"{tmp_path / 'tree'}:{split}",), SIMULATED) for split in ("all", "00", "08")
+    )
+    assert overlap_of(everything, first) == "3 scans are in both"
+    assert overlap_of(first, last) == ""
+    copied = tmp_path / "copied.bin"
+    copied.write_bytes(KittiOdometry(tmp_path / "tree").path(0).read_bytes())
+    assert overlap_of(load_range_images((str(copied),), SIMULATED), first) == "1 scan is in both"
+    halves = [load_range_images((f"{tmp_path / 'tree'}:00{share}",), SIMULATED) for share in ("[:50%]", "[50%:]")]
+    assert overlap_of(*halves) == f"both have scans of {open_dataset(f'{tmp_path}/tree:00').recording(0)}"
+    assert overlap_of(*(load_range_images((f"simulated:3:{split}",), SIMULATED) for split in ("train", "val"))) == ""

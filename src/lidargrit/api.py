@@ -5,43 +5,47 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from lidargrit.datasets import BadPoints
-from lidargrit.datasets._files import read_bin
-from lidargrit.evaluation import score
+from lidargrit import formats
+from lidargrit.evaluation.comparison import Settings, compare_sources
+from lidargrit.evaluation.scorecard import Scorecard
+from lidargrit.formats import BadPoints
 from lidargrit.generators import load
-from lidargrit.loading import DataConfig
-from lidargrit.projection import project, unproject
+from lidargrit.projection import inspect, project, unproject
 from lidargrit.sensors import load_sensor
 from lidargrit.simulator import simulate
-from lidargrit.structures import MetricResult, Scan
+from lidargrit.structures import Scan
 
-__all__ = ["evaluate", "load", "load_scan", "load_sensor", "project", "simulate", "unproject"]
+__all__ = ["evaluate", "inspect", "load", "load_scan", "load_sensor", "project", "simulate", "unproject"]
 
 
-def load_scan(path: str | Path, bad_points: BadPoints = "refuse") -> Scan:
-    """Read one scan from a KITTI-style ``.bin`` file: float32 rows of x, y, z in metres and reflectance.
+def load_scan(path: str | Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
+    """Read one scan from a file of any known format (``lidargrit list formats``), told by its name and its looks.
 
     Args:
         path: of the file.
+        index: of the scan, in a file that holds several.
         bad_points: ``drop`` removes points with NaN or infinite coordinates and points at the origin.
 
     Raises:
         ScanError: the file cannot be used; says what is wrong and what to do.
     """
-    return read_bin(Path(path), bad_points)
+    return formats.read_scan(path, index, bad_points)
 
 
 def evaluate(
-    generated: str, reference: str, metrics: Sequence[str] = ("sliced_wasserstein",), max_scans: int = 0
-) -> list[MetricResult]:
+    generated: str, reference: str, protocol: str = "exact", metrics: Sequence[str] = (), max_scans: int = 0
+) -> Scorecard:
     """Score a folder of samples, or any source of scans, against another.
 
     Args:
-        generated: a folder that ``lidargrit sample`` wrote, or a source of scans.
+        generated: a folder of samples, of ours or of another program, or a source of scans.
         reference: likewise; scans are projected with the sensor of ``generated``.
-        metrics: names, each computed in all its variants.
-        max_scans: of each; 0 for all.
+        protocol: which numbers, and how each is defined (``lidargrit list protocols``).
+        metrics: names, in place of the protocol's.
+        max_scans: of each; 0 for the protocol's.
+
+    Returns:
+        scores with intervals and floors; ``print(card.as_table())``, or each of ``card.scores``.
     """
-    config = DataConfig(max_scans=max_scans)
-    samples = score.open_images(generated, None, config)
-    return score.evaluate(samples, score.open_images(reference, samples.sensor, config), metrics)
+    settings = Settings(protocol=protocol, metrics=tuple(metrics), max_scans=max_scans)
+    return compare_sources(generated, reference, settings)[0]

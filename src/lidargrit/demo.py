@@ -10,8 +10,10 @@ import torch
 from lidargrit.configuration import override
 from lidargrit.datasets import open_dataset
 from lidargrit.errors import DataError
+from lidargrit.evaluation.comparison import Settings, compare_sides
 from lidargrit.evaluation.samples import read_samples, write_samples
-from lidargrit.evaluation.score import as_json, as_table, evaluate, score_reconstruction
+from lidargrit.evaluation.score import score_reconstruction
+from lidargrit.evaluation.sides import Side, Sides
 from lidargrit.files import write_json
 from lidargrit.generators import SamplingConfig
 from lidargrit.generators.lidargrit import LidarGrit
@@ -48,17 +50,19 @@ def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter
     write_samples(generator, folder, folder / "samples", seeds, SamplingConfig(), reporter=reporter)
     samples = read_samples(folder / "samples", _NUM_SAMPLES)
     reconstruction = score_reconstruction(generator.tokenizer, val)
-    scores = evaluate(samples, real, ["sliced_wasserstein"])
+    count = min(len(samples), len(real))
+    sides = Sides(Side("samples", samples, range(count)), Side("train", real, spread(count, len(real))))
+    card = compare_sides(sides, Settings(), reporter)
     write_json(
         folder / "evaluation.json",
-        {"reconstruction_on_val": asdict(reconstruction), "generated_against_train": as_json(scores)},
+        {"reconstruction_on_val": asdict(reconstruction), "generated_against_train": card.to_json()},
     )
     reporter.message(
         f"reconstruction of {reconstruction.num_scans} scans never trained on: range error "
         f"{reconstruction.range_mae_m:.2f} m, mask accuracy {reconstruction.mask_accuracy:.3f}, dropped rays found "
         f"{reconstruction.drop_recall:.2f} with precision {reconstruction.drop_precision:.2f}"
     )
-    reporter.message(as_table(scores))
+    reporter.message(card.as_table())
     reporter.message("(figures of a few minutes on little data; they do not compare with published tables)")
     _draw(generator, "real" if data else "simulated", val, samples, folder)
     return folder

@@ -6,6 +6,7 @@ LidarGritError (ValueError)
 ├── UnknownNameError  no sensor, recipe, metric, ... of that name
 ├── ConfigError       a recipe's setting is unknown or out of its bounds
 ├── CheckpointError   weights or a run that are damaged or of another configuration
+├── WeightsError      published weights of a network that are not to be had, or not what they should be
 ├── OutputError       a place to write to is taken, or could not be written
 └── TrainingError     training cannot go on: the loss is not a number, the codebook collapsed
 """
@@ -45,6 +46,10 @@ class ConfigError(LidarGritError):
 
 class CheckpointError(LidarGritError):
     """Weights or a run that are damaged or of another configuration."""
+
+
+class WeightsError(LidarGritError):
+    """Published weights of a network are not to be had, or not what they should be."""
 
 
 class OutputError(LidarGritError):

@@ -24,6 +24,7 @@ class Scan:
         points_xyz_m: metres.
         reflectance: in [0, 1].
         ring: laser of every point, 0 = the highest.
+        label: class of every point by SemanticKITTI's numbers, with its instance in the upper 16 of 32 bits.
         source: where the scan comes from, for messages.
 
     Raises:
@@ -33,12 +34,13 @@ class Scan:
     points_xyz_m: Float[Tensor, "n 3"]
     reflectance: Float[Tensor, "n"] | None = None
     ring: Int[Tensor, "n"] | None = None
+    label: Int[Tensor, "n"] | None = None
     source: str = "a scan"
 
     def __post_init__(self) -> None:
         if len(self) == 0:
             raise ScanError(f"no point in {self.source}", "a full revolution", "remove the file")
-        for name in ("reflectance", "ring"):
+        for name in ("reflectance", "ring", "label"):
             values: Tensor | None = getattr(self, name)
             if values is not None and values.shape != (len(self),):
                 raise ScanError(
@@ -46,9 +48,12 @@ class Scan:
                     f"one for each of {len(self)} points",
                     "fix it",
                 )
-        bad = ~self.points_xyz_m.isfinite().all(dim=1)
-        self._refuse(bad, "NaN or infinite coordinates")
-        self._refuse((self.points_xyz_m == 0).all(dim=1), "at the origin (placeholders for no return)")
+        # Point by point takes twenty times as long as over all coordinates at once, and is seldom needed.
+        low, high = self.points_xyz_m.aminmax()  # NaN where any is: no comparison holds
+        if not (bool(low > -torch.inf) and bool(high < torch.inf)):
+            self._refuse(~self.points_xyz_m.isfinite().all(dim=1), "NaN or infinite coordinates")
+        if self.points_xyz_m.count_nonzero() < self.points_xyz_m.numel():
+            self._refuse((self.points_xyz_m == 0).all(dim=1), "at the origin (placeholders for no return)")
         if self.reflectance is not None:
             low, high = (float(v) for v in self.reflectance.aminmax())
             if not (low >= 0 and high <= 1):  # also refuses NaN
@@ -108,13 +113,20 @@ class RangeImage:
                     f"the {tuple(self.range_m.shape)} of range_m",
                     "give all one shape",
                 )
-        valid = torch.where(self.return_mask, (self.range_m > 0) & self.range_m.isfinite(), self.range_m == 0)
-        if not bool(valid.all()):
+        if not self._is_valid():
+            valid = torch.where(self.return_mask, (self.range_m > 0) & self.range_m.isfinite(), self.range_m == 0)
             raise ScanError(
                 f"{int((~valid).sum())} pixels whose range contradicts their return mask",
                 "a positive finite range on every return and 0 elsewhere",
                 "build the image with RangeImage.masked",
             )
+
+    def _is_valid(self) -> bool:
+        if not self.range_m.numel():
+            return True
+        nearest, farthest = self.range_m.aminmax()  # NaN where any is: no comparison holds
+        positive = self.range_m > 0
+        return bool(nearest >= 0) and bool(farthest < torch.inf) and torch.equal(positive, self.return_mask)
 
     @classmethod
     def masked(

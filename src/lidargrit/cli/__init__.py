@@ -37,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name in _discovery.names("cli"):
         verb = importlib.import_module(f"lidargrit.cli.{name}")
         sub = verbs.add_parser(
-            name.removesuffix("_"),
+            name.removesuffix("_").replace("_", "-"),
             help=_discovery.summary("cli", name),
             description=f"examples:\n{verb.EXAMPLES}",
             formatter_class=argparse.RawDescriptionHelpFormatter,

@@ -1,4 +1,4 @@
-"""Score any scans against any others, or what a run keeps of scans."""
+"""Score any scans against any others, or what a run keeps of scans; or set scores side by side."""
 
 from __future__ import annotations
 
@@ -6,52 +6,47 @@ import argparse
 from pathlib import Path
 
 EXAMPLES = """\
-  lidargrit evaluate samples /data/held_out
+  lidargrit evaluate samples /data/held_out --report report.html
+  lidargrit evaluate samples kitti_360:/data/kitti_360:test --protocol lidargrit-kitti-360 --json scores.json
+  lidargrit evaluate r2dm_samples kitti_360:/data/kitti_360 --protocol r2dm --weights pointnet=cls_model_39.pth
   lidargrit evaluate runs/mine /data/held_out          errors of reconstruction, for a run instead of samples
-  lidargrit evaluate samples kitti_odometry:/data/kitti_odometry:test --metrics sliced_wasserstein --json scores.json
+  lidargrit evaluate --tables ours.json theirs.json --format markdown
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
-    parser.add_argument("samples", help="a folder of samples, a source of scans, or a run")
-    parser.add_argument("reference", help="likewise; projected with the sensor of the samples")
-    parser.add_argument("--metrics", nargs="+", default=["sliced_wasserstein"], help="see: lidargrit list metrics")
-    parser.add_argument("--variant", help="one definition only, such as reference (default: all that a metric has)")
-    parser.add_argument("--projection-variant", choices=["exact", "reference"], default="exact", help="of scans")
-    parser.add_argument("-n", "--max-scans", type=int, default=0, help="at most so many of each; 0 for all")
-    parser.add_argument("--seed", type=int, default=0, help="of whatever a metric draws")
-    parser.add_argument("--bad-points", choices=["refuse", "drop"], default="refuse", help="NaN, infinite or at 0")
-    parser.add_argument("--bad-scans", choices=["refuse", "skip"], default="refuse", help="that cannot be used")
-    parser.add_argument("--json", type=Path, help="also write the scores to this file")
-    parser.add_argument("--overwrite", action="store_true", help="replace that file if it is there already")
+    add = parser.add_argument
+    add("samples", nargs="?", default="", help="samples of ours or of others (.pth), a source of scans, or a run")
+    add("reference", nargs="?", default="", help="likewise; projected with the sensor of the samples")
+    add("--protocol", default="exact", help="exact (default), lidargrit-kitti-360, lidargrit-kitti-odometry, r2dm, ...")
+    add("--metrics", nargs="+", default=[], help="in place of the protocol's; see: lidargrit list metrics")
+    add("--variant", default="", help="one definition of every metric, in place of the protocol's")
+    add("--projection-variant", choices=["exact", "reference"], help="of scans (default: the protocol's)")
+    add("--samples-format", default="", help="r2dm, lidargen or lidargrit, where .pth files do not tell")
+    add("--weights", nargs="+", default=[], metavar="NAME=FILE", help="of pointnet and rangenet53")
+    add("-n", "--max-scans", type=int, default=0, help="at most so many of each; 0 for the protocol's")
+    add("--intervals", type=int, default=20, metavar="B", help="half-samples for intervals; 0 for none (default: 20)")
+    add("--groups", type=int, default=16, metavar="G", help="of neighbouring scans that stay together (default: 16)")
+    add("--seed", type=int, default=0, help="of whatever is drawn")
+    add("--device", default="cpu", help="where trained networks compute: cpu or cuda")
+    add("--bad-points", choices=["refuse", "drop"], default="refuse", help="NaN, infinite or at 0")
+    add("--bad-scans", choices=["refuse", "skip"], default="refuse", help="that cannot be used")
+    add("--json", type=Path, help="also write scores, hashes and settings to this file")
+    add("--report", type=Path, metavar="FILE.html", help="also write one page with scores and pictures")
+    add("--overwrite", action="store_true", help="replace these files if they are there already")
+    add("--tables", nargs="+", type=Path, metavar="JSON", help="set files of --json side by side, and do nothing else")
+    add("--format", choices=["text", "markdown", "latex"], default="text", help="of the table (default: text)")
 
 
 def run(options: argparse.Namespace) -> None:
     """Score and print a table."""
-    from lidargrit.errors import ConfigError
-    from lidargrit.evaluation.score import as_json, as_table, evaluate, evaluate_run, open_images
-    from lidargrit.files import refuse_to_overwrite, write_json
-    from lidargrit.generators import is_run
-    from lidargrit.loading import DataConfig
+    from lidargrit.evaluation.command import evaluate
+    from lidargrit.evaluation.tables import side_by_side
     from lidargrit.reporting import TerminalReporter
+    from lidargrit.viewer.report import write_report
 
-    if options.max_scans < 0 or options.seed < 0:
-        raise ConfigError(f"-n {options.max_scans}, --seed {options.seed}", "0 or more", "correct the number")
-    refuse_to_overwrite(options.json, options.overwrite)
-    reporter, road = TerminalReporter(), options.projection_variant
-    bad = {"bad_points": options.bad_points, "bad_scans": options.bad_scans}
-    config = DataConfig(max_scans=options.max_scans, variant=road, **bad)
-    about = {"samples": options.samples, "reference": options.reference, "projection_variant": road, **bad}
-    if is_run(Path(options.samples)):
-        errors = evaluate_run(Path(options.samples), options.reference, config, reporter)
-        print("\n".join(f"{name:<20}{value:>10.4g}" for name, value in errors.items()))
-        if options.json:
-            write_json(options.json, {**about, "reconstruction": errors})
+    if options.tables:
+        print(side_by_side(options.tables, options.format))
         return
-    samples = open_images(options.samples, None, config, reporter)
-    reference = open_images(options.reference, samples.sensor, config, reporter)
-    results = evaluate(samples, reference, options.metrics, options.variant, options.seed)
-    print(as_table(results))
-    if options.json:
-        write_json(options.json, {**about, "seed": options.seed, "scores": as_json(results)})
+    print(evaluate(options, TerminalReporter(), write_report))

@@ -1,31 +1,58 @@
-"""List data sets, sensors, tokenizers, generators, metrics and recipes."""
+"""List data sets, formats, sensors, generators, metrics, protocols, recipes and more."""
 
 from __future__ import annotations
 
 import argparse
+import re
+import textwrap
 
 EXAMPLES = """\
   lidargrit list
   lidargrit list datasets
+  lidargrit list formats
 """
 
-_KINDS = ("datasets", "sensors", "tokenizers", "generators", "metrics", "recipes")
+_KINDS = {kind: kind for kind in ("datasets", "formats", "sensors", "tokenizers", "generators", "metrics")}
+_KINDS |= {kind: f"evaluation.{kind}" for kind in ("protocols", "dialects")} | {"recipes": "recipes"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
-    parser.add_argument("kind", nargs="?", choices=_KINDS, help="one kind only")
+    parser.add_argument("kind", nargs="?", choices=_KINDS, help="one kind only, with all that is known of it")
 
 
 def run(options: argparse.Namespace) -> None:
-    """Print every name with its one line; data sets with their layout and licence."""
+    """Print every name with its one line; of data sets and formats asked for alone, all that is known."""
     from lidargrit import _discovery
 
+    facts = {"datasets": _of_dataset, "formats": _of_format}.get(options.kind, lambda name: [])
     for kind in (options.kind,) if options.kind else _KINDS:
         print(kind)
-        for name in _discovery.names(kind):
-            print(f"  {name:<26}{_discovery.summary(kind, name)}")
-            if options.kind == "datasets":
-                from lidargrit.datasets import load
+        for name in _discovery.names(_KINDS[kind]):
+            summary = re.sub(r":\w+:`(\w+)`", r"\1", _discovery.summary(_KINDS[kind], name))
+            print(f"  {name.replace('_', '-') if kind == 'protocols' else name:<29}{summary}")
+            for fact in facts(name):
+                print(
+                    textwrap.fill(fact, 116, initial_indent=" " * 6, subsequent_indent=" " * 10, break_on_hyphens=False)
+                )
 
-                print(f"  {'':<26}layout: {load(name).tree}\n  {'':<26}licence: {load(name).licence}")
+
+def _of_dataset(name: str) -> list[str]:
+    from lidargrit.datasets import load
+
+    cls = load(name)
+    facts = [f"layout: {cls.tree}", f"sensor: {cls.sensor}", f"licence: {cls.licence}", f"cite: {cls.citation}"]
+    for number, (scheme, of) in enumerate(cls.schemes.items()):
+        parts = ", ".join(part if number == 0 else f"{scheme}/{part}" for part in of.parts)
+        facts += [f"splits: {parts} ({scheme}: {of.source})", f"    leak: {of.leak}"]
+    return facts
+
+
+def _of_format(name: str) -> list[str]:
+    from lidargrit.formats import load
+
+    cls = load(name)
+    facts = [f"endings: {', '.join(cls.suffixes)}", f"reflectance: {cls.reflectance}", f"axes: {cls.frame}"]
+    facts += [f"sensor: {cls.sensor}"] if cls.sensor else []
+    facts += ["several scans in one file"] if cls.several else []
+    return facts + ([f"needs: pip install 'lidargrit[{cls.extra}]'"] if cls.extra else [])

@@ -4,25 +4,42 @@ from __future__ import annotations
 
 import re
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 from lidargrit import _discovery
 from lidargrit.errors import DataError
+from lidargrit.formats import BadPoints
 from lidargrit.structures import Scan
 
-BadPoints = Literal["refuse", "drop"]
+
+@dataclass(frozen=True)
+class SplitScheme:
+    """One way to divide a data set, as some paper or program does it.
+
+    Args:
+        source: whose it is.
+        leak: what the parts share that they should not, in one sentence; everybody who compares figures needs it.
+        parts: the sequences of every part: train, val, test.
+    """
+
+    source: str
+    leak: str
+    parts: Mapping[str, tuple[str, ...]]
 
 
 class ScanDataset(ABC):
     """An ordered collection of scans that one sensor made.
 
-    A split is ``all``, a named one, or sequences (drives) joined by "+", as in ``00+03``. A share in brackets takes one
+    A split is ``all``, a part of a scheme such as ``lidargen-code/train``, or sequences (drives), joined by "+" as in
+    ``00+03``; ``train`` alone is the part of the first scheme. A share in brackets takes one
     contiguous block of the scans in order: ``all[:90%]`` and ``all[90%:]`` have no scan in common. Blocks keep
     neighbours in time together, but where one ends within a drive, the same street is seen from both sides of the cut:
     scans near it leak from one share to the other. Whole drives leak least.
 
-    A named split takes those of its sequences that are on disk, so that part of a data set can be used.
+    A part takes those of its sequences that are on disk, so that part of a data set can be used.
 
     Args:
         root: the folder that ``tree`` starts from.
@@ -39,15 +56,16 @@ class ScanDataset(ABC):
     """Under what terms its scans may be used."""
     tree: ClassVar[str]
     """How its files lie below the root."""
-    sensor: ClassVar[str]
+    citation: ClassVar[str] = ""
+    """The paper that describes it."""
+    sensor: str
     """Name of the sensor that made the scans."""
-    splits: ClassVar[dict[str, tuple[str, ...]]] = {}
-    """The sequences of every named split."""
+    schemes: ClassVar[dict[str, SplitScheme]] = {}
+    """The published ways to divide it by name; the first is the default."""
 
     def __init__(self, root: Path, split: str = "all", bad_points: BadPoints = "refuse") -> None:
         self.root, self.split = root, split
         self.bad_points: BadPoints = bad_points
-        self.paths: list[Path] = []
 
     @classmethod
     def public_name(cls) -> str:
@@ -69,6 +87,21 @@ class ScanDataset(ABC):
     @abstractmethod
     def name(self, index: int) -> str:
         """Name one scan, the same on every machine and in every split: "00/000012"."""
+
+    def recording(self, index: int) -> str:
+        """Name the recording that a scan was cut from, the same in every data set that has it; "" if it is alone."""
+        return ""
+
+    def path(self, index: int) -> Path | None:
+        """Return the file that holds a scan; None where scans are not in files."""
+        return None
+
+    @classmethod
+    def splits(cls) -> dict[str, tuple[str, ...]]:
+        """Return the sequences of every named split: "train" of the first scheme, "SCHEME/train" of each."""
+        named = {f"{name}/{part}": of for name, scheme in cls.schemes.items() for part, of in scheme.parts.items()}
+        default = next(iter(cls.schemes.values()), None)
+        return {**(default.parts if default else {}), **named}
 
     @classmethod
     @abstractmethod

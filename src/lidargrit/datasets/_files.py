@@ -1,31 +1,33 @@
-"""What data sets of files share: a folder → sorted paths; float32 rows x, y, z, reflectance ⇄ :class:`Scan`."""
+"""What data sets of files share: a folder → its files in order, the split of them that is wanted, and their scans."""
 
 from __future__ import annotations
 
+import os
 from abc import abstractmethod
+from collections import Counter
+from collections.abc import Iterator
+from fnmatch import fnmatchcase
+from itertools import islice
 from pathlib import Path
 from typing import ClassVar
 
-import numpy as np
-import torch
-
-from lidargrit.datasets import BadPoints, ScanDataset, recognise
+from lidargrit import formats
+from lidargrit.datasets import ScanDataset, recognise
 from lidargrit.datasets._splits import Split
-from lidargrit.errors import DataError, OutputError, ScanError, nearest_names
+from lidargrit.errors import DataError, OutputError, nearest_names
+from lidargrit.formats import BadPoints
 from lidargrit.sensors import load_sensor
 from lidargrit.structures import Scan
 
-_ROW_BYTES = 16  # x, y, z, reflectance
-_POINTS_AT_MOST = 4_000_000  # thirty revolutions of an HDL-64E; a larger file is a map, or no scan at all
-_OTHER_ROWS = {
-    12: "if its rows are x, y, z alone, add a fourth column of zeros",
-    20: "if its rows have 5 columns, as nuScenes writes them, keep four and divide the intensity by 255",
-}
+_NAMED_AT_MOST = 5  # sequences in a message
+_SUBFOLDERS_AT_MOST = 100  # where a root is looked for that is one folder further down
 
 
 class FileDataset(ScanDataset):
-    """A data set with one file per scan."""
+    """A data set of files, each with one scan, or several if its format allows it."""
 
+    format: ClassVar[str]
+    """Name of the files' format; empty where each file tells by its looks."""
     patterns: ClassVar[tuple[str, ...]]
     """Where the files lie, seen from the root; the first pattern that finds any counts."""
     examples: ClassVar[tuple[str, ...]]
@@ -39,32 +41,58 @@ class FileDataset(ScanDataset):
         wanted = Split.parse(split)
         chosen = self._choose(wanted, set(found.values()))
         paths = [path for path, sequence in found.items() if sequence in chosen]
-        self.paths = paths[wanted.block(len(paths))]
-        if not self.paths:
+        several = not self.format or formats.load(self.format).several
+        scans = [(path, index) for path in paths for index in range(self.scans_in(path) if several else 1)]
+        self._scans = scans[wanted.block(len(scans))]
+        self._several = {path for path, index in scans if index}
+        names = Counter(
+            (sequence, name) for path, sequence in found.items() for name in (path.name, formats.stem(path))
+        )
+        self._taken = {name for name, times in names.items() if times > 1}
+        if not self._scans:
             raise DataError(
-                f"the split {split!r} of {len(paths)} scans in {root}, which leaves none",
+                f"the split {split!r} of {len(scans)} scans in {root}, which leaves none",
                 "at least one scan",
                 "take a larger share",
             )
 
     def __len__(self) -> int:
-        return len(self.paths)
+        return len(self._scans)
 
     def scan(self, index: int) -> Scan:
         """Read one scan."""
-        return self.read(self.paths[index], self.bad_points)
+        path, place = self._scans[index]
+        return self._format(path).read(path, place, self.bad_points)
 
     def name(self, index: int) -> str:
-        """Name one scan: its sequence and its file."""
-        path = self.paths[index]
+        """Name one scan: its sequence, its file, and its place in the file if that holds several.
+
+        The ending is left out, unless another file of the sequence would then be called the same.
+        """
+        path, place = self._scans[index]
         sequence = self.sequence_of(path.relative_to(self.root))
-        return path.stem if sequence == "." else f"{sequence}/{path.stem}"
+        stem = formats.stem(path)
+        name = path.name if (sequence, stem) in self._taken else stem
+        name += f"#{place}" if path in self._several else ""
+        return name if sequence == "." else f"{sequence}/{name}"
+
+    def path(self, index: int) -> Path:
+        """Return the file that holds a scan."""
+        return self._scans[index][0]
+
+    def recording(self, index: int) -> str:
+        """Name the recording that a scan was cut from, the same in every data set that has it."""
+        return self.recording_of(self._scans[index][0])
 
     @classmethod
     def matches(cls, root: Path) -> bool:
-        """Tell whether a folder holds a file where this tree has them, in the same format."""
-        first = next((path for pattern in cls.patterns for path in root.glob(pattern)), None)
-        return first is not None and cls.recognises(first)
+        """Tell whether a folder holds a file where this tree has them, in the same format.
+
+        Where the tree names no folder, scans of other formats must not lie there too: they would go unseen.
+        """
+        pattern = cls._pattern_in(root)
+        named = set((pattern or "").split("/")[:-1]) - {"*", "**"}
+        return pattern is not None and (bool(named) or not cls._others_below(root))
 
     @classmethod
     def write_example(cls, root: Path, num_scans: int) -> None:
@@ -77,27 +105,39 @@ class FileDataset(ScanDataset):
             if path.exists():
                 raise OutputError(f"{path}, which exists", "a place to write to", "choose an empty folder")
             path.parent.mkdir(parents=True, exist_ok=True)
-            cls.write(path, simulate(seed=index, sensor=load_sensor(cls.sensor)))
+            writer = formats.load(cls.format) if cls.format else formats.candidates(path)[0]
+            writer.write(path, simulate(seed=index, sensor=load_sensor(cls.sensor)))
 
-    @staticmethod
     @abstractmethod
-    def sequence_of(relative: Path) -> str:
+    def sequence_of(self, relative: Path) -> str:
         """Name the sequence (drive, folder) of a file from its path below the root; "." for none."""
 
-    @staticmethod
-    @abstractmethod
-    def recognises(path: Path) -> bool:
-        """Tell whether a file looks like a scan of this format."""
+    def recording_of(self, path: Path) -> str:
+        """Name the recording of a file: its data set and sequence, or its folder where sequences have no names."""
+        sequence = self.sequence_of(path.relative_to(self.root))
+        return str(path.resolve().parent) if sequence == "." else f"{self.public_name()}/{sequence}"
 
-    @staticmethod
-    @abstractmethod
-    def read(path: Path, bad_points: BadPoints) -> Scan:
-        """Read the scan in a file, or raise ScanError."""
+    @classmethod
+    def scans_in(cls, path: Path) -> int:
+        """Count the scans in a file that belong to the data set."""
+        return formats.count_scans(path)
 
-    @staticmethod
-    @abstractmethod
-    def write(path: Path, scan: Scan) -> None:
-        """Write a scan to a new file."""
+    @classmethod
+    def _format(cls, path: Path) -> type[formats.ScanFormat]:
+        return formats.load(cls.format) if cls.format else formats.recognise(path)
+
+    @classmethod
+    def _pattern_in(cls, root: Path) -> str | None:
+        """Return the first pattern that finds a file, if that is of this tree's format."""
+        firsts = ((pattern, next(root.glob(pattern), None)) for pattern in cls.patterns)
+        pattern, first = next((found for found in firsts if found[1]), (None, None))
+        return pattern if first and cls._format(first).recognises(first) else None
+
+    @classmethod
+    def _others_below(cls, root: Path) -> bool:
+        own = formats.load(cls.format)
+        others = (path for path in scans_below(root) if own not in formats.candidates(path))
+        return any(one.recognises(path) for path in others for one in formats.candidates(path))
 
     @classmethod
     def _find(cls, root: Path) -> list[Path]:
@@ -105,95 +145,56 @@ class FileDataset(ScanDataset):
         return next((paths for paths in found if paths), [])
 
     def _choose(self, split: Split, sequences: set[str]) -> set[str]:
-        named = {**self.splits, "all": tuple(sequences)}
+        named = self.splits()
         for part in split.parts:
-            if part not in named and part not in sequences:
+            if part not in named and part not in sequences and part != "all":
                 raise DataError(
                     f"the split {split.text!r} of {self.root}, with {part!r} neither a split nor a sequence there",
-                    f"one of {nearest_names(part, {*named, *sequences})}",
+                    f"one of {nearest_names(part, {'all', *named, *sequences})}",
                     f"join several with '+', as in {'+'.join(sorted(sequences)[:2])}",
                 )
-        chosen = {sequence for part in split.parts for sequence in named.get(part, (part,))}
-        if not chosen & sequences:
-            raise DataError(
-                f"the split {split.text!r} of {self.root}, none of whose sequences is there",
-                f"a sequence among {', '.join(sorted(chosen))}",
-                f"download one, or use what is there: {'+'.join(sorted(sequences)[:3])}",
-            )
-        return chosen & sequences
+        if "all" in split.parts:
+            return sequences
+        wanted = {sequence for part in split.parts for sequence in named.get(part, (part,))}
+        patterns = [pattern for pattern in wanted if "*" in pattern]  # such as "train/*"
+        chosen = {one for one in sequences if one in wanted or any(fnmatchcase(one, of) for of in patterns)}
+        if not chosen:
+            raise self._none_of(split, sequences, sorted(wanted))
+        return chosen
+
+    def _none_of(self, split: Split, sequences: set[str], wanted: list[str]) -> DataError:
+        more = ", ..." if len(wanted) > _NAMED_AT_MOST else ""
+        return DataError(
+            f"the split {split.text!r} of {self.root}, none of whose sequences is there",
+            f"a sequence among {', '.join(wanted[:_NAMED_AT_MOST])}{more}",
+            f"download one, or use what is there: {'+'.join(sorted(sequences)[:3])}",
+        )
 
     def _wrong_root(self) -> DataError:
+        wanted = f"{self.tree} ({self.title})"
         if not self.root.is_dir():
-            return DataError(f"{self.root}, which is not a folder", f"{self.tree} ({self.title})", "check the path")
+            return DataError(f"{self.root}, which is not a folder", wanted, "check the path")
+        got = f"{self.root}, which has no scan where this data set has them"
+        if right := self._nearby_root():
+            return DataError(got, wanted, f"its root may be {right}: try {self.public_name()}:{right}")
         other = recognise(self.root)
-        return DataError(
-            f"{self.root}, which has no scan where this data set has them",
-            f"{self.tree} ({self.title})",
-            f"it looks like {other}: open it as {other}:{self.root}" if other else "give the ROOT of that tree",
-        )
+        cure = f"it looks like {other}: open it as {other}:{self.root}" if other else "give the ROOT of that tree"
+        return DataError(got, wanted, cure)
+
+    def _nearby_root(self) -> Path | None:
+        """Find the root for a user who named a folder within the tree, or the one that the root lies in."""
+        if self.patterns[0].startswith("**"):  # any folder is a root
+            return None
+        here, depth = self.root.resolve(), self.patterns[0].count("/")
+        below = (one for one in sorted(islice(here.iterdir(), _SUBFOLDERS_AT_MOST)) if one.is_dir())
+        return next((one for one in (*below, *here.parents[:depth]) if self._pattern_in(one)), None)
 
 
-class BinDataset(FileDataset):
-    """A data set of Velodyne files as KITTI writes them: float32 rows x, y, z, reflectance."""
-
-    @staticmethod
-    def recognises(path: Path) -> bool:
-        """Tell whether there is a file; what is wrong with its rows is said when it is read."""
-        return path.is_file()
-
-    @staticmethod
-    def read(path: Path, bad_points: BadPoints) -> Scan:
-        """Read the scan in a file."""
-        return read_bin(path, bad_points)
-
-    @staticmethod
-    def write(path: Path, scan: Scan) -> None:
-        """Write a scan to a new file, with reflectance 0 if it has none."""
-        reflectance = torch.zeros(len(scan)) if scan.reflectance is None else scan.reflectance
-        rows = torch.cat((scan.points_xyz_m, reflectance[:, None]), dim=1)
-        path.write_bytes(rows.numpy().astype("<f4").tobytes())
-
-
-def read_bin(path: Path | str, bad_points: BadPoints = "refuse") -> Scan:
-    """Read a Velodyne file as KITTI writes it: float32 rows x, y, z in metres and reflectance.
-
-    Args:
-        path: the file.
-        bad_points: ``drop`` removes points with NaN or infinite coordinates and points at the origin.
-
-    Returns:
-        the points in the file's order, which on KITTI is the order in which they were fired.
-
-    Raises:
-        ScanError: the file is empty, unreadable, too large or of another format; or what :class:`Scan` refuses.
-    """
-    rows = torch.from_numpy(np.frombuffer(bytearray(_read_rows(Path(path))), dtype="<f4").reshape(-1, 4))
-    if bad_points == "drop":
-        xyz_m = rows[:, :3]
-        rows = rows[xyz_m.isfinite().all(dim=1) & (xyz_m != 0).any(dim=1)]
-    return Scan(rows[:, :3].contiguous(), rows[:, 3].contiguous(), source=str(path))
-
-
-def _read_rows(path: Path) -> bytes:
-    wanted = "float32 rows x, y, z, reflectance, 16 bytes a point"
-    try:
-        if not path.is_file():  # opening a pipe or a device would hang
-            what = "not a file" if path.exists() else "not there"
-            raise ScanError(f"{path}, which is {what}", wanted, "check the path")
-        with path.open("rb") as file:
-            data = file.read(_POINTS_AT_MOST * _ROW_BYTES + 1)
-    except OSError as error:
-        raise ScanError(f"{path}, which cannot be read ({error.strerror})", wanted, "check the path") from None
-    size = len(data)
-    if size == 0:
-        raise ScanError(f"an empty file, {path}", wanted, "download it again, or remove it")
-    if size > _POINTS_AT_MOST * _ROW_BYTES:
-        raise ScanError(f"over {_POINTS_AT_MOST} points in {path}", f"one revolution: {wanted}", "remove the file")
-    if size % _ROW_BYTES:
-        cures = [cure for row_bytes, cure in _OTHER_ROWS.items() if size % row_bytes == 0]
-        raise ScanError(
-            f"{size} bytes in {path}, {size % _ROW_BYTES} more than whole points",
-            wanted,
-            " or ".join(cures) or "download it again: the file was cut short or is of another format",
-        )
-    return data
+def scans_below(root: Path) -> Iterator[Path]:
+    """Find all files that are called like a scan, in no order, leaving out hidden ones and links to folders."""
+    if root.is_file():
+        yield from [root] if formats.candidates(root) else []
+    for folder, below, names in os.walk(root):
+        below[:] = (name for name in below if not name.startswith("."))
+        paths = (Path(folder, name) for name in names if not name.startswith("."))
+        yield from (path for path in paths if formats.candidates(path))

@@ -1,36 +1,48 @@
-"""Any folder with Velodyne files in it, however deep: ROOT/**/*.bin → scans."""
+"""Your own scans, in any format that is known and several at once: ROOT/** → scans."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from lidargrit.datasets._files import BinDataset
+from lidargrit import formats
+from lidargrit.datasets._files import FileDataset, scans_below
+from lidargrit.formats import BadPoints
 
 
-class Folder(BinDataset):
-    """Your own scans as KITTI-style .bin files; a sequence is the folder that holds them, "." for the root itself."""
+class Folder(FileDataset):
+    """A folder of scans, or one file; a sequence is the folder that holds them, "." for the root itself.
 
-    title = "a folder of .bin files"
+    Every file whose ending belongs to a format is a scan, hidden ones left out. The sensor is that of the first file's
+    format, if such files always have the same, and the HDL-64E of KITTI otherwise; choose yours with ``data.sensor``.
+    """
+
+    title = "a folder of scan files"
     licence = "that of your files"
-    tree = "ROOT/**/*.bin"
+    tree = "ROOT/**/FILE of any known format (lidargrit list formats)"
     sensor = "hdl64e_kitti_odometry"
-    patterns = ("**/*.bin",)
+    format = ""
+    citation = "that of your files"
+    patterns = ("**/*",)
     examples = ("{index:06d}.bin", "more/{index:06d}.bin")
+
+    def __init__(self, root: Path, split: str = "all", bad_points: BadPoints = "refuse") -> None:
+        super().__init__(root, split, bad_points)
+        sensors = [one.sensor for one in formats.candidates(self.path(0)) if one.sensor]
+        self.sensor = sensors[0] if sensors else type(self).sensor
 
     @classmethod
     def matches(cls, root: Path) -> bool:
-        """Tell whether this is a folder with such a file in it, or the file itself."""
-        return cls._is_scan(root) or super().matches(root)
+        """Tell whether a folder holds, or a single file is, what is called like a scan; reading tells if it is one."""
+        return next(scans_below(root), None) is not None
 
     @classmethod
     def _find(cls, root: Path) -> list[Path]:
-        return [root] if cls._is_scan(root) else super()._find(root)
+        return sorted(scans_below(root))
 
-    @staticmethod
-    def _is_scan(root: Path) -> bool:
-        return root.suffix == ".bin" and root.is_file()
-
-    @staticmethod
-    def sequence_of(relative: Path) -> str:
+    def sequence_of(self, relative: Path) -> str:
         """Name the folder of a file."""
         return relative.parent.as_posix()
+
+    def recording_of(self, path: Path) -> str:
+        """Name a recording by its folder."""
+        return str(path.resolve().parent)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import ClassVar
 
-from lidargrit.datasets import BadPoints, ScanDataset
+from lidargrit.datasets import ScanDataset, SplitScheme
 from lidargrit.datasets._splits import Split
 from lidargrit.errors import DataError, nearest_names
+from lidargrit.formats import BadPoints
 from lidargrit.sensors import load_sensor
 from lidargrit.structures import Scan
 
@@ -28,10 +29,16 @@ class Simulated(ScanDataset):
 
     title = "simulated streets"
     licence = "none needed: made by this program"
+    citation = "none needed: made by this program"
     tree = "COUNT, a number of scans from 1 to 1000000, not a folder"
     sensor = "hdl64e_kitti_odometry"
-    splits: ClassVar[dict[str, tuple[str, ...]]] = {"train": ("0",), "val": ("1000000",), "test": ("2000000",)}
-    """The first seed of every split."""
+    schemes: ClassVar[dict[str, SplitScheme]] = {
+        "seeds": SplitScheme(
+            source="lidargrit",
+            leak="None: every street is drawn anew.",
+            parts={"train": ("0",), "val": ("1000000",), "test": ("2000000",)},  # the first seed of each
+        )
+    }
 
     def __init__(self, root: Path, split: str = "all", bad_points: BadPoints = "refuse") -> None:
         super().__init__(root, split, bad_points)
@@ -40,7 +47,7 @@ class Simulated(ScanDataset):
         if not 1 <= count <= _SEEDS_APART:
             raise DataError(f"{digits!r} where a count belongs", self.tree, "type for example simulated:1000")
         wanted = Split.parse(split)
-        first_seeds = {**self.splits, "all": self.splits["train"]}
+        first_seeds = {**self.splits(), "all": self.splits()["train"]}
         name = "+".join(wanted.parts)
         if name not in first_seeds:
             raise DataError(
@@ -68,6 +75,10 @@ class Simulated(ScanDataset):
     def name(self, index: int) -> str:
         """Name one scan by its seed: "seed_0000012"."""
         return f"seed_{self._seeds[index]:07d}"
+
+    def recording(self, index: int) -> str:
+        """Name the street of a scan: its seed, of which no other scan is."""
+        return f"simulated/{self.name(index)}"
 
     @classmethod
     def matches(cls, root: Path) -> bool:

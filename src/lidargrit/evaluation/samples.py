@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import zipfile
 import zlib
 from collections.abc import Sequence
@@ -12,12 +13,13 @@ from typing import Any
 import numpy as np
 
 from lidargrit import configuration
-from lidargrit.errors import CheckpointError, DataError, OutputError, ScanError
-from lidargrit.files import atomic_path, is_taken, read_json, write_json
-from lidargrit.generators import WEIGHTS_FILE, Generator, SamplingConfig
-from lidargrit.loading import RangeImages
+from lidargrit.errors import CheckpointError, ConfigError, DataError, OutputError, ScanError
+from lidargrit.files import atomic_path, is_taken, read_json, write_json, write_text
+from lidargrit.generators import TRAINED_ON_FILE, WEIGHTS_FILE, Generator, SamplingConfig
+from lidargrit.loading import Pixels, Provenance, RangeImages
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel
+from lidargrit.training.run import RUN_FILE
 
 MANIFEST = "samples.json"
 
@@ -55,8 +57,11 @@ def write_samples(
         "sampling": configuration.to_json(sampling),
         "sensor": generator.sensor.to_json(),
     }
+    if variant := projection_of(run_folder):
+        manifest["projection_variant"] = variant
     if (folder / MANIFEST).exists():
-        if read_json(folder / MANIFEST) != manifest:
+        there = read_json(folder / MANIFEST)
+        if there != manifest and there != {key: of for key, of in manifest.items() if key != "projection_variant"}:
             raise OutputError(
                 f"{folder}, which holds samples of another model or drawn in another way",
                 "an empty folder, or one that this very command began",
@@ -66,6 +71,8 @@ def write_samples(
         raise OutputError(f"{folder}, which is not empty and holds no samples", "an empty folder", "choose another one")
     else:
         write_json(folder / MANIFEST, manifest)
+    if (run_folder / TRAINED_ON_FILE).is_file() and not (folder / TRAINED_ON_FILE).exists():
+        write_text(folder / TRAINED_ON_FILE, (run_folder / TRAINED_ON_FILE).read_text(encoding="utf-8"))
     missing = [seed for seed in seeds if not _file(folder, seed).exists()]
     with (reporter or Reporter()).progress("sampling", len(seeds), len(seeds) - len(missing)) as progress:
         for first in range(0, len(missing), batch_size):
@@ -87,14 +94,42 @@ def read_samples(folder: Path, count: int | None = None) -> RangeImages:
     Raises:
         DataError: no samples in the folder.
     """
+    manifest = read_json(folder / MANIFEST)
     try:
-        sensor = SensorModel.from_json(read_json(folder / MANIFEST)["sensor"])
-    except (KeyError, TypeError) as error:
-        raise CheckpointError(f"{folder / MANIFEST}, in which {error}", "what lidargrit wrote", "sample anew") from None
+        sensor = SensorModel.from_json(manifest["sensor"])
+    except (KeyError, TypeError, ConfigError) as error:
+        told = error.got if isinstance(error, ConfigError) else error
+        raise CheckpointError(f"{folder / MANIFEST}, in which {told}", "what lidargrit wrote", "sample anew") from None
     paths = sorted(folder.glob("[!.]*.npz"))[:count]  # not what a killed process left half-written
     if not paths:
         raise DataError(f"no sample in {folder}", "at least one", "draw some with: lidargrit sample RUN " + str(folder))
-    return RangeImages(sensor, [_Files(paths, sensor)], [path.stem for path in paths])
+    return RangeImages(sensor, [_Files(paths, sensor, _drawn_as(manifest))])
+
+
+def projection_of(folder: Path) -> str:
+    """Return by which variant of the projection the training scans of a run became images, or those of samples.
+
+    "" where that is not known.
+    """
+    about, place = folder / RUN_FILE, ("recipe", "data", "variant")
+    if is_sample_folder(folder):
+        about, place = folder / MANIFEST, ("projection_variant",)
+    found: Any = read_json(about) if about.is_file() else {}
+    for name in place:
+        found = found.get(name) if isinstance(found, dict) else None
+    return found if isinstance(found, str) else ""
+
+
+def trained_on(folder: Path) -> Provenance:
+    """Return what the model of a run, or of a folder of samples, learned from; empty where that is not known."""
+    if not (folder / TRAINED_ON_FILE).is_file():
+        return Provenance()
+    try:
+        return Provenance(**{name: tuple(of) for name, of in read_json(folder / TRAINED_ON_FILE).items()})
+    except (TypeError, AttributeError) as error:
+        raise CheckpointError(
+            f"{folder / TRAINED_ON_FILE}, in which {error}", "what lidargrit wrote", "restore it, or remove it"
+        ) from None
 
 
 def is_sample_folder(folder: Path) -> bool:
@@ -103,15 +138,16 @@ def is_sample_folder(folder: Path) -> bool:
 
 
 class _Files:
-    """Sample files that read like an array."""
+    """Sample files as a store of images."""
 
-    def __init__(self, paths: list[Path], sensor: SensorModel) -> None:
+    def __init__(self, paths: list[Path], sensor: SensorModel, drawn_as: str) -> None:
         self._paths, self._shape = paths, (sensor.height, sensor.width)
+        self.provenance = Provenance(tuple(f"{drawn_as}/sample {path.stem}" for path in paths))
 
     def __len__(self) -> int:
         return len(self._paths)
 
-    def __getitem__(self, index: int) -> np.ndarray:
+    def read(self, index: int) -> Pixels:
         path = self._paths[index]
         cure = "remove the file and sample again"
         try:
@@ -125,7 +161,13 @@ class _Files:
             )
         if not ((range_m >= 0) & np.isfinite(range_m)).all():
             raise ScanError(f"ranges that are negative or no number in {path}", "metres, 0 for no return", cure)
-        return range_m
+        return range_m, None
+
+
+def _drawn_as(manifest: dict[str, Any]) -> str:
+    """Return what two sets of samples share if equal seeds in them are the same scans: model and settings."""
+    drawn = [manifest.get("weights_sha256"), manifest.get("sampling")]
+    return hashlib.sha256(json.dumps(drawn, sort_keys=True).encode()).hexdigest()[:8]
 
 
 def _file(folder: Path, seed: int) -> Path:

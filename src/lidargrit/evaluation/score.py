@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from lidargrit.datasets import open_dataset
 from lidargrit.errors import ConfigError
+from lidargrit.evaluation.dialects import is_tensor_folder, read_tensor_folder
 from lidargrit.evaluation.reconstruction import ReconstructionErrors, ReconstructionScore
-from lidargrit.evaluation.samples import is_sample_folder, read_samples
-from lidargrit.generators import load
+from lidargrit.evaluation.samples import is_sample_folder, read_samples, trained_on
+from lidargrit.generators import is_run, load
 from lidargrit.generators.lidargrit import LidarGrit
-from lidargrit.loading import DataConfig, RangeImages, load_range_images, spread
-from lidargrit.metrics import load_metric
+from lidargrit.loading import (
+    DataConfig,
+    PreparedImages,
+    Provenance,
+    RangeImages,
+    is_prepared,
+    load_range_images,
+)
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel
-from lidargrit.structures import MetricResult
 from lidargrit.tokenizers import Tokenizer
 
 _BATCH = 16
@@ -30,56 +34,59 @@ def open_images(
     sensor: SensorModel | None = None,
     config: DataConfig | None = None,
     reporter: Reporter | None = None,
+    samples_format: str = "",
 ) -> RangeImages:
     """Open a folder of samples, or any source of scans as range images of a sensor.
 
     Args:
-        source: a folder of samples, or what data sets are opened by ("kitti_raw:ROOT:SPLIT", "FOLDER", ...).
+        source: a folder of samples, of ours or of another program (``.pth``), or what data sets are opened by
+            ("kitti_raw:ROOT:SPLIT", "FOLDER", ...).
         sensor: of scans; the data set's own if not given. Samples have theirs.
         config: how scans are read and projected, and how many at most; its sources and its sensor are not looked at.
         reporter: hears of the projection.
+        samples_format: which program wrote a folder of ``.pth`` files; told from what is in them if empty.
     """
     config = config or DataConfig()
     if is_sample_folder(Path(source)):
         return read_samples(Path(source), config.max_scans or None)
+    if samples_format or is_tensor_folder(Path(source)):
+        return read_tensor_folder(Path(source), samples_format, config.max_scans or None)
+    if is_prepared(source):
+        prepared = PreparedImages(source)
+        return load_range_images((source,), config, reporter, sensor or prepared.sensor)
     dataset = open_dataset(source, config.bad_points)
     return load_range_images((source,), replace(config, sensor=dataset.sensor), reporter, sensor)
 
 
-def evaluate(
-    generated: RangeImages, reference: RangeImages, metrics: Sequence[str], variant: str | None = None, seed: int = 0
-) -> list[MetricResult]:
-    """Score generated range images against real ones; equal numbers of both are compared.
+def warn_of_overlap(source: str, images: RangeImages | None, reference: RangeImages, reporter: Reporter) -> None:
+    """Say what a set, or the model that made it, has seen of the reference.
 
     Args:
-        generated: where there are more of them than of the others, they are taken evenly spaced.
-        reference: likewise.
-        metrics: names of metrics; each is computed in every variant it has, or in
-        variant: this one.
-        seed: of whatever a metric draws.
-
-    Raises:
-        ConfigError: the two sets look along different rays.
-        DataError: too few scans.
+        source: of the set: samples or a run, whose training scans count, or scans.
+        images: of the set, where it holds scans.
+        reference: what it is compared with.
+        reporter: hears of it.
     """
+    if shared := overlap(source, images, reference):
+        reporter.message(f"WARNING: {source} and the reference overlap ({shared}): the scores flatter it")
+
+
+def overlap(source: str, images: RangeImages | None, reference: RangeImages) -> str:
+    """Say in a few words what a set, or the model that made it, has in common with the reference; "" if nothing."""
+    learned = Provenance() if images is None else images.provenance
+    if is_sample_folder(Path(source)) or is_run(Path(source)):
+        learned = trained_on(Path(source))
+    return learned.overlap(reference.provenance)
+
+
+def require_same_rays(generated: RangeImages, reference: RangeImages) -> None:
+    """Refuse two sets that look along different rays, with ConfigError."""
     if not generated.sensor.same_rays(reference.sensor):
         raise ConfigError(
             f"range images of {generated.sensor.name!r} ({generated.sensor.height}x{generated.sensor.width})",
             f"the rays of {reference.sensor.name!r} ({reference.sensor.height}x{reference.sensor.width})",
             "project the scans with the samples' sensor: give the samples first, the scans second",
         )
-    count = min(len(generated), len(reference))
-    classes = [load_metric(name) for name in metrics]
-    running = [cls(variant=each, seed=seed) for cls in classes for each in ([variant] if variant else cls.variants)]
-    taken, real = spread(count, len(generated)), spread(count, len(reference))
-    for first in range(0, count, _BATCH):
-        generated_batch, real_batch = (
-            images.batch(chosen[first : first + _BATCH]) for images, chosen in ((generated, taken), (reference, real))
-        )
-        for metric in running:
-            metric.update(generated_batch, real=False)
-            metric.update(real_batch, real=True)
-    return [metric.compute() for metric in running]
 
 
 @torch.no_grad()
@@ -103,19 +110,5 @@ def evaluate_run(run_folder: Path, source: str, config: DataConfig, reporter: Re
     if not isinstance(generator, LidarGrit):
         raise ConfigError(f"a run of {type(generator).__name__}", "a generator with a tokenizer", "sample and score it")
     images = open_images(source, generator.sensor, config, reporter)
+    warn_of_overlap(str(run_folder), None, images, reporter)
     return asdict(score_reconstruction(generator.tokenizer, images))
-
-
-def as_json(results: Sequence[MetricResult]) -> list[dict[str, Any]]:
-    """Return scores for a file."""
-    return [asdict(result) for result in results]
-
-
-def as_table(results: Sequence[MetricResult]) -> str:
-    """Return scores as lines for a terminal."""
-    lines = [f"{'metric':<22}{'variant':<12}{'value':>10}   {'better':<8}{'scans':>12}"]
-    for result in results:
-        better = "higher" if result.higher_is_better else "lower"
-        scans = f"{result.num_generated} v {result.num_reference}"
-        lines.append(f"{result.metric:<22}{result.variant:<12}{result.value:>10.4f}   {better:<8}{scans:>12}")
-    return "\n".join(lines)

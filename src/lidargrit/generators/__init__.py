@@ -13,11 +13,13 @@ from torch import Tensor, nn
 from lidargrit import _discovery, configuration
 from lidargrit.errors import CheckpointError, ConfigError, LidarGritError
 from lidargrit.files import load_exactly, read_json, read_tensors, write_json, write_tensors
+from lidargrit.loading import RangeImages
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 from lidargrit.tokenizers import MaskDecoding
 
 CONFIG_FILE, WEIGHTS_FILE = "config.json", "model.safetensors"
+TRAINED_ON_FILE = "trained_on.json"  # in a run's folder and beside its samples: which drives, which pixels
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,9 @@ class Generator(nn.Module, ABC):
     @abstractmethod
     def __init__(self, config: Any, sensor: SensorModel) -> None:
         super().__init__()
+
+    def learn(self, images: RangeImages) -> None:
+        """Take from the training scans what needs no objective, such as counts; called once, before the stages."""
 
     @abstractmethod
     def objective(self, stage: str) -> nn.Module:
@@ -120,6 +125,10 @@ def load(folder: str | Path) -> Generator:
     try:
         config, sensor = about["config"], SensorModel.from_json(about["sensor"])
         cls = load_class(str(about["generator"]))
+    except ConfigError as error:
+        raise CheckpointError(
+            f"{folder / CONFIG_FILE}, in which {error.got}", error.wanted, "restore the file"
+        ) from None
     except LidarGritError:
         raise
     except (KeyError, TypeError, ValueError) as error:  # the last from tables that are not rectangular

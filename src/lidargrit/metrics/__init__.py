@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
 from typing import ClassVar
+
+from torch import distributed
 
 from lidargrit import _discovery
 from lidargrit.errors import ConfigError, DataError
@@ -30,6 +33,8 @@ class Metric(ABC):
     """Direction of the value."""
     variants: ClassVar[tuple[str, ...]]
     """The definitions on offer, the default first."""
+    needs_weights: ClassVar[str] = ""
+    """Network whose published weights the metric looks through; empty for most."""
 
     def __init__(self, *, variant: str | None = None, seed: int = 0) -> None:
         self.variant = self.variants[0] if variant is None else variant
@@ -66,6 +71,20 @@ class Metric(ABC):
             ConfigError: the other was made with other options or fed with images of another kind.
         """
 
+    def reduce(self) -> None:
+        """Take in what all other processes of ``torch.distributed``'s group have gathered, in the order of their ranks.
+
+        Every process must call it, and each then has the number for all images; alone, a process keeps what it has.
+        """
+        if not (distributed.is_available() and distributed.is_initialized()):
+            return
+        everyone: list[Metric | None] = [None] * distributed.get_world_size()
+        distributed.all_gather_object(everyone, self)
+        first, *others = (metric for metric in everyone if metric is not None)
+        for other in others:
+            first.merge(other)
+        vars(self).update(vars(first))
+
     def require_same_options(self, other: Metric) -> None:
         """Refuse to merge with a metric of another kind, variant or seed."""
         mine, theirs = ((metric.name, metric.variant, metric.seed) for metric in (self, other))
@@ -84,6 +103,14 @@ class Metric(ABC):
                 f"at least {at_least} of each",
                 "sample more scans, or check the folder",
             )
+
+
+def __getattr__(name: str) -> type[Metric]:
+    """Find ``from lidargrit.metrics import SlicedWasserstein`` in ``sliced_wasserstein.py``, when it is asked for."""
+    file = re.sub(r"(?<!^)(?=[A-Z])", "_", name).lower()
+    if not name[:1].isupper() or file not in _discovery.names("metrics"):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return load_metric(file)
 
 
 def load_metric(name: str) -> type[Metric]:

@@ -213,24 +213,38 @@ def laplacian_pyramid(images: Float[Tensor, "B H W"], *, shifted: bool) -> list[
     """
     levels = []
     for _ in range(num_levels(*images.shape[1:]) - 1):
-        coarse = _blurred(images)[:, ::2, ::2]
-        levels.append(images - _upsampled(coarse, shifted))
+        coarse = _halved(_halved(images, dim=2), dim=1)
+        levels.append(images - _doubled(_doubled(coarse, 1, shifted), 2, shifted))
         images = coarse
     return [*levels, images]
 
 
-def _upsampled(coarse: Float[Tensor, "B h w"], shifted: bool) -> Float[Tensor, "B 2*h 2*w"]:
-    batch, rows, columns = coarse.shape
-    fine = coarse.new_zeros(batch, 2 * rows, 2 * columns)
-    fine[:, int(shifted) :: 2, int(shifted) :: 2] = coarse
-    return _blurred(fine) * 4  # three of four pixels were zeros
+# Burt and Adelson, The Laplacian pyramid as a compact image code, 1983: the kernel [1, 4, 6, 4, 1] / 16 along rows and
+# columns. Pixels that the next level leaves out are never computed, nor is anything multiplied by the zeros between
+# coarse pixels: one axis after the other takes a sixth of the time of a 5x5 convolution.
 
 
-def _blurred(images: Float[Tensor, "B H W"]) -> Float[Tensor, "B H W"]:
-    # Burt and Adelson, The Laplacian pyramid as a compact image code, 1983: the binomial kernel.
-    row = images.new_tensor([1.0, 4.0, 6.0, 4.0, 1.0]) / 16
-    padded = F.pad(images[:, None], (2, 2, 2, 2), mode="reflect")
-    return F.conv2d(padded, torch.outer(row, row)[None, None])[:, 0]
+def _halved(images: Float[Tensor, "B _ _"], dim: int) -> Float[Tensor, "B _ _"]:
+    """Blur along one axis and keep the even pixels; borders are mirrored."""
+    line = images.transpose(dim, 2)
+    line = F.pad(line, (2, 2), mode="reflect")
+    outer, inner = line[..., :-4:2] + line[..., 4::2], line[..., 1:-3:2] + line[..., 3:-1:2]
+    return outer.div_(16).add_(inner, alpha=4 / 16).add_(line[..., 2:-2:2], alpha=6 / 16).transpose(dim, 2)
+
+
+def _doubled(coarse: Float[Tensor, "B _ _"], dim: int, shifted: bool) -> Float[Tensor, "B _ _"]:
+    """Spread pixels along one axis, onto the even places or (shifted) the odd ones, and blur what lies between.
+
+    Mirroring the fine line at its borders repeats the coarse pixel at one end and mirrors at the other.
+    """
+    n = coarse.shape[dim]
+    before, after = (0, n - 2) if shifted else (1, n - 1)
+    line = torch.cat((coarse.narrow(dim, before, 1), coarse, coarse.narrow(dim, after, 1)), dim=dim)
+    left, here, right = (line.narrow(dim, start, n) for start in (0, 1, 2))
+    on = (left + right).div_(8).add_(here, alpha=6 / 8)
+    between = (left + here if shifted else here + right).div_(2)
+    pair = (between, on) if shifted else (on, between)
+    return torch.stack(pair, dim=dim + 1).flatten(dim, dim + 1)
 
 
 def num_positions(rows: int, columns: int) -> int:

@@ -1,7 +1,20 @@
 """Between scans and range images: project, unproject, and the encodings of range that networks see."""
 
 from lidargrit.projection.encoding import RangeEncoding
-from lidargrit.projection.image import Variant, index_map, project
+from lidargrit.projection.fit import closest_sensor
+from lidargrit.projection.image import index_map, project
+from lidargrit.projection.inspection import Inspection, inspect
+from lidargrit.projection.placement import Variant
 from lidargrit.projection.unproject import points_of_pixels, unproject
 
-__all__ = ["RangeEncoding", "Variant", "index_map", "points_of_pixels", "project", "unproject"]
+__all__ = [
+    "Inspection",
+    "RangeEncoding",
+    "Variant",
+    "closest_sensor",
+    "index_map",
+    "inspect",
+    "points_of_pixels",
+    "project",
+    "unproject",
+]

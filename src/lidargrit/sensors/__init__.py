@@ -6,7 +6,7 @@ import json
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 from jaxtyping import Float
@@ -14,8 +14,11 @@ from torch import Tensor
 
 from lidargrit import _discovery
 from lidargrit.errors import ConfigError
+from lidargrit.sensors._checks import check_projection, check_tables, checked_entries
 
 ProjectionName = Literal["spherical", "unfolding"]
+
+_FILE_BYTES_AT_MOST = 100_000_000  # 128x2048 angles of each pixel, twice, take 12 MB of text
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +35,12 @@ class SensorModel:
         projection: how this sensor's scans become range images unless told otherwise.
         column_stride: the image keeps every n-th of ``W * n`` fine columns (the paper's 64x256: every 8th of 2048).
         source: where the numbers come from.
+        azimuth_offset_rad: how far counter-clockwise of its column's azimuth each row's laser looks when it fires. A
+            point is placed by its own azimuth, so images do not depend on it; the simulator aims by it.
+
+    Raises:
+        ConfigError: tables whose shapes do not match, angles out of bounds, rows that do not fall, or limits that are
+            not limits.
     """
 
     name: str
@@ -42,28 +51,16 @@ class SensorModel:
     projection: ProjectionName
     column_stride: int = 1
     source: str = ""
+    azimuth_offset_rad: Float[Tensor, "H"] | None = None
 
     def __post_init__(self) -> None:
-        elevation, azimuth = self.elevation_rad.shape, self.azimuth_rad.shape
-        if not (
-            len(elevation) == len(azimuth) == 2 and azimuth[0] in (1, elevation[0]) and elevation[1] in (1, azimuth[1])
-        ):
-            raise ConfigError(
-                f"elevations of shape {tuple(elevation)} and azimuths of {tuple(azimuth)} for the sensor {self.name!r}",
-                "(H, 1) and (1, W), or (H, W)",
-                "put each elevation into a row of its own and all azimuths into one row",
-            )
-        if not 0 < self.range_min_m < self.range_max_m:
+        check_tables(self.name, self.elevation_rad, self.azimuth_rad, self.azimuth_offset_rad, self.column_stride)
+        check_projection(self.name, self.projection, get_args(ProjectionName))
+        if not 0 < self.range_min_m < self.range_max_m < math.inf:
             raise ConfigError(
                 f"range limits {self.range_min_m} to {self.range_max_m} m for the sensor {self.name!r}",
                 "0 < range_min_m < range_max_m",
                 "correct the sensor's limits",
-            )
-        if not bool((self.elevation_rad.diff(dim=0) < 0).all()):
-            raise ConfigError(
-                f"elevations of the sensor {self.name!r} that do not fall from row to row",
-                "row 0 the highest ray, every next row lower",
-                "sort the rows of the sensor",
             )
 
     @property
@@ -107,7 +104,7 @@ class SensorModel:
 
     def to_json(self) -> dict[str, Any]:
         """Return the sensor as plain numbers and words, for a file."""
-        return {
+        data = {
             "name": self.name,
             "elevation_rad": self.elevation_rad.tolist(),
             "azimuth_rad": self.azimuth_rad.tolist(),
@@ -117,12 +114,18 @@ class SensorModel:
             "column_stride": self.column_stride,
             "source": self.source,
         }
+        if self.azimuth_offset_rad is not None:  # left out if there is none: files from before it existed look the same
+            data["azimuth_offset_rad"] = self.azimuth_offset_rad.tolist()
+        return data
 
     @classmethod
-    def from_json(cls, data: dict[str, Any]) -> SensorModel:
-        """Rebuild a sensor from what :meth:`to_json` returned."""
-        tables = {key: torch.tensor(data[key], dtype=torch.float32) for key in ("elevation_rad", "azimuth_rad")}
-        return cls(**{**data, **tables})
+    def from_json(cls, data: Any) -> SensorModel:
+        """Rebuild a sensor from what :meth:`to_json` returned, or someone wrote by hand.
+
+        Raises:
+            ConfigError: an entry is missing, unknown, of another type or out of its bounds.
+        """
+        return cls(**checked_entries(data, get_args(ProjectionName)))
 
     def same_rays(self, other: SensorModel) -> bool:
         """Tell whether two sensors look along the same rays, within a hundredth of a degree."""
@@ -145,16 +148,26 @@ def load_sensor(name: str) -> SensorModel:
 
     Raises:
         UnknownNameError: no sensor of that name; names its nearest neighbours.
+        ConfigError: the file cannot be read, or does not hold a sensor.
     """
-    if name.endswith(".json"):
-        try:
-            return SensorModel.from_json(json.loads(Path(name).read_text(encoding="utf-8")))
-        except ConfigError:
-            raise
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise ConfigError(
-                f"the sensor file {name}, which cannot be read ({error})",
-                "the JSON of a sensor",
-                "write one with SensorModel.to_json",
-            ) from None
-    return _discovery.load_instance("sensors", name, SensorModel)
+    if not name.endswith(".json"):
+        return _discovery.load_instance("sensors", name, SensorModel)
+    path, wanted, cure = (
+        Path(name),
+        "the JSON of a sensor",
+        "write one with: lidargrit fit-sensor, or SensorModel.to_json",
+    )
+    if path.exists() and not path.is_file():  # opening a pipe or a device would hang
+        raise ConfigError(f"the sensor file {name}, which is not a file", wanted, cure)
+    try:
+        if path.stat().st_size > _FILE_BYTES_AT_MOST:
+            raise ConfigError(f"the sensor file {name}, which is larger than any sensor's", wanted, cure)
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except ConfigError:
+        raise
+    except (OSError, ValueError, RecursionError) as error:
+        raise ConfigError(f"the sensor file {name}, which cannot be read ({error})", wanted, cure) from None
+    try:
+        return SensorModel.from_json(data)
+    except ConfigError as error:
+        raise ConfigError(f"{error.got} in {name}", error.wanted, error.cure) from None

@@ -1,4 +1,8 @@
-"""HDL-64E of KITTI as its scans unfold: 64 unequal rows, every 8th of 2048 columns, 0.9 to 120 m."""
+"""HDL-64E of KITTI as its scans unfold: two blocks of 32 unequal rows, every 8th of 2048 columns, 0.9 to 120 m.
+
+The 32 upper lasers are about 1/3 degree apart, the 32 lower ones about 1/2: rows are not linear in elevation.
+The azimuth offsets of KITTI's own unit are not published.
+"""
 
 import math
 

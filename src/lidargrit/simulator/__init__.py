@@ -1,21 +1,36 @@
-"""Scans without a car: a seed → a procedural street → the returns of a sensor in it."""
+"""Scans without a car: a seed → a scene of triangles → the returns of a sensor in it."""
 
 from __future__ import annotations
 
+from typing import get_args
+
 import numpy as np
-import torch
 
 from lidargrit.errors import ConfigError
 from lidargrit.sensors import SensorModel, load_sensor
-from lidargrit.simulator.raycast import Rays, cast
-from lidargrit.simulator.returns import Chances, returns
-from lidargrit.simulator.street import draw_street
+from lidargrit.simulator.observation import Observation, Settings, observe_scene
+from lidargrit.simulator.power import RaydropModel
+from lidargrit.simulator.scene import Scene, Theme, draw_scene
 from lidargrit.structures import Scan
 
-__all__ = ["simulate"]
+__all__ = ["Observation", "RaydropModel", "Scene", "Theme", "observe", "scene_of", "simulate"]
+
+FRAME_S = 0.1  # from one frame to the next: KITTI's sensor turns at 10 Hz
+_FRAMES_AT_MOST = 100_000  # each draws on a stream of its own, and they are set up one after the other
+_HDL64E_OF_KITTI = RaydropModel()
 
 
-def simulate(seed: int, sensor: SensorModel | None = None, kept_columns_only: bool = False) -> Scan:
+def simulate(
+    seed: int,
+    sensor: SensorModel | None = None,
+    *,
+    theme: Theme = "mixed",
+    frame: int = 0,
+    motion: bool = False,
+    wet: float = 0.0,
+    kept_columns_only: bool = False,
+    model: RaydropModel = _HDL64E_OF_KITTI,
+) -> Scan:
     """Simulate one revolution of a sensor in a street drawn from a seed.
 
     A beam is lost when its received power, which falls with range, with incidence and on dark, glossy or transparent
@@ -25,51 +40,85 @@ def simulate(seed: int, sensor: SensorModel | None = None, kept_columns_only: bo
     Args:
         seed: of the street and of the noise, not negative; the same seed gives the same scan, bit for bit.
         sensor: whose rays are cast, every column that it fires; the HDL-64E of KITTI odometry if not given.
-        kept_columns_only: cast only the columns that the sensor's image keeps, at 1 / column_stride of the work. The
-            points are those of the whole scan that fall into these columns.
+        theme: what kind of street is drawn.
+        frame: how many tenths of a second later; the frames of one seed are a drive through one street.
+        motion: leave the points as a moving car measures them, bent by its motion; otherwise all are as seen from where
+            the revolution began, which is how KITTI odometry stores them.
+        wet: of asphalt and concrete, from 0 (dry) to 1 (soaked).
+        kept_columns_only: cast only the columns that the sensor's image keeps, at a fraction of the work. The points
+            are those of the whole scan that fall into these columns.
+        model: which beams come back.
 
     Returns:
         points in the firing order of KITTI's files: ring by ring from the top, each counter-clockwise from straight
-        ahead; with ring and reflectance.
+        ahead; with ring, reflectance, and label as SemanticKITTI's files hold it (the instance in the upper 16 bits).
 
     Raises:
-        ConfigError: a negative seed.
+        ConfigError: a negative seed or frame, an unknown theme, or a wetness outside [0, 1].
 
     Example:
         >>> scan = simulate(seed=0)
         >>> int(scan.ring.max())
         63
     """
+    seen = observe(
+        seed,
+        sensor,
+        theme=theme,
+        frame=frame,
+        motion=motion,
+        wet=wet,
+        kept_columns_only=kept_columns_only,
+        model=model,
+    )
+    return seen.scan(f"simulated scan {seed}" + (f", frame {frame}" if frame else ""))
+
+
+def observe(
+    seed: int,
+    sensor: SensorModel | None = None,
+    *,
+    theme: Theme = "mixed",
+    frame: int = 0,
+    motion: bool = False,
+    wet: float = 0.0,
+    kept_columns_only: bool = False,
+    model: RaydropModel = _HDL64E_OF_KITTI,
+) -> Observation:
+    """Simulate one revolution as :func:`simulate` does, and tell of every pixel what is there and how it answers.
+
+    Args, Raises: as for :func:`simulate`.
+
+    Returns:
+        arrays of one value for each pixel of ``sensor.fine()``, or of ``sensor`` if ``kept_columns_only``.
+    """
+    _check(seed, theme)
+    if not 0 <= frame <= _FRAMES_AT_MOST:
+        raise ConfigError(f"the frame {frame}", f"a frame from 0 to {_FRAMES_AT_MOST}", "choose another frame")
+    if not 0 <= wet <= 1:  # also refuses NaN
+        raise ConfigError(f"wet {wet}", "a wetness from 0 (dry) to 1 (soaked)", "choose a number between")
+    sensor = sensor or load_sensor("hdl64e_kitti_odometry")
+    root = np.random.default_rng(seed)
+    street_rng, beam_rng = root.spawn(2)
+    if frame:
+        beam_rng = root.spawn(frame)[-1]
+    scene = draw_scene(street_rng, theme)
+    settings = Settings(FRAME_S * frame, motion, wet, kept_columns_only, model)
+    return observe_scene(scene, sensor, street_rng, beam_rng, settings)
+
+
+def scene_of(seed: int, theme: Theme = "mixed") -> Scene:
+    """Return the street that a seed stands for, which :func:`simulate` looks at: its triangles, and the car's way.
+
+    Raises:
+        ConfigError: a negative seed, or an unknown theme.
+    """
+    _check(seed, theme)
+    return draw_scene(np.random.default_rng(seed).spawn(2)[0], theme)
+
+
+def _check(seed: int, theme: str) -> None:
     if seed < 0:
         raise ConfigError(f"the seed {seed}", "a seed of 0 or more", "choose another seed")
-    sensor = sensor or load_sensor("hdl64e_kitti_odometry")
-    street_rng, beam_rng = np.random.default_rng(seed).spawn(2)
-    street = draw_street(street_rng)
-    chances = Chances.draw(beam_rng, sensor.height, sensor.width * sensor.column_stride)
-    rays = Rays.of_sensor(sensor)
-    if kept_columns_only:
-        chances, rays = chances.every(sensor.column_stride), Rays.kept_by(sensor)
-    hits = cast(street, rays, chances.free_path)
-    range_m, came_back, reflectance = returns(street, rays, hits, chances)
-    came_back &= (range_m >= sensor.range_min_m) & (range_m <= sensor.range_max_m)
-    return _in_firing_order(rays, range_m, came_back, reflectance, source=f"simulated scan {seed}")
-
-
-def _in_firing_order(
-    rays: Rays, range_m: np.ndarray, came_back: np.ndarray, reflectance: np.ndarray, source: str
-) -> Scan:
-    azimuth = np.broadcast_to(rays.azimuth_rad, range_m.shape)
-    elevation = np.broadcast_to(rays.elevation_rad, range_m.shape)
-    firing = np.argsort(rays.azimuth_rad % (2 * np.pi), axis=1)  # (#H, W)
-    column = np.broadcast_to(firing, range_m.shape)
-    ring, place = np.nonzero(np.take_along_axis(came_back, column, axis=1))
-    column = column[ring, place]
-    measured, az, el = range_m[ring, column].astype(np.float64), azimuth[ring, column], elevation[ring, column]
-    flat = measured * np.cos(el)
-    xyz_m = np.stack((flat * np.cos(az), flat * np.sin(az), measured * np.sin(el)), axis=1).astype(np.float32)
-    return Scan(
-        torch.from_numpy(xyz_m),
-        torch.from_numpy(reflectance[ring, column]),
-        torch.from_numpy(ring),
-        source=source,
-    )
+    if theme not in get_args(Theme):
+        raise ConfigError(f"the theme {theme!r}", f"one of {', '.join(get_args(Theme))}", "choose one of them")

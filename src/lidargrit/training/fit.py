@@ -14,6 +14,7 @@ from lidargrit.errors import OutputError, TrainingError
 from lidargrit.files import write_text
 from lidargrit.loading import Batches, RangeImages, seed_of, spread
 from lidargrit.reporting import Reporter
+from lidargrit.structures import RangeImage
 from lidargrit.training.checkpoint import load_checkpoint, save_checkpoint
 from lidargrit.training.engine import Engine
 from lidargrit.training.optimiser import WeightAverage, learning_rate_at, make_optimiser
@@ -34,6 +35,7 @@ class Fit:
         seed: of order, augmentation, dropout and draws.
         reporter: hears of the progress.
         built_on: fingerprint of the earlier stages' weights, which a checkpoint must share.
+        workers: threads that read ahead.
     """
 
     objective: nn.Module
@@ -42,6 +44,7 @@ class Fit:
     seed: int
     reporter: Reporter
     built_on: str = ""
+    workers: int = 1
 
     def __post_init__(self) -> None:
         self.engine = Engine(self.config.precision)
@@ -76,11 +79,12 @@ class Fit:
             self.seed,
             self.engine.rank,
             self.engine.world_size,
+            self.workers,
         )
         begun = time.monotonic()
         with self.reporter.progress(what, config.scans, self.scans_seen) as progress:
-            while self.scans_seen < config.scans:
-                terms = self._step(batches)
+            for images in batches.stream(self.scans_seen, config.scans):
+                terms = self._step(images)
                 progress.advance(config.batch_size, f"loss {float(terms['loss']):.4f}")
                 if self._passed(_LOG_EVERY_STEPS * config.batch_size):
                     self._log("train", {name: float(term) for name, term in terms.items()}, time.monotonic() - begun)
@@ -101,12 +105,12 @@ class Fit:
                 totals[name] = totals.get(name, 0.0) + value * len(indices) / len(chosen)
         return totals
 
-    def _step(self, batches: Batches) -> dict[str, Tensor]:
+    def _step(self, images: RangeImage) -> dict[str, Tensor]:
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate_at(self.config, self.scans_seen)
         seed = seed_of(self.seed, 2, self.scans_seen, self.engine.rank)
         torch.manual_seed(seed)  # dropout draws from the global generator
-        terms = self.engine.step(batches.at(self.scans_seen).to(self.engine.device), seed, self.config.gradient_clip)
+        terms = self.engine.step(images.to(self.engine.device), seed, self.config.gradient_clip)
         if not bool(terms["loss"].isfinite()):
             raise TrainingError(
                 f"a loss or gradient of {float(terms['loss'].detach())} after {self.scans_seen} scans",

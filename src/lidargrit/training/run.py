@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import platform
 import subprocess
 import sys
@@ -13,8 +14,8 @@ import torch
 
 from lidargrit import __version__, configuration
 from lidargrit.errors import CheckpointError, OutputError
-from lidargrit.files import is_taken, read_json, write_json
-from lidargrit.generators import Generator, load_class
+from lidargrit.files import is_taken, read_json, write_json, write_text
+from lidargrit.generators import TRAINED_ON_FILE, Generator, load_class
 from lidargrit.loading import RangeImages, load_range_images, seed_of
 from lidargrit.reporting import Reporter
 from lidargrit.training.checkpoint import fingerprint
@@ -44,10 +45,11 @@ def train(recipe: Recipe, folder: Path, reporter: Reporter | None = None) -> Gen
         torch.manual_seed(seed_of(recipe.seed, 9))
         generator = load_class(recipe.generator)(recipe.model, recipe.data.load_sensor())
         _claim(folder, recipe, train_images, val_images)
+        generator.learn(train_images)
         built_on = ""
         for number, stage in enumerate(generator.stages):
             seed, objective = seed_of(recipe.seed, number), generator.objective(stage)
-            fit = Fit(objective, recipe.training[stage], folder / stage, seed, reporter, built_on)
+            fit = Fit(objective, recipe.training[stage], folder / stage, seed, reporter, built_on, recipe.data.workers)
             trained = fit.run(train_images, val_images, f"training {stage}")
             generator.finish(stage, trained)
             built_on = fingerprint(trained)
@@ -97,8 +99,8 @@ def _claim(folder: Path, recipe: Recipe, train_images: RangeImages, val_images: 
     """Write what the run is, once all of it is known to be usable; or find that its data are still the same."""
     data = {
         "sensor": train_images.sensor.to_json(),
-        "train": hashlib.sha256("\n".join(train_images.names).encode()).hexdigest(),
-        "val": hashlib.sha256("\n".join(val_images.names).encode()).hexdigest(),
+        "train": hashlib.sha256("\n".join(train_images.provenance.names).encode()).hexdigest(),
+        "val": hashlib.sha256("\n".join(val_images.provenance.names).encode()).hexdigest(),
     }
     if (folder / RUN_FILE).exists():
         before = read_json(folder / RUN_FILE).get("data", data)
@@ -109,6 +111,7 @@ def _claim(folder: Path, recipe: Recipe, train_images: RangeImages, val_images: 
                     "what it began with",
                     "restore it, or choose another folder",
                 )
+        _write_trained_on(folder, train_images)
         return
     about: dict[str, Any] = {
         "recipe": configuration.to_json(recipe),
@@ -120,14 +123,20 @@ def _claim(folder: Path, recipe: Recipe, train_images: RangeImages, val_images: 
         "python": platform.python_version(),
     }
     write_json(folder / RUN_FILE, about)
+    _write_trained_on(folder, train_images)
+
+
+def _write_trained_on(folder: Path, train_images: RangeImages) -> None:
+    """Write what the model learns from, without the names of the user's files, so that samples can carry it."""
+    if not (folder / TRAINED_ON_FILE).exists():
+        came_from = train_images.provenance
+        facts = {"recordings": sorted({*came_from.recordings} - {""}), "fingerprints": sorted(came_from.fingerprints)}
+        write_text(folder / TRAINED_ON_FILE, json.dumps(facts) + "\n")
 
 
 def _warn_of_overlap(train_images: RangeImages, val_images: RangeImages, reporter: Reporter) -> None:
-    shared = set(train_images.names) & set(val_images.names)
-    if shared:
-        reporter.message(
-            f"WARNING: {len(shared)} scans are in both train and val, e.g. {min(shared)}: val figures mean little"
-        )
+    if shared := train_images.provenance.overlap(val_images.provenance):
+        reporter.message(f"WARNING: train and val overlap ({shared}): val figures flatter the model")
 
 
 def _commit() -> str:

@@ -19,7 +19,7 @@ from lidargrit.files import atomic_path
 from lidargrit.projection import points_of_pixels
 from lidargrit.structures import RangeImage
 
-_AT_MOST = 8  # scans of a group; more make a picture that no viewer shows well
+SCANS_AT_MOST = 8  # scans of a group; more make a picture that no viewer shows well
 _DOTS_PER_INCH = 100  # 1400 pixels across: a laptop shows the picture without shrinking it
 _WIDTH, _ROW, _HEAD, _FOOT = 14.0, 2.95, 0.75, 0.95  # inches: the picture, one scan of one group, title, colour bars
 _NO_RETURN = "#e4e4e4"  # near white: no colour of the range scale comes near it
@@ -117,11 +117,11 @@ def _check(groups: dict[str, RangeImage], max_range_m: float | None) -> None:
     if not groups:
         raise ConfigError("no group of range images to draw", "one or more", "pass for instance {'real': images}")
     for name, images in groups.items():
-        if not 1 <= len(images) <= _AT_MOST or images.range_m.ndim > 3:
+        if not 1 <= len(images) <= SCANS_AT_MOST or images.range_m.ndim > 3:
             raise ConfigError(
                 f"range images of shape {tuple(images.range_m.shape)} in the group {name!r}",
-                f"one image (H, W), or a batch (B, H, W) of 1 to {_AT_MOST}",
-                f"pass a part of them: images[:{_AT_MOST}]",
+                f"one image (H, W), or a batch (B, H, W) of 1 to {SCANS_AT_MOST}",
+                f"pass a part of them: images[:{SCANS_AT_MOST}]",
             )
     if max_range_m is not None and not max_range_m > 0:
         raise ConfigError(f"a largest range of {max_range_m:g} m", "more than 0 m", "leave max_range_m out")

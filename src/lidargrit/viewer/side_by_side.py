@@ -14,7 +14,7 @@ from lidargrit.generators.lidargrit import LidarGrit
 from lidargrit.loading import DataConfig, spread
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
-from lidargrit.viewer.pictures import draw_comparison
+from lidargrit.viewer.pictures import SCANS_AT_MOST, draw_comparison
 
 
 def view(places: Sequence[str], picture: Path, count: int = 3, seed: int = 0, config: DataConfig | None = None) -> None:
@@ -28,8 +28,8 @@ def view(places: Sequence[str], picture: Path, count: int = 3, seed: int = 0, co
         seed: of the first generated scan.
         config: how scans are read and projected.
     """
-    if count < 1:
-        raise ConfigError(f"{count} scans to draw", "1 to 8", "correct the number")
+    if not 1 <= count <= SCANS_AT_MOST:
+        raise ConfigError(f"{count} scans of each to draw", f"1 to {SCANS_AT_MOST}", "correct the number")
     runs = [place for place in places if is_run(Path(place))]
     generators = {place: load(place) for place in runs}
     sensor: SensorModel | None = next((generator.sensor for generator in generators.values()), None)

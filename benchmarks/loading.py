@@ -1,0 +1,84 @@
+"""Prepared range images: room per image, images a second in random order, memory; from simulated scans or a source.
+
+    python benchmarks/loading.py
+    python benchmarks/loading.py --source kitti_odometry:/data/kitti_odometry --images 80000
+
+The images of the source are written over and over again until there are as many as wanted, as a stand-in for a large
+data set. What the disk gives depends on what the system has cached: the second pass is from memory, if it fits.
+"""
+
+import argparse
+import hashlib
+import json
+import resource
+import tempfile
+import time
+from dataclasses import asdict, replace
+from pathlib import Path
+
+from lidargrit.files import write_json, write_text
+from lidargrit.loading import Batches, DataConfig, PreparedImages, RangeImages, prepare
+from lidargrit.loading.prepared import PLAN_FILE, SCANS_FILE, shard_name
+from lidargrit.loading.shards import ShardWriter
+from lidargrit.sensors import load_sensor
+from lidargrit.structures import RangeImage
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--source", default="simulated:32")
+    parser.add_argument("--images", type=int, default=4096)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--batch-size", type=int, default=16)
+    options = parser.parse_args()
+    sensor = replace(load_sensor("hdl64e_kitti_360"), projection="spherical")
+    with tempfile.TemporaryDirectory() as folder:
+        begun = time.perf_counter()
+        config = DataConfig(sensor="hdl64e_kitti_360", max_scans=32)
+        few = prepare(options.source, config, Path(folder) / "few", sensor=sensor)
+        print(f"projected {len(PreparedImages(str(few)))} scans in {time.perf_counter() - begun:.1f} s")
+        many = repeat(few, Path(folder) / "many", options.images)
+        size = sum(path.stat().st_size for path in many.glob("*.shard")) / options.images
+        print(f"{options.images} images of {sensor.height}x{sensor.width}, {size / 1e3:.1f} KB each")
+        before = peak_mb()
+        begun = time.perf_counter()
+        images = RangeImages(sensor, [PreparedImages(str(many))])
+        print(f"opened in {time.perf_counter() - begun:.2f} s")
+        for workers in sorted({1, options.workers}):
+            batches = Batches(images, options.batch_size, (), False, 0, workers=workers)
+            for name in ("first pass", "second pass"):
+                seen, begun = 0, time.perf_counter()
+                for batch in batches.stream(0, options.images):
+                    seen += len(batch)
+                rate = seen / (time.perf_counter() - begun)
+                print(f"{workers} workers, random order, {name}: {rate:,.0f} images a second")
+        print(f"peak memory {before:.0f} MB before, {peak_mb():.0f} MB after (mapped pages of the files included)")
+
+
+def repeat(few: Path, many: Path, count: int) -> Path:
+    """Write the images of a prepared folder again and again."""
+    store = PreparedImages(str(few))
+    plan = replace(store.plan, num_scans=count, digest=hashlib.sha256(b"repeated").hexdigest())
+    many.mkdir()
+    write_text(many / SCANS_FILE, json.dumps([[f"image {place}", "", 0, 0] for place in range(count)]))
+    write_json(many / PLAN_FILE, asdict(plan))
+    pixels = [RangeImages(store.sensor, [store]).batch([index]) for index in range(len(store))]
+    images = [
+        RangeImage(one.range_m[0], one.return_mask[0], one.sensor, None if (r := one.reflectance) is None else r[0])
+        for one in pixels
+    ]
+    for shard in range(plan.num_shards):
+        with (many / shard_name(shard)).open("wb") as file:
+            writer = ShardWriter(file, plan.range_step_m)
+            for place in plan.scans_of(shard):
+                writer.add(place, images[place % len(images)])
+            writer.finish()
+    return many
+
+
+def peak_mb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,44 @@
+"""Find the rows, columns and limits of a sensor in its scans, and write them as a sensor file."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+EXAMPLES = """\
+  lidargrit fit-sensor /data/scans -o my_sensor.json --picture fit.png
+  lidargrit train small runs/mine --set data.train=/data/scans data.sensor=my_sensor.json
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Name the options."""
+    parser.add_argument("source", help="a folder, a data set or a file of scans that one sensor made")
+    parser.add_argument("-o", "--out", type=Path, default=Path("my_sensor.json"), help="(default: my_sensor.json)")
+    parser.add_argument("--picture", type=Path, help="also draw what speaks for and against the fit, as a PNG")
+    parser.add_argument("-n", "--max-scans", type=int, default=20, help="look at so many, evenly spaced (default: 20)")
+    parser.add_argument("--name", help="of the sensor (default: the file's)")
+    parser.add_argument("--bad-points", choices=["refuse", "drop"], default="refuse", help="NaN, infinite or at 0")
+    parser.add_argument("--overwrite", action="store_true", help="replace files that are there already")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Fit, print a table, write the sensor file and perhaps a picture."""
+    from lidargrit.errors import ConfigError
+    from lidargrit.files import refuse_to_overwrite, write_json
+    from lidargrit.fitting import fit_sensor_to_source
+    from lidargrit.fitting.table import as_table
+
+    if options.out.suffix != ".json":
+        raise ConfigError(f"the name {options.out} for a sensor file", "a name that ends in .json", "rename it")
+    for path in (options.out, options.picture):
+        refuse_to_overwrite(path, options.overwrite)
+    name = options.out.stem if options.name is None else options.name
+    fit = fit_sensor_to_source(options.source, name, options.max_scans, options.bad_points)
+    print(as_table(fit))
+    if options.picture:
+        from lidargrit.viewer.sensor_fit import draw_sensor_fit
+
+        draw_sensor_fit(fit, options.picture)
+    write_json(options.out, fit.sensor.to_json())
+    print(f"done: {options.out}; use it with data.sensor={options.out} (train), or wherever a sensor is named")

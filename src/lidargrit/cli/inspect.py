@@ -1,0 +1,56 @@
+"""Say what a projection keeps of a scan, what it loses, and how far off it puts the rest."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+EXAMPLES = """\
+  lidargrit inspect scan.bin                                     with the sensor of ours that looks closest
+  lidargrit inspect /data/kitti_odometry --projection spherical  the first scan of a data set
+  lidargrit inspect scan.bin --sensor vlp16 -o picture.png --json figures.json
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Name the options."""
+    parser.add_argument("scan", help="a file, or a source of scans, of which the first is taken")
+    parser.add_argument("--sensor", help="its name or .json file (default: the data set's, or the closest of ours)")
+    parser.add_argument("--columns", type=int, help="of the full circle (default: the sensor's own)")
+    parser.add_argument("--projection", choices=["spherical", "unfolding"], help="(default: the sensor's own)")
+    parser.add_argument("--variant", choices=["exact", "reference"], default="exact", help="of the projection")
+    parser.add_argument("--bad-points", choices=["refuse", "drop"], default="refuse", help="NaN, infinite or at 0")
+    parser.add_argument("-o", "--out", type=Path, help="also draw a picture, a PNG")
+    parser.add_argument("--json", type=Path, help="also write the figures to this file")
+    parser.add_argument("--overwrite", action="store_true", help="replace files that are there already")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Project one scan and print what became of it."""
+    from lidargrit.api import load_scan
+    from lidargrit.datasets import open_dataset
+    from lidargrit.files import refuse_to_overwrite, write_json
+    from lidargrit.projection.fit import closest_sensor
+    from lidargrit.projection.inspection import as_json, as_table, inspect
+    from lidargrit.sensors import load_sensor
+    from lidargrit.viewer.inspection import draw_inspection
+
+    refuse_to_overwrite(options.out, options.overwrite)
+    refuse_to_overwrite(options.json, options.overwrite)
+    name = options.sensor
+    if Path(options.scan).is_file():
+        scan = load_scan(options.scan, bad_points=options.bad_points)
+    else:
+        dataset = open_dataset(options.scan, options.bad_points)
+        scan = dataset.scan(0)
+        name = name or dataset.sensor
+    sensor = load_sensor(name or closest_sensor(scan))
+    if options.columns is not None:
+        sensor = sensor.with_columns(options.columns)
+    found = inspect(scan, sensor, options.projection, options.variant)
+    print(as_table(found))
+    if options.json:
+        write_json(options.json, as_json(found))
+    if options.out:
+        draw_inspection(found, options.out)
+        print(f"\ndone: look at {options.out}")

@@ -1,0 +1,46 @@
+"""Scans of procedural streets as files, in the layout of KITTI odometry, with labels and poses."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+EXAMPLES = """\
+  lidargrit simulate streets -n 1000
+  lidargrit simulate drives -n 200 --frames 20                 ten drives of two seconds
+  lidargrit simulate clean_and_dropped -n 500 --clean          to train and judge raydrop models
+  lidargrit simulate vlp16 -n 100 --sensor vlp16 --theme city --wet 0.5
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Name the options."""
+    parser.add_argument("out", type=Path, help="an empty folder, or one that the same command began")
+    parser.add_argument("-n", "--num-scans", type=int, required=True, help="in all")
+    parser.add_argument("--sensor", default="hdl64e_kitti_odometry", help="name or .json file")
+    parser.add_argument("--seed", type=int, default=0, help="of the first street")
+    parser.add_argument("--frames", type=int, default=1, help="scans of each street, a tenth of a second apart")
+    parser.add_argument("--theme", choices=["mixed", "city", "suburb", "country"], default="mixed")
+    parser.add_argument("--motion", action="store_true", help="leave in the distortion by our own motion")
+    parser.add_argument("--wet", type=float, default=0.0, help="ground, from 0 (dry) to 1")
+    parser.add_argument("--clean", action="store_true", help="also clean ranges and return probabilities (.npz)")
+    parser.add_argument("--workers", type=int, default=2, help="processes at once")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Simulate, and say what lies where."""
+    from lidargrit.reporting import TerminalReporter
+    from lidargrit.sensors import load_sensor
+    from lidargrit.simulator.drives import DriveConfig, write_drives
+
+    config = DriveConfig(
+        sensor=load_sensor(options.sensor),
+        seed=options.seed,
+        frames=options.frames,
+        theme=options.theme,
+        motion=options.motion,
+        wet=options.wet,
+        clean=options.clean,
+    )
+    write_drives(options.out, options.num_scans, config, options.workers, TerminalReporter())
+    print(f"{options.num_scans} scans in {options.out}: read them as kitti_odometry:{options.out}")

@@ -1,0 +1,94 @@
+"""What a user typed → scores: the words of ``lidargrit evaluate`` as one call of the library."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from collections.abc import Callable
+from pathlib import Path
+
+from lidargrit import _discovery
+from lidargrit.errors import ConfigError, nearest_names
+from lidargrit.evaluation.comparison import Settings, compare_sources
+from lidargrit.evaluation.intervals import Resampling
+from lidargrit.evaluation.score import evaluate_run
+from lidargrit.evaluation.scorecard import Scorecard
+from lidargrit.evaluation.sides import Sides
+from lidargrit.files import refuse_to_overwrite, write_json
+from lidargrit.generators import is_run
+from lidargrit.loading import DataConfig
+from lidargrit.metrics import load_metric
+from lidargrit.reporting import Reporter
+
+
+def evaluate(options: Namespace, reporter: Reporter, write_report: Callable[[Scorecard, Sides, Path], None]) -> str:
+    """Score as the options say, write the files that they name, and return what is to be printed.
+
+    Raises:
+        ConfigError: an option that is missing or out of its bounds.
+    """
+    if not (options.samples and options.reference):
+        got = f"{options.samples!r} alone" if options.samples else "nothing to score"
+        raise ConfigError(got, "samples and what they are compared with", "name two sets, or use --tables")
+    settings = settings_of(options)
+    for path in (options.json, options.report):
+        refuse_to_overwrite(path, options.overwrite)
+    if is_run(Path(options.samples)):
+        return _run(options, settings, reporter)
+    card, sides = compare_sources(options.samples, options.reference, settings, reporter)
+    for warning in card.warnings[len(sides.warnings) :]:
+        reporter.message(f"WARNING: {warning}")
+    if options.json:
+        write_json(options.json, card.to_json())
+    if options.report:
+        write_report(card, sides, options.report)
+    return card.as_table()
+
+
+def settings_of(options: Namespace) -> Settings:
+    """Return the settings that a user's words name."""
+    return Settings(
+        protocol=options.protocol,
+        metrics=tuple(options.metrics),
+        variant=options.variant,
+        projection_variant=options.projection_variant,
+        max_scans=options.max_scans,
+        seed=options.seed,
+        resampling=Resampling(options.groups, options.intervals, max(options.seed, 0)),
+        weights=weights_of(options.weights),
+        samples_format=options.samples_format,
+        device=options.device,
+        data=DataConfig(bad_points=options.bad_points, bad_scans=options.bad_scans),
+    )
+
+
+def weights_of(words: list[str]) -> dict[str, Path]:
+    """Turn words such as ``pointnet=FILE`` into files by the name of their network.
+
+    Raises:
+        ConfigError: a word without ``=``, or a network that no metric looks through.
+    """
+    if not words:
+        return {}
+    known = {load_metric(name).needs_weights for name in _discovery.names("metrics")} - {""}
+    files = {}
+    for word in words:
+        name, equals, path = word.partition("=")
+        if not (equals and path) or name not in known:
+            wanted = f"NAME=FILE with {nearest_names(name, known)} for NAME"
+            raise ConfigError(f"--weights {word}", wanted, "name a network and the file with its weights")
+        files[name] = Path(path)
+    return files
+
+
+def _run(options: Namespace, settings: Settings, reporter: Reporter) -> str:
+    config = DataConfig(
+        max_scans=settings.max_scans,
+        variant=settings.projection_variant or "exact",
+        bad_points=settings.data.bad_points,
+        bad_scans=settings.data.bad_scans,
+    )
+    errors = evaluate_run(Path(options.samples), options.reference, config, reporter)
+    if options.json:
+        about = {"samples": options.samples, "reference": options.reference, "projection_variant": config.variant}
+        write_json(options.json, {**about, "reconstruction": errors})
+    return "\n".join(f"{name:<20}{value:>10.4g}" for name, value in errors.items())

@@ -1,0 +1,198 @@
+"""Samples as other programs write them, one tensor a file: folder of .pth → range images."""
+
+from __future__ import annotations
+
+import math
+import re
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidargrit import _discovery
+from lidargrit.errors import DataError, ScanError, UnknownNameError, nearest_names
+from lidargrit.loading import Pixels, Provenance, RangeImages
+from lidargrit.sensors import SensorModel, load_sensor
+
+_BYTES_AT_MOST = 1 << 30  # of one file, unpacked: a batch of 500 scans of 5 channels has 655 MB
+_SCANS_AT_MOST = 1 << 20
+
+Decoded = tuple[Float[Tensor, "H W"], Float[Tensor, "H W"] | None]
+"""Metres, 0 where nothing returned; reflectance in [0, 1] if there is one."""
+
+
+@dataclass(frozen=True)
+class Dialect:
+    """How one program writes a scan.
+
+    Args:
+        title: whose samples.
+        source: where the facts come from.
+        channels: of its tensors, (channels, rows, columns) each, or (scans, channels, rows, columns).
+        sensors: whose images they may be: name, fine columns, every n-th of them kept; 0 columns for the sensor's own.
+        variant: of the projection by which its training scans became images.
+        decode: turns what is in a tensor into metres.
+    """
+
+    title: str
+    source: str
+    channels: int
+    sensors: tuple[tuple[str, int, int], ...]
+    variant: str
+    decode: Callable[[Tensor], Decoded]
+
+    def sensor_of(self, rows: int, columns: int) -> SensorModel | None:
+        """Return the sensor that has images of a size, None if there is none."""
+        for name, fine_columns, stride in self.sensors:
+            sensor = load_sensor(name)
+            sensor = sensor.with_columns(fine_columns, stride) if fine_columns else sensor
+            if (sensor.height, sensor.width) == (rows, columns):
+                return sensor
+        return None
+
+
+def load_dialect(name: str) -> Dialect:
+    """Return a dialect by its name, or raise UnknownNameError."""
+    name, known = name.replace("-", "_"), _discovery.names("evaluation.dialects")
+    if name not in known:
+        raise UnknownNameError(f"samples of {name!r}", f"those of {nearest_names(name, known, 9)}", "choose one")
+    return _discovery.load_instance("evaluation.dialects", name, Dialect)
+
+
+def is_tensor_folder(folder: Path) -> bool:
+    """Tell whether a folder holds samples as tensors."""
+    try:
+        return folder.is_dir() and any(True for _ in folder.glob("[!.]*.pth"))
+    except OSError:  # a name longer than names can be
+        return False
+
+
+def recognise(folder: Path) -> str:
+    """Name the program that wrote a folder of tensors, by the number of channels of the first.
+
+    Raises:
+        ScanError: a tensor of none of them.
+    """
+    path = _paths(folder)[0]
+    shape = tuple(read_tensor(path).shape)
+    known = {load_dialect(name).channels: name for name in _discovery.names("evaluation.dialects")}
+    if len(shape) < 3 or shape[-3] not in known:
+        wanted = ", ".join(f"{channels} channels ({name})" for channels, name in sorted(known.items()))
+        raise ScanError(f"a tensor of {shape} in {path}", wanted, "name what wrote it with --samples-format")
+    return known[shape[-3]]
+
+
+def read_tensor_folder(folder: Path, name: str = "", count: int | None = None) -> RangeImages:
+    """Return the samples of a folder of tensors, in the order of their numbers; read when asked for.
+
+    Args:
+        folder: of ``.pth`` files, one scan or one batch of scans each.
+        name: of the dialect; told from the number of channels if empty.
+        count: at most so many, the first.
+
+    Raises:
+        DataError: no tensor in the folder.
+        ScanError: a file that is damaged, too large, more than a tensor, or not of this dialect.
+    """
+    dialect = load_dialect(name or recognise(folder))
+    store = _Tensors(_paths(folder), dialect, count)
+    return RangeImages(store.sensor, [store])
+
+
+def read_tensor(path: Path) -> Tensor:
+    """Read the one tensor that a file holds; nothing else in it is looked at, and no code in it is run.
+
+    Raises:
+        ScanError: no tensor, or larger than scans are.
+    """
+    wanted, cure = f"one tensor of at most {_BYTES_AT_MOST >> 20} MB", "save it as one: torch.save(tensor, path)"
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+        if size > _BYTES_AT_MOST:
+            raise ValueError(f"{size} bytes")
+        tensor: Any = torch.load(path, map_location="cpu", weights_only=True)
+        if not isinstance(tensor, Tensor) or tensor.layout != torch.strided:
+            raise TypeError(f"a {type(tensor).__name__}")
+        if tensor.numel() * tensor.element_size() > tensor.untyped_storage().nbytes():
+            raise ValueError("a tensor larger than what the file holds")  # a stride of 0 can name terabytes
+        if not tensor.is_floating_point():
+            raise TypeError(f"numbers of type {tensor.dtype}")
+    except Exception as error:  # damaged bytes make torch raise many kinds, for one cause
+        told = str(error).partition("\n")[0][:120]
+        raise ScanError(f"{path}, which cannot be used ({type(error).__name__}: {told})", wanted, cure) from None
+    return tensor.float()
+
+
+class _Tensors:
+    """Files of tensors as a store of images."""
+
+    def __init__(self, paths: list[Path], dialect: Dialect, count: int | None) -> None:
+        self._dialect, self._last = dialect, (Path(), torch.empty(0))
+        first = self._tensor(paths[0])
+        self.sensor = self._sensor(first, paths[0])
+        self._places: list[tuple[Path, int | None]] = []
+        for path in paths:
+            if first.ndim == 3:
+                self._places.append((path, None))
+            else:
+                self._places += [(path, index) for index in range(len(self._tensor(path)))][:_SCANS_AT_MOST]
+            if count and len(self._places) >= count:
+                break
+        self._places = self._places[:count]
+        self.provenance = Provenance(tuple(f"{path} {index or 0}" for path, index in self._places))
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def read(self, index: int) -> Pixels:
+        path, place = self._places[index]
+        tensor = self._tensor(path)
+        scan = tensor if place is None else tensor[place]
+        if tuple(scan.shape) != (self._dialect.channels, self.sensor.height, self.sensor.width):
+            wanted = f"{self._dialect.channels}x{self.sensor.height}x{self.sensor.width}, as the first"
+            raise ScanError(f"a tensor of {tuple(scan.shape)} in {path}", wanted, "remove the file")
+        range_m, reflectance = self._dialect.decode(scan)
+        if not bool(((range_m >= 0) & (range_m < math.inf)).all()):
+            raise ScanError(f"ranges that are negative or no number in {path}", "metres", "check what wrote it")
+        return _array(range_m), None if reflectance is None else _array(reflectance.nan_to_num().clamp(0, 1))
+
+    def _tensor(self, path: Path) -> Tensor:
+        known, tensor = self._last  # one pair, replaced at once: safe from several threads
+        if known != path:
+            tensor = read_tensor(path)
+            self._last = (path, tensor)
+        return tensor
+
+    def _sensor(self, first: Tensor, path: Path) -> SensorModel:
+        shape = tuple(first.shape)
+        fits = len(shape) in {3, 4} and shape[-3] == self._dialect.channels
+        sensor = self._dialect.sensor_of(*shape[-2:]) if fits else None
+        if sensor is None:
+            sizes = " or ".join(f"{self._dialect.channels}x{h}x{w}" for h, w in self._sizes())
+            raise ScanError(f"a tensor of {shape} in {path}", f"{sizes}: {self._dialect.title}", "check the format")
+        return sensor
+
+    def _sizes(self) -> list[tuple[int, int]]:
+        found = []
+        for name, fine_columns, stride in self._dialect.sensors:
+            sensor = load_sensor(name)
+            found.append((sensor.height, fine_columns // stride if fine_columns else sensor.width))
+        return found
+
+
+def _array(values: Tensor) -> np.ndarray[Any, np.dtype[np.float32]]:
+    return values.contiguous().numpy().astype(np.float32, copy=False)
+
+
+def _paths(folder: Path) -> list[Path]:
+    found = sorted(folder.glob("[!.]*.pth"), key=lambda path: [int(n) for n in re.findall(r"\d{1,18}", path.stem)])
+    if not found:
+        raise DataError(f"no .pth file in {folder}", "samples as tensors, one file each", "check the folder")
+    return found

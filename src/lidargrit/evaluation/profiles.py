@@ -1,0 +1,98 @@
+"""What a set of range images looks like as a whole, and which scans of two sets are alike: sets → arrays to draw."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+
+from lidargrit.evaluation.sides import Side
+from lidargrit.loading import spread
+from lidargrit.projection import points_of_pixels
+
+HALF_VIEW_M = 50.0  # beyond it a 64-row sensor sees little but walls
+_CELLS = 100  # of 1 m, along each axis
+_BATCH = 16
+_ROWS, _COLUMNS = (
+    32,
+    128,
+)  # pixels that are compared: enough to tell streets apart, and few enough for thousands of pairs
+_GENERATED_AT_MOST, _REAL_AT_MOST = 500, 2000  # scans that are compared one by one: a few seconds
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """Means over a set.
+
+    Args:
+        mean_range_m: over the returns of each pixel; NaN where none ever returned.
+        return_rate: of each pixel.
+        density: points per scan in each square metre; row 0 is behind the sensor, column 0 on its right.
+    """
+
+    mean_range_m: Float64[np.ndarray, "H W"]
+    return_rate: Float64[np.ndarray, "H W"]
+    density: Float64[np.ndarray, "x y"]
+
+
+@dataclass(frozen=True)
+class Match:
+    """A generated scan and the reference scan that is most like it.
+
+    Args:
+        generated: its place in the set.
+        real: likewise.
+        distance: mean absolute difference of log2(1 + range in metres) over pixels, 0 for no return.
+    """
+
+    generated: int
+    real: int
+    distance: float
+
+
+@torch.no_grad()
+def profile(side: Side) -> Profile:
+    """Return the means over all compared scans of a set."""
+    sensor = side.images.sensor
+    total = torch.zeros(sensor.height, sensor.width, dtype=torch.float64)
+    returns = torch.zeros_like(total)
+    cells = torch.zeros(_CELLS * _CELLS, dtype=torch.float64)
+    for first in range(0, len(side), _BATCH):
+        images = side.batch(range(first, min(first + _BATCH, len(side))))
+        total += images.range_m.double().sum(dim=0)
+        returns += images.return_mask.sum(dim=0)
+        points = points_of_pixels(images)[images.return_mask][:, :2]
+        cell = ((points + HALF_VIEW_M) * (_CELLS / (2 * HALF_VIEW_M))).floor().long()
+        cell = cell[((cell >= 0) & (cell < _CELLS)).all(dim=1)]
+        cells += torch.bincount(cell[:, 0] * _CELLS + cell[:, 1], minlength=_CELLS * _CELLS)
+    mean = torch.where(returns > 0, total / returns, torch.nan)
+    return Profile(mean.numpy(), (returns / len(side)).numpy(), (cells / len(side)).view(_CELLS, _CELLS).numpy())
+
+
+def matches(samples: Side, reference: Side) -> list[Match]:
+    """Return the nearest reference scan of every generated one, the most alike first.
+
+    Of many scans 500 generated and 2,000 real ones are compared, evenly spaced.
+    """
+    chosen, known = spread(_GENERATED_AT_MOST, len(samples)), spread(_REAL_AT_MOST, len(reference))
+    distance = torch.cdist(_outlines(samples, chosen), _outlines(reference, known), p=1) / (_ROWS * _COLUMNS)
+    nearest = distance.min(dim=1)
+    found = [
+        Match(generated, known[int(real)], float(apart))
+        for generated, real, apart in zip(chosen, nearest.indices, nearest.values, strict=True)
+    ]
+    return sorted(found, key=lambda match: match.distance)
+
+
+def _outlines(side: Side, places: list[int]) -> Float[torch.Tensor, "n pixels"]:
+    """Return some pixels of each scan, as logarithms: a metre matters more nearby."""
+    sensor = side.images.sensor
+    rows = torch.linspace(0, sensor.height - 1, _ROWS).round().long()
+    columns = torch.linspace(0, sensor.width - 1, _COLUMNS).round().long()
+    parts = []
+    for first in range(0, len(places), _BATCH):
+        range_m = side.batch(places[first : first + _BATCH]).range_m
+        parts.append(torch.log2(1 + range_m[:, rows][:, :, columns]).flatten(1))
+    return torch.cat(parts)

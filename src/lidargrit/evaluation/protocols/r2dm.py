@@ -1,0 +1,24 @@
+"""R2DM's program on KITTI-360: 10,000 samples against all scans, 64x1024, 0.5 to 63 m."""
+
+from lidargrit.evaluation.protocols import Choice, Protocol
+
+r2dm = Protocol(
+    title="R2DM on KITTI-360, 64x1024",
+    source="kazuto1011/r2dm@ad66e71, evaluate.py with its defaults",
+    choices=(
+        Choice("frechet_range_distance", "r2dm"),
+        Choice("frechet_pointcloud_distance", "r2dm"),
+        Choice("kernel_pointcloud_distance", "r2dm"),
+        Choice("bev_jsd", "r2dm"),
+        Choice("bev_mmd", "r2dm"),
+    ),
+    sensor="hdl64e_kitti_360",
+    range_m=(0.5, 63.0),
+    num_scans=10000,
+    data_set="kitti_360",
+    splits=("all",),
+    departures=(
+        "the program compares features of all real scans with those of the samples; here of equally many",
+        "the program takes the true points of real scans; here both sets are unprojected along the sensor's rays",
+    ),
+)

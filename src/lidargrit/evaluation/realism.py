@@ -1,0 +1,205 @@
+"""Real scans, simulated ones and a coin for every ray → how far their curves are apart, and which are nearer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from lidargrit.datasets import open_dataset
+from lidargrit.errors import ConfigError, DataError
+from lidargrit.evaluation.score import open_images
+from lidargrit.loading import DataConfig, RangeImages
+from lidargrit.metrics import load_metric
+from lidargrit.reporting import Reporter
+from lidargrit.sensors import SensorModel, load_sensor
+from lidargrit.simulator import Observation, observe
+from lidargrit.structures import MetricResult, RangeImage
+
+CURVES = (
+    "return_rate_per_ring",
+    "return_rate_per_range",
+    "return_rate_by_incidence",
+    "range_histogram_per_ring",
+    "drop_run_lengths",
+    "drop_correlation",
+    "reflectance_histogram",
+    "bev_occupancy",
+)
+"""The metrics that are compared, each a Jensen-Shannon distance."""
+
+_BATCH = 16
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedScans:
+    """Scans of the simulator, before and after the question which rays return.
+
+    Args:
+        clean: where all surfaces within the sensor's limits return.
+        measured: what the sensor records.
+    """
+
+    clean: RangeImage
+    measured: RangeImage
+
+
+@dataclass(frozen=True)
+class CurveScore:
+    """How far one curve of real scans is from others, each a Jensen-Shannon distance from 0 (alike) to 1.
+
+    Args:
+        simulated: from simulated scans, the generated side of the result.
+        bernoulli: from clean simulated ranges with each return dropped by a coin of one constant rate.
+        floor: the first half of the real scans from the second: how much real scans differ.
+    """
+
+    simulated: MetricResult
+    bernoulli: MetricResult
+    floor: MetricResult
+
+    @property
+    def ratio(self) -> float:
+        """Distance of the simulator over that of the coin: below 1 the simulator is nearer to real scans."""
+        return self.simulated.value / self.bernoulli.value if self.bernoulli.value > 0 else float("nan")
+
+
+def compare(simulated: SimulatedScans, real: RangeImages, curves: Sequence[str] = CURVES) -> list[CurveScore]:
+    """Compare real scans with simulated ones and with a coin, curve by curve.
+
+    Args:
+        simulated: scans of the real ones' sensor, as many as wanted.
+        real: at least two, in the order in which they were recorded.
+        curves: names of metrics. ``reflectance_histogram`` is left out where a real scan has no reflectance.
+
+    Raises:
+        ConfigError: the two look along different rays.
+        DataError: fewer than two real scans.
+    """
+    if len(real) < 2:
+        raise DataError(f"{len(real)} real scan", "at least 2: one half is compared with the other", "name more scans")
+    if not simulated.clean.sensor.same_rays(real.sensor):
+        got, wanted = simulated.clean.sensor.name, real.sensor.name
+        raise ConfigError(f"simulated scans of {got!r}", f"the rays of {wanted!r}", "simulate the sensor of the scans")
+    half = len(real) // 2
+    pixels, returned, reflects = 0, 0, True
+    for batch in _batches(real, 0, len(real)):
+        pixels, returned = pixels + batch.return_mask.numel(), returned + int(batch.return_mask.sum())
+        reflects &= batch.reflectance is not None
+    coin = drop_by_coin(simulated.clean, returned / pixels)
+    scores = []
+    for name in curves:
+        if name == "reflectance_histogram" and not reflects:
+            continue
+        scores.append(
+            CurveScore(
+                _distance(name, [simulated.measured], _batches(real, 0, len(real))),
+                _distance(name, [coin], _batches(real, 0, len(real))),
+                _distance(name, _batches(real, 0, half), _batches(real, half, len(real))),
+            )
+        )
+    return scores
+
+
+def drop_by_coin(clean: RangeImage, return_share: float, seed: int = 0) -> RangeImage:
+    """Drop returns by an independent coin of one rate, so that a given share of all pixels returns.
+
+    Args:
+        clean: a batch where all surfaces return.
+        return_share: of all pixels, in [0, 1]; where fewer pixels see a surface, all of these return.
+        seed: of the coin.
+    """
+    rng = torch.Generator().manual_seed(seed)
+    keep = return_share / max(float(clean.return_mask.float().mean()), 1e-9)
+    mask = clean.return_mask & (torch.rand(clean.range_m.shape, generator=rng) < keep)
+    dropped = RangeImage.masked(clean.range_m, mask, clean.sensor)
+    return dropped if clean.reflectance is None else replace(dropped, reflectance=clean.reflectance * mask)
+
+
+def compare_source(
+    source: str,
+    count: int,
+    sensor: str = "",
+    fine: bool = False,
+    seed: int = 0,
+    config: DataConfig | None = None,
+    reporter: Reporter | None = None,
+) -> list[CurveScore]:
+    """Simulate scans and compare them with those of a source.
+
+    Args:
+        source: of real scans.
+        count: of simulated scans, and of real ones at most, evenly spaced.
+        sensor: its name or ``.json`` file; the data set's own if empty.
+        fine: take every column that the sensor fires, not only those that its image keeps.
+        seed: of the first simulated scan.
+        config: how scans are read and projected.
+        reporter: hears how far it is.
+    """
+    if count < 2 or seed < 0:
+        raise ConfigError(f"{count} scans from seed {seed}", "at least 2, and no negative seed", "correct the number")
+    config, reporter = config or DataConfig(), reporter or Reporter()
+    rays = load_sensor(sensor or open_dataset(source, config.bad_points).sensor)
+    rays = rays.fine() if fine else rays
+    real = open_images(source, rays, replace(config, max_scans=count), reporter)
+    pairs = []
+    with reporter.progress("simulating", count) as progress:
+        for each in range(seed, seed + count):
+            pairs.append(simulate_pair(each, rays))
+            progress.advance(1)
+    clean, measured = (RangeImage.stack(list(side)) for side in zip(*pairs, strict=True))
+    return compare(SimulatedScans(clean, measured), real)
+
+
+def simulate_pair(seed: int, sensor: SensorModel) -> tuple[RangeImage, RangeImage]:
+    """Simulate one scan and return both of its images: see :func:`pair_of`."""
+    return pair_of(observe(seed, sensor, kept_columns_only=True), sensor)
+
+
+def pair_of(seen: Observation, sensor: SensorModel) -> tuple[RangeImage, RangeImage]:
+    """Return the image of all surfaces within the sensor's limits, and what the sensor records of it.
+
+    Rays that end on the sensor's own carrier meet no surface. Where nothing returned the range has no noise, and the
+    reflectance is 0: too little light came back to read one.
+    """
+    range_m = torch.from_numpy(np.where(seen.return_mask, seen.range_m, seen.clean_range_m))
+    within = (range_m >= sensor.range_min_m) & (range_m <= sensor.range_max_m) & torch.from_numpy(~seen.blocked)
+    reflectance = torch.from_numpy(seen.reflectance)
+
+    def image(mask: torch.Tensor) -> RangeImage:
+        return RangeImage(torch.where(mask, range_m, 0), mask, sensor, torch.where(mask, reflectance, 0))
+
+    return image(within), image(within & torch.from_numpy(seen.return_mask))
+
+
+def _batches(images: RangeImages, first: int, last: int) -> Iterator[RangeImage]:
+    for start in range(first, last, _BATCH):
+        yield images.batch(range(start, min(start + _BATCH, last)))
+
+
+def _distance(
+    name: str, generated: Sequence[RangeImage] | Iterator[RangeImage], real: Iterator[RangeImage]
+) -> MetricResult:
+    metric = load_metric(name)()
+    for side, is_real in ((generated, False), (real, True)):
+        for batch in side:
+            for start in range(0, len(batch), _BATCH):
+                metric.update(batch[start : start + _BATCH], real=is_real)
+    return metric.compute()
+
+
+def as_json(scores: Sequence[CurveScore]) -> list[dict[str, Any]]:
+    """Return scores with their curves for a file."""
+    return [{**asdict(score), "ratio": score.ratio} for score in scores]
+
+
+def as_table(scores: Sequence[CurveScore]) -> str:
+    """Return scores as lines for a terminal."""
+    lines = [f"{'distance of real scans from':<28}{'simulated':>10}{'coin':>10}{'ratio':>8}{'real':>10}"]
+    for score in scores:
+        values = f"{score.simulated.value:>10.4f}{score.bernoulli.value:>10.4f}{score.ratio:>8.2f}"
+        lines.append(f"{score.simulated.metric:<28}{values}{score.floor.value:>10.4f}")
+    return "\n".join(lines)

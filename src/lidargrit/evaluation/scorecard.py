@@ -1,0 +1,225 @@
+"""What an evaluation found, with everything needed to repeat it: scores → table, JSON, and back."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from lidargrit.errors import DataError
+from lidargrit.evaluation.intervals import Floor, Interval
+from lidargrit.structures import MetricResult
+
+_FILE_BYTES_AT_MOST = 200_000_000  # curves of a dozen metrics take a few MB
+
+
+@dataclass(frozen=True)
+class Score:
+    """One number, how far it is to be trusted, and what the reference scores against itself.
+
+    Args:
+        result: of the metric.
+        interval: 95 %, if wanted and possible.
+        floor: if wanted and possible.
+        options: of the metric, besides variant and seed.
+        seconds: that it took, interval and floor included.
+    """
+
+    result: MetricResult
+    interval: Interval | None = None
+    floor: Floor | None = None
+    options: dict[str, Any] = field(default_factory=dict)
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A number that the protocol asks for and that could not be had.
+
+    Args:
+        metric: its name.
+        variant: its definition.
+        why: in one line.
+    """
+
+    metric: str
+    variant: str
+    why: str
+
+
+@dataclass(frozen=True)
+class Input:
+    """One of the two sets.
+
+    Args:
+        source: as the user named it.
+        data_set: which data set it is of; "samples" for what a generator wrote.
+        split: which part of it.
+        scans: how many it has.
+        scans_used: how many of them were compared.
+        sensor: name and size of its images.
+        projection: how its scans became images.
+        sha256: of the pixels that were compared.
+    """
+
+    source: str
+    data_set: str
+    split: str
+    scans: int
+    scans_used: int
+    sensor: str
+    projection: str
+    sha256: str
+
+
+@dataclass(frozen=True)
+class Scorecard:
+    """All that an evaluation found.
+
+    Args:
+        protocol: its name.
+        about: its title, source and departures.
+        samples: the first set.
+        reference: the second.
+        scores: in the protocol's order.
+        left_out: what could not be scored.
+        deviations: how this evaluation differs from the protocol.
+        warnings: what a reader must know before believing a number.
+        settings: seeds, groups, halves.
+        versions: of this program and what it stands on.
+    """
+
+    protocol: str
+    about: dict[str, Any]
+    samples: Input
+    reference: Input
+    scores: tuple[Score, ...]
+    left_out: tuple[LeftOut, ...] = ()
+    deviations: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    settings: dict[str, Any] = field(default_factory=dict)
+    versions: dict[str, str] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return everything as plain values, for a file."""
+        return {
+            "protocol": {"name": self.protocol, **self.about},
+            "samples": self.samples.source,
+            "reference": self.reference.source,
+            "inputs": {"samples": asdict(self.samples), "reference": asdict(self.reference)},
+            "deviations": list(self.deviations),
+            "warnings": list(self.warnings),
+            "settings": self.settings,
+            "versions": self.versions,
+            "scores": [
+                {
+                    **asdict(score.result),
+                    "options": score.options,
+                    "interval": score.interval and asdict(score.interval),
+                    "floor": score.floor and asdict(score.floor),
+                    "seconds": round(score.seconds, 3),
+                }
+                for score in self.scores
+            ],
+            "left_out": [asdict(each) for each in self.left_out],
+        }
+
+    @classmethod
+    def read(cls, path: Path) -> Scorecard:
+        """Read what :meth:`to_json` returned from a file.
+
+        Raises:
+            DataError: the file cannot be read or holds something else.
+        """
+        wanted, cure = "the scores that lidargrit evaluate --json wrote", "check the path, or evaluate again"
+        try:
+            if not path.is_file():
+                raise OSError("no such file")
+            if path.stat().st_size > _FILE_BYTES_AT_MOST:
+                raise OSError("too large")
+            data = json.loads(path.read_text(encoding="utf-8"))
+            protocol = dict(data["protocol"])
+            return cls(
+                str(protocol.pop("name")),
+                protocol,
+                _input(data["inputs"]["samples"]),
+                _input(data["inputs"]["reference"]),
+                tuple(_score(each) for each in data["scores"]),
+                tuple(LeftOut(**{name: str(of) for name, of in each.items()}) for each in data["left_out"]),
+                tuple(map(str, data["deviations"])),
+                tuple(map(str, data["warnings"])),
+                dict(data["settings"]),
+                dict(data["versions"]),
+            )
+        except (OSError, KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+            raise DataError(f"{path}, which cannot be used ({type(error).__name__}: {error})", wanted, cure) from None
+
+    def as_table(self) -> str:
+        """Return the scores as lines for a terminal."""
+        cells = [("metric", "variant", "score", "95 % interval", "floor", "better", "scans")]
+        cells += [_row(score) for score in self.scores]
+        cells += [(each.metric, each.variant or "-", "left out", *[""] * 4) for each in self.left_out]
+        widths = [max(len(row[column]) for row in cells) for column in range(len(cells[0]))]
+        lines = [
+            "  ".join(
+                text.rjust(width) if 2 <= column <= 4 else text.ljust(width)
+                for column, (text, width) in enumerate(zip(row, widths, strict=True))
+            ).rstrip()
+            for row in cells
+        ]
+        lines += [f"left out: {each.metric}: {each.why}" for each in self.left_out]
+        lines += [f"not the protocol {self.protocol}: {each}" for each in self.deviations]
+        return "\n".join(lines)
+
+
+def figure(value: float) -> str:
+    """Return a number with four digits that count."""
+    if value == 0 or not math.isfinite(value):
+        return f"{value:g}"
+    return f"{value:.4f}" if 1e-2 <= abs(value) < 1e3 else f"{value:.4g}"
+
+
+def _row(score: Score) -> tuple[str, ...]:
+    result, interval, floor = score.result, score.interval, score.floor
+    return (
+        result.metric,
+        result.variant,
+        figure(result.value),
+        f"{figure(interval.low)} .. {figure(interval.high)}" if interval else "-",
+        f"{figure(floor.value)} (n={floor.num_scans})" if floor else "-",
+        "higher" if result.higher_is_better else "lower",
+        f"{result.num_generated} v {result.num_reference}",
+    )
+
+
+def _input(data: dict[str, Any]) -> Input:
+    words = {name: str(data[name]) for name in ("source", "data_set", "split", "sensor", "projection", "sha256")}
+    return Input(**words, scans=int(data["scans"]), scans_used=int(data["scans_used"]))
+
+
+def _score(data: dict[str, Any]) -> Score:
+    result = MetricResult(
+        str(data["metric"]),
+        float(data["value"]),
+        bool(data["higher_is_better"]),
+        int(data["num_generated"]),
+        int(data["num_reference"]),
+        str(data["variant"]),
+        dict(data["details"]),
+    )
+    interval, floor = data["interval"], data["floor"]
+    return Score(
+        result,
+        interval
+        and Interval(
+            float(interval["low"]),
+            float(interval["high"]),
+            float(interval["standard_error"]),
+            int(interval["halves"]),
+        ),
+        floor and Floor(float(floor["value"]), int(floor["num_scans"]), int(floor["halvings"])),
+        dict(data["options"]),
+        float(data["seconds"]),
+    )

@@ -1,0 +1,168 @@
+"""Several systems side by side: files of scores → text, Markdown or LaTeX; published figures in blocks of their own."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal
+
+from lidargrit.errors import DataError
+from lidargrit.evaluation.scorecard import Score, Scorecard, figure
+
+Format = Literal["text", "markdown", "latex"]
+Column = tuple[str, str]  # metric, variant
+
+
+@dataclass(frozen=True)
+class Block:
+    """Rows that may be compared with one another.
+
+    Args:
+        title: what they have in common.
+        columns: metrics and variants.
+        rows: a system and its figures, "" where there is none.
+        notes: lines below.
+    """
+
+    title: str
+    columns: tuple[Column, ...]
+    rows: tuple[tuple[str, tuple[str, ...]], ...]
+    notes: tuple[str, ...] = ()
+
+
+def side_by_side(paths: Sequence[Path], form: Format = "text") -> str:
+    """Set the scores of several files side by side.
+
+    Rows share a block only if they were measured by one protocol against the very same reference. Published figures
+    never stand among measured ones: they get blocks of their own, and only where the measured rows are what the
+    protocol wants; else a line says why they do not compare.
+
+    Args:
+        paths: files that ``lidargrit evaluate --json`` wrote.
+        form: of the table.
+
+    Raises:
+        DataError: a file that cannot be read, or is none of these.
+    """
+    if not paths:
+        raise DataError("no file of scores", "at least one", "write some with: lidargrit evaluate ... --json FILE")
+    measured: dict[tuple[str, str, int], list[tuple[str, Scorecard]]] = {}
+    for path in paths:
+        card = Scorecard.read(path)
+        key = (card.protocol, card.reference.sha256, card.reference.scans_used)
+        measured.setdefault(key, []).append((path.stem, card))
+    blocks = [block for cards in measured.values() for block in (_measured(cards), *_published(cards))]
+    return "\n\n".join(_DRAWN[form](block) for block in blocks)
+
+
+def _measured(cards: Sequence[tuple[str, Scorecard]]) -> Block:
+    columns = list(dict.fromkeys(_column(score) for _, card in cards for score in card.scores))
+    rows, notes = [], []
+    for name, card in cards:
+        scores = {_column(score): score for score in card.scores}
+        rows.append((name, tuple(_cell(scores[column]) if column in scores else "" for column in columns)))
+        notes += [f"{name}: {text}" for text in (*card.deviations, *card.warnings)]
+    card = cards[0][1]
+    floors = {_column(score): score.floor for score in card.scores if score.floor}
+    if floors:
+        count = next(iter(floors.values())).num_scans
+        cells = tuple(figure(floors[column].value) if column in floors else "" for column in columns)
+        rows.append((f"(floor: the reference's halves, n = {count})", cells))
+    title = (
+        f"Measured, protocol {card.protocol}, {card.reference.scans_used:,} scans each, "
+        f"against {card.reference.source} (sha256 {card.reference.sha256[:8]})"
+    )
+    return Block(title, tuple(columns), tuple(rows), tuple(notes))
+
+
+def _published(cards: Sequence[tuple[str, Scorecard]]) -> list[Block]:
+    """Return the published tables of the protocol, or why they do not compare."""
+    tables = [table for table in published() if table["protocol"] == cards[0][1].protocol]
+    if not tables:
+        return []
+    why = list(dict.fromkeys(text for _, card in cards for text in card.deviations))
+    if why:
+        title = f"Published figures of {cards[0][1].protocol}"
+        return [Block(title, (), (), (f"left out, for they do not compare: {'; '.join(why)}",))]
+    return [
+        Block(
+            f"Published, not measured here: {table['title']}",
+            tuple((column["metric"], column["variant"]) for column in table["columns"]),
+            tuple((row["system"], _printed(row["printed"], table["columns"])) for row in table["rows"]),
+            (f"source: {table['source']}", "these figures have neither interval nor floor"),
+        )
+        for table in tables
+    ]
+
+
+def published() -> list[dict[str, Any]]:
+    """Return the published tables that this version knows: protocol, source, columns and rows as printed."""
+    text = resources.files("lidargrit.evaluation").joinpath("published.json").read_text(encoding="utf-8")
+    return json.loads(text)["tables"]
+
+
+def _printed(values: Sequence[Any], columns: Sequence[dict[str, Any]]) -> tuple[str, ...]:
+    """Return printed figures in the metric's own unit, since papers multiply them, with no digit that was not there."""
+    return tuple(
+        "" if value is None else f"{value / column['divided_by']:.4g}"
+        for value, column in zip(values, columns, strict=True)
+    )
+
+
+def _column(score: Score) -> Column:
+    return score.result.metric, score.result.variant
+
+
+def _cell(score: Score) -> str:
+    if score.interval is None:
+        return figure(score.result.value)
+    return f"{figure(score.result.value)} [{figure(score.interval.low)}, {figure(score.interval.high)}]"
+
+
+def _grid(block: Block) -> list[list[str]]:
+    heads = ["system", *(f"{metric} ({variant})" for metric, variant in block.columns)]
+    return [heads, *([name, *(cell or "-" for cell in cells)] for name, cells in block.rows)]
+
+
+def _as_text(block: Block) -> str:
+    lines = [block.title]
+    if block.columns:
+        grid = _grid(block)
+        widths = [max(len(row[place]) for row in grid) for place in range(len(grid[0]))]
+        lines += ["  ".join(t.ljust(w) for t, w in zip(row, widths, strict=True)).rstrip() for row in grid]
+    return "\n".join([*lines, *block.notes])
+
+
+def _as_markdown(block: Block) -> str:
+    lines = [f"**{_marked(block.title)}**", ""]
+    if block.columns:
+        head, *rows = [[_marked(text) for text in row] for row in _grid(block)]
+        lines += [f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows)] + [""]
+    return "\n".join([*lines, *(f"- {_marked(note)}" for note in block.notes)]).rstrip()
+
+
+def _marked(text: str) -> str:
+    for sign in "\\`*_|<>[]":
+        text = text.replace(sign, "\\" + sign)
+    return " ".join(text.split())
+
+
+def _as_latex(block: Block) -> str:
+    lines = [f"% {' '.join(block.title.split())}"]
+    if block.columns:
+        head, *rows = [" & ".join(_typeset(text) for text in row) + r" \\" for row in _grid(block)]
+        layout = "l" + "r" * len(block.columns)
+        lines += [rf"\begin{{tabular}}{{{layout}}}", r"\hline", head, r"\hline", *rows, r"\hline", r"\end{tabular}"]
+    return "\n".join([*lines, *(f"% {' '.join(note.split())}" for note in block.notes)])
+
+
+def _typeset(text: str) -> str:
+    signs = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+    signs |= {sign: "\\" + sign for sign in "&%$#_{}"}
+    return " ".join("".join(signs.get(letter, letter) for letter in text).split())
+
+
+_DRAWN = {"text": _as_text, "markdown": _as_markdown, "latex": _as_latex}

@@ -1,0 +1,246 @@
+"""Scans of a sensor that nobody described → its :class:`SensorModel`, with all that speaks for and against it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float64, Int64
+
+from lidargrit.datasets import BadPoints, open_dataset
+from lidargrit.errors import ConfigError, ScanError
+from lidargrit.fitting.azimuths import columns_of_scans, firing_steps_deg, offsets_deg
+from lidargrit.fitting.elevations import Rows, cluster_rows, nearest_row, rows_of_rings
+from lidargrit.fitting.limits import quantum_m, range_limits_m
+from lidargrit.fitting.points import Points
+from lidargrit.fitting.rings import Method, Rings, recover_rings
+from lidargrit.sensors import ProjectionName, SensorModel, column_azimuths_rad
+from lidargrit.structures import Scan
+
+__all__ = ["SensorFit", "fit_sensor", "fit_sensor_to_source"]
+
+_COLUMNS_UNCLEAR = 1024  # what most range images of the literature have
+_AGREE_AT_LEAST = 0.4  # motion-corrected scans of KITTI reach 0.6, points seen from another place 0.1
+_FEW_SCANS = 5  # a moving car tilts, and its far rings meet little: one scan shows both
+_SHIFT_ASIDE_DEG = 0.3  # offsets below this are the turning of the sensor while it fires
+_STEPS_KEPT = 100_000  # for the picture
+
+
+@dataclass(frozen=True, eq=False)
+class SensorFit:
+    """A sensor that was found in its scans, and the evidence.
+
+    Args:
+        sensor: ready to be written with ``to_json``; its rows are where returns are seen from the origin.
+        method: how the laser of every point was found.
+        num_scans: that were looked at and used.
+        laser_elevation_deg: of the lasers themselves, which far points approach; a maker's table holds these.
+        laser_height_m: of every laser above the origin, as its near points betray it; all 0 where none shows.
+        residual_deg: spread of the points of every row around it (standard deviation, outliers left out).
+        points_per_ring: over all scans.
+        agree_share: of the points, how many lie nearer to their row than a quarter of the way to the next one.
+        counter_clockwise: how it turns, seen from above; None where the order of points does not tell.
+        start_deg: azimuth where a revolution begins in the file; None likewise.
+        range_step_m: in which ranges are counted, or None.
+        coordinate_step_m: in which coordinates are counted, or None.
+        elevations_deg: of the points that were looked at, a row's number for each beside it; for a picture.
+        row_of_point: -1 for points of no row.
+        steps_deg: in azimuth between neighbouring points of a ring; for a picture.
+        warnings: what a user should know, one sentence each.
+    """
+
+    sensor: SensorModel
+    method: Method
+    num_scans: int
+    laser_elevation_deg: Float64[np.ndarray, "H"]
+    laser_height_m: Float64[np.ndarray, "H"]
+    residual_deg: Float64[np.ndarray, "H"]
+    points_per_ring: Int64[np.ndarray, "H"]
+    agree_share: float
+    counter_clockwise: bool | None
+    start_deg: float | None
+    range_step_m: float | None
+    coordinate_step_m: float | None
+    elevations_deg: Float64[np.ndarray, "n"]
+    row_of_point: Int64[np.ndarray, "n"]
+    steps_deg: Float64[np.ndarray, "m"]
+    warnings: tuple[str, ...]
+
+
+def fit_sensor(scans: Sequence[Scan], name: str = "fitted") -> SensorFit:
+    """Find the sensor that made scans: its rows, columns, limits, and how it turns.
+
+    Args:
+        scans: of one sensor, in its own frame; five or more from different places.
+        name: of the new sensor.
+
+    Raises:
+        ConfigError: no scan.
+        ScanError: scans that do not show their sensor: one ring, a camera's crop, a map, points of another frame.
+
+    Example:
+        >>> from lidargrit import simulate
+        >>> fit_sensor([simulate(seed) for seed in range(2)]).sensor.height
+        64
+    """
+    if not scans:
+        raise ConfigError("no scan to fit a sensor to", "at least one", "name a source that holds some")
+    everything = [Points.of_scan(scan) for scan in scans]
+    rings = recover_rings(everything)
+    rows, rings = _rows_by_order(everything, rings) if rings else (None, None)
+    if rows is None or rings is None:
+        rows, rings = _rows_by_elevation(everything, scans[0].source)
+    used = [everything[index] for index in rings.used]
+    if len(rows.elevation_deg) < 2 or rows.agree_share < _AGREE_AT_LEAST:
+        raise ScanError(
+            f"points of {len(rows.elevation_deg)} rings, {rows.agree_share:.0%} of them near their ring's elevation, "
+            f"in {scans[0].source}",
+            "rings of points as a turning sensor with several lasers sees them from its own place",
+            "give scans in the sensor's own frame, of one sensor, each of one revolution",
+        )
+    row_of_point = tuple(_row_numbers(rows, number) for number in rings.of_point)
+    steps = firing_steps_deg(used, row_of_point)
+    columns = columns_of_scans(used, row_of_point, steps)
+    sensor = _model(name, rows, columns, used, row_of_point, rings, len(used))
+    return SensorFit(
+        sensor=sensor,
+        method=rings.method,
+        num_scans=len(used),
+        laser_elevation_deg=rows.laser_elevation_deg,
+        laser_height_m=rows.laser_height_m,
+        residual_deg=rows.residual_deg,
+        points_per_ring=rows.num_points,
+        agree_share=rows.agree_share,
+        counter_clockwise=rings.counter_clockwise,
+        start_deg=rings.start_deg,
+        range_step_m=quantum_m(np.concatenate([points.range_m for points in used])),
+        coordinate_step_m=quantum_m(np.concatenate([scan.points_xyz_m.double().numpy().ravel() for scan in scans])),
+        elevations_deg=np.concatenate([points.elevation_deg for points in used]),
+        row_of_point=np.concatenate(row_of_point),
+        steps_deg=steps[:: max(1, len(steps) // _STEPS_KEPT)],
+        warnings=_warnings(rows, rings, len(scans), columns),
+    )
+
+
+def fit_sensor_to_source(
+    source: str, name: str = "fitted", num_scans: int = 20, bad_points: BadPoints = "refuse"
+) -> SensorFit:
+    """Find the sensor that made the scans of a data source, from some of them, evenly spaced.
+
+    Args:
+        source: as for :func:`lidargrit.datasets.open_dataset`.
+        name: of the new sensor.
+        num_scans: to look at, at most.
+        bad_points: ``refuse`` scans with NaN, infinite or origin points, or ``drop`` these points.
+
+    Raises:
+        ConfigError: no scan to look at, or no name.
+        DataError: the source holds no scans.
+        ScanError: a scan that cannot be used, or does not show its sensor.
+    """
+    if num_scans < 1 or not name.strip():
+        raise ConfigError(f"{num_scans} scans and the name {name!r}", "at least one scan, and a name", "correct them")
+    dataset = open_dataset(source, bad_points)
+    wanted = min(num_scans, len(dataset))
+    return fit_sensor([dataset.scan(index * len(dataset) // wanted) for index in range(wanted)], name)
+
+
+def _rows_by_order(scans: Sequence[Points], rings: Rings) -> tuple[Rows | None, Rings | None]:
+    """Fit rows to recovered rings; nothing if the order of the points was misread."""
+    used = [scans[index] for index in rings.used]
+    elevation = np.concatenate([points.elevation_deg for points in used])
+    range_m = np.concatenate([points.range_m for points in used])
+    rows = rows_of_rings(elevation, range_m, np.concatenate(rings.of_point))
+    in_order = np.diff(rows.number)
+    if rings.method == "ring by ring" and not ((in_order > 0).all() or (in_order < 0).all()):
+        return None, None  # a file sorted ring by ring is sorted by elevation too; this one is sorted otherwise
+    return rows, rings
+
+
+def _rows_by_elevation(scans: Sequence[Points], source: str) -> tuple[Rows, Rings]:
+    """Find rows where elevations gather, and give every point the nearest."""
+    elevation = np.concatenate([points.elevation_deg for points in scans])
+    range_m = np.concatenate([points.range_m for points in scans])
+    peaks, share = cluster_rows(elevation, range_m)
+    if len(peaks) < 2:
+        raise ScanError(
+            f"no rings in {source}: its elevations do not gather",
+            "points of a turning sensor, seen from its own place",
+            "give single scans, not maps, in the sensor's own frame and in the order in which they were fired",
+        )
+    numbers = tuple(nearest_row(points.elevation_deg, peaks) for points in scans)
+    rows = rows_of_rings(elevation, range_m, np.concatenate(numbers))
+    rows = replace(rows, agree_share=share)
+    return rows, Rings("elevation clusters", numbers, tuple(range(len(scans))))
+
+
+def _row_numbers(rows: Rows, number: Int64[np.ndarray, "n"]) -> Int64[np.ndarray, "n"]:
+    """Replace the rings' own numbers by rows counted from the top."""
+    row_of = np.full(max(int(number.max()), int(rows.number.max())) + 1, -1)
+    row_of[rows.number] = np.arange(len(rows.number))
+    return row_of[number]
+
+
+def _model(
+    name: str,
+    rows: Rows,
+    columns: int | None,
+    used: Sequence[Points],
+    row_of_point: Sequence[Int64[np.ndarray, "_"]],
+    rings: Rings,
+    num_scans: int,
+) -> SensorModel:
+    near_m, far_m = range_limits_m(np.concatenate([points.range_m for points in used]))
+    offsets = None
+    lasers = len(rows.number)
+    if rings.by_column:
+        offsets = offsets_deg(used, row_of_point, lasers)
+        if offsets is not None and float(np.ptp(offsets)) < _SHIFT_ASIDE_DEG:
+            offsets = None
+    return SensorModel(
+        name=name,
+        elevation_rad=torch.from_numpy(np.radians(rows.elevation_deg)).float()[:, None],
+        azimuth_rad=column_azimuths_rad(columns or _COLUMNS_UNCLEAR),
+        range_min_m=near_m,
+        range_max_m=far_m,
+        projection=_projection(rows, rings),
+        source=f"lidargrit fit-sensor, from {num_scans} scans, rings by {rings.method}",
+        azimuth_offset_rad=None if offsets is None else torch.from_numpy(np.radians(offsets)).float(),
+    )
+
+
+def _projection(rows: Rows, rings: Rings) -> ProjectionName:
+    """Choose unfolding where it would give every point its row: by a field, or in the order of KITTI's files."""
+    top_down = bool((np.diff(rows.number) > 0).all())
+    if rings.method == "ring field":
+        return "unfolding" if top_down else "spherical"
+    as_kitti = rings.method == "ring by ring" and rings.counter_clockwise and rings.start_deg == 0.0
+    return "unfolding" if top_down and as_kitti else "spherical"
+
+
+def _warnings(rows: Rows, rings: Rings, num_scans: int, columns: int | None) -> tuple[str, ...]:
+    said = []
+    if len(rings.used) < num_scans:
+        left = num_scans - len(rings.used)
+        said.append(f"{left} of {num_scans} scans have another number of rings than the rest, and were left out")
+    if len(rings.used) < _FEW_SCANS:
+        scans = "one scan" if len(rings.used) == 1 else f"{len(rings.used)} scans"
+        said.append(f"only {scans}: rings that met little may be off; give {_FEW_SCANS} or more")
+    if columns is None:
+        said.append(f"the step between firings is not clear; {_COLUMNS_UNCLEAR} columns were assumed")
+    if rings.method == "elevation clusters":
+        said.append("the files do not tell which laser fired a point: rows are where elevations gather")
+    poor = int((rows.num_points < 0.05 * np.median(rows.num_points)).sum())
+    if poor:
+        said.append(f"{poor} rings have few points, so that their elevations are uncertain")
+    gap = np.abs(np.diff(rows.elevation_deg))
+    blurred = int((rows.residual_deg[1:] > gap / 2).sum())
+    if blurred:
+        said.append(
+            f"{blurred} rings are blurred by more than half the way to the next: are the scans in their own frame?"
+        )
+    if rings.method == "ring field" and not bool((np.diff(rows.number) > 0).all()):
+        said.append("the rings of the files are not numbered from the top, so rows go by elevation")
+    return tuple(said)

@@ -1,0 +1,63 @@
+"""A scan in the angles that a fit looks at: :class:`Scan` → range, elevation and azimuth of every point."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from lidargrit.errors import ScanError
+from lidargrit.structures import Scan
+
+_NOISE_RANGE_M = 1.0  # nearer points are the car that carries the sensor, or placeholders: their angles mean little
+_SECTORS, _SECTORS_AT_LEAST = 36, 27  # of 10 degrees: a camera's crop fills a quarter of them, a revolution nearly all
+_POINTS_AT_LEAST = 200  # fewer show no rings
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """The points of one scan in the order of its file, without those too near to have an angle.
+
+    Args:
+        range_m: distance from the origin.
+        elevation_deg: up-positive.
+        azimuth_deg: counter-clockwise from +x, in [-180, 180].
+        ring: as the file has it, or None.
+        place: of every point in the file, counted with those that were left out here.
+        num_in_file: points with those that were left out.
+    """
+
+    range_m: Float64[np.ndarray, "n"]
+    elevation_deg: Float64[np.ndarray, "n"]
+    azimuth_deg: Float64[np.ndarray, "n"]
+    ring: Int64[np.ndarray, "n"] | None
+    place: Int64[np.ndarray, "n"]
+    num_in_file: int
+
+    def __len__(self) -> int:
+        return len(self.range_m)
+
+    @classmethod
+    def of_scan(cls, scan: Scan) -> Points:
+        """Return the points of a scan, or refuse one that cannot show its sensor.
+
+        Raises:
+            ScanError: too few points, or not a full revolution.
+        """
+        x, y, z = scan.points_xyz_m.double().numpy().T
+        flat = np.hypot(x, y)
+        range_m = np.hypot(flat, z)
+        place = np.flatnonzero(range_m > _NOISE_RANGE_M)
+        azimuth_deg = np.degrees(np.arctan2(y[place], x[place]))
+        sectors = len(np.unique(np.floor(azimuth_deg * (_SECTORS / 360))))
+        if len(place) < _POINTS_AT_LEAST or sectors < _SECTORS_AT_LEAST:
+            raise ScanError(
+                f"{len(place)} points beyond {_NOISE_RANGE_M:g} m, in {sectors * 360 // _SECTORS} of 360 degrees of "
+                f"azimuth, in {scan.source}",
+                "a full revolution in the sensor's own frame",
+                "use uncropped scans",
+            )
+        ring = None if scan.ring is None else scan.ring.numpy().astype(np.int64)[place]
+        elevation_deg = np.degrees(np.arctan2(z[place], flat[place]))
+        return cls(range_m[place], elevation_deg, azimuth_deg, ring, place, len(scan))

@@ -1,0 +1,48 @@
+"""A :class:`SensorFit` → a few lines that say what was found and how well."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from lidargrit.fitting import SensorFit
+
+_ROWS_SHOWN = 8  # spread over the sensor; the file and the picture have all
+
+
+def as_table(fit: SensorFit) -> str:
+    """Return what a user wants to know of a fit, one fact a line, and some of its rows."""
+    sensor, step_m = fit.sensor, fit.range_step_m or fit.coordinate_step_m
+    turning = {True: "counter-clockwise", False: "clockwise", None: "not known from the files"}[fit.counter_clockwise]
+    start = "" if fit.start_deg is None else f", files begin at {fit.start_deg:.0f} degrees"
+    of_what = "ranges" if fit.range_step_m else "coordinates"
+    facts = {
+        "rings": f"{sensor.height} ({fit.method}; scans: {fit.num_scans})",
+        "columns": f"{sensor.width} ({360 / sensor.width:.3f} degrees)",
+        "turns": f"{turning}{start}",
+        "range": f"{sensor.range_min_m:g} to {sensor.range_max_m:g} m"
+        + (f", {of_what} in steps of {step_m:g} m" if step_m else ""),
+        "lasers": _lasers(fit),
+        "projection": sensor.projection,
+        "agreement": f"{fit.agree_share:.1%} of the points lie close to their ring's elevation",
+    }
+    rows = [f"{'row':>4}{'elevation':>12}{'laser':>10}{'spread':>9}{'points':>10}    (degrees)"]
+    for row in np.unique(np.linspace(0, sensor.height - 1, _ROWS_SHOWN).round().astype(int)):
+        seen_deg = math.degrees(float(sensor.elevation_rad[row, 0]))
+        laser_deg, spread_deg = fit.laser_elevation_deg[row], fit.residual_deg[row]
+        rows.append(f"{row:>4}{seen_deg:>12.3f}{laser_deg:>10.3f}{spread_deg:>9.3f}{fit.points_per_ring[row]:>10}")
+    said = [f"note: {warning}" for warning in fit.warnings]
+    return "\n".join([*(f"{name:<12}{fact}" for name, fact in facts.items()), "", *rows, *said])
+
+
+def _lasers(fit: SensorFit) -> str:
+    """Tell where the lasers sit and look, as far as the points betray it."""
+    said = []
+    if np.any(fit.laser_height_m):
+        low_m, high_m = fit.laser_height_m.min(), fit.laser_height_m.max()
+        said.append(f"{low_m * 100:.1f} to {high_m * 100:.1f} cm above the origin")
+    if fit.sensor.azimuth_offset_rad is not None:
+        low, high = (math.degrees(float(value)) for value in fit.sensor.azimuth_offset_rad.aminmax())
+        said.append(f"{low:.2f} to {high:.2f} degrees aside of their column")
+    return ", ".join(said) or "at the origin, as far as the points tell"

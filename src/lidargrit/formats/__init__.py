@@ -1,0 +1,209 @@
+"""Files of scans: a path → :class:`Scan`, whichever sensor or program wrote it; one format = one file here."""
+
+from __future__ import annotations
+
+import functools
+import os
+from abc import ABC, abstractmethod
+from io import BufferedReader
+from pathlib import Path
+from typing import ClassVar, Literal
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from lidargrit import _discovery
+from lidargrit.errors import OutputError, ScanError
+from lidargrit.structures import Scan
+
+BadPoints = Literal["refuse", "drop"]
+POINTS_AT_MOST = 4_000_000  # thirty revolutions of an HDL-64E; a larger file is a map, or no scan at all
+
+
+class ScanFormat(ABC):
+    """How one kind of file holds scans; the class has no state and is used as it is."""
+
+    title: ClassVar[str]
+    """One line for lists."""
+    suffixes: ClassVar[tuple[str, ...]]
+    """How names of such files end, in lower case."""
+    reflectance: ClassVar[str]
+    """What the file's values are, and what they are divided by to lie in [0, 1]."""
+    frame: ClassVar[str] = "x forward, y left, z up"
+    """The axes in the file; scans that are read always have x forward, y left, z up."""
+    sensor: ClassVar[str] = ""
+    """The sensor that makes such files, if it is always the same."""
+    several: ClassVar[bool] = False
+    """Whether one file may hold more than one scan."""
+    keeps: ClassVar[tuple[str, ...]] = ()
+    """What :meth:`write` keeps of a scan besides its points, in files of the first suffix: reflectance, ring, label."""
+    extra: ClassVar[str] = ""
+    """Which optional part of this program reads them: pip install 'lidargrit[EXTRA]'."""
+
+    @classmethod
+    def public_name(cls) -> str:
+        """Return the name that a user types: the file that defines the class."""
+        return cls.__module__.rpartition(".")[2]
+
+    @staticmethod
+    @abstractmethod
+    def recognises(path: Path) -> bool:
+        """Tell, from as few bytes as will do, whether a file looks like this format; False if it cannot be read."""
+
+    @staticmethod
+    def count(path: Path) -> int:
+        """Count the scans in a file, or raise ScanError."""
+        return 1
+
+    @staticmethod
+    @abstractmethod
+    def read(path: Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
+        """Read one scan of a file, or raise ScanError."""
+
+    @classmethod
+    def write(cls, path: Path, scan: Scan) -> None:
+        """Write a scan to a new file."""
+        raise OutputError(f"a scan to write as {cls.title}", "a format that can be written", "choose .bin or .ply")
+
+
+def load(name: str) -> type[ScanFormat]:
+    """Return a format's class by its name, or raise UnknownNameError."""
+    return _discovery.load_class("formats", name, ScanFormat)
+
+
+def candidates(path: Path) -> tuple[type[ScanFormat], ...]:
+    """Return the formats whose files end as this one does; of several endings that fit, the longest counts."""
+    return _formats_of_suffixes().get(_suffix(path), ())
+
+
+def stem(path: Path) -> str:
+    """Return a file's name without the ending of its format, which may hold several dots."""
+    return path.name[: len(path.name) - len(_suffix(path))] if _suffix(path) else path.stem
+
+
+def recognise(path: Path) -> type[ScanFormat]:
+    """Return the format of a file, by its name and, where several formats share an ending, by what is in it.
+
+    Raises:
+        ScanError: no format has this ending, or there is no file to look at.
+    """
+    named = candidates(path)
+    open_file(path, named[0].title if named else "a file of a scan").close()
+    if not named:
+        known = ", ".join(sorted(_formats_of_suffixes()))
+        raise ScanError(f"{path}, whose ending we do not know", f"one of {known}", "convert or rename the file")
+    if len(named) == 1:
+        return named[0]
+    return next((one for one in named if one.recognises(path)), named[0])  # the first says best what is wrong with it
+
+
+def read_scan(path: Path | str, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
+    """Read a scan from a file of any format that we know.
+
+    Args:
+        path: the file.
+        index: which of the scans in it.
+        bad_points: ``drop`` removes points with NaN or infinite coordinates and points at the origin.
+
+    Raises:
+        ScanError: the file cannot be used; says what is wrong and what to do.
+    """
+    form = recognise(Path(path))
+    if index and not 0 <= index < (count := form.count(Path(path))):
+        raise ScanError(f"scan number {index} of {path}", f"one of its {count}, counted from 0", "take a lower number")
+    return form.read(Path(path), index, bad_points)
+
+
+def count_scans(path: Path) -> int:
+    """Count the scans in a file; one, too, where the file cannot be read, which is said when it is."""
+    if not any(one.several for one in candidates(path)):
+        return 1  # without opening it: a folder may hold a hundred thousand
+    try:
+        return recognise(path).count(path)
+    except ScanError:
+        return 1
+
+
+def _suffix(path: Path) -> str:
+    fitting = [suffix for suffix in _formats_of_suffixes() if path.name.lower().endswith(suffix)]
+    return max(fitting, key=len, default="")
+
+
+@functools.cache
+def _formats_of_suffixes() -> dict[str, tuple[type[ScanFormat], ...]]:
+    table: dict[str, list[type[ScanFormat]]] = {}
+    for name in _discovery.names("formats"):
+        for suffix in load(name).suffixes:
+            table.setdefault(suffix, []).append(load(name))
+    return {suffix: tuple(ones) for suffix, ones in table.items()}
+
+
+def scan_of(
+    points_xyz_m: Float[Tensor, "n 3"],
+    reflectance: Float[Tensor, "n"] | None,
+    ring: Int[Tensor, "n"] | None,
+    source: str,
+    bad_points: BadPoints,
+    label: Int[Tensor, "n"] | None = None,
+) -> Scan:
+    """Make a scan of what a file holds, without points that are no returns if ``bad_points`` is ``drop``."""
+    if bad_points == "drop":
+        kept = points_xyz_m.isfinite().all(dim=1) & (points_xyz_m != 0).any(dim=1)
+        points_xyz_m = points_xyz_m[kept]
+        reflectance, ring, label = (None if one is None else one[kept] for one in (reflectance, ring, label))
+    return Scan(points_xyz_m.contiguous(), reflectance, ring, label, source)
+
+
+def open_file(path: Path, wanted: str) -> BufferedReader:
+    """Open a file to read its bytes.
+
+    Raises:
+        ScanError: it is not there, not a file or unreadable.
+    """
+    try:
+        if not path.is_file():  # opening a pipe or a device would hang
+            what = "not a file" if path.exists() else "not there"
+            raise ScanError(f"{path}, which is {what}", wanted, "check the path")
+        return path.open("rb")
+    except OSError as error:
+        raise ScanError(f"{path}, which cannot be read ({error.strerror})", wanted, "check the path") from None
+
+
+def read_bytes(path: Path, at_most: int, wanted: str) -> bytes:
+    """Read a whole file of limited size.
+
+    Raises:
+        ScanError: it is not a file, empty, unreadable or larger.
+    """
+    with open_file(path, wanted) as file:
+        try:
+            size = os.fstat(file.fileno()).st_size
+            data = file.read(size) if size <= at_most else b""  # read() makes room for all that it is asked for
+        except OSError as error:
+            raise ScanError(f"{path}, which cannot be read ({error.strerror})", wanted, "check the disk") from None
+    if size > at_most:
+        raise ScanError(f"{size:,} bytes in {path}", f"at most {at_most:,}: {wanted}", "split it into revolutions")
+    if not data:
+        raise ScanError(f"an empty file, {path}", wanted, "download it again, or remove it")
+    return data
+
+
+def first_bytes(path: Path, at_most: int) -> bytes:
+    """Read the beginning of a file to recognise it by; nothing if it cannot be read."""
+    try:
+        with open_file(path, "") as file:
+            return file.read(at_most)
+    except (ScanError, OSError):
+        return b""
+
+
+def damaged(path: Path, wanted: str, error: Exception) -> ScanError:
+    """Return, in one line, what a library says of a file that it stumbled over."""
+    said = "".join(filter(str.isprintable, " ".join(str(error).split())))[:120] or type(error).__name__
+    return ScanError(f"{path}, a damaged file ({said})", wanted, "download it again, or remove it")
+
+
+def float_tensor(values: object) -> Tensor:
+    """Return an array of any number type as float32 of its own memory."""
+    return torch.as_tensor(values).to(torch.float32, copy=True)

@@ -1,0 +1,98 @@
+"""The floor: every pixel drawn from its own histogram, as if it had no neighbours; seeds → range images."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from lidargrit.errors import CheckpointError, ConfigError
+from lidargrit.generators import Generator, SamplingConfig
+from lidargrit.loading import RangeImages
+from lidargrit.sensors import SensorModel
+from lidargrit.structures import RangeImage
+
+_BATCH = 16
+
+
+@dataclass(frozen=True)
+class MarginalConfig:
+    """How finely ranges are counted.
+
+    Args:
+        bins: of a logarithmic axis between the sensor's limits; 128 make each 4 % wide.
+    """
+
+    bins: int = 128
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.bins <= 4096:
+            raise ConfigError(f"{self.bins} bins", "1 to 4096", "choose about a hundred")
+
+
+class Marginal(Generator):
+    """Knows of each pixel how often it returns and how far, and nothing of how pixels hang together.
+
+    A metric that gives it a good score does not look at shapes. It has no stage to train by an objective: it counts,
+    see :meth:`learn`.
+    """
+
+    Config = MarginalConfig
+    stages = ()
+    scans: Tensor
+    counts: Tensor
+
+    def __init__(self, config: MarginalConfig, sensor: SensorModel) -> None:
+        super().__init__(config, sensor)
+        self.config, self.sensor = config, sensor
+        self.register_buffer("scans", torch.zeros((), dtype=torch.int64))
+        self.register_buffer("counts", torch.zeros(config.bins, sensor.height, sensor.width, dtype=torch.int32))
+
+    def objective(self, stage: str) -> nn.Module:
+        """Refuse: there is no stage."""
+        raise NotImplementedError(stage)
+
+    def finish(self, stage: str, objective: nn.Module) -> None:
+        """Refuse: there is no stage."""
+        raise NotImplementedError(stage)
+
+    def learn(self, images: RangeImages) -> None:
+        """Count the returns of all images."""
+        edges = self._edges_m()[1:-1]
+        for first in range(0, len(images), _BATCH):
+            batch = images.batch(range(first, min(first + _BATCH, len(images))))
+            place = torch.bucketize(batch.range_m, edges)
+            for one, mask in zip(place, batch.return_mask, strict=True):
+                self.counts.scatter_add_(0, one[None], mask[None].int())
+            self.scans += len(batch)
+
+    @torch.no_grad()
+    def sample(self, seeds: Sequence[int], sampling: SamplingConfig | None = None) -> RangeImage:
+        """Write one scan for each seed; settings of sampling are not looked at.
+
+        Raises:
+            CheckpointError: nothing was counted yet.
+        """
+        if not int(self.scans):
+            raise CheckpointError("a generator that has counted no scan", "one that has", "call learn(images) first")
+        edges = self._edges_m().to(self.counts.device)
+        total = self.counts.cumsum(dim=0)
+        images = []
+        for seed in seeds:
+            rng = torch.Generator().manual_seed(seed)  # on the CPU: the same numbers on every device
+            draws = torch.rand(3, self.sensor.height, self.sensor.width, generator=rng).to(self.counts.device)
+            returned = draws[0] < total[-1] / self.scans
+            # The first bin at which the counts so far exceed the drawn share of all.
+            chosen = (total <= draws[1] * total[-1]).sum(dim=0).clamp(max=self.config.bins - 1)
+            low, high = edges[chosen], edges[chosen + 1]
+            images.append(RangeImage.masked(low * (high / low) ** draws[2], returned, self.sensor))
+        return RangeImage.stack(images)
+
+    def _edges_m(self) -> Float[Tensor, " edges"]:
+        low, high = torch.tensor([self.sensor.range_min_m, self.sensor.range_max_m], dtype=torch.float64).log()
+        edges = torch.linspace(float(low), float(high), self.config.bins + 1, dtype=torch.float64).exp().float()
+        edges[0], edges[-1] = self.sensor.range_min_m, self.sensor.range_max_m  # not a rounding error beyond
+        return edges

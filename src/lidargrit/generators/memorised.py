@@ -1,0 +1,76 @@
+"""The ceiling, and a cheat: the training scans themselves; seeds → range images."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from lidargrit.errors import CheckpointError, ConfigError
+from lidargrit.generators import Generator, SamplingConfig
+from lidargrit.loading import RangeImages, spread
+from lidargrit.sensors import SensorModel
+from lidargrit.structures import RangeImage
+
+
+@dataclass(frozen=True)
+class MemorisedConfig:
+    """How many scans are kept.
+
+    Args:
+        scans: of the training set at most, evenly spaced; each of 64x1024 pixels takes 0.26 MB.
+    """
+
+    scans: int = 1000
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.scans <= 100_000:
+            raise ConfigError(f"{self.scans} scans", "1 to 100,000", "choose about a thousand")
+
+
+class Memorised(Generator):
+    """Gives back what it was shown: the best that a generator without a thought of its own can score.
+
+    A generator that scores better on held-out scans has learned something; one that scores the same may have learned
+    them by heart. It has no stage to train by an objective: it keeps scans, see :meth:`learn`.
+    """
+
+    Config = MemorisedConfig
+    stages = ()
+    scans: Tensor
+    range_m: Tensor
+
+    def __init__(self, config: MemorisedConfig, sensor: SensorModel) -> None:
+        super().__init__(config, sensor)
+        self.config, self.sensor = config, sensor
+        self.register_buffer("scans", torch.zeros((), dtype=torch.int64))
+        self.register_buffer("range_m", torch.zeros(config.scans, sensor.height, sensor.width))
+
+    def objective(self, stage: str) -> nn.Module:
+        """Refuse: there is no stage."""
+        raise NotImplementedError(stage)
+
+    def finish(self, stage: str, objective: nn.Module) -> None:
+        """Refuse: there is no stage."""
+        raise NotImplementedError(stage)
+
+    def learn(self, images: RangeImages) -> None:
+        """Keep the images, in an order that does not follow the drive, so that the first seeds are not neighbours."""
+        kept = spread(self.config.scans, len(images))
+        for place, index in enumerate(torch.randperm(len(kept), generator=torch.Generator().manual_seed(0)).tolist()):
+            self.range_m[place] = images.batch([kept[index]]).range_m[0]
+        self.scans.fill_(len(kept))
+
+    @torch.no_grad()
+    def sample(self, seeds: Sequence[int], sampling: SamplingConfig | None = None) -> RangeImage:
+        """Give the scan of each seed: as many seeds in a row as there are scans give each of them once.
+
+        Raises:
+            CheckpointError: nothing was kept yet.
+        """
+        if not int(self.scans):
+            raise CheckpointError("a generator that has kept no scan", "one that has", "call learn(images) first")
+        range_m = self.range_m[torch.tensor([seed % int(self.scans) for seed in seeds])]
+        return RangeImage(range_m, range_m > 0, self.sensor)

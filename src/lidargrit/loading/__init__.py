@@ -1,0 +1,25 @@
+"""Data sources → batches of range images: projected once, kept on disk, drawn and augmented by seed."""
+
+from lidargrit.loading.batches import Batches, seed_of, spread
+from lidargrit.loading.config import DataConfig
+from lidargrit.loading.images import ImageStore, Pixels, Provenance, RangeImages
+from lidargrit.loading.prepare import cache_folder, damaged_shards, load_range_images, prepare, prepare_and_describe
+from lidargrit.loading.prepared import PreparedImages, is_prepared
+
+__all__ = [
+    "Batches",
+    "DataConfig",
+    "ImageStore",
+    "Pixels",
+    "Provenance",
+    "PreparedImages",
+    "RangeImages",
+    "cache_folder",
+    "damaged_shards",
+    "is_prepared",
+    "load_range_images",
+    "prepare",
+    "prepare_and_describe",
+    "seed_of",
+    "spread",
+]

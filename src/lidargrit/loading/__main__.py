@@ -1,0 +1,11 @@
+"""One of the processes that make shards; see workers.py."""
+
+import sys
+from pathlib import Path
+
+from lidargrit.loading.workers import work
+
+try:
+    sys.exit(work(Path(sys.argv[1]), int(sys.argv[2]), [int(shard) for shard in sys.argv[3:]]))
+except (KeyboardInterrupt, BrokenPipeError):
+    sys.exit(130)

@@ -1,0 +1,100 @@
+"""Training batches as a function of the scans seen before; read ahead by threads, in the same order however many."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+
+import numpy as np
+import torch
+
+from lidargrit.augmentation import Augmentation, augment
+from lidargrit.errors import ConfigError
+from lidargrit.loading.images import RangeImages
+from lidargrit.structures import RangeImage
+
+
+class Batches:
+    """Training batches as a function of the scans seen before, so that a stopped run goes on as if never stopped.
+
+    Args:
+        images: what to draw from; every scan once per epoch, in an order of the seed.
+        batch_size: over all processes.
+        augmentations: applied in turn.
+        any_columns: of the fine columns keep others every time a scan is seen; see :class:`FitConfig`.
+        seed: of order and augmentation.
+        rank: this process, of
+        world_size: this many; each takes its share of every batch.
+        workers: threads that read ahead.
+    """
+
+    def __init__(
+        self,
+        images: RangeImages,
+        batch_size: int,
+        augmentations: Sequence[Augmentation],
+        any_columns: bool,
+        seed: int,
+        rank: int = 0,
+        world_size: int = 1,
+        workers: int = 1,
+    ) -> None:
+        if batch_size % world_size:
+            raise ConfigError(
+                f"batch_size={batch_size} on {world_size} processes",
+                "a multiple of the processes",
+                "change one of them",
+            )
+        self.images, self.batch_size, self.augmentations = images, batch_size, tuple(augmentations)
+        self.any_columns, self.seed, self.rank, self.world_size = any_columns, seed, rank, world_size
+        self.workers = workers
+        self._epoch, self._order = -1, torch.empty(0)
+
+    def stream(self, scans_seen: int, until: int) -> Iterator[RangeImage]:
+        """Yield the batches that follow ``scans_seen`` scans, to the last that begins before ``until``."""
+        waiting: deque[Future[RangeImage]] = deque()
+        with ThreadPoolExecutor(self.workers, thread_name_prefix="reading scans") as pool:
+            try:
+                for position in range(scans_seen, until, self.batch_size):
+                    waiting.append(pool.submit(self._read, *self._drawn(position)))
+                    if len(waiting) > 2 * self.workers:  # enough for none to idle, and few enough to hold in memory
+                        yield waiting.popleft().result()
+                while waiting:
+                    yield waiting.popleft().result()
+            finally:
+                pool.shutdown(wait=True, cancel_futures=True)
+
+    def at(self, scans_seen: int) -> RangeImage:
+        """Return this process's share of the batch that follows ``scans_seen`` scans."""
+        return self._read(*self._drawn(scans_seen))
+
+    def _drawn(self, scans_seen: int) -> tuple[list[int], int]:
+        """Choose the scans of a batch, and the seed of all else that is random about it."""
+        share = self.batch_size // self.world_size
+        first = scans_seen + self.rank * share
+        return [self._draw(position) for position in range(first, first + share)], seed_of(self.seed, 1, first)
+
+    def _read(self, indices: list[int], seed: int) -> RangeImage:
+        rng = torch.Generator().manual_seed(seed)
+        columns = torch.randint(self.images.sensor.column_stride, (len(indices),), generator=rng).tolist()
+        images = self.images.batch(indices, columns if self.any_columns else None)
+        return augment(images, self.augmentations, rng)
+
+    def _draw(self, position: int) -> int:
+        epoch, place = divmod(position, len(self.images))
+        if epoch != self._epoch:
+            rng = torch.Generator().manual_seed(seed_of(self.seed, 0, epoch))
+            self._epoch, self._order = epoch, torch.randperm(len(self.images), generator=rng)
+        return int(self._order[place])
+
+
+def seed_of(*parts: int) -> int:
+    """Mix whole numbers into one seed: near numbers give seeds that have nothing in common."""
+    return int(np.random.SeedSequence(parts).generate_state(1, np.uint64)[0] >> np.uint64(1))
+
+
+def spread(count: int, total: int) -> list[int]:
+    """Return at most ``count`` of ``total`` indices, evenly spaced: neighbours in time are nearly the same scan."""
+    count = min(count, total)
+    return [index * total // count for index in range(count)]

@@ -1,0 +1,278 @@
+"""Scans → prepared range images: planned once, projected by many processes on many machines, taken up where stopped."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
+
+from lidargrit import __version__
+from lidargrit.datasets import ScanDataset, open_dataset
+from lidargrit.errors import ConfigError, DataError, OutputError
+from lidargrit.files import is_taken, write_json, write_text
+from lidargrit.loading.batches import spread
+from lidargrit.loading.config import DataConfig
+from lidargrit.loading.images import RangeImages
+from lidargrit.loading.prepared import (
+    PLAN_FILE,
+    SCANS_FILE,
+    Place,
+    Plan,
+    PreparedImages,
+    is_prepared,
+    read_plan,
+    shard_name,
+)
+from lidargrit.loading.shards import LocalBytes, range_step_m, read_index
+from lidargrit.loading.workers import make_shards
+from lidargrit.reporting import Reporter
+from lidargrit.sensors import SensorModel
+
+_FORMAT = 2  # to be raised whenever projection or simulation give other pixels for the same scan
+_SHARD_SCANS = 128  # 12 MB of a KITTI-360 size image: what a killed process loses, and 625 files for 80,000 scans
+_ABANDONED_S = 3600.0  # a half-written file so old was left by a killed process
+_WAIT_S, _PATIENCE_S = 0.5, 1800.0  # for shards that other processes make; a shard takes seconds
+
+
+def load_range_images(
+    sources: Sequence[str], config: DataConfig, reporter: Reporter | None = None, sensor: SensorModel | None = None
+) -> RangeImages:
+    """Open range images of the sources: prepared ones as they are, scans projected once and then found in the cache.
+
+    The cache is ``$LIDARGRIT_CACHE``, else ``lidargrit`` in the user's cache folder. It may be deleted at any time.
+
+    Args:
+        sources: as in :class:`DataConfig`.
+        config: how scans become images; its own sources are not looked at.
+        reporter: hears of the progress.
+        sensor: stands in for the config's.
+
+    Raises:
+        DataError: no source, a source without a scan, or prepared scans of another sensor.
+        ScanError: a scan that cannot be used; ``bad_scans=skip`` leaves it out.
+    """
+    if not sources:
+        raise DataError("no source of scans", "at least one", "name one with --set data.train=FOLDER")
+    reporter, sensor = reporter or Reporter(), sensor or config.load_sensor()
+    stores: list[PreparedImages] = []
+    for source in sources:
+        if is_prepared(source):
+            prepared = PreparedImages(source, config.max_scans)
+            _check_rays(source, prepared.sensor, sensor)
+        else:
+            prepared = PreparedImages(str(prepare(source, config, reporter=reporter, sensor=sensor)))
+        for why in prepared.left_out.values():
+            reporter.message(f"left out: {why}")
+        stores.append(prepared)
+    images = RangeImages(sensor, stores)
+    if not len(images):
+        raise DataError(f"no usable scan in {', '.join(sources)}", "at least one", "see the messages above")
+    return images
+
+
+def prepare(
+    source: str,
+    config: DataConfig,
+    folder: Path | None = None,
+    reporter: Reporter | None = None,
+    sensor: SensorModel | None = None,
+    rank: int | None = None,
+    world_size: int | None = None,
+) -> Path:
+    """Project every scan of a source into a folder of shards; what is there already is kept, if it is still right.
+
+    Args:
+        source: of scans, as data sets are opened by.
+        config: how scans become images, how many processes work, what is done with bad scans.
+        folder: where to; a place in the cache, named by everything the pixels depend on, if not given.
+        reporter: hears of the progress.
+        sensor: stands in for the config's.
+        rank: this machine, which makes its part and waits for the others to make theirs; ``RANK`` in the environment
+            if not given, and 0 without that.
+        world_size: of so many; ``WORLD_SIZE`` if not given, and 1 without that.
+
+    Returns:
+        the folder, complete.
+
+    Raises:
+        OutputError: the folder holds something else, or what is no longer right.
+        ScanError: a scan that cannot be used; names it.
+    """
+    reporter, sensor = reporter or Reporter(), sensor or config.load_sensor()
+    rank, world_size = _from_environment("RANK", rank, 0), _from_environment("WORLD_SIZE", world_size, 1)
+    if not 0 <= rank < world_size:
+        raise ConfigError(f"rank {rank} of {world_size}", "0 <= rank < world size", "number the machines from 0")
+    dataset = open_dataset(source, config.bad_points)
+    if dataset.sensor != sensor.name and not config.sensor.endswith(".json"):
+        reporter.message(f"WARNING: {source} was made by {dataset.sensor}, and is imaged as {sensor.name}")
+    plan, scans = _plan(source, dataset, sensor, config)
+    facts = json.dumps(asdict(plan), sort_keys=True).encode()
+    folder = folder or cache_folder() / hashlib.sha256(facts).hexdigest()[:24]
+    _claim(folder, plan, scans)
+    missing = [shard for shard in range(plan.num_shards) if not _is_whole(folder, shard)]
+    if missing:
+        _remove_abandoned(folder)
+        mine = [shard for shard in missing if shard % world_size == rank]
+        make_shards(folder, plan, mine, dataset, config.workers, reporter)
+        _wait_for(folder, [shard for shard in missing if shard % world_size != rank], reporter)
+    return folder
+
+
+def prepare_and_describe(
+    source: str,
+    config: DataConfig,
+    folder: Path | None,
+    reporter: Reporter,
+    rank: int | None = None,
+    world_size: int | None = None,
+    verify: bool = False,
+) -> str:
+    """Prepare, read everything back if asked to, and say in a line what lies where.
+
+    Args, Raises: as for :func:`prepare`.
+    """
+    begun = time.monotonic()
+    folder = prepare(source, config, folder, reporter, rank=rank, world_size=world_size)
+    if verify and (damaged := damaged_shards(folder, reporter)):
+        reporter.message(f"damaged and made again: {', '.join(map(shard_name, damaged))}")
+        for shard in damaged:
+            (folder / shard_name(shard)).unlink()
+        prepare(source, config, folder, reporter, rank=rank, world_size=world_size)
+    images, seconds = PreparedImages(str(folder)), time.monotonic() - begun
+    for why in images.left_out.values():
+        reporter.message(f"left out: {why}")
+    size = sum(path.stat().st_size for path in folder.glob("*.shard"))
+    return (
+        f"{len(images)} range images of {images.sensor.height}x{images.sensor.width} in {folder}: "
+        f"{size / 1e6:.1f} MB, {size / 1e3 / max(len(images), 1):.0f} KB each, in {seconds:.1f} s"
+        + (f"; {len(images.left_out)} scans left out" if images.left_out else "")
+    )
+
+
+def damaged_shards(folder: Path, reporter: Reporter | None = None) -> list[int]:
+    """Read every image of a prepared folder and return the shards with one that is not what was written."""
+    images = PreparedImages(str(folder))
+    damaged: set[int] = set()
+    with (reporter or Reporter()).progress("verifying", len(images)) as progress:
+        for index in range(len(images)):
+            try:
+                images.read(index, verify=True)
+            except DataError:
+                damaged.add(images.shard_of(index))
+            progress.advance(1)
+    return sorted(damaged)
+
+
+def cache_folder() -> Path:
+    """Return where projected scans are kept."""
+    if "LIDARGRIT_CACHE" in os.environ:
+        return Path(os.environ["LIDARGRIT_CACHE"])
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "lidargrit"
+
+
+def _from_environment(name: str, given: int | None, default: int) -> int:
+    """Return what a launcher such as torchrun says, unless a number is given."""
+    text = os.environ.get(name, str(default)) if given is None else str(given)
+    if not text.isdecimal():
+        raise ConfigError(f"{name}={text!r}", "a whole number from 0", "correct it")
+    return int(text)
+
+
+def _plan(
+    source: str, dataset: ScanDataset, sensor: SensorModel, config: DataConfig
+) -> tuple[Plan, list[tuple[str, str, int, int]]]:
+    """Return the plan and its scans: what identifies each, its drive, and its file's size and time."""
+    fine, scans = sensor.fine(), []
+    for index in spread(config.max_scans or len(dataset), len(dataset)):
+        path = dataset.path(index)
+        try:
+            status = None if path is None else path.stat()
+        except OSError:
+            raise DataError(f"{path}, which cannot be read", "files that are there", "remove the link") from None
+        name = (
+            dataset.name(index)
+            if path is None
+            else "".join((str(path.resolve()), *dataset.name(index).partition("#")[1:]))
+        )
+        size, time_ns = (status.st_size, status.st_mtime_ns) if status else (0, 0)
+        scans.append((name, dataset.recording(index), size, time_ns))
+    plan = Plan(
+        format=_FORMAT,
+        version=__version__,
+        source=source,
+        sensor=fine.to_json(),
+        variant=config.variant,
+        bad_points=config.bad_points,
+        bad_scans=config.bad_scans,
+        max_scans=config.max_scans,
+        range_step_m=range_step_m(fine),
+        shard_scans=_SHARD_SCANS,
+        num_scans=len(scans),
+        digest=hashlib.sha256(json.dumps(scans).encode()).hexdigest(),
+    )
+    return plan, scans
+
+
+def _claim(folder: Path, plan: Plan, scans: list[tuple[str, str, int, int]]) -> None:
+    """Write the plan into a free folder, or find that the folder's is the same."""
+    if (folder / PLAN_FILE).exists():
+        if differing := plan.differences(read_plan(Place(str(folder)))):
+            raise OutputError(
+                f"{folder}, which is stale: prepared with another {', '.join(differing)}",
+                "an empty folder, or what was prepared from these very scans in this very way",
+                "prepare into another folder, or remove this one",
+            )
+        return
+    if is_taken(folder, SCANS_FILE) and not (folder / SCANS_FILE).exists():
+        raise OutputError(f"{folder}, which holds something else", "an empty folder", "choose another one")
+    write_text(folder / SCANS_FILE, json.dumps(scans))
+    write_json(folder / PLAN_FILE, asdict(plan))  # last: it says that the folder is ours
+
+
+def _is_whole(folder: Path, shard: int) -> bool:
+    path = folder / shard_name(shard)
+    try:
+        read_index(LocalBytes(path), path.name)
+    except (OSError, ValueError):  # ValueError: an empty file, and our own errors
+        return False
+    return True
+
+
+def _remove_abandoned(folder: Path) -> None:
+    for path in folder.glob(".*.shard.*"):
+        with suppress(OSError):
+            if time.time() - path.stat().st_mtime > _ABANDONED_S:
+                path.unlink()
+
+
+def _wait_for(folder: Path, shards: list[int], reporter: Reporter) -> None:
+    """Wait until other machines have made their shards."""
+    last = time.monotonic()
+    with reporter.progress("waiting for others", len(shards)) as progress:
+        while shards:
+            still = [shard for shard in shards if not _is_whole(folder, shard)]
+            if len(still) < len(shards):
+                last = time.monotonic()
+                progress.advance(len(shards) - len(still))
+            elif time.monotonic() - last > _PATIENCE_S:
+                raise DataError(
+                    f"{len(still)} shards of {folder} still missing after {_PATIENCE_S / 60:.0f} minutes",
+                    "the other processes to make them",
+                    "see what became of them; the same command goes on",
+                )
+            shards = still
+            time.sleep(_WAIT_S if still else 0)
+
+
+def _check_rays(source: str, prepared: SensorModel, sensor: SensorModel) -> None:
+    if not prepared.same_rays(sensor.fine()):
+        raise DataError(
+            f"{source}, prepared for {prepared.name!r} ({prepared.height}x{prepared.width})",
+            f"the rays of {sensor.name!r} ({sensor.fine().height}x{sensor.fine().width} with every fine column)",
+            "name the sensor that it was prepared for, or prepare it for this one",
+        )

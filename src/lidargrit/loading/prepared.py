@@ -1,0 +1,194 @@
+"""Prepared scans: a folder, here or far away, that holds a plan and shards → range images."""
+
+from __future__ import annotations
+
+import json
+import threading
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from lidargrit.errors import DataError
+from lidargrit.loading.batches import spread
+from lidargrit.loading.images import Pixels, Provenance
+from lidargrit.loading.shards import Bytes, Entry, LocalBytes, read_image, read_index
+from lidargrit.sensors import SensorModel
+
+PLAN_FILE, SCANS_FILE = "plan.json", "scans.json"
+_PLAN_AT_MOST = 1 << 30  # bytes; the list of a million scans has a quarter of that
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything that the pixels depend on, so that one look tells whether they are still right.
+
+    Args:
+        format: of the shards, raised whenever projection or simulation give other pixels for the same scan.
+        version: of lidargrit.
+        source: where the scans come from, as the user named it.
+        sensor: with all its fine columns.
+        variant: of the projection.
+        bad_points: refused or dropped.
+        bad_scans: refused or skipped.
+        max_scans: taken evenly from the source; 0 for all.
+        range_step_m: in which ranges are kept.
+        shard_scans: how many scans make a shard.
+        num_scans: how many there are.
+        digest: of the files: their places, sizes and times.
+    """
+
+    format: int
+    version: str
+    source: str
+    sensor: dict[str, Any]
+    variant: str
+    bad_points: str
+    bad_scans: str
+    max_scans: int
+    range_step_m: float
+    shard_scans: int
+    num_scans: int
+    digest: str
+
+    @property
+    def num_shards(self) -> int:
+        """How many shards there will be."""
+        return -(-self.num_scans // self.shard_scans)
+
+    def scans_of(self, shard: int) -> range:
+        """Return the places in the plan of one shard's scans."""
+        return range(shard * self.shard_scans, min((shard + 1) * self.shard_scans, self.num_scans))
+
+    def differences(self, other: Plan) -> list[str]:
+        """Name what differs from another plan."""
+        mine, theirs = asdict(self), asdict(other)
+        return [name for name in mine if mine[name] != theirs[name]]
+
+
+def shard_name(shard: int) -> str:
+    """Return the file name of a shard."""
+    return f"{shard:06d}.shard"
+
+
+def is_prepared(source: str) -> bool:
+    """Tell whether a source is a place that prepared scans lie in: a URL, or a folder with a plan."""
+    try:
+        return "://" in source or (Path(source).expanduser() / PLAN_FILE).is_file()
+    except OSError:  # a name longer than names can be
+        return False
+
+
+class Place:
+    """A folder of this machine, or any that fsspec reaches by a URL such as s3://bucket/scans."""
+
+    def __init__(self, location: str) -> None:
+        self.location = location
+        self._is_local = "://" not in location
+        if not self._is_local:
+            import fsspec  # noqa: PLC0415  only for what is far away
+
+            try:
+                self._files, self._root = fsspec.core.url_to_fs(location)
+            except (ValueError, ImportError, OSError) as error:
+                raise DataError(f"{location} ({error})", "a URL that fsspec can open", "check it") from None
+
+    def open(self, name: str) -> Bytes:
+        """Open a file to read pieces of it.
+
+        Raises:
+            DataError: it is not there.
+        """
+        try:
+            if self._is_local:
+                return LocalBytes(Path(self.location).expanduser() / name)
+            return _RemoteBytes(self._files, f"{self._root}/{name}")
+        except (OSError, ValueError) as error:  # an empty file cannot be mapped
+            raise DataError(
+                f"{self.location}/{name}, which cannot be read ({error})", "what lidargrit prepare wrote", "prepare it"
+            ) from None
+
+    def read_json(self, name: str) -> Any:
+        """Read a whole JSON file, or raise DataError."""
+        file = self.open(name)
+        try:
+            if file.size > _PLAN_AT_MOST:
+                raise ValueError(f"{file.size} bytes")
+            return json.loads(bytes(file.read(0, file.size)))
+        except (OSError, ValueError) as error:
+            raise DataError(
+                f"{self.location}/{name}, which is damaged ({error})", "what lidargrit prepare wrote", "prepare again"
+            ) from None
+
+
+class _RemoteBytes:
+    def __init__(self, files: Any, path: str) -> None:
+        self._files, self._path = files, path
+        self.size = int(files.info(path)["size"])
+
+    def read(self, start: int, end: int) -> bytes:
+        return self._files.cat_file(self._path, start, end)
+
+
+def read_plan(place: Place) -> Plan:
+    """Read the plan of a prepared place, or raise DataError."""
+    try:
+        return Plan(**place.read_json(PLAN_FILE))
+    except TypeError as error:
+        raise DataError(
+            f"{place.location}/{PLAN_FILE}, which is no plan ({error})", "one of this version", "prepare again"
+        ) from None
+
+
+class PreparedImages:
+    """The range images of a prepared place.
+
+    Args:
+        location: a folder or a URL.
+        max_scans: taken evenly; 0 for all.
+
+    Raises:
+        DataError: nothing prepared is there, or it is not complete, or damaged.
+    """
+
+    def __init__(self, location: str, max_scans: int = 0) -> None:
+        self._place = Place(location)
+        self.plan = read_plan(self._place)
+        self.sensor = SensorModel.from_json(self.plan.sensor)
+        self._shape = (self.sensor.height, self.sensor.width)
+        self._entries: list[tuple[int, Entry]] = []
+        self.left_out: dict[int, str] = {}
+        self._open: dict[int, Bytes] = {}
+        self._lock = threading.Lock()
+        scans = self._place.read_json(SCANS_FILE)
+        for shard in range(self.plan.num_shards):
+            entries, left_out = read_index(self._bytes(shard), shard_name(shard))
+            if sorted([*(entry.scan for entry in entries), *left_out]) != list(self.plan.scans_of(shard)):
+                raise DataError(f"{shard_name(shard)} with other scans", "those of the plan", "prepare again")
+            self._entries += [(shard, entry) for entry in entries]
+            self.left_out |= left_out
+        if max_scans:
+            self._entries = [self._entries[index] for index in spread(max_scans, len(self._entries))]
+        self.provenance = Provenance(
+            tuple(scans[entry.scan][0] for _, entry in self._entries),
+            tuple(scans[entry.scan][1] for _, entry in self._entries),
+            tuple(entry.fingerprint for _, entry in self._entries),
+        )
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def read(self, index: int, verify: bool = False) -> Pixels:
+        """Return the pixels of one image; ``verify`` compares them with their fingerprint."""
+        shard, entry = self._entries[index]
+        name = f"{self._place.location}/{shard_name(shard)}"
+        return read_image(self._bytes(shard), entry, self._shape, self.plan.range_step_m, name, verify)
+
+    def shard_of(self, index: int) -> int:
+        """Return which shard holds an image."""
+        return self._entries[index][0]
+
+    def _bytes(self, shard: int) -> Bytes:
+        with self._lock:
+            if shard not in self._open:
+                self._open[shard] = self._place.open(shard_name(shard))
+            return self._open[shard]

@@ -1,0 +1,273 @@
+"""What is counted in two sets of range images → curves → the Jensen-Shannon distance between them."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64, Int64
+from scipy.special import rel_entr
+from torch import Tensor
+
+from lidargrit.errors import ConfigError
+from lidargrit.metrics import Metric
+from lidargrit.sensors import SensorModel
+from lidargrit.structures import MetricResult, RangeImage
+
+_LEAST = 500  # pixels in a bin: the standard error of a share stays below 0.5 / sqrt(500) = 0.022
+_COLUMNS = 256  # neighbours are at least as far away as in an image of so many columns: 25 cm at 10 m,
+_ROWS = 32  # and of so many rows: 15 cm at 10 m, against the noise of 2 cm that a range has
+_REACH = 8  # times that far they may be: 11 degrees, across the window of a car 5 m away
+_AGREE = 0.1  # two surfaces nearer to one another than that share of their range are taken for one
+
+
+@dataclass(frozen=True, eq=False)
+class Curves:
+    """The curves of two sets and how far they are apart.
+
+    Args:
+        divergence: Jensen-Shannon, base 2, in [0, 1]; a mean where there are several distributions.
+        axis: where along the axis the values stand.
+        generated: NaN where too little was seen.
+        real: likewise.
+    """
+
+    divergence: float
+    axis: Float64[np.ndarray, " n"]
+    generated: Float64[np.ndarray, "*rows n"]
+    real: Float64[np.ndarray, "*rows n"]
+
+
+class CurveMetric(Metric):
+    """Counts something in the pixels of every image and compares what the counts of two sets say.
+
+    The value is the Jensen-Shannon distance: the square root of the divergence in base 2, from 0 (alike) to 1 (nothing
+    in common). The details hold the curves with their labels: ``axis``, ``generated`` and ``real``, None where too
+    little was seen.
+    Only counts are kept, so that memory does not grow with the sets and no order of images matters.
+
+    Raises:
+        ConfigError: images of two sizes or two pairs of range limits.
+
+    Source:
+        Lin, Divergence measures based on the Shannon entropy, IEEE Trans. Information Theory 37(1), 1991, eq. 4.1;
+        its square root is a metric: Endres and Schindelin, IEEE Trans. Information Theory 49(7), 2003.
+    """
+
+    higher_is_better = False
+    variants = ("exact",)
+    axis_label: ClassVar[str]
+    """What the axis of the curves is, with its unit."""
+    curve_label: ClassVar[str]
+    """What the curves are."""
+
+    def __init__(self, *, variant: str | None = None, seed: int = 0) -> None:
+        super().__init__(variant=variant, seed=seed)
+        self._sensor: SensorModel | None = None
+        self._counts: dict[bool, Int64[np.ndarray, "..."]] = {}
+        self._images = {False: 0, True: 0}
+
+    @abstractmethod
+    def count(self, images: RangeImage) -> Int64[np.ndarray, "..."]:
+        """Count in a batch; counts of batches add up."""
+
+    @abstractmethod
+    def curves(
+        self, generated: Int64[np.ndarray, "..."], real: Int64[np.ndarray, "..."], sensor: SensorModel
+    ) -> Curves:
+        """Turn the counts of both sets into curves and compare these."""
+
+    @torch.no_grad()
+    def update(self, images: RangeImage, *, real: bool) -> None:
+        """Count in a batch of images, on the CPU."""
+        sensor = self._require_kind(images.sensor)
+        images = images.to("cpu") if images.range_m.ndim == 3 else RangeImage.stack([images.to("cpu")])
+        self._add(real, self.count(images), len(images))
+        self._sensor = sensor
+
+    def compute(self) -> MetricResult:
+        """Return the distance, and the curves in the details."""
+        self.require_images(self._images[False], self._images[True], at_least=1)
+        assert self._sensor is not None
+        curves = self.curves(self._counts[False], self._counts[True], self._sensor)
+        details: dict[str, Any] = {
+            "axis_label": self.axis_label,
+            "curve_label": self.curve_label,
+            "axis": curves.axis.tolist(),
+            "generated": _listed(curves.generated),
+            "real": _listed(curves.real),
+        }
+        value = math.sqrt(max(curves.divergence, 0.0))
+        return MetricResult(self.name, value, False, self._images[False], self._images[True], self.variant, details)
+
+    def merge(self, other: Metric) -> None:
+        """Add what another process has counted."""
+        self.require_same_options(other)
+        assert isinstance(other, CurveMetric)
+        if other._sensor is None:
+            return
+        self._sensor = self._require_kind(other._sensor)
+        for real, counts in other._counts.items():
+            self._add(real, counts, other._images[real])
+
+    def _add(self, real: bool, counts: Int64[np.ndarray, "..."], num_images: int) -> None:
+        self._counts[real] = self._counts.get(real, 0) + counts
+        self._images[real] += num_images
+
+    def _require_kind(self, sensor: SensorModel) -> SensorModel:
+        known = self._sensor or sensor
+        kinds = [(s.height, s.width, s.range_min_m, s.range_max_m) for s in (sensor, known)]
+        if kinds[0] != kinds[1]:
+            raise ConfigError(
+                "range images of {}x{} between {:g} and {:g} m".format(*kinds[0]),
+                "{}x{} between {:g} and {:g} m, as the images before".format(*kinds[1]),
+                "project both sets with one sensor",
+            )
+        return known
+
+
+def _listed(curve: Float64[np.ndarray, "..."]) -> list[Any]:
+    return np.where(np.isnan(curve), None, curve).tolist()  # pyright: ignore[reportArgumentType, reportCallIssue]
+
+
+def divergence(
+    first: Float[np.ndarray, "*rows n"] | Int64[np.ndarray, "*rows n"],
+    second: Float[np.ndarray, "*rows n"] | Int64[np.ndarray, "*rows n"],
+) -> Float64[np.ndarray, "*rows"]:
+    """Return the Jensen-Shannon divergence, base 2, of distributions along the last axis, given as counts or shares.
+
+    Two that are both empty are alike; an empty one and another have nothing in common.
+    """
+    p, q = (normalised(side) for side in (first, second))
+    middle = (p + q) / 2
+    apart = (rel_entr(p, middle) + rel_entr(q, middle)).sum(axis=-1) / (2 * math.log(2))
+    empty = np.isnan(p).any(axis=-1).astype(int) + np.isnan(q).any(axis=-1)
+    return np.asarray(np.choose(empty, [apart, 1.0, 0.0]))
+
+
+def normalised(counts: Float[np.ndarray, "*rows n"] | Int64[np.ndarray, "*rows n"]) -> Float64[np.ndarray, "*rows n"]:
+    """Return shares of the last axis, NaN where nothing was counted."""
+    total = counts.sum(axis=-1, keepdims=True).astype(float)
+    return counts / np.where(total > 0, total, np.nan)
+
+
+def compare_shares(
+    generated: Int64[np.ndarray, "2 n"], real: Int64[np.ndarray, "2 n"], axis: Float64[np.ndarray, " n"]
+) -> Curves:
+    """Compare how often something happens, bin by bin: the mean divergence of the bins' yes and no.
+
+    Every bin weighs the same, as in a drawn curve, but those with fewer than 500 trials in either set are left out;
+    should that leave none, all with a trial count. If none has a trial in both sets there is nothing to compare: 0 for
+    two that are both empty, 1 otherwise.
+
+    Args:
+        generated: how often it was tried, and how often it happened.
+        real: likewise.
+        axis: where the bins stand.
+    """
+    trials = np.minimum(generated[0], real[0])
+    kept = trials >= _LEAST if (trials >= _LEAST).any() else trials > 0
+    yes_and_no = [np.stack((side[1], side[0] - side[1]), axis=-1) for side in (generated, real)]
+    each = divergence(*yes_and_no)[kept]
+    alike = not (generated[0].any() or real[0].any())
+    mean = float(each.mean()) if len(each) else float(not alike)
+    drawn = [np.where(kept, normalised(side)[:, 0], np.nan) for side in yes_and_no]
+    return Curves(mean, axis, *drawn)
+
+
+def compare_histograms(
+    generated: Int64[np.ndarray, "*rows n"], real: Int64[np.ndarray, "*rows n"], axis: Float64[np.ndarray, " n"]
+) -> Curves:
+    """Compare histograms, one or one a row: the mean divergence of the rows."""
+    return Curves(float(divergence(generated, real).mean()), axis, normalised(generated), normalised(real))
+
+
+def log_edges(low: float, high: float, bins: int) -> Float64[np.ndarray, " edges"]:
+    """Return the edges of bins that are equally wide on a logarithmic axis."""
+    return np.geomspace(low, high, bins + 1)
+
+
+def middles(edges: Float64[np.ndarray, " edges"]) -> Float64[np.ndarray, " n"]:
+    """Return the geometric middles of bins."""
+    return np.sqrt(edges[1:] * edges[:-1])
+
+
+def histogram(values: Float[Tensor, " n"], edges: Float64[np.ndarray, " edges"]) -> Int64[np.ndarray, " bins"]:
+    """Count values in bins; the last bin holds its upper edge, and what lies outside is in none."""
+    return np.histogram(values.double().numpy(), edges)[0]
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """What the neighbours of every pixel tell of the surface that its ray should meet; the pixel itself is not asked.
+
+    A plane has an inverse range that is linear in the direction, so ranges are interpolated as 1 / range. Since a
+    pixel's own return plays no part, returns and drops are placed alike, and the share of returns is not biased by it.
+
+    Args:
+        range_m: interpolated along the row between the nearest return on either side, NaN where there is none within
+            11 degrees on both or where the two differ by more than a tenth (the sky, the edge of an object).
+        incidence_rad: angle between the ray and the normal of the plane through these two and the nearest returns
+            above and below; NaN also where these two say another range than the first, by more than a tenth.
+    """
+
+    range_m: Float[Tensor, "B H W"]
+    incidence_rad: Float[Tensor, "B H W"]
+
+    @classmethod
+    def of(cls, images: RangeImage) -> Surroundings:
+        """Look around every pixel of a batch."""
+        sensor = images.sensor
+        size = (sensor.height, sensor.width)
+        inverse = torch.where(images.return_mask, 1 / images.range_m, torch.nan)  # NaN spreads to all that needs it
+        azimuth, elevation = (angle.expand(size) for angle in (sensor.azimuth_rad, sensor.elevation_rad))
+        columns, rows = max(1, sensor.width // _COLUMNS), max(1, sensor.height // _ROWS)
+        left, left_at = _nearest(inverse, azimuth, -columns, dim=-1)
+        right, right_at = _nearest(inverse, azimuth, columns, dim=-1)
+        up, up_at = _nearest(inverse, elevation, -rows, dim=-2)
+        down, down_at = _nearest(inverse, elevation, rows, dim=-2)
+        to_left, to_right = (left_at - azimuth) % (2 * math.pi), (azimuth - right_at) % (2 * math.pi)
+        slope_along_row = (left - right) / (to_left + to_right)
+        slope_across = (up - down) / (up_at - down_at)
+        by_row = right + slope_along_row * to_right
+        by_column = down + slope_across * (elevation - down_at)
+        one_surface = (left - right).abs() <= _AGREE * torch.maximum(left, right)
+        by_row = torch.where(one_surface, by_row, torch.nan)
+        plane = (by_row - by_column).abs() <= _AGREE * by_row
+        # With m the normal over the plane's distance, 1 / range = m . direction; its slopes are m along the tangents.
+        across = torch.hypot(slope_along_row / elevation.cos(), slope_across)
+        incidence = torch.where(plane, torch.atan2(across, by_row), torch.nan)
+        return cls(1 / by_row, incidence)
+
+
+def _nearest(
+    inverse_per_m: Float[Tensor, "B H W"], angle_rad: Float[Tensor, "H W"], step: int, dim: int
+) -> tuple[Float[Tensor, "B H W"], Float[Tensor, "B H W"]]:
+    """Return inverse range and angle of the nearest return on one side, from ``step`` to eight steps away, else NaN.
+
+    Rows are circular, columns end at the top and the bottom.
+    """
+    found = torch.full_like(inverse_per_m, torch.nan)
+    at = torch.full_like(inverse_per_m, torch.nan)
+    sign = 1 if step > 0 else -1
+    outwards = range(step, _REACH * step + sign, sign)
+    for shift in reversed(outwards):  # the nearest last: it stays
+        moved = inverse_per_m.roll(-shift, dims=dim)
+        if dim == -2:  # what came round the edge is no neighbour
+            moved[:, slice(-shift, None) if shift > 0 else slice(0, -shift)] = torch.nan
+        returned = ~moved.isnan()
+        found = torch.where(returned, moved, found)
+        at = torch.where(returned, angle_rad.roll(-shift, dims=dim), at)
+    return found, at
+
+
+def count_shares(
+    place: Float[Tensor, "B H W"], happened: Tensor, edges: Float64[np.ndarray, " edges"]
+) -> Int64[np.ndarray, "2 bins"]:
+    """Count, for bins of a quantity known at some pixels (NaN elsewhere), all pixels and those where it happened."""
+    known = ~place.isnan()
+    return np.stack((histogram(place[known], edges), histogram(place[known & happened], edges)))

@@ -1,0 +1,156 @@
+"""A network's name and the file with its weights → features of images, each image looked at once."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import OrderedDict
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32
+from torch import Tensor, nn
+
+from lidargrit.errors import ConfigError, WeightsError
+from lidargrit.metrics._networks.pointnet import POINTNET_WEIGHTS, PointNet
+from lidargrit.metrics._networks.rangenet import RANGENET_WEIGHTS, RangeNet53
+from lidargrit.metrics._networks.weights import PublishedWeights, find_weights, read_weights
+from lidargrit.reporting import Reporter
+
+NETWORKS: dict[str, tuple[PublishedWeights, Callable[[], nn.Module]]] = {
+    published.name: (published, build)
+    for published, build in ((POINTNET_WEIGHTS, PointNet), (RANGENET_WEIGHTS, RangeNet53))
+}
+"""Where the weights of each network come from, and what they fill."""
+
+_BATCH = 8  # images at a time elsewhere than on a CPU, which is no faster with several; RangeNet-53 takes 0.1 GB each
+_REMEMBERED = 512  # images: several metrics, and several variants of one, ask for the same batches; 8 MB at most
+
+
+class Network:
+    """A network that only looks: images in, features out.
+
+    It remembers what it said of the last 512 images, so that metrics which share it, or variants that see the same in
+    an image, cost it only once. Pickled, it is the name of its file; whoever unpickles it reads that file.
+
+    Args:
+        name: one of ``NETWORKS``.
+        path: the file with its weights.
+        device: where it computes.
+
+    Raises:
+        WeightsError: the file is not to be had, or not of this network.
+        ConfigError: a device that is not there.
+    """
+
+    def __init__(self, name: str, path: Path, device: str) -> None:
+        published, build = NETWORKS[name]
+        weights, self.sha256 = read_weights(published, path)
+        self.name, self.path, self._device = name, path, usable_device(device)
+        self._module = filled(build, weights, path).to(self._device)
+        self._known: OrderedDict[bytes, Float32[np.ndarray, " d"]] = OrderedDict()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return load_network, (self.name, self.path, str(self._device))
+
+    def features(self, images: Float[Tensor, "B ..."]) -> Float32[np.ndarray, "B d"]:
+        """Return the features of a batch, on the CPU.
+
+        Raises:
+            WeightsError: features that are no finite numbers: the weights are none that came from training.
+        """
+        images = images.float()
+        keys = [_key(image) for image in images.cpu()]
+        new = list({key: index for index, key in enumerate(keys) if key not in self._known}.values())
+        step = 1 if self._device.type == "cpu" else _BATCH
+        for first in range(0, len(new), step):
+            some = new[first : first + step]
+            for index, features in zip(some, self._look(images[some]), strict=True):
+                self._known[keys[index]] = features
+        for key in keys:
+            self._known.move_to_end(key)
+        found = np.stack([self._known[key] for key in keys])
+        while len(self._known) > _REMEMBERED:
+            self._known.popitem(last=False)
+        return found
+
+    @torch.no_grad()
+    def _look(self, images: Float32[Tensor, "b ..."]) -> Float32[np.ndarray, "b d"]:
+        # TensorFloat-32 would change the fourth digit of the features from one graphics card to the next.
+        with torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True, allow_tf32=False):
+            features = self._module(images.to(self._device)).cpu().numpy()
+        if not np.isfinite(features).all():
+            raise WeightsError(
+                f"features that are not finite from {self.name} with {self.path}",
+                "weights that came from training",
+                "remove the file and get it again",
+            )
+        return features
+
+
+def _key(image: Tensor) -> bytes:
+    content = hashlib.blake2b(image.contiguous().numpy().data, digest_size=16, key=str(tuple(image.shape)).encode())
+    return content.digest()
+
+
+def load_network(
+    name: str, weights: Path | None = None, device: str = "cpu", reporter: Reporter | None = None
+) -> Network:
+    """Return a network with its published weights; the same object while its file stays the same.
+
+    Args:
+        name: one of ``NETWORKS``.
+        weights: the file, where it is not to be looked for or fetched.
+        device: where it is to compute, such as "cuda".
+        reporter: hears of a download.
+
+    Raises:
+        WeightsError: the file is not to be had, or not of this network.
+    """
+    path = find_weights(NETWORKS[name][0], weights, reporter)
+    status = path.stat() if path.is_file() else None
+    return _loaded(name, path, device, status and (status.st_size, status.st_mtime_ns))
+
+
+@lru_cache(maxsize=2)  # the two that there are
+def _loaded(name: str, path: Path, device: str, _file: tuple[int, int] | None) -> Network:
+    return Network(name, path, device)
+
+
+def usable_device(name: str) -> torch.device:
+    """Return a device by its name, such as "cpu" or "cuda".
+
+    Raises:
+        ConfigError: no such device here.
+    """
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError):  # an assertion: PyTorch was built without it
+        raise ConfigError(f"device {name!r}", "one that PyTorch finds on this computer", "try cpu or cuda") from None
+    return device
+
+
+def filled(build: Callable[[], nn.Module], weights: dict[str, Tensor], source: Path) -> nn.Module:
+    """Make a network and give it weights of the very same layout.
+
+    Raises:
+        WeightsError: a name or a size differs; names the first.
+    """
+    with torch.device("meta"):  # no memory, and no draw from the global random source, for what is replaced anyway
+        module = build()
+    wanted = {name: tensor.shape for name, tensor in module.state_dict().items()}
+    given = {name: tensor.shape for name, tensor in weights.items()}
+    for name in sorted(wanted.keys() | given.keys()):
+        if wanted.get(name) != given.get(name):
+            got, want = (tuple(shapes[name]) if name in shapes else "nothing" for shapes in (given, wanted))
+            raise WeightsError(
+                f"weights in {source} that are not of {build.__name__} ({got} for {name!r})",
+                f"{want} there",
+                "give the file that was published for this network",
+            )
+    module.load_state_dict(weights, assign=True)
+    return module.requires_grad_(False)

@@ -1,0 +1,257 @@
+"""The weights that others have published for a network → a file on this computer, fetched if need be → its tensors."""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import http.client
+import io
+import math
+import os
+import tarfile
+import time
+import urllib.error
+import urllib.request
+import zipfile
+import zlib
+from collections.abc import Generator
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from lidargrit.errors import WeightsError
+from lidargrit.files import atomic_path
+from lidargrit.loading import cache_folder
+from lidargrit.reporting import Reporter
+
+FOLDER_VARIABLE = "LIDARGRIT_WEIGHTS"
+"""Environment variable with the folder that is looked into first."""
+
+_TIMEOUT_S = 30.0  # without a byte: longer than any server that works takes to answer
+_AGAIN_S = 60.0  # after a failure, for as long, nobody is asked again: every variant of every metric would wait
+_CHUNK = 2**20  # bytes at a time: a progress bar that moves, and little memory
+_ZIP, _PICKLE = b"PK\x03\x04", b"\x80"  # how files of torch.save begin: since version 1.6, and before it
+
+_failures: dict[str, tuple[float, str]] = {}  # by address: when, and why
+
+
+@dataclass(frozen=True)
+class PublishedWeights:
+    """Where the weights of a network can be had, and on which terms.
+
+    Args:
+        name: of the network, as ``--weights NAME=FILE`` knows it.
+        url: of the file; https only.
+        licence: what its publishers say of its use.
+        bytes_at_most: of the file, and of what it unpacks to; more is refused unread.
+        sha256: of the file, if it is known; if not, only the layout of what the file holds can be checked.
+        members: of a ``.tar.gz``: the files to read, each with the name that goes before those of its tensors. Empty
+            for a file of ``torch.save``.
+    """
+
+    name: str
+    url: str
+    licence: str
+    bytes_at_most: int
+    sha256: str | None = None
+    members: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def file_name(self) -> str:
+        """The last part of the address."""
+        return self.url.rpartition("/")[2]
+
+
+def find_weights(published: PublishedWeights, given: Path | None = None, reporter: Reporter | None = None) -> Path:
+    """Return the file with the weights: the given one, else one that lies ready, else fetch it into the cache.
+
+    It is looked for in ``$LIDARGRIT_WEIGHTS`` and in ``weights`` in the cache, by the name that it has at its source.
+
+    Raises:
+        WeightsError: it lies nowhere and cannot be fetched; says from where to get it, and on which terms.
+    """
+    if given is not None:
+        return given
+    folders = [Path(folder) for folder in [os.environ.get(FOLDER_VARIABLE)] if folder] + [cache_folder() / "weights"]
+    for folder in folders:
+        if (folder / published.file_name).exists():
+            return folder / published.file_name
+    target = folders[-1] / published.file_name
+    _fetch(published, target, reporter or Reporter())
+    return target
+
+
+def read_weights(published: PublishedWeights, path: Path) -> tuple[dict[str, Tensor], str]:
+    """Read tensors by name, and nothing but tensors, from what may be anybody's file.
+
+    Returns:
+        the tensors, float32, in memory of their own, without the counters that networks in training keep; and the
+        SHA-256 of the file.
+
+    Raises:
+        WeightsError: no file, too large a one, another checksum than is known, or anything in it but float32 tensors.
+    """
+    if not path.is_file():  # a pipe would hang
+        raise _unfit(published, f"{path}, which is no file")
+    with path.open("rb") as file:
+        data = file.read(published.bytes_at_most + 1)
+    if len(data) > published.bytes_at_most:
+        raise _unfit(published, f"{path}, which is larger than {published.bytes_at_most / 1e6:.0f} MB")
+    checksum = hashlib.sha256(data).hexdigest()
+    if published.sha256 not in {None, checksum}:
+        raise _unfit(published, f"{path} with the SHA-256 {checksum}")
+    try:
+        parts = _members(published, data) if published.members else {"": data}
+        tensors = {
+            prefix + name: tensor
+            for prefix, part in parts.items()
+            for name, tensor in _tensors(part, published.bytes_at_most).items()
+            if not name.endswith("num_batches_tracked")
+        }
+    except _Refused as why:
+        raise _unfit(published, f"{path}, {why}") from None
+    return tensors, checksum
+
+
+class _Refused(Exception):  # noqa: N818  it never leaves this file
+    """Why a file is not read; follows its name in a sentence."""
+
+
+def _members(published: PublishedWeights, data: bytes) -> dict[str, bytes]:
+    """Return the wanted files of a ``.tar.gz`` by their prefixes; none is ever written to disk, so paths do no harm."""
+    found: dict[str, bytes] = {}
+    try:
+        with (
+            closing(_Bounded(gzip.GzipFile(fileobj=io.BytesIO(data)), published.bytes_at_most)) as unpacked,
+            tarfile.open(fileobj=unpacked, mode="r|") as archive,
+        ):
+            for member in archive:
+                prefix = published.members.get(member.name)
+                if prefix is None or member.type not in {tarfile.REGTYPE, tarfile.AREGTYPE}:  # a sparse one may swell
+                    continue
+                if prefix in found:
+                    raise _Refused(f"which holds {member.name!r} twice")
+                if member.size > published.bytes_at_most:
+                    raise _Refused(f"whose {member.name!r} is too large")
+                reader = archive.extractfile(member)
+                assert reader is not None  # it is for links only
+                found[prefix] = reader.read()
+    except (OSError, EOFError, tarfile.TarError, zlib.error, ValueError) as error:
+        raise _Refused(f"which is no whole .tar.gz ({error})") from None
+    if missing := [name for name, prefix in published.members.items() if prefix not in found]:
+        raise _Refused(f"which lacks {' and '.join(map(repr, missing))}")
+    return found
+
+
+class _Bounded(io.RawIOBase):
+    """A stream that refuses to give more than so many bytes: a small gzip may hold terabytes."""
+
+    def __init__(self, stream: gzip.GzipFile, at_most: int) -> None:
+        self._stream, self._left = stream, at_most
+
+    def read(self, size: int = -1) -> bytes:
+        data = self._stream.read(min(size, self._left + 1) if size >= 0 else self._left + 1)
+        self._left -= len(data)
+        if self._left < 0:
+            raise _Refused("which unpacks to too much")
+        return data
+
+
+def _tensors(data: bytes, at_most: int) -> dict[str, Tensor]:
+    if data.startswith(_ZIP):
+        _refuse_swelling(data)
+    elif not data.startswith(_PICKLE):
+        raise _Refused("which is no file of torch.save")
+    try:
+        loaded = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    except Exception as error:  # whatever a stranger's file does to the reader, it is the file's fault
+        raise _Refused(f"which does not hold tensors only ({type(error).__name__})") from None
+    if not isinstance(loaded, dict) or not all(isinstance(name, str) for name in loaded):
+        raise _Refused("which holds no tensors by name")
+    tensors = {name: value for name, value in loaded.items() if not name.endswith("num_batches_tracked")}
+    for name, value in tensors.items():
+        # Numbers that lie nowhere, or are repeated to fill a large tensor, take no room in the file.
+        plain = isinstance(value, Tensor) and value.layout == torch.strided and value.device.type == "cpu"
+        if not plain or value.dtype != torch.float32 or 4 * value.numel() > at_most:
+            raise _Refused(f"whose {name!r} is no float32 tensor of a network")
+    return {name: value.detach().contiguous() for name, value in tensors.items()}
+
+
+def _refuse_swelling(data: bytes) -> None:
+    """Refuse a zip that is more than it seems; PyTorch itself stores without compression."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            entries = archive.infolist()
+    except (zipfile.BadZipFile, ValueError, NotImplementedError) as error:
+        raise _Refused(f"which is no whole file of torch.save ({error})") from None
+    if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
+        raise _Refused("whose tensors are compressed, as PyTorch does not write them")
+    if sum(entry.file_size for entry in entries) > len(data):
+        raise _Refused("whose parts overlap")
+
+
+def _fetch(published: PublishedWeights, target: Path, reporter: Reporter) -> None:
+    failed_s, why = _failures.pop(published.url, (-math.inf, ""))
+    if time.monotonic() - failed_s < _AGAIN_S:
+        _failures[published.url] = failed_s, why
+        raise _missing(published, target, why)
+    reporter.message(f"fetching {published.url} ({published.licence})")
+    with atomic_path(target) as temporary:
+        with temporary.open("wb") as file, closing(_received(published, target, reporter)) as chunks:
+            for chunk in chunks:
+                file.write(chunk)
+        try:
+            _, checksum = read_weights(published, temporary)
+        except WeightsError:
+            raise _missing(published, target, "what came is not what was asked for") from None
+    if published.sha256 is None:
+        reporter.message(f"{target}: SHA-256 {checksum}; none is known to compare it with")
+
+
+def _received(published: PublishedWeights, target: Path, reporter: Reporter) -> Generator[bytes, None, None]:
+    request = urllib.request.Request(published.url, headers={"User-Agent": "lidargrit"})
+    received = 0
+    try:
+        with urllib.request.build_opener(_HttpsOnly).open(request, timeout=_TIMEOUT_S) as response:
+            promised = response.headers.get("Content-Length", "")
+            expected = int(promised) if promised.isdecimal() else published.bytes_at_most
+            with reporter.progress(f"{published.file_name}, MB", expected // 10**6) as progress:
+                while chunk := response.read(_CHUNK):
+                    before, received = received, received + len(chunk)
+                    if received > published.bytes_at_most:
+                        raise _missing(published, target, "the server sends too much")
+                    progress.advance(received // 10**6 - before // 10**6)
+                    yield chunk
+    except (OSError, http.client.HTTPException) as error:
+        reason = error.reason if isinstance(error, urllib.error.URLError) else error
+        raise _missing(published, target, str(reason).replace("\n", " ") or type(error).__name__) from None
+    if promised and promised != str(received):
+        raise _missing(published, target, f"{received} of {promised} bytes came")
+
+
+class _HttpsOnly(urllib.request.HTTPRedirectHandler):
+    def redirect_request(self, req, fp, code, msg, headers, newurl):
+        if not newurl.startswith("https://"):
+            raise urllib.error.URLError(f"the server points to {newurl}, which is not https")
+        return super().redirect_request(req, fp, code, msg, headers, newurl)
+
+
+def _missing(published: PublishedWeights, target: Path, why: str) -> WeightsError:
+    _failures.setdefault(published.url, (time.monotonic(), why))
+    return WeightsError(
+        f"no weights of {published.name} on this computer, and none from the network ({why})",
+        f"{published.file_name} from {published.url} (licence: {published.licence})",
+        f"put it into {target.parent} or ${FOLDER_VARIABLE}, or name it: --weights {published.name}=FILE",
+    )
+
+
+def _unfit(published: PublishedWeights, got: str) -> WeightsError:
+    known = f" with the SHA-256 {published.sha256}" if published.sha256 else ""
+    return WeightsError(
+        f"as weights of {published.name} {got}",
+        f"{published.file_name} from {published.url}{known}",
+        "remove the file and get it again",
+    )

@@ -1,0 +1,39 @@
+"""How often the neighbour of a drop drops too, at several lags: two sets → Jensen-Shannon distance, mean over lags."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Int64
+
+from lidargrit.metrics._curves import CurveMetric, Curves, compare_shares
+from lidargrit.sensors import SensorModel
+from lidargrit.structures import RangeImage
+
+_COLUMN_LAGS = (1, 2, 4, 8, 16)
+_ROW_LAGS = (1, 2)
+
+
+class DropCorrelation(CurveMetric):
+    """Compare the probability that the pixel at a lag has no return either; at each lag, the divergence of two coins.
+
+    The lags are 1, 2, 4, 8 and 16 columns, rows being circular, and 1 and 2 rows, where there is such a row. Along the
+    axis of the curves rows are negative. A drop is a pixel without a return, for whatever cause, the sky included.
+    """
+
+    title = "How often neighbours of drops drop too"
+    axis_label = "lag [pixels; negative: rows]"
+    curve_label = "share of drops"
+
+    def count(self, images: RangeImage) -> Int64[np.ndarray, "2 lags"]:
+        """Count the drops that have a neighbour at a lag, and those whose neighbour drops."""
+        dropped = ~images.return_mask
+        pairs = [(dropped[:, :-lag], dropped[:, lag:]) for lag in _ROW_LAGS[::-1]]
+        pairs += [(dropped, dropped.roll(-lag, dims=2)) for lag in _COLUMN_LAGS]
+        return np.array([[int(one.sum()) for one, _ in pairs], [int((one & other).sum()) for one, other in pairs]])
+
+    def curves(
+        self, generated: Int64[np.ndarray, "2 lags"], real: Int64[np.ndarray, "2 lags"], sensor: SensorModel
+    ) -> Curves:
+        """Return the probability over the lag."""
+        axis = np.array([-lag for lag in _ROW_LAGS[::-1]] + list(_COLUMN_LAGS), dtype=float)
+        return compare_shares(generated, real, axis)

@@ -1,0 +1,29 @@
+"""Fréchet distance between the features that RangeNet++ finds in two sets of images (FRD): two sets → a number."""
+
+from __future__ import annotations
+
+from jaxtyping import Float
+from torch import Tensor
+
+from lidargrit.metrics._networks.features import normalised_images
+from lidargrit.metrics._networks.frechet import FrechetMetric
+from lidargrit.structures import RangeImage
+
+
+class FrechetRangeDistance(FrechetMetric):
+    """Compare 4096 features of every range image, seen by a RangeNet-53 that was trained on SemanticKITTI at 64x1024.
+
+    Needs reflectance. ``r2dm`` takes what is not between 0.5 and 63 m for dropped, as that program does; ``exact``
+    takes every return, as LiDARGen does. Both programs put real points where they were measured, these lie on rays.
+
+    Source:
+        Zyrianov et al., LiDARGen, ECCV 2022, section 4.2; vzyrianov/lidargen@4c3226c; kazuto1011/r2dm@ad66e71.
+    """
+
+    title = "Fréchet distance between RangeNet++ features of range images (FRD)"
+    variants = ("r2dm", "exact")
+    needs_weights = "rangenet53"
+
+    def inputs(self, images: RangeImage) -> Float[Tensor, "B 5 H W"]:
+        """Return the five channels that RangeNet++ was trained on."""
+        return normalised_images(images, self.variant)

@@ -1,0 +1,35 @@
+"""Share of rays that return against the angle at which they should strike: two sets → Jensen-Shannon distance."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Int64
+
+from lidargrit.metrics._curves import CurveMetric, Curves, Surroundings, compare_shares, count_shares
+from lidargrit.sensors import SensorModel
+from lidargrit.structures import RangeImage
+
+_EDGES_DEG = np.linspace(0, 90, 19)  # 5 degrees each: what noise of 2 cm does to a plane through points 25 cm apart
+
+
+class ReturnRateByIncidence(CurveMetric):
+    """Compare the share of returns in bins of incidence; in each, the divergence of two coins, and the mean over bins.
+
+    Every pixel, returned or not, gets the plane of its neighbours: the nearest return on either side along the row and
+    along the column. 0 degrees strikes the plane squarely. Pixels with too few neighbours, or whose neighbours lie on
+    no common plane, are left out, and with them surfaces that are lost as a whole.
+    """
+
+    title = "Share of returns against incidence"
+    axis_label = "incidence [degrees]"
+    curve_label = "share of returns"
+
+    def count(self, images: RangeImage) -> Int64[np.ndarray, "2 bins"]:
+        """Count the pixels whose plane is known and, among them, the returns."""
+        return count_shares(Surroundings.of(images).incidence_rad.rad2deg(), images.return_mask, _EDGES_DEG)
+
+    def curves(
+        self, generated: Int64[np.ndarray, "2 bins"], real: Int64[np.ndarray, "2 bins"], sensor: SensorModel
+    ) -> Curves:
+        """Return the share of returns over the incidence."""
+        return compare_shares(generated, real, (_EDGES_DEG[1:] + _EDGES_DEG[:-1]) / 2)

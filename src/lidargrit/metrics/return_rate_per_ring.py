@@ -1,0 +1,29 @@
+"""Share of rays that return, row by row: two sets → Jensen-Shannon distance, the root of the mean over rows."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Int64
+
+from lidargrit.metrics._curves import CurveMetric, Curves, compare_shares
+from lidargrit.sensors import SensorModel
+from lidargrit.structures import RangeImage
+
+
+class ReturnRatePerRing(CurveMetric):
+    """Compare the share of pixels that return in every row; in each, the divergence of two coins."""
+
+    title = "Share of returns in every row"
+    axis_label = "row, from the top"
+    curve_label = "share of returns"
+
+    def count(self, images: RangeImage) -> Int64[np.ndarray, "2 H"]:
+        """Count the pixels and the returns of every row."""
+        returned = images.return_mask.sum(dim=(0, 2)).numpy()
+        return np.stack((np.full_like(returned, len(images) * images.sensor.width), returned))
+
+    def curves(
+        self, generated: Int64[np.ndarray, "2 H"], real: Int64[np.ndarray, "2 H"], sensor: SensorModel
+    ) -> Curves:
+        """Return the share of returns over the rows."""
+        return compare_shares(generated, real, np.arange(sensor.height, dtype=float))

@@ -1,0 +1,95 @@
+"""Where the points of a scan fall: points → row, column and range of each, and the nearest of each pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int, Int32
+
+from lidargrit.projection import spherical, unfolding
+from lidargrit.sensors import ProjectionName, SensorModel
+from lidargrit.structures import Scan
+
+Variant = Literal["exact", "reference"]
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """The place of every point in the image, before any point is left out.
+
+    Args:
+        row: -1 above all rows, and ``height`` or more below them.
+        column: of the fine columns.
+        range_m: Euclidean distance from the sensor.
+        height: rows of the image.
+        width: its fine columns.
+    """
+
+    row: Int[np.ndarray, "n"]
+    column: Int32[np.ndarray, "n"]
+    range_m: Float32[np.ndarray, "n"]
+    height: int
+    width: int
+
+    def in_rows(self) -> Bool[np.ndarray, "n"]:
+        """Tell which points have a row."""
+        return (self.row >= 0) & (self.row < self.height)
+
+    def nearest(
+        self, eligible: Bool[np.ndarray, "n"]
+    ) -> tuple[Int32[np.ndarray, "H fine_W"], Float32[np.ndarray, "H fine_W"]]:
+        """Find the nearest of the eligible points in each pixel; of equally near ones the last.
+
+        Every eligible point must have a row.
+
+        Returns:
+            its index, -1 for none, and its range, infinite for none.
+        """
+        spare = self.height * self.width  # a pixel beyond the image takes the points that are left out
+        pixel = self.row.astype(np.int64)
+        pixel *= self.width
+        pixel += self.column
+        pixel[~eligible] = spare
+        least_m = np.full(spare + 1, np.inf, dtype=np.float32)
+        np.minimum.at(least_m, pixel, self.range_m)
+        nearest = np.flatnonzero(self.range_m == least_m.take(pixel))
+        point = np.full(spare + 1, -1, dtype=np.int32)
+        point[pixel.take(nearest)] = nearest  # of several writes to a pixel the last one stays
+        shape = self.height, self.width
+        return point[:spare].reshape(shape), least_m[:spare].reshape(shape)
+
+
+def place(scan: Scan, sensor: SensorModel, method: ProjectionName, variant: Variant) -> Placement:
+    """Find the row, the fine column and the range of every point."""
+    xyz_m = np.ascontiguousarray(scan.points_xyz_m.numpy().T)  # NumPy is far faster along whole coordinates
+    with np.errstate(over="ignore", under="ignore"):
+        range_m = xyz_m[0] * xyz_m[0]
+        range_m += xyz_m[1] * xyz_m[1]
+        range_m += xyz_m[2] * xyz_m[2]
+        np.sqrt(range_m, out=range_m)
+    height, width = sensor.height, sensor.width * sensor.column_stride
+    if variant == "reference":
+        if method == "spherical":
+            row = spherical.reference_rows(xyz_m, range_m, height)
+        else:
+            row = unfolding.reference_rings(xyz_m, height)
+        return Placement(row, unfolding.reference_columns(xyz_m, width), range_m, height, width)
+    if method == "spherical":
+        row = spherical.rows(xyz_m, range_m, row_elevation_rad(sensor))
+    elif scan.ring is not None:
+        row = scan.ring.numpy()
+    else:
+        row = unfolding.rings_from_firing_order(xyz_m)
+    return Placement(row, unfolding.columns(xyz_m, width), range_m, height, width)
+
+
+def within_limits(range_m: Float32[np.ndarray, "n"], sensor: SensorModel) -> Bool[np.ndarray, "n"]:
+    """Tell which ranges the sensor can return; the limits themselves are inside."""
+    return (range_m >= sensor.range_min_m) & (range_m <= sensor.range_max_m)
+
+
+def row_elevation_rad(sensor: SensorModel) -> np.ndarray:
+    """Return one elevation (H,) for every row: the mean over its pixels, for a sensor with angles for every pixel."""
+    return sensor.elevation_rad.mean(dim=1).double().numpy()

@@ -1,0 +1,168 @@
+"""Simulated drives as files: seeds → a tree laid out as KITTI odometry and SemanticKITTI are."""
+
+from __future__ import annotations
+
+import multiprocessing
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from lidargrit.errors import ConfigError, OutputError
+from lidargrit.files import atomic_path, is_taken, read_json, write_json, write_text
+from lidargrit.formats.kitti_bin import KittiBin
+from lidargrit.reporting import Reporter
+from lidargrit.sensors import SensorModel
+from lidargrit.simulator import observe, scene_of
+
+MANIFEST = "simulated.json"
+_SCANS_PER_SEQUENCE = 10_000  # of streets seen once each: a folder that any file browser still opens
+_FRAME_S = 0.1  # Velodyne and KITTI: ten revolutions a second
+# KITTI's poses are those of its left camera: x right, y down, z forward. Ours sits in the sensor itself.
+_CAMERA_FROM_SENSOR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+
+
+@dataclass(frozen=True)
+class DriveConfig:
+    """What is simulated.
+
+    Args:
+        sensor: whose scans.
+        seed: of the first street; the next has the next.
+        frames: scans of each street, a tenth of a second apart; 1 gives as many streets as scans.
+        theme: of the streets.
+        motion: leave the distortion by the car's own motion in the scans; KITTI odometry has it removed.
+        wet: of the ground, from 0 (dry) to 1.
+        clean: also write what a raydrop model learns from and is judged by: the clean range of every pixel, the
+            probability of a return, the drawn mask, reflectance and label, as ``observation/NNNNNN.npz``.
+    """
+
+    sensor: SensorModel
+    seed: int = 0
+    frames: int = 1
+    theme: Any = "mixed"
+    motion: bool = False
+    wet: float = 0.0
+    clean: bool = False
+
+    def __post_init__(self) -> None:
+        if self.frames < 1 or self.seed < 0:
+            raise ConfigError(f"frames={self.frames}, seed={self.seed}", "1 frame or more, a seed from 0", "correct it")
+
+    def street_of(self, scan: int) -> tuple[int, int]:
+        """Return the seed of a scan's street and its frame there."""
+        return self.seed + scan // self.frames, scan % self.frames
+
+    def place_of(self, scan: int) -> tuple[str, int]:
+        """Return a scan's sequence and its number in it: a drive each, or many single streets together."""
+        together = self.frames if self.frames > 1 else _SCANS_PER_SEQUENCE
+        return f"{scan // together:02d}", scan % together
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all that the scans depend on."""
+        return {**vars(self), "sensor": self.sensor.to_json()}
+
+
+def write_drives(
+    out: Path, num_scans: int, config: DriveConfig, workers: int = 1, reporter: Reporter | None = None
+) -> None:
+    """Write scans, labels and poses; scans that are there already are not simulated again.
+
+    The tree is ``sequences/SS/{velodyne/NNNNNN.bin, labels/NNNNNN.label, poses.txt, times.txt, calib.txt}``.
+
+    Args:
+        out: an empty folder, or one that the same simulation began; more scans can be added to it.
+        num_scans: in all.
+        config: of what.
+        workers: processes at once.
+        reporter: hears of the progress.
+
+    Raises:
+        OutputError: the folder holds something else.
+    """
+    if num_scans < 1 or workers < 1:
+        raise ConfigError(f"{num_scans} scans by {workers} processes", "at least one of each", "correct it")
+    _claim(out, config)
+    missing = [scan for scan in range(num_scans) if not _label_file(out, config, scan).exists()]
+    write = partial(_write_scan, out, config)
+    with (reporter or Reporter()).progress("simulating", num_scans, num_scans - len(missing)) as progress:
+        if min(workers, len(missing)) <= 1:
+            for scan in missing:
+                write(scan)
+                progress.advance(1)
+        else:
+            with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
+                for _ in pool.map(write, missing, chunksize=4):
+                    progress.advance(1)
+    _write_sequence_files(out, config, num_scans)
+
+
+def _claim(out: Path, config: DriveConfig) -> None:
+    facts = config.to_json()
+    if (out / MANIFEST).exists():
+        if read_json(out / MANIFEST) != facts:
+            raise OutputError(
+                f"{out}, which holds scans simulated in another way", "an empty folder", "choose another folder"
+            )
+    elif is_taken(out, MANIFEST):
+        raise OutputError(f"{out}, which is not empty and holds no simulation", "an empty folder", "choose another")
+    else:
+        write_json(out / MANIFEST, facts)
+
+
+def _write_scan(out: Path, config: DriveConfig, scan: int) -> None:
+    """Write one scan's files; its labels come last and say that the others are there."""
+    seed, frame = config.street_of(scan)
+    seen = observe(seed, config.sensor, theme=config.theme, frame=frame, motion=config.motion, wet=config.wet)
+    points = seen.scan(f"simulated scan {seed}")
+    assert points.label is not None
+    label_file = _label_file(out, config, scan)
+    folder, name = label_file.parent.parent, label_file.stem
+    KittiBin.write(folder / "velodyne" / f"{name}.bin", points)
+    if config.clean:
+        with atomic_path(folder / "observation" / f"{name}.npz") as temporary:
+            np.savez_compressed(
+                temporary,
+                clean_range_m=seen.clean_range_m,
+                return_probability=seen.return_probability.astype(np.float16),
+                return_mask=seen.return_mask,
+                range_m=seen.range_m,
+                reflectance=seen.reflectance,
+                label=seen.label,
+                cos_incidence=seen.cos_incidence.astype(np.float16),
+            )
+    with atomic_path(label_file) as temporary:
+        temporary.write_bytes(points.label.numpy().astype("<u4").tobytes())
+
+
+def _label_file(out: Path, config: DriveConfig, scan: int) -> Path:
+    sequence, number = config.place_of(scan)
+    return out / "sequences" / sequence / "labels" / f"{number:06d}.label"
+
+
+def _write_sequence_files(out: Path, config: DriveConfig, num_scans: int) -> None:
+    """Write what a sequence has once: poses in KITTI's form, times and calibration."""
+    poses: dict[str, list[Float64[np.ndarray, "4 4"]]] = {}
+    for first in range(0, num_scans, config.frames):
+        scene = scene_of(config.street_of(first)[0], config.theme) if config.frames > 1 else None
+        for scan in range(first, min(first + config.frames, num_scans)):
+            relative = np.eye(4)
+            if scene is not None:
+                moved = np.linalg.inv(scene.sensor_pose()) @ scene.sensor_pose(_FRAME_S * (scan - first))
+                relative = _CAMERA_FROM_SENSOR @ moved @ np.linalg.inv(_CAMERA_FROM_SENSOR)
+            poses.setdefault(config.place_of(scan)[0], []).append(relative)
+    projection = _numbers(np.eye(3, 4))
+    calibration = [f"P{camera}: {projection}" for camera in range(4)] + [f"Tr: {_numbers(_CAMERA_FROM_SENSOR[:3])}"]
+    for sequence, relative in poses.items():
+        folder = out / "sequences" / sequence
+        write_text(folder / "poses.txt", "".join(f"{_numbers(pose[:3])}\n" for pose in relative))
+        write_text(folder / "times.txt", "".join(f"{place * _FRAME_S:e}\n" for place in range(len(relative))))
+        write_text(folder / "calib.txt", "".join(f"{line}\n" for line in calibration))
+
+
+def _numbers(matrix: Float64[np.ndarray, "3 4"]) -> str:
+    return " ".join(f"{value:.9e}" for value in matrix.ravel())

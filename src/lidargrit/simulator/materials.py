@@ -1,0 +1,58 @@
+"""What surfaces are made of: a material's name → how it answers a beam of 905 nm."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Material:
+    """How one kind of surface answers a beam; how bright it scatters (albedo) belongs to each triangle.
+
+    Args:
+        name: what it is.
+        diffuse: factor on the triangle's albedo, the share scattered evenly; clear coats and panes scatter little.
+        gloss: strength of the mirror-like lobe, seen only close to normal incidence.
+        lobe_power: exponent of the cosine of incidence in that lobe; the higher, the narrower.
+        retroreflection: strength of the lobe that goes straight back whatever the incidence (foils, number plates).
+        passes: share of the light that goes through (glass).
+        mottle: how much its reflectance differs from spot to spot, as a share: leaves turn every way, plaster is rough.
+        source: where the numbers come from.
+    """
+
+    name: str
+    diffuse: float = 1.0
+    gloss: float = 0.0
+    lobe_power: float = 1.0
+    retroreflection: float = 0.0
+    passes: float = 0.0
+    mottle: float = 0.0
+    source: str = ""
+
+
+ASPHALT, CONCRETE, PLASTER, BRICK, METAL, PAINT, GLASS, FOIL, LEAVES, BARK, CLOTH, SKIN, RUBBER, GRASS, WATER = range(
+    15
+)
+
+# Fitted to 67 scans of KITTI by benchmarks/fit_raydrop.py: diffuse of asphalt to leaves and grass, all of paint,
+# diffuse and passes of glass, foil. With them come the albedos that the scenes draw, so a diffuse may be above 1.
+# Mottle is set so that neighbouring readings differ as in KITTI: by 0.12 on the ground, and 0.20 above it.
+# The other numbers are set by eye: bodies of cars fade out in rows, their windows are dark.
+MATERIALS: tuple[Material, ...] = (
+    Material("asphalt", diffuse=1.66),
+    Material("concrete", diffuse=1.09, mottle=0.08),
+    Material("plaster", diffuse=0.715, mottle=0.12),
+    Material("brick", diffuse=1.02, mottle=0.2),
+    Material("metal", gloss=0.966, lobe_power=30.0),
+    Material("paint", diffuse=0.285, gloss=1.36, lobe_power=45.6),
+    # Clear glass would pass 0.9; that of cars and houses is made to keep heat out, which begins at this wavelength.
+    Material("glass", diffuse=0.0093, gloss=0.00258, lobe_power=40.0, passes=0.2),
+    Material("foil", retroreflection=32.4),
+    Material("leaves", diffuse=0.859, mottle=0.4),
+    Material("bark", mottle=0.4),
+    Material("cloth"),
+    Material("skin"),
+    Material("rubber"),
+    Material("grass", diffuse=0.899, mottle=0.2),
+    Material("water", gloss=0.02, lobe_power=200.0, passes=0.95),
+)

@@ -1,0 +1,234 @@
+"""What a sensor sees of a scene: a scene, a sensor and a random stream → all there is to know about every pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32, Float64, Int32, UInt16
+
+from lidargrit.sensors import SensorModel
+from lidargrit.simulator.beams import REVOLUTION_S, Beams
+from lidargrit.simulator.echoes import Echoes, edges, listen
+from lidargrit.simulator.mesh import Mesh
+from lidargrit.simulator.power import (
+    Chances,
+    Lasers,
+    RaydropModel,
+    Surfaces,
+    levels,
+    reflectance,
+    return_probability,
+)
+from lidargrit.simulator.tracing import Tracer, in_reach
+from lidargrit.structures import Scan
+
+
+@runtime_checkable
+class Surroundings(Protocol):
+    """What a sensor needs of a scene."""
+
+    def mesh(self, time_s: float = 0.0) -> Mesh:
+        """Return what there is to meet at a time."""
+        ...
+
+    def sensor_pose(self, time_s: float = 0.0) -> Float64[np.ndarray, "4 4"]:
+        """Return the sensor's frame in the scene's at a time."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """One simulated revolution, pixel by pixel: what is there, how likely it comes back, and what was measured.
+
+    Rows fall from the top, columns go from straight behind clockwise, as in range images.
+
+    Args:
+        clean_range_m: range without noise, whether it came back or not; 0 where the ray meets nothing
+            within the sensor's reach. The car that
+            carries the sensor is not part of the scene.
+        return_probability: chance of a return, given all but what differs from pulse to pulse; ``return_mask`` is drawn
+            by it.
+        return_mask: True = the beam came back.
+        blocked: True = the ray ends on the car that carries the sensor, and never comes back.
+        range_m: measured, with noise; 0 where nothing returned.
+        reflectance: measured, in [0, 1]; 0 where nothing returned.
+        label: class of what the ray meets, by SemanticKITTI's numbers; 0 for nothing.
+        instance: number of the object that the ray meets; 0 for what is no single object.
+        cos_incidence: cosine between ray and surface normal; 0 where the ray meets nothing.
+        directions: unit vectors of the rays in the sensor's frame when each was fired.
+        sensor_pose: from the sensor's frame to the scene's when the revolution begins.
+    """
+
+    clean_range_m: Float32[np.ndarray, "H W"]
+    return_probability: Float32[np.ndarray, "H W"]
+    return_mask: Bool[np.ndarray, "H W"]
+    blocked: Bool[np.ndarray, "H W"]
+    range_m: Float32[np.ndarray, "H W"]
+    reflectance: Float32[np.ndarray, "H W"]
+    label: UInt16[np.ndarray, "H W"]
+    instance: Int32[np.ndarray, "H W"]
+    cos_incidence: Float32[np.ndarray, "H W"]
+    directions: Float32[np.ndarray, "H W 3"]
+    sensor_pose: Float64[np.ndarray, "4 4"]
+
+    def scan(self, source: str) -> Scan:
+        """Return the points that came back in the firing order of KITTI's files.
+
+        Args:
+            source: where the scan comes from, for messages.
+
+        Raises:
+            ScanError: not one point came back.
+        """
+        x, y = self.directions[..., 0], self.directions[..., 1]
+        turn = np.arctan2(-y, -x)  # from -pi to pi, rising as the azimuth does from 0 to 2 pi
+        # Rows are two runs already, which a stable sort joins in one pass.
+        order = np.argsort(turn, axis=1, kind="stable")
+        came_back = np.take_along_axis(self.return_mask, order, axis=1)
+        ring, place = np.nonzero(came_back)
+        column = order[ring, place]
+        at = ring * self.range_m.shape[1] + column
+        xyz_m = self.directions.reshape(-1, 3)[at] * self.range_m.ravel()[at][:, None]
+        label = self.label.ravel()[at].astype(np.int64) | (self.instance.ravel()[at].astype(np.int64) & 0xFFFF) << 16
+        return Scan(
+            torch.from_numpy(xyz_m),
+            torch.from_numpy(self.reflectance.ravel()[at]),
+            torch.from_numpy(ring),
+            torch.from_numpy(label),
+            source=source,
+        )
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How a scene is looked at.
+
+    Args:
+        time_s: when the revolution begins.
+        motion: whether the sensor moves during the revolution.
+        wet: of the ground, 0 (dry) to 1 (soaked).
+        kept_columns_only: leave out the columns that the sensor's image leaves out.
+        model: which beams come back.
+    """
+
+    time_s: float = 0.0
+    motion: bool = False
+    wet: float = 0.0
+    kept_columns_only: bool = False
+    model: RaydropModel = field(default_factory=RaydropModel)
+
+
+def observe_scene(
+    scene: Surroundings,
+    sensor: SensorModel,
+    scene_rng: np.random.Generator,
+    beam_rng: np.random.Generator,
+    settings: Settings,
+) -> Observation:
+    """Look at a scene for one revolution.
+
+    Things other than the sensor stand still during a revolution.
+
+    Args:
+        scene: what there is.
+        sensor: whose rays are cast.
+        scene_rng: of what stays with the scene from one revolution to the next: the gain of every object.
+        beam_rng: of what differs from one revolution to the next.
+        settings: when and how.
+    """
+    model = settings.model
+    begun, ended = (scene.sensor_pose(settings.time_s + after_s) for after_s in (0.0, REVOLUTION_S))
+    poses = (begun, ended) if settings.motion else (begun,)
+    beams = Beams.draw(sensor, beam_rng, model.gap_share)
+    height, fine_width = beams.azimuth_rad.shape
+    chances = Chances.draw(beam_rng, height, fine_width, model)
+    stride = fine_width // sensor.width if settings.kept_columns_only else 1
+    kept = slice(None, None, stride)
+    looked, chances = beams.columns(kept), chances.columns(kept)
+
+    elevations_rad = float(beams.elevation_rad.min()), float(beams.elevation_rad.max())
+    mesh = in_reach(scene.mesh(settings.time_s), poses, elevations_rad, sensor.range_max_m)
+    tracer, surfaces = Tracer(mesh, sensor.range_max_m), Surfaces.of(mesh, model, settings.wet)
+    rays = looked.rays(*poses)
+    first = tracer.cast(*rays)
+    range_m = first.range_m.reshape(looked.azimuth_rad.shape)
+    if stride == 1:
+        beside = np.roll(range_m, 1, axis=1), np.roll(range_m, -1, axis=1)
+    else:
+        beside = _beside(tracer, beams, poses, stride)
+    edge = edges(range_m, *beside, model.edge_share).ravel()
+    echoes = listen(tracer, surfaces, rays, first, edge, model)
+    limits_m = sensor.range_min_m, sensor.range_max_m
+    lasers = Lasers.of(sensor, model)
+    return _measure(mesh, surfaces, echoes, looked, lasers, chances, scene_rng, limits_m, begun, model)
+
+
+def _beside(
+    tracer: Tracer,
+    beams: Beams,
+    poses: tuple[Float64[np.ndarray, "4 4"], ...],
+    stride: int,
+) -> tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "H W"]]:
+    """Cast the fine columns to the left and to the right of every ``stride``-th."""
+    found = []
+    for start in (stride - 1, 1):
+        looked = beams.columns(slice(start, None, stride))
+        found.append(tracer.cast(*looked.rays(*poses)).range_m.reshape(looked.azimuth_rad.shape))
+    return np.roll(found[0], 1, axis=1), found[1]
+
+
+def _object_gains(mesh: Mesh, rng: np.random.Generator, model: RaydropModel) -> Float32[np.ndarray, " objects"]:
+    """Draw the natural log of the gain of every object by its number; what is no single object has none."""
+    gains = rng.standard_normal(int(mesh.instance.max()) + 1, dtype=np.float32) * np.float32(model.object_spread)
+    gains[0] = 0
+    return gains
+
+
+def _measure(
+    mesh: Mesh,
+    surfaces: Surfaces,
+    echoes: Echoes,
+    beams: Beams,
+    lasers: Lasers,
+    chances: Chances,
+    scene_rng: np.random.Generator,
+    limits_m: tuple[float, float],
+    pose: Float64[np.ndarray, "4 4"],
+    model: RaydropModel,
+) -> Observation:
+    """Decide by chance which echoes are noticed, and what is read from them."""
+    shape = beams.azimuth_rad.shape
+    label = np.append(mesh.label, np.uint16(0))[echoes.triangle]
+    instance = np.append(mesh.instance, np.int32(0))[echoes.triangle]
+    of_object = _object_gains(mesh, scene_rng, model)[instance]
+    log_gain = (lasers.log_gain + chances.patch).ravel() + of_object
+    level = levels(echoes.power, log_gain, model)
+    clear = beams.clear.ravel() & (echoes.range_m >= limits_m[0]) & (echoes.range_m <= limits_m[1])
+    probability = np.where(clear, return_probability(level, model), np.float32(0))
+    noise = np.float32(model.pulse_spread) * chances.pulse.ravel()
+    range_m = echoes.range_m + np.float32(model.range_sigma_m) * chances.range_noise.ravel()
+    came_back = clear & beams.fired.ravel() & (level + noise > 0)
+    came_back &= (range_m >= limits_m[0]) & (range_m <= limits_m[1])
+    shine = surfaces.shine(echoes.triangle, echoes.cos_incidence)
+    # An object that answers more strongly than others of its kind reads brighter too.
+    scattered = surfaces.albedo[echoes.triangle] * np.exp(of_object)
+    scattered = (scattered.reshape(shape) * lasers.reading).ravel()
+    # The very pulse that comes back stronger reads brighter.
+    chance = chances.pulse.ravel() * surfaces.mottle[surfaces.material[echoes.triangle]]
+    bright = reflectance(scattered, shine, level + noise, chance, model)
+    return Observation(
+        clean_range_m=np.where(np.isinf(echoes.range_m), np.float32(0), echoes.range_m).reshape(shape),
+        return_probability=probability.reshape(shape),
+        return_mask=came_back.reshape(shape),
+        blocked=~beams.clear,
+        range_m=np.where(came_back, range_m, np.float32(0)).reshape(shape),
+        reflectance=np.where(came_back, bright, np.float32(0)).reshape(shape),
+        label=label.reshape(shape),
+        instance=instance.reshape(shape),
+        cos_incidence=echoes.cos_incidence.reshape(shape),
+        directions=beams.directions(),
+        sensor_pose=pose,
+    )

@@ -1,0 +1,265 @@
+"""What of a beam comes back: surfaces, incidence and range → power, the chance of a return, and reflectance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Int32, UInt8
+from scipy.special import ndtr
+
+from lidargrit.sensors import SensorModel
+from lidargrit.simulator.kitti_car import LASER_GAINS, LASER_READINGS
+from lidargrit.simulator.materials import ASPHALT, CONCRETE, MATERIALS, Material
+from lidargrit.simulator.mesh import Mesh
+
+
+@dataclass(frozen=True)
+class RaydropModel:
+    """All numbers that decide which beams come back, and what is measured; the defaults suit the HDL-64E of KITTI.
+
+    Powers are in units of what a white plate at 1 m would send back, were the receiver in focus there. "Fitted" numbers
+    bring simulated scans nearest to 67 scans of KITTI, all together: ``benchmarks/fit_raydrop.py`` finds them, and
+    ``docs/results/simulator-against-kitti.md`` says how near that is. Single ones of them are not measurements.
+
+    Args:
+        least_power: weaker echoes are lost. Set by hand: asphalt is lost at about 55 m, as in KITTI. The fit does not
+            move it, since albedos and gains do the same.
+        near_m: nearer than this the receiver is out of focus, and power no longer grows as 1 / range^2. Fitted.
+        extinction_per_m: share of light that air takes per metre, one way. 0 is clear air; fog of 500 m visibility has
+            about 0.006, by Koschmieder's rule, 3 / visibility.
+        gloss: factor on the gloss of all materials.
+        retroreflection: factor on the retroreflection of all materials.
+        laser_gains: natural logarithm of the gain of each laser of KITTI's HDL-64E, from the top. Fitted, to its share
+            of returns and its reflectance.
+        laser_readings: factor of the reflectance that each of them reports. Fitted likewise.
+        laser_spread: of the gains of other sensors, drawn at random; a sensor keeps them. As KITTI's neighbours differ.
+        patch_spread: the same, along a ring. Fitted.
+        patch_deg: how far along a ring the gain stays alike. Fitted.
+        object_spread: the same, from object to object. Fitted.
+        pulse_spread: the same, from pulse to pulse. Fitted.
+        gap_share: pixels into which no firing falls. Measured: 2.9 to 3.5 % of four unfolded KITTI scans.
+        divergence_mrad: full angle of a beam. Velodyne's HDL-64E S2 data sheet: 2 mrad.
+        pulse_length_m: echoes nearer to one another than this are one. The same data sheet: pulses of 5 ns, so c t / 2.
+        edge_share: an edge is where inverse range bends by more than this share of itself; a plane has no bend.
+        range_sigma_m: noise of the range. The HDL-64E S2 data sheet: accuracy below 2 cm, one sigma.
+        dim_level: log of power over the least one, below which reflectance reads 0. Fitted.
+        dim_share: of its reflectance that an echo just above that level reads: KITTI has few readings below 0.05 but 0.
+            Fitted.
+        bright_level: the same level, above which it reads in full. Fitted.
+        reflectance_spread: of reflectance, from pulse to pulse, as a share of it, on top of its material's. Set by
+            hand: with it neighbouring readings of near ground differ as in KITTI, by 0.12.
+        wet_darkening: share of its scattering that soaked asphalt or concrete loses. Assumed: about half, as films of
+            water on rough ground darken it.
+        wet_gloss: strength of the mirror-like lobe of soaked ground. Assumed: 0.02, as Fresnel's law has it for water.
+        materials: how surfaces answer.
+    """
+
+    least_power: float = 2.5e-6
+    near_m: float = 12.3
+    extinction_per_m: float = 0.0
+    gloss: float = 1.0
+    retroreflection: float = 1.0
+    laser_gains: tuple[float, ...] = LASER_GAINS
+    laser_readings: tuple[float, ...] = LASER_READINGS
+    laser_spread: float = 0.31
+    patch_spread: float = 0.141
+    patch_deg: float = 4.82
+    object_spread: float = 0.522
+    pulse_spread: float = 0.424
+    gap_share: float = 0.033
+    divergence_mrad: float = 2.0
+    pulse_length_m: float = 0.75
+    edge_share: float = 0.05
+    range_sigma_m: float = 0.02
+    dim_level: float = 2.67
+    dim_share: float = 0.175
+    bright_level: float = 3.1
+    reflectance_spread: float = 0.08
+    wet_darkening: float = 0.5
+    wet_gloss: float = 0.02
+    materials: tuple[Material, ...] = MATERIALS
+
+
+@dataclass(frozen=True, eq=False)
+class Surfaces:
+    """How every triangle of a scene answers; the last entry stands for nothing, which does not.
+
+    Args:
+        albedo: share of light scattered evenly.
+        material: index into the tables below.
+        gloss: of every material, strength of the mirror-like lobe.
+        lobe_power: of every material, exponent of that lobe.
+        retroreflection: of every material, strength of the lobe that goes straight back.
+        passes: of every material, share of the light that goes through.
+        mottle: of every material, how much what is read of it differs from spot to spot, as a share.
+    """
+
+    albedo: Float32[np.ndarray, " t"]
+    material: UInt8[np.ndarray, " t"]
+    gloss: Float32[np.ndarray, " m"]
+    lobe_power: Float32[np.ndarray, " m"]
+    retroreflection: Float32[np.ndarray, " m"]
+    passes: Float32[np.ndarray, " m"]
+    mottle: Float32[np.ndarray, " m"]
+
+    @classmethod
+    def of(cls, mesh: Mesh, model: RaydropModel, wet: float = 0.0) -> Surfaces:
+        """Look up the materials of a mesh, on ground between dry (``wet`` 0) and soaked (1)."""
+        albedo = np.append(mesh.albedo, np.float32(0))
+        material = np.append(mesh.material, np.uint8(len(model.materials)))
+        nothing = Material("nothing")
+        diffuse, gloss, lobe_power, retro, passes, mottle = (
+            np.array([getattr(m, name) for m in (*model.materials, nothing)], np.float32)
+            for name in ("diffuse", "gloss", "lobe_power", "retroreflection", "passes", "mottle")
+        )
+        albedo *= diffuse[material]
+        gloss, retro = gloss * np.float32(model.gloss), retro * np.float32(model.retroreflection)
+        if wet:
+            albedo[(material == ASPHALT) | (material == CONCRETE)] *= np.float32(1 - wet * model.wet_darkening)
+            gloss[[ASPHALT, CONCRETE]] = wet * model.wet_gloss
+            lobe_power[[ASPHALT, CONCRETE]] = 100  # a film on rough ground: a narrow lobe, a third at 8 degrees
+        mottle = np.hypot(mottle, np.float32(model.reflectance_spread))
+        return cls(albedo, material, gloss, lobe_power, retro, passes, mottle)
+
+    def passing(self) -> Float32[np.ndarray, " t"]:
+        """Return the share of light that goes through each triangle."""
+        return self.passes[self.material]
+
+    def shine(
+        self, triangle: Int32[np.ndarray, " n"], cos_incidence: Float32[np.ndarray, " n"]
+    ) -> Float32[np.ndarray, " n"]:
+        """Return what surfaces send back besides the light they scatter evenly: gloss and retroreflection."""
+        material = self.material[triangle]
+        shine = np.zeros(len(triangle), np.float32)
+        bright = np.flatnonzero(((self.gloss > 0) | (self.retroreflection > 0))[material])
+        of, cos = material[bright], cos_incidence[bright]
+        shine[bright] = self.gloss[of] * cos ** self.lobe_power[of] + self.retroreflection[of] * cos
+        return shine
+
+    def brightness(
+        self, triangle: Int32[np.ndarray, " n"], cos_incidence: Float32[np.ndarray, " n"]
+    ) -> Float32[np.ndarray, " n"]:
+        """Return how brightly surfaces answer: Lambert's law, a mirror-like lobe, and retroreflection.
+
+        A foil sends light back whatever the incidence; only the area that it turns to the beam shrinks.
+        """
+        return self.albedo[triangle] * cos_incidence + self.shine(triangle, cos_incidence)
+
+
+def received_power(
+    brightness: Float32[np.ndarray, "*shape"], range_m: Float32[np.ndarray, "*shape"], model: RaydropModel
+) -> Float32[np.ndarray, "*shape"]:
+    """Return the power that comes back from surfaces that fill the beam; 0 from infinity.
+
+    The overlap of beam and receiver, which HDL-64E lacks close by, is written as a constant added to range^2.
+
+    Source:
+        Wagner et al., ISPRS J. 60(2), 2006, eq. 4 (the lidar equation) for an extended target.
+    """
+    power = brightness / (range_m * range_m + np.float32(model.near_m**2))
+    if model.extinction_per_m:
+        power = power * np.exp(np.float32(-2 * model.extinction_per_m) * range_m)
+    return power
+
+
+@dataclass(frozen=True, eq=False)
+class Lasers:
+    """How the lasers of one sensor differ, row by row; they are alike in all scans.
+
+    Args:
+        log_gain: natural log of the power's factor.
+        reading: factor of the reflectance that is reported.
+    """
+
+    log_gain: Float32[np.ndarray, "H 1"]
+    reading: Float32[np.ndarray, "H 1"]
+
+    @classmethod
+    def of(cls, sensor: SensorModel, model: RaydropModel) -> Lasers:
+        """Look up the lasers of KITTI's own sensor, or draw those of another.
+
+        Rows of equal elevations, as in KITTI-360's images, are no lasers: several meet in one.
+        """
+        if sensor.name == "hdl64e_kitti_odometry" and sensor.height == len(model.laser_gains):
+            return cls(*(np.array(t, np.float32)[:, None] for t in (model.laser_gains, model.laser_readings)))
+        gains = np.random.default_rng(64).normal(0, model.laser_spread, (sensor.height, 1)).astype(np.float32)
+        return cls(gains, np.ones_like(gains))
+
+
+@dataclass(frozen=True, eq=False)
+class Chances:
+    """All that is random about the beams of one scan besides where they look.
+
+    Args:
+        patch: natural log of the power's factor along a ring.
+        pulse: of the power's factor from pulse to pulse, in standard deviations.
+        range_noise: of the range, in standard deviations.
+    """
+
+    patch: Float32[np.ndarray, "H W"]
+    pulse: Float32[np.ndarray, "H W"]
+    range_noise: Float32[np.ndarray, "H W"]
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator, height: int, width: int, model: RaydropModel) -> Chances:
+        """Draw the chances of a scan of one size."""
+        num_knots = max(round(360 / model.patch_deg), 1)
+        knots = rng.standard_normal((height, num_knots), dtype=np.float32) * np.float32(model.patch_spread)
+        place = np.arange(width, dtype=np.float32) * np.float32(num_knots / width)
+        left = place.astype(np.intp)
+        share = place - left.astype(np.float32)
+        patch = knots[:, left] * (1 - share)
+        patch += knots[:, (left + 1) % num_knots] * share
+        return cls(
+            patch,
+            pulse=rng.standard_normal((height, width), dtype=np.float32),
+            range_noise=rng.standard_normal((height, width), dtype=np.float32),
+        )
+
+    def columns(self, which: slice) -> Chances:
+        """Return the chances of some columns."""
+        return Chances(self.patch[:, which], self.pulse[:, which], self.range_noise[:, which])
+
+
+def levels(
+    power: Float32[np.ndarray, "*shape"], log_gain: Float32[np.ndarray, "*shape"], model: RaydropModel
+) -> Float32[np.ndarray, "*shape"]:
+    """Return the natural log of power times gain over the least power; minus infinity for no power."""
+    with np.errstate(divide="ignore"):
+        return np.log(power * np.float32(1 / model.least_power)) + log_gain
+
+
+def return_probability(level: Float32[np.ndarray, "*shape"], model: RaydropModel) -> Float32[np.ndarray, "*shape"]:
+    """Return the probability that a pulse is fired into the pixel and, with its own chance, exceeds the least power.
+
+    The factor from pulse to pulse is log-normal, so this is the normal distribution function of the level.
+    """
+    if model.pulse_spread == 0:
+        return (level > 0).astype(np.float32) * np.float32(1 - model.gap_share)
+    return ndtr(level * np.float32(1 / model.pulse_spread)) * np.float32(1 - model.gap_share)
+
+
+def reflectance(
+    scattered: Float32[np.ndarray, "*shape"],
+    shine: Float32[np.ndarray, "*shape"],
+    level: Float32[np.ndarray, "*shape"],
+    chance: Float32[np.ndarray, "*shape"],
+    model: RaydropModel,
+) -> Float32[np.ndarray, "*shape"]:
+    """Return what the sensor reports as reflectance: hundredths in [0, 0.99].
+
+    A sensor undoes range and incidence from the strength of the echo, but a weak echo reads too dark: KITTI's road
+    reads alike up to 17 m and falls to 0 at 30 m, though it is seen to 55 m.
+
+    Args:
+        scattered: share of light that the surface scatters evenly.
+        shine: what it sends back besides.
+        level: natural log of power over the least power.
+        chance: how much too bright this one reads, as a share.
+        model: the numbers.
+    """
+    full = scattered * (1 + chance) + np.float32(0.5) * shine
+    seen = (level - np.float32(model.dim_level)) * np.float32(1 / (model.bright_level - model.dim_level))
+    dimmed = np.where(seen > 0, model.dim_share + (1 - model.dim_share) * np.minimum(seen, 1), 0).astype(np.float32)
+    return np.round(np.clip(full * dimmed, 0, 0.99), 2)

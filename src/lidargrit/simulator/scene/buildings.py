@@ -1,0 +1,289 @@
+"""Houses: where they stand and how large → walls with windows, doors, balconies, roofs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int, Num
+
+from lidargrit.simulator import labels, materials
+from lidargrit.simulator.scene.plan import Plan, Poses
+from lidargrit.simulator.scene.shapes import Pile, boxes, owners, quads, rows_of
+
+_SINK_M = 1.5  # walls go on below the ground, which may fall away
+_RELIEF_TO_M = 40.0  # how deep windows lie farther away is less than a beam is wide
+_BALCONIES_TO_M = 60.0  # they are a metre or two wide
+_WINDOWS_TO_M = 85.0  # a window farther away is hit by a beam or two
+_OCCLUDERS_TO_M = 55.0  # houses farther away hide little that is not far itself
+_HIDDEN_M = 90.0  # what houses hide is drawn as if it were so far away: hardly a beam finds it
+_THROUGH_PANE = materials.MATERIALS[materials.GLASS].passes ** 2  # share of light that comes back from behind one
+_PANE, _SHUTTER, _DOOR = range(3)
+_CURTAINED = 0.45  # share of the panes
+
+
+@dataclass(frozen=True, eq=False)
+class Houses:
+    """Houses with x along their fronts and the street on the side of -y; the origin is the middle of the floor.
+
+    Args:
+        poses: of the middles.
+        length_m: along the street.
+        depth_m: away from it.
+        height_m: of the walls.
+        storey_m: height of a storey; a garage has one storey.
+        roof_m: how much the ridge stands over the walls; 0 for flat roofs.
+        wall_material: brick, plaster or concrete.
+        wall_albedo: of the walls.
+        plain: no windows at all: garages and sheds.
+    """
+
+    poses: Poses
+    length_m: Float[np.ndarray, " n"]
+    depth_m: Float[np.ndarray, " n"]
+    height_m: Float[np.ndarray, " n"]
+    storey_m: Float[np.ndarray, " n"]
+    roof_m: Float[np.ndarray, " n"]
+    wall_material: Int[np.ndarray, " n"]
+    wall_albedo: Float[np.ndarray, " n"]
+    plain: np.ndarray
+
+    def away_m(self, plan: Plan, places_m: Num[np.ndarray, "p _"]) -> Float[np.ndarray, " p"]:
+        """Return how near our car comes to places; those that houses hide from it count as far."""
+        away = plan.away_m(places_m)
+        hides = np.flatnonzero((plan.away_m(self.poses.xyz_m) < _OCCLUDERS_TO_M) & ~self.plain)
+        beside = np.flatnonzero((away > 12.0) & (away < _HIDDEN_M))
+        from_x, from_y = self._into(hides, plan.eyes_m)  # (houses, eyes): lines of sight in the frame of each house
+        to_x, to_y = self._into(hides, places_m[beside, :2])
+        spans = []
+        with np.errstate(divide="ignore", invalid="ignore"):  # a line along a wall counts as free
+            for start, end, size in ((from_x, to_x, self.length_m), (from_y, to_y, self.depth_m)):
+                inverse, half = 1 / (end[:, :, None] - start[:, None]), (size[hides, None, None] / 2).astype(np.float32)
+                middle, reach = -start[:, None] * inverse, half * abs(inverse)
+                spans.append((middle - reach, middle + reach))
+        enter, leave = np.maximum(spans[0][0], spans[1][0]), np.minimum(spans[0][1], spans[1][1])
+        blocked = (enter < leave) & (enter > 0) & (leave < 1)  # a place in a house is not hidden by it
+        away[beside[blocked.any(axis=0).all(axis=-1)]] = _HIDDEN_M
+        return away
+
+    def _into(self, which: np.ndarray, places_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return x and y of places (p, 2) in the frames of some houses (h, p)."""
+        x, y = (places_m[:, axis] - self.poses.xyz_m[which, axis, None] for axis in (0, 1))
+        cos, sin = np.cos(self.poses.yaw_rad[which, None]), np.sin(self.poses.yaw_rad[which, None])
+        return (cos * x + sin * y).astype(np.float32), (cos * y - sin * x).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class _Walls:
+    """Flat walls of houses: the house, where the wall begins and which way it runs (both in the house's frame)."""
+
+    house: np.ndarray
+    start: np.ndarray  # (w, 2)
+    along: np.ndarray  # (w, 2), unit
+    length: np.ndarray
+    away: np.ndarray  # from our car's way
+    glazed: np.ndarray
+
+
+def add_houses(pile: Pile, rng: np.random.Generator, plan: Plan, houses: Houses) -> None:
+    """Add houses; walls that the sensor never sees are plain."""
+    walls = _walls(plan, houses)
+    _add_plain_walls(pile, houses, walls)
+    _add_windows(pile, rng, houses, walls)
+    _add_insides(pile, rng, houses, walls)
+    _add_roofs(pile, rng, houses)
+    _add_balconies(pile, rng, houses, walls)
+
+
+def _walls(plan: Plan, houses: Houses) -> _Walls:
+    count = len(houses.length_m)
+    half = np.stack((houses.length_m, houses.depth_m), axis=1) / 2
+    start = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)], float)[:, None] * half  # front, right, back, left
+    along = np.repeat(np.array([(1, 0), (0, 1), (-1, 0), (0, -1)], float)[:, None], count, axis=1)
+    length = np.stack((houses.length_m, houses.depth_m, houses.length_m, houses.depth_m))
+    outward = np.stack((along[..., 1], -along[..., 0]), axis=-1)
+    before = start + along * length[..., None] / 2 + outward  # a step before the middle of each wall
+    cos, sin = np.cos(houses.poses.yaw_rad), np.sin(houses.poses.yaw_rad)
+    turned = np.stack((cos * before[..., 0] - sin * before[..., 1], sin * before[..., 0] + cos * before[..., 1]), -1)
+    away = houses.away_m(plan, (turned + houses.poses.xyz_m[:, :2]).reshape(-1, 2))
+    eyes = np.stack(houses._into(np.arange(count), plan.eyes_m), axis=-1)  # (n, k, 2)
+    faces = (((eyes - start[:, :, None]) * outward[:, :, None]).sum(axis=3) > 0).any(axis=2)
+    glazed = (faces & ~houses.plain).ravel() & (away < _WINDOWS_TO_M)
+    return _Walls(
+        np.tile(np.arange(count), 4), start.reshape(-1, 2), along.reshape(-1, 2), length.ravel(), away, glazed
+    )
+
+
+def _on_wall(
+    houses: Houses, walls: _Walls, which: np.ndarray, along_m: np.ndarray, deep_m: np.ndarray, z_m: np.ndarray
+) -> np.ndarray:
+    """Return world points (m, k, 3) of places on walls: along the wall, behind its face, and up."""
+    along, start = walls.along[which][:, None], walls.start[which][:, None]
+    inward = np.stack((-along[..., 1], along[..., 0]), axis=-1)
+    flat = start + along * along_m[..., None] + inward * deep_m[..., None]
+    local = np.concatenate((flat, np.broadcast_to(z_m, along_m.shape)[..., None]), axis=-1).astype(np.float32)
+    return houses.poses.of(walls.house[which]).put(local)
+
+
+def _add_wall_quads(pile: Pile, houses: Houses, walls: _Walls, which: np.ndarray, spans: np.ndarray) -> None:
+    """Add rectangles of wall; spans has the columns from, to, bottom, top."""
+    along, z = spans[:, [0, 1, 1, 0]], spans[:, [2, 2, 3, 3]]
+    points = _on_wall(houses, walls, which, along, np.zeros_like(along), z)
+    house = walls.house[which]
+    pile.add(quads(points), houses.wall_material[house][:, None], houses.wall_albedo[house][:, None], labels.BUILDING)
+
+
+def _add_plain_walls(pile: Pile, houses: Houses, walls: _Walls) -> None:
+    """Add whole walls where there is no relief, and the foot of the others."""
+    relief = walls.glazed & (walls.away < _RELIEF_TO_M)
+    plain = np.flatnonzero(~relief)
+    top = houses.height_m[walls.house]
+    _add_wall_quads(pile, houses, walls, plain, rows_of(0.0, walls.length, -_SINK_M, top)[plain])
+    foot = np.flatnonzero(relief)
+    _add_wall_quads(pile, houses, walls, foot, rows_of(0.0, walls.length, -_SINK_M, 0.0)[foot])
+
+
+def _add_windows(pile: Pile, rng: np.random.Generator, houses: Houses, walls: _Walls) -> None:
+    """Divide walls into bays and storeys; each cell is a frame of wall round an opening, its reveal and its pane.
+
+    Far cells are dark patches on a whole wall.
+    """
+    which = np.flatnonzero(walls.glazed)
+    house = walls.house[which]
+    taste = rng.uniform(2.0, 3.4, len(houses.length_m))  # width of a bay
+    bays = np.maximum((walls.length[which] / taste[house]).round(), 1).astype(int)
+    storeys = np.maximum((houses.height_m / houses.storey_m).round(), 1).astype(int)[house]
+    cell = owners(bays * storeys)
+    order = np.arange(len(cell)) - np.repeat(np.cumsum(bays * storeys) - bays * storeys, bays * storeys)
+    bay, storey = order % bays[cell], order // bays[cell]
+    wall, home = which[cell], house[cell]
+    width, height = walls.length[wall] / bays[cell], houses.height_m[home] / storeys[cell]
+    left, low = bay * width, storey * height
+    style = rng.uniform(0, 1, (3, len(houses.length_m)))[:, home]
+    half_width = np.minimum(0.42 + 0.45 * style[0], width * 0.42)
+    sill, head = 0.75 + 0.35 * style[1], 2.0 + 0.35 * style[2]
+    chance = rng.random(len(cell))
+    shop = (storey == 0) & (houses.storey_m[home] > 3.3) & (style[0] > 0.4)  # tall ground floors have large panes
+    half_width, sill = np.where(shop, width * 0.42, half_width), np.where(shop, 0.4, sill)
+    kind = np.where(chance < 0.16, _SHUTTER, _PANE)
+    door = (storey == 0) & (chance > 0.88) & ~shop
+    kind, sill = np.where(door, _DOOR, kind), np.where(door, 0.02, sill)
+    blind = chance[::-1] > 0.84  # a cell without a window
+    near = walls.away[wall] < _RELIEF_TO_M
+    span = rows_of(left, left + width, low, low + height)
+    shut = near & blind
+    _add_wall_quads(pile, houses, walls, wall[shut], span[shut])
+    middle = left + width / 2
+    hole = rows_of(middle - half_width, middle + half_width, low + sill, low + np.minimum(head, height - 0.1))
+    open_, patch = np.flatnonzero(near & ~blind), np.flatnonzero(~near & ~blind)
+    _add_cells(pile, rng, houses, walls, wall[open_], span[open_], hole[open_], kind[open_])
+    _add_patches(pile, rng, houses, walls, wall[patch], hole[patch], kind[patch])
+
+
+def _add_patches(
+    pile: Pile, rng: np.random.Generator, houses: Houses, walls: _Walls, wall: np.ndarray, hole: np.ndarray,
+    kind: np.ndarray,
+) -> None:  # fmt: skip
+    """Add openings as flat patches before a whole wall, as bright as what is seen through a pane."""
+    along, z = hole[:, [0, 1, 1, 0]], hole[:, [2, 2, 3, 3]]
+    points = _on_wall(houses, walls, wall, along, np.full(along.shape, -0.03), z)
+    room = np.where(rng.random(len(kind)) < _CURTAINED, rng.uniform(0.25, 0.6, len(kind)), 0.09)
+    bright = np.where(kind == _PANE, room * _THROUGH_PANE, rng.uniform(0.15, 0.55, len(kind)))
+    material = np.where(kind == _DOOR, materials.PAINT, materials.PLASTER)
+    pile.add(quads(points), material[:, None], bright[:, None], labels.BUILDING)
+
+
+def _add_cells(
+    pile: Pile,
+    rng: np.random.Generator,
+    houses: Houses,
+    walls: _Walls,
+    wall: np.ndarray,
+    span: np.ndarray,
+    hole: np.ndarray,
+    kind: np.ndarray,
+) -> None:
+    frame = [
+        np.stack((span[:, 0], span[:, 1], span[:, 2], hole[:, 2]), axis=1),
+        np.stack((span[:, 0], span[:, 1], hole[:, 3], span[:, 3]), axis=1),
+        np.stack((span[:, 0], hole[:, 0], hole[:, 2], hole[:, 3]), axis=1),
+        np.stack((hole[:, 1], span[:, 1], hole[:, 2], hole[:, 3]), axis=1),
+    ]
+    _add_wall_quads(pile, houses, walls, np.tile(wall, 4), np.concatenate(frame))
+    house = walls.house[wall]
+    deep = np.where(kind == _SHUTTER, 0.05, 0.14)[:, None]
+    along, z = hole[:, [0, 1, 1, 0]], hole[:, [2, 2, 3, 3]]
+    outer, inner = (_on_wall(houses, walls, wall, along, np.broadcast_to(d, along.shape), z) for d in (deep * 0, deep))
+    reveal = np.stack((outer, np.roll(outer, -1, 1), np.roll(inner, -1, 1), inner), axis=2)
+    material, albedo = houses.wall_material[house][:, None, None], houses.wall_albedo[house][:, None, None]
+    pile.add(quads(reveal), material, albedo, labels.BUILDING)
+    filling = np.array([materials.GLASS, materials.PLASTER, materials.PAINT])[kind]
+    bright = np.where(kind == _PANE, 0.02, rng.uniform(0.15, 0.55, len(kind)))
+    pile.add(quads(inner), filling[:, None], bright[:, None], labels.BUILDING)
+    curtain = np.flatnonzero((kind == _PANE) & (rng.random(len(kind)) < _CURTAINED))  # cloth close behind the pane
+    along, z = along[curtain], z[curtain]
+    points = _on_wall(houses, walls, wall[curtain], along, np.full(along.shape, 0.25), z)
+    pile.add(quads(points), materials.CLOTH, rng.uniform(0.25, 0.6, (len(curtain), 1)), labels.BUILDING)
+
+
+def _add_insides(pile: Pile, rng: np.random.Generator, houses: Houses, walls: _Walls) -> None:
+    """Stand dark inner walls behind the windows."""
+    opened = (walls.glazed & (walls.away < _RELIEF_TO_M)).reshape(4, -1).any(axis=0)
+    half = np.stack((houses.length_m, houses.depth_m), axis=1) / 2 - 0.9
+    some = np.flatnonzero(opened & (half.min(axis=1) > 0.5))
+    half, top = half[some], houses.height_m[some] - 0.1
+    inner = boxes(rows_of(-half[:, 0], -half[:, 1], -0.2), rows_of(half[:, 0], half[:, 1], top))
+    dark = rng.uniform(0.03, 0.15, (len(some), 1))
+    pile.add(houses.poses.of(some).put(inner[:, :8]), materials.PLASTER, dark, labels.BUILDING)
+
+
+def _add_roofs(pile: Pile, rng: np.random.Generator, houses: Houses) -> None:
+    """Add saddle roofs with eaves, their gables, and flat lids."""
+    out = np.where(houses.roof_m > 0, 0.35, 0.02)
+    half_length, half_depth = houses.length_m / 2 + out, houses.depth_m / 2 + out
+    low, ridge = houses.height_m, houses.height_m + houses.roof_m + 0.02
+    hip = np.where(rng.random(len(low)) < 0.25, houses.depth_m / 2, 0.0) * (houses.length_m > houses.depth_m * 1.1)
+    corner = [rows_of(a * half_length, b * half_depth, low) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    tops = [rows_of(a * (half_length - hip), 0.0, ridge) for a in (-1, 1)]
+    slopes = np.stack(
+        [
+            np.stack((corner[0], corner[1], tops[1], tops[0]), axis=1),
+            np.stack((corner[2], corner[3], tops[0], tops[1]), axis=1),
+        ],
+        axis=1,
+    )
+    tiles = houses.poses.put(quads(slopes))
+    bright = rng.uniform(0.12, 0.35, (len(low), 1, 1))
+    pile.add(tiles, materials.BRICK, bright, labels.BUILDING)
+    ends = np.stack(
+        [np.stack((corner[1], corner[2], tops[1]), axis=1), np.stack((corner[3], corner[0], tops[0]), axis=1)], axis=1
+    )
+    gable = houses.poses.put(ends.astype(np.float32))
+    pile.add(gable, houses.wall_material[:, None], houses.wall_albedo[:, None], labels.BUILDING)
+
+
+def _add_balconies(pile: Pile, rng: np.random.Generator, houses: Houses, walls: _Walls) -> None:
+    """Hang balconies on some fronts, put steps before some doors, and add bays that break the plane."""
+    count = len(houses.length_m)
+    front = (walls.glazed & (walls.away < _BALCONIES_TO_M))[:count]
+    many = np.where(front, rng.poisson(1.6, count), 0)
+    home = owners(many)
+    x = rng.uniform(-0.5, 0.5, len(home)) * np.maximum(houses.length_m[home] - 4.0, 0.5)
+    face = -houses.depth_m[home] / 2
+    kind = rng.random(len(home))
+    storey = np.minimum(np.floor(rng.random(len(home)) * 3) + 1, np.round(houses.height_m / houses.storey_m)[home] - 1)
+    half, out = rng.uniform(0.8, 1.8, len(home)), rng.uniform(0.6, 1.5, len(home))
+    material, albedo = houses.wall_material[home], houses.wall_albedo[home]
+    hung = np.flatnonzero((kind < 0.5) & (storey > 0))
+    floor = storey * houses.storey_m[home]
+    slab = boxes(rows_of(x - half, face - out, floor - 0.15), rows_of(x + half, face, floor))
+    rail = boxes(rows_of(x - half, face - out, floor), rows_of(x + half, face - out + 0.06, floor + 0.95))
+    balcony = np.stack((slab, rail), axis=1)[hung]
+    pile.add(houses.poses.of(home[hung]).put(balcony), materials.CONCRETE, albedo[hung][:, None, None], labels.BUILDING)
+    steps = np.flatnonzero(kind > 0.75)
+    step = boxes(rows_of(x - half, face - out, -_SINK_M), rows_of(x + half, face, 0.15 + 0.5 * kind))[steps]
+    pile.add(houses.poses.of(home[steps]).put(step), materials.CONCRETE, 0.3, labels.BUILDING)
+    bays = np.flatnonzero((kind > 0.5) & (kind < 0.75))
+    tall = houses.height_m[home] * np.where(half > 1.2, 1.0, 0.45)
+    bay = boxes(rows_of(x - half, face - out * 0.6, -_SINK_M), rows_of(x + half, face + 0.05, tall))[bays]
+    pile.add(houses.poses.of(home[bays]).put(bay), material[bays][:, None], albedo[bays][:, None], labels.BUILDING)

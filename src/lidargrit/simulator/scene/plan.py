@@ -1,0 +1,307 @@
+"""The lie of the land: random numbers → where roads run, how the ground rises, and where street places are in metres.
+
+Everything is laid out in street coordinates: u runs along our road, v to its left, both in metres. Roads and houses are
+upright rectangles there; one smooth map bends them into the world.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Num, Shaped
+
+from lidargrit.simulator.scene.shapes import blocks
+
+Theme = Literal["city", "suburb", "country", "mixed"]
+EXTENT_M = 125.0  # a little more than the 120 m that the sensor sees
+_PARKING_M = 2.1  # width of a parked row
+_PARK_CHANCE = {"city": (0.7, 0.65), "suburb": (0.5, 0.45), "country": (0.0, 0.0)}  # right, left
+_LANE_M = {"city": (2.9, 3.5), "suburb": (2.6, 3.1), "country": (2.8, 3.4)}
+_PAVEMENT_M = {"city": (2.0, 4.5), "suburb": (1.2, 2.8), "country": (0.0, 0.01)}
+_SETBACK_M = {"city": (0.0, 2.5), "suburb": (2.0, 8.5), "country": (5.0, 18.0)}
+_SIDE_STREETS = {"city": 2.0, "suburb": 2.2, "country": 0.5}  # how many on average
+_SPEED_M_S = {"city": (2.0, 11.0), "suburb": (3.0, 11.0), "country": (9.0, 22.0)}
+_LOOKS_FOR_S = 2.0  # how long a street keeps its full detail around our car
+_EYES_APART_M = 6.0  # at most, along our car's way
+_SKEW_REACH_M, _SKEW_WIDTH_M = 25.0, 25.0  # how far from our road, and from its mouth, a side street runs askew
+
+
+@dataclass(frozen=True, eq=False)
+class SideStreet:
+    """A street that leaves ours at ``u_m``; its own v axis is ours."""
+
+    u_m: float
+    half_m: float
+    pavement_m: float
+    sides: tuple[int, ...]
+    skew: float
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Where things stand: foot points, headings and the slope of the ground there."""
+
+    xyz_m: Float[np.ndarray, "n 3"]
+    yaw_rad: Float[np.ndarray, " n"]
+    slope: Float[np.ndarray, "n 2"]
+
+    def put(self, local_m: Float32[np.ndarray, "n *shape 3"], lean: bool = False) -> Float32[np.ndarray, "n *shape 3"]:
+        """Move things from their own frames into the world; what leans follows the slope of the ground."""
+        spread = (slice(None),) + (None,) * (local_m.ndim - 2)
+        cos, sin = (f(self.yaw_rad).astype(np.float32)[spread] for f in (np.cos, np.sin))
+        foot, slope = self.xyz_m.astype(np.float32), self.slope.astype(np.float32)
+        out = np.empty_like(local_m)
+        x = cos * local_m[..., 0] - sin * local_m[..., 1]
+        y = sin * local_m[..., 0] + cos * local_m[..., 1]
+        np.add(x, foot[:, 0][spread], out=out[..., 0])
+        np.add(y, foot[:, 1][spread], out=out[..., 1])
+        np.add(local_m[..., 2], foot[:, 2][spread], out=out[..., 2])
+        if lean:
+            out[..., 2] += slope[:, 0][spread] * x + slope[:, 1][spread] * y
+        return out
+
+    def of(self, which: Shaped[np.ndarray, " m"]) -> Poses:
+        """Return the poses of some, or of some several times over."""
+        return Poses(self.xyz_m[which], self.yaw_rad[which], self.slope[which])
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Where everything may stand.
+
+    Args:
+        theme: city, suburb or country.
+        lanes: 1 if cars of both ways share the carriageway, otherwise 2.
+        lane_m: width of a lane.
+        edge_m: from the middle of the carriageway to the kerb, right and left, both positive.
+        parked: whether cars park along the kerb, right and left.
+        pavement_m: widths of the pavements, right and left.
+        setback_m: from pavement to houses, right and left.
+        our_v_m: where our own car drives.
+        side_streets: that leave our road.
+        bridge_u_m: where another road crosses above ours, or infinite.
+        line: knots of the middle of our road: u, x, y, cosine and sine of its heading, in a frame that begins at u = 0.
+        waves: amplitude, wave vector (2) and phase of every wave of the ground.
+        tilt: of the whole ground along x and y.
+        camber: fall of the road from its middle to its edges.
+        banks_m: how far the ground rises beside the road, right and left.
+        level_m: of pavements, and of gardens or fields, over the road.
+        speed_m_s: of our own car.
+        eyes_m: places on our car's way in the first seconds, in the world: detail is for them.
+    """
+
+    theme: str
+    lanes: int
+    lane_m: float
+    edge_m: tuple[float, float]
+    parked: tuple[bool, bool]
+    pavement_m: tuple[float, float]
+    setback_m: tuple[float, float]
+    our_v_m: float
+    side_streets: tuple[SideStreet, ...]
+    bridge_u_m: float
+    line: Float[np.ndarray, "k 5"]
+    waves: Float[np.ndarray, "w 4"]
+    tilt: Float[np.ndarray, "2"]
+    camber: float
+    banks_m: tuple[float, float]
+    level_m: tuple[float, float]
+    speed_m_s: float
+    eyes_m: Float[np.ndarray, "k 2"] = field(init=False, repr=False)
+    _origin: tuple[np.ndarray, float, float] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        here, ahead = self._bent(np.array([0.0, 1.0]), np.full(2, self.our_v_m))
+        heading = np.arctan2(*(ahead - here)[::-1])
+        object.__setattr__(self, "_origin", (here, float(heading), 0.0))
+        foot_m = float(self.height_m(np.zeros(1), np.array([self.our_v_m]))[0])
+        object.__setattr__(self, "_origin", (here, float(heading), foot_m))
+        way = self.speed_m_s * _LOOKS_FOR_S
+        u = np.linspace(0.0, way, 1 + int(np.ceil(way / _EYES_APART_M)))
+        object.__setattr__(self, "eyes_m", self._flat(u, np.full(len(u), self.our_v_m)))
+
+    def away_m(self, places_m: Num[np.ndarray, "n _"]) -> Float[np.ndarray, " n"]:
+        """Return how near our car comes to places in the first seconds; one figure for all frames of a street."""
+        apart = places_m[:, :2] - self.eyes_m[:, None]
+        return np.sqrt((apart[..., 0] ** 2 + apart[..., 1] ** 2).min(axis=0))
+
+    def edge(self, side: int) -> float:
+        """Return the v of the kerb on the left (side 1) or on the right (-1)."""
+        return side * self.edge_m[(side + 1) // 2]
+
+    def front(self, side: int) -> float:
+        """Return the v of the line of houses."""
+        which = (side + 1) // 2
+        return side * (self.edge_m[which] + self.pavement_m[which] + self.setback_m[which])
+
+    def place(self, u_m: Num[np.ndarray, "*s"], v_m: Num[np.ndarray, "*s"]) -> Float[np.ndarray, "*s 3"]:
+        """Return the points of the ground, at the level of the road, of places in the street."""
+        flat = self._flat(u_m, v_m)
+        return np.concatenate((flat, self._height(flat, u_m, v_m)[..., None]), axis=-1)
+
+    def height_m(self, u_m: Num[np.ndarray, "*s"], v_m: Num[np.ndarray, "*s"]) -> Float[np.ndarray, "*s"]:
+        """Return how high the ground, at the level of the road, is over our own wheels."""
+        return self._height(self._flat(u_m, v_m), u_m, v_m)
+
+    def poses(
+        self,
+        u_m: Num[np.ndarray, " n"],
+        v_m: Num[np.ndarray, " n"],
+        turn_rad: float | Num[np.ndarray, " n"] = 0.0,
+        across: bool | Bool[np.ndarray, " n"] = False,
+        rise_m: float | Num[np.ndarray, " n"] = 0.0,
+    ) -> Poses:
+        """Return poses of things that head along the street, or along side streets (``across``), turned and raised."""
+        u, v = np.asarray(u_m, np.float64), np.asarray(v_m, np.float64)
+        step_u, step_v = np.where(across, 0.0, 0.5), np.where(across, 0.5, 0.0)
+        flat, before, behind = self._flat(np.stack((u, u + step_u, u - step_u)), np.stack((v, v + step_v, v - step_v)))
+        ahead = before - behind
+        foot = np.concatenate((flat, (self._height(flat, u, v) + rise_m)[:, None]), axis=1)
+        around = foot[:, None, :2] + np.array([(0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5)])
+        high = self._ground(around)
+        slope = np.stack((high[:, 0] - high[:, 1], high[:, 2] - high[:, 3]), axis=-1)
+        return Poses(foot, np.arctan2(ahead[:, 1], ahead[:, 0]) + turn_rad, slope)
+
+    def blocks(
+        self,
+        u_from_m: float | Num[np.ndarray, " n"],
+        u_to_m: float | Num[np.ndarray, " n"],
+        v_from_m: float | Num[np.ndarray, " n"],
+        v_to_m: float | Num[np.ndarray, " n"],
+        bottom_m: float | Num[np.ndarray, " n"],
+        top_m: float | Num[np.ndarray, " n"],
+        flare_m: float = 0.0,
+    ) -> Float32[np.ndarray, "n 12 3 3"]:
+        """Return boxes of the street, bent as the street is; heights are over the road's level at each corner.
+
+        Slopes at their u ends run out at the bottom by ``flare_m``.
+        """
+        spans = (u_from_m, u_to_m, v_from_m, v_to_m, bottom_m, top_m)
+        u_0, u_1, v_0, v_1, z_0, z_1 = np.broadcast_arrays(*(np.atleast_1d(s) for s in spans))
+        u = np.stack((u_0 - flare_m, u_0, u_0 - flare_m, u_0, u_1 + flare_m, u_1, u_1 + flare_m, u_1), axis=1)
+        v = np.stack((v_0, v_0, v_1, v_1, v_0, v_0, v_1, v_1), axis=1)
+        corners = self.place(u, v)
+        corners[..., 2] += np.stack((z_0, z_1) * 4, axis=1)
+        return blocks(corners)
+
+    def in_side_street(
+        self, u_m: Num[np.ndarray, "*s"], v_m: Num[np.ndarray, "*s"], spare_m: float = 0.0
+    ) -> Float[np.ndarray, "*s"]:
+        """Return by how many metres places lie inside a side street (negative: outside all)."""
+        inside = np.full(np.broadcast_shapes(np.shape(u_m), np.shape(v_m)), -np.inf)
+        for street in self.side_streets:
+            depth = street.half_m + spare_m - np.abs(np.asarray(u_m) - street.u_m)
+            for side in street.sides:
+                inside = np.maximum(inside, np.where(np.asarray(v_m) * side > 0, depth, -np.inf))
+        return inside
+
+    def _bent(self, u_m: np.ndarray, v_m: np.ndarray) -> np.ndarray:
+        u = np.asarray(u_m, np.float64)
+        v = np.asarray(v_m, np.float64)
+        for street in self.side_streets:
+            if street.skew:
+                reach = _SKEW_REACH_M * np.tanh(v / _SKEW_REACH_M)
+                u = u + street.skew * reach * np.exp(-(((np.asarray(u_m) - street.u_m) / _SKEW_WIDTH_M) ** 2))
+        knots = self.line
+        step = knots[1, 0] - knots[0, 0]
+        place = np.clip((u - knots[0, 0]) / step, 0, len(knots) - 1.001)
+        left = place.astype(np.intp)
+        share = (place - left)[..., None]
+        near = knots[left]
+        both = near + (knots[left + 1] - near) * share
+        tangent = both[..., 3:]
+        return both[..., 1:3] + np.stack((-tangent[..., 1], tangent[..., 0]), axis=-1) * v[..., None]
+
+    def _flat(self, u_m: np.ndarray, v_m: np.ndarray) -> np.ndarray:
+        here, heading, _ = self._origin
+        if np.shape(u_m) != np.shape(v_m):
+            u_m, v_m = np.broadcast_arrays(u_m, v_m)
+        away = self._bent(u_m, v_m) - here
+        cos, sin = np.cos(heading), np.sin(heading)
+        return away @ np.array([[cos, -sin], [sin, cos]])
+
+    def _ground(self, flat: np.ndarray) -> np.ndarray:
+        phase = flat @ self.waves[:, 1:3].T + self.waves[:, 3]
+        return np.sin(phase) @ self.waves[:, 0] + flat @ self.tilt
+
+    def _height(self, flat: np.ndarray, u_m: np.ndarray, v_m: np.ndarray) -> np.ndarray:
+        v = np.broadcast_to(np.asarray(v_m, np.float64), flat.shape[:-1])
+        height = self._ground(flat) - self._origin[2]
+        height = height - self.camber * np.clip(np.abs(v), 0, min(self.edge_m))
+        for which, side in enumerate((-1, 1)):
+            if self.banks_m[which]:
+                beside = np.clip((side * v - self.edge_m[which] - 1.5) / 14.0, 0, 1)
+                height = height + self.banks_m[which] * beside**2 * (3 - 2 * beside)
+        return height
+
+
+def draw_plan(rng: np.random.Generator, theme: Theme) -> Plan:
+    """Draw roads and ground of one theme."""
+    kind = str(rng.choice(["suburb", "city", "country"], p=[0.52, 0.38, 0.10])) if theme == "mixed" else theme
+    lanes = 2 if kind == "country" or rng.random() < {"city": 0.8, "suburb": 0.5}[kind] else 1
+    lane = rng.uniform(*_LANE_M[kind]) * (1.0 if lanes == 2 else rng.uniform(1.15, 1.35))
+    parked = rng.random(2) < _PARK_CHANCE[kind]
+    edge = lane * lanes / 2 + np.where(parked, _PARKING_M, rng.uniform(0.15, 0.4, 2))
+    close = 0.15 if kind == "suburb" and rng.random() < 0.2 else 1.0  # streets without front gardens
+    setback = close * rng.uniform(*_SETBACK_M[kind], 2)
+    pavement = rng.uniform(*_PAVEMENT_M[kind], 2)
+    streets = _draw_side_streets(rng, kind)
+    bridge = rng.uniform(14, 70) * rng.choice([-1, 1]) if rng.random() < 0.06 else np.inf
+    if any(abs(street.u_m - bridge) < 22 for street in streets):
+        bridge = np.inf
+    wild = kind == "country"
+    return Plan(
+        theme=kind,
+        lanes=lanes,
+        lane_m=lane,
+        edge_m=(float(edge[0]), float(edge[1])),
+        parked=(bool(parked[0]), bool(parked[1])),
+        pavement_m=(float(pavement[0]), float(pavement[1])),
+        setback_m=(float(setback[0]), float(setback[1])),
+        our_v_m=-lane / 2 + rng.normal(0, 0.12) if lanes == 2 else rng.uniform(-0.2, 0.2),
+        side_streets=streets,
+        bridge_u_m=float(bridge),
+        line=_draw_line(rng, kind),
+        waves=_draw_waves(rng),
+        tilt=rng.normal(0, 0.015, 2),
+        camber=rng.uniform(0.005, 0.025),
+        banks_m=(rng.normal(0.2, 1.0), rng.normal(0.2, 1.0)) if wild else (0.0, 0.0),
+        level_m=(0.0, -0.03) if wild else (rng.uniform(0.06, 0.15), rng.uniform(0.1, 0.25)),
+        speed_m_s=0.0 if rng.random() < 0.15 else float(rng.uniform(*_SPEED_M_S[kind])),
+    )
+
+
+def _draw_side_streets(rng: np.random.Generator, kind: str) -> tuple[SideStreet, ...]:
+    streets: list[SideStreet] = []
+    for _ in range(min(rng.poisson(_SIDE_STREETS[kind]), 4)):
+        u, skew = rng.normal(0, 42), float(np.clip(rng.normal(0, 0.25), -0.5, 0.5))
+        sides = ((-1, 1), (1,), (-1,))[rng.choice(3, p=[0.4, 0.3, 0.3])]
+        half, pavement = rng.uniform(2.3, 4.0), 0.0 if kind == "country" else rng.uniform(1.0, 2.2)
+        if abs(u) < 95 and all(abs(u - other.u_m) > 32 for other in streets):
+            streets.append(SideStreet(float(u), half, pavement, sides, skew))
+    return tuple(streets)
+
+
+def _draw_line(rng: np.random.Generator, kind: str) -> np.ndarray:
+    """Draw a gentle arc, in half of the streets with a bend or two."""
+    u = np.arange(-260.0, 261.0, 2.0)
+    yaw = rng.normal(0, 0.0012) * u
+    for side in (-1, 1):
+        if rng.random() < (0.45 if kind != "country" else 0.7):
+            at, length = side * rng.uniform(22, 85), rng.uniform(10, 25)
+            yaw += rng.uniform(-0.6, 0.6) * (np.tanh((u - at) / length) + side)
+    middle = (yaw[1:] + yaw[:-1]) / 2
+    steps = np.stack((np.cos(middle), np.sin(middle)), axis=1) * 2.0
+    xy = np.concatenate((np.zeros((1, 2)), np.cumsum(steps, axis=0)))
+    xy -= xy[len(u) // 2]
+    return np.column_stack((u, xy, np.cos(yaw), np.sin(yaw)))
+
+
+def _draw_waves(rng: np.random.Generator) -> np.ndarray:
+    """Draw waves of the ground whose slopes have a spread of about one in sixty each."""
+    length, turn = np.exp(rng.uniform(np.log(45), np.log(260), 4)), rng.uniform(0, 2 * np.pi, 4)
+    number = 2 * np.pi / length
+    amplitude = rng.normal(0, 0.012, 4) / number
+    return np.column_stack((amplitude, number * np.cos(turn), number * np.sin(turn), rng.uniform(0, 2 * np.pi, 4)))

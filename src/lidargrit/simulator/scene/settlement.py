@@ -1,0 +1,204 @@
+"""Where houses stand: a plan → rows along the streets, garages, blocks behind, and the gaps between."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Num
+
+from lidargrit.simulator import materials
+from lidargrit.simulator.scene.buildings import Houses
+from lidargrit.simulator.scene.movers import Stands
+from lidargrit.simulator.scene.plan import EXTENT_M, Plan
+
+_LENGTH_M = {"city": (8.0, 20.0), "suburb": (7.5, 14.0), "country": (9.0, 18.0)}
+_DEPTH_M = {"city": (9.0, 13.0), "suburb": (7.5, 11.0), "country": (8.0, 14.0)}
+_STOREYS = {"city": (2, 6), "suburb": (1, 4), "country": (1, 3)}
+_GAP_CHANCE = {"city": 0.22, "suburb": 0.72, "country": 1.0}
+_GAP_M = {"city": (2.5, 9.0), "suburb": (2.5, 11.0), "country": (10.0, 90.0)}
+_BEHIND = {"city": 0.6, "suburb": 0.45, "country": 0.06}  # share of the places behind the rows that are built on
+_PARK_CHANCE = {"city": 0.07, "suburb": 0.14, "country": 0.3}
+_LATTICE_M = 24.0
+
+
+@dataclass(frozen=True, eq=False)
+class Settlement:
+    """Houses and where they leave room.
+
+    Args:
+        houses: all of them.
+        boxes_m: u from, u to, v from, v to of every house.
+        gaps_m: u from, u to and side of the gaps in the rows along our road.
+        parks_m: u from, u to and side of stretches without houses.
+    """
+
+    houses: Houses
+    boxes_m: Float[np.ndarray, "n 4"]
+    gaps_m: Float[np.ndarray, "g 3"]
+    parks_m: Float[np.ndarray, "p 3"]
+
+    def covers(self, u_m: Num[np.ndarray, " p"], v_m: Num[np.ndarray, " p"], spare_m: float) -> Bool[np.ndarray, " p"]:
+        """Tell which places lie in a house, or nearer to one than a spare way."""
+        return _covered(self.boxes_m, np.asarray(u_m), np.asarray(v_m), spare_m)
+
+
+def _covered(boxes: np.ndarray, u: np.ndarray, v: np.ndarray, spare: float | np.ndarray) -> Bool[np.ndarray, " p"]:
+    spare = np.asarray(spare)[..., None]
+    inside_u = (u[:, None] > boxes[:, 0] - spare) & (u[:, None] < boxes[:, 1] + spare)
+    inside_v = (v[:, None] > boxes[:, 2] - spare) & (v[:, None] < boxes[:, 3] + spare)
+    return np.any(inside_u & inside_v, axis=1)
+
+
+def free_spans(plan: Plan, side: int, spare_m: float = 0.5) -> list[tuple[float, float]]:
+    """Return from where to where our road has land beside it on one side: no side street, no bridge."""
+    taken = [
+        (s.u_m, s.half_m + s.pavement_m + spare_m + 6.0 * abs(s.skew)) for s in plan.side_streets if side in s.sides
+    ]
+    if np.isfinite(plan.bridge_u_m):
+        taken.append((plan.bridge_u_m, 13.0 + spare_m))  # its banks
+    spans, start = [], -EXTENT_M + 5
+    for middle, half in sorted(taken):
+        if middle - half - start > 4:
+            spans.append((start, middle - half))
+        start = max(start, middle + half)
+    return [*spans, (start, EXTENT_M - 5)]
+
+
+def settle(rng: np.random.Generator, plan: Plan) -> Settlement:
+    """Draw where houses stand."""
+    rows, gaps, parks = [], [np.zeros((0, 3))], [np.zeros((0, 3))]
+    for side in (-1, 1):
+        for span in free_spans(plan, side):
+            if rng.random() < _PARK_CHANCE[plan.theme]:
+                parks.append(np.array([(*span, side)]))
+                continue
+            start, length = _row(rng, plan.theme, span)
+            front = side * plan.front(side) + _steps(rng, len(start))
+            rows.append((start, length, front, np.full(len(start), side)))
+            from_, to = np.append(span[0], start + length), np.append(start, span[1])
+            gap = np.column_stack((from_, to, np.full(len(to), side)))
+            gaps.append(gap[gap[:, 1] - gap[:, 0] > 1.5])
+    blocks = [_stand_along(rng, plan, *row) for row in rows]
+    blocks += [_stand_beside(rng, plan, street, side, flank) for street in plan.side_streets for side in street.sides
+               for flank in (-1, 1)]  # fmt: skip
+    garages = _garages(rng, plan, np.concatenate(gaps))
+    blocks.append(garages)
+    taken = np.concatenate([b[1] for b in blocks])
+    blocks.append(_stand_behind(rng, plan, taken))
+    stands = Stands.join([b[0] for b in blocks])
+    extents = np.concatenate([b[1] for b in blocks])
+    size = np.concatenate([b[2] for b in blocks])
+    plain = np.concatenate([np.full(len(b[0]), b is garages) for b in blocks])
+    houses = _draw_houses(rng, plan, stands, size, plain)
+    return Settlement(houses, extents, np.concatenate(gaps), np.concatenate(parks))
+
+
+def _row(rng: np.random.Generator, theme: str, span: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Fill a span with houses and gaps; contiguous rows occur in every theme."""
+    count = int((span[1] - span[0]) / 7) + 2
+    length = rng.uniform(*_LENGTH_M[theme], count)
+    closed = theme == "suburb" and rng.random() < 0.2
+    gap = rng.uniform(*_GAP_M[theme], count) * (rng.random(count) < (0.15 if closed else _GAP_CHANCE[theme]))
+    ends = span[0] + np.cumsum(length + gap)
+    start = ends - length
+    fits = ends <= span[1]
+    start, length = start[fits], length[fits]
+    rest = span[1] - (ends[fits][-1] if fits.any() else span[0])
+    if rest > 6 and theme != "country":  # a last house up to the corner
+        start, length = np.append(start, span[1] - rest), np.append(length, min(rest, 16.0))
+    return start, length
+
+
+def _steps(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Return how far each house stands behind the line."""
+    back = rng.uniform(0, 0.5, count)
+    return back + np.where(rng.random(count) < 0.25, rng.uniform(1.0, 8.0, count), 0.0)
+
+
+def _stand_along(
+    rng: np.random.Generator, plan: Plan, start: np.ndarray, length: np.ndarray, front: np.ndarray, side: np.ndarray
+) -> tuple[Stands, np.ndarray, np.ndarray]:
+    depth = rng.uniform(*_DEPTH_M[plan.theme], len(start))
+    stands = Stands.of(start + length / 2, side * (front + depth / 2), np.where(side > 0, 0.0, np.pi))
+    near, far = side * front, side * (front + depth)
+    extent = np.column_stack((start, start + length, np.minimum(near, far), np.maximum(near, far)))
+    return stands, extent, np.column_stack((length, depth))
+
+
+def _stand_beside(
+    rng: np.random.Generator, plan: Plan, street, side: int, flank: int
+) -> tuple[Stands, np.ndarray, np.ndarray]:
+    """Line one flank of a side street, from behind the corner house on."""
+    first = abs(plan.front(side)) + 14.0 + rng.uniform(0, 6)
+    start, length = _row(rng, plan.theme, (first, 112.0))
+    depth = rng.uniform(*_DEPTH_M[plan.theme], len(start))
+    front = street.half_m + street.pavement_m + min(plan.setback_m) * 0.7 + _steps(rng, len(start))
+    u_near, u_far = street.u_m + flank * front, street.u_m + flank * (front + depth)
+    others = np.array([s.u_m for s in plan.side_streets if s is not street and side in s.sides])
+    middle_u = (u_near + u_far) / 2
+    clear = (np.abs(middle_u[:, None] - others) > depth[:, None] / 2 + 6.0).all(axis=1) & (np.abs(middle_u) < 122)
+    if np.isfinite(plan.bridge_u_m):
+        clear &= (np.abs(middle_u - plan.bridge_u_m) > 18) | (start > 75)
+    stands = Stands.of(middle_u, side * (start + length / 2), np.pi if flank > 0 else 0.0, across=True)
+    v_from, v_to = side * start, side * (start + length)
+    extent = np.column_stack(
+        (np.minimum(u_near, u_far), np.maximum(u_near, u_far), np.minimum(v_from, v_to), np.maximum(v_from, v_to))
+    )
+    return stands.those(clear), extent[clear], np.column_stack((length, depth))[clear]
+
+
+def _garages(rng: np.random.Generator, plan: Plan, gaps: np.ndarray) -> tuple[Stands, np.ndarray, np.ndarray]:
+    wide = gaps[:, 1] - gaps[:, 0]
+    chosen = (wide > 3.2) & (rng.random(len(gaps)) < {"city": 0.25, "suburb": 0.45, "country": 0.1}[plan.theme])
+    gap, length = gaps[chosen], np.minimum(wide[chosen] - 0.3, rng.uniform(2.9, 6.0, chosen.sum()))
+    side = gap[:, 2]
+    front = np.where(side > 0, plan.front(1), -plan.front(-1)) + rng.uniform(0.5, 7.0, len(gap))
+    start = gap[:, 0] + 0.1
+    depth = rng.uniform(5.0, 7.0, len(gap))
+    stands = Stands.of(start + length / 2, side * (front + depth / 2), np.where(side > 0, 0.0, np.pi))
+    near, far = side * front, side * (front + depth)
+    extent = np.column_stack((start, start + length, np.minimum(near, far), np.maximum(near, far)))
+    return stands, extent, np.column_stack((length, depth))
+
+
+def _stand_behind(rng: np.random.Generator, plan: Plan, taken: np.ndarray) -> tuple[Stands, np.ndarray, np.ndarray]:
+    """Build here and there behind the rows, as a backdrop; blocks of a city are large."""
+    line = np.arange(-EXTENT_M + 8, EXTENT_M, _LATTICE_M)
+    u, v = (a.ravel() for a in np.meshgrid(line, line))
+    u, v = u + rng.uniform(-5, 5, len(u)), v + rng.uniform(-5, 5, len(v))
+    size = rng.uniform(8, 15 if plan.theme != "city" else 21, (len(u), 2))
+    reach = size.max(axis=1) / 2
+    behind = np.maximum(v * np.sign(v) - np.where(v > 0, plan.front(1), -plan.front(-1)), 0)
+    pavement = max((s.pavement_m for s in plan.side_streets), default=0.0)
+    free = (rng.random(len(u)) < _BEHIND[plan.theme]) & (behind > reach + 3)
+    free &= ~_covered(taken, u, v, reach + 1.0) & (plan.in_side_street(u, v, pavement) < -reach)
+    if np.isfinite(plan.bridge_u_m):
+        free &= np.abs(u - plan.bridge_u_m) > 13 + reach
+    u, v, size = u[free], v[free], size[free]
+    stands = Stands.of(u, v, np.where(v > 0, 0.0, np.pi) + rng.choice([0, np.pi / 2], len(u)))
+    half = size.max(axis=1) / 2
+    return stands, np.column_stack((u - half, u + half, v - half, v + half)), size
+
+
+def _draw_houses(rng: np.random.Generator, plan: Plan, stands: Stands, size: np.ndarray, plain: np.ndarray) -> Houses:
+    count = len(stands)
+    storey = rng.uniform(2.6, 3.0, count) if plan.theme != "city" else rng.uniform(2.8, 3.8, count)
+    storeys = rng.integers(*_STOREYS[plan.theme], count)
+    storey = np.where(plain, rng.uniform(2.3, 2.9, count), storey)
+    height = np.where(plain, storey, storey * storeys + rng.uniform(0.0, 0.6, count))
+    flat = plain | (rng.random(count) < (0.25 if plan.theme == "city" else 0.12))
+    slope = rng.uniform(0.5, 1.0, count)
+    material = rng.choice([materials.PLASTER, materials.BRICK, materials.CONCRETE], count, p=[0.72, 0.18, 0.1])
+    bright = np.where(material == materials.PLASTER, rng.uniform(0.2, 0.7, count), rng.uniform(0.2, 0.45, count))
+    return Houses(
+        poses=plan.poses(stands.u_m, stands.v_m, stands.turn_rad, stands.across, plan.level_m[1]),
+        length_m=size[:, 0],
+        depth_m=size[:, 1],
+        height_m=height,
+        storey_m=storey,
+        roof_m=np.where(flat, 0.0, size[:, 1] / 2 * slope),
+        wall_material=material,
+        wall_albedo=bright,
+        plain=plain,
+    )

@@ -1,0 +1,137 @@
+"""What real, simulated and coin-dropped scans have in common: scores of curves → PNG."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import PowerNorm
+from matplotlib.figure import Figure
+from matplotlib.gridspec import GridSpec, SubplotSpec
+from matplotlib.ticker import NullFormatter, ScalarFormatter
+
+from lidargrit.errors import ConfigError
+from lidargrit.evaluation.realism import CurveScore
+from lidargrit.files import atomic_path
+
+_WIDTH, _ROW, _HEAD = 14.0, 3.4, 0.6  # inches: the picture, a row of panels, the title
+_DOTS_PER_INCH = 100  # 1400 pixels across: a laptop shows the picture without shrinking it
+_SIDES = {
+    "real": "#26323c",
+    "simulated": "#d1495b",
+    "coin": "#2a8fbd",
+}  # dark, warm, cold: told apart when printed grey
+_TICKS_M = (1, 2, 5, 10, 20, 50, 100)
+
+
+def draw_curves(scores: Sequence[CurveScore], path: Path, title: str = "") -> None:
+    """Draw the curves of real scans, of simulated ones and of a coin: a panel for each score.
+
+    Curves with two axes, such as a histogram for every row, get one image for each side, and the mean over rows where
+    rows are of one kind.
+
+    Args:
+        scores: of any curves.
+        path: of the PNG; an older picture there is replaced, in one step.
+        title: above everything.
+
+    Raises:
+        ConfigError: no score.
+        OutputError: the picture cannot be written.
+    """
+    if not scores:
+        raise ConfigError("no curve to draw", "at least one", "compare some scans first")
+    flat = [score for score in scores if _curve(score, "real").ndim == 1]
+    deep = [score for score in scores if _curve(score, "real").ndim == 2]
+    rows = -(-len(flat) // 2) + len(deep)
+    height = _HEAD + _ROW * rows
+    figure = Figure(figsize=(_WIDTH, height), dpi=_DOTS_PER_INCH)
+    FigureCanvasAgg(figure)
+    grid = GridSpec(
+        rows, 2, figure, left=0.06, right=0.98, top=1 - (_HEAD + 0.35) / height, bottom=0.55 / height,
+        hspace=0.6, wspace=0.16,
+    )  # fmt: skip
+    figure.text(0.5, 1 - 0.3 / height, title, ha="center", va="center", fontsize=15)
+    for index, score in enumerate(flat):
+        _draw_lines(figure.add_subplot(grid[index // 2, index % 2]), score)
+    for index, score in enumerate(deep):
+        _draw_images(figure, grid[rows - len(deep) + index, :], score)
+    with atomic_path(path) as unfinished:
+        figure.savefig(unfinished, format="png", dpi=_DOTS_PER_INCH)
+
+
+def _curve(score: CurveScore, side: str) -> Float64[np.ndarray, "*rows n"]:
+    result = score.bernoulli if side == "coin" else score.simulated
+    return np.array(result.details["real" if side == "real" else "generated"], dtype=float)
+
+
+def _title(score: CurveScore) -> str:
+    name = score.simulated.metric.replace("_", " ")
+    distances = f"simulated {score.simulated.value:.3f}, coin {score.bernoulli.value:.3f}, real {score.floor.value:.3f}"
+    return f"{name}\ndistance of real from {distances}"
+
+
+def _draw_lines(axes: Axes, score: CurveScore) -> None:
+    details = score.simulated.details
+    axis, label = np.array(details["axis"], dtype=float), details["axis_label"]
+    lags = axis[0] < 0  # rows and columns share the axis: no line of numbers
+    for side, colour in _SIDES.items():
+        place = np.arange(len(axis)) if lags else axis
+        axes.plot(place, _curve(score, side), color=colour, label=side, marker=".", markersize=4, linewidth=1.2)
+    axes.set_title(_title(score), loc="left", fontsize=10)
+    axes.set(xlabel=label, ylabel=details["curve_label"])
+    if lags:
+        axes.set_xticks(np.arange(len(axis)), [f"{-lag:g} rows" if lag < 0 else f"{lag:g}" for lag in axis])
+    elif label.endswith("[m]"):
+        _log_axis(axes)
+    elif label.endswith("[pixels]"):
+        axes.set(xscale="log", yscale="log")  # long runs are rare
+    axes.grid(alpha=0.3, linewidth=0.5)
+    axes.legend(fontsize=9)
+
+
+def _log_axis(axes: Axes) -> None:
+    axes.set_xscale("log")
+    axes.set_xticks([t for t in _TICKS_M if axes.get_xlim()[0] <= t <= axes.get_xlim()[1]])
+    axes.xaxis.set_major_formatter(ScalarFormatter())
+    axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+def _draw_images(figure: Figure, place: SubplotSpec, score: CurveScore) -> None:
+    """Draw one image for each side on one scale, with the mean over rows beside them where rows share an axis."""
+    details = score.simulated.details
+    axis = np.array(details["axis"], dtype=float)
+    images = {side: _curve(score, side) for side in _SIDES}
+    is_map = images["real"].shape == (len(axis), len(axis))  # a view from above: both axes are metres
+    grid = place.subgridspec(1, 4, wspace=0.25)
+    norm = PowerNorm(0.5, 0, np.nanmax([np.nanmax(image, initial=0) for image in images.values()]) or 1)
+    for index, (side, image) in enumerate(images.items()):
+        axes = figure.add_subplot(grid[0, index])
+        if is_map:
+            half = axis[-1] + 0.5
+            axes.imshow(image[::-1, ::-1], norm=norm, cmap="magma", extent=(half, -half, -half, half))
+            axes.set(xlabel="left [m]", ylabel="forward [m]" if index == 0 else "")
+        else:
+            axes.pcolormesh(axis, np.arange(len(image)), np.nan_to_num(image), norm=norm, cmap="magma")
+            axes.set(xlabel=details["axis_label"], ylim=(len(image) - 0.5, -0.5), ylabel="row" if index == 0 else "")
+            _log_axis(axes)
+        axes.set_title(side, loc="left", fontsize=10)
+    box = place.get_position(figure)
+    figure.text(box.x0, box.y1 + 0.35 / figure.get_figheight(), _title(score), fontsize=10)
+    axes = figure.add_subplot(grid[0, 3])
+    for side, colour in _SIDES.items():
+        drawn = np.sort(images[side].ravel())[::-1] if is_map else np.nanmean(images[side], axis=0)
+        axes.plot(np.arange(1, len(drawn) + 1) if is_map else axis, drawn, color=colour, label=side, linewidth=1.2)
+    if is_map:
+        axes.set(xscale="log", xlabel="rank of the cell")
+        axes.set_title("cells, the fullest first", loc="left", fontsize=10)
+    else:
+        _log_axis(axes)
+        axes.set_xlabel(details["axis_label"])
+        axes.set_title("mean over rows", loc="left", fontsize=10)
+    axes.grid(alpha=0.3, linewidth=0.5)
+    axes.legend(fontsize=9)

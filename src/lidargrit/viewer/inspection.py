@@ -1,0 +1,115 @@
+"""What a projection does to one scan, as a picture: :class:`Inspection` → PNG."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import BoundaryNorm, ListedColormap, LogNorm
+from matplotlib.figure import Figure
+
+from lidargrit.files import atomic_path
+from lidargrit.projection.fit import elevations_deg
+from lidargrit.projection.inspection import FATES, Inspection
+from lidargrit.projection.placement import row_elevation_rad
+
+_DOTS_PER_INCH = 100
+_NO_RETURN = "#e4e4e4"  # near white: no colour of the range scale comes near it
+_COLOURS = {
+    "above": "#7b3294",
+    "below": "#e66101",
+    "nearer": "#000000",
+    "farther": "#2c7bb6",
+    "left_out": "#c9c9c9",
+    "hidden": "#d7191c",
+    "kept": "#1a9641",
+}
+_DOTS_AT_MOST = 20_000  # of one fate in a view; more hide one another and take seconds to draw
+
+
+def draw_inspection(inspection: Inspection, path: Path) -> None:
+    """Draw where points collide, which are lost, and how their elevations lie to the sensor's rows.
+
+    Args:
+        inspection: of one scan.
+        path: of the PNG; an older picture there is replaced, in one step.
+
+    Raises:
+        OutputError: the picture cannot be written.
+    """
+    figure = Figure(figsize=(14, 11), dpi=_DOTS_PER_INCH, layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplot_mosaic(
+        [["range"] * 3, ["collisions"] * 3, ["above", "side", "rows"]], height_ratios=[1, 1, 2.4]
+    )
+    sensor = inspection.sensor
+    figure.suptitle(
+        f"{Path(inspection.scan.source).name}: {inspection.method}, {inspection.variant}, to "
+        f"{sensor.height}x{sensor.width} of {sensor.name}"
+    )
+    _draw_range(figure, panels["range"], inspection)
+    _draw_collisions(figure, panels["collisions"], inspection)
+    _draw_lost(panels["above"], panels["side"], inspection)
+    _draw_rows(panels["rows"], inspection)
+    with atomic_path(path) as unfinished:
+        figure.savefig(unfinished, format="png", dpi=_DOTS_PER_INCH)
+
+
+def _draw_range(figure: Figure, axes: Axes, inspection: Inspection) -> None:
+    shown = np.ma.masked_where(~inspection.filled(), inspection.range_m)
+    colours = colormaps["viridis_r"].with_extremes(bad=_NO_RETURN)
+    norm = LogNorm(inspection.sensor.range_min_m, inspection.sensor.range_max_m)
+    drawn = axes.imshow(shown, cmap=colours, norm=norm, aspect="auto", interpolation="nearest")
+    figure.colorbar(drawn, ax=axes, label="range [m]", pad=0.01)
+    axes.set_title(f"range image, {inspection.filled().mean():.1%} of the pixels filled", loc="left")
+    axes.set_ylabel("row")
+
+
+def _draw_collisions(figure: Figure, axes: Axes, inspection: Inspection) -> None:
+    # 0 grey, 1 white, and from 2 on ever darker red.
+    colours = ListedColormap([_NO_RETURN, "white", "#fcae91", "#fb6a4a", "#cb181d", "#67000d"])
+    norm = BoundaryNorm([0, 1, 2, 3, 4, 6, 1000], colours.N)
+    drawn = axes.imshow(inspection.points_per_pixel, cmap=colours, norm=norm, aspect="auto", interpolation="nearest")
+    bar = figure.colorbar(drawn, ax=axes, label="points", pad=0.01)
+    bar.set_ticks([0.5, 1.5, 2.5, 3.5, 5, 500], labels=["0", "1", "2", "3", "4, 5", "6 ..."])
+    hidden = inspection.counts()["hidden"]
+    axes.set_title(f"points per pixel; {hidden} are behind a nearer one of their pixel", loc="left")
+    axes.set(ylabel="row", xlabel="column, from straight behind by the left to straight ahead and the right")
+
+
+def _draw_lost(above: Axes, side: Axes, inspection: Inspection) -> None:
+    """Draw every point from above and from the side, the lost ones in the colour of their fate."""
+    x, y, z = inspection.scan.points_xyz_m.numpy().T
+    away = np.hypot(x, y)
+    for number, name in reversed(list(enumerate(FATES))):  # the kept ones first, so that they hide no lost one
+        those = np.flatnonzero(inspection.fate == number)
+        if len(those):
+            shown = those[:: -(-len(those) // _DOTS_AT_MOST)]
+            faint = {"color": _COLOURS[name], "linewidths": 0, "alpha": 0.25 if name in ("kept", "left_out") else 0.8}
+            size = 1.5 if name in ("kept", "left_out") else 4
+            above.scatter(y[shown], x[shown], s=size, **faint)
+            side.scatter(away[shown], z[shown], s=size, **faint)
+            side.scatter([], [], color=_COLOURS[name], s=20, label=f"{FATES[name]}: {len(those)}")
+    half, (low, high) = float(np.quantile(away, 0.99)), np.quantile(z, (0.001, 0.999))
+    above.plot(0, 0, marker="+", color="black")
+    above.set(xlim=(half, -half), ylim=(-half, half), aspect="equal", xlabel="left [m]", ylabel="forward [m]")
+    above.set_title("from above", loc="left")
+    side.set(xlim=(0, half), ylim=(low - 0.5, high + 0.5), xlabel="distance from the axis [m]", ylabel="height [m]")
+    side.set_title("from the side, turned about the axis", loc="left")
+    side.legend(loc="upper right", fontsize=8)
+
+
+def _draw_rows(axes: Axes, inspection: Inspection) -> None:
+    """Draw how many points lie at each elevation, over lines where the sensor has its rows."""
+    rows_deg = np.degrees(row_elevation_rad(inspection.sensor))
+    points_deg = elevations_deg(inspection.scan.points_xyz_m)
+    low, high = np.quantile(points_deg, (0.001, 0.999))
+    low, high = min(float(low), rows_deg[-1]) - 1, max(float(high), rows_deg[0]) + 1
+    axes.hlines(rows_deg, 0, 1, transform=axes.get_yaxis_transform(), color="#1a9641", linewidth=0.5)
+    # Ten bins of a degree show rings apart, of which the densest sensors have four in a degree.
+    axes.hist(points_deg, bins=np.arange(low, high, 0.1).tolist(), orientation="horizontal", color="#26323c")
+    axes.set(ylim=(low, high), xlabel="points in a tenth of a degree", ylabel="elevation [°]")
+    axes.set_title("points (dark) and the sensor's rows (lines)", loc="left")

@@ -1,0 +1,76 @@
+"""Scores and curves → drawings that lie inside a page: SVG in the page's own colours."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from html import escape
+
+import numpy as np
+from jaxtyping import Float
+
+from lidargrit.evaluation.scorecard import Score, figure
+
+_WIDE, _TALL = 320, 34  # a score's drawing
+_CHART_WIDE, _CHART_TALL = 720, 260
+_LEFT, _RIGHT, _TOP, _BOTTOM = 48, 12, 12, 40
+
+
+def score_chart(score: Score) -> str:
+    """Draw a score as a dot on its interval, from 0, with the floor as an upright line; a screen reader hears it."""
+    value, interval, floor = score.result.value, score.interval, score.floor
+    low, high = (interval.low, interval.high) if interval else (value, value)
+    marks = [low, high, value, *([floor.value] if floor else [])]
+    if not np.isfinite(marks).all():
+        return ""
+    first, last = min(0.0, *marks), max(0.0, *marks)
+    spread = (last - first) or 1.0
+
+    def x(at: float) -> float:
+        return 10 + (at - first) / spread * (_WIDE - 20)
+
+    middle = _TALL / 2
+    told = f"score {figure(value)}"
+    parts = [f'<line class="axis" x1="10" y1="{middle}" x2="{_WIDE - 10}" y2="{middle}"/>']
+    parts.append(f'<line class="axis" x1="{x(0.0):.1f}" y1="{middle - 5}" x2="{x(0.0):.1f}" y2="{middle + 5}"/>')
+    if interval:
+        told += f", 95 % interval {figure(low)} to {figure(high)}"
+        parts.append(f'<line class="interval" x1="{x(low):.1f}" y1="{middle}" x2="{x(high):.1f}" y2="{middle}"/>')
+    if floor:
+        told += f", floor {figure(floor.value)}"
+        parts.append(
+            f'<line class="floor" x1="{x(floor.value):.1f}" y1="4" x2="{x(floor.value):.1f}" y2="{_TALL - 4}"/>'
+        )
+    parts.append(f'<circle class="dot" cx="{x(value):.1f}" cy="{middle}" r="5"/>')
+    return (
+        f'<svg viewBox="0 0 {_WIDE} {_TALL}" width="{_WIDE}" height="{_TALL}" role="img" aria-label="{escape(told)}">'
+        + "".join(parts)
+        + "</svg>"
+    )
+
+
+def line_chart(lines: Mapping[str, Float[np.ndarray, " n"]], x_label: str, y_label: str, x_ticks: Sequence[int]) -> str:
+    """Draw shares from 0 to 1, one line a name: the first solid, the second dashed, so that colour is not needed."""
+    count = max(len(values) for values in lines.values())
+    wide, tall = _CHART_WIDE - _LEFT - _RIGHT, _CHART_TALL - _TOP - _BOTTOM
+
+    def place(index: int, share: float) -> tuple[float, float]:
+        return _LEFT + index / max(count - 1, 1) * wide, _TOP + (1 - share) * tall
+
+    parts = []
+    for share in (0.0, 0.25, 0.5, 0.75, 1.0):
+        (left, y), (right, _) = place(0, share), place(count - 1, share)
+        parts.append(f'<line class="grid" x1="{left:.1f}" y1="{y:.1f}" x2="{right:.1f}" y2="{y:.1f}"/>')
+        parts.append(f'<text x="{left - 6:.1f}" y="{y + 4:.1f}" text-anchor="end">{share:.0%}</text>')
+    for tick in x_ticks:
+        x, y = place(tick, 0.0)
+        parts.append(f'<text x="{x:.1f}" y="{y + 16:.1f}" text-anchor="middle">{tick}</text>')
+    for number, (name, values) in enumerate(lines.items()):
+        points = " ".join("{:.1f},{:.1f}".format(*place(i, float(v))) for i, v in enumerate(values))
+        parts.append(f'<polyline class="line line{number}" points="{points}"><title>{escape(name)}</title></polyline>')
+    parts.append(
+        f'<text x="{_LEFT + wide / 2:.1f}" y="{_CHART_TALL - 6}" text-anchor="middle">{escape(x_label)}</text>'
+    )
+    told = escape(f"{y_label} by {x_label}: " + " and ".join(lines))
+    return f'<svg class="chart" viewBox="0 0 {_CHART_WIDE} {_CHART_TALL}" role="img" aria-label="{told}">' + (
+        "".join(parts) + "</svg>"
+    )

@@ -1,0 +1,63 @@
+"""Arrays → pictures that lie inside a page: PNG as data URIs."""
+
+from __future__ import annotations
+
+import base64
+import io
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from matplotlib import colormaps
+from matplotlib.colors import LogNorm, Normalize, PowerNorm, to_rgb
+from PIL import Image
+
+NO_RETURN = "#e4e4e4"  # near white: no colour of the range scale comes near it
+_WIDE, _TALL = 512, 128  # pixels of a range image on the page: 4 times wider than tall, twice as tall as it is
+_VIEW = 300  # pixels of a view from above
+
+Picture = str
+"""A data URI."""
+
+
+def range_picture(
+    range_m: Float[np.ndarray, "H W"], known: Bool[np.ndarray, "H W"], limits_m: tuple[float, float]
+) -> Picture:
+    """Draw ranges from near (yellow) to far (violet) on a logarithmic scale, light grey where nothing is known."""
+    colours = colormaps["viridis_r"](LogNorm(*limits_m, clip=True)(np.where(known, range_m, limits_m[0])))[..., :3]
+    colours[~known] = to_rgb(NO_RETURN)
+    return _picture(_bytes(colours), (_WIDE, _TALL))
+
+
+def rate_picture(rate: Float[np.ndarray, "H W"]) -> Picture:
+    """Draw shares from 0 (dark) to 1 (light)."""
+    return _picture(_bytes(colormaps["cividis"](Normalize(0, 1)(rate))[..., :3]), (_WIDE, _TALL))
+
+
+def density_picture(density: Float[np.ndarray, "x y"], highest: float) -> Picture:
+    """Draw a density seen from above, forward up and left to the left; roots of densities, so that far cells show."""
+    colours = colormaps["magma"](PowerNorm(0.4, 0, max(highest, 1e-9), clip=True)(_upright(density)))[..., :3]
+    return _picture(_bytes(colours), (_VIEW, _VIEW))
+
+
+def difference_picture(difference: Float[np.ndarray, "x y"], largest: float) -> Picture:
+    """Draw a difference of densities: red where the first is denser, blue where the second is, roots as above."""
+    scaled = np.sign(difference) * (np.abs(difference) / max(largest, 1e-9)).clip(0, 1) ** 0.4
+    return _picture(_bytes(colormaps["RdBu_r"](Normalize(-1, 1)(_upright(scaled)))[..., :3]), (_VIEW, _VIEW))
+
+
+def _upright(view: Float[np.ndarray, "x y"]) -> Float[np.ndarray, "x y"]:
+    return view[::-1, ::-1]  # x grows forward, up on the page; y grows to the left
+
+
+def _bytes(colours: Float[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
+    return (colours * 255).round().astype(np.uint8)
+
+
+def _picture(pixels: UInt8[np.ndarray, "H W 3"], at_least: tuple[int, int]) -> Picture:
+    """Encode pixels, each repeated so often that the picture is at least so large: no browser need smooth it."""
+    wide, tall = (-(-wanted // size) for wanted, size in zip(at_least, pixels.shape[1::-1], strict=True))
+    image = Image.fromarray(pixels.repeat(tall, axis=0).repeat(wide, axis=1))
+    image = image.quantize(128, dither=Image.Dither.NONE)  # a third of the bytes, no difference to be seen
+    data = io.BytesIO()
+    image.save(data, "PNG", optimize=True)
+    return "data:image/png;base64," + base64.b64encode(data.getvalue()).decode()

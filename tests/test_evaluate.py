@@ -1,0 +1,288 @@
+"""Protocols, scorecards and tables: what is compared, what is told of it, and what never stands side by side."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from lidargrit import _discovery
+from lidargrit.cli import main
+from lidargrit.errors import ConfigError, DataError, LidarGritError, UnknownNameError
+from lidargrit.evaluation.comparison import Settings, choices, compare_sources
+from lidargrit.evaluation.intervals import Resampling
+from lidargrit.evaluation.protocols import Choice, Protocol, load_protocol
+from lidargrit.evaluation.scorecard import Scorecard, figure
+from lidargrit.evaluation.sides import open_sides
+from lidargrit.evaluation.tables import published, side_by_side
+from lidargrit.files import write_json
+from lidargrit.loading import DataConfig
+from lidargrit.metrics import load_metric
+from lidargrit.sensors import load_sensor
+
+CHEAP = ("return_rate_per_ring", "bev_occupancy")
+PROTOCOLS = _discovery.names("evaluation.protocols")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _cache(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("LIDARGRIT_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+def write_scans(folder, count, seed, variant=""):
+    """Write range images as another program would, or with a manifest as this one does."""
+    rng = torch.Generator().manual_seed(seed)
+    smooth = torch.rand(count, 64, 32, generator=rng).repeat_interleave(8, dim=2)
+    range_m = (2 + 60 * smooth) * (torch.rand(count, 64, 256, generator=rng) < 0.8)
+    folder.mkdir()
+    for index in range(count):
+        if variant:
+            np.savez_compressed(folder / f"{index:08d}.npz", range_m=range_m[index].numpy())
+        else:
+            torch.save(range_m[index][None].clone(), folder / f"{index}.pth")
+    if variant:
+        sensor = load_sensor("hdl64e_kitti_odometry").to_json()
+        write_json(folder / "samples.json", {"sensor": sensor, "projection_variant": variant})
+    return str(folder)
+
+
+@pytest.fixture(scope="module")
+def sets(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sets")
+    return write_scans(folder / "generated", 12, 0), write_scans(folder / "real", 10, 1)
+
+
+@pytest.fixture(scope="module")
+def card(sets):
+    return compare_sources(*sets, Settings(metrics=CHEAP))[0]
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_a_protocol_asks_for_what_there_is(name):
+    protocol = load_protocol(name.replace("_", "-").upper())
+    assert protocol.title
+    assert protocol.source
+    for choice in protocol.choices:
+        assert choice.variant in load_metric(choice.metric).variants
+    sensor = protocol.load_sensor()
+    assert (sensor is None) == (name == "exact")
+    if sensor is not None:
+        assert (sensor.height, sensor.width) == (64, 256 if name.endswith("odometry") else 1024)
+        assert protocol.data_set in _discovery.names("datasets")
+    assert 20 < len(_discovery.summary("evaluation.protocols", name)) < 180
+
+
+def test_the_papers_protocol_is_the_papers():
+    protocol = load_protocol("lidargrit-kitti-360")
+    sensor = protocol.load_sensor()
+    assert sensor is not None
+    assert (sensor.column_stride, protocol.variant, protocol.num_scans, protocol.range_m) == (
+        2,
+        "reference",
+        5000,
+        (1.45, 80.0),
+    )
+    with pytest.raises(UnknownNameError, match="lidargrit_kitti_360"):
+        load_protocol("lidargrit-360")
+
+
+def test_a_scorecard_tells_all_that_is_needed_to_repeat_it(card):
+    data = json.loads(json.dumps(card.to_json()))
+    assert data["protocol"]["name"] == "exact"
+    assert data["samples"] == card.samples.source
+    assert data["inputs"]["samples"]["scans"] == 12
+    assert data["inputs"]["reference"]["scans_used"] == 10
+    assert (data["inputs"]["reference"]["data_set"], data["inputs"]["reference"]["split"]) == ("samples", "lidargrit")
+    assert data["inputs"]["samples"]["sha256"] != data["inputs"]["reference"]["sha256"]
+    assert data["settings"]["resampling"] == {"groups": 16, "halves": 20, "seed": 0}
+    assert {"lidargrit", "python", "torch", "numpy", "scipy"} <= set(data["versions"])
+    for score in data["scores"]:
+        assert score["num_generated"] == score["num_reference"] == 10
+        assert score["interval"]["low"] <= score["value"] <= score["interval"]["high"]
+        assert score["floor"]["num_scans"] == 5
+        assert score["seconds"] >= 0
+    assert any("10 scans of each set" in warning for warning in card.warnings)
+
+
+def test_the_same_again_gives_the_same(card, sets):
+    again = compare_sources(*sets, Settings(metrics=CHEAP))[0]
+    without = [replace(score, seconds=0.0) for score in card.scores]
+    assert [replace(score, seconds=0.0) for score in again.scores] == without
+    assert again.samples == card.samples
+
+
+def test_no_intervals_where_none_are_wanted(card, sets):
+    plain = compare_sources(*sets, Settings(metrics=CHEAP, resampling=Resampling(halves=0)))[0]
+    assert all(score.interval is None and score.floor is None for score in plain.scores)
+    assert [s.result.value for s in plain.scores] == pytest.approx([s.result.value for s in card.scores])
+    assert "0.0" in plain.as_table()
+
+
+def test_a_metric_that_cannot_be_had_leaves_the_others(monkeypatch, tmp_path, sets):
+    monkeypatch.setenv("LIDARGRIT_WEIGHTS", str(tmp_path))
+    missing = tmp_path / "none.pth"
+    settings = Settings(
+        metrics=(*CHEAP, "frechet_pointcloud_distance"), weights={"pointnet": missing}, resampling=Resampling(halves=0)
+    )
+    card = compare_sources(*sets, settings)[0]
+    assert [score.result.metric for score in card.scores] == list(CHEAP)
+    assert {each.metric for each in card.left_out} == {"frechet_pointcloud_distance"}
+    assert "none.pth" in card.left_out[0].why
+    line = next(line for line in card.as_table().splitlines() if line.startswith("left out:"))
+    assert "frechet_pointcloud_distance: got" in line
+    with pytest.raises(LidarGritError, match=r"none\.pth"):
+        compare_sources(*sets, replace(settings, metrics=("frechet_pointcloud_distance",)))
+
+
+def test_what_is_not_as_the_protocol_wants_is_told():
+    sides = open_sides(
+        "simulated:3:train", "simulated:3:test", load_protocol("lidargrit-kitti-odometry"), DataConfig(max_scans=2)
+    )
+    told = " | ".join(sides.deviations)
+    assert "2 of the 5,000 scans" in told
+    assert "the reference is simulated, not kitti_odometry" in told
+    assert "projected by 'exact', not by 'reference'" in told
+    assert len(sides.samples) == len(sides.reference) == 2
+    other = open_sides("simulated:3:train", "simulated:3:test", load_protocol("exact"), DataConfig())
+    assert other.deviations == ()
+
+
+def test_returns_outside_the_window_are_none(sets):
+    protocol = Protocol("t", "s", (Choice("sliced_wasserstein"),), range_m=(5.0, 20.0))
+    batch = open_sides(*sets, protocol, DataConfig()).samples.batch([0, 1])
+    returned = batch.range_m[batch.return_mask]
+    assert float(returned.min()) > 5
+    assert float(returned.max()) < 20
+
+
+def test_sets_that_overlap_and_roads_that_differ_are_told(sets, tmp_path):
+    plain = Settings(metrics=CHEAP, resampling=Resampling(halves=0))
+    same, _ = compare_sources(sets[0], sets[0], plain)
+    assert any("overlap (12 scans are in both)" in warning for warning in same.warnings)
+    assert [score.result.value for score in same.scores] == [0.0, 0.0]
+    ours = [write_scans(tmp_path / name, 4, 5, variant=name) for name in ("exact", "reference")]
+    for samples, differs in zip(ours, (True, False), strict=True):
+        card, sides = compare_sources(samples, sets[1], plain)
+        assert any("different roads" in warning for warning in card.warnings) == differs
+        assert sides.samples.facts().projection == f"unfolding, {'exact' if differs else 'reference'}"
+
+
+def test_metrics_by_name_take_the_protocols_definitions():
+    protocol = load_protocol("r2dm")
+    by_name = choices(protocol, Settings("r2dm", metrics=("bev-jsd", "sliced_wasserstein", "bev_jsd")))
+    assert [(c.metric, c.variant) for c in by_name] == [
+        ("bev_jsd", "r2dm"),
+        ("sliced_wasserstein", "reference"),
+        ("sliced_wasserstein", "textbook"),
+    ]
+    every = choices(load_protocol("exact"), Settings(metrics=("sliced_wasserstein",)))
+    assert [c.variant for c in every] == ["reference", "textbook"]
+    assert choices(protocol, Settings("r2dm", variant="exact"))[0].variant == "exact"
+    with pytest.raises(UnknownNameError, match="bev_jsd"):
+        choices(protocol, Settings(metrics=("bev_jds",)))
+    with pytest.raises(ConfigError, match="0 or more"):
+        Settings(seed=-1)
+
+
+def test_a_scorecard_is_read_back_and_nothing_else_is(card, tmp_path):
+    path = tmp_path / "scores.json"
+    write_json(path, card.to_json())
+    again = Scorecard.read(path)
+    assert again.as_table() == card.as_table()
+    assert again.samples == card.samples
+    for bad in ("[]", "{}", "nonsense", '{"protocol": 1}', "[" * 100000):
+        path.write_text(bad)
+        with pytest.raises(DataError, match=r"scores\.json, which cannot be used"):
+            Scorecard.read(path)
+    data = card.to_json()
+    data["scores"][0]["value"] = {"a": 1}
+    write_json(path, data)
+    with pytest.raises(DataError, match="evaluate again"):
+        Scorecard.read(path)
+    with pytest.raises(DataError, match="no such file"):
+        Scorecard.read(tmp_path / "none.json")
+
+
+def as_if(card, protocol, deviations=(), sha256="ab" * 32):
+    scores = tuple(
+        replace(score, result=replace(score.result, metric=choice.metric, variant=choice.variant))
+        for score, choice in zip(card.scores, load_protocol(protocol).choices, strict=False)
+    )
+    reference = replace(card.reference, sha256=sha256)
+    return replace(card, protocol=protocol, deviations=deviations, scores=scores, reference=reference)
+
+
+def test_published_figures_stand_apart_and_only_beside_their_equals(card, tmp_path):
+    paths = [tmp_path / f"{name}.json" for name in ("ours", "theirs", "elsewhere")]
+    write_json(paths[0], as_if(card, "lidargrit_kitti_odometry").to_json())
+    write_json(paths[1], as_if(card, "lidargrit_kitti_odometry").to_json())
+    text = side_by_side(paths[:2])
+    measured, *tables = text.split("\n\n")
+    assert "ours" in measured
+    assert "theirs" in measured
+    assert "DUSty" not in measured
+    assert len(tables) == 2
+    assert all(table.startswith("Published, not measured here:") for table in tables)
+    assert "0.1515" in text  # printed as 15.15, times 100
+    # Another reference stands in a block of its own, and what is not the protocol gets no published figures.
+    deviant = as_if(card, "lidargrit_kitti_odometry", ("the reference is simulated, not kitti_odometry",), "cd" * 32)
+    write_json(paths[2], deviant.to_json())
+    text = side_by_side([paths[2]])
+    assert "DUSty" not in text
+    assert "left out, for they do not compare: the reference is simulated" in text
+    assert side_by_side(paths).count("Measured, protocol") == 2
+    write_json(paths[0], card.to_json())
+    assert "ublished" not in side_by_side(paths[:1])
+
+
+def test_tables_can_be_set_in_markdown_and_latex(card, tmp_path):
+    path = tmp_path / "100%_of|it.json"
+    write_json(path, as_if(card, "lidargrit_kitti_odometry").to_json())
+    markdown = side_by_side([path], "markdown")
+    assert r"100%\_of\|it" in markdown
+    assert "| --- |" in markdown
+    latex = side_by_side([path], "latex")
+    assert r"100\%\_of|it" in latex
+    assert latex.count(r"\begin{tabular}") == latex.count(r"\end{tabular}") == 3
+    with pytest.raises(DataError, match="no file of scores"):
+        side_by_side([])
+
+
+def test_published_tables_are_whole():
+    for table in published():
+        protocol = load_protocol(table["protocol"])
+        columns = [(column["metric"], column["variant"]) for column in table["columns"]]
+        assert columns == [(choice.metric, choice.variant) for choice in protocol.choices]
+        assert "table" in table["source"]
+        assert all(len(row["printed"]) == len(columns) for row in table["rows"])
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(0.0, "0"), (0.12345, "0.1235"), (1.5e-4, "0.00015"), (12345.6, "1.235e+04"), (np.nan, "nan")]
+)
+def test_figures_have_four_digits(value, text):
+    assert figure(value) == text
+
+
+def test_the_command_line_writes_scores_page_and_table(tmp_path, capsys, sets):
+    words = ["evaluate", *sets, "--metrics", *CHEAP, "--intervals", "4"]
+    files = ["--json", str(tmp_path / "s.json"), "--report", str(tmp_path / "s.html")]
+    assert main([*words, *files]) == 0
+    head, *rows = capsys.readouterr().out.splitlines()
+    assert head.split() == ["metric", "variant", "score", "95", "%", "interval", "floor", "better", "scans"]
+    assert len(rows) == 2
+    assert (tmp_path / "s.html").read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
+    assert main(["evaluate", "--tables", str(tmp_path / "s.json"), "--format", "latex"]) == 0
+    assert "tabular" in capsys.readouterr().out
+    for wrong, told in (
+        ([*words, *files], "there already"),
+        (["evaluate", sets[0]], "alone; wanted samples and what they are compared with"),
+        ([*words, "--weights", "pointnet"], "NAME=FILE"),
+        ([*words, "--protocol", "r3dm"], "wanted one of"),
+        ([*words, "--groups", "2"], "half"),
+    ):
+        assert main(wrong) != 0
+        assert told in capsys.readouterr().err.replace("halves", "half")

@@ -1,0 +1,169 @@
+"""Samples of other programs: told apart, turned into metres, and never trusted."""
+
+import contextlib
+import pickle
+import zipfile
+
+import pytest
+import torch
+
+from lidargrit import _discovery
+from lidargrit.errors import DataError, ScanError, UnknownNameError
+from lidargrit.evaluation.dialects import (
+    is_tensor_folder,
+    load_dialect,
+    read_tensor,
+    read_tensor_folder,
+    recognise,
+)
+from lidargrit.evaluation.score import open_images
+from lidargrit.projection import unproject
+
+SIZE = (64, 1024)
+
+
+def scan(seed=0, size=SIZE):
+    """Metres within the limits of all, 0 where nothing returned, and reflectance."""
+    rng = torch.Generator().manual_seed(seed)
+    mask = torch.rand(size, generator=rng) < 0.8
+    return (2 + 58 * torch.rand(size, generator=rng)) * mask, torch.rand(size, generator=rng)
+
+
+def r2dm(range_m, reflectance):
+    rows, columns = (torch.arange(n) / n for n in SIZE)
+    pitch, yaw = torch.deg2rad(3 - 28 * rows)[:, None], torch.deg2rad(180 - 360 * columns)[None]
+    x, y, z = range_m * pitch.cos() * yaw.cos(), range_m * pitch.cos() * yaw.sin(), range_m * pitch.sin()
+    return torch.stack((range_m, x, y, z, reflectance))
+
+
+def lidargen(range_m, reflectance):
+    return torch.stack((torch.log2(range_m + 1.0001) / 6, reflectance)).clamp(0, 1)
+
+
+def lidargrit(range_m, reflectance):
+    return range_m[None]
+
+
+WRITERS = {"r2dm": r2dm, "lidargen": lidargen, "lidargrit": lidargrit}
+
+
+def test_every_dialect_is_tested():
+    assert sorted(WRITERS) == _discovery.names("evaluation.dialects")
+    for name in WRITERS:
+        assert load_dialect(name).source
+        assert 20 < len(_discovery.summary("evaluation.dialects", name)) < 180
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_folder_of_tensors_is_recognised_and_gives_metres(name, tmp_path):
+    for index in (0, 2, 10):
+        torch.save(WRITERS[name](*scan(index)), tmp_path / f"samples_{index}.pth")
+    assert is_tensor_folder(tmp_path)
+    assert recognise(tmp_path) == name
+    images = open_images(str(tmp_path))
+    assert len(images) == 3
+    batch = images.batch([0, 1, 2])
+    for place, index in enumerate((0, 2, 10)):  # by number, not by letter
+        range_m, reflectance = scan(index)
+        assert torch.allclose(batch.range_m[place], range_m, atol=0.01)
+        if name == "lidargrit":
+            assert batch.reflectance is None
+        else:
+            assert torch.allclose(batch.reflectance[place], reflectance * (range_m > 0))
+    assert images.sensor.name == "hdl64e_kitti_360"
+    assert torch.equal(open_images(str(tmp_path), samples_format=name).batch([0]).range_m, batch.range_m[:1])
+
+
+def test_points_of_r2dm_lie_half_a_cell_from_its_own(tmp_path):
+    range_m, reflectance = scan(1)
+    tensor = r2dm(range_m, reflectance)
+    torch.save(tensor, tmp_path / "samples_0000000000.pth")
+    ours = unproject(read_tensor_folder(tmp_path).batch([0])[0]).points_xyz_m
+    theirs = tensor[1:4, range_m > 0].T
+    apart = torch.linalg.vector_norm(ours - theirs, dim=1) / range_m[range_m > 0]
+    half_cell = (torch.deg2rad(torch.tensor([28 / 64 / 2, 360 / 1024 / 2])) ** 2).sum().sqrt()
+    assert bool((apart < half_cell * 1.01).all())
+    assert bool((apart > half_cell * 0.7).all())
+
+
+def test_a_file_may_hold_a_batch_of_scans(tmp_path):
+    torch.save(torch.stack([lidargen(*scan(i)) for i in range(3)]), tmp_path / "samples.pth")
+    images = read_tensor_folder(tmp_path, count=2)
+    assert len(images) == 2
+    assert torch.allclose(images.batch([1]).range_m[0], scan(1)[0], atol=0.01)
+
+
+def test_the_small_images_of_lidargrit_are_by_ring(tmp_path):
+    torch.save(lidargrit(*scan(size=(64, 256))), tmp_path / "0.pth")
+    assert read_tensor_folder(tmp_path).sensor.projection == "unfolding"
+
+
+class Evil:
+    def __reduce__(self):
+        return (print, ("this must not run",))
+
+
+def test_no_code_of_a_stranger_runs(tmp_path, capsys):
+    torch.save({"a": Evil()}, tmp_path / "0.pth", pickle_module=pickle)
+    with pytest.raises(ScanError, match=r"0\.pth, which cannot be used"):
+        read_tensor(tmp_path / "0.pth")
+    assert "must not run" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("what", ["text", "cut", "no tensor", "swollen", "bomb", "whole numbers", "empty", "sparse"])
+def test_what_is_no_tensor_is_refused(what, tmp_path, monkeypatch):
+    monkeypatch.setattr("lidargrit.evaluation.dialects._BYTES_AT_MOST", 16 << 20)
+    path = tmp_path / "0.pth"
+    contents = {
+        "no tensor": {"a": 1},
+        "swollen": torch.zeros(1).expand(1 << 20),
+        "whole numbers": torch.zeros(5, 64, 1024, dtype=torch.int64),
+        "sparse": torch.zeros(5, 64).to_sparse(),
+    }
+    torch.save(contents.get(what, torch.zeros(5, 64, 1024)), path)
+    if what == "text":
+        path.write_text("hello")
+    elif what == "empty":
+        path.write_bytes(b"")
+    elif what == "cut":
+        path.write_bytes(path.read_bytes()[:-5000])
+    elif what == "bomb":
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("archive/data/0", "w") as file:
+            for _ in range(17):
+                file.write(bytes(1 << 20))
+    with pytest.raises(ScanError, match="wanted one tensor of at most 16 MB"):
+        read_tensor(path)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_flipped_bytes_never_crash(seed, tmp_path):
+    path = tmp_path / "0.pth"
+    torch.save(lidargrit(*scan(size=(64, 256))), path)
+    data = bytearray(path.read_bytes())
+    rng = torch.Generator().manual_seed(seed)
+    ends = list(range(600)) + list(range(len(data) - 600, len(data)))  # where everything but the pixels is
+    for place in torch.randint(len(ends), (5,), generator=rng).tolist():
+        data[ends[place]] = int(torch.randint(256, (1,), generator=rng))
+    path.write_bytes(bytes(data))
+    with contextlib.suppress(ScanError):
+        read_tensor_folder(tmp_path).batch([0])
+
+
+def test_other_sizes_numbers_and_names_are_refused(tmp_path):
+    with pytest.raises(DataError, match=r"no \.pth file"):
+        read_tensor_folder(tmp_path, "r2dm")
+    with pytest.raises(UnknownNameError, match="lidargen"):
+        load_dialect("lidagen")
+    torch.save(torch.zeros(5, 32, 1024), tmp_path / "0.pth")
+    with pytest.raises(ScanError, match="wanted 5x64x1024"):
+        read_tensor_folder(tmp_path)
+    torch.save(torch.zeros(3, 64, 1024), tmp_path / "0.pth")
+    with pytest.raises(ScanError, match=r"5 channels \(r2dm\)"):
+        read_tensor_folder(tmp_path)
+    torch.save(torch.full((1, 64, 1024), torch.nan), tmp_path / "0.pth")
+    torch.save(torch.zeros(1, 64, 256), tmp_path / "1.pth")
+    images = read_tensor_folder(tmp_path)
+    with pytest.raises(ScanError, match="negative or no number"):
+        images.batch([0])
+    with pytest.raises(ScanError, match="1x64x1024, as the first"):
+        images.batch([1])

@@ -1,0 +1,185 @@
+"""Files that lie about themselves: refused by their headers, before anything is unpacked or given room."""
+
+import re
+import struct
+import tracemalloc
+import zipfile
+from io import BytesIO
+
+import numpy as np
+import pytest
+
+from format_examples import example, pcd_files, ply_files
+from lidargrit.errors import ScanError
+from lidargrit.formats import candidates, load, read_scan
+
+MEGABYTES_AT_MOST = 20  # each file here is small
+
+
+@pytest.fixture(scope="module")
+def scan():
+    return example(load("ply"), columns=4)
+
+
+@pytest.fixture
+def refused(tmp_path):
+    """Return a function that writes bytes to a file, which must be refused, and returns the one line."""
+
+    def read(data: bytes, name: str) -> str:
+        path = tmp_path / name
+        path.write_bytes(data)
+        candidates(path)  # loads what all readers need, which is not to be counted
+        tracemalloc.start()
+        with pytest.raises(ScanError) as refusal:
+            read_scan(path)
+        most_bytes = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert most_bytes < MEGABYTES_AT_MOST * 1_000_000
+        assert str(path) in str(refusal.value)
+        assert "\n" not in str(refusal.value)
+        return str(refusal.value)
+
+    return read
+
+
+HUGE = ("-1", "0", "4000001", "2147483648", "18446744073709551617", "9" * 5000, "1e9", "nan", "0x10", "٣", "")
+
+
+def test_text_that_claims_far_more_rows_than_it_has(refused):
+    head = "VERSION 0.7\nFIELDS x y z h\nSIZE 4 4 4 1\nTYPE F F F U\nCOUNT 1 1 1 50\nWIDTH 4000000\nHEIGHT 1\n"
+    assert "4000000 rows of 53 numbers" in refused((head + "POINTS 4000000\nDATA ascii\n1 2 3 4\n").encode(), "a.pcd")
+    many = "".join(f"property double p{place}\n" for place in range(200))
+    head = f"ply\nformat ascii 1.0\nelement vertex 4000000\nproperty float x\n{many}end_header\n"
+    assert "4000000 rows of 201 numbers" in refused((head + "1 2 3\n").encode(), "a.ply")
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
+@pytest.mark.parametrize("count", HUGE)
+def test_pcd_of_absurd_counts(refused, scan, encoding, count):
+    data = pcd_files(scan.points_xyz_m.numpy(), scan.reflectance.numpy(), scan.ring.numpy())[f"pcd_{encoding}"]
+    for key in ("POINTS", "WIDTH", "HEIGHT"):
+        refused(re.sub(rf"{key} \d+".encode(), f"{key} {count}".encode(), data), "a.pcd")
+    both = re.sub(rb"(POINTS|WIDTH) \d+", rf"\1 {count}".encode(), data)
+    refused(both, "a.pcd")
+    for key in ("COUNT", "SIZE"):
+        refused(re.sub(rf"{key} \d+".encode(), f"{key} {count}".encode(), data), "a.pcd")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "text"),
+    [
+        (b"TYPE F", b"TYPE X", "a field of type 'X' and size 8"),
+        (b"SIZE 8", b"SIZE 3", "a field of type 'F' and size 3"),
+        (b"COUNT 1", b"COUNT 9999", "counts from 1 to 9999 values a point"),
+        (b"FIELDS x", b"FIELDS x y", "7 fields, 6 sizes, 6 types, 6 counts"),
+        (
+            b"FIELDS x",
+            b"FIELDS u",
+            "whose columns are 'u', 'y', 'z', 'intensity', 'stamp', 'channel'; wanted x",
+        ),
+        (b"DATA ", b"ATAD ", "no header that ends with DATA"),
+        (b"DATA binary_compressed", b"DATA zip", "bytes of DATA 'zip'"),
+    ],
+)
+def test_pcd_of_other_headers(refused, scan, old, new, text):
+    files = pcd_files(scan.points_xyz_m.numpy(), scan.reflectance.numpy(), scan.ring.numpy())
+    assert text in refused(files["pcd_binary_compressed"].replace(old, new, 1), "a.pcd")
+
+
+def test_pcd_that_would_unpack_to_far_more(refused, scan):
+    data = pcd_files(scan.points_xyz_m.numpy(), scan.reflectance.numpy(), scan.ring.numpy())["pcd_binary_compressed"]
+    start = data.index(b"binary_compressed\n") + 18
+    for packed, unpacked in ((10, 2**32 - 1), (2**32 - 1, 10), (0, 0)):
+        lying = data[:start] + struct.pack("<II", packed, unpacked) + data[start + 8 :]
+        assert re.search(f"of {packed} bytes, {unpacked} unpacked", refused(lying, "a.pcd"))
+    million = re.sub(rb"(POINTS|WIDTH) \d+", rb"\g<1> 4000000", data)
+    bomb = million[: million.index(b"_compressed\n") + 12] + struct.pack("<II", 9, 4_000_000 * 27) + bytes(9)
+    refused(bomb, "a.pcd")
+
+
+@pytest.mark.parametrize("count", HUGE)
+@pytest.mark.parametrize("name", ["ply_ascii", "ply_binary_big_endian"])
+def test_ply_of_absurd_counts(refused, scan, name, count):
+    data = ply_files(scan.points_xyz_m.numpy(), scan.reflectance.numpy(), scan.ring.numpy())[name]
+    refused(re.sub(rb"vertex \d+", f"vertex {count}".encode(), data), "a.ply")
+    if count != "0":
+        refused(data.replace(b"camera 1", f"camera {count}".encode()), "a.ply")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "text"),
+    [
+        (b"ascii 1.0", b"utf8 1.0", "the format 'format utf8 1.0'"),
+        (b"double y", b"quad y", "'property quad y' in its header"),
+        (b"double y", b"double x", "'property double x' in its header"),
+        (b"property double y", b"property list uchar double y", "'property list uchar double y' in its header"),
+        (b"property float view", b"property list int int view", "1 rows of 'camera' before its vertices"),
+        (b"element vertex", b"element point", "no vertices"),
+        (b"double x", b"double u", "whose columns are 'u', 'y', 'z'"),
+        (b"end_header", b"header_end", "no PLY file"),
+        (b"ply", b"PLY", "no PLY file"),
+    ],
+)
+def test_ply_of_other_headers(refused, scan, old, new, text):
+    data = ply_files(scan.points_xyz_m.numpy(), scan.reflectance.numpy(), scan.ring.numpy())["ply_ascii"]
+    assert text in refused(data.replace(old, new, 1), "a.ply")
+
+
+def npy(header: str, body: bytes = bytes(96), version: tuple[int, int] = (1, 0)) -> bytes:
+    length = struct.pack("<H" if version == (1, 0) else "<I", len(header))
+    return b"\x93NUMPY" + bytes(version) + length + header.encode() + body
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (1000000, 3)}",
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (4000001, 3)}",
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (-8, -3)}",
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (8, 10**30)}",
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (2, 2, 2, 3)}",
+        "{'descr': '<f4', 'fortran_order': False, 'shape': ()}",
+        "{'descr': '|O', 'fortran_order': False, 'shape': (4, 3)}",
+        "{'descr': '<c8', 'fortran_order': False, 'shape': (4, 3)}",
+        "{'descr': '|V999999999', 'fortran_order': False, 'shape': (4, 3)}",
+        "{'descr': [('x', '<f4')], 'fortran_order': False, 'shape': (4,)}",
+        "__import__('os').abort()",
+        "(" * 1000,
+        "-" * 1000 + "1",
+        "[" * 9000,
+    ],
+)
+@pytest.mark.parametrize("version", [(1, 0), (2, 0), (3, 0), (9, 9)])
+def test_arrays_of_absurd_headers(refused, header, version):
+    refused(npy(header, version=version), "a.npy")
+    with BytesIO() as buffer:
+        with zipfile.ZipFile(buffer, "w") as archive:
+            archive.writestr("points.npy", npy(header, version=version))
+        refused(buffer.getvalue(), "a.npz")
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_archives_that_would_unpack_to_far_more(refused, method):
+    small = npy("{'descr': '<f4', 'fortran_order': False, 'shape': (8, 3)}")
+    with BytesIO() as buffer:
+        with zipfile.ZipFile(buffer, "w", method) as archive:
+            archive.writestr("points.npy", small + bytes(30_000_000))
+        data = buffer.getvalue()
+    true_size = struct.pack("<I", len(small) + 30_000_000)
+    refused(data.replace(true_size, struct.pack("<I", len(small))), "a.npz")
+    assert "bytes in one array" in refused(data.replace(true_size, struct.pack("<I", 2**31)), "a.npz")
+    if method != zipfile.ZIP_DEFLATED:  # of which zipfile unpacks all at once
+        assert f"packed by method {method}" in refused(data, "a.npz")
+
+
+def test_archives_whose_directory_is_the_bomb(refused):
+    with BytesIO() as buffer:
+        with zipfile.ZipFile(buffer, "w") as archive:
+            for place in range(3000):
+                archive.writestr(f"{place}.npy", b"")
+        assert "no directory of at most 65536 bytes at its end" in refused(buffer.getvalue(), "a.npz")
+
+
+def test_pickles_are_not_loaded(refused, tmp_path):
+    np.save(tmp_path / "o.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    assert "dtype('O')" in refused((tmp_path / "o.npy").read_bytes(), "a.npy")

@@ -1,0 +1,128 @@
+"""Simulated scans against real ones and a coin: the comparison, its table, its picture and its verb."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from lidargrit.cli import main
+from lidargrit.errors import ConfigError, DataError
+from lidargrit.evaluation.realism import CURVES, SimulatedScans, as_table, compare, drop_by_coin, simulate_pair
+from lidargrit.loading import DataConfig, load_range_images
+from lidargrit.metrics import load_metric
+from lidargrit.sensors import load_sensor
+from lidargrit.structures import RangeImage
+from lidargrit.viewer.curves import draw_curves
+
+SENSOR = load_sensor("hdl64e_kitti_odometry")
+COUNT = 3
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("LIDARGRIT_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="module")
+def simulated():
+    pairs = [simulate_pair(seed, SENSOR) for seed in range(COUNT)]
+    return SimulatedScans(*(RangeImage.stack(list(side)) for side in zip(*pairs, strict=True)))
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    """The same scans, as a data set: what compares as real here."""
+    return load_range_images((f"simulated:{COUNT}",), DataConfig())
+
+
+@pytest.fixture(scope="module")
+def scores(simulated, recorded):
+    return compare(simulated, recorded)
+
+
+def test_what_is_measured_is_part_of_what_is_clean(simulated):
+    clean, measured = simulated.clean, simulated.measured
+    assert not (measured.return_mask & ~clean.return_mask).any()
+    assert torch.equal(measured.range_m[measured.return_mask], clean.range_m[measured.return_mask])
+    assert 0.7 < measured.return_mask.float().mean() < clean.return_mask.float().mean() < 1
+
+
+def test_the_coin_keeps_a_share_whatever_it_meets(simulated):
+    for share in (0.3, 0.8):
+        dropped = drop_by_coin(simulated.clean, share)
+        assert math.isclose(dropped.return_mask.float().mean(), share, abs_tol=0.01)
+        near = simulated.clean.return_mask & (simulated.clean.range_m < 8)
+        far = simulated.clean.return_mask & (simulated.clean.range_m > 20)
+        kept = [float(dropped.return_mask[some].float().mean()) for some in (near, far)]
+        assert math.isclose(*kept, abs_tol=0.02)
+        assert (dropped.reflectance[~dropped.return_mask] == 0).all()
+    assert torch.equal(drop_by_coin(simulated.clean, 1.0).return_mask, simulated.clean.return_mask)
+    assert torch.equal(dropped.return_mask, drop_by_coin(simulated.clean, 0.8).return_mask)
+
+
+def test_scans_are_nearer_to_the_simulator_that_made_them_than_to_a_coin(simulated, recorded, scores):
+    """Between the two lie only projection and the half scans that make the floor."""
+    assert recorded.batch([0]).return_mask.sum() > 0
+    named = {score.simulated.metric: score for score in scores}
+    assert set(CURVES) - {"reflectance_histogram"} <= set(named) <= set(CURVES)
+    for score in scores:
+        assert score.simulated.value < 0.02
+        assert score.simulated.value < score.bernoulli.value
+        assert score.floor.value > score.simulated.value
+        assert score.ratio == score.simulated.value / score.bernoulli.value
+        assert (score.simulated.num_generated, score.floor.num_generated, score.floor.num_reference) == (3, 1, 2)
+
+
+def test_distances_are_those_of_the_metrics(simulated, recorded, scores):
+    real = recorded.batch(range(COUNT))
+    coin = drop_by_coin(simulated.clean, float(real.return_mask.float().mean()))
+    metric = load_metric("drop_run_lengths")()
+    metric.update(coin, real=False)
+    metric.update(real, real=True)
+    score = next(score for score in scores if score.simulated.metric == "drop_run_lengths")
+    assert np.isclose(score.bernoulli.value, metric.compute().value)
+
+
+def test_the_table_names_every_curve(scores):
+    lines = as_table(scores).splitlines()
+    assert [line.split()[0] for line in lines[1:]] == [score.simulated.metric for score in scores]
+
+
+def test_one_scan_and_other_rays_are_refused(simulated, recorded):
+    with pytest.raises(DataError, match="got 1 real scan; wanted at least 2"):
+        compare(simulated, load_range_images(("simulated:1",), DataConfig()))
+    clean = simulated.clean
+    elsewhere = SENSOR.with_columns(2048, 8)
+    turned = RangeImage(clean.range_m, clean.return_mask, elsewhere.with_columns(256))
+    with pytest.raises(ConfigError, match="simulate the sensor of the scans"):
+        compare(SimulatedScans(turned, turned), recorded)
+
+
+def test_the_picture_has_every_panel(scores, tmp_path):
+    draw_curves(scores, tmp_path / "all.png", "title")
+    draw_curves(scores[:1], tmp_path / "one.png")
+    sizes = [(tmp_path / name).read_bytes()[16:24] for name in ("all.png", "one.png")]
+    widths, heights = zip(*((int.from_bytes(s[:4]), int.from_bytes(s[4:])) for s in sizes), strict=True)
+    assert widths == (1400, 1400)
+    assert heights[0] > heights[1] > 300
+    with pytest.raises(ConfigError, match="no curve to draw"):
+        draw_curves([], tmp_path / "none.png")
+
+
+def test_the_verb(tmp_path, capsys):
+    picture, file = tmp_path / "curves.png", tmp_path / "curves.json"
+    words = ["compare-sim", "simulated:2:val", "-n", "2", "-o", str(picture), "--json", str(file)]
+    assert main(words) == 0
+    assert "drop_run_lengths" in capsys.readouterr().out
+    told = json.loads(file.read_text())
+    assert told["real"] == "simulated:2:val"
+    assert {"simulated", "bernoulli", "floor", "ratio"} == set(told["curves"][0])
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert main(words) == 2  # it is there already
+    assert "add --overwrite" in capsys.readouterr().err
+    assert main(["compare-sim", "simulated:2", "-n", "1", "-o", str(tmp_path / "new.png")]) == 2
+    assert "at least 2" in capsys.readouterr().err

@@ -1,0 +1,242 @@
+"""Street scenes: the same from the same numbers, sound triangles, clear of our own car, and laid out like streets."""
+
+import inspect
+
+import numpy as np
+import pytest
+
+from lidargrit.errors import ConfigError
+from lidargrit.simulator import labels, materials
+from lidargrit.simulator.scene import SENSOR_HEIGHT_M, draw_scene
+from lidargrit.simulator.scene.layout import driving, parked
+from lidargrit.simulator.scene.movers import Stands
+from lidargrit.simulator.scene.plan import draw_plan
+from lidargrit.simulator.scene.settlement import settle
+from lidargrit.simulator.scene.vehicles import draw_vehicles
+
+THEMES = ("city", "suburb", "country")
+SEEDS = range(12)
+CARS = (labels.CAR, labels.MOVING_CAR, labels.TRUCK, labels.MOVING_TRUCK)
+FIELDS = ("triangles_m", "material", "albedo", "label", "instance")
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    return {(theme, seed): draw_scene(np.random.default_rng(seed), theme) for theme in THEMES for seed in SEEDS}
+
+
+@pytest.fixture(scope="module")
+def meshes(scenes):
+    return {key: scene.mesh() for key, scene in scenes.items()}
+
+
+@pytest.mark.parametrize("theme", THEMES)
+def test_one_state_one_scene(theme):
+    np.random.seed(1)  # noqa: NPY002
+    one = draw_scene(np.random.default_rng(7), theme)
+    np.random.seed(2)  # noqa: NPY002
+    two = draw_scene(np.random.default_rng(7), theme)
+    for time_s in (0.0, 0.7):
+        for field in FIELDS:
+            assert np.array_equal(getattr(one.mesh(time_s), field), getattr(two.mesh(time_s), field)), field
+        assert np.array_equal(one.sensor_pose(time_s), two.sensor_pose(time_s))
+    assert len(draw_scene(np.random.default_rng(8), theme).mesh()) != len(one.mesh())
+
+
+def test_mixed_draws_mostly_streets_with_houses():
+    drawn = [draw_plan(np.random.default_rng(seed), "mixed").theme for seed in range(200)]
+    assert set(drawn) == set(THEMES)
+    assert drawn.count("country") < 40
+    assert drawn.count("suburb") > drawn.count("city") > drawn.count("country")
+
+
+def test_unknown_theme_is_refused():
+    with pytest.raises(ConfigError, match="the theme 'village'; wanted one of city"):
+        inspect.unwrap(draw_scene)(np.random.default_rng(0), "village")
+
+
+def test_triangles_are_sound(meshes):
+    for mesh in meshes.values():
+        assert np.isfinite(mesh.triangles_m).all()
+        sides = mesh.triangles_m[:, 1:] - mesh.triangles_m[:, :1]
+        area = np.linalg.norm(np.cross(sides[:, 0].astype(float), sides[:, 1].astype(float)), axis=1) / 2
+        assert np.mean(area < 1e-7) < 0.002
+        assert area.max() < 3000
+        assert np.abs(mesh.triangles_m[..., 2]).max() < 60
+
+
+def test_labels_materials_and_brightness_are_in_range(meshes):
+    for mesh in meshes.values():
+        assert set(np.unique(mesh.label)) <= labels.LABELS
+        assert mesh.material.max() < len(materials.MATERIALS)
+        assert mesh.albedo.min() > 0
+        assert mesh.albedo.max() < 0.9
+        leaves = mesh.albedo[mesh.material == materials.LEAVES]
+        assert 0.2 < leaves.min() <= leaves.max() <= 0.6
+        asphalt = mesh.albedo[mesh.label == labels.ROAD]
+        assert 0.08 < asphalt.min() <= asphalt.max() < 0.3
+
+
+def test_things_have_instances_and_the_ground_has_none(meshes):
+    things = (*CARS, labels.PERSON, labels.MOVING_PERSON, labels.BICYCLIST, labels.MOVING_BICYCLIST)
+    for mesh in meshes.values():
+        is_thing = np.isin(mesh.label, things)
+        assert (mesh.instance[is_thing] > 0).all()
+        assert (mesh.instance[np.isin(mesh.label, (labels.ROAD, labels.BUILDING, labels.VEGETATION))] == 0).all()
+        pairs = np.unique(mesh.instance[mesh.instance > 0] * 1000 + mesh.label[mesh.instance > 0])
+        assert len(np.unique(pairs // 1000)) == len(pairs)  # one class to an instance
+
+
+@pytest.mark.parametrize("time_s", [0.0, 0.5, 1.0])
+def test_nothing_stands_in_our_own_car(scenes, time_s):
+    low, high = np.array([-2.3, -0.95, 0.35 - SENSOR_HEIGHT_M]), np.array([2.3, 0.95, 0.3])
+    for key, scene in scenes.items():
+        to_sensor = np.linalg.inv(scene.sensor_pose(time_s))
+        local = scene.mesh(time_s).triangles_m @ to_sensor[:3, :3].T + to_sensor[:3, 3]
+        apart = (local.max(axis=1) < low) | (local.min(axis=1) > high)  # by their own boxes: stricter than need be
+        near = ~apart.any(axis=1)
+        assert not near.any(), (key, np.unique(scene.mesh(time_s).label[near]))
+
+
+def test_the_sensor_stands_over_the_road(scenes):
+    for scene in scenes.values():
+        start, later = scene.sensor_pose(), scene.sensor_pose(1.0)
+        assert np.allclose(start[:3, :3] @ start[:3, :3].T, np.eye(3), atol=1e-12)
+        assert np.allclose(start[:3, 3], [0, 0, SENSOR_HEIGHT_M], atol=0.2)
+        assert start[0, 0] > 0.99
+        way = np.linalg.norm(later[:3, 3] - start[:3, 3])
+        assert way == pytest.approx(scene.speed_m_s, rel=0.05, abs=0.01)
+        mesh = scene.mesh()
+        road = mesh.triangles_m[mesh.label == labels.ROAD].mean(axis=1)
+        below = road[np.hypot(road[:, 0], road[:, 1]) < 2.5]
+        assert np.abs(below[:, 2]).max() < 0.25
+
+
+@pytest.mark.parametrize("theme", ["city", "suburb"])
+def test_parked_cars_stand_at_kerbs_and_not_in_houses(theme):
+    at_kerb, all_along = 0, 0
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        plan = draw_plan(rng, theme)
+        town = settle(rng, plan)
+        stands = parked(rng, plan, town)
+        assert not town.covers(stands.u_m, stands.v_m, 0.5).any()
+        along = ~stands.across
+        kerb = np.where(stands.v_m > 0, plan.edge_m[1], plan.edge_m[0])[along] - np.abs(stands.v_m[along])
+        assert np.all((kerb > 0.9) & (kerb < 1.15))  # half a car and a hand
+        assert (plan.in_side_street(stands.u_m[along], stands.v_m[along], 2.0) < 0).all()
+        at_kerb, all_along = at_kerb + along.sum(), all_along + len(stands)
+    assert at_kerb > 0.4 * all_along > 60
+
+
+def test_drivers_keep_their_distance():
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        plan = draw_plan(rng, "mixed")
+        stands = driving(rng, plan, 8.0)
+        ours = np.abs(stands.v_m - plan.our_v_m) < 1.7
+        for time_s in (0.0, 1.0, 2.0):
+            way = stands.speed_m_s * time_s * np.cos(stands.turn_rad) * ~stands.across
+            assert (np.abs(stands.u_m + way - 8.0 * time_s)[ours & ~stands.across] > 7).all()
+
+
+def test_houses_have_windows(meshes):
+    shares = []  # of all upright walls, those that turn their backs and inner ones too
+    for (theme, _), mesh in meshes.items():
+        if theme == "country":
+            continue
+        sides = (mesh.triangles_m[:, 1:] - mesh.triangles_m[:, :1]).astype(float)
+        normal = np.cross(sides[:, 0], sides[:, 1])
+        area = np.linalg.norm(normal, axis=1) / 2
+        near = np.hypot(*mesh.triangles_m.mean(axis=1)[:, :2].T) < 30
+        upright = np.abs(normal[:, 2]) < 0.1 * 2 * area
+        facade = (mesh.label == labels.BUILDING) & upright & near
+        glass = facade & (mesh.material == materials.GLASS)
+        shares.append(area[glass].sum() / area[facade].sum())
+    assert 0.03 < np.mean(shares) < 0.3
+    assert min(shares) > 0.005
+
+
+def test_the_number_of_triangles_is_bounded(meshes):
+    counts = np.array([len(mesh) for mesh in meshes.values()])
+    assert 25_000 < np.median(counts) < 55_000
+    assert counts.max() < 90_000
+
+
+def _slow_sight(town, place, eye):
+    """Tell whether a house stands between, by many points on the way."""
+    way = eye + np.linspace(0, 1, 1000)[:, None] * (place - eye)
+    houses = town.houses
+    for house in range(len(houses.length_m)):
+        yaw, apart = houses.poses.yaw_rad[house], way - houses.poses.xyz_m[house, :2]
+        x, y = (
+            np.cos(yaw) * apart[:, 0] + np.sin(yaw) * apart[:, 1],
+            np.cos(yaw) * apart[:, 1] - np.sin(yaw) * apart[:, 0],
+        )
+        inside = (np.abs(x) < houses.length_m[house] / 2) & (np.abs(y) < houses.depth_m[house] / 2)
+        if inside.any() and not inside[-1] and not inside[0] and not houses.plain[house]:
+            return False
+    return True
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_things_count_as_far_only_behind_houses(seed):
+    rng = np.random.default_rng(seed)
+    plan = draw_plan(rng, "suburb")
+    town = settle(rng, plan)
+    places = rng.uniform(-50, 50, (60, 2))
+    away, straight = town.houses.away_m(plan, places), plan.away_m(places)
+    nearest = [min(np.hypot(*(place - eye)) for eye in plan.eyes_m) for place in places]
+    assert np.allclose(straight, nearest)
+    hidden = away > straight
+    assert np.array_equal(away[~hidden], straight[~hidden])
+    for place in places[hidden]:
+        assert not any(_slow_sight(town, place, eye) for eye in plan.eyes_m)
+    checked = (straight > 12) & (straight < 40) & ~hidden
+    assert np.mean([any(_slow_sight(town, place, eye) for eye in plan.eyes_m) for place in places[checked]]) > 0.8
+
+
+def test_our_car_passes_what_is_drawn_in_detail(scenes):
+    for scene in scenes.values():
+        way = np.array([scene.sensor_pose(time_s)[:2, 3] for time_s in np.linspace(0, 2, 9)])
+        assert scene.plan.away_m(way).max() < 3.1  # half of what lies between two of the places that count
+
+
+def test_far_cars_are_as_large_as_near_ones():
+    kinds, far = np.arange(6), {}
+    stands = Stands.of(np.arange(6.0) * 20, 0.0)
+    for away in (0.0, 80.0):
+        herds = draw_vehicles(np.random.default_rng(3), kinds, stands, 1, np.full(6, away))
+        far[away] = herds[0].local_m
+    assert far[80.0].shape[1] < 0.45 * far[0.0].shape[1]
+    for corner in (np.min, np.max):
+        near_m, far_m = (corner(m, axis=(1, 2)) for m in (far[0.0], far[80.0]))
+        assert np.allclose(near_m, far_m, atol=0.06)
+
+
+def test_what_moves_moves_and_the_rest_stays(scenes):
+    moved = 0
+    for scene in scenes.values():
+        one, two = scene.mesh(0.0), scene.mesh(1.0)
+        assert np.array_equal(one.label, two.label)
+        assert np.array_equal(one.instance, two.instance)
+        way = np.linalg.norm(two.triangles_m.mean(axis=1) - one.triangles_m.mean(axis=1), axis=1)
+        moving = one.label >= labels.MOVING_CAR
+        assert (way[~moving] == 0).all()
+        assert (way[moving] > 0.3).all()
+        moved += len(np.unique(one.instance[moving]))
+    assert moved > 30
+
+
+def test_backdrop_leaves_little_bare_sky(meshes):
+    """In most directions something stands higher than the sensor's top ring."""
+    share = {theme: [] for theme in THEMES}
+    for (theme, _), mesh in meshes.items():
+        corner = mesh.triangles_m.reshape(-1, 3)
+        flat = np.hypot(corner[:, 0], corner[:, 1])
+        high = corner[(corner[:, 2] - SENSOR_HEIGHT_M) > np.tan(np.radians(2.6)) * flat]
+        sector = ((np.arctan2(high[:, 1], high[:, 0]) + np.pi) / (2 * np.pi) * 120).astype(int)
+        share[theme].append(len(np.unique(sector)) / 120)
+    assert np.mean(share["city"]) > 0.7
+    assert np.mean(share["suburb"]) > 0.7
+    assert np.mean(share["country"]) > 0.4
