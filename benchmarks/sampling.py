@@ -11,8 +11,7 @@ import time
 
 import torch
 
-from lidargrit.generators import SamplingConfig
-from lidargrit.generators.lidargrit import LidarGrit, sample_tokens
+from lidargrit.generators.lidargrit import LidarGrit, TokenSampling, sample_tokens
 from lidargrit.recipes import load_recipe
 
 
@@ -35,7 +34,7 @@ def main() -> None:
     with torch.no_grad():
         for batch in options.batch:
             uniform = torch.rand((batch, length))
-            cached = seconds(lambda uniform=uniform: sample_tokens(transformer, uniform, SamplingConfig()))
+            cached = seconds(lambda uniform=uniform: sample_tokens(transformer, uniform, TokenSampling()))
             prefixes = [torch.zeros((batch, n), dtype=torch.long) for n in range(length // 16, length + 1, length // 8)]
             steps = [min(seconds(lambda p=p: transformer(p)) for _ in range(2)) for p in prefixes]
             recomputed = sum(steps) / len(steps) * length  # midpoints of eight equal spans of the length

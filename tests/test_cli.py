@@ -147,11 +147,26 @@ def test_a_seed_gives_the_same_sample_whatever_is_drawn_beside_it(run_folder, sa
 
 
 def test_sampling_options_reach_the_model(run_folder, tmp_path, typed):
-    typed("sample", run_folder, tmp_path, "-n", 2, "--temperature", 0, "--mask", "threshold", "--device", "cpu")
+    typed(
+        "sample", run_folder, tmp_path, "-n", 2, "--set", "temperature=0", "--set", "mask=threshold", "--device", "cpu"
+    )
     images = read_samples(tmp_path).batch([0, 1])
     assert torch.equal(images.range_m[0], images.range_m[1]), "the likeliest tokens do not depend on the seed"
     manifest = json.loads((tmp_path / "samples.json").read_text())
     assert manifest["sampling"] == {"temperature": 0.0, "top_k": 0, "top_p": 1.0, "mask": "threshold"}
+
+
+def test_samples_tell_what_they_cost_and_those_from_before_go_on(run_folder, tmp_path, typed):
+    typed("sample", run_folder, tmp_path, "-n", 1)
+    manifest = json.loads((tmp_path / "samples.json").read_text())
+    assert manifest["generator"] == "lidargrit"
+    assert manifest["cost_per_scan"]["network_evaluations"] == 8 * 8 + 1
+    assert manifest["cost_per_scan"]["flops"] > 1e6
+    for later in ("generator", "cost_per_scan", "projection_variant"):
+        del manifest[later]
+    (tmp_path / "samples.json").write_text(json.dumps(manifest))
+    typed("sample", run_folder, tmp_path, "-n", 2)
+    assert len(read_samples(tmp_path)) == 2
 
 
 def test_evaluate_prints_a_table_and_writes_json(samples, tmp_path, typed):
@@ -195,6 +210,7 @@ def test_list_names_everything_there_is(typed):
         for name in _discovery.names(kind):
             assert f"  {name} " in told
             assert f"  {name} " in typed("list", kind)
+    assert "sample --set: temperature=1.0, top_k=0, top_p=1.0, mask=bernoulli" in typed("list", "generators")
     assert "licence: " in typed("list", "datasets")
     assert "  lidargrit-kitti-360 " in typed("list", "protocols")
     assert "  lidargen " in typed("list", "dialects")

@@ -5,12 +5,11 @@ import pytest
 import torch
 from scipy import stats
 
-from lidargrit.generators import SamplingConfig
-from lidargrit.generators.lidargrit import START_TOKEN, after_start, choose, sample_tokens
+from lidargrit.generators.lidargrit import START_TOKEN, TokenSampling, after_start, choose, sample_tokens
 from lidargrit.nn.transformer import CausalTransformer, TransformerConfig
 from reference_weights import seeded_weights
 
-GREEDY = SamplingConfig(temperature=0.0)
+GREEDY = TokenSampling(temperature=0.0)
 
 
 @pytest.fixture
@@ -73,7 +72,7 @@ def test_top_k_keeps_what_the_program_keeps(golden_transformer):
     logits = torch.from_numpy(data["logits"][0])
     kept = torch.zeros_like(logits, dtype=torch.bool)
     for uniform in torch.linspace(0, 0.9999, 4000):
-        kept.scatter_(1, choose(logits, uniform.expand(len(logits)), SamplingConfig(top_k=5))[:, None], True)
+        kept.scatter_(1, choose(logits, uniform.expand(len(logits)), TokenSampling(top_k=5))[:, None], True)
     theirs = torch.from_numpy(data["topk5_of_logits0"])
     # Every token that can be drawn is among the program's; one too unlikely for 4,000 steps may be missing.
     assert bool((~kept | theirs.isfinite()).all())
@@ -98,7 +97,7 @@ def test_a_token_never_sees_what_follows(transformer):
     assert not torch.allclose(before[:, 12:], after[:, 12:])
 
 
-@pytest.mark.parametrize("sampling", [SamplingConfig(), SamplingConfig(0.7, 5), SamplingConfig(1.2, 0, 0.8), GREEDY])
+@pytest.mark.parametrize("sampling", [TokenSampling(), TokenSampling(0.7, 5), TokenSampling(1.2, 0, 0.8), GREEDY])
 def test_sampling_is_the_same_with_and_without_cache_and_in_any_batch(transformer, sampling):
     uniform = torch.rand((4, 24), generator=torch.Generator().manual_seed(1))
     with torch.no_grad():
@@ -112,7 +111,7 @@ def test_sampling_is_the_same_with_and_without_cache_and_in_any_batch(transforme
 def test_tokens_are_drawn_with_their_probability():
     logits = torch.tensor([[0.0, 1.0, 2.0, -1.0, 0.5]])
     uniform = torch.rand(20_000, generator=torch.Generator().manual_seed(0))
-    drawn = choose(logits.expand(20_000, -1), uniform, SamplingConfig(top_k=0))
+    drawn = choose(logits.expand(20_000, -1), uniform, TokenSampling(top_k=0))
     expected = logits[0].double().softmax(0).numpy() * 20_000
     assert stats.chisquare(torch.bincount(drawn, minlength=5).numpy(), expected).pvalue > 1e-3
 
@@ -121,9 +120,23 @@ def test_top_p_keeps_the_smallest_set_that_holds_the_share():
     logits = torch.tensor([[0.5, 0.3, 0.15, 0.05]]).log()
     uniform = torch.linspace(0, 0.9999, 1000)
     for top_p, kept in ((0.4, {0}), (0.5, {0}), (0.6, {0, 1}), (0.81, {0, 1, 2}), (1.0, {0, 1, 2, 3})):
-        drawn = choose(logits.expand(1000, -1), uniform, SamplingConfig(top_k=0, top_p=top_p))
+        drawn = choose(logits.expand(1000, -1), uniform, TokenSampling(top_k=0, top_p=top_p))
         assert set(drawn.tolist()) == kept
 
 
 def test_the_start_token_is_an_ordinary_one():
     assert after_start(torch.tensor([[5, 6]])).tolist() == [[START_TOKEN, 5, 6]]
+
+
+def test_the_cost_is_what_torch_counts():
+    from torch.utils.flop_counter import FlopCounterMode
+
+    from lidargrit.generators.lidargrit import LidarGrit
+    from lidargrit.recipes import load_recipe
+
+    recipe = load_recipe("small", ["model.transformer.width=32", "data.columns=512", "data.column_stride=8"])
+    generator = LidarGrit(recipe.model, recipe.data.load_sensor())
+    with FlopCounterMode(display=False) as counter:
+        generator.sample([0])
+    assert generator.cost().flops == counter.get_total_flops()
+    assert generator.cost().network_evaluations == 256 + 1

@@ -39,26 +39,33 @@ def from_json(cls: type[T], data: Any, source: str) -> T:
         ) from None
 
 
-def override(config: T, settings: Iterable[str]) -> T:
+def override(config: T, settings: Iterable[str], owner: str = "this recipe", cure: str = "see all with --dry-run") -> T:
     """Return the configuration with settings of the form ``a.b=value`` changed.
 
     A value is read as YAML. A list needs no brackets: ``data.train=/data/one,/data/two``.
 
+    Args:
+        config: what is changed; not itself, a copy.
+        settings: each NAME=VALUE.
+        owner: whose settings they are, for a message.
+        cure: how the user finds their names.
+
     Raises:
         ConfigError: an unknown name (names its nearest neighbours) or a value of another type.
     """
+    known: dict[str, Any] = leaves(config)
     values: dict[str, Any] = {}
     for setting in settings:
         path, equals, text = setting.partition("=")
         if not equals:
-            raise ConfigError(f"the setting {setting!r}", "NAME=VALUE", f"e.g. --set {next(iter(leaves(config)))}=...")
+            raise ConfigError(f"the setting {setting!r}", "NAME=VALUE", f"e.g. --set {next(iter(known), 'name')}=...")
         values[path.strip()] = text
-    unknown = [path for path in values if path not in leaves(config)]
+    unknown = [path for path in values if path not in known]
     if unknown:
         raise ConfigError(
-            f"the setting {unknown[0]!r}, which this recipe does not have",
-            f"one such as {nearest_names(unknown[0], leaves(config))}",
-            "see all with --dry-run",
+            f"the setting {unknown[0]!r}, which {owner} does not have",
+            f"one such as {nearest_names(unknown[0], known)}" if known else "none, for it has no settings",
+            cure,
         )
     return _replaced(config, "", values)
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import asdict, replace
 from pathlib import Path
 
-import torch
-
 from lidargrit.configuration import override
 from lidargrit.datasets import open_dataset
 from lidargrit.errors import DataError
@@ -15,8 +13,7 @@ from lidargrit.evaluation.samples import read_samples, write_samples
 from lidargrit.evaluation.score import score_reconstruction
 from lidargrit.evaluation.sides import Side, Sides
 from lidargrit.files import write_json
-from lidargrit.generators import SamplingConfig
-from lidargrit.generators.lidargrit import LidarGrit
+from lidargrit.generators import Generator
 from lidargrit.loading import DataConfig, RangeImages, load_range_images, spread
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
@@ -43,13 +40,12 @@ def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter
     recipe = override(recipe, settings)
     reporter.message("lidargrit demo: about 9 minutes on two cores; stop it at any time, the same command goes on")
     generator = train(recipe, folder, reporter)
-    assert isinstance(generator, LidarGrit)
     val = load_range_images(recipe.data.val, recipe.data, reporter)
     real = load_range_images(recipe.data.train, recipe.data, reporter)
     seeds = range(_NUM_SAMPLES)
-    write_samples(generator, folder, folder / "samples", seeds, SamplingConfig(), reporter=reporter)
+    write_samples(generator, folder, folder / "samples", seeds, reporter=reporter)
     samples = read_samples(folder / "samples", _NUM_SAMPLES)
-    reconstruction = score_reconstruction(generator.tokenizer, val)
+    reconstruction = score_reconstruction(generator.get_tokenizer(), val)
     count = min(len(samples), len(real))
     sides = Sides(Side("samples", samples, range(count)), Side("train", real, spread(count, len(real))))
     card = compare_sides(sides, Settings(), reporter)
@@ -96,13 +92,11 @@ def divided(data: str, reporter: Reporter) -> DataConfig:
     return DataConfig(train=(train,), val=(val,), sensor=dataset.sensor, max_scans=_MAX_SCANS)
 
 
-def _draw(generator: LidarGrit, kind: str, val: RangeImages, samples: RangeImages, folder: Path) -> None:
+def _draw(generator: Generator, kind: str, val: RangeImages, samples: RangeImages, folder: Path) -> None:
     real = val.batch(spread(3, len(val)))
-    with torch.no_grad():
-        reconstructed = generator.tokenizer.decode(generator.tokenizer.encode(real))
     title = f"{kind} scans never trained on, what the tokens keep of them, and new scans"
     draw_comparison(
-        {kind: real, "reconstructed": reconstructed, "generated": samples.batch(range(3))},
+        {kind: real, "reconstructed": generator.reconstruct(real), "generated": samples.batch(range(3))},
         folder / PICTURE,
         title=title,
     )

@@ -15,7 +15,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
     parser.add_argument("--data", help="a folder of scans; simulated ones if not given")
     parser.add_argument("--out", type=Path, help="run folder (default: runs/demo, or runs/demo-FOLDER)")
-    parser.add_argument("--set", nargs="+", default=[], metavar="NAME=VALUE", help="change settings of the recipe")
+    settings = "change settings of the recipe"
+    parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help=settings)
 
 
 def run(options: argparse.Namespace) -> None:

@@ -22,19 +22,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Print every name with its one line; of data sets and formats asked for alone, all that is known."""
+    """Print every name with its one line; of a kind asked for alone, all that is known."""
     from lidargrit import _discovery
 
-    facts = {"datasets": _of_dataset, "formats": _of_format}.get(options.kind, lambda name: [])
+    facts = {"datasets": _of_dataset, "formats": _of_format, "generators": _of_generator}.get(options.kind)
+    wrapper = textwrap.TextWrapper(116, initial_indent=" " * 6, subsequent_indent=" " * 10, break_on_hyphens=False)
     for kind in (options.kind,) if options.kind else _KINDS:
         print(kind)
         for name in _discovery.names(_KINDS[kind]):
             summary = re.sub(r":\w+:`(\w+)`", r"\1", _discovery.summary(_KINDS[kind], name))
             print(f"  {name.replace('_', '-') if kind == 'protocols' else name:<29}{summary}")
-            for fact in facts(name):
-                print(
-                    textwrap.fill(fact, 116, initial_indent=" " * 6, subsequent_indent=" " * 10, break_on_hyphens=False)
-                )
+            for fact in facts(name) if facts else ():
+                print(wrapper.fill(fact))
 
 
 def _of_dataset(name: str) -> list[str]:
@@ -56,3 +55,9 @@ def _of_format(name: str) -> list[str]:
     facts += [f"sensor: {cls.sensor}"] if cls.sensor else []
     facts += ["several scans in one file"] if cls.several else []
     return facts + ([f"needs: pip install 'lidargrit[{cls.extra}]'"] if cls.extra else [])
+
+
+def _of_generator(name: str) -> list[str]:
+    from lidargrit.generators import load_class
+
+    return load_class(name).about()

@@ -7,8 +7,8 @@ from pathlib import Path
 
 EXAMPLES = """\
   lidargrit sample runs/demo samples -n 100
-  lidargrit sample runs/demo bolder -n 100 --temperature 1.1 --mask threshold
-  lidargrit sample runs/demo as_released -n 100 --top-k 100
+  lidargrit sample runs/demo bolder -n 100 --set temperature=1.1 mask=threshold
+  lidargrit sample runs/demo as_released -n 100 --set top_k=100
 """
 
 
@@ -19,10 +19,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-n", "--count", type=int, default=16, help="number of scans (default: 16)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the first; the next have the next seeds")
     parser.add_argument("--batch-size", type=int, default=8, help="scans drawn at once (default: 8)")
-    parser.add_argument("--temperature", type=float, default=1.0, help="0 takes the likeliest token (default: 1)")
-    parser.add_argument("--top-k", type=int, default=0, help="among the k likeliest; 0 for all (default: 0)")
-    parser.add_argument("--top-p", type=float, default=1.0, help="among those that hold this probability (default: 1)")
-    parser.add_argument("--mask", choices=["bernoulli", "threshold"], default="bernoulli", help="how rays are dropped")
+    choices = "change how the generator draws; see: lidargrit list generators"
+    parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help=choices)
     parser.add_argument("--device", help="cpu or cuda (default: cuda if there is one)")
 
 
@@ -30,9 +28,10 @@ def run(options: argparse.Namespace) -> None:
     """Sample to disk."""
     import torch
 
+    from lidargrit.configuration import override
     from lidargrit.errors import ConfigError
     from lidargrit.evaluation.samples import write_samples
-    from lidargrit.generators import SamplingConfig, load
+    from lidargrit.generators import load
     from lidargrit.reporting import TerminalReporter
 
     if options.count < 1 or options.batch_size < 1 or options.seed < 0:
@@ -41,8 +40,9 @@ def run(options: argparse.Namespace) -> None:
             "at least one scan, at least one at once, and no negative seed",
             "correct the number",
         )
-    sampling = SamplingConfig(options.temperature, options.top_k, options.top_p, options.mask)
     generator = load(options.run_folder)
+    owner = f"sampling from {generator.public_name()!r}"
+    sampling = override(generator.Sampling(), options.set, owner, "see all with: lidargrit list generators")
     try:
         generator.to(options.device or ("cuda" if torch.cuda.is_available() else "cpu"))
     except (RuntimeError, AssertionError) as error:  # torch's ways to say: no such device, or not in this build

@@ -16,7 +16,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
     parser.add_argument("recipe", help="name of a recipe; see: lidargrit list recipes")
     parser.add_argument("out", type=Path, help="run folder")
-    parser.add_argument("--set", nargs="+", default=[], metavar="NAME=VALUE", help="change settings of the recipe")
+    settings = "change settings of the recipe"
+    parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help=settings)
     parser.add_argument("--dry-run", action="store_true", help="say what would be done, with every setting, and stop")
 
 

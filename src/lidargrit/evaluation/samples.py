@@ -7,6 +7,7 @@ import json
 import zipfile
 import zlib
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,14 @@ import numpy as np
 from lidargrit import configuration
 from lidargrit.errors import CheckpointError, ConfigError, DataError, OutputError, ScanError
 from lidargrit.files import atomic_path, is_taken, read_json, write_json, write_text
-from lidargrit.generators import TRAINED_ON_FILE, WEIGHTS_FILE, Generator, SamplingConfig
+from lidargrit.generators import TRAINED_ON_FILE, WEIGHTS_FILE, Generator
 from lidargrit.loading import Pixels, Provenance, RangeImages
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel
 from lidargrit.training.run import RUN_FILE
 
 MANIFEST = "samples.json"
+_LATER_ENTRIES = ("projection_variant", "generator")  # not in folders of before they existed
 
 _UNREADABLE = (  # what numpy and zipfile raise on damaged bytes, RuntimeError also where a bit says "encrypted"
     *(OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, RuntimeError),
@@ -34,7 +36,7 @@ def write_samples(
     run_folder: Path,
     folder: Path,
     seeds: Sequence[int],
-    sampling: SamplingConfig,
+    sampling: Any = None,
     batch_size: int = 8,
     reporter: Reporter | None = None,
 ) -> None:
@@ -45,23 +47,26 @@ def write_samples(
         run_folder: whose weights identify it.
         folder: gets ``samples.json`` and ``SEED.npz`` with ``range_m`` (H, W) in metres, 0 where nothing returned.
         seeds: one a scan.
-        sampling: temperature and the like.
+        sampling: choices, of the generator's own ``Sampling``; its defaults if not given.
         batch_size: scans drawn at once; the scans do not depend on it.
         reporter: hears of the progress.
 
     Raises:
         OutputError: the folder holds samples of another model or setting, something else, or cannot be written.
     """
+    sampling = generator.Sampling() if sampling is None else sampling
     manifest: dict[str, Any] = {
         "weights_sha256": hashlib.sha256((run_folder / WEIGHTS_FILE).read_bytes()).hexdigest(),
+        "generator": generator.public_name(),
         "sampling": configuration.to_json(sampling),
+        "cost_per_scan": asdict(generator.cost(sampling)),
         "sensor": generator.sensor.to_json(),
     }
     if variant := projection_of(run_folder):
         manifest["projection_variant"] = variant
     if (folder / MANIFEST).exists():
         there = read_json(folder / MANIFEST)
-        if there != manifest and there != {key: of for key, of in manifest.items() if key != "projection_variant"}:
+        if not _same(there, manifest):
             raise OutputError(
                 f"{folder}, which holds samples of another model or drawn in another way",
                 "an empty folder, or one that this very command began",
@@ -135,6 +140,14 @@ def trained_on(folder: Path) -> Provenance:
 def is_sample_folder(folder: Path) -> bool:
     """Tell whether a folder holds samples that lidargrit wrote."""
     return (folder / MANIFEST).is_file()
+
+
+def _same(there: Any, manifest: dict[str, Any]) -> bool:
+    """Tell whether samples there are drawn as these will be; their cost follows from the rest, and is only told."""
+    if not isinstance(there, dict):
+        return False
+    wanted = {key: of for key, of in manifest.items() if key in there or key not in _LATER_ENTRIES}
+    return {**there, "cost_per_scan": None} == {**wanted, "cost_per_scan": None}
 
 
 class _Files:

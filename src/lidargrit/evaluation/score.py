@@ -13,7 +13,6 @@ from lidargrit.evaluation.dialects import is_tensor_folder, read_tensor_folder
 from lidargrit.evaluation.reconstruction import ReconstructionErrors, ReconstructionScore
 from lidargrit.evaluation.samples import is_sample_folder, read_samples, trained_on
 from lidargrit.generators import is_run, load
-from lidargrit.generators.lidargrit import LidarGrit
 from lidargrit.loading import (
     DataConfig,
     PreparedImages,
@@ -107,8 +106,7 @@ def evaluate_run(run_folder: Path, source: str, config: DataConfig, reporter: Re
         ConfigError: a run whose generator has no tokenizer.
     """
     generator = load(run_folder)
-    if not isinstance(generator, LidarGrit):
-        raise ConfigError(f"a run of {type(generator).__name__}", "a generator with a tokenizer", "sample and score it")
+    tokenizer = generator.get_tokenizer()
     images = open_images(source, generator.sensor, config, reporter)
     warn_of_overlap(str(run_folder), None, images, reporter)
-    return asdict(score_reconstruction(generator.tokenizer, images))
+    return asdict(score_reconstruction(tokenizer, images))

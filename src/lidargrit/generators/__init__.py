@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from lidargrit import _discovery, configuration
@@ -16,47 +17,51 @@ from lidargrit.files import load_exactly, read_json, read_tensors, write_json, w
 from lidargrit.loading import RangeImages
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
-from lidargrit.tokenizers import MaskDecoding
+from lidargrit.tokenizers import Tokenizer
 
 CONFIG_FILE, WEIGHTS_FILE = "config.json", "model.safetensors"
 TRAINED_ON_FILE = "trained_on.json"  # in a run's folder and beside its samples: which drives, which pixels
 
 
 @dataclass(frozen=True)
-class SamplingConfig:
-    """How scans are drawn.
+class NoSampling:
+    """Of a generator that leaves nothing to choose when scans are drawn."""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What drawing one scan takes, counted and not timed, so the same on every machine.
 
     Args:
-        temperature: above 1 bolder, below 1 safer than the model's own probabilities; 0 takes the likeliest token.
-        top_k: draw among the k likeliest tokens only; 0 for all, the model's own distribution, since the paper names no
-            other. The released program's is 100, which makes a barely trained model bland.
-        top_p: draw among the likeliest tokens that together hold this probability; 1 for all.
-        mask: ``bernoulli`` draws each return with its probability (the released program, so what the paper's scores
-            were computed with); ``threshold`` keeps what is at least as likely as not (the paper's eq. 1).
+        network_evaluations: passes through a network, one after the other.
+        flops: floating-point operations of products and convolutions, two for each multiplication with its addition.
     """
 
-    temperature: float = 1.0
-    top_k: int = 0
-    top_p: float = 1.0
-    mask: MaskDecoding = "bernoulli"
+    network_evaluations: int
+    flops: int
 
-    def __post_init__(self) -> None:
-        if not (self.temperature >= 0 and self.top_k >= 0 and 0 < self.top_p <= 1):
-            raise ConfigError(
-                f"temperature={self.temperature}, top_k={self.top_k}, top_p={self.top_p}",
-                "temperature >= 0, top_k >= 0, 0 < top_p <= 1",
-                "correct the one that is out of bounds",
-            )
+
+CAPABILITIES = {  # name → what a generator that declares it can do besides sampling, for people
+    "tokens": "give the tokenizer whose tokens it writes",
+    "encode": "give scans back from a code of its own",
+    "complete": "fill in the pixels of a scan that were not observed",
+    "invert": "search the scan nearest to a given one among those it can write",
+    "likelihood": "tell how likely a scan is",
+}
 
 
 class Generator(nn.Module, ABC):
     """A system that writes new scans of one sensor.
 
     It is made of ``Config`` and a sensor, and trained in ``stages``, one after the other, each by its own objective.
+    Every one can ``sample``, by the choices of its ``Sampling``. What else it can do, it declares in ``capabilities``;
+    asked for anything beyond them, it says which generators can.
     """
 
     Config: ClassVar[type]
+    Sampling: ClassVar[type] = NoSampling
     stages: ClassVar[tuple[str, ...]]
+    capabilities: ClassVar[frozenset[str]] = frozenset()
     sensor: SensorModel
     config: Any
 
@@ -76,19 +81,82 @@ class Generator(nn.Module, ABC):
         """Take over the weights of a stage's trained objective."""
 
     @abstractmethod
-    def sample(self, seeds: Sequence[int], sampling: SamplingConfig | None = None) -> RangeImage:
+    def sample(self, seeds: Sequence[int], sampling: Any = None) -> RangeImage:
         """Write one scan for each seed; a seed gives the same scan whatever the others are.
+
+        Args:
+            seeds: one a scan.
+            sampling: choices, of the generator's own ``Sampling``; its defaults if not given.
 
         Example::
 
             lidargrit.load("runs/demo").sample(seeds=[0, 1, 2, 3])
         """
 
+    @abstractmethod
+    def cost(self, sampling: Any = None) -> Cost:
+        """Return what drawing one scan takes."""
+
+    def get_tokenizer(self) -> Tokenizer:
+        """Return the tokenizer whose tokens the generator writes (``tokens``)."""
+        raise self._cannot("tokens")
+
+    def reconstruct(self, images: RangeImage) -> RangeImage:
+        """Return what the generator's code keeps of a batch of scans (``encode``)."""
+        raise self._cannot("encode")
+
+    def complete(
+        self, images: RangeImage, observed: Bool[Tensor, "B H W"], seeds: Sequence[int], sampling: Any = None
+    ) -> RangeImage:
+        """Return scans that agree with what was observed and make up the rest (``complete``).
+
+        Args:
+            images: (B, H, W); what they hold where nothing was observed is not looked at.
+            observed: where they are known, be it a return or that there was none.
+            seeds: one for each image.
+            sampling: choices; the defaults if not given.
+        """
+        raise self._cannot("complete")
+
+    def invert(self, images: RangeImage, seeds: Sequence[int], sampling: Any = None) -> RangeImage:
+        """Return for each scan the nearest that the generator can write, as far as a search from a seed finds it."""
+        raise self._cannot("invert")
+
+    def log_likelihood(self, images: RangeImage) -> Float[Tensor, "B"]:
+        """Return the log-likelihood of each scan in nats (``likelihood``).
+
+        It is that of the generator's own representation of a scan, such as its tokens: systems do not compare by it.
+        """
+        raise self._cannot("likelihood")
+
+    def _cannot(self, capability: str) -> ConfigError:
+        able = [name for name in _discovery.names("generators") if capability in load_class(name).capabilities]
+        return ConfigError(
+            f"a generator {self.public_name()!r}, which cannot {CAPABILITIES[capability]}",
+            f"one that can: {', '.join(able) or 'none of ours'}",
+            "see what each can do with: lidargrit list generators",
+        )
+
+    @classmethod
+    def about(cls) -> list[str]:
+        """Return what the generator can do, and the choices of its sampling with their defaults, for people."""
+        facts = [f"can {told} ({name})" for name, told in CAPABILITIES.items() if name in cls.capabilities]
+        settings = [f"{name}={value}" for name, value in configuration.leaves(cls.Sampling()).items()]
+        return [*facts, f"sample --set: {', '.join(settings)}"] if settings else facts
+
+    @classmethod
+    def public_name(cls) -> str:
+        """Return the name of the file that defines the class."""
+        return cls.__module__.rpartition(".")[2]
+
     def save(self, folder: Path) -> None:
         """Write the weights and, last, the configuration that says they are there."""
         write_tensors(folder / WEIGHTS_FILE, self.state_dict())
-        name = type(self).__module__.rpartition(".")[2]
-        config = {"generator": name, "config": configuration.to_json(self.config), "sensor": self.sensor.to_json()}
+        config = {
+            "generator": self.public_name(),
+            "config": configuration.to_json(self.config),
+            "sensor": self.sensor.to_json(),
+        }
         write_json(folder / CONFIG_FILE, config)
 
     @classmethod

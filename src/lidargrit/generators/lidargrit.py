@@ -10,14 +10,43 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from lidargrit.generators import Generator, SamplingConfig
+from lidargrit.errors import ConfigError
+from lidargrit.generators import Cost, Generator
+from lidargrit.nn.flops import flops_of
 from lidargrit.nn.transformer import CausalTransformer, TransformerConfig
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage, TokenGrid
-from lidargrit.tokenizers import Tokenizer
+from lidargrit.tokenizers import MaskDecoding, Tokenizer
 from lidargrit.tokenizers.vqvae import Vqvae, VqvaeConfig
 
 START_TOKEN = 0  # the reference prepends an ordinary token, shared with the first code, not one of its own
+
+
+@dataclass(frozen=True)
+class TokenSampling:
+    """How tokens are drawn, and returns.
+
+    Args:
+        temperature: above 1 bolder, below 1 safer than the model's own probabilities; 0 takes the likeliest token.
+        top_k: draw among the k likeliest tokens only; 0 for all, the model's own distribution, since the paper names no
+            other. The released program's is 100, which makes a barely trained model bland.
+        top_p: draw among the likeliest tokens that together hold this probability; 1 for all.
+        mask: ``bernoulli`` draws each return with its probability (the released program, so what the paper's scores
+            were computed with); ``threshold`` keeps what is at least as likely as not (the paper's eq. 1).
+    """
+
+    temperature: float = 1.0
+    top_k: int = 0
+    top_p: float = 1.0
+    mask: MaskDecoding = "bernoulli"
+
+    def __post_init__(self) -> None:
+        if not (self.temperature >= 0 and self.top_k >= 0 and 0 < self.top_p <= 1):
+            raise ConfigError(
+                f"temperature={self.temperature}, top_k={self.top_k}, top_p={self.top_p}",
+                "temperature >= 0, top_k >= 0, 0 < top_p <= 1",
+                "correct the one that is out of bounds",
+            )
 
 
 @dataclass(frozen=True)
@@ -36,7 +65,9 @@ class LidarGrit(Generator):
     """
 
     Config = LidarGritConfig
+    Sampling = TokenSampling
     stages = ("tokenizer", "transformer")
+    capabilities = frozenset({"tokens", "encode", "likelihood"})
 
     def __init__(self, config: LidarGritConfig, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
@@ -58,9 +89,9 @@ class LidarGrit(Generator):
             self.transformer.load_state_dict(objective.transformer.state_dict())
 
     @torch.no_grad()
-    def sample(self, seeds: Sequence[int], sampling: SamplingConfig | None = None) -> RangeImage:
+    def sample(self, seeds: Sequence[int], sampling: TokenSampling | None = None) -> RangeImage:
         """Write one scan for each seed; a seed gives the same scan whatever the others are."""
-        sampling = sampling or SamplingConfig()
+        sampling = sampling or TokenSampling()
         self.eval()
         device = self.transformer.head.weight.device
         rngs = [torch.Generator().manual_seed(seed) for seed in seeds]  # on the CPU: the same numbers on every device
@@ -71,6 +102,34 @@ class LidarGrit(Generator):
         return self.tokenizer.decode(
             grid, sampling.mask, torch.stack([torch.rand(size, generator=rng) for rng in rngs]).to(device)
         )
+
+    def get_tokenizer(self) -> Tokenizer:
+        """Return the VQ-VAE."""
+        return self.tokenizer
+
+    @torch.no_grad()
+    def reconstruct(self, images: RangeImage) -> RangeImage:
+        """Return what the tokens keep of a batch of scans, the mask by threshold."""
+        return self.tokenizer.decode(self.tokenizer.encode(images))
+
+    @torch.no_grad()
+    def log_likelihood(self, images: RangeImage) -> Float[Tensor, "B"]:
+        """Return the log-likelihood of each scan's tokens in nats; what is lost in encoding is not counted."""
+        self.eval()
+        tokens = self.tokenizer.encode(images).tokens.flatten(1)
+        logits = self.transformer(after_start(tokens[:, :-1]))
+        return -F.cross_entropy(logits.double().movedim(-1, 1), tokens, reduction="none").sum(dim=1).float()
+
+    def cost(self, sampling: TokenSampling | None = None) -> Cost:
+        """Return one step of the transformer for each token, with those before it in a cache, and one decoding."""
+        sizes, tokens = self.config.transformer, self.transformer.context_length
+        # Per token and layer: four projections and a perceptron of four times the width, then queries by keys and
+        # weights by values over all tokens so far.
+        products = sizes.layers * (24 * sizes.width**2 * tokens + 2 * sizes.width * tokens * (tokens + 1))
+        head = 2 * sizes.width * self.transformer.num_tokens * tokens
+        latents = (1, self.tokenizer.config.code_dim, *self.tokenizer.grid_size)
+        decoding = flops_of(self.tokenizer.post_quant_conv, latents) + flops_of(self.tokenizer.decoder, latents)
+        return Cost(tokens + 1, products + head + decoding)
 
 
 class NextToken(nn.Module):
@@ -104,7 +163,7 @@ def after_start(tokens: Int[Tensor, "B T"]) -> Int[Tensor, "B T+1"]:
 
 
 def sample_tokens(
-    transformer: CausalTransformer, uniform: Float[Tensor, "B T"], sampling: SamplingConfig, use_cache: bool = True
+    transformer: CausalTransformer, uniform: Float[Tensor, "B T"], sampling: TokenSampling, use_cache: bool = True
 ) -> Int[Tensor, "B T"]:
     """Draw token sequences in raster order, one uniform number a token.
 
@@ -122,7 +181,7 @@ def sample_tokens(
     return tokens[:, 1:]
 
 
-def choose(logits: Float[Tensor, "B K"], uniform: Float[Tensor, "B"], sampling: SamplingConfig) -> Int[Tensor, "B"]:
+def choose(logits: Float[Tensor, "B K"], uniform: Float[Tensor, "B"], sampling: TokenSampling) -> Int[Tensor, "B"]:
     """Choose one token for each row of logits by its uniform number."""
     if sampling.temperature == 0:
         return logits.argmax(dim=1)

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from lidargrit.errors import CheckpointError, ConfigError
-from lidargrit.generators import Generator, SamplingConfig
+from lidargrit.generators import Cost, Generator, NoSampling
 from lidargrit.loading import RangeImages
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
@@ -70,8 +70,8 @@ class Marginal(Generator):
             self.scans += len(batch)
 
     @torch.no_grad()
-    def sample(self, seeds: Sequence[int], sampling: SamplingConfig | None = None) -> RangeImage:
-        """Write one scan for each seed; settings of sampling are not looked at.
+    def sample(self, seeds: Sequence[int], sampling: NoSampling | None = None) -> RangeImage:
+        """Write one scan for each seed; there is nothing to choose.
 
         Raises:
             CheckpointError: nothing was counted yet.
@@ -90,6 +90,10 @@ class Marginal(Generator):
             low, high = edges[chosen], edges[chosen + 1]
             images.append(RangeImage.masked(low * (high / low) ** draws[2], returned, self.sensor))
         return RangeImage.stack(images)
+
+    def cost(self, sampling: NoSampling | None = None) -> Cost:
+        """Return nothing: there is no network."""
+        return Cost(0, 0)
 
     def _edges_m(self) -> Float[Tensor, " edges"]:
         low, high = torch.tensor([self.sensor.range_min_m, self.sensor.range_max_m], dtype=torch.float64).log()

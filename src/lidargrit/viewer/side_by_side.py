@@ -5,12 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import torch
-
 from lidargrit.errors import ConfigError
 from lidargrit.evaluation.score import open_images
-from lidargrit.generators import SamplingConfig, is_run, load
-from lidargrit.generators.lidargrit import LidarGrit
+from lidargrit.generators import is_run, load
 from lidargrit.loading import DataConfig, spread
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
@@ -21,7 +18,8 @@ def view(places: Sequence[str], picture: Path, count: int = 3, seed: int = 0, co
     """Draw scans, samples and what a run makes of them.
 
     Args:
-        places: each a run's folder (drawn as *generated*, and as *reconstructed* if there are scans beside it), a
+        places: each a run's folder (drawn as *generated*, and as *reconstructed* if there are scans beside it and
+            its generator can encode), a
             folder of samples, or a source of scans.
         picture: the PNG.
         count: scans of each, evenly spaced.
@@ -40,11 +38,9 @@ def view(places: Sequence[str], picture: Path, count: int = 3, seed: int = 0, co
             groups[_short(place)] = images.batch(spread(count, len(images)))
     scans = dict(groups)
     for place, generator in generators.items():
-        if scans and isinstance(generator, LidarGrit):
-            with torch.no_grad():
-                real = next(iter(scans.values()))
-                groups[f"{_short(place)}: reconstructed"] = generator.tokenizer.decode(generator.tokenizer.encode(real))
-        groups[f"{_short(place)}: generated"] = generator.sample(range(seed, seed + count), SamplingConfig())
+        if scans and "encode" in generator.capabilities:
+            groups[f"{_short(place)}: reconstructed"] = generator.reconstruct(next(iter(scans.values())))
+        groups[f"{_short(place)}: generated"] = generator.sample(range(seed, seed + count))
     if not groups:
         raise ConfigError("nothing to draw", "a scan, a folder or a run", "name at least one")
     draw_comparison(groups, picture)
