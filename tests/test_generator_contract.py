@@ -22,6 +22,11 @@ SIZES = {  # the smallest of each, and the quickest way to draw from it: a new g
     ),
     "marginal": ("bins=16", ""),
     "memorised": ("scans=8", ""),
+    "r2dm": (
+        "unet.channels=8 unet.channel_multipliers=[1,1] unet.residual_blocks=[1,1] unet.norm_groups=2 "
+        "unet.attention_heads=2",
+        "steps=3 resamples=2",
+    ),
 }
 METHODS = {  # what a capability is called by
     "tokens": "get_tokenizer",

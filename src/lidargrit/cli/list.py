@@ -8,8 +8,7 @@ import textwrap
 
 EXAMPLES = """\
   lidargrit list
-  lidargrit list datasets
-  lidargrit list formats
+  lidargrit list generators
 """
 
 _KINDS = {kind: kind for kind in ("datasets", "formats", "sensors", "tokenizers", "generators", "metrics")}

@@ -1,0 +1,317 @@
+"""R2DM: a diffusion model of log range and reflectance, raydrop by a window of ranges; seeds → range images."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from lidargrit.errors import CheckpointError, ConfigError
+from lidargrit.files import load_exactly
+from lidargrit.generators import Cost, Generator
+from lidargrit.loading import RangeImages, spread
+from lidargrit.nn import diffusion
+from lidargrit.nn.diffusion import Sampler, SeededNoise
+from lidargrit.nn.flops import flops_of
+from lidargrit.nn.unet import EfficientUnet, UnetConfig
+from lidargrit.sensors import SensorModel, load_sensor
+from lidargrit.structures import RangeImage
+
+_BATCH = 8
+_SHARE_SCANS = 1000  # whose returns are counted: more would not change their share
+_CALIBRATION_SEED = 1 << 40  # of the first scan that is drawn for it: no one draws their samples there
+
+
+@dataclass(frozen=True)
+class R2dmConfig:
+    """What the model learns, and its network.
+
+    Args:
+        unet: sizes.
+        reflectance: learn it beside the range, as published; set it to false where scans have none, or for a sharper
+            range (the authors' own remark).
+        calibration_scans: drawn at the end of training to fit the threshold of the ``calibrated`` raydrop; 0 for none.
+    """
+
+    unet: UnetConfig = field(default_factory=UnetConfig)
+    reflectance: bool = True
+    calibration_scans: int = 16
+
+    def __post_init__(self) -> None:
+        if self.calibration_scans < 0:
+            raise ConfigError(f"calibration_scans={self.calibration_scans}", "0 or more", "raise it")
+
+
+@dataclass(frozen=True)
+class DiffusionSampling:
+    """How images are drawn, and where there is no return.
+
+    Args:
+        steps: evaluations of the network; 256 are published, for completion 32.
+        sampler: ``ddpm`` adds fresh noise after each step (published), ``ddim`` only at the beginning.
+        raydrop: ``published`` has a return where the drawn range lies inside the sensor's limits. ``calibrated``, which
+            is not of the paper, has one where the drawn value is above a threshold, fitted so that as many rays return
+            as in the training scans.
+        resamples: how often each step is taken when a scan is completed.
+    """
+
+    steps: int = 256
+    sampler: Sampler = "ddpm"
+    raydrop: Literal["published", "calibrated"] = "published"
+    resamples: int = 16
+
+    def __post_init__(self) -> None:
+        if self.steps < 1 or self.resamples < 1:
+            raise ConfigError(f"steps={self.steps}, resamples={self.resamples}", "at least 1 of both", "raise it")
+
+
+_COMPLETION = DiffusionSampling(steps=32)  # with 16 resamples: the reference's own demonstration
+_CALIBRATION = DiffusionSampling(steps=32)
+
+
+class R2dm(Generator):
+    """Draws the image of log ranges, in which a missing return is a range that no return has.
+
+    Source:
+        Nakashima and Kurazume, LiDAR Data Synthesis with Denoising Diffusion Probabilistic Models, ICRA 2024; numbers
+        from kazuto1011/r2dm@1c5963d (MIT).
+    """
+
+    Config = R2dmConfig
+    Sampling = DiffusionSampling
+    stages = ("diffusion",)
+    capabilities = frozenset({"complete"})
+    return_share: Tensor
+    return_threshold: Tensor
+
+    def __init__(self, config: R2dmConfig, sensor: SensorModel) -> None:
+        super().__init__(config, sensor)
+        self.config, self.sensor = config, sensor
+        self.shape = (1 + config.reflectance, sensor.height, sensor.width)
+        angles = torch.broadcast_tensors(sensor.elevation_rad, sensor.azimuth_rad)
+        self.network = EfficientUnet(config.unet, self.shape[0], *(angle.contiguous() for angle in angles))
+        self.register_buffer("return_share", torch.tensor(math.nan))
+        self.register_buffer("return_threshold", torch.tensor(math.nan))
+
+    def learn(self, images: RangeImages) -> None:
+        """Count how many of the training scans' rays return."""
+        chosen = spread(_SHARE_SCANS, len(images))
+        shares = [
+            images.batch(chosen[first : first + _BATCH]).return_mask.float().mean((1, 2))
+            for first in range(0, len(chosen), _BATCH)
+        ]
+        self.return_share.fill_(float(torch.cat(shares).mean()))
+
+    def objective(self, stage: str) -> nn.Module:
+        """Return the denoising of the network."""
+        return Denoising(self.network, self.sensor)
+
+    def finish(self, stage: str, objective: nn.Module) -> None:
+        """Take over the trained network, and fit the threshold of the calibrated raydrop."""
+        assert isinstance(objective, Denoising)
+        self.network.load_state_dict(objective.network.state_dict())
+        self.calibrate()
+
+    def calibrate(self) -> None:
+        """Fit the threshold above which as many drawn values lie as rays returned in the training scans."""
+        seeds = range(_CALIBRATION_SEED, _CALIBRATION_SEED + self.config.calibration_scans)
+        if not seeds or not bool(self.return_share.isfinite()):
+            return
+        parts = [self._draw(seeds[first : first + _BATCH], _CALIBRATION) for first in range(0, len(seeds), _BATCH)]
+        levels = torch.cat([part[:, 0].flatten() for part in parts]).sort().values
+        dropped = min(round((1 - float(self.return_share)) * len(levels)), len(levels) - 1)
+        self.return_threshold.fill_(float(levels[dropped]))
+
+    def sample(self, seeds: Sequence[int], sampling: DiffusionSampling | None = None) -> RangeImage:
+        """Write one scan for each seed; a seed gives the same scan whatever the others are."""
+        sampling = sampling or DiffusionSampling()
+        self._check(sampling)
+        return self._decoded(self._draw(seeds, sampling), sampling)
+
+    @torch.no_grad()
+    def complete(
+        self,
+        images: RangeImage,
+        observed: Bool[Tensor, "B H W"],
+        seeds: Sequence[int],
+        sampling: DiffusionSampling | None = None,
+    ) -> RangeImage:
+        """Return scans that agree with what was observed and make up the rest, by RePaint over DDPM.
+
+        Args:
+            images: (B, H, W); what they hold where nothing was observed is not looked at.
+            observed: where they are known, be it a return or that there was none.
+            seeds: one for each image.
+            sampling: 32 steps with 16 resamples each if not given.
+
+        Raises:
+            ConfigError: images of other rays, or as many seeds or masks as there are not images.
+        """
+        sampling = sampling or _COMPLETION
+        self._check(sampling)
+        if not images.sensor.same_rays(self.sensor) or observed.shape != images.range_m.shape:
+            raise ConfigError(
+                f"{tuple(images.range_m.shape)} of {images.sensor.name!r}, observed at {tuple(observed.shape)}",
+                f"(B, {self.sensor.height}, {self.sensor.width}) of {self.sensor.name!r}, and masks of that shape",
+                "project the scans with the generator's sensor",
+            )
+        if len(seeds) != len(images):
+            raise ConfigError(f"{len(seeds)} seeds for {len(images)} images", "one for each", "correct the seeds")
+        self.eval()
+        device = self.network.coords.device
+        images, observed = images.to(device), observed.to(device)
+        noise = SeededNoise(seeds, self.shape, device)
+        clean = encode(images, self.config.reflectance)
+        drawn = diffusion.repaint(self.network, noise, clean, observed[:, None], sampling.steps, sampling.resamples)
+        made_up = self._decoded(drawn, sampling)
+        reflectance = None
+        if made_up.reflectance is not None and images.reflectance is not None:
+            reflectance = torch.where(observed, images.reflectance, made_up.reflectance)
+        range_m = torch.where(observed, images.range_m, made_up.range_m)
+        return RangeImage(range_m, range_m > 0, self.sensor, reflectance)
+
+    def cost(self, sampling: DiffusionSampling | None = None) -> Cost:
+        """Return the network's passes, one a step."""
+        steps = (sampling or DiffusionSampling()).steps
+        return Cost(steps, steps * flops_of(self.network, (1, *self.shape), (1,)))
+
+    @torch.no_grad()
+    def _draw(self, seeds: Sequence[int], sampling: DiffusionSampling) -> Float[Tensor, "B C H W"]:
+        self.eval()
+        noise = SeededNoise(seeds, self.shape, self.network.coords.device)
+        return diffusion.sample(self.network, noise, sampling.steps, sampling.sampler)
+
+    def _decoded(self, drawn: Float[Tensor, "B C H W"], sampling: DiffusionSampling) -> RangeImage:
+        level, sensor = drawn[:, 0], self.sensor
+        range_m = torch.exp2((level + 1) * (math.log2(1 + sensor.range_max_m) / 2)) - 1
+        if sampling.raydrop == "calibrated":
+            returned = level >= self.return_threshold
+        else:  # without the limits themselves, as in the reference: a value cut at the far end is no return
+            returned = (range_m > sensor.range_min_m) & (range_m < sensor.range_max_m)
+        image = RangeImage.masked(range_m.clamp(sensor.range_min_m, sensor.range_max_m), returned, sensor)
+        if not self.config.reflectance:
+            return image
+        return replace(image, reflectance=((drawn[:, 1] + 1) / 2).clamp(0, 1) * returned)
+
+    def _check(self, sampling: DiffusionSampling) -> None:
+        if sampling.raydrop == "calibrated" and not bool(self.return_threshold.isfinite()):
+            raise ConfigError(
+                "raydrop=calibrated for a model whose threshold was never fitted",
+                "raydrop=published",
+                "train with model.calibration_scans above 0",
+            )
+
+
+def encode(images: RangeImage, with_reflectance: bool) -> Float[Tensor, "B C H W"]:
+    """Map a batch to what the network sees: log2(1 + range) over that of the limit, in [-1, 1], -1 without a return.
+
+    The shortest range of a return lies above -1: at -0.59 for 1.45 m of 80 m. Between the two is nothing, which is how
+    the published model tells a return from none.
+
+    Raises:
+        ConfigError: a single image, or images without the reflectance that is to be learned.
+    """
+    if images.range_m.ndim != 3:
+        raise ConfigError("a single range image", "a batch", "make one with RangeImage.stack([image])")
+    far = images.sensor.range_max_m
+    level = torch.log2(1 + images.range_m.clamp(max=far)) * (2 / math.log2(1 + far)) - 1
+    if not with_reflectance:
+        return level[:, None]
+    if images.reflectance is None:
+        raise ConfigError(
+            "range images without reflectance",
+            "images with it, for model.reflectance=true",
+            "use --set model.reflectance=false, or prepare scans that have it",
+        )
+    return torch.stack((level, 2 * images.reflectance * images.return_mask - 1), dim=1)
+
+
+class Denoising(nn.Module):
+    """The objective: the squared error of the predicted noise at a random time, weighed by min-SNR."""
+
+    def __init__(self, network: EfficientUnet, sensor: SensorModel) -> None:
+        super().__init__()
+        self.network, self.sensor = network, sensor
+
+    def forward(self, images: RangeImage, rng: torch.Generator) -> dict[str, Tensor]:
+        """Return the weighed error as ``loss``, and the plain one beside it."""
+        clean = encode(images, with_reflectance=self.network.out_conv.out_channels > 1)
+        time = torch.rand(len(clean), generator=rng, device=clean.device, dtype=torch.float64)
+        noise = torch.randn(clean.shape, generator=rng, device=clean.device)
+        log_snr = diffusion.log_snr_at(time).float()
+        predicted = self.network(diffusion.noised(clean, log_snr, noise), log_snr).float()
+        error = (predicted - noise).square().mean((1, 2, 3))
+        return {"loss": (error * diffusion.min_snr_weight(log_snr)).mean(), "noise_mse": error.mean()}
+
+
+def load_published(path: Path, sensor: str = "hdl64e_kitti_360") -> R2dm:
+    """Make a generator of a checkpoint that the authors published (r2dm-h-kitti360-300k.pth and the like).
+
+    Such a file is torch's, a dictionary of which this reads ``cfg`` (the settings by name, in one level) and
+    ``ema_weights``. Its names of weights are ours below ``network.``, where it has ``denoiser.`` or, in later versions,
+    ``model.``; its constants (``scale``, ``kernel``, ``freqs``, ``phase``) are built in here. ``coords`` are the ray
+    angles that it was trained with, at the edges of cells, and are kept; where a pixel's point lies is the sensor's.
+    Only the published form is known: log range, predicted noise, cosine schedule, continuous time, Fourier features.
+
+    Args:
+        path: of the file; code in it is not run.
+        sensor: whose rays the images have: by elevation for the KITTI-360 weights.
+
+    Raises:
+        CheckpointError: another file, or a model of another form.
+
+    Source:
+        kazuto1011/r2dm@1c5963d (MIT), utils/inference.py and utils/training.py.
+    """
+    wanted, cure = "a checkpoint of R2DM's authors", "download it again from kazuto1011/r2dm, release 'weights'"
+    try:
+        file = torch.load(path, map_location="cpu", weights_only=True)
+        settings, published = dict(file["cfg"]), dict(file["ema_weights"])
+        unet = UnetConfig(
+            channels=int(settings["model_base_channels"]),
+            channel_multipliers=_four(settings["model_channel_multiplier"]),
+            residual_blocks=_four(settings["model_num_residual_blocks"]),
+            norm_groups=int(settings["model_gn_num_groups"]),
+            attention_heads=int(settings["model_attn_num_heads"]),
+        )
+    except ConfigError:
+        raise
+    except (OSError, KeyError, TypeError, ValueError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
+        told = str(error).partition("\n")[0][:100]
+        raise CheckpointError(f"{path}, which cannot be read ({type(error).__name__}: {told})", wanted, cure) from None
+    for name, known in _KNOWN_FORM.items():
+        if settings.get(name, known) != known:
+            raise CheckpointError(f"{path} with {name}={settings[name]!r}", f"{name}={known!r}", "use other weights")
+    generator = R2dm(R2dmConfig(unet, bool(settings.get("train_reflectance", True))), load_sensor(sensor))
+    ours = {
+        f"network.{name.partition('.')[2]}": tensor
+        for name, tensor in published.items()
+        if name.partition(".")[0] in ("denoiser", "model") and name.rpartition(".")[2] not in _CONSTANTS
+    }
+    own = {name: tensor for name, tensor in generator.state_dict().items() if not name.startswith("network.")}
+    load_exactly(generator, ours | own, path)
+    return generator.eval()
+
+
+_CONSTANTS = ("scale", "kernel", "freqs", "phase")
+_KNOWN_FORM: dict[str, Any] = {
+    "model_name": "efficient_unet",
+    "image_format": "log_depth",
+    "train_depth": True,
+    "model_coords_embedding": "fourier_features",
+    "diffusion_objective": "eps",
+    "diffusion_beta_schedule": "cosine",
+    "diffusion_timesteps_type": "continuous",
+}
+
+
+def _four(setting: Any) -> tuple[int, ...]:
+    """Return a setting of the reference that is one number for all four levels, or one for each."""
+    return (int(setting),) * 4 if isinstance(setting, int) else tuple(int(each) for each in setting)
