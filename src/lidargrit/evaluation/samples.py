@@ -45,7 +45,8 @@ def write_samples(
     Args:
         generator: what to sample from, as loaded from
         run_folder: whose weights identify it.
-        folder: gets ``samples.json`` and ``SEED.npz`` with ``range_m`` (H, W) in metres, 0 where nothing returned.
+        folder: gets ``samples.json`` and ``SEED.npz`` with ``range_m`` (H, W) in metres, 0 where nothing returned,
+            and ``reflectance`` in [0, 1] if the generator writes it.
         seeds: one a scan.
         sampling: choices, of the generator's own ``Sampling``; its defaults if not given.
         batch_size: scans drawn at once; the scans do not depend on it.
@@ -83,9 +84,12 @@ def write_samples(
         for first in range(0, len(missing), batch_size):
             some = missing[first : first + batch_size]
             images = generator.sample(some, sampling)
-            for seed, range_m in zip(some, images.range_m.cpu().numpy(), strict=True):
+            pixels = {"range_m": images.range_m.cpu().numpy()}
+            if images.reflectance is not None:
+                pixels["reflectance"] = images.reflectance.cpu().numpy()
+            for place, seed in enumerate(some):
                 with atomic_path(_file(folder, seed)) as temporary:
-                    np.savez_compressed(temporary, range_m=range_m)
+                    np.savez_compressed(temporary, **{name: of[place] for name, of in pixels.items()})
             progress.advance(len(some))
 
 
@@ -166,6 +170,7 @@ class _Files:
         try:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as opened:
                 range_m = opened["range_m"]
+                reflectance = opened.get("reflectance")
         except _UNREADABLE as error:
             raise ScanError(f"{path}, which cannot be read ({error})", "an .npz with range_m", cure) from None
         if range_m.shape != self._shape or range_m.dtype != np.float32:
@@ -174,7 +179,13 @@ class _Files:
             )
         if not ((range_m >= 0) & np.isfinite(range_m)).all():
             raise ScanError(f"ranges that are negative or no number in {path}", "metres, 0 for no return", cure)
-        return range_m, None
+        if reflectance is not None and not (
+            reflectance.shape == self._shape
+            and reflectance.dtype == np.float32
+            and ((reflectance >= 0) & (reflectance <= 1)).all()
+        ):
+            raise ScanError(f"a damaged reflectance in {path}", f"float32 {self._shape} in [0, 1]", cure)
+        return range_m, reflectance
 
 
 def _drawn_as(manifest: dict[str, Any]) -> str:

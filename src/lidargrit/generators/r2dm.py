@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import pickle
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -272,7 +273,8 @@ def load_published(path: Path, sensor: str = "hdl64e_kitti_360") -> R2dm:
     """
     wanted, cure = "a checkpoint of R2DM's authors", "download it again from kazuto1011/r2dm, release 'weights'"
     try:
-        file = torch.load(path, map_location="cpu", weights_only=True)
+        with warnings.catch_warnings(action="ignore"):  # of pickles in another dialect, which fail or load all the same
+            file = torch.load(path, map_location="cpu", weights_only=True)
         settings, published = dict(file["cfg"]), dict(file["ema_weights"])
         unet = UnetConfig(
             channels=int(settings["model_base_channels"]),

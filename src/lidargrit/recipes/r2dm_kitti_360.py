@@ -5,7 +5,7 @@ from lidargrit.loading import DataConfig
 from lidargrit.training import FitConfig, Recipe
 
 RECIPE = Recipe(
-    title="R2DM on KITTI-360 (set data.train and data.val to prepared scans, which keep the reflectance)",
+    title="R2DM on KITTI-360 (set data.train and data.val to kitti_360:ROOT:SPLIT)",
     generator="r2dm",
     model=R2dmConfig(),
     data=DataConfig(

@@ -1,0 +1,228 @@
+"""R2DM: its network against a slow one, its published layout, raydrop, completion, learning."""
+
+import math
+
+import pytest
+import torch
+
+from lidargrit.errors import CheckpointError, ConfigError
+from lidargrit.evaluation.samples import read_samples, write_samples
+from lidargrit.generators.r2dm import DiffusionSampling, R2dm, R2dmConfig, encode, load_published
+from lidargrit.nn.flops import flops_of
+from lidargrit.nn.unet import EfficientUnet, UnetConfig
+from lidargrit.sensors import load_sensor
+from lidargrit.structures import RangeImage
+from reference_unet import SlowUnet
+
+SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
+TINY = UnetConfig(8, (1, 2), (1, 1), norm_groups=2, attention_heads=2)
+PUBLISHED = {
+    "image_format": "log_depth",
+    "train_reflectance": True,
+    "resolution": (64, 1024),
+    "model_base_channels": 4,
+    "model_temb_channels": None,
+    "model_channel_multiplier": (1, 2, 1, 2),
+    "model_num_residual_blocks": 1,
+    "model_gn_num_groups": 2,
+    "model_attn_num_heads": 2,
+    "model_coords_embedding": "fourier_features",
+    "diffusion_objective": "eps",
+    "diffusion_beta_schedule": "cosine",
+    "diffusion_timesteps_type": "continuous",
+}
+
+
+def walls(count=2, reflectance=True):
+    rng = torch.Generator().manual_seed(0)
+    mask = torch.rand(count, 64, 32, generator=rng) < 0.8
+    range_m = torch.where(mask, (2 + 90 * torch.rand(count, 1, 32, generator=rng)).expand(-1, 64, -1), 0)
+    return RangeImage(range_m, mask, SENSOR, torch.rand(count, 64, 32, generator=rng) * mask if reflectance else None)
+
+
+def made(**settings):
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        return R2dm(R2dmConfig(TINY, **settings), SENSOR).eval()
+
+
+def seeded_checkpoint(prefix="denoiser"):
+    """Draw weights by name in the reference's layout, constants included, of a network that is small and whole."""
+    with torch.device("meta"):
+        angles = torch.zeros(64, 1024)
+        layout = EfficientUnet(UnetConfig(4, (1, 2, 1, 2), (1,) * 4, 2, 2), 2, angles, angles).state_dict()
+    rng = torch.Generator().manual_seed(5)
+    weights = {
+        f"{prefix}.{name}": torch.randn(of.shape, generator=rng) * (0.3 if of.ndim > 1 else 1.0)
+        for name, of in layout.items()
+    }
+    weights |= {
+        f"{prefix}.coords_embedding.freqs": torch.ones(16, 2, 1, 1),
+        f"{prefix}.coords_embedding.phase": torch.zeros(16),
+        f"{prefix}.d_block1.residual_blocks.0.scale": torch.tensor(math.sqrt(0.5)),
+        f"{prefix}.d_block2.downsample.1.kernel": torch.tensor([1, 3, 3, 1]) / 8,
+        "_dummy": torch.tensor([]),
+    }
+    return {"cfg": dict(PUBLISHED), "weights": {}, "ema_weights": weights, "global_step": 300_000}
+
+
+def test_the_published_size_has_the_published_parameters_and_operations():
+    with torch.device("meta"):
+        angles = torch.zeros(64, 1024)
+        network = EfficientUnet(UnetConfig(), 2, angles, angles)
+    assert sum(weight.numel() for weight in network.parameters()) == 31_099_650
+    # Measured in the reference: 229 GFLOP, by a counter that does not see into torch's own attention.
+    products = sum(2 * 1024 * (4 * width**2 + 2 * 1024 * width) for width in (512, 256))
+    assert (flops_of(network, (1, 2, 64, 1024), (1,)) - products) / 1e9 == pytest.approx(229, abs=0.5)
+
+
+def test_published_weights_give_what_a_slow_network_gives(tmp_path):
+    checkpoint = seeded_checkpoint()
+    torch.save(checkpoint, tmp_path / "weights.pth")
+    generator = load_published(tmp_path / "weights.pth")
+    rng = torch.Generator().manual_seed(1)
+    noisy = torch.randn(2, 2, 64, 1024, generator=rng)
+    log_snr = torch.tensor([-7.5, 2.25])
+    with torch.no_grad():
+        ours = generator.network(noisy, log_snr)
+    slow = SlowUnet(checkpoint["ema_weights"], blocks=1, groups=2, heads=2)
+    theirs = torch.from_numpy(slow(noisy[1].double().numpy(), 2.25)).float()
+    assert float(theirs.std()) > 0.1
+    assert torch.allclose(ours[1], theirs, atol=2e-3 * float(theirs.abs().max()))
+    assert not torch.allclose(ours[0], theirs, atol=0.1)
+    assert generator.config.reflectance
+    assert torch.equal(generator.network.coords, checkpoint["ema_weights"]["denoiser.coords"])
+
+
+def test_a_turned_image_gives_a_turned_answer_but_for_the_rays():
+    generator = made()
+    with torch.no_grad(), torch.random.fork_rng():
+        torch.manual_seed(3)
+        for weight in generator.parameters():
+            weight.copy_(0.2 * torch.randn(weight.shape))
+        generator.network.coords.zero_()
+        noisy = torch.randn(1, 2, 64, 32)
+        straight = generator.network(noisy, torch.tensor([0.0]))
+        turned = generator.network(noisy.roll(6, 3), torch.tensor([0.0]))
+    assert torch.allclose(turned, straight.roll(6, 3), atol=1e-4)
+
+
+def test_later_versions_of_the_layout_are_read_too(tmp_path):
+    for prefix in ("denoiser", "model"):
+        torch.save(seeded_checkpoint(prefix), tmp_path / f"{prefix}.pth")
+    first, second = (load_published(tmp_path / f"{name}.pth").state_dict() for name in ("denoiser", "model"))
+    assert all(torch.equal(first[name], second[name]) for name in first if name.startswith("network."))
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (
+            lambda c: c["cfg"].update(diffusion_objective="v"),
+            "diffusion_objective='v'; wanted diffusion_objective='eps'",
+        ),
+        (lambda c: c["cfg"].update(model_coords_embedding=None), "model_coords_embedding=None"),
+        (lambda c: c["cfg"].update(model_channel_multiplier=(1, 2)), "channel_multipliers"),
+        (lambda c: c["ema_weights"].pop("denoiser.in_conv.bias"), "lacks 'network.in_conv.bias'"),
+        (lambda c: c["ema_weights"].update({"denoiser.new": torch.ones(1)}), "has besides 'network.new'"),
+        (lambda c: c.pop("ema_weights"), r"cannot be read \(KeyError: 'ema_weights'\)"),
+    ],
+)
+def test_weights_of_another_form_are_refused(tmp_path, change, text):
+    checkpoint = seeded_checkpoint()
+    change(checkpoint)
+    torch.save(checkpoint, tmp_path / "weights.pth")
+    with pytest.raises((CheckpointError, ConfigError), match=text):
+        load_published(tmp_path / "weights.pth")
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"PK\x03\x04 cut", b"\x80\x04cos\nsystem\n.", b"\x80\x02cposix\nsystem\n.", b"words"]
+)
+def test_a_file_that_is_no_checkpoint_is_refused_and_never_run(tmp_path, content):
+    (tmp_path / "weights.pth").write_bytes(content)
+    with pytest.raises(CheckpointError, match=r"weights\.pth, which cannot be read"):
+        load_published(tmp_path / "weights.pth")
+
+
+def test_ranges_are_encoded_as_published_and_come_back():
+    sensor, images = load_sensor("hdl64e_kitti_360").with_columns(32), walls()
+    images = RangeImage(images.range_m.clamp(max=79.9), images.return_mask, sensor, images.reflectance)
+    encoded = encode(images, with_reflectance=True)
+    assert bool((encoded[:, 0][~images.return_mask] == -1).all())
+    near = RangeImage(torch.full((1, 64, 32), 1.45), torch.ones(1, 64, 32, dtype=torch.bool), sensor)
+    assert float(encode(near, with_reflectance=False)[0, 0, 0, 0]) == pytest.approx(-0.592, abs=1e-3)
+    back = R2dm(R2dmConfig(TINY), sensor)._decoded(encoded, DiffusionSampling())
+    assert torch.equal(back.return_mask, images.return_mask)
+    assert torch.allclose(back.range_m, images.range_m, rtol=1e-4)
+    assert torch.allclose(back.reflectance, images.reflectance, atol=1e-6)
+
+
+def test_calibrated_raydrop_returns_as_many_rays_as_the_training_scans():
+    generator = made(reflectance=False, calibration_scans=4)
+    with pytest.raises(ConfigError, match=r"raydrop=calibrated.*never fitted"):
+        generator.sample([0], DiffusionSampling(steps=2, raydrop="calibrated"))
+    generator.return_share.fill_(0.7)
+    generator.calibrate()
+    sampling = DiffusionSampling(steps=32, raydrop="calibrated")
+    assert float(generator.sample(range(4), sampling).return_mask.float().mean()) == pytest.approx(0.7, abs=0.03)
+
+
+def test_scans_without_reflectance_train_the_range_only():
+    images = walls(reflectance=False)
+    with pytest.raises(ConfigError, match=r"without reflectance.*model\.reflectance=false"):
+        made().objective("diffusion")(images, torch.Generator().manual_seed(0))
+    generator = made(reflectance=False)
+    assert bool(generator.objective("diffusion")(images, torch.Generator().manual_seed(0))["loss"].isfinite())
+    assert generator.sample([0], DiffusionSampling(steps=2)).reflectance is None
+
+
+def test_a_completed_scan_keeps_what_was_observed():
+    generator, images = made(), walls()
+    observed = torch.zeros(2, 64, 32, dtype=torch.bool)
+    observed[:, ::4] = True
+    done = generator.complete(images, observed, [0, 1], DiffusionSampling(steps=3, resamples=2))
+    for name in ("range_m", "return_mask", "reflectance"):
+        assert torch.equal(getattr(done, name)[observed], getattr(images, name)[observed])
+    assert not torch.equal(done.range_m[~observed], images.range_m[~observed])
+    other = RangeImage.masked(torch.full((2, 64, 32), 9.0), observed, SENSOR)  # nothing is known where not observed
+    hidden = RangeImage(
+        torch.where(observed, images.range_m, other.range_m),
+        torch.where(observed, images.return_mask, other.return_mask),
+        SENSOR,
+        torch.where(observed, images.reflectance, 0),
+    )
+    again = generator.complete(hidden, observed, [0, 1], DiffusionSampling(steps=3, resamples=2))
+    assert torch.equal(again.range_m, done.range_m)
+    with pytest.raises(ConfigError, match="1 seeds for 2 images"):
+        generator.complete(images, observed, [0])
+    with pytest.raises(ConfigError, match="observed at"):
+        generator.complete(images, observed[:1], [0, 1])
+
+
+def test_reflectance_is_saved_with_samples_and_read_back(tmp_path):
+    generator = made()
+    generator.save(tmp_path / "run")
+    write_samples(generator, tmp_path / "run", tmp_path / "out", [0, 1], DiffusionSampling(steps=2))
+    drawn, read = generator.sample([0, 1], DiffusionSampling(steps=2)), read_samples(tmp_path / "out").batch([0, 1])
+    assert torch.allclose(read.range_m, drawn.range_m)
+    assert torch.allclose(read.reflectance, drawn.reflectance)
+
+
+def test_an_image_is_learned_by_heart():
+    generator, images = made(reflectance=False), walls(1, reflectance=False)
+    objective = generator.objective("diffusion").train()
+    optimiser = torch.optim.Adam(objective.parameters(), lr=5e-3)
+    losses = []
+    batch = RangeImage.stack([images[0]] * 2)
+    for step in range(80):
+        loss = objective(batch, torch.Generator().manual_seed(step))["loss"]
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        losses.append(float(loss.detach()))
+    assert sum(losses[-20:]) < 0.7 * sum(losses[:20])
+    drawn = generator.sample([0], DiffusionSampling(steps=12))
+    unlearned = made(reflectance=False).sample([0], DiffusionSampling(steps=12))
+    error, before = (float((each.range_m - images.range_m).abs().mean()) for each in (drawn, unlearned))
+    assert error < 0.7 * before
