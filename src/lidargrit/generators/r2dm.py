@@ -26,6 +26,7 @@ from lidargrit.sensors import SensorModel, load_sensor
 from lidargrit.structures import RangeImage
 
 _BATCH = 8
+_FILE_BYTES_AT_MOST = 4 << 30  # the published ones, with optimiser and average, take half a gigabyte
 _SHARE_SCANS = 1000  # whose returns are counted: more would not change their share
 _CALIBRATION_SEED = 1 << 40  # of the first scan that is drawn for it: no one draws their samples there
 
@@ -273,6 +274,8 @@ def load_published(path: Path, sensor: str = "hdl64e_kitti_360") -> R2dm:
     """
     wanted, cure = "a checkpoint of R2DM's authors", "download it again from kazuto1011/r2dm, release 'weights'"
     try:
+        if not path.is_file() or path.stat().st_size > _FILE_BYTES_AT_MOST:  # opening a pipe would hang
+            raise ValueError("no file, or far too large a one")
         with warnings.catch_warnings(action="ignore"):  # of pickles in another dialect, which fail or load all the same
             file = torch.load(path, map_location="cpu", weights_only=True)
         settings, published = dict(file["cfg"]), dict(file["ema_weights"])

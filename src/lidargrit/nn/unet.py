@@ -249,22 +249,30 @@ class _Halve(nn.Module):
     """Weigh four neighbours by 1, 3, 3, 1 along each axis and keep every second; beyond the rows lie zeros."""
 
     def forward(self, x: Tensor) -> Tensor:
-        x = F.pad(x, (1, 1, 0, 0), mode="circular")
-        x = (x[..., :-2:2] + x[..., 3::2] + 3 * (x[..., 1:-1:2] + x[..., 2::2])) / 8
-        x = F.pad(x, (0, 0, 1, 1))
-        return (x[:, :, :-2:2] + x[:, :, 3::2] + 3 * (x[:, :, 1:-1:2] + x[:, :, 2::2])) / 8
+        even, odd = x.unflatten(-1, (-1, 2)).unbind(-1)
+        x = (odd.roll(1, -1) + even.roll(-1, -1) + 3 * (even + odd)) / 8
+        even, odd = x.unflatten(2, (-1, 2)).unbind(3)
+        return (_down(odd) + _up(even) + 3 * (even + odd)) / 8
 
 
 class _Double(nn.Module):
     """Put two pixels in the place of one, each three parts of it and one part of its nearer neighbour."""
 
     def forward(self, x: Tensor) -> Tensor:
-        x = F.pad(x, (1, 1, 0, 0), mode="circular")
-        middle = 3 * x[..., 1:-1]
-        x = torch.stack((middle + x[..., :-2], middle + x[..., 2:]), dim=-1).flatten(-2) / 4
-        x = F.pad(x, (0, 0, 1, 1))
-        middle = 3 * x[:, :, 1:-1]
-        return torch.stack((middle + x[:, :, :-2], middle + x[:, :, 2:]), dim=3).flatten(2, 3) / 4
+        thrice = 3 * x
+        x = torch.stack((thrice + x.roll(1, -1), thrice + x.roll(-1, -1)), dim=-1).flatten(-2) / 4
+        thrice = 3 * x
+        return torch.stack((thrice + _down(x), thrice + _up(x)), dim=3).flatten(2, 3) / 4
+
+
+def _down(x: Tensor) -> Tensor:
+    """Move every row one down; zeros come in."""
+    return F.pad(x[:, :, :-1], (0, 0, 1, 0))
+
+
+def _up(x: Tensor) -> Tensor:
+    """Move every row one up; zeros come in."""
+    return F.pad(x[:, :, 1:], (0, 0, 0, 1))
 
 
 def _silenced(layer: Layer) -> Layer:
