@@ -1,0 +1,372 @@
+"""DUSty: a GAN that draws a clean scan, then drops rays from it; seeds → range images."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.func import functional_call
+
+from lidargrit.errors import CheckpointError, ConfigError
+from lidargrit.generators import Cost, Generator
+from lidargrit.loading import seed_of
+from lidargrit.nn.dcgan import LEVELS, Discriminator, Synthesis, Widths, from_published
+from lidargrit.nn.differentiable_augmentation import (
+    AugmentationDefect,
+    DifferentiableAugmentation,
+    augment_differentiably,
+)
+from lidargrit.nn.flops import flops_of
+from lidargrit.projection import RangeEncoding
+from lidargrit.sensors import SensorModel
+from lidargrit.structures import RangeImage
+from lidargrit.tokenizers import MaskDecoding
+
+Variant = Literal["dusty_1", "dusty_2", "baseline"]
+
+_LOGITS: dict[Variant, int] = {"dusty_1": 1, "dusty_2": 2, "baseline": 0}  # maps of returns that the network draws
+_NO_RETURN = -1.0  # as an encoded range; the same as a return at the far limit
+
+# The search for the latent of a scan, after Karras et al., StyleGAN2, 2020, appendix D, with the numbers of the program.
+_NOISE, _NOISE_ENDS = 0.05, 0.75  # deviation of what is added to latents at first; the share of steps after which none is
+_RISE, _FALL = 0.05, 0.25  # shares of steps in which the rate rises from 0, and falls to 0
+
+
+@dataclass(frozen=True)
+class DustyConfig:
+    """Networks and losses of DUSty v1; the defaults are the published ones but for two that are named.
+
+    Args:
+        variant: ``dusty_1`` drops every ray by a probability of its own; ``dusty_2`` besides keeps or drops the scan as
+            a whole; ``baseline`` draws a range image with its holes, and far pixels are read as no return.
+        latent_dim: length of a latent.
+        channels: of the finest level of both networks; each of four coarser ones has twice as many,
+        max_channels: but not more than these.
+        temperature: of the returns' soft copy through which gradients flow.
+        penalty_weight: gamma of the penalty on the discriminator's gradient at real images (R1).
+        penalty_every: steps between two penalties, each of which then counts as many times. The program takes it at
+            every step, which takes twice the time.
+        augmentations: what the discriminator sees on all images; see lidargrit.nn.differentiable_augmentation.
+        augmentation_defects: those of the program to repeat; none by default.
+    """
+
+    variant: Variant = "dusty_1"
+    latent_dim: int = 512
+    channels: int = 64
+    max_channels: int = 512
+    temperature: float = 1.0
+    penalty_weight: float = 1.0
+    penalty_every: int = 16
+    augmentations: tuple[DifferentiableAugmentation, ...] = ("brightness", "contrast", "translation", "cutout")
+    augmentation_defects: tuple[AugmentationDefect, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("latent_dim", "channels", "max_channels", "penalty_every"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"{name}={getattr(self, name)}", "at least 1", "raise it")
+        if not (self.temperature > 0 and self.penalty_weight >= 0):
+            raise ConfigError(
+                f"temperature={self.temperature}, penalty_weight={self.penalty_weight}",
+                "a temperature above 0 and a weight of 0 or more",
+                "raise the one that is too low",
+            )
+
+
+@dataclass(frozen=True)
+class DustySampling:
+    """How scans are drawn, and how the latent of a given scan is searched.
+
+    Args:
+        mask: ``bernoulli`` draws each return with its probability, as the program does; ``threshold`` keeps what is at
+            least as likely as not.
+        raydrop_seed: mixed with a scan's seed for its raydrop only: another one drops other rays of the same scan.
+        tolerance: of ``baseline`` alone: what lies nearer than this to the far limit, in shares of the span of inverse
+            range, is no return. The published 0.008 was tuned on KITTI odometry; there it is 58 m.
+        search_steps: of the optimiser that looks for a latent.
+        search_rate: its learning rate at its highest.
+    """
+
+    mask: MaskDecoding = "bernoulli"
+    raydrop_seed: int = 0
+    tolerance: float = 0.008
+    search_steps: int = 1000
+    search_rate: float = 0.1
+
+    def __post_init__(self) -> None:
+        for name, least in (("raydrop_seed", 0), ("tolerance", 0), ("search_steps", 1), ("search_rate", 0)):
+            if not getattr(self, name) >= least:
+                raise ConfigError(f"{name}={getattr(self, name)}", f"at least {least}", "raise it")
+
+
+class Dusty(Generator):
+    """A generative adversarial network over inverse range, whose raydrop is a stage of its own.
+
+    Source:
+        Nakashima and Kurazume, Learning to Drop Points for LiDAR Scan Synthesis, IROS 2021; kazuto1011/dusty-gan@0374a5e,
+        MIT.
+    """
+
+    Config = DustyConfig
+    Sampling = DustySampling
+    stages = ("adversarial",)
+    capabilities = frozenset({"complete", "invert"})
+
+    def __init__(self, config: DustyConfig, sensor: SensorModel) -> None:
+        super().__init__(config, sensor)
+        _check_size(sensor)
+        self.config, self.sensor = config, sensor
+        self.encoding = InverseRange(sensor)
+        self.synthesis = Synthesis(config.latent_dim, _widths(config), _size(sensor), _LOGITS[config.variant])
+
+    def objective(self, stage: str) -> nn.Module:
+        """Return the game of the network against a discriminator."""
+        return Game(self.synthesis, self.config, self.sensor)
+
+    def finish(self, stage: str, objective: nn.Module) -> None:
+        """Take over the trained network; its discriminator has done its work."""
+        assert isinstance(objective, Game)
+        self.synthesis.load_state_dict(objective.synthesis.state_dict())
+
+    @torch.no_grad()
+    def sample(self, seeds: Sequence[int], sampling: DustySampling | None = None) -> RangeImage:
+        """Write one scan for each seed; a seed gives the same scan whatever the others are."""
+        self.eval()
+        return self._draw(self._normal(seeds, 1)[:, 0], seeds, sampling or DustySampling())
+
+    def cost(self, sampling: DustySampling | None = None) -> Cost:
+        """Return one pass of the network."""
+        return Cost(1, flops_of(self.synthesis, (1, self.config.latent_dim)))
+
+    def invert(
+        self, images: RangeImage, seeds: Sequence[int], sampling: DustySampling | None = None
+    ) -> RangeImage:
+        """Return for each scan the nearest that the network draws, as far as a search from a seed finds it."""
+        sampling = sampling or DustySampling()
+        latents = self._search(images, images.return_mask, seeds, sampling)
+        with torch.no_grad():
+            return self._draw(latents, seeds, sampling)
+
+    def complete(
+        self,
+        images: RangeImage,
+        observed: Bool[Tensor, "B H W"],
+        seeds: Sequence[int],
+        sampling: DustySampling | None = None,
+    ) -> RangeImage:
+        """Return what was observed, and elsewhere the nearest scan that the network draws."""
+        sampling = sampling or DustySampling()
+        latents = self._search(images, images.return_mask & observed, seeds, sampling)
+        with torch.no_grad():
+            drawn = self._draw(latents, seeds, sampling).to(images.range_m.device)
+        range_m = torch.where(observed, images.range_m, drawn.range_m)
+        return RangeImage(range_m, range_m > 0, self.sensor)
+
+    def _draw(self, latents: Tensor, seeds: Sequence[int], sampling: DustySampling) -> RangeImage:
+        encoded, logits = self.synthesis(latents)
+        range_m = self.encoding.decode(encoded[:, 0])
+        if logits is None:
+            returned = encoded[:, 0] > _NO_RETURN + 2 * sampling.tolerance
+        else:
+            returned = logits[:, 0] + self._logistic(seeds, sampling) > 0
+            if logits.shape[1] > 1:
+                returned &= logits[:, 1] > 0
+        return RangeImage.masked(range_m, returned, self.sensor)
+
+    def _logistic(self, seeds: Sequence[int], sampling: DustySampling) -> Tensor:
+        """Return what is added to logits, whose signs then are draws; numbers of their own for each seed."""
+        if sampling.mask == "threshold":
+            return self._latent_like(torch.zeros(()))
+        rngs = [torch.Generator().manual_seed(seed_of(seed, sampling.raydrop_seed)) for seed in seeds]
+        return self._latent_like(torch.stack([logistic_noise(_size(self.sensor), rng) for rng in rngs]))
+
+    def _normal(self, seeds: Sequence[int], count: int) -> Float[Tensor, "B count D"]:
+        """Draw latents for each seed, on the CPU: the same numbers on every device."""
+        rngs = [torch.Generator().manual_seed(seed) for seed in seeds]
+        size = (count, self.config.latent_dim)
+        return self._latent_like(torch.stack([torch.randn(size, generator=rng) for rng in rngs]))
+
+    def _latent_like(self, tensor: Tensor) -> Tensor:
+        return tensor.to(self.synthesis.project.weight)
+
+    def _search(
+        self, images: RangeImage, known: Bool[Tensor, "B H W"], seeds: Sequence[int], sampling: DustySampling
+    ) -> Float[Tensor, "B D"]:
+        """Return the latents whose clean ranges are nearest to the known returns: mean distance of inverse ranges.
+
+        Latents stay on the sphere on which almost all random ones lie, and are shaken at first, to leave dead ends.
+        """
+        self.eval()
+        steps, device = sampling.search_steps, self.synthesis.project.weight.device
+        target, known = self.encoding.encode(images.to(device)), known.to(device)
+        draws = self._normal(seeds, steps + 1)
+        latents = _on_sphere(draws[:, 0]).requires_grad_()
+        optimiser = torch.optim.Adam([latents], lr=sampling.search_rate)
+        weights = {name: weight.detach() for name, weight in self.synthesis.named_parameters()}
+        for step in range(steps):
+            done = step / steps
+            optimiser.param_groups[0]["lr"] = sampling.search_rate * _rate_at(done)
+            shaken = latents + _NOISE * max(0.0, 1 - done / _NOISE_ENDS) ** 2 * draws[:, step + 1]
+            with torch.enable_grad():
+                encoded, _ = functional_call(self.synthesis, weights, (shaken,))
+                error = ((encoded - target)[:, 0].abs() * known).sum((1, 2)) / known.sum((1, 2)).clamp(min=1)
+                (latents.grad,) = torch.autograd.grad(error.sum() / 2, latents)
+            optimiser.step()
+            latents.data = _on_sphere(latents.data)
+        return latents.detach()
+
+    @classmethod
+    def from_published(cls, path: Path, sensor: SensorModel) -> Dusty:
+        """Make a generator of a checkpoint of the program, whose moving average is taken; nothing but tensors is read.
+
+        Raises:
+            CheckpointError: no such file, or one that holds something else, or a model of another size of images.
+        """
+        weights = from_published(_read_published(path))
+        try:
+            logits = weights["return_head.weight"].shape[1] if "return_head.weight" in weights else 0
+            config = DustyConfig(
+                variant=next(name for name, count in _LOGITS.items() if count == logits),
+                latent_dim=weights["project.weight"].shape[0],
+                channels=weights["range_head.weight"].shape[0],
+                max_channels=weights["project.weight"].shape[1],
+                penalty_every=1,
+            )
+        except (KeyError, IndexError, StopIteration):
+            raise _unfit(path, "which holds no generator of DUSty v1") from None
+        generator = cls.from_weights(config, sensor, weights, path)
+        assert isinstance(generator, Dusty)
+        return generator
+
+
+class InverseRange:
+    """Ranges as DUSty's networks see them: 1 at the near limit, linear in 1 / range, -1 at the far one and no return."""
+
+    def __init__(self, sensor: SensorModel) -> None:
+        self._nearest_first = RangeEncoding("inverse", sensor.range_min_m, sensor.range_max_m)
+
+    def encode(self, images: RangeImage) -> Float[Tensor, "B 1 H W"]:
+        """Encode a batch."""
+        everywhere = torch.ones_like(images.return_mask)
+        encoded = -self._nearest_first.encode(images.range_m, everywhere)
+        return torch.where(images.return_mask, encoded, _NO_RETURN)[:, None]
+
+    def decode(self, encoded: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+        """Return metres."""
+        return self._nearest_first.decode(-encoded)
+
+
+class Game(nn.Module):
+    """What DUSty trains: two players who take turns, each with the same random numbers.
+
+    The discriminator learns to tell real scans from drawn ones, the network to be taken for real (the non-saturating
+    loss of Goodfellow et al., 2014). Every so often the discriminator's gradient at real scans is held down (R1,
+    Mescheder et al., 2018). It sees the composed image only, never the mask.
+    """
+
+    phases = ("discriminator", "generator")
+    turns: Tensor
+
+    def __init__(self, synthesis: Synthesis, config: DustyConfig, sensor: SensorModel) -> None:
+        super().__init__()
+        self.config, self.sensor, self.encoding = config, sensor, InverseRange(sensor)
+        self.synthesis, self.discriminator = synthesis, Discriminator(_widths(config), _size(sensor))
+        self.register_buffer("turns", torch.zeros((), dtype=torch.int64))  # of the discriminator
+
+    def forward(self, images: RangeImage, rng: torch.Generator, phase: str) -> dict[str, Tensor]:
+        """Return a player's loss; the other one's weights are out of its reach."""
+        if phase == "discriminator":
+            with torch.no_grad():
+                drawn, _ = self._draw(len(images), rng)
+            return self._discriminate(self.encoding.encode(images), drawn, rng)
+        drawn, return_rate = self._draw(len(images), rng)
+        frozen = {name: weight.detach() for name, weight in self.discriminator.named_parameters()}
+        logits = functional_call(self.discriminator, frozen, (self._augment(drawn, rng),))
+        real_rate = images.return_mask.float().mean()
+        return {"loss": F.softplus(-logits.float()).mean(), "return_rate": return_rate, "real_return_rate": real_rate}
+
+    def _discriminate(self, real: Tensor, drawn: Tensor, rng: torch.Generator) -> dict[str, Tensor]:
+        seen, config = self._augment(real, rng), self.config
+        takes_penalty = False
+        if self.training:
+            self.turns += 1
+            takes_penalty = config.penalty_weight > 0 and int(self.turns) % config.penalty_every == 0
+        seen.requires_grad_(takes_penalty)
+        of_real = self.discriminator(seen).float()
+        of_drawn = self.discriminator(self._augment(drawn, rng)).float()
+        loss = F.softplus(-of_real).mean() + F.softplus(of_drawn).mean()
+        terms = {"loss": loss, "real_logit": of_real.mean(), "drawn_logit": of_drawn.mean()}
+        if takes_penalty:
+            (gradient,) = torch.autograd.grad(of_real.sum(), seen, create_graph=True)
+            penalty = gradient.float().square().sum((1, 2, 3)).mean()
+            terms["squared_gradient"] = penalty
+            terms["loss"] = loss + config.penalty_weight / 2 * config.penalty_every * penalty
+        return terms
+
+    def _draw(self, count: int, rng: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Draw encoded scans, and tell the share of pixels that return."""
+        latents = torch.randn(count, self.config.latent_dim, generator=rng, device=rng.device)
+        encoded, logits = self.synthesis(latents)
+        if logits is None:
+            return encoded, (encoded.detach() > _NO_RETURN + 2 * DustySampling().tolerance).float().mean()
+        noise = logistic_noise((count, 1, *encoded.shape[-2:]), rng)
+        returned = straight_through(logits[:, :1], noise, self.config.temperature)
+        if logits.shape[1] > 1:
+            whole = logistic_noise((count, 1, 1, 1), rng) if self.training else torch.zeros_like(noise[..., :1, :1])
+            returned = returned * straight_through(logits[:, 1:], whole, self.config.temperature)
+        return returned * encoded + (1 - returned) * _NO_RETURN, returned.detach().mean()
+
+    def _augment(self, images: Tensor, rng: torch.Generator) -> Tensor:
+        return augment_differentiably(images, self.config.augmentations, self.config.augmentation_defects, rng)
+
+
+def logistic_noise(size: tuple[int, ...], rng: torch.Generator) -> Float[Tensor, "*size"]:
+    """Draw numbers that turn a logit into a coin: logit + noise > 0 with the logit's probability."""
+    uniform = torch.rand(size, generator=rng, device=rng.device).clamp(min=torch.finfo(torch.float32).tiny)
+    return uniform.log() - (-uniform).log1p()
+
+
+def straight_through(
+    logits: Float[Tensor, "*shape"], noise: Float[Tensor, "*#shape"], temperature: float
+) -> Float[Tensor, "*shape"]:
+    """Draw 0 or 1, with the gradient of a sigmoid as steep as the temperature is low.
+
+    Source:
+        Maddison et al., The Concrete Distribution, 2017; Jang et al., Gumbel-Softmax, 2017, section 2.2.
+    """
+    soft = torch.sigmoid((logits.float() + noise) / temperature)
+    return ((soft > 0.5).float() - soft).detach() + soft
+
+
+def _widths(config: DustyConfig) -> Widths:
+    return Widths(config.channels, config.max_channels)
+
+
+def _size(sensor: SensorModel) -> tuple[int, int]:
+    return sensor.height, sensor.width
+
+
+def _check_size(sensor: SensorModel) -> None:
+    unit = 1 << LEVELS
+    if sensor.height % unit or sensor.width % unit or sensor.height < 2 * unit:
+        raise ConfigError(
+            f"range images of {sensor.height}x{sensor.width}",
+            f"rows and columns in multiples of {unit}, and at least {2 * unit} rows",
+            "choose another sensor, or data.columns and data.column_stride",
+        )
+
+
+def _on_sphere(latents: Tensor) -> Tensor:
+    return latents / latents.square().mean(dim=1, keepdim=True).add(1e-9).sqrt()
+
+
+def _rate_at(done: float) -> float:
+    """Return the share of the search's rate after a share of its steps."""
+    fall = 0.5 - 0.5 * math.cos(math.pi * min(1.0, (1 - done) / _FALL))
+    return fall * min(1.0, done / _RISE)
