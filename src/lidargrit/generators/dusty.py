@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +23,9 @@ from lidargrit.nn.differentiable_augmentation import (
     augment_differentiably,
 )
 from lidargrit.nn.flops import flops_of
+from lidargrit.nn.latent_search import search_latents
+from lidargrit.nn.published import read_checkpoint
+from lidargrit.nn.raydrop import logistic_noise, straight_through
 from lidargrit.projection import RangeEncoding
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
@@ -34,9 +36,7 @@ Variant = Literal["dusty_1", "dusty_2", "baseline"]
 _LOGITS: dict[Variant, int] = {"dusty_1": 1, "dusty_2": 2, "baseline": 0}  # maps of returns that the network draws
 _NO_RETURN = -1.0  # as an encoded range; the same as a return at the far limit
 
-# The search for the latent of a scan, after Karras et al., StyleGAN2, 2020, appendix D, with the numbers of the program.
-_NOISE, _NOISE_ENDS = 0.05, 0.75  # deviation of what is added to latents at first; the share of steps after which none is
-_RISE, _FALL = 0.05, 0.25  # shares of steps in which the rate rises from 0, and falls to 0
+_PUBLISHED_BYTES_AT_MOST = 2**29  # weights, their average and the optimiser of a published model take 350 MB
 
 
 @dataclass(frozen=True)
@@ -144,9 +144,7 @@ class Dusty(Generator):
         """Return one pass of the network."""
         return Cost(1, flops_of(self.synthesis, (1, self.config.latent_dim)))
 
-    def invert(
-        self, images: RangeImage, seeds: Sequence[int], sampling: DustySampling | None = None
-    ) -> RangeImage:
+    def invert(self, images: RangeImage, seeds: Sequence[int], sampling: DustySampling | None = None) -> RangeImage:
         """Return for each scan the nearest that the network draws, as far as a search from a seed finds it."""
         sampling = sampling or DustySampling()
         latents = self._search(images, images.return_mask, seeds, sampling)
@@ -198,28 +196,16 @@ class Dusty(Generator):
     def _search(
         self, images: RangeImage, known: Bool[Tensor, "B H W"], seeds: Sequence[int], sampling: DustySampling
     ) -> Float[Tensor, "B D"]:
-        """Return the latents whose clean ranges are nearest to the known returns: mean distance of inverse ranges.
-
-        Latents stay on the sphere on which almost all random ones lie, and are shaken at first, to leave dead ends.
-        """
+        """Return the latents whose clean ranges are nearest to the known returns: mean distance of inverse ranges."""
         self.eval()
-        steps, device = sampling.search_steps, self.synthesis.project.weight.device
-        target, known = self.encoding.encode(images.to(device)), known.to(device)
-        draws = self._normal(seeds, steps + 1)
-        latents = _on_sphere(draws[:, 0]).requires_grad_()
-        optimiser = torch.optim.Adam([latents], lr=sampling.search_rate)
-        weights = {name: weight.detach() for name, weight in self.synthesis.named_parameters()}
-        for step in range(steps):
-            done = step / steps
-            optimiser.param_groups[0]["lr"] = sampling.search_rate * _rate_at(done)
-            shaken = latents + _NOISE * max(0.0, 1 - done / _NOISE_ENDS) ** 2 * draws[:, step + 1]
-            with torch.enable_grad():
-                encoded, _ = functional_call(self.synthesis, weights, (shaken,))
-                error = ((encoded - target)[:, 0].abs() * known).sum((1, 2)) / known.sum((1, 2)).clamp(min=1)
-                (latents.grad,) = torch.autograd.grad(error.sum() / 2, latents)
-            optimiser.step()
-            latents.data = _on_sphere(latents.data)
-        return latents.detach()
+        device = self.synthesis.project.weight.device
+        target, known = self.encoding.encode(images.to(device))[:, 0], known.to(device)
+
+        def error_of(latents: Tensor) -> Tensor:
+            distance = (self.synthesis(latents)[0][:, 0] - target).abs() / 2
+            return (distance * known).sum((1, 2)) / known.sum((1, 2)).clamp(min=1)
+
+        return search_latents(error_of, self._normal(seeds, sampling.search_steps + 1), sampling.search_rate)
 
     @classmethod
     def from_published(cls, path: Path, sensor: SensorModel) -> Dusty:
@@ -228,7 +214,7 @@ class Dusty(Generator):
         Raises:
             CheckpointError: no such file, or one that holds something else, or a model of another size of images.
         """
-        weights = from_published(_read_published(path))
+        weights = from_published(read_checkpoint(path, ("G_ema",), _PUBLISHED_BYTES_AT_MOST))
         try:
             logits = weights["return_head.weight"].shape[1] if "return_head.weight" in weights else 0
             config = DustyConfig(
@@ -239,7 +225,9 @@ class Dusty(Generator):
                 penalty_every=1,
             )
         except (KeyError, IndexError, StopIteration):
-            raise _unfit(path, "which holds no generator of DUSty v1") from None
+            raise CheckpointError(
+                f"{path}, whose 'G_ema' is no generator of DUSty v1", "one that its program saved", "check the path"
+            ) from None
         generator = cls.from_weights(config, sensor, weights, path)
         assert isinstance(generator, Dusty)
         return generator
@@ -326,24 +314,6 @@ class Game(nn.Module):
         return augment_differentiably(images, self.config.augmentations, self.config.augmentation_defects, rng)
 
 
-def logistic_noise(size: tuple[int, ...], rng: torch.Generator) -> Float[Tensor, "*size"]:
-    """Draw numbers that turn a logit into a coin: logit + noise > 0 with the logit's probability."""
-    uniform = torch.rand(size, generator=rng, device=rng.device).clamp(min=torch.finfo(torch.float32).tiny)
-    return uniform.log() - (-uniform).log1p()
-
-
-def straight_through(
-    logits: Float[Tensor, "*shape"], noise: Float[Tensor, "*#shape"], temperature: float
-) -> Float[Tensor, "*shape"]:
-    """Draw 0 or 1, with the gradient of a sigmoid as steep as the temperature is low.
-
-    Source:
-        Maddison et al., The Concrete Distribution, 2017; Jang et al., Gumbel-Softmax, 2017, section 2.2.
-    """
-    soft = torch.sigmoid((logits.float() + noise) / temperature)
-    return ((soft > 0.5).float() - soft).detach() + soft
-
-
 def _widths(config: DustyConfig) -> Widths:
     return Widths(config.channels, config.max_channels)
 
@@ -360,13 +330,3 @@ def _check_size(sensor: SensorModel) -> None:
             f"rows and columns in multiples of {unit}, and at least {2 * unit} rows",
             "choose another sensor, or data.columns and data.column_stride",
         )
-
-
-def _on_sphere(latents: Tensor) -> Tensor:
-    return latents / latents.square().mean(dim=1, keepdim=True).add(1e-9).sqrt()
-
-
-def _rate_at(done: float) -> float:
-    """Return the share of the search's rate after a share of its steps."""
-    fall = 0.5 - 0.5 * math.cos(math.pi * min(1.0, (1 - done) / _FALL))
-    return fall * min(1.0, done / _RISE)

@@ -49,9 +49,7 @@ class Engine:
                 break
         return terms
 
-    def _step(
-        self, images: RangeImage, seed: int, gradient_clip: float, phase: str
-    ) -> tuple[dict[str, Tensor], bool]:
+    def _step(self, images: RangeImage, seed: int, gradient_clip: float, phase: str) -> tuple[dict[str, Tensor], bool]:
         terms = self._objective(lambda: images, seed, phase)
         if not bool(terms["loss"].isfinite()):
             return terms, False

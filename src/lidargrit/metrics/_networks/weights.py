@@ -12,19 +12,18 @@ import tarfile
 import time
 import urllib.error
 import urllib.request
-import zipfile
 import zlib
 from collections.abc import Generator
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import torch
 from torch import Tensor
 
 from lidargrit.errors import WeightsError
 from lidargrit.files import atomic_path
 from lidargrit.loading import cache_folder
+from lidargrit.nn.published import RefusedFileError, float_tensors, unpickle
 from lidargrit.reporting import Reporter
 
 FOLDER_VARIABLE = "LIDARGRIT_WEIGHTS"
@@ -33,7 +32,6 @@ FOLDER_VARIABLE = "LIDARGRIT_WEIGHTS"
 _TIMEOUT_S = 30.0  # without a byte: longer than any server that works takes to answer
 _AGAIN_S = 60.0  # after a failure, for as long, nobody is asked again: every variant of every metric would wait
 _CHUNK = 2**20  # bytes at a time: a progress bar that moves, and little memory
-_ZIP, _PICKLE = b"PK\x03\x04", b"\x80"  # how files of torch.save begin: since version 1.6, and before it
 
 _failures: dict[str, tuple[float, str]] = {}  # by address: when, and why
 
@@ -108,16 +106,12 @@ def read_weights(published: PublishedWeights, path: Path) -> tuple[dict[str, Ten
         tensors = {
             prefix + name: tensor
             for prefix, part in parts.items()
-            for name, tensor in _tensors(part, published.bytes_at_most).items()
+            for name, tensor in float_tensors(unpickle(part), published.bytes_at_most).items()
             if not name.endswith("num_batches_tracked")
         }
-    except _Refused as why:
+    except RefusedFileError as why:
         raise _unfit(published, f"{path}, {why}") from None
     return tensors, checksum
-
-
-class _Refused(Exception):  # noqa: N818  it never leaves this file
-    """Why a file is not read; follows its name in a sentence."""
 
 
 def _members(published: PublishedWeights, data: bytes) -> dict[str, bytes]:
@@ -133,16 +127,16 @@ def _members(published: PublishedWeights, data: bytes) -> dict[str, bytes]:
                 if prefix is None or member.type not in {tarfile.REGTYPE, tarfile.AREGTYPE}:  # a sparse one may swell
                     continue
                 if prefix in found:
-                    raise _Refused(f"which holds {member.name!r} twice")
+                    raise RefusedFileError(f"which holds {member.name!r} twice")
                 if member.size > published.bytes_at_most:
-                    raise _Refused(f"whose {member.name!r} is too large")
+                    raise RefusedFileError(f"whose {member.name!r} is too large")
                 reader = archive.extractfile(member)
                 assert reader is not None  # it is for links only
                 found[prefix] = reader.read()
     except (OSError, EOFError, tarfile.TarError, zlib.error, ValueError) as error:
-        raise _Refused(f"which is no whole .tar.gz ({error})") from None
+        raise RefusedFileError(f"which is no whole .tar.gz ({error})") from None
     if missing := [name for name, prefix in published.members.items() if prefix not in found]:
-        raise _Refused(f"which lacks {' and '.join(map(repr, missing))}")
+        raise RefusedFileError(f"which lacks {' and '.join(map(repr, missing))}")
     return found
 
 
@@ -156,41 +150,8 @@ class _Bounded(io.RawIOBase):
         data = self._stream.read(min(size, self._left + 1) if size >= 0 else self._left + 1)
         self._left -= len(data)
         if self._left < 0:
-            raise _Refused("which unpacks to too much")
+            raise RefusedFileError("which unpacks to too much")
         return data
-
-
-def _tensors(data: bytes, at_most: int) -> dict[str, Tensor]:
-    if data.startswith(_ZIP):
-        _refuse_swelling(data)
-    elif not data.startswith(_PICKLE):
-        raise _Refused("which is no file of torch.save")
-    try:
-        loaded = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
-    except Exception as error:  # whatever a stranger's file does to the reader, it is the file's fault
-        raise _Refused(f"which does not hold tensors only ({type(error).__name__})") from None
-    if not isinstance(loaded, dict) or not all(isinstance(name, str) for name in loaded):
-        raise _Refused("which holds no tensors by name")
-    tensors = {name: value for name, value in loaded.items() if not name.endswith("num_batches_tracked")}
-    for name, value in tensors.items():
-        # Numbers that lie nowhere, or are repeated to fill a large tensor, take no room in the file.
-        plain = isinstance(value, Tensor) and value.layout == torch.strided and value.device.type == "cpu"
-        if not plain or value.dtype != torch.float32 or 4 * value.numel() > at_most:
-            raise _Refused(f"whose {name!r} is no float32 tensor of a network")
-    return {name: value.detach().contiguous() for name, value in tensors.items()}
-
-
-def _refuse_swelling(data: bytes) -> None:
-    """Refuse a zip that is more than it seems; PyTorch itself stores without compression."""
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            entries = archive.infolist()
-    except (zipfile.BadZipFile, ValueError, NotImplementedError) as error:
-        raise _Refused(f"which is no whole file of torch.save ({error})") from None
-    if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
-        raise _Refused("whose tensors are compressed, as PyTorch does not write them")
-    if sum(entry.file_size for entry in entries) > len(data):
-        raise _Refused("whose parts overlap")
 
 
 def _fetch(published: PublishedWeights, target: Path, reporter: Reporter) -> None:

@@ -1,0 +1,96 @@
+"""A file of torch.save, which may be anybody's → the tensors in it, by name, and nothing else."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lidargrit.errors import CheckpointError
+
+_ZIP, _PICKLE = b"PK\x03\x04", b"\x80"  # how files of torch.save begin: since version 1.6, and before it
+
+
+class RefusedFileError(Exception):
+    """Why a file is not read; follows its name in a sentence."""
+
+
+def read_checkpoint(path: Path, place: Sequence[str], bytes_at_most: int) -> dict[str, Tensor]:
+    """Return the weights of one network in a checkpoint of another program.
+
+    Args:
+        path: of the file.
+        place: names that lead to the weights, such as ``("G_ema",)``; they are all that is looked at.
+        bytes_at_most: of the file; a larger one is refused unread.
+
+    Raises:
+        CheckpointError: no file, too large a one, or anything but float32 tensors in that place.
+    """
+    try:
+        if not path.is_file():  # a pipe would hang
+            raise RefusedFileError("which is no file")
+        with path.open("rb") as file:
+            data = file.read(bytes_at_most + 1)
+        if len(data) > bytes_at_most:
+            raise RefusedFileError(f"which is larger than {bytes_at_most / 1e6:.0f} MB")
+        found = unpickle(data)
+        for name in place:
+            if not isinstance(found, dict) or name not in found:
+                raise RefusedFileError(f"which holds no {name!r}")
+            found = found[name]
+        return float_tensors(found, bytes_at_most)
+    except (RefusedFileError, OSError) as why:
+        raise CheckpointError(
+            f"{path}, {why}", f"a checkpoint with weights at {'.'.join(place)!r}", "check the path"
+        ) from None
+
+
+def unpickle(data: bytes) -> Any:
+    """Return what a file of torch.save holds; no code in it is run.
+
+    Raises:
+        RefusedFileError: it holds more than tensors, numbers and their containers, or more than it seems to.
+    """
+    if data.startswith(_ZIP):
+        _refuse_swelling(data)
+    elif not data.startswith(_PICKLE):
+        raise RefusedFileError("which is no file of torch.save")
+    try:
+        return torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    except Exception as error:  # whatever a stranger's file does to the reader, it is the file's fault
+        raise RefusedFileError(f"which does not hold tensors only ({type(error).__name__})") from None
+
+
+def float_tensors(loaded: object, bytes_at_most: int) -> dict[str, Tensor]:
+    """Return float32 tensors by their names, in memory of their own, without the counters that training keeps.
+
+    Raises:
+        RefusedFileError: anything else was loaded, or a tensor is larger than the limit.
+    """
+    if not isinstance(loaded, dict) or not all(isinstance(name, str) for name in loaded):
+        raise RefusedFileError("which holds no tensors by name")
+    tensors = {name: value for name, value in loaded.items() if not name.endswith("num_batches_tracked")}
+    for name, value in tensors.items():
+        # Numbers that lie nowhere, or are repeated to fill a large tensor, take no room in the file.
+        plain = isinstance(value, Tensor) and value.layout == torch.strided and value.device.type == "cpu"
+        if not plain or value.dtype != torch.float32 or 4 * value.numel() > bytes_at_most:
+            raise RefusedFileError(f"whose {name!r} is no float32 tensor of a network")
+    return {name: value.detach().contiguous() for name, value in tensors.items()}
+
+
+def _refuse_swelling(data: bytes) -> None:
+    """Refuse a zip that is more than it seems; PyTorch itself stores without compression."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            entries = archive.infolist()
+    except (zipfile.BadZipFile, ValueError, NotImplementedError) as error:
+        raise RefusedFileError(f"which is no whole file of torch.save ({error})") from None
+    if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
+        raise RefusedFileError("whose tensors are compressed, as PyTorch does not write them")
+    if sum(entry.file_size for entry in entries) > len(data):
+        raise RefusedFileError("whose parts overlap")

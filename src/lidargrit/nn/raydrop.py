@@ -1,0 +1,28 @@
+"""Coins that gradients flow through: logits of a return → 0 or 1 for each ray."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def logistic_noise(size: tuple[int, ...], rng: torch.Generator) -> Float[Tensor, "..."]:
+    """Draw numbers that turn a logit into a coin: logit + noise is above 0 with the logit's probability."""
+    uniform = torch.rand(size, generator=rng, device=rng.device).clamp(min=torch.finfo(torch.float32).tiny)
+    return uniform.log() - (-uniform).log1p()
+
+
+def straight_through(logits: Tensor, noise: Tensor, temperature: float) -> Float[Tensor, "..."]:
+    """Return 0 or 1 by the sign of logits + noise, with the gradient of a sigmoid as steep as the temperature is low.
+
+    Args:
+        logits: of 1.
+        noise: of the same shape, or one that fits; see :func:`logistic_noise`.
+        temperature: above 0.
+
+    Source:
+        Maddison et al., The Concrete Distribution, 2017; Jang et al., Gumbel-Softmax, 2017, section 2.2.
+    """
+    soft = torch.sigmoid((logits.float() + noise) / temperature)
+    return ((soft > 0.5).float() - soft).detach() + soft
