@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 import torch.nn.functional as F
@@ -85,7 +86,7 @@ class Discriminator(nn.Module):
     def __init__(self, widths: Widths, size: tuple[int, int]) -> None:
         super().__init__()
         inputs = [2, *(widths.at(level) for level in range(LEVELS))]
-        self.down = nn.ModuleList(_Convolution(a, b, (4, 4), 2) for a, b in zip(inputs[:-1], inputs[1:], strict=True))
+        self.down = nn.ModuleList(_Convolution(a, b, (4, 4), 2) for a, b in pairwise(inputs))
         self.verdict = _Convolution(inputs[-1], 1, (size[0] >> LEVELS, size[1] >> LEVELS), 1)
 
     def forward(self, images: Float[Tensor, "B 1 H W"]) -> Float[Tensor, "B"]:

@@ -29,9 +29,9 @@ class Fit:
 
     Args:
         objective: a module that turns (range image, random generator) into terms, one of them ``loss``; it has a
-            ``sensor`` and may have ``warnings()``, lines that a person should see. One of several players who take turns
-            names them in ``phases``: every step asks it once for each, with the name as third argument, and moves the
-            weights that this player's loss reaches before it asks for the next; terms are logged under the name.
+            ``sensor`` and may have ``warnings()``, lines that a person should see. One of several players names them in
+            ``phases``; every step asks it once for each, with the name as third argument, and moves the weights that
+            this player's loss reaches before it asks for the next.
         config: how it learns.
         folder: where ``checkpoint.safetensors`` and ``log.jsonl`` lie.
         seed: of order, augmentation, dropout and draws.
