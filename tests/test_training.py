@@ -34,6 +34,17 @@ TINY = [
         for setting in ("scans=12", "batch_size=2", "precision=fp32", "checkpoint_every=4", "validate_every=100")
     ],
 ]
+TINY_GAN = [
+    *TINY[:4],
+    "model.latent_dim=8",
+    "model.channels=4",
+    "model.max_channels=8",
+    "model.penalty_every=4",
+    *[
+        f"training.adversarial.{setting}"
+        for setting in ("scans=24", "batch_size=2", "precision=fp32", "checkpoint_every=4", "validate_every=8")
+    ],
+]
 
 
 @pytest.fixture(autouse=True)
@@ -78,10 +89,18 @@ class StopAfter(Reporter):
 
 
 @pytest.mark.parametrize(
-    ("stage", "scans"), [("tokenizer", 6), ("tokenizer", 8), ("transformer", 2), ("transformer", 10)]
+    ("recipe", "stage", "scans"),
+    [
+        (("demo", TINY), "tokenizer", 6),
+        (("demo", TINY), "tokenizer", 8),
+        (("demo", TINY), "transformer", 2),
+        (("demo", TINY), "transformer", 10),
+        (("dusty_small", TINY_GAN), "adversarial", 6),  # between two penalties on the discriminator
+        (("dusty_small", TINY_GAN), "adversarial", 16),
+    ],
 )
-def test_a_stopped_run_ends_with_the_same_bits_as_one_that_was_not(tmp_path, stage, scans):
-    recipe = load_recipe("demo", TINY)
+def test_a_stopped_run_ends_with_the_same_bits_as_one_that_was_not(tmp_path, recipe, stage, scans):
+    recipe = load_recipe(*recipe)
     train(recipe, tmp_path / "whole")
     with pytest.raises(StopAfterError):
         train(recipe, tmp_path / "stopped", StopAfter(stage, scans))

@@ -109,8 +109,8 @@ class Dusty(Generator):
     """A generative adversarial network over inverse range, whose raydrop is a stage of its own.
 
     Source:
-        Nakashima and Kurazume, Learning to Drop Points for LiDAR Scan Synthesis, IROS 2021; kazuto1011/dusty-gan@0374a5e,
-        MIT.
+        Nakashima and Kurazume, Learning to Drop Points for LiDAR Scan Synthesis, IROS 2021; its program,
+        kazuto1011/dusty-gan@0374a5e, MIT.
     """
 
     Config = DustyConfig
@@ -228,13 +228,14 @@ class Dusty(Generator):
             raise CheckpointError(
                 f"{path}, whose 'G_ema' is no generator of DUSty v1", "one that its program saved", "check the path"
             ) from None
-        generator = cls.from_weights(config, sensor, weights, path)
+        ours = {f"synthesis.{name}": weight for name, weight in weights.items()}
+        generator = cls.from_weights(config, sensor, ours, path)
         assert isinstance(generator, Dusty)
         return generator
 
 
 class InverseRange:
-    """Ranges as DUSty's networks see them: 1 at the near limit, linear in 1 / range, -1 at the far one and no return."""
+    """Ranges as DUSty's networks see them: linear in 1 / range, 1 at the near limit, -1 at the far one or no return."""
 
     def __init__(self, sensor: SensorModel) -> None:
         self._nearest_first = RangeEncoding("inverse", sensor.range_min_m, sensor.range_max_m)

@@ -73,7 +73,7 @@ class Synthesis(nn.Module):
 class Discriminator(nn.Module):
     """An encoded range image → the logit of its being real.
 
-    It sees the image blurred along columns, and blurred along rows: that hides the single missing pixels of a real scan.
+    It sees the image blurred along columns and blurred along rows, which hides single missing pixels.
 
     Args:
         widths: channels.

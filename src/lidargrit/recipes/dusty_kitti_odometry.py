@@ -5,7 +5,7 @@ from lidargrit.loading import DataConfig
 from lidargrit.training import FitConfig, Recipe
 
 RECIPE = Recipe(
-    title="DUSty-I on KITTI odometry (DUSty-II: model.variant=dusty_2; its DCGAN without raydrop: model.variant=baseline)",
+    title="DUSty-I on KITTI odometry (model.variant=dusty_2 for DUSty-II, baseline for its plain DCGAN)",
     generator="dusty",
     model=DustyConfig(penalty_every=1),
     data=DataConfig(
