@@ -7,11 +7,11 @@ from lidargrit.training import FitConfig, Recipe
 RECIPE = Recipe(
     title="DUSty-I, small: 64x256, for two CPU cores and minutes",
     generator="dusty",
-    model=DustyConfig(latent_dim=128, channels=32, max_channels=128),
+    model=DustyConfig(latent_dim=128, channels=16, max_channels=128),
     data=DataConfig(train=("simulated:2000:train",), val=("simulated:32:val",)),
     training={
         "adversarial": FitConfig(
-            scans=100_000,
+            scans=60_000,
             batch_size=16,
             learning_rate=2e-3,
             betas=(0.0, 0.99),
