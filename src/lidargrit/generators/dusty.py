@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from lidargrit.errors import CheckpointError, ConfigError
+from lidargrit.files import load_exactly
 from lidargrit.generators import Cost, Generator
 from lidargrit.loading import seed_of
 from lidargrit.nn.dcgan import LEVELS, Discriminator, Synthesis, Widths, from_published
@@ -27,7 +28,7 @@ from lidargrit.nn.latent_search import search_latents
 from lidargrit.nn.published import read_checkpoint
 from lidargrit.nn.raydrop import logistic_noise, straight_through
 from lidargrit.projection import RangeEncoding
-from lidargrit.sensors import SensorModel
+from lidargrit.sensors import SensorModel, load_sensor
 from lidargrit.structures import RangeImage
 from lidargrit.tokenizers import MaskDecoding
 
@@ -207,32 +208,6 @@ class Dusty(Generator):
 
         return search_latents(error_of, self._normal(seeds, sampling.search_steps + 1), sampling.search_rate)
 
-    @classmethod
-    def from_published(cls, path: Path, sensor: SensorModel) -> Dusty:
-        """Make a generator of a checkpoint of the program, whose moving average is taken; nothing but tensors is read.
-
-        Raises:
-            CheckpointError: no such file, or one that holds something else, or a model of another size of images.
-        """
-        weights = from_published(read_checkpoint(path, ("G_ema",), _PUBLISHED_BYTES_AT_MOST))
-        try:
-            logits = weights["return_head.weight"].shape[1] if "return_head.weight" in weights else 0
-            config = DustyConfig(
-                variant=next(name for name, count in _LOGITS.items() if count == logits),
-                latent_dim=weights["project.weight"].shape[0],
-                channels=weights["range_head.weight"].shape[0],
-                max_channels=weights["project.weight"].shape[1],
-                penalty_every=1,
-            )
-        except (KeyError, IndexError, StopIteration):
-            raise CheckpointError(
-                f"{path}, whose 'G_ema' is no generator of DUSty v1", "one that its program saved", "check the path"
-            ) from None
-        ours = {f"synthesis.{name}": weight for name, weight in weights.items()}
-        generator = cls.from_weights(config, sensor, ours, path)
-        assert isinstance(generator, Dusty)
-        return generator
-
 
 class InverseRange:
     """Ranges as DUSty's networks see them: linear in 1 / range, 1 at the near limit, -1 at the far one or no return."""
@@ -313,6 +288,42 @@ class Game(nn.Module):
 
     def _augment(self, images: Tensor, rng: torch.Generator) -> Tensor:
         return augment_differentiably(images, self.config.augmentations, self.config.augmentation_defects, rng)
+
+
+def load_published(path: Path, sensor: str = "hdl64e_kitti_odometry") -> Dusty:
+    """Make a generator of a checkpoint that the authors published, or that their program saved.
+
+    Such a file is torch's, a dictionary of which this reads ``G_ema``: the moving average of the generator's weights,
+    under the names that lidargrit.nn.dcgan translates. Which variant it is, and how wide, is told by the weights. The
+    program's images are in the columns and rows of the sensor that is the default here.
+
+    Args:
+        path: of the file; code in it is not run.
+        sensor: whose rays the images have.
+
+    Raises:
+        CheckpointError: no such file, or one that holds something else, or a model of images of another size.
+
+    Source:
+        kazuto1011/dusty-gan@0374a5e (MIT), trainers/dcgan_amp.py and utils/__init__.py.
+    """
+    weights = from_published(read_checkpoint(path, ("G_ema",), _PUBLISHED_BYTES_AT_MOST))
+    try:
+        logits = weights["return_head.weight"].shape[1] if "return_head.weight" in weights else 0
+        config = DustyConfig(
+            variant=next(name for name, count in _LOGITS.items() if count == logits),
+            latent_dim=weights["project.weight"].shape[0],
+            channels=weights["range_head.weight"].shape[0],
+            max_channels=weights["project.weight"].shape[1],
+            penalty_every=1,
+        )
+    except (KeyError, IndexError, StopIteration):
+        raise CheckpointError(
+            f"{path}, whose 'G_ema' is no generator of DUSty v1", "one that its program saved", "check the path"
+        ) from None
+    generator = Dusty(config, load_sensor(sensor))
+    load_exactly(generator, {f"synthesis.{name}": weight for name, weight in weights.items()}, path)
+    return generator.eval()
 
 
 def _widths(config: DustyConfig) -> Widths:
