@@ -86,8 +86,10 @@ class Discriminator(nn.Module):
     def __init__(self, widths: Widths, size: tuple[int, int]) -> None:
         super().__init__()
         inputs = [2, *(widths.at(level) for level in range(LEVELS))]
-        self.down = nn.ModuleList(_Convolution(a, b, (4, 4), 2) for a, b in pairwise(inputs))
-        self.verdict = _Convolution(inputs[-1], 1, (size[0] >> LEVELS, size[1] >> LEVELS), 1)
+        self.down = nn.ModuleList(
+            _Convolution(a, b, (4, 4), 2, _GAIN if level else 1.0) for level, (a, b) in enumerate(pairwise(inputs))
+        )
+        self.verdict = _Convolution(inputs[-1], 1, (size[0] >> LEVELS, size[1] >> LEVELS), 1, _GAIN)
 
     def forward(self, images: Float[Tensor, "B 1 H W"]) -> Float[Tensor, "B"]:
         """Judge."""
@@ -104,12 +106,12 @@ class _Convolution(nn.Conv2d):
         Karras et al., Progressive Growing of GANs, 2018, section 4.1.
     """
 
-    def __init__(self, inputs: int, outputs: int, kernel: tuple[int, int], stride: int) -> None:
+    def __init__(self, inputs: int, outputs: int, kernel: tuple[int, int], stride: int, gain: float) -> None:
         super().__init__(inputs, outputs, kernel, stride)
-        _start(self)
+        self.scale = _start(self, gain)
 
     def forward(self, input: Tensor) -> Tensor:
-        return super().forward(input * _scale(self.weight))
+        return F.conv2d(input, self.weight * self.scale, self.bias, self.stride)
 
 
 class _Spread(nn.ConvTranspose2d):
@@ -117,41 +119,44 @@ class _Spread(nn.ConvTranspose2d):
 
     def __init__(self, inputs: int, outputs: int, kernel: tuple[int, int]) -> None:
         super().__init__(inputs, outputs, kernel)
-        _start(self)
+        self.scale = _start(self, 1.0)
 
     def forward(self, input: Tensor, output_size: list[int] | None = None) -> Tensor:
-        return super().forward(input * _scale(self.weight), output_size)
+        return super().forward(input * self.scale, output_size)  # not the weights, which here are most of the network's
 
 
 class _Double(nn.ConvTranspose2d):
-    """The same for a transposed convolution that doubles rows and columns."""
+    """The same for a transposed convolution that doubles rows and columns, behind a rectifier."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
-        super().__init__(inputs, outputs, 4, 2, padding=3)  # 1 as usual, and 2 that one padded pixel has become
-        _start(self)
+        super().__init__(inputs, outputs, 4, 2)
+        self.scale = _start(self, _GAIN)
 
     def forward(self, input: Tensor, output_size: list[int] | None = None) -> Tensor:
-        return super().forward(_pad(input) * _scale(self.weight), output_size)
+        # The padding takes 1 pixel off each side as usual, and the 2 that a padded pixel has become.
+        return F.conv_transpose2d(_pad(input), self.weight * self.scale, self.bias, 2, padding=3)
 
 
-def _start(layer: nn.Conv2d | nn.ConvTranspose2d) -> None:
+def _start(layer: nn.Conv2d | nn.ConvTranspose2d, gain: float) -> float:
+    """Draw a layer's first weights and return by what they are multiplied when used.
+
+    It is the program's scale, which for transposed convolutions counts outputs where it means to count inputs.
+    """
     assert layer.bias is not None
     nn.init.normal_(layer.weight)
     nn.init.zeros_(layer.bias)
-
-
-def _scale(weight: Tensor) -> float:
-    """Return the program's scale, which for transposed convolutions counts outputs where it means to count inputs."""
-    return 1 / math.sqrt(weight[0].numel())
+    return gain / math.sqrt(layer.weight[0].numel())
 
 
 def _rectify(features: Tensor) -> Tensor:
-    return F.leaky_relu(features, _SLOPE) * _GAIN
+    """Rectify; the program's gain behind it is in the scale of the layer that follows, which spares a pass."""
+    return F.leaky_relu(features, _SLOPE)
 
 
 def _pad(features: Tensor) -> Tensor:
     """Add a pixel on all sides: columns go around the circle, rows are mirrored."""
-    return F.pad(F.pad(features, (1, 1, 0, 0), mode="circular"), (0, 0, 1, 1), mode="reflect")
+    wide = torch.cat((features[..., -1:], features, features[..., :1]), dim=3)
+    return torch.cat((wide[..., 1:2, :], wide, wide[..., -2:-1, :]), dim=2)
 
 
 def _blurred_both_ways(images: Tensor) -> Tensor:
