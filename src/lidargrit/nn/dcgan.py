@@ -67,7 +67,7 @@ class Synthesis(nn.Module):
         for layer in self.up:
             features = _rectify(layer(features))
         logits = None if self.return_head is None else self.return_head(features)
-        return torch.tanh(self.range_head(features)), logits
+        return torch.tanh(self.range_head(features).float()), logits
 
 
 class Discriminator(nn.Module):
@@ -93,9 +93,12 @@ class Discriminator(nn.Module):
 
     def forward(self, images: Float[Tensor, "B 1 H W"]) -> Float[Tensor, "B"]:
         """Judge."""
-        features = _blurred_both_ways(images)
-        for layer in self.down:
-            features = _rectify(layer(_pad(features)))
+        # In 16 bits all that is farther than some 60 m would be next to the same value.
+        with torch.autocast("cuda" if images.is_cuda else "cpu", enabled=False):
+            features = self.down[0](_pad(_blurred_both_ways(images)))
+        for layer in self.down[1:]:
+            features = layer(_pad(_rectify(features)))
+        features = _rectify(features)
         return self.verdict(features)[:, 0, 0, 0]
 
 
