@@ -60,7 +60,7 @@ class DiffusionSampling:
         sampler: ``ddpm`` adds fresh noise after each step (published), ``ddim`` only at the beginning.
         raydrop: ``published`` has a return where the drawn range lies inside the sensor's limits. ``calibrated``, which
             is not of the paper, has one where the drawn value is above a threshold, fitted so that as many rays return
-            as in the training scans.
+            as in the training scans; from a barely trained model that may take near returns away.
         resamples: how often each step is taken when a scan is completed.
     """
 
@@ -154,10 +154,12 @@ class R2dm(Generator):
             sampling: 32 steps with 16 resamples each if not given.
 
         Raises:
-            ConfigError: images of other rays, or as many seeds or masks as there are not images.
+            ConfigError: images of other rays, as many seeds or masks as there are not images, or another sampler.
         """
         sampling = sampling or _COMPLETION
         self._check(sampling)
+        if sampling.sampler != "ddpm":
+            raise ConfigError(f"sampler={sampling.sampler} for completion", "sampler=ddpm", "RePaint adds fresh noise")
         if not images.sensor.same_rays(self.sensor) or observed.shape != images.range_m.shape:
             raise ConfigError(
                 f"{tuple(images.range_m.shape)} of {images.sensor.name!r}, observed at {tuple(observed.shape)}",
