@@ -42,7 +42,7 @@ class Cost:
 
 
 CAPABILITIES = {  # name → what a generator that declares it can do besides sampling, for people
-    "tokens": "give the tokenizer whose tokens it writes",
+    "tokens": "turn scans into tokens and back",
     "encode": "give scans back from a code of its own",
     "complete": "fill in the pixels of a scan that were not observed",
     "invert": "search the scan nearest to a given one among those it can write",
