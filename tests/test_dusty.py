@@ -106,6 +106,16 @@ def test_the_baseline_reads_far_pixels_as_no_return():
     assert 0 < float(coarse.return_mask.float().mean()) < 1
 
 
+def test_what_is_drawn_at_the_far_limit_is_no_return():
+    """No return and the far limit are one value to DUSty's networks, so that either may stand for the other."""
+    generator = made()
+    generator.synthesis.return_head.bias.data.fill_(30.0)
+    assert bool(generator.sample([0]).return_mask.all())
+    assert float(generator.sample([0], DustySampling(tolerance=0.5)).return_mask.float().mean()) < 1
+    generator.synthesis.range_head.bias.data.fill_(-30.0)
+    assert not bool(generator.sample([0]).return_mask.any())
+
+
 def test_images_of_other_sizes_are_refused():
     for columns in (40, 8):
         with pytest.raises(ConfigError, match=r"rows and columns in multiples of 16"):

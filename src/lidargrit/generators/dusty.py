@@ -35,6 +35,7 @@ from lidargrit.tokenizers import MaskDecoding
 Variant = Literal["dusty_1", "dusty_2", "baseline"]
 
 _LOGITS: dict[Variant, int] = {"dusty_1": 1, "dusty_2": 2, "baseline": 0}  # maps of returns that the network draws
+_TOLERANCE: dict[Variant, float] = {"dusty_1": 0.0, "dusty_2": 0.0, "baseline": 0.008}  # of the program
 _NO_RETURN = -1.0  # as an encoded range; the same as a return at the far limit
 
 _PUBLISHED_BYTES_AT_MOST = 2**29  # weights, their average and the optimiser of a published model take 350 MB
@@ -88,22 +89,24 @@ class DustySampling:
         mask: ``bernoulli`` draws each return with its probability, as the program does; ``threshold`` keeps what is at
             least as likely as not.
         raydrop_seed: mixed with a scan's seed for its raydrop only: another one drops other rays of the same scan.
-        tolerance: of ``baseline`` alone: what lies nearer than this to the far limit, in shares of the span of inverse
-            range, is no return. The published 0.008 was tuned on KITTI odometry; there it is 58 m.
+        tolerance: what lies nearer than this to the far limit, in shares of the span of inverse range, is no return. If
+            not given it is the program's: 0 with a mask, where only the limit itself is none, and 0.008 for
+            ``baseline``, which was tuned on KITTI odometry and there is 58 m.
         search_steps: of the optimiser that looks for a latent.
         search_rate: its learning rate at its highest.
     """
 
     mask: MaskDecoding = "bernoulli"
     raydrop_seed: int = 0
-    tolerance: float = 0.008
+    tolerance: float | None = None
     search_steps: int = 1000
     search_rate: float = 0.1
 
     def __post_init__(self) -> None:
         for name, least in (("raydrop_seed", 0), ("tolerance", 0), ("search_steps", 1), ("search_rate", 0)):
-            if not getattr(self, name) >= least:
-                raise ConfigError(f"{name}={getattr(self, name)}", f"at least {least}", "raise it")
+            value = getattr(self, name)
+            if value is not None and not value >= least:
+                raise ConfigError(f"{name}={value}", f"at least {least}", "raise it")
 
 
 class Dusty(Generator):
@@ -170,10 +173,10 @@ class Dusty(Generator):
     def _draw(self, latents: Tensor, seeds: Sequence[int], sampling: DustySampling) -> RangeImage:
         encoded, logits = self.synthesis(latents)
         range_m = self.encoding.decode(encoded[:, 0])
-        if logits is None:
-            returned = encoded[:, 0] > _NO_RETURN + 2 * sampling.tolerance
-        else:
-            returned = logits[:, 0] + self._logistic(seeds, sampling) > 0
+        tolerance = _TOLERANCE[self.config.variant] if sampling.tolerance is None else sampling.tolerance
+        returned = encoded[:, 0] > _NO_RETURN + 2 * tolerance
+        if logits is not None:
+            returned &= logits[:, 0] + self._logistic(seeds, sampling) > 0
             if logits.shape[1] > 1:
                 returned &= logits[:, 1] > 0
         return RangeImage.masked(range_m, returned, self.sensor)
@@ -278,7 +281,7 @@ class Game(nn.Module):
         latents = torch.randn(count, self.config.latent_dim, generator=rng, device=rng.device)
         encoded, logits = self.synthesis(latents)
         if logits is None:
-            return encoded, (encoded.detach() > _NO_RETURN + 2 * DustySampling().tolerance).float().mean()
+            return encoded, (encoded.detach() > _NO_RETURN + 2 * _TOLERANCE["baseline"]).float().mean()
         noise = logistic_noise((count, 1, *encoded.shape[-2:]), rng)
         returned = straight_through(logits[:, :1], noise, self.config.temperature)
         if logits.shape[1] > 1:
