@@ -1,0 +1,157 @@
+"""Recipes and finished runs → each trained, sampled and scored alike → one table; goes on where it stopped."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from lidargrit.configuration import override
+from lidargrit.errors import ConfigError
+from lidargrit.evaluation.comparison import Settings, compare_sources
+from lidargrit.evaluation.samples import write_samples
+from lidargrit.evaluation.tables import Format, side_by_side
+from lidargrit.files import read_json, write_json
+from lidargrit.generators import Generator, is_run, load, load_class
+from lidargrit.recipes import load_recipe
+from lidargrit.reporting import Reporter
+from lidargrit.training import Recipe, train, training_flops, with_budget
+
+COSTS = "costs.json"
+
+
+@dataclass(frozen=True)
+class Contest:
+    """What all systems have in common.
+
+    Args:
+        reference: a source of scans that none was trained on.
+        num_samples: of each system.
+        settings: of the evaluation; its protocol above all.
+        recipe_settings: of every recipe, as ``train --set`` takes them: the same data for all.
+        flops: what the training of each takes; 0 leaves every recipe's own budget.
+        batch_size: scans drawn at once.
+    """
+
+    reference: str
+    num_samples: int = 256
+    settings: Settings = field(default_factory=Settings)
+    recipe_settings: tuple[str, ...] = ()
+    flops: float = 0.0
+    batch_size: int = 8
+
+    def __post_init__(self) -> None:
+        if self.num_samples < 2 or self.batch_size < 1 or not self.flops >= 0:
+            raise ConfigError(
+                f"{self.num_samples} samples, {self.batch_size} at once, {self.flops:g} operations",
+                "at least 2 samples, at least 1 at once, and no negative budget",
+                "correct the number",
+            )
+
+
+def hold(systems: Sequence[str], folder: Path, contest: Contest, reporter: Reporter | None = None) -> list[Path]:
+    """Train or load each system, draw its samples and score them, and return the files of scores.
+
+    Args:
+        systems: each a recipe's name or the folder of a finished run, and after a colon, if wanted, how it is drawn
+            from: ``r2dm_small:steps=32``. A recipe is trained once, in how many ways ever it is drawn from.
+        folder: gets a run folder ``runs/RECIPE``, and for each system ``SYSTEM/samples``, ``SYSTEM/SYSTEM.json`` with
+            its scores and ``SYSTEM/costs.json``. What is there is not made again.
+        contest: what all have in common.
+        reporter: hears of the progress.
+
+    Raises:
+        ConfigError: a system that occurs twice, or a recipe that does not take a setting.
+    """
+    reporter = reporter or Reporter()
+    names = [system.replace("/", "_") for system in systems]
+    if len(set(names)) < len(names) or not names:
+        raise ConfigError(
+            f"the systems {', '.join(systems) or '(none)'}", "each once, and at least one", "correct them"
+        )
+    plans = [_Plan.of(system, contest) for system in systems]  # a wrong word is told before anything is trained
+    scores = []
+    for name, plan in zip(names, plans, strict=True):
+        reporter.message(f"{name}:")
+        run = plan.run if plan.recipe is None else folder / "runs" / str(plan.run)
+        generator = load(run) if plan.recipe is None or is_run(run) else train(plan.recipe, run, reporter)
+        seconds = _sample(generator, run, folder / name / "samples", plan.sampling, contest, reporter)
+        _write_costs(folder / name / COSTS, plan.recipe, generator, plan.sampling, seconds, contest.num_samples)
+        card, _ = compare_sources(str(folder / name / "samples"), contest.reference, contest.settings, reporter)
+        scores.append(folder / name / f"{name}.json")
+        write_json(scores[-1], card.to_json())
+    return scores
+
+
+def as_table(scores: Sequence[Path], form: Format = "text") -> str:
+    """Return the scores side by side, and below them what each system costs."""
+    lines = [f"{'system':<32}{'parameters':>12}{'training':>11}{'evaluations':>13}{'a scan':>11}{'seconds':>9}"]
+    for path in scores:
+        of = read_json(path.parent / COSTS)
+        training, flops = of["training_flops"], of["flops_per_scan"]
+        lines.append(
+            f"{path.stem:<32}{of['parameters']:>12,}{f'{training:.2g}' if training is not None else '-':>11}"
+            f"{of['network_evaluations']:>13,}{f'{flops:.2g}':>11}{of['seconds_per_scan'] or math.nan:>9.3g}"
+        )
+    lines.append("(training and a scan: floating-point operations; seconds: for one scan, on this machine, in batches)")
+    return f"{side_by_side(scores, form)}\n\n" + "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """How one system comes about.
+
+    Args:
+        run: folder of a finished run, or the name of the run that the recipe gets.
+        recipe: None for a finished run.
+        sampling: how it is drawn from, of the generator's own ``Sampling``.
+    """
+
+    run: Path
+    recipe: Recipe | None
+    sampling: Any
+
+    @classmethod
+    def of(cls, system: str, contest: Contest) -> _Plan:
+        name, _, settings = system.partition(":")
+        recipe = None if is_run(Path(name)) else load_recipe(name, contest.recipe_settings)
+        cls_of = type(load(name)) if recipe is None else load_class(recipe.generator)
+        owner, cure = f"sampling from {name!r}", "see all with: lidargrit list generators"
+        sampling = override(cls_of.Sampling(), settings.split(",") if settings else [], owner, cure)
+        if recipe is not None and contest.flops:
+            recipe = with_budget(recipe, contest.flops)
+        return cls(Path(name), recipe, sampling)
+
+
+def _sample(
+    generator: Generator, run: Path, folder: Path, sampling: Any, contest: Contest, reporter: Reporter
+) -> float | None:
+    """Draw what is not there yet, and return the seconds for a scan; None if all was there."""
+    before = len(list(folder.glob("[!.]*.npz"))) if folder.is_dir() else 0
+    begun = time.perf_counter()
+    write_samples(generator, run, folder, range(contest.num_samples), sampling, contest.batch_size, reporter)
+    drawn = contest.num_samples - before
+    return (time.perf_counter() - begun) / drawn if drawn > 0 else None
+
+
+def _write_costs(
+    path: Path, recipe: Recipe | None, generator: Generator, sampling: Any, seconds: float | None, num_samples: int
+) -> None:
+    """Write what a system costs, once: a later call that draws nothing would have no time to tell."""
+    if seconds is None and path.exists():
+        return
+    cost = generator.cost(sampling)
+    write_json(
+        path,
+        {
+            "parameters": sum(weight.numel() for weight in generator.parameters()),
+            "training_flops": None if recipe is None else sum(training_flops(recipe).values()),
+            "network_evaluations": cost.network_evaluations,
+            "flops_per_scan": cost.flops,
+            "seconds_per_scan": seconds,
+            "scans": num_samples,
+        },
+    )

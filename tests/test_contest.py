@@ -1,0 +1,82 @@
+"""Several systems trained, sampled and scored alike, to one table; equal compute; the arithmetic counted by hand."""
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from lidargrit.cli import main
+from lidargrit.errors import ConfigError, LidarGritError
+from lidargrit.evaluation.comparison import Settings
+from lidargrit.evaluation.contest import Contest, as_table, hold
+from lidargrit.evaluation.intervals import Resampling
+from lidargrit.recipes import load_recipe
+from lidargrit.training import training_flops, with_budget
+
+FEW = ("data.train=simulated:6:train", "data.val=simulated:2:val", "data.columns=512", "data.column_stride=8")
+QUICK = Settings(metrics=("bev_jsd",), resampling=Resampling(groups=4, halves=2))
+CONTEST = Contest("simulated:8:test", 8, QUICK, (*FEW, "seed=3"), batch_size=4)
+
+
+def test_systems_are_made_once_and_set_side_by_side(tmp_path):
+    systems = ["marginal", "memorised"]
+    scores = hold(systems, tmp_path, CONTEST)
+    table = as_table(scores)
+    assert all(name in table for name in systems)
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npz")}
+    assert len(before) == 16
+    assert hold(systems, tmp_path, CONTEST) == scores
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npz")} == before
+    costs = json.loads((tmp_path / "marginal" / "costs.json").read_text())
+    assert costs["training_flops"] == 0
+    assert costs["seconds_per_scan"] > 0
+    again = hold([str(tmp_path / "runs" / "marginal")], tmp_path / "again", CONTEST)  # a finished run
+    assert json.loads(again[0].read_text())["scores"][0]["value"] == pytest.approx(
+        json.loads(scores[0].read_text())["scores"][0]["value"]
+    )
+
+
+def test_a_recipe_is_trained_once_in_how_many_ways_ever_it_is_drawn_from(tmp_path, capsys):
+    words = ["compare", str(tmp_path), "r2dm_small:steps=1", "r2dm_small:steps=2", "--flops", "3e10", "-n", "2"]
+    assert main([*words, "--against", "simulated:2:test", "--set", *FEW]) == 0
+    told = capsys.readouterr().out
+    assert [path.name for path in (tmp_path / "runs").iterdir()] == ["r2dm_small"]
+    assert "r2dm_small:steps=1 " in told
+    assert "r2dm_small:steps=2 " in told
+
+
+@pytest.mark.parametrize(
+    ("systems", "told"),
+    [
+        ([], "at least one"),
+        (["marginal", "marginal"], "each once"),
+        (["marginl"], "marginal"),
+        (["r2dm_small:step=3"], "steps"),
+    ],
+)
+def test_wrong_words_are_told_before_anything_is_trained(systems, told, tmp_path):
+    with pytest.raises(LidarGritError, match=told):
+        hold(systems, tmp_path, CONTEST)
+    assert not list(tmp_path.rglob("*"))
+
+
+def test_training_flops_are_three_forward_passes_of_a_plain_stack():
+    recipe = load_recipe("r2dm_small", FEW)
+    network = load_recipe("r2dm_small", FEW).model
+    counted = training_flops(recipe)["diffusion"] / recipe.training["diffusion"].scans
+    from lidargrit.generators.r2dm import R2dm
+
+    generator = R2dm(network, recipe.data.load_sensor())
+    one_pass = generator.cost(replace(generator.Sampling(), steps=1)).flops
+    assert 2.8 * one_pass < counted < 3.0 * one_pass  # the first layer needs no gradient of its input
+
+
+def test_a_budget_scales_all_stages_alike():
+    recipe = load_recipe("dusty_small")
+    cost = sum(training_flops(recipe).values())
+    half = with_budget(recipe, cost / 2)
+    assert half.training["adversarial"].scans == pytest.approx(recipe.training["adversarial"].scans / 2, abs=16)
+    assert sum(training_flops(half).values()) == pytest.approx(cost / 2, rel=1e-3)
+    assert with_budget(load_recipe("marginal"), 1.0) == load_recipe("marginal")
+    with pytest.raises(ConfigError, match="at least one batch"):
+        with_budget(recipe, 1e6)
