@@ -153,7 +153,14 @@ def test_sampling_options_reach_the_model(run_folder, tmp_path, typed):
     images = read_samples(tmp_path).batch([0, 1])
     assert torch.equal(images.range_m[0], images.range_m[1]), "the likeliest tokens do not depend on the seed"
     manifest = json.loads((tmp_path / "samples.json").read_text())
-    assert manifest["sampling"] == {"temperature": 0.0, "top_k": 0, "top_p": 1.0, "mask": "threshold"}
+    assert manifest["sampling"] == {
+        "temperature": 0.0,
+        "top_k": 0,
+        "top_p": 1.0,
+        "mask": "threshold",
+        "weights": "fp32",
+        "decoder": "fp32",
+    }
 
 
 def test_samples_tell_what_they_cost_and_those_from_before_go_on(run_folder, tmp_path, typed):
@@ -164,6 +171,7 @@ def test_samples_tell_what_they_cost_and_those_from_before_go_on(run_folder, tmp
     assert manifest["cost_per_scan"]["flops"] > 1e6
     for later in ("generator", "cost_per_scan", "projection_variant"):
         del manifest[later]
+    del manifest["sampling"]["decoder"]  # as before there was a choice
     (tmp_path / "samples.json").write_text(json.dumps(manifest))
     typed("sample", run_folder, tmp_path, "-n", 2)
     assert len(read_samples(tmp_path)) == 2
@@ -201,6 +209,13 @@ def test_view_draws_runs_samples_and_scans(run_folder, samples, tmp_path, typed)
     typed("view", run_folder, "-o", tmp_path / "run.png", "-n", 1)
     with Image.open(tmp_path / "run.png") as picture:
         assert picture.height < four_rows
+
+
+def test_processes_share_the_seeds(run_folder, tmp_path, typed):
+    for rank in (1, 0):
+        assert "done: 2 scans" in typed("sample", run_folder, tmp_path, "-n", 4, "--rank", rank, "--world-size", 2)
+        assert len(read_samples(tmp_path)) == (4 if rank == 0 else 2)
+    assert {path.stem for path in tmp_path.glob("*.npz")} == {f"{seed:08d}" for seed in range(4)}
 
 
 def test_list_names_everything_there_is(typed):

@@ -1,6 +1,7 @@
 """The contract that every generator keeps: seeds, limits, saving, what it declares, what it costs."""
 
 import functools
+import itertools
 import re
 
 import pytest
@@ -85,6 +86,12 @@ def test_a_seed_gives_the_same_scan_whatever_the_batch(name):
     assert same(generator.sample([4], sampling), together[1:2])
     assert same(generator.sample([5, 3], sampling), RangeImage.stack([together[2], together[0]]))
     assert not torch.equal(together.range_m[0], together.range_m[1])
+
+
+def test_streams_the_same_scans_without_end(name):
+    generator, sampling = made(name)
+    streamed = list(itertools.islice(generator.stream(itertools.count(3), sampling, batch_size=2), 3))
+    assert same(RangeImage.stack(streamed), generator.sample([3, 4, 5], sampling))
 
 
 def test_scans_are_those_of_its_sensor(name):

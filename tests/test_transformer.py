@@ -1,12 +1,15 @@
-"""The transformer against the reference program; its cache and its sampling."""
+"""The transformer against the reference program; how it writes token by token."""
+
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
 from scipy import stats
 
-from lidargrit.generators.lidargrit import START_TOKEN, TokenSampling, after_start, choose, sample_tokens
+from lidargrit.generators.lidargrit import START_TOKEN, TokenSampling, after_start, choose, sample_by_recomputing
 from lidargrit.nn.transformer import CausalTransformer, TransformerConfig
+from lidargrit.nn.writing import TokenWriter
 from reference_weights import seeded_weights
 
 GREEDY = TokenSampling(temperature=0.0)
@@ -57,11 +60,11 @@ def test_logits_and_loss_are_the_programs(golden_transformer):
 @pytest.mark.shared
 def test_greedy_steps_with_the_cache_are_the_programs(golden_transformer):
     model, data = golden_transformer
-    cache = model.new_cache(2)
+    writer = TokenWriter(model, 2, partial(choose, sampling=GREEDY))
     tokens, chosen = torch.tensor([0, 3]), []
     with torch.no_grad():
-        for _ in range(30):
-            tokens = choose(model.next_logits(tokens, cache), torch.zeros(2), GREEDY)
+        for position in range(30):
+            tokens = choose(writer.next_logits(tokens, position), torch.zeros(2), GREEDY)
             chosen.append(tokens)
     assert np.array_equal(torch.stack(chosen, 1).numpy(), data["greedy_from_sos_0_and_3"])
 
@@ -79,12 +82,19 @@ def test_top_k_keeps_what_the_program_keeps(golden_transformer):
     assert int(kept.sum()) > 0.9 * int(theirs.isfinite().sum())
 
 
-def test_the_cache_gives_the_logits_of_the_whole_prefix(transformer):
+def write(transformer, uniform, sampling, **options):
+    return TokenWriter(transformer, len(uniform), partial(choose, sampling=sampling), **options).write(uniform)
+
+
+@pytest.mark.parametrize(("precision", "tolerance"), [("fp32", 1e-5), ("bf16", 0.2), ("int8", 0.2)])
+def test_steps_give_the_logits_of_the_whole_prefix(transformer, precision, tolerance):
     tokens = torch.randint(20, (3, 24), generator=torch.Generator().manual_seed(0))
+    writer = TokenWriter(transformer, 3, partial(choose, sampling=GREEDY), precision=precision)
     with torch.no_grad():
-        whole, cache = transformer(tokens), transformer.new_cache(3)
-        stepwise = torch.stack([transformer.next_logits(tokens[:, i], cache) for i in range(24)], dim=1)
-    assert torch.allclose(whole, stepwise, atol=1e-5)
+        whole = transformer(tokens)
+        stepwise = torch.stack([writer.next_logits(tokens[:, i], i) for i in range(24)], dim=1)
+    assert whole.std() > 1
+    assert float((whole - stepwise).abs().max()) < tolerance
 
 
 def test_a_token_never_sees_what_follows(transformer):
@@ -98,14 +108,27 @@ def test_a_token_never_sees_what_follows(transformer):
 
 
 @pytest.mark.parametrize("sampling", [TokenSampling(), TokenSampling(0.7, 5), TokenSampling(1.2, 0, 0.8), GREEDY])
-def test_sampling_is_the_same_with_and_without_cache_and_in_any_batch(transformer, sampling):
+def test_written_tokens_are_those_of_recomputing_in_any_batch_and_by_static_shapes(transformer, sampling):
     uniform = torch.rand((4, 24), generator=torch.Generator().manual_seed(1))
     with torch.no_grad():
-        together = sample_tokens(transformer, uniform, sampling)
-        recomputed = sample_tokens(transformer, uniform, sampling, use_cache=False)
-        alone = torch.cat([sample_tokens(transformer, uniform[i : i + 1], sampling) for i in range(4)])
-    assert torch.equal(together, recomputed)
-    assert torch.equal(together, alone)
+        recomputed = sample_by_recomputing(transformer, uniform, sampling)
+    assert torch.equal(write(transformer, uniform, sampling), recomputed)
+    assert torch.equal(torch.cat([write(transformer, uniform[i : i + 1], sampling) for i in range(4)]), recomputed)
+    assert torch.equal(write(transformer, uniform, sampling, static=True), recomputed)
+
+
+@pytest.mark.parametrize("static", [False, True])
+def test_a_writer_may_write_again_and_further_than_one_recording(static):
+    torch.manual_seed(0)
+    longer = CausalTransformer(TransformerConfig(layers=1, heads=2, width=16), num_tokens=8, context_length=140).eval()
+    torch.nn.init.normal_(longer.pos_emb)
+    writer = TokenWriter(longer, 2, partial(choose, sampling=TokenSampling()), static=static)
+    one, other = torch.rand((2, 2, 140), generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        expected = [sample_by_recomputing(longer, uniform, TokenSampling()) for uniform in (one, other, one)]
+    assert all(
+        torch.equal(writer.write(uniform), tokens) for uniform, tokens in zip((one, other, one), expected, strict=True)
+    )
 
 
 def test_tokens_are_drawn_with_their_probability():
@@ -140,3 +163,24 @@ def test_the_cost_is_what_torch_counts():
         generator.sample([0])
     assert generator.cost().flops == counter.get_total_flops()
     assert generator.cost().network_evaluations == 256 + 1
+
+
+def test_a_changed_weight_is_noticed_and_surprise_sums_to_the_likelihood():
+    from lidargrit.generators.lidargrit import LidarGrit
+    from lidargrit.recipes import load_recipe
+
+    recipe = load_recipe("small", ["model.transformer.width=32", "data.columns=512", "data.column_stride=8"])
+    torch.manual_seed(0)
+    generator = LidarGrit(recipe.model, recipe.data.load_sensor()).eval()
+    first = generator.sample([0])
+    assert torch.equal(generator.sample([0]).range_m, first.range_m)
+    with torch.no_grad():
+        surprise = generator.surprise(first)
+        tokens = generator.tokenizer.encode(first)
+        odds = generator.transformer(after_start(tokens.tokens.flatten(1)[:, :-1])).softmax(-1)
+        for place in (0, 7, 255):
+            share = odds[0, place, tokens.tokens.flatten()[place]]
+            assert float(surprise.flatten()[place]) == pytest.approx(-np.log2(float(share)), abs=1e-4)
+        assert float(generator.log_likelihood(first)) == pytest.approx(-float(surprise.sum()) * np.log(2), rel=1e-5)
+        generator.transformer.head.weight.mul_(-30)
+    assert not torch.equal(generator.sample([0]).range_m, first.range_m)

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from lidargrit.errors import ConfigError
+from lidargrit.nn.convolution import FoldedUpsample, Upsample
 from lidargrit.sensors import load_sensor
 from lidargrit.structures import RangeImage, TokenGrid
 from lidargrit.tokenizers.vqvae import Vqvae, VqvaeConfig, reconstruction_loss
@@ -138,6 +139,32 @@ def test_padding_around_the_circle_commutes_with_turning_the_car():
             assert torch.allclose(decoded.roll(8, -1), again, atol=1e-3) == commutes
             if commutes:
                 assert float((tokens.roll(4, -1) == turned_tokens).float().mean()) > 0.99
+
+
+@pytest.mark.parametrize("padding", ["zero", "wrap"])
+def test_folded_upsampling_is_upsampling(padding):
+    torch.manual_seed(0)
+    upsample, x = Upsample(6, padding), torch.randn(2, 6, 4, 8)
+    with torch.no_grad():
+        assert torch.allclose(FoldedUpsample(upsample)(x), upsample(x), atol=1e-5)
+
+
+@pytest.mark.parametrize("padding", ["zero", "wrap"])
+def test_what_only_decodes_decodes_the_same(padding):
+    torch.manual_seed(0)
+    sensor = sensor_of(16, 32)
+    config = replace(SMALL, channel_multipliers=(1, 2, 2), padding=padding)
+    vqvae = Vqvae(config, sensor).eval()
+    before = {name: weight.clone() for name, weight in vqvae.state_dict().items()}
+    tokens = TokenGrid(torch.randint(16, (2, 4, 8)), 16)
+    with torch.no_grad():
+        plain, exact = vqvae.decode_parts(tokens), vqvae.for_decoding("fp32").decode_parts(tokens)
+        short = vqvae.for_decoding("bf16").decode_parts(tokens)
+    assert torch.allclose(plain.range_m, exact.range_m, atol=1e-3)
+    assert torch.allclose(plain.return_logits, exact.return_logits, atol=1e-4)
+    assert 0 < float((plain.range_m - short.range_m).abs().mean()) < 1.5  # ranges of an untrained network
+    assert before.keys() == vqvae.state_dict().keys()
+    assert all(torch.equal(weight, before[name]) for name, weight in vqvae.state_dict().items())
 
 
 def test_threshold_and_bernoulli_masks():

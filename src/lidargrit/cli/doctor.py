@@ -23,7 +23,7 @@ def run(options: argparse.Namespace) -> None:
     import torch
 
     from lidargrit.loading import cache_folder
-    from lidargrit.training.engine import has_bf16
+    from lidargrit.nn.precision import has_bf16
 
     existing = next(folder for folder in (cache_folder(), *cache_folder().parents) if folder.exists())
     memory_gib = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 
 EXAMPLES = """\
   lidargrit sample runs/demo samples -n 100
   lidargrit sample runs/demo bolder -n 100 --set temperature=1.1 mask=threshold
   lidargrit sample runs/demo as_released -n 100 --set top_k=100
+  torchrun --nproc-per-node 8 -m lidargrit sample runs/demo many -n 100000       one process a GPU
 """
 
 
@@ -21,7 +23,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--batch-size", type=int, default=8, help="scans drawn at once (default: 8)")
     choices = "change how the generator draws; see: lidargrit list generators"
     parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help=choices)
-    parser.add_argument("--device", help="cpu or cuda (default: cuda if there is one)")
+    parser.add_argument("--rank", type=int, help="which process this is of several that share the work, from 0")
+    parser.add_argument("--world-size", type=int, help="of how many; under torchrun both are known")
+    parser.add_argument("--device", help="cpu, cuda or cuda:1 (default: cuda if there is one)")
 
 
 def run(options: argparse.Namespace) -> None:
@@ -32,6 +36,7 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.errors import ConfigError
     from lidargrit.evaluation.samples import write_samples
     from lidargrit.generators import load
+    from lidargrit.loading import place_among
     from lidargrit.reporting import TerminalReporter
 
     if options.count < 1 or options.batch_size < 1 or options.seed < 0:
@@ -40,14 +45,16 @@ def run(options: argparse.Namespace) -> None:
             "at least one scan, at least one at once, and no negative seed",
             "correct the number",
         )
+    rank, world_size = place_among(options.rank, options.world_size)
     generator = load(options.run_folder)
     owner = f"sampling from {generator.public_name()!r}"
     sampling = override(generator.Sampling(), options.set, owner, "see all with: lidargrit list generators")
     try:
-        generator.to(options.device or ("cuda" if torch.cuda.is_available() else "cpu"))
+        own = f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu"
+        generator.to(options.device or own)
     except (RuntimeError, AssertionError) as error:  # torch's ways to say: no such device, or not in this build
         told = str(error).partition("\n")[0]
         raise ConfigError(f"--device {options.device}", f"cpu or cuda ({told})", "leave it out") from None
-    seeds = range(options.seed, options.seed + options.count)
+    seeds = range(options.seed, options.seed + options.count)[rank::world_size]
     write_samples(generator, options.run_folder, options.out, seeds, sampling, options.batch_size, TerminalReporter())
-    print(f"done: {options.count} scans lie in {options.out}; look at them with: lidargrit view {options.out}")
+    print(f"done: {len(seeds)} scans lie in {options.out}; look at them with: lidargrit view {options.out}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import zipfile
 import zlib
 from collections.abc import Sequence
@@ -40,14 +41,14 @@ def write_samples(
     batch_size: int = 8,
     reporter: Reporter | None = None,
 ) -> None:
-    """Write one file for each seed; seeds that are there already are not drawn again.
+    """Write one file for each seed, at bounded memory; seeds that are there already are not drawn again.
 
     Args:
         generator: what to sample from, as loaded from
         run_folder: whose weights identify it.
         folder: gets ``samples.json`` and ``SEED.npz`` with ``range_m`` (H, W) in metres, 0 where nothing returned,
             and ``reflectance`` in [0, 1] if the generator writes it.
-        seeds: one a scan.
+        seeds: one a scan; other processes may write others into the same folder meanwhile.
         sampling: choices, of the generator's own ``Sampling``; its defaults if not given.
         batch_size: scans drawn at once; the scans do not depend on it.
         reporter: hears of the progress.
@@ -67,30 +68,28 @@ def write_samples(
         manifest["projection_variant"] = variant
     if (folder / MANIFEST).exists():
         there = read_json(folder / MANIFEST)
-        if not _same(there, manifest):
+        if not _same(there, manifest, configuration.to_json(generator.Sampling())):
             raise OutputError(
                 f"{folder}, which holds samples of another model or drawn in another way",
                 "an empty folder, or one that this very command began",
                 "choose another folder",
             )
-    elif is_taken(folder, MANIFEST):
+    elif is_taken(folder, MANIFEST) and not (folder / MANIFEST).exists():  # another process may just have begun it
         raise OutputError(f"{folder}, which is not empty and holds no samples", "an empty folder", "choose another one")
     else:
         write_json(folder / MANIFEST, manifest)
     if (run_folder / TRAINED_ON_FILE).is_file() and not (folder / TRAINED_ON_FILE).exists():
         write_text(folder / TRAINED_ON_FILE, (run_folder / TRAINED_ON_FILE).read_text(encoding="utf-8"))
-    missing = [seed for seed in seeds if not _file(folder, seed).exists()]
+    there = {entry.name for entry in os.scandir(folder)}
+    missing = [seed for seed in seeds if _file(folder, seed).name not in there]
     with (reporter or Reporter()).progress("sampling", len(seeds), len(seeds) - len(missing)) as progress:
-        for first in range(0, len(missing), batch_size):
-            some = missing[first : first + batch_size]
-            images = generator.sample(some, sampling)
-            pixels = {"range_m": images.range_m.cpu().numpy()}
-            if images.reflectance is not None:
-                pixels["reflectance"] = images.reflectance.cpu().numpy()
-            for place, seed in enumerate(some):
-                with atomic_path(_file(folder, seed)) as temporary:
-                    np.savez_compressed(temporary, **{name: of[place] for name, of in pixels.items()})
-            progress.advance(len(some))
+        for seed, image in zip(missing, generator.stream(missing, sampling, batch_size), strict=True):
+            pixels = {"range_m": image.range_m.cpu().numpy()}
+            if image.reflectance is not None:
+                pixels["reflectance"] = image.reflectance.cpu().numpy()
+            with atomic_path(_file(folder, seed)) as temporary:
+                np.savez_compressed(temporary, **pixels)
+            progress.advance(1)
 
 
 def read_samples(folder: Path, count: int | None = None) -> RangeImages:
@@ -146,10 +145,14 @@ def is_sample_folder(folder: Path) -> bool:
     return (folder / MANIFEST).is_file()
 
 
-def _same(there: Any, manifest: dict[str, Any]) -> bool:
-    """Tell whether samples there are drawn as these will be; their cost follows from the rest, and is only told."""
-    if not isinstance(there, dict):
+def _same(there: Any, manifest: dict[str, Any], defaults: dict[str, Any]) -> bool:
+    """Tell whether samples there are drawn as these will be; their cost follows from the rest, and is only told.
+
+    A choice that folders of before it existed do not name was what is now its default.
+    """
+    if not isinstance(there, dict) or not isinstance(there.get("sampling"), dict):
         return False
+    there = {**there, "sampling": {**defaults, **there["sampling"]}}
     wanted = {key: of for key, of in manifest.items() if key in there or key not in _LATER_ENTRIES}
     return {**there, "cost_per_scan": None} == {**wanted, "cost_per_scan": None}
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -92,6 +93,19 @@ class Generator(nn.Module, ABC):
 
             lidargrit.load("runs/demo").sample(seeds=[0, 1, 2, 3])
         """
+
+    def stream(self, seeds: Iterable[int], sampling: Any = None, batch_size: int = 8) -> Iterator[RangeImage]:
+        """Yield one scan for each seed, drawn so many at once; nothing is kept, so seeds may be without end.
+
+        Args:
+            seeds: one a scan, such as ``itertools.count(0)``.
+            sampling: as for :meth:`sample`.
+            batch_size: the scans do not depend on it.
+        """
+        remaining = iter(seeds)
+        while some := list(islice(remaining, batch_size)):
+            images = self.sample(some, sampling)
+            yield from (images[index] for index in range(len(images)))
 
     @abstractmethod
     def cost(self, sampling: Any = None) -> Cost:

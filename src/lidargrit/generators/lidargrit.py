@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -13,7 +16,9 @@ from torch import Tensor, nn
 from lidargrit.errors import ConfigError
 from lidargrit.generators import Cost, Generator
 from lidargrit.nn.flops import flops_of
+from lidargrit.nn.precision import Precision
 from lidargrit.nn.transformer import CausalTransformer, TransformerConfig
+from lidargrit.nn.writing import TokenWriter, WeightPrecision
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage, TokenGrid
 from lidargrit.tokenizers import MaskDecoding, Tokenizer
@@ -33,12 +38,18 @@ class TokenSampling:
         top_p: draw among the likeliest tokens that together hold this probability; 1 for all.
         mask: ``bernoulli`` draws each return with its probability (the released program, so what the paper's scores
             were computed with); ``threshold`` keeps what is at least as likely as not (the paper's eq. 1).
+        weights: of the transformer. ``fp32`` is exact; ``bf16`` and ``int8`` (CPUs only) read less memory for a token
+            and change the odds a little, see docs/performance.md.
+        decoder: ``fp32`` gives the same scan on every machine; ``bf16`` is quicker and moves ranges a little, ``auto``
+            is that where the machine has instructions for it.
     """
 
     temperature: float = 1.0
     top_k: int = 0
     top_p: float = 1.0
     mask: MaskDecoding = "bernoulli"
+    weights: WeightPrecision = "fp32"
+    decoder: Precision = "fp32"
 
     def __post_init__(self) -> None:
         if not (self.temperature >= 0 and self.top_k >= 0 and 0 < self.top_p <= 1):
@@ -75,6 +86,7 @@ class LidarGrit(Generator):
         self.tokenizer = Vqvae(config.tokenizer, sensor)
         height, width = self.tokenizer.grid_size
         self.transformer = CausalTransformer(config.transformer, config.tokenizer.num_codes, height * width)
+        self._prepared: _Prepared | None = None
 
     def objective(self, stage: str) -> nn.Module:
         """Return the VQ-VAE itself, or the transformer's objective over the frozen VQ-VAE."""
@@ -96,10 +108,11 @@ class LidarGrit(Generator):
         device = self.transformer.head.weight.device
         rngs = [torch.Generator().manual_seed(seed) for seed in seeds]  # on the CPU: the same numbers on every device
         uniform = torch.stack([torch.rand(self.transformer.context_length, generator=rng) for rng in rngs])
-        tokens = sample_tokens(self.transformer, uniform.to(device), sampling)
-        grid = TokenGrid(tokens.unflatten(1, self.tokenizer.grid_size), self.tokenizer.num_codes)
+        writer, tokenizer = self._prepare(len(seeds), sampling)
+        tokens = writer.write(uniform.to(device))
+        grid = TokenGrid(tokens.unflatten(1, tokenizer.grid_size), tokenizer.num_codes)
         size = (self.sensor.height, self.sensor.width)
-        return self.tokenizer.decode(
+        return tokenizer.decode(
             grid, sampling.mask, torch.stack([torch.rand(size, generator=rng) for rng in rngs]).to(device)
         )
 
@@ -113,12 +126,17 @@ class LidarGrit(Generator):
         return self.tokenizer.decode(self.tokenizer.encode(images))
 
     @torch.no_grad()
+    def surprise(self, images: RangeImage) -> Float[Tensor, "B h w"]:
+        """Return how many bits each token of each scan takes after those before it, by one pass over all of them."""
+        self.eval()
+        tokens = self.tokenizer.encode(images).tokens
+        logits = self.transformer(after_start(tokens.flatten(1)[:, :-1]))
+        nats = F.cross_entropy(logits.double().movedim(-1, 1), tokens.flatten(1), reduction="none")
+        return (nats / math.log(2)).float().view(tokens.shape)
+
     def log_likelihood(self, images: RangeImage) -> Float[Tensor, "B"]:
         """Return the log-likelihood of each scan's tokens in nats; what is lost in encoding is not counted."""
-        self.eval()
-        tokens = self.tokenizer.encode(images).tokens.flatten(1)
-        logits = self.transformer(after_start(tokens[:, :-1]))
-        return -F.cross_entropy(logits.double().movedim(-1, 1), tokens, reduction="none").sum(dim=1).float()
+        return -self.surprise(images).double().sum(dim=(1, 2)).mul(math.log(2)).float()
 
     def cost(self, sampling: TokenSampling | None = None) -> Cost:
         """Return one step of the transformer for each token, with those before it in a cache, and one decoding."""
@@ -128,8 +146,27 @@ class LidarGrit(Generator):
         products = sizes.layers * (24 * sizes.width**2 * tokens + 2 * sizes.width * tokens * (tokens + 1))
         head = 2 * sizes.width * self.transformer.num_tokens * tokens
         latents = (1, self.tokenizer.config.code_dim, *self.tokenizer.grid_size)
-        decoding = flops_of(self.tokenizer.post_quant_conv, latents) + flops_of(self.tokenizer.decoder, latents)
+        decoding = flops_of(self.tokenizer.post_quant_conv, latents) + flops_of(
+            self.tokenizer.decoder.prepared("fp32"), latents
+        )
         return Cost(tokens + 1, products + head + decoding)
+
+    def _prepare(self, batch_size: int, sampling: TokenSampling) -> tuple[TokenWriter, Vqvae]:
+        """Return what draws tokens and what decodes them, kept from the last time if nothing has changed since."""
+        weights = tuple((weight.data_ptr(), weight._version) for weight in self.parameters())
+        key = (batch_size, sampling, weights)
+        if self._prepared is None or self._prepared.key != key:
+            self._prepared = None  # its cache is given back before the next is taken
+            chooser = partial(choose, sampling=sampling)
+            writer = TokenWriter(self.transformer, batch_size, chooser, START_TOKEN, sampling.weights)
+            self._prepared = _Prepared(key, writer, self.tokenizer.for_decoding(sampling.decoder))
+        return self._prepared.writer, self._prepared.tokenizer
+
+
+class _Prepared(NamedTuple):
+    key: object
+    writer: TokenWriter
+    tokenizer: Vqvae
 
 
 class NextToken(nn.Module):
@@ -162,22 +199,22 @@ def after_start(tokens: Int[Tensor, "B T"]) -> Int[Tensor, "B T+1"]:
     return F.pad(tokens, (1, 0), value=START_TOKEN)
 
 
-def sample_tokens(
-    transformer: CausalTransformer, uniform: Float[Tensor, "B T"], sampling: TokenSampling, use_cache: bool = True
+def sample_by_recomputing(
+    transformer: CausalTransformer, uniform: Float[Tensor, "B T"], sampling: TokenSampling
 ) -> Int[Tensor, "B T"]:
-    """Draw token sequences in raster order, one uniform number a token.
+    """Draw token sequences in raster order as the released program does: every step reads the whole prefix again.
+
+    This is the plain statement of what :class:`TokenWriter` does quicker, and what it is tested against.
 
     Args:
         transformer: what to draw from.
         uniform: random numbers in [0, 1); the token is where the distribution function first exceeds its number.
         sampling: temperature, top-k and top-p.
-        use_cache: off, every step reads the whole prefix again, as the released program does: for comparison.
     """
     tokens = torch.full((len(uniform), 1), START_TOKEN, dtype=torch.long, device=uniform.device)
-    cache = transformer.new_cache(len(uniform)) if use_cache else None
     for step in range(uniform.shape[1]):
-        logits = transformer.next_logits(tokens[:, -1], cache) if cache else transformer(tokens)[:, -1]
-        tokens = torch.cat((tokens, choose(logits, uniform[:, step], sampling)[:, None]), dim=1)
+        chosen = choose(transformer(tokens)[:, -1], uniform[:, step], sampling)
+        tokens = torch.cat((tokens, chosen[:, None]), dim=1)
     return tokens[:, 1:]
 
 

@@ -3,7 +3,14 @@
 from lidargrit.loading.batches import Batches, seed_of, spread
 from lidargrit.loading.config import DataConfig
 from lidargrit.loading.images import ImageStore, Pixels, Provenance, RangeImages
-from lidargrit.loading.prepare import cache_folder, damaged_shards, load_range_images, prepare, prepare_and_describe
+from lidargrit.loading.prepare import (
+    cache_folder,
+    damaged_shards,
+    load_range_images,
+    place_among,
+    prepare,
+    prepare_and_describe,
+)
 from lidargrit.loading.prepared import PreparedImages, is_prepared
 
 __all__ = [
@@ -18,6 +25,7 @@ __all__ = [
     "damaged_shards",
     "is_prepared",
     "load_range_images",
+    "place_among",
     "prepare",
     "prepare_and_describe",
     "seed_of",

@@ -104,9 +104,7 @@ def prepare(
         ScanError: a scan that cannot be used; names it.
     """
     reporter, sensor = reporter or Reporter(), sensor or config.load_sensor()
-    rank, world_size = _from_environment("RANK", rank, 0), _from_environment("WORLD_SIZE", world_size, 1)
-    if not 0 <= rank < world_size:
-        raise ConfigError(f"rank {rank} of {world_size}", "0 <= rank < world size", "number the machines from 0")
+    rank, world_size = place_among(rank, world_size)
     dataset = open_dataset(source, config.bad_points)
     if dataset.sensor != sensor.name and not config.sensor.endswith(".json"):
         reporter.message(f"WARNING: {source} was made by {dataset.sensor}, and is imaged as {sensor.name}")
@@ -173,6 +171,18 @@ def cache_folder() -> Path:
     if "LIDARGRIT_CACHE" in os.environ:
         return Path(os.environ["LIDARGRIT_CACHE"])
     return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "lidargrit"
+
+
+def place_among(rank: int | None, world_size: int | None) -> tuple[int, int]:
+    """Return which process this is, and of how many: as given, or as a launcher such as torchrun says, or 0 of 1.
+
+    Raises:
+        ConfigError: numbers that contradict each other.
+    """
+    rank, world_size = _from_environment("RANK", rank, 0), _from_environment("WORLD_SIZE", world_size, 1)
+    if not 0 <= rank < world_size:
+        raise ConfigError(f"rank {rank} of {world_size}", "0 <= rank < world size", "number the machines from 0")
+    return rank, world_size
 
 
 def _from_environment(name: str, given: int | None, default: int) -> int:

@@ -55,6 +55,30 @@ class Upsample(nn.Module):
         return self.conv(F.interpolate(x, scale_factor=2.0, mode="nearest"))
 
 
+class FoldedUpsample(nn.Module):
+    """What :class:`Upsample` computes, in 4/9 of its operations and without the repeated pixels.
+
+    A repeated pixel meets the sum of neighbouring weights: an output pixel sees only 2x2 different inputs. Together the
+    four kernels, one for each output pixel of an input's, are one transposed convolution of 4x4 weights and stride 2.
+    """
+
+    def __init__(self, upsample: Upsample) -> None:
+        super().__init__()
+        conv = upsample.conv
+        self.wraps = conv.wraps
+        shifts = [(right, 1 - right, down, 1 - down) for right in (0, 1) for down in (0, 1)]
+        summed = torch.stack([F.pad(conv.weight.detach(), shift) for shift in shifts]).sum(0)
+        self.weight = nn.Parameter(summed.transpose(0, 1).flip(2, 3).contiguous(), requires_grad=False)
+        self.bias = conv.bias
+
+    def forward(self, x: Float[Tensor, "B C h w"]) -> Float[Tensor, "B C H W"]:
+        """Double the rows and the columns."""
+        if not self.wraps:
+            return F.conv_transpose2d(x, self.weight, self.bias, stride=2, padding=1)
+        x = F.pad(x, (1, 1, 0, 0), mode="circular")
+        return F.conv_transpose2d(x, self.weight, self.bias, stride=2, padding=(1, 3))
+
+
 def group_norm(channels: int) -> nn.GroupNorm:
     """Return the reference's normalisation: 32 groups, epsilon 1e-6."""
     return nn.GroupNorm(32, channels, eps=1e-6)
@@ -79,6 +103,6 @@ class ResidualBlock(nn.Module):
 
     def forward(self, x: Float[Tensor, "B C H W"]) -> Float[Tensor, "B D H W"]:
         """Add what the two convolutions find to the input."""
-        h = self.conv1(F.silu(self.norm1(x)))
-        h = self.conv2(self.dropout(F.silu(self.norm2(h))))
+        h = self.conv1(F.silu(self.norm1(x), inplace=True))
+        h = self.conv2(self.dropout(F.silu(self.norm2(h), inplace=True)))
         return (self.nin_shortcut(x) if self.conv1.in_channels != self.conv1.out_channels else x) + h

@@ -1,11 +1,11 @@
-"""A causal transformer over tokens, with a key/value cache: tokens so far → logits of the next.
+"""A causal transformer over tokens: tokens so far → logits of the next.
 
-Parameter names follow the reference's state dict (a minGPT), so that published weights load.
+It reads whole sequences; ``nn.writing`` writes them token by token. Parameter names follow the reference's state dict
+(a minGPT), so that published weights load.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -48,15 +48,6 @@ class TransformerConfig:
                 raise ConfigError(f"{name}={getattr(self, name)}", "a share in [0, 1)", "lower it")
 
 
-@dataclass
-class KeyValueCache:
-    """Keys and values of the tokens so far, in memory taken once: one pair of tensors a layer."""
-
-    keys: list[Float[Tensor, "B heads T d"]]
-    values: list[Float[Tensor, "B heads T d"]]
-    length: int = 0
-
-
 class CausalTransformer(nn.Module):
     """Pre-norm blocks, learned positions, exact GELU, an untied head without bias.
 
@@ -87,22 +78,6 @@ class CausalTransformer(nn.Module):
             x = block(x)
         return self.head(self.ln_f(x))
 
-    def new_cache(self, batch_size: int) -> KeyValueCache:
-        """Return an empty cache for ``batch_size`` sequences of the longest length."""
-        heads = self.config.heads
-        shape = (batch_size, heads, self.context_length, self.config.width // heads)
-        weight = self.head.weight
-        empty = [torch.zeros(shape, device=weight.device, dtype=weight.dtype) for _ in range(2 * len(self.blocks))]
-        return KeyValueCache(empty[::2], empty[1::2])
-
-    def next_logits(self, tokens: Int[Tensor, "B"], cache: KeyValueCache) -> Float[Tensor, "B K"]:
-        """Return the logits that follow one more token, remembering its keys and values in the cache."""
-        x = (self.tok_emb(tokens) + self.pos_emb[0, cache.length])[:, None]
-        for block, keys, values in zip(self.blocks, cache.keys, cache.values, strict=True):
-            x = block(x, keys, values, cache.length)
-        cache.length += 1
-        return self.head(self.ln_f(x[:, 0]))
-
 
 class _Attention(nn.Module):
     def __init__(self, config: TransformerConfig) -> None:
@@ -113,21 +88,12 @@ class _Attention(nn.Module):
         self.value = nn.Linear(config.width, config.width)
         self.proj = nn.Linear(config.width, config.width)
 
-    def forward(
-        self, x: Tensor, past_keys: Tensor | None = None, past_values: Tensor | None = None, length: int = 0
-    ) -> Tensor:
+    def forward(self, x: Tensor) -> Tensor:
         q, k, v = (
             linear(x).unflatten(-1, (self.heads, -1)).transpose(1, 2) for linear in (self.query, self.key, self.value)
         )  # (B, heads, T, d)
-        if past_keys is None or past_values is None:
-            dropout = self.dropout if self.training else 0.0
-            mixed = F.scaled_dot_product_attention(q, k, v, dropout_p=dropout, is_causal=True)
-        else:
-            past_keys[:, :, length], past_values[:, :, length] = k[:, :, 0], v[:, :, 0]
-            keys, values = past_keys[:, :, : length + 1], past_values[:, :, : length + 1]
-            # For a single query two products beat the fused kernel on CPUs.
-            weights = (q @ keys.transpose(2, 3) / math.sqrt(q.shape[-1])).softmax(dim=-1)
-            mixed = weights @ values
+        dropout = self.dropout if self.training else 0.0
+        mixed = F.scaled_dot_product_attention(q, k, v, dropout_p=dropout, is_causal=True)
         return self.proj(mixed.transpose(1, 2).flatten(-2))
 
 
@@ -141,8 +107,8 @@ class _Block(nn.Module):
         )
         self.drop = nn.Dropout(config.residual_dropout)
 
-    def forward(self, x: Tensor, *past: Tensor | int) -> Tensor:
-        x = x + self.drop(self.attn(self.ln1(x), *past))
+    def forward(self, x: Tensor) -> Tensor:
+        x = x + self.drop(self.attn(self.ln1(x)))
         return x + self.drop(self.mlp(self.ln2(x)))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
 from typing import Literal
@@ -12,7 +13,16 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from lidargrit.errors import ConfigError
-from lidargrit.nn.convolution import Convolution, Downsample, Padding, ResidualBlock, Upsample, group_norm
+from lidargrit.nn.convolution import (
+    Convolution,
+    Downsample,
+    FoldedUpsample,
+    Padding,
+    ResidualBlock,
+    Upsample,
+    group_norm,
+)
+from lidargrit.nn.precision import Precision, dtype_of
 from lidargrit.nn.quantiser import CodebookLoss, VectorQuantiser
 from lidargrit.projection import RangeEncoding
 from lidargrit.sensors import SensorModel
@@ -143,13 +153,27 @@ class Decoder(nn.Module):
 
     def forward(self, z: Float[Tensor, "B D h w"]) -> Float[Tensor, "B heads H W"]:
         """Grow the latents to an image."""
-        x = self.conv_in(z)
+        x = self.conv_in(z.to(self.conv_in.weight))
         for block in self.mid.children():
             x = block(x)
         for stage in reversed(list(self.up)):
             for layer in [*stage.get_submodule("block").children(), *_named(stage, "upsample")]:
                 x = layer(x)
-        return self.conv_out(F.silu(self.norm_out(x)))
+        return self.conv_out(F.silu(self.norm_out(x.to(self.conv_out.weight.dtype))))
+
+    def prepared(self, precision: Precision) -> Decoder:
+        """Return a copy for decoding only, quicker: channels last, upsampling folded, perhaps in 16 bits.
+
+        The last layers stay in 32 bits: 16 would leave 8 of them for a range, steps of 0.2 m at 80 m.
+        """
+        fast = copy.deepcopy(self).eval().requires_grad_(False)
+        for stage in fast.up:
+            for upsample in _named(stage, "upsample"):
+                assert isinstance(upsample, Upsample)
+                stage.add_module("upsample", FoldedUpsample(upsample))
+        for layer in (fast.conv_in, fast.mid, fast.up):
+            layer.to(dtype_of(precision))
+        return fast.to(fast.conv_out.weight.device, memory_format=torch.channels_last)
 
 
 class Vqvae(Tokenizer):
@@ -203,6 +227,12 @@ class Vqvae(Tokenizer):
         """Return clean range and return logits of a batch of tokens."""
         encoded, return_logits = self._heads(self.quantize.lookup(tokens.tokens))
         return Decoded(self.range_encoding.decode(encoded), return_logits)
+
+    def for_decoding(self, precision: Precision) -> Vqvae:
+        """Return a tokenizer with the same weights that only decodes, quicker; see :meth:`Decoder.prepared`."""
+        fast = copy.copy(self)
+        fast._modules = {**self._modules, "decoder": self.decoder.prepared(precision)}
+        return fast
 
     def forward(self, images: RangeImage, rng: torch.Generator) -> dict[str, Tensor]:
         """Return the loss of eq. 5 of the paper and its terms, with the error in metres and the mask's accuracy."""

@@ -5,11 +5,12 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from lidargrit.nn.precision import Precision, dtype_of
 from lidargrit.structures import RangeImage
 
 
@@ -20,13 +21,13 @@ class Engine:
         precision: ``fp32``, ``bf16``, or ``auto`` for the second where the machine has instructions for it.
     """
 
-    def __init__(self, precision: Literal["fp32", "bf16", "auto"]) -> None:
+    def __init__(self, precision: Precision) -> None:
         from lightning_fabric import Fabric  # noqa: PLC0415  takes a second, and only training needs it
 
         logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # it tells the precision at every start
         # One device, unless a launcher such as torchrun began this process as one of several.
         launched = "LOCAL_RANK" in os.environ
-        short = precision == "bf16" or (precision == "auto" and has_bf16())
+        short = dtype_of(precision) == torch.bfloat16
         self._fabric: Any = Fabric(precision="bf16-mixed" if short else "32-true", devices="auto" if launched else 1)
         self._fabric.launch()
         self.device, self.rank, self.world_size = self._fabric.device, self._fabric.global_rank, self._fabric.world_size
@@ -75,14 +76,6 @@ class Engine:
                 terms = _joined(terms, _ask(objective, images.to(self.device), rng, phase), phase)
         objective.train(was_training)
         return {name: float(term) for name, term in terms.items()}
-
-
-def has_bf16() -> bool:
-    """Tell whether this machine computes in bfloat16 natively."""
-    if torch.cuda.is_available():
-        return torch.cuda.is_bf16_supported(including_emulation=False)
-    # Torch has no public question for this yet; a torch without this one is taken for a machine without bfloat16.
-    return bool(getattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)())
 
 
 class _Door(nn.Module):

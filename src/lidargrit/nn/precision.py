@@ -1,0 +1,22 @@
+"""What a machine computes quickly: → whether in 16 bits."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+
+Precision = Literal["fp32", "bf16", "auto"]
+
+
+def has_bf16() -> bool:
+    """Tell whether this machine computes in bfloat16 natively."""
+    if torch.cuda.is_available():
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    # Torch has no public question for this yet; a torch without this one is taken for a machine without bfloat16.
+    return bool(getattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)())
+
+
+def dtype_of(precision: Precision) -> torch.dtype:
+    """Return the type of a precision's numbers; ``auto`` is bf16 where the machine has instructions for it."""
+    return torch.bfloat16 if precision == "bf16" or (precision == "auto" and has_bf16()) else torch.float32

@@ -1,0 +1,195 @@
+"""Sequences written token by token, as fast as memory is read: (transformer, uniform numbers) → tokens.
+
+The transformer itself reads whole sequences, for training and for likelihoods. Here its weights are laid out for one
+token at a time, and every step costs Python and the machine as little as can be: query, key and value come from one
+product, the cache is memory taken once, and residuals are added in place. In 32 bits all of it is exact algebra.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from lidargrit.errors import ConfigError
+from lidargrit.nn.transformer import CausalTransformer
+
+WeightPrecision = Literal["fp32", "bf16", "int8"]
+Choose = Callable[[Tensor, Tensor], Tensor]
+
+_SPAN = 128  # where shapes must not change, attention reads a multiple of so many positions: 8 graphs for 1,024 tokens
+
+
+class TokenWriter:
+    """Writes sequences of the transformer's longest length, ``batch_size`` at once, from one set of weights.
+
+    Args:
+        transformer: in evaluation; later changes of its weights may go unnoticed.
+        batch_size: number of sequences.
+        choose: (logits (B, K), uniform numbers (B,)) → tokens (B,).
+        start: the token that every sequence begins after.
+        precision: ``fp32`` writes what the transformer writes when it reads the whole prefix for every token. ``bf16``
+            keeps weights, activations and cache in 16 bits. ``int8`` keeps the weights of the blocks in 8 bits, with
+            one scale a row, and the rest in 16; only on CPUs.
+        static: compute with shapes that do not change from token to token, recorded into CUDA graphs on a GPU; what a
+            GPU wants, and its default.
+
+    Raises:
+        ConfigError: 8 bits on a device that is not a CPU.
+    """
+
+    def __init__(
+        self,
+        transformer: CausalTransformer,
+        batch_size: int,
+        choose: Choose,
+        start: int = 0,
+        precision: WeightPrecision = "fp32",
+        static: bool | None = None,
+    ) -> None:
+        self._device = transformer.head.weight.device
+        if precision == "int8" and self._device.type != "cpu":
+            raise ConfigError(f"8-bit weights on {self._device.type}", "a CPU", "use bf16 there")
+        self._choose, self._start, self._length = choose, start, transformer.context_length
+        self._static = self._device.type == "cuda" if static is None else static
+        dtype = torch.float32 if precision == "fp32" else torch.bfloat16
+        heads, width = transformer.config.heads, transformer.config.width
+        self._embedding = transformer.tok_emb.weight.detach().to(dtype)
+        self._positions = transformer.pos_emb[0].detach().to(dtype)
+        self._blocks = [_Block(block, heads, precision) for block in transformer.blocks]
+        self._last_norm = _norm(transformer.ln_f, dtype)
+        self._head = transformer.head.weight.detach().to(dtype)
+        # Layer, key or value, sequence and head, position, number: one step writes all layers' slices of a position.
+        size = (len(self._blocks), 2, batch_size * heads, self._length, width // heads)
+        self._cache = torch.zeros(size, dtype=dtype, device=self._device)
+        self._slots = self._cache.unflatten(2, (batch_size, heads))
+        fused = torch.zeros(batch_size, 3 * width, dtype=dtype, device=self._device)
+        self._fused, self._query = fused, fused[:, :width].view(batch_size, heads, 1, width // heads)
+        self._newest = fused[:, width:].view(batch_size, 2, heads, width // heads).transpose(0, 1)
+        self._tokens = torch.zeros(batch_size, dtype=torch.long, device=self._device)
+        self._written = torch.zeros(batch_size, self._length, dtype=torch.long, device=self._device)
+        self._uniform = torch.zeros(batch_size, self._length, device=self._device)
+        self._position = torch.zeros(1, dtype=torch.long, device=self._device)
+        self._graphs: dict[int, Callable[[], None]] = {}
+
+    @torch.no_grad()
+    def write(self, uniform: Float[Tensor, "B T"]) -> Int[Tensor, "B T"]:
+        """Write one sequence for each row of uniform numbers in [0, 1), one number a token."""
+        length = uniform.shape[1]
+        if self._static:
+            self._record_graphs(length)
+            self._uniform[:, :length] = uniform
+            self._rewind()
+            for step in range(length):
+                self._graphs[step // _SPAN]()
+        else:
+            self._tokens.fill_(self._start)
+            for step in range(length):
+                self._tokens = self._choose(self.next_logits(self._tokens, step), uniform[:, step])
+                self._written[:, step] = self._tokens
+        return self._written[:, :length].clone()
+
+    @torch.no_grad()
+    def next_logits(self, tokens: Int[Tensor, "B"], position: int) -> Float[Tensor, "B K"]:
+        """Return the logits that follow a token, which comes after ``position`` others that were given before."""
+        slots = self._slots[:, :, :, :, position].unbind()
+
+        def remember(layer: int) -> None:
+            slots[layer].copy_(self._newest)
+
+        x = F.embedding(tokens, self._embedding) + self._positions[position]
+        return self._logits(x, self._cache[:, :, :, : position + 1], remember)
+
+    def _logits(self, x: Tensor, past: Tensor, remember: Callable[[int], None], unseen: Tensor | None = None) -> Tensor:
+        keys_and_values = past.unflatten(2, self._query.shape[:2]).unbind()
+        for layer, (block, (keys, values)) in enumerate(zip(self._blocks, keys_and_values, strict=True)):
+            block.query_key_value(block.norm1(x), self._fused)
+            remember(layer)
+            x.add_(block.proj(_mix(self._query, keys, values, unseen).view_as(x), None))
+            x.add_(block.contract(F.gelu(block.expand(block.norm2(x), None)), None))
+        return F.linear(self._last_norm(x), self._head).float()
+
+    def _static_step(self, span: int) -> None:
+        """Write one token at the position that a tensor holds, and advance it; no shape depends on the position."""
+        slots = self._slots.unbind()
+
+        def remember(layer: int) -> None:
+            slots[layer].index_copy_(3, self._position, self._newest.unsqueeze(3))
+
+        x = F.embedding(self._tokens, self._embedding) + self._positions.index_select(0, self._position)
+        unseen = torch.arange(span, device=self._device) > self._position
+        logits = self._logits(x, self._cache[:, :, :, :span], remember, unseen)
+        chosen = self._choose(logits, self._uniform.index_select(1, self._position)[:, 0])
+        self._tokens.copy_(chosen)
+        self._written.index_copy_(1, self._position, chosen[:, None])
+        self._position.add_(1)
+
+    def _rewind(self) -> None:
+        self._tokens.fill_(self._start)
+        self._position.zero_()
+
+    def _record_graphs(self, length: int) -> None:
+        for index in range(len(self._graphs), math.ceil(length / _SPAN)):
+            span = min((index + 1) * _SPAN, self._length)
+            if self._device.type != "cuda":
+                self._graphs[index] = lambda span=span: self._static_step(span)
+                continue
+            stream, graph = torch.cuda.Stream(), torch.cuda.CUDAGraph()
+            stream.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(stream):  # once outside of the graph, so that libraries take their workspaces
+                self._rewind()
+                self._static_step(span)
+            torch.cuda.current_stream().wait_stream(stream)
+            self._rewind()
+            with torch.cuda.graph(graph):
+                self._static_step(span)
+            self._graphs[index] = graph.replay
+
+
+class _Block:
+    """One block's weights, laid out for single tokens; the scale of attention is already in the query's."""
+
+    def __init__(self, block: nn.Module, heads: int, precision: WeightPrecision) -> None:
+        attention, perceptron = block.get_submodule("attn"), block.get_submodule("mlp")
+        query, key, value, proj = (_weights(attention, name) for name in ("query", "key", "value", "proj"))
+        scale = 1 / math.sqrt(query[0].shape[0] // heads)
+        weight = torch.cat((query[0] * scale, key[0], value[0]))
+        self.query_key_value = _product(weight, torch.cat((query[1] * scale, key[1], value[1])), precision)
+        self.proj = _product(*proj, precision)
+        self.expand, self.contract = (_product(*_weights(perceptron, name), precision) for name in ("0", "2"))
+        dtype = torch.float32 if precision == "fp32" else torch.bfloat16
+        self.norm1, self.norm2 = (_norm(block.get_submodule(name), dtype) for name in ("ln1", "ln2"))
+
+
+def _weights(parent: nn.Module, name: str) -> tuple[Tensor, Tensor]:
+    linear = parent.get_submodule(name)
+    return linear.get_parameter("weight").detach(), linear.get_parameter("bias").detach()
+
+
+def _norm(norm: nn.Module, dtype: torch.dtype) -> Callable[[Tensor], Tensor]:
+    weight, bias = norm.get_parameter("weight").detach().to(dtype), norm.get_parameter("bias").detach().to(dtype)
+    return lambda x: torch.layer_norm(x, weight.shape, weight, bias)
+
+
+def _product(weight: Tensor, bias: Tensor, precision: WeightPrecision) -> Callable[[Tensor, Tensor | None], Tensor]:
+    """Return (x, where to) → x @ weight.T + bias."""
+    if precision == "int8":
+        scale = weight.abs().amax(dim=1).clamp(min=1e-12) / 127
+        rounded, scale, bias = (weight / scale[:, None]).round().to(torch.int8), scale.bfloat16(), bias.bfloat16()
+        return lambda x, out: torch.add(torch.ops.aten._weight_int8pack_mm(x, rounded, scale), bias, out=out)
+    dtype = torch.float32 if precision == "fp32" else torch.bfloat16
+    columns, bias = weight.to(dtype).T, bias.to(dtype)
+    return lambda x, out: torch.addmm(bias, x, columns, out=out)
+
+
+def _mix(query: Tensor, keys: Tensor, values: Tensor, unseen: Tensor | None) -> Tensor:
+    """Return the values (B, heads, 1, d), weighted by how well their keys fit the query, whose scale is in it."""
+    if query.dtype != torch.float32:
+        return F.scaled_dot_product_attention(query, keys, values, None if unseen is None else ~unseen[None], scale=1.0)
+    fit = query @ keys.transpose(2, 3)  # for a single query in 32 bits two products beat the fused kernel on CPUs
+    return (fit if unseen is None else fit.masked_fill_(unseen, -torch.inf)).softmax(dim=-1) @ values
