@@ -24,6 +24,7 @@ from lidargrit.structures import RangeImage, TokenGrid
 from lidargrit.tokenizers import MaskDecoding, Tokenizer
 from lidargrit.tokenizers.vqvae import Vqvae, VqvaeConfig
 
+_DECODED_AT_ONCE = 4  # enough to keep a GPU busy; more would only take memory, 35 MB a scan and layer at 64x1024
 START_TOKEN = 0  # the reference prepends an ordinary token, shared with the first code, not one of its own
 
 
@@ -110,11 +111,15 @@ class LidarGrit(Generator):
         uniform = torch.stack([torch.rand(self.transformer.context_length, generator=rng) for rng in rngs])
         writer, tokenizer = self._prepare(len(seeds), sampling)
         tokens = writer.write(uniform.to(device))
-        grid = TokenGrid(tokens.unflatten(1, tokenizer.grid_size), tokenizer.num_codes)
         size = (self.sensor.height, self.sensor.width)
-        return tokenizer.decode(
-            grid, sampling.mask, torch.stack([torch.rand(size, generator=rng) for rng in rngs]).to(device)
-        )
+        images = []
+        for first in range(0, len(seeds), _DECODED_AT_ONCE):
+            some = slice(first, first + _DECODED_AT_ONCE)
+            grid = TokenGrid(tokens[some].unflatten(1, tokenizer.grid_size), tokenizer.num_codes)
+            uniform = torch.stack([torch.rand(size, generator=rng) for rng in rngs[some]]).to(device)
+            part = tokenizer.decode(grid, sampling.mask, uniform)
+            images += [part[index] for index in range(len(part))]
+        return RangeImage.stack(images)
 
     def get_tokenizer(self) -> Tokenizer:
         """Return the VQ-VAE."""

@@ -173,7 +173,10 @@ class Decoder(nn.Module):
                 stage.add_module("upsample", FoldedUpsample(upsample))
         for layer in (fast.conv_in, fast.mid, fast.up):
             layer.to(dtype_of(precision))
-        return fast.to(fast.conv_out.weight.device, memory_format=torch.channels_last)
+        for weight in fast.parameters():
+            if weight.ndim == 4:
+                weight.data = weight.contiguous(memory_format=torch.channels_last)
+        return fast
 
 
 class Vqvae(Tokenizer):
