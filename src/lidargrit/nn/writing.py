@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Literal
 
 import torch
@@ -182,6 +183,11 @@ def _product(weight: Tensor, bias: Tensor, precision: WeightPrecision) -> Callab
         scale = weight.abs().amax(dim=1).clamp(min=1e-12) / 127
         rounded, scale, bias = (weight / scale[:, None]).round().to(torch.int8), scale.bfloat16(), bias.bfloat16()
         return lambda x, out: torch.add(torch.ops.aten._weight_int8pack_mm(x, rounded, scale), bias, out=out)
+    if precision == "bf16" and weight.device.type == "cpu" and torch.ops.mkldnn._is_mkldnn_bf16_supported():
+        # In the order in which oneDNN reads them, half the time of a plain product at 16 sequences.
+        packed, bias = torch.ops.mkldnn._reorder_linear_weight(weight.bfloat16()), bias.bfloat16()
+        multiply = partial(torch.ops.mkldnn._linear_pointwise, W=packed, B=bias, attr="none", scalars=[], algorithm="")
+        return lambda x, out: multiply(x) if out is None else out.copy_(multiply(x))
     dtype = torch.float32 if precision == "fp32" else torch.bfloat16
     columns, bias = weight.to(dtype).T, bias.to(dtype)
     return lambda x, out: torch.addmm(bias, x, columns, out=out)
