@@ -107,11 +107,11 @@ class TokenWriter:
         return self._logits(x, self._cache[:, :, :, : position + 1], remember)
 
     def _logits(self, x: Tensor, past: Tensor, remember: Callable[[int], None], unseen: Tensor | None = None) -> Tensor:
-        keys_and_values = past.unflatten(2, self._query.shape[:2]).unbind()
-        for layer, (block, (keys, values)) in enumerate(zip(self._blocks, keys_and_values, strict=True)):
+        keys, values = (each.unbind() for each in past.unflatten(2, self._query.shape[:2]).unbind(1))
+        for layer, block in enumerate(self._blocks):
             block.query_key_value(block.norm1(x), self._fused)
             remember(layer)
-            x.add_(block.proj(_mix(self._query, keys, values, unseen).view_as(x), None))
+            x.add_(block.proj(_mix(self._query, keys[layer], values[layer], unseen).view_as(x), None))
             x.add_(block.contract(F.gelu(block.expand(block.norm2(x), None)), None))
         return F.linear(self._last_norm(x), self._head).float()
 
