@@ -84,7 +84,7 @@ def write_samples(
     missing = [seed for seed in seeds if _file(folder, seed).name not in there]
     with (reporter or Reporter()).progress("sampling", len(seeds), len(seeds) - len(missing)) as progress:
         for seed, image in zip(missing, generator.stream(missing, sampling, batch_size), strict=True):
-            pixels = {"range_m": image.range_m.cpu().numpy()}
+            pixels: dict[str, Any] = {"range_m": image.range_m.cpu().numpy()}
             if image.reflectance is not None:
                 pixels["reflectance"] = image.reflectance.cpu().numpy()
             with atomic_path(_file(folder, seed)) as temporary:
