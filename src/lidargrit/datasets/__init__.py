@@ -160,6 +160,24 @@ def open_dataset(source: str, bad_points: BadPoints = "refuse") -> ScanDataset:
     return load(name)(root, split, bad_points)
 
 
+def without_place(source: str) -> tuple[str, str]:
+    """Return a source's data set and split, of which nothing tells where a user keeps it; "" for what is not known.
+
+    Example:
+        >>> without_place("kitti_360:/data/kitti_360:train")
+        ('kitti_360', 'train')
+    """
+    head, colon, rest = source.partition(":")
+    if colon and head in _discovery.names("datasets"):
+        name, (_, split) = head, _root_and_split(rest)
+    else:
+        root, split = _root_and_split(source)
+        name = (recognise(root) or "") if root.is_dir() else ""
+    known = load(name).splits() if name else {}
+    part = split.partition("[")[0]
+    return name, split if part in known or "/" not in part else ""
+
+
 def load(name: str) -> type[ScanDataset]:
     """Return a data set's class by its name, or raise UnknownNameError."""
     return _discovery.load_class("datasets", name, ScanDataset)

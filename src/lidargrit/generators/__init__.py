@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
+import importlib
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from lidargrit import _discovery, configuration
 from lidargrit.errors import CheckpointError, ConfigError, LidarGritError
-from lidargrit.files import load_exactly, read_json, read_tensors, write_json, write_tensors
+from lidargrit.files import load_exactly, read_json, read_tensors, write_json, write_tensors, write_text
 from lidargrit.loading import RangeImages
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 from lidargrit.tokenizers import Tokenizer
 
-CONFIG_FILE, WEIGHTS_FILE = "config.json", "model.safetensors"
+CONFIG_FILE, WEIGHTS_FILE, CARD_FILE = "config.json", "model.safetensors", "README.md"  # the names that the hub knows
 TRAINED_ON_FILE = "trained_on.json"  # in a run's folder and beside its samples: which drives, which pixels
 
 
@@ -63,6 +65,8 @@ class Generator(nn.Module, ABC):
     Sampling: ClassVar[type] = NoSampling
     stages: ClassVar[tuple[str, ...]]
     capabilities: ClassVar[frozenset[str]] = frozenset()
+    published_files: ClassVar[tuple[str, ...]] = ()
+    """What the files hold that the system's authors published its weights in, in order; none if we read none."""
     sensor: SensorModel
     config: Any
 
@@ -184,6 +188,58 @@ class Generator(nn.Module, ABC):
         load_exactly(generator, weights, source)
         return generator.eval()
 
+    @classmethod
+    def from_published(cls, files: Sequence[Path], config: Any, sensor: SensorModel) -> Generator:
+        """Make a generator with the weights that the system's authors published, or that their program saved.
+
+        Args:
+            files: as many as ``published_files``, in that order; code in them is not run.
+            config: sizes, where the files do not tell them.
+            sensor: whose rays their images have.
+
+        Raises:
+            CheckpointError: other files, or weights of other sizes.
+        """
+        able = [name for name in _discovery.names("generators") if load_class(name).published_files]
+        raise ConfigError(
+            f"a generator {cls.public_name()!r}, of which nobody published weights",
+            f"a recipe of {', '.join(able)}",
+            "see which generator a recipe has with: lidargrit train RECIPE OUT --dry-run",
+        )
+
+    def save_pretrained(self, folder: str | Path, card: str = "") -> None:
+        """Write what a repository of the Hugging Face hub holds: weights, configuration, and a model card if given.
+
+        These are the files of :meth:`save`. ``lidargrit publish`` writes the card from a run.
+
+        Args:
+            folder: for the files.
+            card: Markdown, for ``README.md``.
+        """
+        if card:
+            write_text(Path(folder) / CARD_FILE, card)
+        self.save(Path(folder))
+
+    @classmethod
+    def from_pretrained(cls, name: str | Path, revision: str | None = None) -> Self:
+        """Read a generator from a folder, or from a repository of the Hugging Face hub.
+
+        Args:
+            name: of a run's or a published folder, or "USER/REPOSITORY" if no such folder is there.
+            revision: of the repository: a branch, a tag or a commit.
+
+        Raises:
+            CheckpointError: no such folder or repository, a damaged one, or another kind of generator in it.
+        """
+        generator = load(name if Path(name).is_dir() else _downloaded(str(name), revision))
+        if not isinstance(generator, cls):
+            raise CheckpointError(
+                f"{name}, which holds a generator {generator.public_name()!r}",
+                f"one of {cls.public_name()!r}",
+                "read it with Generator.from_pretrained",
+            )
+        return generator
+
 
 def is_run(folder: Path) -> bool:
     """Tell whether a folder is that of a finished run."""
@@ -224,3 +280,18 @@ def load(folder: str | Path) -> Generator:
 def load_class(name: str) -> type[Generator]:
     """Return the generator class of a name, or raise UnknownNameError."""
     return _discovery.load_class("generators", name, Generator)
+
+
+def _downloaded(name: str, revision: str | None) -> Path:
+    """Fetch the files of a repository by the hub's own client, which keeps them in its cache."""
+    wanted, cure = "a run's folder, or USER/REPOSITORY on the Hugging Face hub", "check the name"
+    if not re.fullmatch(r"[\w.-]+/[\w.-]+", name):
+        raise CheckpointError(f"{name}, which is no folder", wanted, cure)
+    try:
+        hub = importlib.import_module("huggingface_hub")  # an extra: nothing else needs it
+        return Path(hub.snapshot_download(name, revision=revision, allow_patterns=["*.json", WEIGHTS_FILE]))
+    except ImportError:
+        got, cure = f"{name}, which is no folder here", "to fetch it from the hub: pip install 'lidargrit[hub]'"
+    except Exception as error:  # its client has a dozen kinds, from a wrong name to a broken line, and changes them
+        got = f"{name}, which cannot be fetched ({type(error).__name__}: {str(error).partition(chr(10))[0][:100]})"
+    raise CheckpointError(got, wanted, cure)

@@ -38,6 +38,7 @@ _LOGITS: dict[Variant, int] = {"dusty_1": 1, "dusty_2": 2, "baseline": 0}  # map
 _TOLERANCE: dict[Variant, float] = {"dusty_1": 0.0, "dusty_2": 0.0, "baseline": 0.008}  # of the program
 _NO_RETURN = -1.0  # as an encoded range; the same as a return at the far limit
 
+_PUBLISHED_SENSOR = "hdl64e_kitti_odometry"
 _PUBLISHED_BYTES_AT_MOST = 2**29  # weights, their average and the optimiser of a published model take 350 MB
 
 
@@ -121,6 +122,7 @@ class Dusty(Generator):
     Sampling = DustySampling
     stages = ("adversarial",)
     capabilities = frozenset({"complete", "invert"})
+    published_files = ("generator",)
 
     def __init__(self, config: DustyConfig, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
@@ -147,6 +149,11 @@ class Dusty(Generator):
     def cost(self, sampling: DustySampling | None = None) -> Cost:
         """Return one pass of the network."""
         return Cost(1, flops_of(self.synthesis, (1, self.config.latent_dim)))
+
+    @classmethod
+    def from_published(cls, files: Sequence[Path], config: DustyConfig, sensor: SensorModel) -> Dusty:
+        """Make a generator of one checkpoint, which tells its own sizes; see :func:`load_published`."""
+        return load_published(files[0], sensor)
 
     def invert(self, images: RangeImage, seeds: Sequence[int], sampling: DustySampling | None = None) -> RangeImage:
         """Return for each scan the nearest that the network draws, as far as a search from a seed finds it."""
@@ -293,16 +300,16 @@ class Game(nn.Module):
         return augment_differentiably(images, self.config.augmentations, self.config.augmentation_defects, rng)
 
 
-def load_published(path: Path, sensor: str = "hdl64e_kitti_odometry") -> Dusty:
+def load_published(path: Path, sensor: SensorModel | None = None) -> Dusty:
     """Make a generator of a checkpoint that the authors published, or that their program saved.
 
     Such a file is torch's, a dictionary of which this reads ``G_ema``: the moving average of the generator's weights,
     under the names that lidargrit.nn.dcgan translates. Which variant it is, and how wide, is told by the weights. The
-    program's images are in the columns and rows of the sensor that is the default here.
+    program's images are in the columns and rows of that sensor.
 
     Args:
         path: of the file; code in it is not run.
-        sensor: whose rays the images have.
+        sensor: whose rays the images have; if not given, KITTI odometry's.
 
     Raises:
         CheckpointError: no such file, or one that holds something else, or a model of images of another size.
@@ -324,7 +331,7 @@ def load_published(path: Path, sensor: str = "hdl64e_kitti_odometry") -> Dusty:
         raise CheckpointError(
             f"{path}, whose 'G_ema' is no generator of DUSty v1", "one that its program saved", "check the path"
         ) from None
-    generator = Dusty(config, load_sensor(sensor))
+    generator = Dusty(config, sensor or load_sensor(_PUBLISHED_SENSOR))
     load_exactly(generator, {f"synthesis.{name}": weight for name, weight in weights.items()}, path)
     return generator.eval()
 

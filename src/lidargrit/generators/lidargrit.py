@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -14,9 +15,11 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from lidargrit.errors import ConfigError
+from lidargrit.files import load_exactly
 from lidargrit.generators import Cost, Generator
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.precision import Precision
+from lidargrit.nn.published import read_checkpoint
 from lidargrit.nn.transformer import CausalTransformer, TransformerConfig
 from lidargrit.nn.writing import TokenWriter, WeightPrecision
 from lidargrit.sensors import SensorModel
@@ -26,6 +29,12 @@ from lidargrit.tokenizers.vqvae import Vqvae, VqvaeConfig
 
 _DECODED_AT_ONCE = 4  # enough to keep a GPU busy; more would only take memory, 35 MB a scan and layer at 64x1024
 START_TOKEN = 0  # the reference prepends an ordinary token, shared with the first code, not one of its own
+_PUBLISHED_BYTES_AT_MOST = 2 << 30  # the first release's transformer of 126 M weights, with its optimiser, takes 1.6 GB
+_PUBLISHED_NETWORKS = {  # ours → its name in a checkpoint of the program, and what in it is no weight of the network
+    "tokenizer": ("VQ", ("loss.*",)),  # a discriminator and an image network, whose terms have the weight 0
+    "transformer": ("Transformer", ("*.attn.mask",)),  # a triangle of ones
+}
+_COUNTERS = ("quantize.usage", "quantize.code_sums")  # of our training, which other programs do not keep
 
 
 @dataclass(frozen=True)
@@ -80,6 +89,7 @@ class LidarGrit(Generator):
     Sampling = TokenSampling
     stages = ("tokenizer", "transformer")
     capabilities = frozenset({"tokens", "encode", "likelihood"})
+    published_files = tuple(_PUBLISHED_NETWORKS)
 
     def __init__(self, config: LidarGritConfig, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
@@ -166,6 +176,24 @@ class LidarGrit(Generator):
             writer = TokenWriter(self.transformer, batch_size, chooser, START_TOKEN, sampling.weights)
             self._prepared = _Prepared(key, writer, self.tokenizer.for_decoding(sampling.decoder))
         return self._prepared.writer, self._prepared.tokenizer
+
+    @classmethod
+    def from_published(cls, files: Sequence[Path], config: LidarGritConfig, sensor: SensorModel) -> LidarGrit:
+        """Make a generator of a VQ-VAE's and a transformer's checkpoint, whose names of weights are ours.
+
+        The files do not tell the heads of attention, nor the order of tokens: only that of the paper, row by row over
+        the whole image, is known here.
+
+        Source:
+            hamedhaghighi/LidarGRIT@a3f86e7, models/base_model.py.
+        """
+        generator = cls(config, sensor)
+        for (part, (name, ignored)), path in zip(_PUBLISHED_NETWORKS.items(), files, strict=True):
+            network = generator.get_submodule(part)
+            weights = read_checkpoint(path, (name,), _PUBLISHED_BYTES_AT_MOST, ignored)
+            counters = {ours: of for ours, of in network.state_dict().items() if ours in _COUNTERS}
+            load_exactly(network, weights | counters, path)
+        return generator.eval()
 
 
 class _Prepared(NamedTuple):

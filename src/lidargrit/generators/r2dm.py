@@ -26,6 +26,7 @@ from lidargrit.sensors import SensorModel, load_sensor
 from lidargrit.structures import RangeImage
 
 _BATCH = 8
+_PUBLISHED_SENSOR = "hdl64e_kitti_360"
 _FILE_BYTES_AT_MOST = 4 << 30  # the published ones, with optimiser and average, take half a gigabyte
 _SHARE_SCANS = 1000  # whose returns are counted: more would not change their share
 _CALIBRATION_SEED = 1 << 40  # of the first scan that is drawn for it: no one draws their samples there
@@ -90,6 +91,7 @@ class R2dm(Generator):
     Sampling = DiffusionSampling
     stages = ("diffusion",)
     capabilities = frozenset({"complete"})
+    published_files = ("settings and network",)
     return_share: Tensor
     return_threshold: Tensor
 
@@ -186,6 +188,11 @@ class R2dm(Generator):
         steps = (sampling or DiffusionSampling()).steps
         return Cost(steps, steps * flops_of(self.network, (1, *self.shape), (1,)))
 
+    @classmethod
+    def from_published(cls, files: Sequence[Path], config: R2dmConfig, sensor: SensorModel) -> R2dm:
+        """Make a generator of one checkpoint, which tells its own sizes; see :func:`load_published`."""
+        return load_published(files[0], sensor)
+
     @torch.no_grad()
     def _draw(self, seeds: Sequence[int], sampling: DiffusionSampling) -> Float[Tensor, "B C H W"]:
         self.eval()
@@ -255,7 +262,7 @@ class Denoising(nn.Module):
         return {"loss": (error * diffusion.min_snr_weight(log_snr)).mean(), "noise_mse": error.mean()}
 
 
-def load_published(path: Path, sensor: str = "hdl64e_kitti_360") -> R2dm:
+def load_published(path: Path, sensor: SensorModel | None = None) -> R2dm:
     """Make a generator of a checkpoint that the authors published (r2dm-h-kitti360-300k.pth and the like).
 
     Such a file is torch's, a dictionary of which this reads ``cfg`` (the settings by name, in one level) and
@@ -266,7 +273,7 @@ def load_published(path: Path, sensor: str = "hdl64e_kitti_360") -> R2dm:
 
     Args:
         path: of the file; code in it is not run.
-        sensor: whose rays the images have: by elevation for the KITTI-360 weights.
+        sensor: whose rays the images have; if not given, by elevation, for the KITTI-360 weights.
 
     Raises:
         CheckpointError: another file, or a model of another form.
@@ -296,7 +303,8 @@ def load_published(path: Path, sensor: str = "hdl64e_kitti_360") -> R2dm:
     for name, known in _KNOWN_FORM.items():
         if settings.get(name, known) != known:
             raise CheckpointError(f"{path} with {name}={settings[name]!r}", f"{name}={known!r}", "use other weights")
-    generator = R2dm(R2dmConfig(unet, bool(settings.get("train_reflectance", True))), load_sensor(sensor))
+    config = R2dmConfig(unet, bool(settings.get("train_reflectance", True)))
+    generator = R2dm(config, sensor or load_sensor(_PUBLISHED_SENSOR))
     ours = {
         f"network.{name.partition('.')[2]}": tensor
         for name, tensor in published.items()

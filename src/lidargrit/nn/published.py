@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import zipfile
 from collections.abc import Sequence
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +21,16 @@ class RefusedFileError(Exception):
     """Why a file is not read; follows its name in a sentence."""
 
 
-def read_checkpoint(path: Path, place: Sequence[str], bytes_at_most: int) -> dict[str, Tensor]:
+def read_checkpoint(
+    path: Path, place: Sequence[str], bytes_at_most: int, ignored: Sequence[str] = ()
+) -> dict[str, Tensor]:
     """Return the weights of one network in a checkpoint of another program.
 
     Args:
         path: of the file.
         place: names that lead to the weights, such as ``("G_ema",)``; they are all that is looked at.
         bytes_at_most: of the file; a larger one is refused unread.
+        ignored: patterns of names that are passed over, such as ``loss.*``.
 
     Raises:
         CheckpointError: no file, too large a one, or anything but float32 tensors in that place.
@@ -43,6 +47,8 @@ def read_checkpoint(path: Path, place: Sequence[str], bytes_at_most: int) -> dic
             if not isinstance(found, dict) or name not in found:
                 raise RefusedFileError(f"which holds no {name!r}")
             found = found[name]
+        if isinstance(found, dict):
+            found = {name: of for name, of in found.items() if not any(fnmatchcase(str(name), p) for p in ignored)}
         return float_tensors(found, bytes_at_most)
     except (RefusedFileError, OSError) as why:
         raise CheckpointError(
@@ -80,6 +86,8 @@ def float_tensors(loaded: object, bytes_at_most: int) -> dict[str, Tensor]:
         plain = isinstance(value, Tensor) and value.layout == torch.strided and value.device.type == "cpu"
         if not plain or value.dtype != torch.float32 or 4 * value.numel() > bytes_at_most:
             raise RefusedFileError(f"whose {name!r} is no float32 tensor of a network")
+    if 4 * sum(value.numel() for value in tensors.values()) > bytes_at_most:
+        raise RefusedFileError("whose tensors are larger than the file could be")
     return {name: value.detach().contiguous() for name, value in tensors.items()}
 
 

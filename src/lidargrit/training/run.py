@@ -22,7 +22,7 @@ from lidargrit.training.checkpoint import fingerprint
 from lidargrit.training.fit import Fit
 from lidargrit.training.settings import Recipe
 
-RUN_FILE = "run.json"
+RUN_FILE = "run.json"  # ``origin`` in it says that the weights beside it were not trained in this folder
 
 
 def train(recipe: Recipe, folder: Path, reporter: Reporter | None = None) -> Generator:
@@ -78,6 +78,10 @@ def _check_folder(folder: Path, recipe: Recipe) -> None:
         theirs = about.get("recipe") if isinstance(about, dict) else None
         if not isinstance(theirs, dict):
             raise CheckpointError(f"{folder / RUN_FILE} without a recipe", "what lidargrit wrote", "restore the file")
+        if "origin" in about:
+            raise OutputError(
+                f"{folder}, whose weights were {about['origin']}", "a run of train's", "choose another folder"
+            )
         mine, other = configuration.leaves(ours), configuration.leaves(theirs)
         differing = [name for name in mine.keys() | other.keys() if mine.get(name) != other.get(name)]
         if differing:

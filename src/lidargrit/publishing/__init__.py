@@ -1,0 +1,116 @@
+"""Weights that change hands: the files of a system's authors → a run folder; a run → a folder that can be shared."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from lidargrit import __version__, configuration
+from lidargrit.errors import CheckpointError, ConfigError, OutputError
+from lidargrit.evaluation.samples import MANIFEST, is_sample_folder, trained_on
+from lidargrit.evaluation.scorecard import Scorecard
+from lidargrit.files import is_taken, read_json, write_json
+from lidargrit.generators import TRAINED_ON_FILE, WEIGHTS_FILE, Generator, load, load_class
+from lidargrit.publishing.card import data_set_of, model_card
+from lidargrit.recipes import load_recipe
+from lidargrit.training.run import RUN_FILE
+
+
+def import_weights(recipe: str, folder: Path, files: Sequence[Path], settings: Sequence[str] = ()) -> Generator:
+    """Make a run folder of the weights that a system's authors published, or that their program saved.
+
+    Args:
+        recipe: says which generator, of which sizes, and the sensor; nothing is trained.
+        folder: gets ``run.json``, ``model.safetensors`` and ``config.json``, as after training.
+        files: of ``torch.save``, in the order of the generator's ``published_files``; code in them is not run.
+        settings: of the recipe, changed as in ``data.variant=reference``.
+
+    Raises:
+        ConfigError: as many files as the generator's weights do not come in.
+        CheckpointError: a file that holds something else, or weights of other sizes; names the first.
+        OutputError: the folder holds something else.
+    """
+    made_of = load_recipe(recipe, settings)
+    cls = load_class(made_of.generator)
+    if cls.published_files and len(files) != len(cls.published_files):
+        raise ConfigError(
+            f"{len(files)} {'file' if len(files) == 1 else 'files'}",
+            f"{len(cls.published_files)}, for the {' and the '.join(cls.published_files)} of {made_of.generator!r}",
+            "name them in this order",
+        )
+    generator = cls.from_published(files, made_of.model, made_of.data.load_sensor())
+    about: dict[str, Any] = {
+        "origin": "imported",
+        "files": [{"name": path.name, "sha256": _sha256(path)} for path in files],
+        "recipe": configuration.to_json(made_of),
+        "lidargrit": __version__,
+    }
+    if is_taken(folder, RUN_FILE) and not ((folder / RUN_FILE).is_file() and read_json(folder / RUN_FILE) == about):
+        raise OutputError(f"{folder}, which is not empty", "an empty folder", "choose another one")
+    write_json(folder / RUN_FILE, about)
+    generator.save(folder)
+    return generator
+
+
+def publish(run: Path, folder: Path, scores: Path | None = None) -> str:
+    """Write what of a run others need, and nothing of where its user keeps things; nothing is uploaded.
+
+    Args:
+        run: folder of a finished run.
+        folder: gets ``model.safetensors``, ``config.json``, a model card (``README.md``), and the run's recipe and what
+            it learned from, without folders and file names. It is a run folder again: all that reads runs reads it.
+        scores: of the run's samples, as ``lidargrit evaluate --json`` wrote them.
+
+    Returns:
+        the card.
+
+    Raises:
+        CheckpointError: no finished run.
+        ConfigError: scores of samples of other weights.
+        OutputError: the folder is not empty.
+    """
+    generator = load(run)
+    if is_taken(folder, RUN_FILE):
+        raise OutputError(f"{folder}, which is not empty", "an empty folder", "choose another one")
+    about: Any = read_json(run / RUN_FILE) if (run / RUN_FILE).is_file() else {}
+    if not isinstance(about, dict) or not isinstance(about.get("recipe", {}), dict):
+        raise CheckpointError(f"{run / RUN_FILE} without a recipe", "what lidargrit wrote", "restore the file")
+    scored = Scorecard.read(scores) if scores else None
+    if scored:
+        _check_scores(scored, run)
+    learned = trained_on(run)
+    card = model_card(generator, about, learned, scored)
+    public = {name: about[name] for name in ("files", "lidargrit", "commit", "torch", "python") if name in about}
+    write_json(folder / RUN_FILE, {"origin": "published", "recipe": _without_places(about, generator), **public})
+    if learned.recordings or learned.fingerprints:
+        # A recording that has no name of its own goes by its folder.
+        drives = [recording for recording in learned.recordings if not Path(recording).is_absolute()]
+        write_json(folder / TRAINED_ON_FILE, {"recordings": drives, "fingerprints": list(learned.fingerprints)})
+    generator.save_pretrained(folder, card)
+    return card
+
+
+def _without_places(about: dict[str, Any], generator: Generator) -> dict[str, Any]:
+    recipe = about.get("recipe", {})
+    data = recipe.get("data", {})
+    sources = {part: ["::".join(data_set_of(source)) for source in data.get(part, ())] for part in ("train", "val")}
+    return {**recipe, "data": {**data, **sources, "sensor": generator.sensor.name}}
+
+
+def _check_scores(scores: Scorecard, run: Path) -> None:
+    """Refuse scores of other weights, where their samples are still there to tell."""
+    samples = Path(scores.samples.source)
+    if not is_sample_folder(samples):
+        return
+    theirs = read_json(samples / MANIFEST)
+    if not isinstance(theirs, dict) or theirs.get("weights_sha256") != _sha256(run / WEIGHTS_FILE):
+        raise ConfigError(
+            f"scores of {samples}, which were not drawn from {run}", "scores of this run's samples", "evaluate those"
+        )
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

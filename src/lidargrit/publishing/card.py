@@ -1,0 +1,197 @@
+"""What is known of a run → a model card: Markdown for people, with a head for the Hugging Face hub."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable
+from typing import Any
+
+from lidargrit import _discovery
+from lidargrit.datasets import load as load_dataset
+from lidargrit.datasets import without_place
+from lidargrit.errors import LidarGritError
+from lidargrit.evaluation.scorecard import Scorecard, figure
+from lidargrit.generators import Generator
+from lidargrit.loading import Provenance
+from lidargrit.loading.prepared import Place, is_prepared, read_plan
+
+_PIPELINE = "unconditional-image-generation"  # of the hub's tasks the nearest; it has none for scans
+_CREATIVE_COMMONS = re.compile(r"CC ([A-Z-]+) (\d\.\d) \([a-z-]+\)")  # without terms beside it
+_FREE = load_dataset("simulated").licence
+_PLACE = re.compile(r"(?<![\w.])(?:~|[A-Za-z]:)?[/\\][^\s,;:)']*")
+
+
+def model_card(
+    generator: Generator, about: dict[str, Any], learned: Provenance, scores: Scorecard | None = None
+) -> str:
+    """Write the card of a model, from what its run folder tells and nothing else.
+
+    Args:
+        generator: the model.
+        about: its ``run.json``; empty if that is not there.
+        learned: from which recordings and pixels.
+        scores: of its samples.
+
+    Source:
+        The head's entries are those of the hub's documentation, "Model cards".
+    """
+    licences = _licences(about)
+    bound = _hub_licence(licences)
+    head = {
+        "library_name": "lidargrit",
+        "pipeline_tag": _PIPELINE,
+        **({"license": bound} if bound else {}),
+        "tags": ["lidar", "point-cloud", "range-image", generator.public_name()],
+    }
+    parts = [
+        "\n".join(["---", *(f"{name}: {json.dumps(of)}" for name, of in head.items()), "---"]),  # JSON is YAML
+        _what(generator),
+        _how_to_sample(),
+        _data(about, learned),
+        _licence(about, licences),
+        _training(about),
+        *([_scores(scores)] if scores else ["## Scores\n\nNone were given with this model."]),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def data_set_of(source: str) -> tuple[str, str]:
+    """Return the data set and the split of a source; of prepared scans, those that they were prepared from."""
+    if "://" in source:  # where it lies is nobody's business, and asking there may take long
+        return "", ""
+    try:
+        return without_place(read_plan(Place(source)).source if is_prepared(source) else source)
+    except LidarGritError:
+        return "", ""
+
+
+def _what(generator: Generator) -> str:
+    sensor, name = generator.sensor, generator.public_name()
+    weights = sum(weight.numel() for weight in generator.parameters())
+    return (
+        f"# {name} for {sensor.name}\n\n"
+        f"{_discovery.summary('generators', name)}\n\n"
+        f"It writes range images of {sensor.height}x{sensor.width} pixels, {sensor.range_min_m:g} to "
+        f"{sensor.range_max_m:g} m, in the rays of the sensor `{sensor.name}`, and has {weights:,} parameters.\n"
+        "Made with [lidargrit](https://pypi.org/project/lidargrit/): `config.json` holds its sizes and rays."
+    )
+
+
+def _how_to_sample() -> str:
+    return """## How to sample
+
+```sh
+lidargrit sample FOLDER samples -n 16    # FOLDER is where these files lie
+lidargrit view samples
+```
+
+```python
+from lidargrit import unproject
+from lidargrit.generators import Generator
+
+model = Generator.from_pretrained("FOLDER")  # or "USER/NAME", with the extra lidargrit[hub]
+scans = model.sample(seeds=[0, 1, 2, 3])  # one for each seed
+points_xyz_m = unproject(scans[0]).points_xyz_m
+```"""
+
+
+def _data(about: dict[str, Any], learned: Provenance) -> str:
+    data = about.get("recipe", {}).get("data", {})
+    if not data:
+        return "## Data\n\nNot told by the run."
+    lines = ["## Data", ""]
+    if _imported(about):
+        lines += ["The model's authors trained it; what they learned from is theirs to tell. The recipe names:", ""]
+    lines += ["| part | data set | split | licence |", "|---|---|---|---|"]
+    leaks: list[str] = []
+    for part in ("train", "val"):
+        for name, split in map(data_set_of, data.get(part, ())):
+            licence = load_dataset(name).licence if name else "not known"
+            lines.append(f"| {part} | {name or 'unnamed scans'} | {split or '-'} | {licence} |")
+            leaks += _leaks(name, split)
+    lines += ["", *dict.fromkeys(leaks)]
+    if data.get("variant"):
+        lines.append(f"Scans became images by the `{data['variant']}` projection.")
+    if learned.fingerprints:
+        lines.append(f"It learned from {len(learned.fingerprints):,} different images.")
+    return "\n".join(lines)
+
+
+def _leaks(name: str, split: str) -> list[str]:
+    """Tell what a published split's parts share."""
+    part = split.partition("[")[0]
+    found = []
+    for number, (scheme, of) in enumerate(load_dataset(name).schemes.items() if name else ()):
+        if part in {f"{scheme}/{each}" for each in of.parts} | (set(of.parts) if number == 0 else set()):
+            found.append(f"Splits of {name} are those of {of.source}. What they share: {of.leak}")
+    return found
+
+
+def _licence(about: dict[str, Any], licences: list[str]) -> str:
+    lines = ["## Licence", ""]
+    if _imported(about):
+        lines.append("The weights are their authors': whether they may be passed on, and used, is for these to say.")
+    if any("non-commercial" in licence for licence in licences):
+        lines.append("It learned from data for non-commercial use only: treat the weights as non-commercial too.")
+    lines += [f"The data are under: {licence}." for licence in licences]
+    if not licences:
+        lines.append("What the data demand is not known from the run.")
+    return "\n".join(lines)
+
+
+def _training(about: dict[str, Any]) -> str:
+    recipe = about.get("recipe", {})
+    files = [f"- `{file['name']}`, SHA-256 `{file['sha256']}`" for file in about.get("files", ())]
+    if _imported(about):
+        return "\n".join(["## Training", "", "Not by lidargrit: the weights were imported from", "", *files])
+    lines = ["## Training", "", "| stage | scans seen | batch | learning rate |", "|---|---|---|---|"]
+    for stage, fit in recipe.get("training", {}).items():
+        lines.append(f"| {stage} | {fit['scans']:,} | {fit['batch_size']} | {fit['learning_rate']:g} |")
+    if not recipe.get("training"):
+        lines = ["## Training", "", "None is told by the run."]
+    software = [f"{name} {about[name]}" for name in ("lidargrit", "commit", "torch", "python") if name in about]
+    lines += ["", f"Seed {recipe.get('seed', 'unknown')}; {', '.join(software) or 'software unknown'}."]
+    return "\n".join([*lines, "Every setting is in `run.json`."])
+
+
+def _scores(card: Scorecard) -> str:
+    reference = " ".join(filter(None, (card.reference.data_set, card.reference.split))) or "scans"
+    lines = [
+        "## Scores",
+        "",
+        f"By the protocol `{card.protocol}`, against {card.reference.scans_used:,} of {reference}.",
+        "The interval is 95 %; the floor is what such scans score against one another.",
+        "",
+        "| metric | variant | score | interval | floor | better |",
+        "|---|---|---|---|---|---|",
+    ]
+    for score in card.scores:
+        interval, result = score.interval, score.result
+        between = f"{figure(interval.low)} to {figure(interval.high)}" if interval else "-"
+        floor = figure(score.floor.value) if score.floor else "-"
+        better = "higher" if result.higher_is_better else "lower"
+        lines.append(
+            f"| {result.metric} | {result.variant} | {figure(result.value)} | {between} | {floor} | {better} |"
+        )
+    notes = [f"- not the protocol: {each}" for each in card.deviations] + [
+        f"- warning: {each}" for each in card.warnings
+    ]
+    return "\n".join([*lines, "", *(_PLACE.sub("…", note) for note in notes)]).rstrip()
+
+
+def _imported(about: dict[str, Any]) -> bool:
+    return bool(about.get("files"))
+
+
+def _licences(about: dict[str, Any]) -> list[str]:
+    sources: Iterable[str] = about.get("recipe", {}).get("data", {}).get("train", ())
+    names = {data_set_of(source)[0] for source in sources}
+    return sorted({load_dataset(name).licence if name else "not known" for name in names})
+
+
+def _hub_licence(licences: list[str]) -> str:
+    """Return the hub's word for what the data demand: ``other`` where none fits, "" where they demand nothing."""
+    bound = [_CREATIVE_COMMONS.fullmatch(licence) for licence in licences if licence != _FREE]
+    words = {f"cc-{found[1]}-{found[2]}".lower() if found else "other" for found in bound}
+    return "other" if len(words) > 1 else "".join(words)

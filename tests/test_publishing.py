@@ -1,0 +1,225 @@
+"""A run → a folder that can be shared: the hub's file names, a card that keeps to the facts, no path of the user's."""
+
+import json
+import sys
+from types import SimpleNamespace
+
+import pytest
+import torch
+import yaml
+
+import lidargrit
+from lidargrit.cli import main
+from lidargrit.datasets import load, without_place
+from lidargrit.errors import CheckpointError
+from lidargrit.generators import Generator
+from lidargrit.generators.lidargrit import LidarGrit
+from lidargrit.generators.marginal import Marginal
+from lidargrit.loading import Provenance
+from lidargrit.publishing.card import data_set_of, model_card
+from tiny_runs import MODEL, SHORT, contents, the_one_line
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Return a finished run on a user's own drives, with samples and their scores beside it."""
+    folder = tmp_path_factory.mktemp("private_place")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("LIDARGRIT_CACHE", str(folder / "cache"))
+        load("kitti_odometry").write_example(folder / "data", 4)
+        sources = [f"data.train=[kitti_odometry:{folder / 'data'}:train]", f"data.val=[{folder / 'data'}:08]"]
+        assert main(["train", "demo", str(folder / "run"), "--set", *MODEL, *SHORT, *sources]) == 0
+        assert main(["sample", str(folder / "run"), str(folder / "samples"), "-n", "3"]) == 0
+        words = [
+            "--metrics",
+            "sliced_wasserstein",
+            "bev_jsd",
+            "--intervals",
+            "0",
+            "--json",
+            str(folder / "scores.json"),
+        ]
+        assert main(["evaluate", str(folder / "samples"), f"{folder / 'data'}:00", *words]) == 0
+    return folder / "run"
+
+
+def head_of(card):
+    _, head, body = card.split("---\n", 2)
+    return yaml.safe_load(head), body
+
+
+def test_what_is_published_is_a_run_without_the_users_places(run, tmp_path, capsys):
+    public = tmp_path / "public"
+    assert main(["publish", str(run), str(public), "--scores", str(run.parent / "scores.json")]) == 0
+    assert "to upload: hf upload USER/NAME" in capsys.readouterr().out
+    files = contents(public)
+    assert set(files) == {"README.md", "config.json", "model.safetensors", "run.json", "trained_on.json"}
+    assert all(b"private_place" not in of and b"/tmp" not in of for of in files.values())
+    assert (public / "model.safetensors").read_bytes() == (run / "model.safetensors").read_bytes()
+    about = json.loads(files["run.json"])
+    assert about["recipe"]["data"]["train"] == ["kitti_odometry::train"]
+    assert about["recipe"]["training"]["transformer"]["scans"] == 8
+    model = Generator.from_pretrained(public)
+    assert torch.equal(model.sample([3]).range_m, lidargrit.load(run).sample([3]).range_m)
+    assert main(["sample", str(public), str(tmp_path / "drawn"), "-n", "1"]) == 0
+    assert json.loads((tmp_path / "drawn" / "samples.json").read_text())["projection_variant"] == "exact"
+    again = tmp_path / "again"
+    assert main(["publish", str(public), str(again), "--scores", str(run.parent / "scores.json")]) == 0
+    assert contents(again) == files
+    assert main(["train", "demo", str(public), "--set", *MODEL]) == 2
+    assert "whose weights were published" in capsys.readouterr().err
+
+
+def test_the_card_tells_the_facts(run, tmp_path):
+    assert main(["publish", str(run), str(tmp_path / "public"), "--scores", str(run.parent / "scores.json")]) == 0
+    head, body = head_of((tmp_path / "public" / "README.md").read_text())
+    assert head == {
+        "library_name": "lidargrit",
+        "pipeline_tag": "unconditional-image-generation",
+        "license": "cc-by-nc-sa-3.0",
+        "tags": ["lidar", "point-cloud", "range-image", "lidargrit"],
+    }
+    scores = json.loads((run.parent / "scores.json").read_text())["scores"]
+    for fact in (
+        "# lidargrit for hdl64e_kitti_odometry",
+        "range images of 64x64 pixels, 0.9 to 120 m",
+        "| train | kitti_odometry | train | CC BY-NC-SA 3.0 (non-commercial) |",
+        "| val | kitti_odometry | 08 | CC BY-NC-SA 3.0 (non-commercial) |",
+        "Splits of kitti_odometry are those of ",
+        "treat the weights as non-commercial too",
+        "| tokenizer | 4 | 4 | 0.0015 |",
+        "| transformer | 8 | 8 | 0.001 |",
+        f"lidargrit {lidargrit.__version__}, commit ",
+        "By the protocol `exact`, against 3 of kitti_odometry 00.",
+        "Generator.from_pretrained(",
+    ):
+        assert fact in body, fact
+    assert sum(
+        line.startswith(f"| {score['metric']} | {score['variant']} |") for score in scores for line in body.splitlines()
+    ) == len(scores)
+
+
+def test_scores_of_other_weights_and_taken_folders_are_refused(run, tmp_path, capsys):
+    def error(*words):
+        assert main(["publish", *map(str, words)]) == 2
+        return the_one_line(capsys.readouterr().err, "publish")
+
+    samples = run.parent / "samples" / "samples.json"
+    before = samples.read_text()
+    try:
+        samples.write_text(before.replace(json.loads(before)["weights_sha256"], "0" * 64))
+        told = error(run, tmp_path / "new", "--scores", run.parent / "scores.json")
+    finally:
+        samples.write_text(before)
+    assert "which were not drawn from" in told
+    assert not (tmp_path / "new").exists()
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "taken" / "thesis.tex").write_text("")
+    assert "which is not empty" in error(run, tmp_path / "taken")
+    assert "holds no finished model" in error(tmp_path / "taken", tmp_path / "new")
+    assert "which cannot be used" in error(run, tmp_path / "new", "--scores", run / "run.json")
+
+
+def marginal():
+    recipe = lidargrit.load_sensor("hdl64e_kitti_odometry").with_columns(32)
+    return Marginal(Marginal.Config(bins=8), recipe)
+
+
+@pytest.mark.parametrize(
+    ("sources", "licence"),
+    [
+        (["kitti_360:/data/k:train"], "cc-by-nc-sa-3.0"),
+        (["simulated:100:train"], None),
+        (["simulated:100:train", "kitti_raw:/data/raw"], "cc-by-nc-sa-3.0"),
+        (["kitti_360:/data/k", "argoverse2:/data/a"], "other"),
+        (["nuscenes:/data/n"], "other"),
+        (["/data/somewhere/that/is/gone"], "other"),
+        (["https://example.org/prepared"], "other"),
+    ],
+)
+def test_the_licence_is_what_the_data_demand(sources, licence):
+    card = model_card(marginal(), {"recipe": {"data": {"train": sources}}}, Provenance())
+    head, body = head_of(card)
+    assert head.get("license") == licence
+    assert ("non-commercial" in body) == any(name in " ".join(sources) for name in ("kitti", "nuscenes", "argo"))
+    assert "/data" not in body
+    assert "example.org" not in body
+
+
+def test_a_card_of_which_nothing_is_known_claims_nothing():
+    head, body = head_of(model_card(marginal(), {}, Provenance()))
+    assert "license" not in head
+    for line in ("Not told by the run.", "What the data demand is not known", "None were given with this model."):
+        assert line in body
+
+
+def test_a_card_of_imported_weights_names_their_files_and_their_authors_rights():
+    about = {
+        "origin": "published",
+        "files": [{"name": "vq.pth", "sha256": "ab" * 32}],
+        "recipe": {"data": {"train": ["kitti_360::train"]}, "training": {"tokenizer": {"scans": 5}}},
+    }
+    body = head_of(model_card(marginal(), about, Provenance()))[1]
+    assert f"- `vq.pth`, SHA-256 `{'ab' * 32}`" in body
+    assert "Not by lidargrit" in body
+    assert "The weights are their authors'" in body
+    assert "scans seen" not in body
+
+
+@pytest.mark.parametrize(
+    ("source", "name", "split"),
+    [
+        ("kitti_360:/data/k360:train_without_val[:90%]", "kitti_360", "train_without_val[:90%]"),
+        ("kitti_360:/data/k360:lidargen-code/train", "kitti_360", "lidargen-code/train"),
+        ("kitti_360:/data/k360", "kitti_360", "all"),
+        ("simulated:2000:val", "simulated", "val"),
+        ("kitti_360::train", "kitti_360", "train"),
+        ("kitti_odometry:/data/a:/secret/b", "kitti_odometry", ""),
+        ("/home/me/scans:00+03", "", "00+03"),
+    ],
+)
+def test_a_source_without_its_place(source, name, split):
+    assert without_place(source) == data_set_of(source) == (name, split)
+
+
+def test_prepared_scans_are_named_by_what_they_were_prepared_from(tmp_path):
+    assert (
+        main(["prepare", "simulated:2:train", "-o", str(tmp_path / "prepared"), "--columns", "64", "--workers", "1"])
+        == 0
+    )
+    assert data_set_of(str(tmp_path / "prepared")) == ("simulated", "train")
+
+
+def test_saved_and_read_in_the_hubs_way(tmp_path):
+    model = marginal()
+    model.save_pretrained(str(tmp_path / "model"), card="# A model\n")
+    assert set(contents(tmp_path / "model")) == {"README.md", "config.json", "model.safetensors"}
+    again = Marginal.from_pretrained(str(tmp_path / "model"))
+    assert all(torch.equal(of, again.state_dict()[name]) for name, of in model.state_dict().items())
+    assert isinstance(Generator.from_pretrained(tmp_path / "model"), Marginal)
+    with pytest.raises(CheckpointError, match="holds a generator 'marginal'; wanted one of 'lidargrit'"):
+        LidarGrit.from_pretrained(tmp_path / "model")
+    model.save_pretrained(tmp_path / "bare")
+    assert set(contents(tmp_path / "bare")) == {"config.json", "model.safetensors"}
+
+
+def test_a_name_that_is_no_folder_is_asked_of_the_hub(tmp_path, monkeypatch):
+    marginal().save_pretrained(tmp_path / "fetched")
+    asked = []
+
+    def snapshot_download(name, revision, allow_patterns):
+        asked.append((name, revision, tuple(allow_patterns)))
+        if name == "nobody/nothing":
+            raise RuntimeError("404\nlong story")
+        return str(tmp_path / "fetched")
+
+    monkeypatch.setitem(sys.modules, "huggingface_hub", SimpleNamespace(snapshot_download=snapshot_download))
+    assert isinstance(Generator.from_pretrained("some-one/model.1", revision="v1"), Marginal)
+    assert asked == [("some-one/model.1", "v1", ("*.json", "model.safetensors"))]
+    with pytest.raises(CheckpointError, match=r"which cannot be fetched \(RuntimeError: 404\);"):
+        Generator.from_pretrained("nobody/nothing")
+    with pytest.raises(CheckpointError, match="runs/mine/gone, which is no folder"):
+        Generator.from_pretrained("runs/mine/gone")
+    monkeypatch.setitem(sys.modules, "huggingface_hub", None)  # as if it were not installed
+    with pytest.raises(CheckpointError, match=r"pip install 'lidargrit\[hub\]'"):
+        Generator.from_pretrained("some-one/model")
