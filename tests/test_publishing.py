@@ -1,6 +1,7 @@
 """A run → a folder that can be shared: the hub's file names, a card that keeps to the facts, no path of the user's."""
 
 import json
+import shutil
 import sys
 from types import SimpleNamespace
 
@@ -87,10 +88,11 @@ def test_the_card_tells_the_facts(run, tmp_path):
         "| val | kitti_odometry | 08 | CC BY-NC-SA 3.0 (non-commercial) |",
         "Splits of kitti_odometry are those of ",
         "treat the weights as non-commercial too",
+        "Recipe: LidarGRIT, demo: the small model for a few minutes.",
         "| tokenizer | 4 | 4 | 0.0015 |",
         "| transformer | 8 | 8 | 0.001 |",
         f"lidargrit {lidargrit.__version__}, commit ",
-        "By the protocol `exact`, against 3 of kitti_odometry 00.",
+        "By the protocol `exact`, against 2 of kitti_odometry 00.",
         "Generator.from_pretrained(",
     ):
         assert fact in body, fact
@@ -118,6 +120,11 @@ def test_scores_of_other_weights_and_taken_folders_are_refused(run, tmp_path, ca
     assert "which is not empty" in error(run, tmp_path / "taken")
     assert "holds no finished model" in error(tmp_path / "taken", tmp_path / "new")
     assert "which cannot be used" in error(run, tmp_path / "new", "--scores", run / "run.json")
+    shutil.copytree(run, tmp_path / "edited")
+    for edited in ("[]", '{"recipe": 5}', '{"recipe": {"data": {"train": 5}}}', '{"recipe": {"training": {"x": {}}}}'):
+        (tmp_path / "edited" / "run.json").write_text(edited)
+        assert "run.json, which cannot be used" in error(tmp_path / "edited", tmp_path / "new")
+    assert not (tmp_path / "new").exists()
 
 
 def marginal():

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
@@ -221,7 +221,7 @@ class Generator(nn.Module, ABC):
         self.save(Path(folder))
 
     @classmethod
-    def from_pretrained(cls, name: str | Path, revision: str | None = None) -> Self:
+    def from_pretrained(cls, name: str | Path, revision: str | None = None) -> Generator:
         """Read a generator from a folder, or from a repository of the Hugging Face hub.
 
         Args:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import pickle
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,13 +19,14 @@ from lidargrit.loading import RangeImages, spread
 from lidargrit.nn import diffusion
 from lidargrit.nn.diffusion import Sampler, SeededNoise
 from lidargrit.nn.flops import flops_of
+from lidargrit.nn.published import RefusedFileError, float_tensors, read_everything
 from lidargrit.nn.unet import EfficientUnet, UnetConfig
 from lidargrit.sensors import SensorModel, load_sensor
 from lidargrit.structures import RangeImage
 
 _BATCH = 8
 _PUBLISHED_SENSOR = "hdl64e_kitti_360"
-_FILE_BYTES_AT_MOST = 4 << 30  # the published ones, with optimiser and average, take half a gigabyte
+_FILE_BYTES_AT_MOST = 1 << 30  # the published ones, with optimiser and average, take half a gigabyte
 _SHARE_SCANS = 1000  # whose returns are counted: more would not change their share
 _CALIBRATION_SEED = 1 << 40  # of the first scan that is drawn for it: no one draws their samples there
 
@@ -283,11 +282,14 @@ def load_published(path: Path, sensor: SensorModel | None = None) -> R2dm:
     """
     wanted, cure = "a checkpoint of R2DM's authors", "download it again from kazuto1011/r2dm, release 'weights'"
     try:
-        if not path.is_file() or path.stat().st_size > _FILE_BYTES_AT_MOST:  # opening a pipe would hang
-            raise ValueError("no file, or far too large a one")
-        with warnings.catch_warnings(action="ignore"):  # of pickles in another dialect, which fail or load all the same
-            file = torch.load(path, map_location="cpu", weights_only=True)
-        settings, published = dict(file["cfg"]), dict(file["ema_weights"])
+        file = read_everything(path, _FILE_BYTES_AT_MOST)
+        settings = dict(file["cfg"])
+        weights = {
+            f"network.{name.partition('.')[2]}": tensor
+            for name, tensor in file["ema_weights"].items()
+            if name.partition(".")[0] in ("denoiser", "model") and name.rpartition(".")[2] not in _CONSTANTS
+        }
+        published = float_tensors(weights, _FILE_BYTES_AT_MOST)
         unet = UnetConfig(
             channels=int(settings["model_base_channels"]),
             channel_multipliers=_four(settings["model_channel_multiplier"]),
@@ -297,7 +299,7 @@ def load_published(path: Path, sensor: SensorModel | None = None) -> R2dm:
         )
     except ConfigError:
         raise
-    except (OSError, KeyError, TypeError, ValueError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
+    except (OSError, KeyError, TypeError, ValueError, AttributeError, RefusedFileError) as error:
         told = str(error).partition("\n")[0][:100]
         raise CheckpointError(f"{path}, which cannot be read ({type(error).__name__}: {told})", wanted, cure) from None
     for name, known in _KNOWN_FORM.items():
@@ -305,13 +307,8 @@ def load_published(path: Path, sensor: SensorModel | None = None) -> R2dm:
             raise CheckpointError(f"{path} with {name}={settings[name]!r}", f"{name}={known!r}", "use other weights")
     config = R2dmConfig(unet, bool(settings.get("train_reflectance", True)))
     generator = R2dm(config, sensor or load_sensor(_PUBLISHED_SENSOR))
-    ours = {
-        f"network.{name.partition('.')[2]}": tensor
-        for name, tensor in published.items()
-        if name.partition(".")[0] in ("denoiser", "model") and name.rpartition(".")[2] not in _CONSTANTS
-    }
     own = {name: tensor for name, tensor in generator.state_dict().items() if not name.startswith("network.")}
-    load_exactly(generator, ours | own, path)
+    load_exactly(generator, published | own, path)
     return generator.eval()
 
 

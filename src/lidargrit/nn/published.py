@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import warnings
 import zipfile
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
@@ -36,13 +37,7 @@ def read_checkpoint(
         CheckpointError: no file, too large a one, or anything but float32 tensors in that place.
     """
     try:
-        if not path.is_file():  # a pipe would hang
-            raise RefusedFileError("which is no file")
-        with path.open("rb") as file:
-            data = file.read(bytes_at_most + 1)
-        if len(data) > bytes_at_most:
-            raise RefusedFileError(f"which is larger than {bytes_at_most / 1e6:.0f} MB")
-        found = unpickle(data)
+        found = read_everything(path, bytes_at_most)
         for name in place:
             if not isinstance(found, dict) or name not in found:
                 raise RefusedFileError(f"which holds no {name!r}")
@@ -56,6 +51,22 @@ def read_checkpoint(
         ) from None
 
 
+def read_everything(path: Path, bytes_at_most: int) -> Any:
+    """Return all that a checkpoint of another program holds.
+
+    Raises:
+        RefusedFileError: no file, too large a one, or one that holds more than tensors, numbers and their containers.
+        OSError: it cannot be read.
+    """
+    if not path.is_file():  # a pipe would hang
+        raise RefusedFileError("which is no file")
+    with path.open("rb") as file:
+        data = file.read(bytes_at_most + 1)
+    if len(data) > bytes_at_most:
+        raise RefusedFileError(f"which is larger than {bytes_at_most / 1e6:.0f} MB")
+    return unpickle(data)
+
+
 def unpickle(data: bytes) -> Any:
     """Return what a file of torch.save holds; no code in it is run.
 
@@ -67,7 +78,8 @@ def unpickle(data: bytes) -> Any:
     elif not data.startswith(_PICKLE):
         raise RefusedFileError("which is no file of torch.save")
     try:
-        return torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+        with warnings.catch_warnings(action="ignore"):  # of pickles in another dialect, which fail or load all the same
+            return torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except Exception as error:  # whatever a stranger's file does to the reader, it is the file's fault
         raise RefusedFileError(f"which does not hold tensors only ({type(error).__name__})") from None
 

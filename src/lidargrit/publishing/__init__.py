@@ -75,15 +75,17 @@ def publish(run: Path, folder: Path, scores: Path | None = None) -> str:
     if is_taken(folder, RUN_FILE):
         raise OutputError(f"{folder}, which is not empty", "an empty folder", "choose another one")
     about: Any = read_json(run / RUN_FILE) if (run / RUN_FILE).is_file() else {}
-    if not isinstance(about, dict) or not isinstance(about.get("recipe", {}), dict):
-        raise CheckpointError(f"{run / RUN_FILE} without a recipe", "what lidargrit wrote", "restore the file")
     scored = Scorecard.read(scores) if scores else None
     if scored:
         _check_scores(scored, run)
     learned = trained_on(run)
-    card = model_card(generator, about, learned, scored)
-    public = {name: about[name] for name in ("files", "lidargrit", "commit", "torch", "python") if name in about}
-    write_json(folder / RUN_FILE, {"origin": "published", "recipe": _without_places(about, generator), **public})
+    try:
+        card, public = model_card(generator, about, learned, scored), _without_places(about, generator)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise CheckpointError(
+            f"{run / RUN_FILE}, which cannot be used ({error!r})", "what lidargrit wrote", "restore the file"
+        ) from None
+    write_json(folder / RUN_FILE, public)
     if learned.recordings or learned.fingerprints:
         # A recording that has no name of its own goes by its folder.
         drives = [recording for recording in learned.recordings if not Path(recording).is_absolute()]
@@ -93,10 +95,13 @@ def publish(run: Path, folder: Path, scores: Path | None = None) -> str:
 
 
 def _without_places(about: dict[str, Any], generator: Generator) -> dict[str, Any]:
+    """Return what a run says of itself without the command, and with data sets and splits in place of sources."""
     recipe = about.get("recipe", {})
     data = recipe.get("data", {})
     sources = {part: ["::".join(data_set_of(source)) for source in data.get(part, ())] for part in ("train", "val")}
-    return {**recipe, "data": {**data, **sources, "sensor": generator.sensor.name}}
+    recipe = {**recipe, "data": {**data, **sources, "sensor": generator.sensor.name}}
+    kept = {name: about[name] for name in ("files", "lidargrit", "commit", "torch", "python") if name in about}
+    return {"origin": "published", **kept, "recipe": recipe}
 
 
 def _check_scores(scores: Scorecard, run: Path) -> None:

@@ -74,7 +74,7 @@ def _what(generator: Generator) -> str:
         f"{_discovery.summary('generators', name)}\n\n"
         f"It writes range images of {sensor.height}x{sensor.width} pixels, {sensor.range_min_m:g} to "
         f"{sensor.range_max_m:g} m, in the rays of the sensor `{sensor.name}`, and has {weights:,} parameters.\n"
-        "Made with [lidargrit](https://pypi.org/project/lidargrit/): `config.json` holds its sizes and rays."
+        "It is read by the Python package `lidargrit`; `config.json` holds its sizes and rays."
     )
 
 
@@ -145,7 +145,8 @@ def _training(about: dict[str, Any]) -> str:
     files = [f"- `{file['name']}`, SHA-256 `{file['sha256']}`" for file in about.get("files", ())]
     if _imported(about):
         return "\n".join(["## Training", "", "Not by lidargrit: the weights were imported from", "", *files])
-    lines = ["## Training", "", "| stage | scans seen | batch | learning rate |", "|---|---|---|---|"]
+    lines = ["## Training", "", f"Recipe: {recipe.get('title', 'unknown')}.", ""]
+    lines += ["| stage | scans seen | batch | learning rate |", "|---|---|---|---|"]
     for stage, fit in recipe.get("training", {}).items():
         lines.append(f"| {stage} | {fit['scans']:,} | {fit['batch_size']} | {fit['learning_rate']:g} |")
     if not recipe.get("training"):
