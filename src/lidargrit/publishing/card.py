@@ -112,7 +112,7 @@ def _data(about: dict[str, Any], learned: Provenance) -> str:
             leaks += _leaks(name, split)
     lines += ["", *dict.fromkeys(leaks)]
     if data.get("variant"):
-        lines.append(f"Scans became images by the `{data['variant']}` projection.")
+        lines.append(f"Scans are to become images by the `{data['variant']}` projection, as those it learned from.")
     if learned.fingerprints:
         lines.append(f"It learned from {len(learned.fingerprints):,} different images.")
     return "\n".join(lines)
