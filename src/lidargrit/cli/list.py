@@ -6,10 +6,7 @@ import argparse
 import re
 import textwrap
 
-EXAMPLES = """\
-  lidargrit list
-  lidargrit list generators
-"""
+EXAMPLES = "  lidargrit list\n  lidargrit list generators\n"
 
 _KINDS = {kind: kind for kind in ("datasets", "formats", "sensors", "tokenizers", "generators", "metrics")}
 _KINDS |= {kind: f"evaluation.{kind}" for kind in ("protocols", "dialects")} | {"recipes": "recipes"}
@@ -25,17 +22,14 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit import _discovery
 
     facts = {"datasets": _of_dataset, "formats": _of_format, "generators": _of_generator}.get(options.kind)
+    wrapper = textwrap.TextWrapper(116, initial_indent=" " * 6, subsequent_indent=" " * 10, break_on_hyphens=False)
     for kind in (options.kind,) if options.kind else _KINDS:
         print(kind)
         for name in _discovery.names(_KINDS[kind]):
             summary = re.sub(r":\w+:`(\w+)`", r"\1", _discovery.summary(_KINDS[kind], name))
             print(f"  {name.replace('_', '-') if kind == 'protocols' else name:<29}{summary}")
             for fact in facts(name) if facts else ():
-                print(
-                    textwrap.indent(
-                        textwrap.fill(fact, 110, subsequent_indent=" " * 4, break_on_hyphens=False), " " * 6
-                    )
-                )
+                print(wrapper.fill(fact))
 
 
 def _of_dataset(name: str) -> list[str]:
@@ -54,7 +48,8 @@ def _of_format(name: str) -> list[str]:
 
     cls = load(name)
     facts = [f"endings: {', '.join(cls.suffixes)}", f"reflectance: {cls.reflectance}", f"axes: {cls.frame}"]
-    facts += ([f"sensor: {cls.sensor}"] if cls.sensor else []) + (["several scans in one file"] * cls.several)
+    facts += [f"sensor: {cls.sensor}"] if cls.sensor else []
+    facts += ["several scans in one file"] if cls.several else []
     return facts + ([f"needs: pip install 'lidargrit[{cls.extra}]'"] if cls.extra else [])
 
 
