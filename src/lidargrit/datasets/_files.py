@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from abc import abstractmethod
 from collections import Counter
@@ -115,7 +116,7 @@ class FileDataset(ScanDataset):
     def recording_of(self, path: Path) -> str:
         """Name the recording of a file: its data set and sequence, or its folder where sequences have no names."""
         sequence = self.sequence_of(path.relative_to(self.root))
-        return str(path.resolve().parent) if sequence == "." else f"{self.public_name()}/{sequence}"
+        return unnamed_recording(path) if sequence == "." else f"{self.public_name()}/{sequence}"
 
     @classmethod
     def scans_in(cls, path: Path) -> int:
@@ -198,3 +199,9 @@ def scans_below(root: Path) -> Iterator[Path]:
         below[:] = (name for name in below if not name.startswith("."))
         paths = (Path(folder, name) for name in names if not name.startswith("."))
         yield from (path for path in paths if formats.candidates(path))
+
+
+def unnamed_recording(path: Path) -> str:
+    """Name the recording of a file that nothing else names by its folder, without telling where that lies."""
+    folder = path.resolve().parent
+    return f"#{hashlib.sha256(str(folder).encode()).hexdigest()[:12]}/{folder.name}"

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from lidargrit.datasets import SplitScheme
-from lidargrit.datasets._files import FileDataset
+from lidargrit.datasets._files import FileDataset, unnamed_recording
 
 
 class Argoverse2(FileDataset):
@@ -48,7 +48,8 @@ class Argoverse2(FileDataset):
     def recording_of(self, path: Path) -> str:
         """Name the log of a file, also where the root is the log itself."""
         folder = path.resolve().parent
-        return f"argoverse2/{folder.parts[-3]}" if folder.parts[-2:] == ("sensors", "lidar") else str(folder)
+        in_a_log = folder.parts[-2:] == ("sensors", "lidar")
+        return f"argoverse2/{folder.parts[-3]}" if in_a_log else unnamed_recording(path)
 
     @classmethod
     def scans_in(cls, path: Path) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from lidargrit import formats
-from lidargrit.datasets._files import FileDataset, scans_below
+from lidargrit.datasets._files import FileDataset, scans_below, unnamed_recording
 from lidargrit.formats import BadPoints
 
 
@@ -45,4 +45,4 @@ class Folder(FileDataset):
 
     def recording_of(self, path: Path) -> str:
         """Name a recording by its folder."""
-        return str(path.resolve().parent)
+        return unnamed_recording(path)

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 from lidargrit import formats
 from lidargrit.datasets import SplitScheme
-from lidargrit.datasets._files import FileDataset
+from lidargrit.datasets._files import FileDataset, unnamed_recording
 from lidargrit.datasets._splits import Split
 from lidargrit.errors import DataError, ScanError
 from lidargrit.formats import BadPoints
@@ -99,7 +99,7 @@ class Nuscenes(FileDataset):
     def recording_of(self, path: Path) -> str:
         """Name the log of a file: scenes are cut from it."""
         log, _ = _log_and_time(path)
-        return str(path.resolve().parent) if log == "." else f"nuscenes/{log}"
+        return unnamed_recording(path) if log == "." else f"nuscenes/{log}"
 
     @classmethod
     def _find(cls, root: Path) -> list[Path]:

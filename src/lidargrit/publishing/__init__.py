@@ -87,8 +87,8 @@ def publish(run: Path, folder: Path, scores: Path | None = None) -> str:
         ) from None
     write_json(folder / RUN_FILE, public)
     if learned.recordings or learned.fingerprints:
-        # A recording that has no name of its own goes by its folder.
-        drives = [recording for recording in learned.recordings if not Path(recording).is_absolute()]
+        # A recording that has no name of its own goes by its folder, which is the user's.
+        drives = [recording for recording in learned.recordings if not recording.startswith("#")]
         write_json(folder / TRAINED_ON_FILE, {"recordings": drives, "fingerprints": list(learned.fingerprints)})
     generator.save_pretrained(folder, card)
     return card
