@@ -18,7 +18,7 @@ NAMES = _discovery.names("formats")
 
 
 def can_write(cls: type[ScanFormat]) -> bool:
-    return cls.write.__func__ is not ScanFormat.write.__func__
+    return cls.can_write()
 
 
 def example(cls: type[ScanFormat], columns: int = 64) -> Scan:

@@ -57,6 +57,11 @@ def open_images(
     return load_range_images((source,), replace(config, sensor=dataset.sensor), reporter, sensor)
 
 
+def holds_images(source: str) -> bool:
+    """Tell whether a source holds range images, as samples and prepared scans are, and not the points of scans."""
+    return is_sample_folder(Path(source)) or is_tensor_folder(Path(source)) or is_prepared(source)
+
+
 def warn_of_overlap(source: str, images: RangeImages | None, reference: RangeImages, reporter: Reporter) -> None:
     """Say what a set, or the model that made it, has seen of the reference.
 

@@ -46,6 +46,11 @@ class ScanFormat(ABC):
         """Return the name that a user types: the file that defines the class."""
         return cls.__module__.rpartition(".")[2]
 
+    @classmethod
+    def can_write(cls) -> bool:
+        """Tell whether :meth:`write` writes."""
+        return "write" in cls.__dict__
+
     @staticmethod
     @abstractmethod
     def recognises(path: Path) -> bool:

@@ -1,0 +1,220 @@
+"""Scans for other programs: samples, prepared scans or a data set → a folder of point clouds, or a KITTI tree."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from lidargrit import _discovery, formats
+from lidargrit.datasets import ScanDataset, open_dataset
+from lidargrit.errors import DataError, OutputError, ScanError, UnknownNameError, nearest_names
+from lidargrit.evaluation.score import holds_images, open_images
+from lidargrit.files import atomic_path, is_taken, read_json, write_json
+from lidargrit.formats import ScanFormat
+from lidargrit.formats.kitti_bin import KittiBin
+from lidargrit.loading import DataConfig, RangeImages, spread
+from lidargrit.projection import unproject
+from lidargrit.reporting import Reporter
+from lidargrit.structures import Scan
+
+MANIFEST = "export.json"
+TREE = "kitti_odometry"  # the data set that reads such a tree back
+_KITTI_NAME = re.compile(r"\d{2}/\d{6}")  # sequence and number
+
+
+def export_scans(
+    source: str, out: Path, kind: str, config: DataConfig | None = None, reporter: Reporter | None = None
+) -> int:
+    """Write every scan of a source to a file of its own; files that are there already are not written again.
+
+    Scans keep the points that they have; a range image gives a point for each return, on its pixel's ray. Files are
+    called as the scans are, or ``NNNNNN`` by their place in samples and prepared scans; ``export.json`` tells which
+    file holds which scan.
+
+    Args:
+        source: samples of ours or of another program, a prepared place, or what data sets are opened by.
+        out: an empty folder, or one that the same command began; more scans can be added to it.
+        kind: a format's name or one of its endings ("pcd", "npz", ...), or ``kitti_odometry`` for the tree
+            ``sequences/SS/velodyne/NNNNNN.bin``, with SemanticKITTI's ``labels/NNNNNN.label`` where scans have labels.
+        config: of it, ``max_scans``, ``bad_points`` and ``bad_scans`` count.
+        reporter: hears of the progress.
+
+    Returns:
+        how many scans are there now.
+
+    Raises:
+        UnknownNameError: no such format.
+        OutputError: the folder holds something else, or cannot be written.
+        DataError: no such source, or no usable scan in it.
+        ScanError: a scan that cannot be used.
+    """
+    config, reporter = config or DataConfig(), reporter or Reporter()
+    layout = _Tree(out) if kind == TREE else _Flat(out, *_format(kind))
+    scans = _open(source, config)
+    files = layout.files([scans.name(index) for index in range(len(scans))])
+    identities = [scans.identity(index) for index in range(len(scans))]
+    _claim(out, {"source": source, "format": kind, "scans": dict(zip(files, identities, strict=True))})
+    missing = [index for index, file in enumerate(files) if not layout.is_there(file)]
+    left_out = 0
+    with reporter.progress("exporting", len(files), len(files) - len(missing)) as progress:
+        for index in missing:
+            try:
+                layout.write(files[index], scans.scan(index))
+            except ScanError as error:
+                if config.bad_scans == "refuse":
+                    raise
+                reporter.message(f"left out: {error}")
+                left_out += 1
+            progress.advance(1)
+    if left_out == len(files):
+        raise DataError(f"no usable scan in {source}", "at least one", "see the messages above")
+    return len(files) - left_out
+
+
+def kinds() -> list[str]:
+    """Return what a user may ask for: the formats that can be written, and the tree."""
+    return [*(name for name in _discovery.names("formats") if formats.load(name).can_write()), TREE]
+
+
+@dataclass(frozen=True)
+class _OfDataset:
+    """The scans of a data set that are wanted."""
+
+    dataset: ScanDataset
+    indices: Sequence[int]
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def name(self, index: int) -> str:
+        """Return what its file is to be called."""
+        return self.dataset.name(self.indices[index])
+
+    def identity(self, index: int) -> str:
+        """Return what tells it from every other scan that could be in its file."""
+        return self.name(index)
+
+    def scan(self, index: int) -> Scan:
+        return self.dataset.scan(self.indices[index])
+
+
+@dataclass(frozen=True)
+class _OfImages:
+    """Range images as scans, numbered: they have no short names of their own."""
+
+    images: RangeImages
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def name(self, index: int) -> str:
+        """Return its place."""
+        return f"{index:06d}"
+
+    def identity(self, index: int) -> str:
+        """Return which model's seed it is, or whose scan it was projected from."""
+        return self.images.provenance.names[index]
+
+    def scan(self, index: int) -> Scan:
+        return unproject(self.images.batch([index])[0])
+
+
+def _open(source: str, config: DataConfig) -> _OfDataset | _OfImages:
+    if holds_images(source):
+        return _OfImages(open_images(source, None, config))
+    dataset = open_dataset(source, config.bad_points)
+    return _OfDataset(dataset, spread(config.max_scans or len(dataset), len(dataset)))
+
+
+class _Flat:
+    """Files of one format, in folders as the scans' names have them."""
+
+    def __init__(self, out: Path, form: type[ScanFormat], suffix: str) -> None:
+        self._out, self._form, self._suffix = out, form, suffix
+
+    def files(self, names: list[str]) -> list[str]:
+        """Return the file of every scan, below the folder."""
+        return [name + self._suffix for name in names]
+
+    def is_there(self, file: str) -> bool:
+        return (self._out / file).exists()
+
+    def write(self, file: str, scan: Scan) -> None:
+        self._form.write(self._out / file, scan)
+
+
+class _Tree:
+    """The tree of KITTI odometry, with labels as SemanticKITTI has them."""
+
+    def __init__(self, out: Path) -> None:
+        self._out = out
+
+    def files(self, names: list[str]) -> list[str]:
+        """Keep KITTI's own names; number other folders, and the scans in each, in their order."""
+        if not all(map(_KITTI_NAME.fullmatch, names)):
+            folders = [str(PurePosixPath(name).parent) for name in names]
+            sequences = {folder: f"{place:02d}" for place, folder in enumerate(dict.fromkeys(folders))}
+            seen: Counter[str] = Counter()
+            numbered = []
+            for folder in folders:
+                numbered.append(f"{sequences[folder]}/{seen[folder]:06d}")
+                seen[folder] += 1
+            names = numbered
+        return [f"sequences/{name[:-7]}/velodyne/{name[-6:]}.bin" for name in names]
+
+    def is_there(self, file: str) -> bool:
+        return (self._out / file).exists()
+
+    def write(self, file: str, scan: Scan) -> None:
+        path = self._out / file
+        if scan.label is not None:  # first: the points say that the scan is there
+            with atomic_path(path.parents[1] / "labels" / f"{path.stem}.label") as temporary:
+                temporary.write_bytes(scan.label.numpy().astype("<u4").tobytes())
+        KittiBin.write(path, scan)
+
+
+def _format(kind: str) -> tuple[type[ScanFormat], str]:
+    """Return the format of a name or an ending, and the ending of its files."""
+    if kind in _discovery.names("formats"):
+        form, suffix = formats.load(kind), formats.load(kind).suffixes[0]
+    else:
+        suffix = f".{kind.lower().removeprefix('.')}"
+        form = next((one for one in formats.candidates(Path(f"scan{suffix}")) if suffix in one.suffixes), None)
+    if form is None or not form.can_write():
+        raise UnknownNameError(f"the format {kind!r} to write", nearest_names(kind, kinds(), 99), "choose one")
+    return form, suffix
+
+
+def _claim(out: Path, facts: dict[str, Any]) -> None:
+    """Write down what the folder holds, or add to what the same command wrote before.
+
+    Raises:
+        OutputError: the folder holds something else, or another scan in one of the files.
+    """
+    escaping = [file for file in facts["scans"] if file.startswith("/") or ".." in PurePosixPath(file).parts]
+    if escaping:
+        raise OutputError(f"a scan that would lie outside, in {escaping[0]}", "names below a folder", "rename it")
+    if is_taken(out, MANIFEST) and not (out / MANIFEST).is_file():
+        raise OutputError(f"{out}, which is not empty and holds no export", "an empty folder", "choose another one")
+    if (out / MANIFEST).is_file():
+        there = read_json(out / MANIFEST)
+        known = there.get("scans") if isinstance(there, dict) else None
+        if not isinstance(known, dict) or any(there.get(name) != facts[name] for name in ("source", "format")):
+            raise OutputError(
+                f"{out}, which holds other scans or another format", "an empty folder", "choose another one"
+            )
+        changed = [file for file, name in facts["scans"].items() if known.get(file, name) != name]
+        if changed:
+            raise OutputError(
+                f"{out}, where {changed[0]} is another scan of {facts['source']}",
+                "as many scans as before, or all",
+                "choose another folder",
+            )
+        if facts["scans"].keys() <= known.keys():
+            return
+        facts = {**facts, "scans": {**known, **facts["scans"]}}
+    write_json(out / MANIFEST, facts)

@@ -1,0 +1,206 @@
+"""Exported scans: read back by other libraries and by our readers, resumed, and never written over what is not ours."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+import torch
+
+from lidargrit.cli import main
+from lidargrit.datasets import open_dataset
+from lidargrit.errors import ConfigError, DataError, OutputError, ScanError, UnknownNameError
+from lidargrit.evaluation.score import open_images
+from lidargrit.export import MANIFEST, export_scans, kinds
+from lidargrit.formats import read_scan
+from lidargrit.loading import DataConfig, prepare
+from lidargrit.projection import unproject
+from lidargrit.sensors import load_sensor
+
+SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(512, 8)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _cache(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("LIDARGRIT_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="module")
+def samples(tmp_path_factory):
+    """Return a folder as ``lidargrit sample`` writes it, of two scans with reflectance."""
+    folder = tmp_path_factory.mktemp("samples")
+    (folder / "samples.json").write_text(
+        json.dumps({"weights_sha256": "a", "sampling": {}, "sensor": SENSOR.to_json()}), encoding="utf-8"
+    )
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        range_m = rng.uniform(2, 60, (64, 64)).astype(np.float32) * (rng.random((64, 64)) < 0.8)
+        reflectance = rng.random((64, 64)).astype(np.float32) * (range_m > 0)
+        np.savez(folder / f"{seed:08d}.npz", range_m=range_m.astype(np.float32), reflectance=reflectance)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def streets(tmp_path_factory):
+    """Return two simulated scans as a source with labels, written once."""
+    folder = tmp_path_factory.mktemp("streets") / "tree"
+    assert export_scans("simulated:2:val", folder, "kitti_odometry") == 2
+    return f"kitti_odometry:{folder}"
+
+
+def by_library(path):
+    """Read x, y, z, and the other columns by their names, without our readers."""
+    if path.suffix == ".bin":
+        rows = np.fromfile(path, dtype="<f4").reshape(-1, 4)
+        return rows[:, :3], {"intensity": rows[:, 3]}
+    if path.suffix == ".npz":
+        with np.load(path, allow_pickle=False) as opened:
+            return opened["points"], {name: opened[name] for name in opened.files if name != "points"}
+    if path.suffix == ".pcd":
+        from pypcd4.pypcd4 import PointCloud
+
+        data = PointCloud.from_path(path).pc_data
+        return np.stack([data[axis] for axis in "xyz"], axis=1), {name: data[name] for name in data.dtype.names}
+    if path.suffix == ".las":
+        import laspy
+
+        cloud = laspy.read(path)
+        columns = {name: np.asarray(cloud[name]) for name in cloud.point_format.extra_dimension_names}
+        return np.asarray(cloud.xyz), {**columns, "intensity": np.asarray(cloud.intensity) / 65_535}
+    import trimesh
+
+    cloud = trimesh.load(path)
+    rows = cloud.metadata["_ply_raw"]["vertex"]["data"]
+    return np.asarray(cloud.vertices), {name: rows[name] for name in rows.dtype.names}
+
+
+@pytest.mark.parametrize("kind", ["kitti_bin", "npz", "pcd", "ply", "las"])
+def test_other_libraries_and_we_read_the_points_of_samples(samples, tmp_path, kind):
+    assert export_scans(str(samples), tmp_path / "out", kind) == 2
+    images = open_images(str(samples))
+    files = sorted(path for path in (tmp_path / "out").iterdir() if path.name != MANIFEST)
+    assert [path.stem for path in files] == ["000000", "000001"]
+    for index, path in enumerate(files):
+        wanted = unproject(images.batch([index])[0])
+        near_m = 0.00005 + 1e-9 if kind == "las" else 0.0  # half a step
+        points, columns = by_library(path)
+        assert np.abs(points - wanted.points_xyz_m.numpy()).max() <= near_m
+        assert np.abs(columns["intensity"] - wanted.reflectance.numpy()).max() < 1e-5
+        back = read_scan(path)
+        assert torch.allclose(back.points_xyz_m, wanted.points_xyz_m, rtol=0, atol=near_m + 1e-5 * bool(near_m))
+        assert torch.allclose(back.reflectance, wanted.reflectance, rtol=0, atol=1e-5)
+        if kind != "kitti_bin":
+            assert np.array_equal(columns["ring"], wanted.ring.numpy())
+            assert torch.equal(back.ring, wanted.ring)
+
+
+@pytest.mark.parametrize("kind", ["npz", "pcd", "ply", "las"])
+def test_labels_of_scans_are_kept(streets, tmp_path, kind):
+    export_scans(streets, tmp_path, kind, DataConfig(max_scans=1))
+    wanted = open_dataset(streets).scan(0)
+    path = tmp_path / "00" / f"000000.{kind}"
+    points, columns = by_library(path)
+    assert np.abs(points - wanted.points_xyz_m.numpy()).max() <= 0.0000501
+    assert np.array_equal(columns["label"], wanted.label.numpy())
+    assert torch.equal(read_scan(path).label, wanted.label)
+
+
+def test_a_tree_is_read_back_as_kitti_odometry_with_labels(streets):
+    simulated, tree = open_dataset("simulated:2:val"), open_dataset(streets)
+    assert [tree.name(index) for index in range(2)] == ["00/000000", "00/000001"]
+    for index in range(2):
+        wanted, got = simulated.scan(index), tree.scan(index)
+        assert torch.equal(got.points_xyz_m, wanted.points_xyz_m)
+        assert torch.equal(got.reflectance, wanted.reflectance)
+        assert torch.equal(got.label, wanted.label)
+
+
+def test_a_tree_keeps_the_numbers_of_a_tree_and_numbers_folders(streets, samples, tmp_path):
+    export_scans(f"{streets}:all[50%:]", tmp_path / "half", "kitti_odometry")
+    assert open_dataset(f"kitti_odometry:{tmp_path / 'half'}").name(0) == "00/000001"
+    for place, folder in enumerate(("b", "a")):
+        export_scans(str(samples), tmp_path / "drives" / folder, "ply", DataConfig(max_scans=place + 1))
+    export_scans(f"folder:{tmp_path / 'drives'}", tmp_path / "tree", "kitti_odometry")
+    tree = open_dataset(f"kitti_odometry:{tmp_path / 'tree'}")
+    assert [tree.name(index) for index in range(len(tree))] == ["00/000000", "00/000001", "01/000000"]
+    assert not list((tmp_path / "tree").rglob("labels")), "there are none"
+
+
+def test_prepared_scans_are_exported_with_the_points_of_their_pixels(streets, tmp_path):
+    sensor = load_sensor("hdl64e_kitti_odometry")
+    prepare(streets, DataConfig(workers=1), tmp_path / "prepared", sensor=sensor)
+    assert export_scans(str(tmp_path / "prepared"), tmp_path / "out", "bin") == 2
+    wanted = unproject(open_images(str(tmp_path / "prepared")).batch([1])[0])
+    assert torch.equal(read_scan(tmp_path / "out" / "000001.bin").points_xyz_m, wanted.points_xyz_m)
+    told = json.loads((tmp_path / "out" / MANIFEST).read_text(encoding="utf-8"))["scans"]
+    assert sorted(told) == ["000000.bin", "000001.bin"]
+    assert all(scan.endswith(f"velodyne/{file}") for file, scan in told.items())
+
+
+def test_the_same_command_goes_on_and_adds(samples, tmp_path):
+    out = tmp_path / "out"
+    assert export_scans(str(samples), out, "ply", DataConfig(max_scans=1)) == 1
+    (out / "000000.ply").write_bytes(b"ours, and not written again")
+    assert export_scans(str(samples), out, "ply") == 2
+    assert (out / "000000.ply").read_bytes() == b"ours, and not written again"
+    (out / "000000.ply").unlink()
+    assert export_scans(str(samples), out, "ply", DataConfig(max_scans=1)) == 1
+    assert len(read_scan(out / "000000.ply")) > 1000
+    assert len(json.loads((out / MANIFEST).read_text(encoding="utf-8"))["scans"]) == 2
+    assert sorted(path.name for path in out.iterdir()) == ["000000.ply", "000001.ply", MANIFEST]
+
+
+def test_what_is_not_ours_is_left_alone(samples, tmp_path):
+    (tmp_path / "000000.ply").write_bytes(b"somebody's")
+    with pytest.raises(OutputError, match="not empty and holds no export"):
+        export_scans(str(samples), tmp_path, "ply")
+    out = tmp_path / "out"
+    export_scans(str(samples), out, "ply")
+    with pytest.raises(OutputError, match="other scans or another format"):
+        export_scans(str(samples), out, "pcd")
+    with pytest.raises(OutputError, match="other scans or another format"):
+        export_scans("simulated:1", out, "ply")
+    about = json.loads((samples / "samples.json").read_text(encoding="utf-8"))
+    (tmp_path / "new").mkdir()
+    (tmp_path / "new" / "samples.json").write_text(json.dumps({**about, "weights_sha256": "b"}), encoding="utf-8")
+    (tmp_path / "new" / "00000000.npz").write_bytes((samples / "00000000.npz").read_bytes())
+    told = json.loads((out / MANIFEST).read_text(encoding="utf-8"))
+    (out / MANIFEST).write_text(json.dumps({**told, "source": str(tmp_path / "new")}), encoding="utf-8")
+    with pytest.raises(OutputError, match=r"000000\.ply is another scan"):
+        export_scans(str(tmp_path / "new"), out, "ply")
+    assert (tmp_path / "000000.ply").read_bytes() == b"somebody's"
+
+
+def test_bad_scans_are_refused_or_left_out(samples, tmp_path):
+    scans = tmp_path / "scans"
+    export_scans(str(samples), scans, "bin")
+    (scans / "000000.bin").write_bytes(b"no scan at all, of an odd length")
+    with pytest.raises(ScanError, match=r"000000\.bin"):
+        export_scans(str(scans), tmp_path / "out", "ply")
+    assert export_scans(str(scans), tmp_path / "out", "ply", DataConfig(bad_scans="skip")) == 1
+    (scans / "000001.bin").unlink()
+    with pytest.raises(DataError, match="no usable scan"):
+        export_scans(str(scans), tmp_path / "none", "ply", DataConfig(bad_scans="skip"))
+
+
+def test_other_formats_and_sources_are_refused(samples, tmp_path):
+    assert {"kitti_bin", "pcd", "ply", "las", "numpy_array", "kitti_odometry"} <= set(kinds())
+    for kind in ("plx", "ouster_pcap", "pcap", ""):
+        with pytest.raises(UnknownNameError, match="the format"):
+            export_scans(str(samples), tmp_path / "out", kind)
+    with pytest.raises(DataError):
+        export_scans(str(tmp_path / "nowhere"), tmp_path / "out", "ply")
+    with pytest.raises(ConfigError):
+        export_scans(str(samples), tmp_path / "out", "ply", DataConfig(max_scans=-1))
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_command(samples, tmp_path, capsys):
+    words = ["export", str(samples), str(tmp_path / "out"), "--format", "pcd"]
+    assert main(words) == 0
+    told = capsys.readouterr()
+    assert re.match(r"done: 2 scans in .*out", told.out)
+    assert main([*words[:-1], "ply"]) == 2
+    assert "wanted an empty folder" in capsys.readouterr().err
