@@ -1,4 +1,4 @@
-"""Draw scans, samples and runs side by side on one scale, as a PNG."""
+"""Show scans, samples and runs side by side on one scale, as a PNG or a page to turn and step through."""
 
 from __future__ import annotations
 
@@ -8,27 +8,29 @@ from pathlib import Path
 EXAMPLES = """\
   lidargrit view /data/scans                           range image, return mask and bird's-eye view
   lidargrit view /data/held_out runs/demo -o all.png   real, reconstructed and generated
+  lidargrit view samples /data/held_out -o all.html -n 12       a page to turn, zoom and step through
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
     parser.add_argument("places", nargs="+", metavar="PATH", help="a run, a folder of samples, a scan, or other scans")
-    parser.add_argument("-o", "--out", type=Path, default=Path("view.png"), help="the picture (default: view.png)")
+    parser.add_argument("-o", "--out", type=Path, default=Path("view.png"), help=".png or .html (default: view.png)")
     parser.add_argument("-n", "--count", type=int, default=3, help="scans of each (default: 3)")
     parser.add_argument("--seed", type=int, default=0, help="of the first generated scan")
     parser.add_argument("--bad-points", choices=["refuse", "drop"], default="refuse", help="NaN, infinite or at 0")
     parser.add_argument("--bad-scans", choices=["refuse", "skip"], default="refuse", help="that cannot be used")
-    parser.add_argument("--overwrite", action="store_true", help="replace a picture that is there already")
+    parser.add_argument("--overwrite", action="store_true", help="replace what is there already")
 
 
 def run(options: argparse.Namespace) -> None:
-    """Draw the picture."""
+    """Draw the picture, or write the page."""
     from lidargrit.files import refuse_to_overwrite
     from lidargrit.loading import DataConfig
+    from lidargrit.reporting import TerminalReporter
     from lidargrit.viewer import view
 
     refuse_to_overwrite(options.out, options.overwrite)
     config = DataConfig(bad_points=options.bad_points, bad_scans=options.bad_scans)
-    view(options.places, options.out, options.count, options.seed, config)
+    view(options.places, options.out, options.count, options.seed, config, TerminalReporter())
     print(f"done: look at {options.out}")

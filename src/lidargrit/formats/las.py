@@ -67,7 +67,7 @@ class Las(ScanFormat):
         try:
             with (
                 warnings.catch_warnings(action="ignore"),  # of remarks that it cannot read, and of huge coordinates
-                laspy.open(BytesIO(data), read_evlrs=False) as reader,
+                laspy.LasReader(BytesIO(data), read_evlrs=False) as reader,
             ):
                 columns = _columns(reader.read_points(-1))
         except Exception as error:  # the library meets a damaged file with whatever it stumbles over

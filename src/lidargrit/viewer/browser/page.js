@@ -1,0 +1,169 @@
+// The whole page: controls, keys, and the panes that follow them.
+
+class Page {
+  constructor(told) {
+    this.told = told;
+    this.classes = told.classes;
+    this.camera = new Camera();
+    this.control = Object.fromEntries(
+      ["previous", "next", "place", "counter", "mode", "dropped", "size", "reset", "legend"].map((id) => [
+        id,
+        document.getElementById(id),
+      ]),
+    );
+    this.panes = told.sources.map((source) => new Pane(new Source(source), this));
+    this.count = Math.max(...this.panes.map((pane) => pane.source.count));
+    this.index = 0;
+    this.dark = window.matchMedia("(prefers-color-scheme: dark)");
+    document.getElementById("panes").append(...this.panes.map((pane) => pane.element));
+    this.offerModes();
+    this.listen();
+  }
+
+  get withDropped() {
+    return this.control.dropped.checked;
+  }
+
+  get pointSize() {
+    return Number(this.control.size.value);
+  }
+
+  // Only what some scan has.
+  offerModes() {
+    const has = (name) => this.told.sources.some((source) => source.scans.some((scan) => scan[name]));
+    for (const name of ["reflectance", "label"]) {
+      this.control.mode.querySelector(`[value=${name}]`).disabled = !has(name);
+    }
+    this.control.place.max = String(this.count);
+    for (const name of ["previous", "next", "place"]) {
+      this.control[name].disabled = this.count < 2;
+    }
+  }
+
+  listen() {
+    const { previous, next, place, mode, dropped, size, reset } = this.control;
+    previous.addEventListener("click", () => this.step(-1));
+    next.addEventListener("click", () => this.step(1));
+    place.addEventListener("input", () => this.go(Number(place.value) - 1));
+    mode.addEventListener("change", () => this.paint());
+    dropped.addEventListener("change", () => this.redraw());
+    size.addEventListener("input", () => this.redraw());
+    reset.addEventListener("click", () => this.lookAgain());
+    this.dark.addEventListener("change", () => this.paint());
+    window.addEventListener("keydown", (event) => this.press(event));
+    new ResizeObserver(() => this.redraw()).observe(document.getElementById("panes"));
+  }
+
+  press(event) {
+    const keys = {
+      ArrowLeft: () => this.step(-1),
+      ArrowRight: () => this.step(1),
+      a: () => this.camera.orbit(-0.08, 0),
+      d: () => this.camera.orbit(0.08, 0),
+      w: () => this.camera.orbit(0, 0.08),
+      s: () => this.camera.orbit(0, -0.08),
+      "+": () => this.camera.zoom(0.87),
+      "=": () => this.camera.zoom(0.87), // the same key without Shift
+      "-": () => this.camera.zoom(1.15),
+      0: () => this.camera.reset(),
+    };
+    // Sliders and lists have these keys for themselves, and the browser has those with Ctrl.
+    const taken = event.target.matches?.("input[type=range], select") || event.ctrlKey || event.metaKey || event.altKey;
+    if (!taken && event.key in keys) {
+      event.preventDefault();
+      keys[event.key]();
+      this.redraw();
+    }
+  }
+
+  lookAgain() {
+    this.camera.reset();
+    this.redraw();
+  }
+
+  // Round and round: after the last comes the first.
+  step(by) {
+    return this.go((this.index + by + this.count) % this.count);
+  }
+
+  async go(index) {
+    this.index = index;
+    this.control.place.value = String(index + 1);
+    this.control.counter.textContent = `Scan ${index + 1} of ${this.count}`;
+    await Promise.all(this.panes.map((pane) => pane.show(index)));
+    if (this.index === index) {
+      this.paint();
+      this.panes.forEach((pane) => pane.mark(pane.marked ?? -1));
+    }
+  }
+
+  look() {
+    const theme = this.dark.matches ? "dark" : "light";
+    return {
+      ...this.told.looks[theme],
+      classes: this.classes,
+      scales: this.told.scales,
+      mode: this.control.mode.value,
+    };
+  }
+
+  paint() {
+    const look = this.look();
+    this.panes.filter((pane) => pane.points).forEach((pane) => pane.paint(look));
+    this.control.legend.replaceChildren(...legendOf(look));
+    this.redraw();
+  }
+
+  redraw() {
+    this.waiting ??= requestAnimationFrame(() => {
+      this.waiting = null;
+      this.panes.filter((pane) => pane.points).forEach((pane) => pane.draw());
+    });
+  }
+
+  // Mark a pixel in every pane that looks along the same rays.
+  mark(from, pixel) {
+    for (const pane of this.panes) {
+      const alike = pane.source.height === from.source.height && pane.source.width === from.source.width;
+      pane.mark(alike ? pixel : -1);
+    }
+  }
+}
+
+// What the colours mean: a ramp with its ends, or the classes by name.
+function legendOf(look) {
+  const text = (words) => Object.assign(document.createElement("span"), { textContent: words });
+  const css = (colour) => `rgb(${colour.join(" ")})`;
+  const chip = (colour, words) => {
+    const one = text(words);
+    one.className = "chip";
+    one.style.setProperty("--chip", colour);
+    return one;
+  };
+  if (look.mode === "label") {
+    // Classes of one colour share a chip.
+    const names = new Map();
+    for (const one of look.classes) {
+      names.set(css(one.colour), [...(names.get(css(one.colour)) ?? []), one.name]);
+    }
+    const chips = [...names].map(([colour, together]) => chip(colour, together.join(", ")));
+    return [...chips, chip(css(look.noReturn), "nothing came back")];
+  }
+  const ramp = document.createElement("span");
+  ramp.className = "ramp";
+  ramp.style.backgroundImage = `linear-gradient(to right, ${look.ramps[look.mode].map(css).join(",")})`;
+  const [low, high] = look.scales[look.mode].map((value) => Number(value.toFixed(1)));
+  const ends = {
+    range: [`${low} m`, `${high} m away`],
+    height: [`${low} m`, `${high} m above the sensor`],
+    reflectance: ["0, dark", "1, bright"],
+    ring: ["top row", "bottom row"],
+  }[look.mode];
+  return [text(ends[0]), ramp, text(ends[1]), chip(css(look.noReturn), "nothing came back")];
+}
+
+const page = new Page(JSON.parse(document.getElementById("scans").textContent));
+page.go(0).catch((error) => {
+  document.getElementById("trouble").hidden = false;
+  document.getElementById("trouble").append(` (${error})`);
+});

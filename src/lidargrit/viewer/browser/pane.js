@@ -1,0 +1,165 @@
+// One source on the page: its points, its range image beneath, and what lies under the pointer.
+
+class Pane {
+  constructor(source, page) {
+    this.source = source;
+    this.page = page;
+    this.element = document.getElementById("pane").content.firstElementChild.cloneNode(true);
+    this.part = Object.fromEntries(
+      [...this.element.querySelectorAll("[data-part]")].map((part) => [part.dataset.part, part]),
+    );
+    this.part.name.textContent = source.name;
+    this.part.cloud.setAttribute("aria-label", `Points of ${source.name}. Turn with W, A, S and D, zoom with + and -.`);
+    this.part.image.setAttribute("aria-label", `Range image of ${source.name}. Shift and arrows move the mark.`);
+    this.part.image.width = source.width;
+    this.part.image.height = source.height;
+    this.drawer = drawerFor(this.part.cloud);
+    this.part.slow.hidden = this.drawer instanceof WebglPoints;
+    this.listen();
+  }
+
+  listen() {
+    const { cloud, image, bin, ply } = this.part;
+    bin.addEventListener("click", () => this.save("bin", binFile));
+    ply.addEventListener("click", () => this.save("ply", plyFile));
+    image.addEventListener("pointermove", (event) => this.page.mark(this, this.pixelAt(event)));
+    image.addEventListener("pointerleave", () => this.page.mark(this, -1));
+    image.addEventListener("keydown", (event) => this.walk(event));
+    cloud.addEventListener("pointerleave", () => this.page.mark(this, -1));
+    cloud.addEventListener("redraw", () => this.page.redraw());
+    cloud.addEventListener("pointerdown", (event) => cloud.setPointerCapture(event.pointerId));
+    cloud.addEventListener("pointermove", (event) => (event.buttons ? this.drag(event) : this.find(event)));
+    cloud.addEventListener("contextmenu", (event) => event.preventDefault());
+    cloud.addEventListener(
+      "wheel",
+      (event) => {
+        event.preventDefault();
+        this.page.camera.zoom(Math.exp(Math.sign(event.deltaY) * Math.min(0.3, Math.abs(event.deltaY) / 600)));
+        this.page.redraw();
+      },
+      { passive: false },
+    );
+  }
+
+  drag(event) {
+    const { camera } = this.page;
+    const height = this.part.cloud.clientHeight;
+    if (event.shiftKey || event.buttons > 1) {
+      camera.pan(-event.movementX / height, event.movementY / height);
+    } else {
+      camera.orbit(-event.movementX * 0.006, event.movementY * 0.006);
+    }
+    this.page.redraw();
+  }
+
+  // The search goes over all points: once a frame is enough.
+  find(event) {
+    const [left, top] = [event.offsetX, event.offsetY];
+    cancelAnimationFrame(this.search);
+    this.search = requestAnimationFrame(() => {
+      const { clientWidth, clientHeight } = this.part.cloud;
+      const matrix = this.page.camera.matrix(clientWidth / clientHeight);
+      this.page.mark(this, pick(matrix, this.points, this.page.withDropped, clientWidth, clientHeight, left, top));
+    });
+  }
+
+  pixelAt(event) {
+    const { clientWidth, clientHeight } = this.part.image;
+    const column = Math.floor((event.offsetX / clientWidth) * this.source.width);
+    const row = Math.floor((event.offsetY / clientHeight) * this.source.height);
+    const inside = column >= 0 && row >= 0 && column < this.source.width && row < this.source.height;
+    return inside ? row * this.source.width + column : -1;
+  }
+
+  walk(event) {
+    const steps = { ArrowLeft: -1, ArrowRight: 1, ArrowUp: -this.source.width, ArrowDown: this.source.width };
+    if (!event.shiftKey || !(event.key in steps)) {
+      return;
+    }
+    event.preventDefault();
+    event.stopPropagation();
+    const from = this.marked >= 0 ? this.marked : Math.floor((this.source.height / 2 + 0.5) * this.source.width);
+    this.page.mark(this, Math.min(this.source.size - 1, Math.max(0, from + steps[event.key])));
+  }
+
+  async show(index) {
+    const scan = await this.source.scan(index);
+    if (this.page.index !== index) {
+      return; // somebody has stepped on meanwhile
+    }
+    this.scan = scan;
+    this.points = pointsOf(this.source, this.scan);
+    this.drawer.setPoints(this.points);
+    const place = this.source.place(index) + 1;
+    const share = Math.round((100 * this.scan.returns) / this.source.size);
+    const returns = this.scan.returns.toLocaleString("en");
+    this.part.about.textContent =
+      `${this.scan.name} (${place} of ${this.source.count}): ${returns} points, ${share} % of rays came back`;
+  }
+
+  paint(look) {
+    const colours = coloursOf(this.source, this.scan, this.points, look);
+    this.drawer.setColours(colours);
+    const picture = new ImageData(colours, this.source.width, this.source.height);
+    this.part.image.getContext("2d").putImageData(picture, 0, 0);
+    const missing = (look.mode === "reflectance" && !this.scan.reflectance) || (look.mode === "label" && !this.scan.label);
+    this.part.missing.textContent = missing ? `No ${look.mode} is known here.` : "";
+  }
+
+  draw() {
+    const { cloud } = this.part;
+    const dense = window.devicePixelRatio || 1;
+    const [width, height] = [Math.round(cloud.clientWidth * dense), Math.round(cloud.clientHeight * dense)];
+    if (cloud.width !== width || cloud.height !== height) {
+      [cloud.width, cloud.height] = [width, height];
+    }
+    this.drawer.draw(this.page.camera.matrix(width / height), this.page.pointSize * dense, this.page.withDropped);
+    this.placeMarks();
+  }
+
+  // Point at a pixel in both pictures, and say what it is; -1 for none.
+  mark(pixel) {
+    this.marked = pixel;
+    this.placeMarks();
+    this.part.told.textContent = pixel < 0 ? " " : this.tell(pixel);
+  }
+
+  placeMarks() {
+    const { cloud, image, cloudMark, imageMark } = this.part;
+    const pixel = this.marked ?? -1;
+    const matrix = this.page.camera.matrix(cloud.clientWidth / cloud.clientHeight);
+    const seen = pixel < 0 ? null : onScreen(matrix, this.points, pixel, cloud.clientWidth, cloud.clientHeight);
+    const inside = seen && seen[0] > 0 && seen[1] > 0 && seen[0] < cloud.clientWidth && seen[1] < cloud.clientHeight;
+    cloudMark.hidden = !inside || (!this.page.withDropped && this.scan.steps[pixel] === 0);
+    imageMark.hidden = pixel < 0;
+    if (inside) {
+      cloudMark.style.transform = `translate(${seen[0]}px, ${seen[1]}px)`;
+    }
+    if (pixel >= 0) {
+      const across = (((pixel % this.source.width) + 0.5) / this.source.width) * image.clientWidth;
+      const down = ((Math.floor(pixel / this.source.width) + 0.5) / this.source.height) * image.clientHeight;
+      imageMark.style.transform = `translate(${across}px, ${down}px)`;
+    }
+  }
+
+  tell(pixel) {
+    const { source, scan } = this;
+    const place = `Row ${Math.floor(pixel / source.width)}, column ${pixel % source.width}: `;
+    if (scan.steps[pixel] === 0) {
+      return `${place}nothing came back`;
+    }
+    const facts = [`${rangeM(source, scan, pixel).toFixed(2)} m away`, `height ${this.points[4 * pixel + 2].toFixed(2)} m`];
+    if (scan.reflectance) {
+      facts.push(`reflectance ${(scan.reflectance[pixel] / 255).toFixed(2)}`);
+    }
+    if (scan.label) {
+      facts.push(this.page.classes[scan.label[pixel]].name);
+    }
+    return place + facts.join(", ");
+  }
+
+  save(ending, write) {
+    const parts = write(this.source, this.scan, this.points, this.page.classes);
+    save(parts, `${this.source.name}-${this.scan.name}.${ending}`);
+  }
+}

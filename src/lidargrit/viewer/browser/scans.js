@@ -1,0 +1,121 @@
+// Packed pixels in the page -> ranges, points and colours of one scan.
+
+// One set of scans that share their rays.
+class Source {
+  constructor(told) {
+    this.name = told.name;
+    this.height = told.height;
+    this.width = told.width;
+    this.size = told.height * told.width;
+    this.rangeStepM = told.rangeStepM;
+    this.endM = told.endM;
+    this.told = told;
+    this.unpacked = new Map();
+  }
+
+  get count() {
+    return this.told.scans.length;
+  }
+
+  // A set with fewer scans than the longest stays at its last one.
+  place(index) {
+    return Math.min(index, this.count - 1);
+  }
+
+  async scan(index) {
+    const place = this.place(index);
+    if (!this.rays) {
+      this.rays = await unpackRays(this);
+    }
+    if (!this.unpacked.has(place)) {
+      this.unpacked.set(place, await unpackScan(this, this.told.scans[place]));
+    }
+    return this.unpacked.get(place);
+  }
+}
+
+async function unpackScan(source, told) {
+  const steps = new Uint16Array(await unpack(told.range));
+  let returns = 0;
+  for (const step of steps) {
+    returns += step > 0;
+  }
+  return {
+    name: told.name,
+    steps,
+    returns,
+    reflectance: told.reflectance && new Uint8Array(await unpack(told.reflectance)),
+    label: told.label && new Uint8Array(await unpack(told.label)),
+  };
+}
+
+// The browser itself unpacks gzip.
+async function unpack(text) {
+  const packed = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+  const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
+  return new Response(stream).arrayBuffer();
+}
+
+// The unit vector of every pixel's ray: x forward, y left, z up.
+async function unpackRays(source) {
+  const elevation = new Float32Array(await unpack(source.told.elevation));
+  const azimuth = new Float32Array(await unpack(source.told.azimuth));
+  const rays = new Float32Array(3 * source.size);
+  for (let pixel = 0; pixel < source.size; pixel++) {
+    const row = Math.floor(pixel / source.width);
+    const up = elevation[elevation.length === source.size ? pixel : row];
+    const around = azimuth[azimuth.length === source.size ? pixel : pixel % source.width];
+    rays[3 * pixel] = Math.cos(up) * Math.cos(around);
+    rays[3 * pixel + 1] = Math.cos(up) * Math.sin(around);
+    rays[3 * pixel + 2] = Math.sin(up);
+  }
+  return rays;
+}
+
+function rangeM(source, scan, pixel) {
+  return scan.steps[pixel] * source.rangeStepM;
+}
+
+// x, y, z and 1 for a return, 0 for the end of a ray that did not return.
+function pointsOf(source, scan) {
+  const points = new Float32Array(4 * source.size);
+  for (let pixel = 0; pixel < source.size; pixel++) {
+    const returned = scan.steps[pixel] > 0;
+    const range = returned ? rangeM(source, scan, pixel) : source.endM;
+    for (let axis = 0; axis < 3; axis++) {
+      points[4 * pixel + axis] = range * source.rays[3 * pixel + axis];
+    }
+    points[4 * pixel + 3] = returned ? 1 : 0;
+  }
+  return points;
+}
+
+// What can be shown by colour: the place of a pixel on the ramp, 0 to 1.
+const PLACES = {
+  range: (source, scan, points, [near, far]) => (pixel) =>
+    Math.log(rangeM(source, scan, pixel) / near) / Math.log(far / near),
+  height: (source, scan, points, [low, high]) => (pixel) => (points[4 * pixel + 2] - low) / (high - low),
+  reflectance: (source, scan) => scan.reflectance && ((pixel) => scan.reflectance[pixel] / 255),
+  ring: (source) => (pixel) => Math.floor(pixel / source.width) / (source.height - 1),
+};
+
+// Red, green, blue and opacity of every pixel, for points and for the range image alike.
+function coloursOf(source, scan, points, look) {
+  const colours = new Uint8ClampedArray(4 * source.size).fill(255);
+  const ramp = look.ramps[look.mode];
+  const place = look.mode === "label" ? null : PLACES[look.mode](source, scan, points, look.scales[look.mode]);
+  const classOf = look.mode === "label" && scan.label && ((pixel) => look.classes[scan.label[pixel]].colour);
+  for (let pixel = 0; pixel < source.size; pixel++) {
+    let colour = look.unknown;
+    if (scan.steps[pixel] === 0) {
+      colour = look.noReturn;
+    } else if (place) {
+      const step = Math.round(Math.min(1, Math.max(0, place(pixel))) * (ramp.length - 1));
+      colour = ramp[step];
+    } else if (classOf) {
+      colour = classOf(pixel);
+    }
+    colours.set(colour, 4 * pixel);
+  }
+  return colours;
+}

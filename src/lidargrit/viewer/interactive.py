@@ -1,0 +1,172 @@
+"""Scans to turn, zoom and step through: range images → one HTML page that needs no network and no other file.
+
+The page holds ranges in 16 bits and the rays of each sensor once; the browser makes the points. Its scripts and its
+style are the files in ``browser/``.
+"""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import hashlib
+import json
+import re
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+
+from lidargrit import __version__
+from lidargrit.errors import ConfigError
+from lidargrit.files import write_text
+from lidargrit.projection import points_of_pixels
+from lidargrit.viewer.classes import name_and_colour
+from lidargrit.viewer.gathering import Shown
+
+PAGE_SCANS_AT_MOST = 100  # of each source: about 15 MB of a KITTI-360 size image, which browsers still open at once
+SOURCES_AT_MOST = 8  # browsers keep 8 to 16 WebGL canvases alive
+_FOLDER = Path(__file__).parent / "browser"
+_SCRIPTS = ("scans.js", "camera.js", "points.js", "files.js", "pane.js", "page.js")
+_RANGE_STEPS = 65_535  # 16 bits, of which 0 is no return
+_CLASSES_AT_MOST = 255  # 8 bits; SemanticKITTI has 34
+_RAMP_STEPS = 64
+# Which part of which scale: ends that would vanish into the background are left out.
+_RAMPS = {
+    "dark": {
+        "range": ("viridis_r", 0.0, 0.85),
+        "height": ("turbo", 0.1, 0.95),
+        "reflectance": ("inferno", 0.25, 1.0),
+        "ring": ("turbo", 0.1, 0.95),
+    },
+    "light": {
+        "range": ("viridis_r", 0.12, 1.0),
+        "height": ("turbo", 0.03, 0.95),
+        "reflectance": ("inferno_r", 0.18, 1.0),
+        "ring": ("turbo", 0.03, 0.95),
+    },
+}
+_NO_RETURN = {"dark": (72, 81, 90), "light": (214, 220, 225)}
+_UNKNOWN = {"dark": (140, 150, 160), "light": (110, 120, 130)}
+
+
+def write_page(shown: Sequence[Shown], path: Path) -> None:
+    """Write a page with groups of scans side by side, on one scale of each colour.
+
+    Args:
+        shown: 1 to 8 groups; the i-th scans of all are shown together.
+        path: of the page; an older one there is replaced, in one step.
+
+    Raises:
+        ConfigError: no group, or too many.
+        OutputError: the page cannot be written.
+    """
+    write_text(path, page(shown))
+
+
+def page(shown: Sequence[Shown]) -> str:
+    """Return the page as text. Whatever comes from outside, such as names of files, is escaped."""
+    if not 1 <= len(shown) <= SOURCES_AT_MOST:
+        raise ConfigError(
+            f"{len(shown)} groups of scans side by side", f"1 to {SOURCES_AT_MOST}", "name fewer, or make two pages"
+        )
+    script = '"use strict";\n' + "\n".join(_read(name) for name in _SCRIPTS)
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    coarsest_m = max(_far_m(one) for one in shown) / _RANGE_STEPS
+    parts = {
+        "title": escape(f"Scans: {', '.join(one.name for one in shown)}"),
+        "style": _read("page.css"),
+        "script": script,
+        # No other script runs, and nothing is fetched, whatever a file name may hold.
+        "script_hash": f"sha256-{digest}",
+        "scans": json.dumps(_told(shown)).replace("<", "\\u003c"),
+        "precision": f"Ranges are kept here in steps of {1000 * coarsest_m:.1f} mm. "
+        f"Written by lidargrit {__version__}.",
+    }
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], _read("page.html"))
+
+
+def _read(name: str) -> str:
+    return (_FOLDER / name).read_text(encoding="utf-8")
+
+
+def _told(shown: Sequence[Shown]) -> dict[str, Any]:
+    """Return all that the page needs to know, as plain numbers and words."""
+    labels = [one.label[one.images.return_mask] for one in shown if one.label is not None]
+    numbers = sorted({int(number) for label in labels for number in label.unique()})
+    if len(numbers) > _CLASSES_AT_MOST:
+        raise ConfigError(f"{len(numbers)} classes of labels", f"at most {_CLASSES_AT_MOST}", "show fewer scans")
+    named = [(number, *name_and_colour(number)) for number in numbers]
+    return {
+        "sources": [_source(one, numbers) for one in shown],
+        "classes": [{"number": number, "name": name, "colour": colour} for number, name, colour in named],
+        "scales": _scales(shown),
+        "looks": {
+            theme: {
+                "ramps": {mode: _ramp(*of) for mode, of in ramps.items()},
+                "noReturn": _NO_RETURN[theme],
+                "unknown": _UNKNOWN[theme],
+            }
+            for theme, ramps in _RAMPS.items()
+        },
+    }
+
+
+def _source(shown: Shown, numbers: list[int]) -> dict[str, Any]:
+    """Return one group: its rays once, and the pixels of every scan."""
+    images = shown.images.to("cpu")
+    step_m = _far_m(shown) / _RANGE_STEPS
+    steps = (images.range_m.detach() / step_m).round().clamp(1, _RANGE_STEPS) * images.return_mask
+    reflectance, label = images.reflectance, shown.label
+    scans: list[dict[str, Any]] = []
+    for index, name in enumerate(shown.scan_names):
+        scan = {"name": name, "range": _packed(steps[index].numpy().astype("<u2"))}
+        if reflectance is not None:
+            scan["reflectance"] = _packed((255 * reflectance[index].detach()).round().numpy().astype(np.uint8))
+        if label is not None:
+            scan["label"] = _packed(np.searchsorted(numbers, label[index].numpy()).astype(np.uint8))
+        scans.append(scan)
+    return {
+        "name": shown.name,
+        "height": images.sensor.height,
+        "width": images.sensor.width,
+        "elevation": _packed(images.sensor.elevation_rad.numpy().astype("<f4")),
+        "azimuth": _packed(images.sensor.azimuth_rad.numpy().astype("<f4")),
+        "rangeStepM": step_m,
+        "endM": min(images.sensor.range_max_m, _far_m(shown)),  # a ray ends where returns do: the rest is empty
+        "scans": scans,
+    }
+
+
+def _far_m(shown: Shown) -> float:
+    return max(float(shown.images.range_m.max()), 1.0)
+
+
+def _packed(values: np.ndarray) -> str:
+    return base64.b64encode(gzip.compress(values.tobytes(), mtime=0)).decode()
+
+
+def _scales(shown: Sequence[Shown]) -> dict[str, tuple[float, float]]:
+    """Find ends of the colours that hold all but the outermost returns of all groups."""
+    ranges = np.concatenate([one.images.range_m[one.images.return_mask].detach().cpu().numpy() for one in shown])
+    heights = np.concatenate(
+        [points_of_pixels(one.images)[one.images.return_mask][:, 2].detach().cpu().numpy() for one in shown]
+    )
+    if not len(ranges):
+        ranges, heights = np.array([1.0, 10.0]), np.array([-2.0, 2.0])
+    near, far = (float(value) for value in np.quantile(ranges, (0.005, 0.999)))
+    low, high = (float(value) for value in np.quantile(heights, (0.01, 0.99)))
+    return {
+        "range": (near, max(far, 1.01 * near)),
+        "height": (low, max(high, low + 0.1)),
+        "reflectance": (0.0, 1.0),
+        "ring": (0.0, 1.0),
+    }
+
+
+def _ramp(name: str, start: float, end: float) -> list[list[int]]:
+    """Return red, green and blue of equal steps along a part of a scale."""
+    colours = colormaps[name](np.linspace(start, end, _RAMP_STEPS))[:, :3]
+    return (255 * colours).round().astype(int).tolist()
