@@ -81,8 +81,7 @@ class Browser:
         """Open a page of this machine, and wait until it is drawn."""
         self.events.clear()
         self.send("Page.navigate", url=path.as_uri())
-        self.wait("document.readyState === 'complete' && document.querySelector('#counter')?.textContent")
-        self.wait("[...document.querySelectorAll('[data-part=about]')].some((one) => one.textContent)")
+        self.wait("document.readyState === 'complete'")
         self.settle()
 
     def run(self, script: str) -> object:
@@ -100,6 +99,7 @@ class Browser:
 
     def settle(self) -> None:
         """Wait until what was asked for is drawn."""
+        self.wait("document.querySelector('[aria-busy]')?.ariaBusy !== 'true'")
         self.run("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))")
 
     def box(self, selector: str, which: int = 0) -> tuple[float, float, float, float]:

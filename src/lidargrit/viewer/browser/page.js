@@ -15,7 +15,8 @@ class Page {
     this.count = Math.max(...this.panes.map((pane) => pane.source.count));
     this.index = 0;
     this.dark = window.matchMedia("(prefers-color-scheme: dark)");
-    document.getElementById("panes").append(...this.panes.map((pane) => pane.element));
+    this.area = document.getElementById("panes");
+    this.area.append(...this.panes.map((pane) => pane.element));
     this.offerModes();
     this.listen();
   }
@@ -51,7 +52,7 @@ class Page {
     reset.addEventListener("click", () => this.lookAgain());
     this.dark.addEventListener("change", () => this.paint());
     window.addEventListener("keydown", (event) => this.press(event));
-    new ResizeObserver(() => this.redraw()).observe(document.getElementById("panes"));
+    new ResizeObserver(() => this.redraw()).observe(this.area);
   }
 
   press(event) {
@@ -90,10 +91,12 @@ class Page {
     this.index = index;
     this.control.place.value = String(index + 1);
     this.control.counter.textContent = `Scan ${index + 1} of ${this.count}`;
+    this.area.setAttribute("aria-busy", "true"); // until all pictures are of this scan
     await Promise.all(this.panes.map((pane) => pane.show(index)));
     if (this.index === index) {
       this.paint();
       this.panes.forEach((pane) => pane.mark(pane.marked ?? -1));
+      this.area.setAttribute("aria-busy", "false");
     }
   }
 

@@ -106,13 +106,14 @@ class PlainPoints {
     const picture = this.context.createImageData(width, height);
     const shown = new Uint32Array(picture.data.buffer);
     const nearest = new Float32Array(width * height).fill(Infinity);
-    const side = Math.max(1, Math.round(sizePx * 0.7));
     for (let pixel = 0; 4 * pixel < this.points.length; pixel++) {
       const seen = withDropped || this.points[4 * pixel + 3] ? onScreen(matrix, this.points, pixel, width, height) : null;
       if (!seen) {
         continue;
       }
-      const [left, top] = [Math.floor(seen[0]), Math.floor(seen[1])];
+      const grown = Math.min(2.5, Math.max(0.7, 30 / seen[2])); // as the vertex shader does it
+      const side = Math.max(1, Math.round(sizePx * (this.points[4 * pixel + 3] ? grown : 0.6)));
+      const [left, top] = [Math.round(seen[0] - side / 2), Math.round(seen[1] - side / 2)];
       for (let y = Math.max(0, top); y < Math.min(height, top + side); y++) {
         for (let x = Math.max(0, left); x < Math.min(width, left + side); x++) {
           if (seen[2] < nearest[y * width + x]) {
@@ -127,7 +128,18 @@ class PlainPoints {
 }
 
 function drawerFor(canvas) {
-  // Points are squares of whole pixels already, and smoothing takes three times as long where there is no graphics card.
-  const gl = canvas.getContext("webgl", { antialias: false });
-  return gl ? new WebglPoints(canvas, gl) : new PlainPoints(canvas);
+  if (!hasGraphicsCard()) {
+    return new PlainPoints(canvas);
+  }
+  // Points are squares of whole pixels already: there is nothing to smooth.
+  return new WebglPoints(canvas, canvas.getContext("webgl", { antialias: false }));
+}
+
+// WebGL that is computed on the processor takes ten times as long as our own few lines.
+function hasGraphicsCard() {
+  const gl = document.createElement("canvas").getContext("webgl");
+  const about = gl?.getExtension("WEBGL_debug_renderer_info");
+  const name = about ? gl.getParameter(about.UNMASKED_RENDERER_WEBGL) : "";
+  gl?.getExtension("WEBGL_lose_context")?.loseContext(); // a browser keeps few of them
+  return Boolean(gl) && !/swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
 }
