@@ -17,6 +17,7 @@ class Page {
     this.dark = window.matchMedia("(prefers-color-scheme: dark)");
     this.area = document.getElementById("panes");
     this.area.append(...this.panes.map((pane) => pane.element));
+    document.getElementById("slow").hidden = hasGraphicsCard();
     this.offerModes();
     this.listen();
   }
@@ -159,7 +160,7 @@ function legendOf(look) {
   const ends = {
     range: [`${low} m`, `${high} m away`],
     height: [`${low} m`, `${high} m above the sensor`],
-    reflectance: ["0, dark", "1, bright"],
+    reflectance: ["weak, 0", "1, strong"],
     ring: ["top row", "bottom row"],
   }[look.mode];
   return [text(ends[0]), ramp, text(ends[1]), chip(css(look.noReturn), "nothing came back")];

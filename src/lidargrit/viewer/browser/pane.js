@@ -14,7 +14,6 @@ class Pane {
     this.part.image.width = source.width;
     this.part.image.height = source.height;
     this.drawer = drawerFor(this.part.cloud);
-    this.part.slow.hidden = this.drawer instanceof WebglPoints;
     this.listen();
   }
 
@@ -94,7 +93,7 @@ class Pane {
     const share = Math.round((100 * this.scan.returns) / this.source.size);
     const returns = this.scan.returns.toLocaleString("en");
     this.part.about.textContent =
-      `${this.scan.name} (${place} of ${this.source.count}): ${returns} points, ${share} % of rays came back`;
+      `${this.scan.name} (${place} of ${this.source.count}): ${returns} points, from ${share} % of rays`;
   }
 
   paint(look) {

@@ -135,11 +135,16 @@ function drawerFor(canvas) {
   return new WebglPoints(canvas, canvas.getContext("webgl", { antialias: false }));
 }
 
+let graphicsCard = null; // asked once: a browser keeps few contexts
+
 // WebGL that is computed on the processor takes ten times as long as our own few lines.
 function hasGraphicsCard() {
-  const gl = document.createElement("canvas").getContext("webgl");
-  const about = gl?.getExtension("WEBGL_debug_renderer_info");
-  const name = about ? gl.getParameter(about.UNMASKED_RENDERER_WEBGL) : "";
-  gl?.getExtension("WEBGL_lose_context")?.loseContext(); // a browser keeps few of them
-  return Boolean(gl) && !/swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
+  if (graphicsCard === null) {
+    const gl = document.createElement("canvas").getContext("webgl");
+    const about = gl?.getExtension("WEBGL_debug_renderer_info");
+    const name = about ? gl.getParameter(about.UNMASKED_RENDERER_WEBGL) : "";
+    gl?.getExtension("WEBGL_lose_context")?.loseContext();
+    graphicsCard = Boolean(gl) && !/swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
+  }
+  return graphicsCard;
 }
