@@ -46,11 +46,7 @@ def _of_dataset(name: str) -> list[str]:
 def _of_format(name: str) -> list[str]:
     from lidargrit.formats import load
 
-    cls = load(name)
-    facts = [f"endings: {', '.join(cls.suffixes)}", f"reflectance: {cls.reflectance}", f"axes: {cls.frame}"]
-    facts += [f"sensor: {cls.sensor}"] if cls.sensor else []
-    facts += ["several scans in one file"] if cls.several else []
-    return facts + ([f"needs: pip install 'lidargrit[{cls.extra}]'"] if cls.extra else [])
+    return load(name).about()
 
 
 def _of_generator(name: str) -> list[str]:

@@ -47,6 +47,15 @@ class ScanFormat(ABC):
         return cls.__module__.rpartition(".")[2]
 
     @classmethod
+    def about(cls) -> list[str]:
+        """Return all that is known of the format, a fact a line."""
+        facts = [f"endings: {', '.join(cls.suffixes)}", f"reflectance: {cls.reflectance}", f"axes: {cls.frame}"]
+        facts += [f"sensor: {cls.sensor}"] if cls.sensor else []
+        facts += ["several scans in one file"] if cls.several else []
+        facts += ["can be written: lidargrit export"] if cls.can_write() else []
+        return facts + ([f"needs: pip install 'lidargrit[{cls.extra}]'"] if cls.extra else [])
+
+    @classmethod
     def can_write(cls) -> bool:
         """Tell whether :meth:`write` writes."""
         return "write" in cls.__dict__
