@@ -347,6 +347,16 @@ def test_light_and_dark(opened):
     assert drawn(opened.screenshot(".cloud")) > 0.02
 
 
+def test_an_old_browser_is_told_so(browser, written):
+    script = {"source": "delete globalThis.DecompressionStream;"}
+    number = browser.send("Page.addScriptToEvaluateOnNewDocument", **script)["identifier"]
+    browser.open(written)
+    browser.send("Page.removeScriptToEvaluateOnNewDocument", identifier=number)
+    browser.move(300, 300)
+    assert "browser of 2023" in browser.run("document.querySelector('#trouble:not([hidden])').textContent")
+    assert browser.troubles() == []
+
+
 @pytest.mark.parametrize(
     "script",
     [

@@ -93,7 +93,12 @@ class Page {
     this.control.place.value = String(index + 1);
     this.control.counter.textContent = `Scan ${index + 1} of ${this.count}`;
     this.area.setAttribute("aria-busy", "true"); // until all pictures are of this scan
-    await Promise.all(this.panes.map((pane) => pane.show(index)));
+    try {
+      await Promise.all(this.panes.map((pane) => pane.show(index)));
+    } catch (error) {
+      document.getElementById("trouble").hidden = false;
+      console.warn(error);
+    }
     if (this.index === index) {
       this.paint();
       this.panes.forEach((pane) => pane.mark(pane.marked ?? -1));
@@ -121,7 +126,7 @@ class Page {
   redraw() {
     this.waiting ??= requestAnimationFrame(() => {
       this.waiting = null;
-      this.panes.filter((pane) => pane.points).forEach((pane) => pane.draw());
+      this.panes.filter((pane) => pane.painted).forEach((pane) => pane.draw());
     });
   }
 
@@ -167,7 +172,4 @@ function legendOf(look) {
 }
 
 const page = new Page(JSON.parse(document.getElementById("scans").textContent));
-page.go(0).catch((error) => {
-  document.getElementById("trouble").hidden = false;
-  document.getElementById("trouble").append(` (${error})`);
-});
+page.go(0);

@@ -53,6 +53,9 @@ class Pane {
 
   // The search goes over all points: once a frame is enough.
   find(event) {
+    if (!this.points) {
+      return;
+    }
     const [left, top] = [event.offsetX, event.offsetY];
     cancelAnimationFrame(this.search);
     this.search = requestAnimationFrame(() => {
@@ -88,7 +91,7 @@ class Pane {
     }
     this.scan = scan;
     this.points = pointsOf(this.source, this.scan);
-    this.drawer.setPoints(this.points);
+    this.fresh = true; // points and colours are drawn together, once all panes have theirs
     const place = this.source.place(index) + 1;
     const share = Math.round((100 * this.scan.returns) / this.source.size);
     const returns = this.scan.returns.toLocaleString("en");
@@ -98,6 +101,11 @@ class Pane {
 
   paint(look) {
     const colours = coloursOf(this.source, this.scan, this.points, look);
+    if (this.fresh) {
+      this.drawer.setPoints(this.points);
+      this.fresh = false;
+    }
+    this.painted = true;
     this.drawer.setColours(colours);
     const picture = new ImageData(colours, this.source.width, this.source.height);
     this.part.image.getContext("2d").putImageData(picture, 0, 0);
@@ -118,6 +126,9 @@ class Pane {
 
   // Point at a pixel in both pictures, and say what it is; -1 for none.
   mark(pixel) {
+    if (!this.points) {
+      return; // nothing is shown yet
+    }
     this.marked = pixel;
     this.placeMarks();
     this.part.told.textContent = pixel < 0 ? " " : this.tell(pixel);
