@@ -207,6 +207,10 @@ def test_view_draws_runs_samples_and_scans(run_folder, samples, tmp_path, typed)
         assert picture.format == "PNG"
         four_rows = picture.height
     typed("view", run_folder, "-o", tmp_path / "run.png", "-n", 1)
+    typed("view", samples, run_folder, "-o", tmp_path / "run.html", "-n", 9)
+    page = (tmp_path / "run.html").read_text(encoding="utf-8")
+    assert page.count(": reconstructed") >= 1
+    assert page.count('"seed ') == 9
     with Image.open(tmp_path / "run.png") as picture:
         assert picture.height < four_rows
 

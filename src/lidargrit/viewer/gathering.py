@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from lidargrit.sensors import SensorModel, load_sensor
 from lidargrit.structures import RangeImage, Scan
 
 _CLASS_BITS = 0xFFFF  # of a label; the instance stands above them
+_BATCH = 8  # scans drawn at once: what a laptop has room for
 _NAME_LETTERS = 40  # of a place: what fits above a picture
 
 
@@ -69,14 +70,24 @@ def gather(
     scans = shown[0] if shown else None
     for place, generator in generators.items():
         if scans is not None and "encode" in generator.capabilities:
-            again = generator.reconstruct(scans.images)
+            images = scans.images
+            again = _joined(generator.reconstruct(images[part]) for part in _parts(len(images)))
             shown.append(Shown(f"{_short(place)}: reconstructed", again, scans.scan_names))
         seeds = range(seed, seed + count)
         names = tuple(f"seed {one}" for one in seeds)
-        shown.append(Shown(f"{_short(place)}: generated", generator.sample(seeds), names))
+        drawn = _joined(generator.sample(seeds[part]) for part in _parts(count))
+        shown.append(Shown(f"{_short(place)}: generated", drawn, names))
     if not shown:
         raise ConfigError("nothing to draw", "a scan, a folder or a run", "name at least one")
     return shown
+
+
+def _parts(count: int) -> list[slice]:
+    return [slice(first, first + _BATCH) for first in range(0, count, _BATCH)]
+
+
+def _joined(batches: Iterable[RangeImage]) -> RangeImage:
+    return RangeImage.stack([batch[index].to("cpu") for batch in batches for index in range(len(batch))])
 
 
 def _of_images(place: str, count: int, sensor: SensorModel | None, config: DataConfig, reporter: Reporter) -> Shown:

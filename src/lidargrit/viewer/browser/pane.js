@@ -131,7 +131,7 @@ class Pane {
     }
     this.marked = pixel;
     this.placeMarks();
-    this.part.told.textContent = pixel < 0 ? " " : this.tell(pixel);
+    this.part.told.textContent = pixel < 0 ? "" : this.tell(pixel);
   }
 
   placeMarks() {
@@ -152,20 +152,19 @@ class Pane {
     }
   }
 
+  // The place comes last: it is what may be cut off where panes are narrow.
   tell(pixel) {
     const { source, scan } = this;
-    const place = `Row ${Math.floor(pixel / source.width)}, column ${pixel % source.width}: `;
+    const facts = scan.label && scan.steps[pixel] ? [this.page.classes[scan.label[pixel]].name] : [];
     if (scan.steps[pixel] === 0) {
-      return `${place}nothing came back`;
+      facts.push("nothing came back");
+    } else {
+      facts.push(`${rangeM(source, scan, pixel).toFixed(2)} m away`, `height ${this.points[4 * pixel + 2].toFixed(2)} m`);
     }
-    const facts = [`${rangeM(source, scan, pixel).toFixed(2)} m away`, `height ${this.points[4 * pixel + 2].toFixed(2)} m`];
-    if (scan.reflectance) {
+    if (scan.reflectance && scan.steps[pixel]) {
       facts.push(`reflectance ${(scan.reflectance[pixel] / 255).toFixed(2)}`);
     }
-    if (scan.label) {
-      facts.push(this.page.classes[scan.label[pixel]].name);
-    }
-    return place + facts.join(", ");
+    return `${facts.join(", ")} (row ${Math.floor(pixel / source.width)}, column ${pixel % source.width})`;
   }
 
   save(ending, write) {
