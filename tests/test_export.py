@@ -96,6 +96,18 @@ def test_other_libraries_and_we_read_the_points_of_samples(samples, tmp_path, ki
             assert torch.equal(back.ring, wanted.ring)
 
 
+def test_samples_of_another_program_are_exported_with_the_points_of_their_rays(tmp_path):
+    tensor = torch.zeros(5, 64, 1024)  # as R2DM writes them: range, x, y, z, reflectance
+    tensor[0, 10:, ::2], tensor[4, 10:, ::2] = 12.5, 0.25
+    (tmp_path / "r2dm").mkdir()
+    torch.save(tensor, tmp_path / "r2dm" / "samples_0000000000.pth")
+    assert export_scans(str(tmp_path / "r2dm"), tmp_path / "out", "ply") == 1
+    back = read_scan(tmp_path / "out" / "000000.ply")
+    rays = load_sensor("hdl64e_kitti_360").ray_directions()[10:, ::2].reshape(-1, 3)
+    assert torch.allclose(back.points_xyz_m, 12.5 * rays, rtol=0, atol=1e-5)
+    assert bool((back.reflectance == 0.25).all())
+
+
 @pytest.mark.parametrize("kind", ["npz", "pcd", "ply", "las"])
 def test_labels_of_scans_are_kept(streets, tmp_path, kind):
     export_scans(streets, tmp_path, kind, DataConfig(max_scans=1))
