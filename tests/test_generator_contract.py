@@ -23,6 +23,11 @@ SIZES = {  # the smallest of each, and the quickest way to draw from it: a new g
         "",
     ),
     "marginal": ("bins=16", ""),
+    "maskgit": (
+        "tokenizer.channels=32 tokenizer.channel_multipliers=[1,1,1,1] tokenizer.code_dim=8 tokenizer.num_codes=32 "
+        "transformer.layers=1 transformer.heads=2 transformer.width=16",
+        "steps=4",
+    ),
     "memorised": ("scans=8", ""),
     "r2dm": (
         "unet.channels=8 unet.channel_multipliers=[1,1] unet.residual_blocks=[1,1] unet.norm_groups=2 "

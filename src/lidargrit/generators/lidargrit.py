@@ -16,18 +16,17 @@ from torch import Tensor, nn
 
 from lidargrit.errors import ConfigError
 from lidargrit.files import load_exactly
-from lidargrit.generators import Cost, Generator
-from lidargrit.nn.flops import flops_of
+from lidargrit.generators import Cost
+from lidargrit.generators._tokens import TokenGenerator, TokenObjective, draw_tokens
 from lidargrit.nn.precision import Precision
 from lidargrit.nn.published import read_checkpoint
 from lidargrit.nn.transformer import CausalTransformer, TransformerConfig
 from lidargrit.nn.writing import TokenWriter, WeightPrecision
 from lidargrit.sensors import SensorModel
-from lidargrit.structures import RangeImage, TokenGrid
-from lidargrit.tokenizers import MaskDecoding, Tokenizer
+from lidargrit.structures import RangeImage
+from lidargrit.tokenizers import MaskDecoding
 from lidargrit.tokenizers.vqvae import Vqvae, VqvaeConfig
 
-_DECODED_AT_ONCE = 4  # enough to keep a GPU busy; more would only take memory, 35 MB a scan and layer at 64x1024
 START_TOKEN = 0  # the reference prepends an ordinary token, shared with the first code, not one of its own
 _PUBLISHED_BYTES_AT_MOST = 2 << 30  # the first release's transformer of 126 M weights, with its optimiser, takes 1.6 GB
 _PUBLISHED_NETWORKS = {  # ours → its name in a checkpoint of the program, and what in it is no weight of the network
@@ -78,7 +77,7 @@ class LidarGritConfig:
     transformer: TransformerConfig = field(default_factory=TransformerConfig)
 
 
-class LidarGrit(Generator):
+class LidarGrit(TokenGenerator):
     """The paper's system.
 
     Source:
@@ -87,14 +86,12 @@ class LidarGrit(Generator):
 
     Config = LidarGritConfig
     Sampling = TokenSampling
-    stages = ("tokenizer", "transformer")
-    capabilities = frozenset({"tokens", "encode", "likelihood"})
     published_files = tuple(_PUBLISHED_NETWORKS)
+    capabilities = TokenGenerator.capabilities | {"likelihood"}
+    transformer: CausalTransformer
 
     def __init__(self, config: LidarGritConfig, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
-        self.config, self.sensor = config, sensor
-        self.tokenizer = Vqvae(config.tokenizer, sensor)
         height, width = self.tokenizer.grid_size
         self.transformer = CausalTransformer(config.transformer, config.tokenizer.num_codes, height * width)
         self._prepared: _Prepared | None = None
@@ -102,14 +99,6 @@ class LidarGrit(Generator):
     def objective(self, stage: str) -> nn.Module:
         """Return the VQ-VAE itself, or the transformer's objective over the frozen VQ-VAE."""
         return self.tokenizer if stage == "tokenizer" else NextToken(self.tokenizer, self.transformer)
-
-    def finish(self, stage: str, objective: nn.Module) -> None:
-        """Take over a stage's trained weights."""
-        if stage == "tokenizer":
-            self.tokenizer.load_state_dict(objective.state_dict())
-        else:
-            assert isinstance(objective, NextToken)
-            self.transformer.load_state_dict(objective.transformer.state_dict())
 
     @torch.no_grad()
     def sample(self, seeds: Sequence[int], sampling: TokenSampling | None = None) -> RangeImage:
@@ -121,24 +110,7 @@ class LidarGrit(Generator):
         uniform = torch.stack([torch.rand(self.transformer.context_length, generator=rng) for rng in rngs])
         writer, tokenizer = self._prepare(len(seeds), sampling)
         tokens = writer.write(uniform.to(device))
-        size = (self.sensor.height, self.sensor.width)
-        images = []
-        for first in range(0, len(seeds), _DECODED_AT_ONCE):
-            some = slice(first, first + _DECODED_AT_ONCE)
-            grid = TokenGrid(tokens[some].unflatten(1, tokenizer.grid_size), tokenizer.num_codes)
-            uniform = torch.stack([torch.rand(size, generator=rng) for rng in rngs[some]]).to(device)
-            part = tokenizer.decode(grid, sampling.mask, uniform)
-            images += [part[index] for index in range(len(part))]
-        return RangeImage.stack(images)
-
-    def get_tokenizer(self) -> Tokenizer:
-        """Return the VQ-VAE."""
-        return self.tokenizer
-
-    @torch.no_grad()
-    def reconstruct(self, images: RangeImage) -> RangeImage:
-        """Return what the tokens keep of a batch of scans, the mask by threshold."""
-        return self.tokenizer.decode(self.tokenizer.encode(images))
+        return self.decode(tokens, rngs, sampling.mask, tokenizer)
 
     @torch.no_grad()
     def surprise(self, images: RangeImage) -> Float[Tensor, "B h w"]:
@@ -160,11 +132,7 @@ class LidarGrit(Generator):
         # weights by values over all tokens so far.
         products = sizes.layers * (24 * sizes.width**2 * tokens + 2 * sizes.width * tokens * (tokens + 1))
         head = 2 * sizes.width * self.transformer.num_tokens * tokens
-        latents = (1, self.tokenizer.config.code_dim, *self.tokenizer.grid_size)
-        decoding = flops_of(self.tokenizer.post_quant_conv, latents) + flops_of(
-            self.tokenizer.decoder.prepared("fp32"), latents
-        )
-        return Cost(tokens + 1, products + head + decoding)
+        return Cost(tokens + 1, products + head + self.decoding_flops())
 
     def _prepare(self, batch_size: int, sampling: TokenSampling) -> tuple[TokenWriter, Vqvae]:
         """Return what draws tokens and what decodes them, kept from the last time if nothing has changed since."""
@@ -202,29 +170,15 @@ class _Prepared(NamedTuple):
     tokenizer: Vqvae
 
 
-class NextToken(nn.Module):
+class NextToken(TokenObjective):
     """The transformer's objective: negative log-likelihood of each token after those before it, in nats per token."""
-
-    token_counts: Tensor
-
-    def __init__(self, tokenizer: Tokenizer, transformer: CausalTransformer) -> None:
-        super().__init__()
-        self.transformer, self.sensor = transformer, tokenizer.sensor
-        self._frozen = [tokenizer.eval().requires_grad_(False)]  # in a list: its weights are not this stage's
-        self.register_buffer("token_counts", torch.ones(transformer.num_tokens))
 
     def forward(self, images: RangeImage, rng: torch.Generator) -> dict[str, Tensor]:
         """Return eq. 6 of the paper per token, beside it that of a model which knows only how often tokens occur."""
-        # Tokens are made in full precision, as they are when a scan is encoded outside of training.
-        with torch.no_grad(), torch.autocast(images.range_m.device.type, enabled=False):
-            self._frozen[0].to(images.range_m.device)
-            tokens = self._frozen[0].encode(images).tokens.flatten(1)
-            if self.training:
-                self.token_counts += torch.bincount(tokens.flatten(), minlength=len(self.token_counts))
-            unigram = -(self.token_counts / self.token_counts.sum()).log()[tokens].mean()
+        tokens, unigram_nll = self.encode(images)
         logits = self.transformer(after_start(tokens[:, :-1]))
         loss = F.cross_entropy(logits.float().flatten(0, 1), tokens.flatten())
-        return {"loss": loss, "unigram_nll": unigram}
+        return {"loss": loss, "unigram_nll": unigram_nll.mean()}
 
 
 def after_start(tokens: Int[Tensor, "B T"]) -> Int[Tensor, "B T+1"]:
@@ -263,6 +217,4 @@ def choose(logits: Float[Tensor, "B K"], uniform: Float[Tensor, "B"], sampling: 
         ordered, order = logits.softmax(dim=1).sort(dim=1, descending=True)
         spare = ordered.cumsum(dim=1) - ordered >= sampling.top_p  # those before it already hold enough
         logits = logits.masked_fill(torch.zeros_like(spare).scatter(1, order, spare), -torch.inf)
-    distribution = logits.softmax(dim=1).cumsum(dim=1)
-    threshold = (uniform.double() * distribution[:, -1])[:, None]  # the sum may miss 1 by a rounding error
-    return torch.searchsorted(distribution, threshold, right=True)[:, 0].clamp(max=logits.shape[1] - 1)
+    return draw_tokens(logits, uniform)

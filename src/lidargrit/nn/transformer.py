@@ -1,6 +1,6 @@
-"""A causal transformer over tokens: tokens so far → logits of the next.
+"""Transformers over tokens: those so far → logits of the next; or some of them → logits of the rest.
 
-It reads whole sequences; ``nn.writing`` writes them token by token. Parameter names follow the reference's state dict
+They read whole sequences; ``nn.writing`` writes them token by token. Parameter names follow the reference's state dict
 (a minGPT), so that published weights load.
 """
 
@@ -48,41 +48,60 @@ class TransformerConfig:
                 raise ConfigError(f"{name}={getattr(self, name)}", "a share in [0, 1)", "lower it")
 
 
-class CausalTransformer(nn.Module):
+class Transformer(nn.Module):
     """Pre-norm blocks, learned positions, exact GELU, an untied head without bias.
 
     Args:
         config: sizes.
-        num_tokens: size of the vocabulary.
+        num_inputs: how many different tokens it reads.
+        num_tokens: how many different tokens it tells the logits of.
         context_length: longest sequence.
+        causal: whether a token sees only itself and those before it.
 
     Source:
         Haghighi et al., LidarGRIT, 2024, section 3.3; layers as in hamedhaghighi/LidarGRIT@a3f86e7.
     """
 
-    def __init__(self, config: TransformerConfig, num_tokens: int, context_length: int) -> None:
+    def __init__(
+        self, config: TransformerConfig, num_inputs: int, num_tokens: int, context_length: int, causal: bool
+    ) -> None:
         super().__init__()
         self.config, self.num_tokens, self.context_length = config, num_tokens, context_length
-        self.tok_emb = nn.Embedding(num_tokens, config.width)
+        self.tok_emb = nn.Embedding(num_inputs, config.width)
         self.pos_emb = nn.Parameter(torch.zeros(1, context_length, config.width))
         self.drop = nn.Dropout(config.embedding_dropout)
-        self.blocks = nn.ModuleList(_Block(config) for _ in range(config.layers))
+        self.blocks = nn.ModuleList(_Block(config, causal) for _ in range(config.layers))
         self.ln_f = nn.LayerNorm(config.width)
         self.head = nn.Linear(config.width, num_tokens, bias=False)
         self.apply(_initialise)
 
     def forward(self, tokens: Int[Tensor, "B T"]) -> Float[Tensor, "B T K"]:
-        """Return the logits of the token after each one."""
+        """Return the logits at each place: of the token after it if causal, else of its own."""
         x = self.drop(self.tok_emb(tokens) + self.pos_emb[:, : tokens.shape[1]])
         for block in self.blocks:
             x = block(x)
         return self.head(self.ln_f(x))
 
 
+class CausalTransformer(Transformer):
+    """Reads tokens so far and tells the next, at every place of a sequence at once."""
+
+    def __init__(self, config: TransformerConfig, num_tokens: int, context_length: int) -> None:
+        super().__init__(config, num_tokens, num_tokens, context_length, causal=True)
+
+
+class MaskedTransformer(Transformer):
+    """Reads a sequence in which some tokens are hidden, shown as ``mask_token``, and tells what they are."""
+
+    def __init__(self, config: TransformerConfig, num_tokens: int, context_length: int) -> None:
+        super().__init__(config, num_tokens + 1, num_tokens, context_length, causal=False)
+        self.mask_token = num_tokens
+
+
 class _Attention(nn.Module):
-    def __init__(self, config: TransformerConfig) -> None:
+    def __init__(self, config: TransformerConfig, causal: bool) -> None:
         super().__init__()
-        self.heads, self.dropout = config.heads, config.attention_dropout
+        self.heads, self.dropout, self.causal = config.heads, config.attention_dropout, causal
         self.key = nn.Linear(config.width, config.width)
         self.query = nn.Linear(config.width, config.width)
         self.value = nn.Linear(config.width, config.width)
@@ -93,15 +112,15 @@ class _Attention(nn.Module):
             linear(x).unflatten(-1, (self.heads, -1)).transpose(1, 2) for linear in (self.query, self.key, self.value)
         )  # (B, heads, T, d)
         dropout = self.dropout if self.training else 0.0
-        mixed = F.scaled_dot_product_attention(q, k, v, dropout_p=dropout, is_causal=True)
+        mixed = F.scaled_dot_product_attention(q, k, v, dropout_p=dropout, is_causal=self.causal)
         return self.proj(mixed.transpose(1, 2).flatten(-2))
 
 
 class _Block(nn.Module):
-    def __init__(self, config: TransformerConfig) -> None:
+    def __init__(self, config: TransformerConfig, causal: bool) -> None:
         super().__init__()
         self.ln1, self.ln2 = nn.LayerNorm(config.width), nn.LayerNorm(config.width)
-        self.attn = _Attention(config)
+        self.attn = _Attention(config, causal)
         self.mlp = nn.Sequential(
             nn.Linear(config.width, 4 * config.width), nn.GELU(), nn.Linear(4 * config.width, config.width)
         )

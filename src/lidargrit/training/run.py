@@ -13,11 +13,12 @@ from typing import Any
 import torch
 
 from lidargrit import __version__, configuration
-from lidargrit.errors import CheckpointError, OutputError
+from lidargrit.errors import CheckpointError, ConfigError, OutputError
 from lidargrit.files import is_taken, read_json, write_json, write_text
-from lidargrit.generators import TRAINED_ON_FILE, Generator, load_class
+from lidargrit.generators import TRAINED_ON_FILE, Generator, load, load_class
 from lidargrit.loading import RangeImages, load_range_images, seed_of
 from lidargrit.reporting import Reporter
+from lidargrit.tokenizers import Tokenizer
 from lidargrit.training.checkpoint import fingerprint
 from lidargrit.training.fit import Fit
 from lidargrit.training.settings import Recipe
@@ -35,6 +36,7 @@ def train(recipe: Recipe, folder: Path, reporter: Reporter | None = None) -> Gen
         OutputError: the folder holds something else, or cannot be written.
         DataError, ScanError: the data cannot be used.
         TrainingError: the loss is not finite.
+        ConfigError: the tokenizer to be taken from another run is not this recipe's.
     """
     reporter = reporter or Reporter()
     _check_folder(folder, recipe)
@@ -44,13 +46,21 @@ def train(recipe: Recipe, folder: Path, reporter: Reporter | None = None) -> Gen
     with torch.random.fork_rng(range(torch.cuda.device_count())):  # the caller's random numbers are the caller's
         torch.manual_seed(seed_of(recipe.seed, 9))
         generator = load_class(recipe.generator)(recipe.model, recipe.data.load_sensor())
+        borrowed = None if recipe.tokenizer_from is None else _tokenizer_of(Path(recipe.tokenizer_from), generator)
         _claim(folder, recipe, train_images, val_images)
         generator.learn(train_images)
         built_on = ""
         for number, stage in enumerate(generator.stages):
-            seed, objective = seed_of(recipe.seed, number), generator.objective(stage)
-            fit = Fit(objective, recipe.training[stage], folder / stage, seed, reporter, built_on, recipe.data.workers)
-            trained = fit.run(train_images, val_images, f"training {stage}")
+            if stage == "tokenizer" and borrowed is not None:
+                trained = borrowed
+            else:
+                seed, objective, config = (
+                    seed_of(recipe.seed, number),
+                    generator.objective(stage),
+                    recipe.training[stage],
+                )
+                fit = Fit(objective, config, folder / stage, seed, reporter, built_on, recipe.data.workers)
+                trained = fit.run(train_images, val_images, f"training {stage}")
             generator.finish(stage, trained)
             built_on = fingerprint(trained)
     generator.save(folder)
@@ -69,6 +79,21 @@ def plan(recipe: Recipe) -> str:
         budget = recipe.training[stage]
         lines.append(f"{stage}: {count:,} parameters, {budget.scans:,} scans in batches of {budget.batch_size}")
     return "\n".join(lines)
+
+
+def _tokenizer_of(donor: Path, generator: Generator) -> Tokenizer:
+    """Return the tokenizer of a finished run, once it is known to be of the generator's own sizes and sensor."""
+    ours, theirs = generator.get_tokenizer(), load(donor).get_tokenizer()
+    mine, other = (configuration.leaves(tokenizer.config) for tokenizer in (ours, theirs))
+    differing = [name for name in mine if mine[name] != other.get(name)]
+    if differing or not ours.sensor.same_rays(theirs.sensor):
+        setting = f"model.tokenizer.{differing[0]}={other.get(differing[0])}" if differing else "data.sensor"
+        raise ConfigError(
+            f"tokenizer_from={donor}, whose tokenizer is another ({setting})",
+            "one of this recipe's model.tokenizer and sensor",
+            "set them as there, or choose another run",
+        )
+    return theirs
 
 
 def _check_folder(folder: Path, recipe: Recipe) -> None:
@@ -115,7 +140,7 @@ def _claim(folder: Path, recipe: Recipe, train_images: RangeImages, val_images: 
                     "what it began with",
                     "restore it, or choose another folder",
                 )
-        _write_trained_on(folder, train_images)
+        _write_trained_on(folder, train_images, recipe.tokenizer_from)
         return
     about: dict[str, Any] = {
         "recipe": configuration.to_json(recipe),
@@ -127,15 +152,18 @@ def _claim(folder: Path, recipe: Recipe, train_images: RangeImages, val_images: 
         "python": platform.python_version(),
     }
     write_json(folder / RUN_FILE, about)
-    _write_trained_on(folder, train_images)
+    _write_trained_on(folder, train_images, recipe.tokenizer_from)
 
 
-def _write_trained_on(folder: Path, train_images: RangeImages) -> None:
+def _write_trained_on(folder: Path, train_images: RangeImages, tokenizer_from: str | None) -> None:
     """Write what the model learns from, without the names of the user's files, so that samples can carry it."""
     if not (folder / TRAINED_ON_FILE).exists():
         came_from = train_images.provenance
-        facts = {"recordings": sorted({*came_from.recordings} - {""}), "fingerprints": sorted(came_from.fingerprints)}
-        write_text(folder / TRAINED_ON_FILE, json.dumps(facts) + "\n")
+        facts = {"recordings": {*came_from.recordings} - {""}, "fingerprints": {*came_from.fingerprints}}
+        if tokenizer_from is not None:  # what the tokenizer learned from, the model has learned from
+            theirs = read_json(Path(tokenizer_from) / TRAINED_ON_FILE)
+            facts = {name: known | set(theirs[name]) for name, known in facts.items()}
+        write_text(folder / TRAINED_ON_FILE, json.dumps({name: sorted(known) for name, known in facts.items()}) + "\n")
 
 
 def _warn_of_overlap(train_images: RangeImages, val_images: RangeImages, reporter: Reporter) -> None:

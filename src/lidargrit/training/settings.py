@@ -76,6 +76,7 @@ class Recipe:
         training: how each stage of the generator learns.
         seed: of everything random.
         published: what the paper reports for it, for the reader; empty if this is not an experiment of the paper.
+        tokenizer_from: folder of a finished run whose tokenizer is taken as it is, in place of training one.
     """
 
     title: str
@@ -85,6 +86,7 @@ class Recipe:
     training: dict[str, FitConfig]
     seed: int = 0
     published: str = ""
+    tokenizer_from: str | None = None
 
     def __post_init__(self) -> None:
         if self.seed < 0:

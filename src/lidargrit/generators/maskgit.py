@@ -1,0 +1,178 @@
+"""MaskGIT over LidarGRIT's tokens: a transformer fills in many at once, in few passes; seeds → range images."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Int
+from torch import Tensor, nn
+
+from lidargrit.errors import ConfigError
+from lidargrit.generators import Cost
+from lidargrit.generators._tokens import TokenGenerator, TokenObjective, draw_tokens
+from lidargrit.nn.precision import Precision, dtype_of
+from lidargrit.nn.transformer import MaskedTransformer, TransformerConfig
+from lidargrit.sensors import SensorModel
+from lidargrit.structures import RangeImage
+from lidargrit.tokenizers import MaskDecoding
+from lidargrit.tokenizers.vqvae import VqvaeConfig
+
+
+@dataclass(frozen=True)
+class MaskedSampling:
+    """How tokens are drawn, and returns.
+
+    Args:
+        steps: passes of the transformer; at most one a token.
+        temperature: of the tokens, above 1 bolder, below 1 safer than the model's own probabilities; 0 takes the
+            likeliest token.
+        order_temperature: of which tokens a pass keeps: the Gumbel noise that is added to the logarithm of a token's
+            probability, falling to 0 with the last pass. 0 keeps the surest; the more, the nearer to any order. The
+            default is that of the authors' program.
+        mask: ``bernoulli`` draws each return with its probability; ``threshold`` keeps what is at least as likely as
+            not.
+        weights: ``fp32`` is exact; ``bf16`` computes the transformer's products in 16 bits, as training does where it
+            is quicker; ``auto`` is that where the machine has instructions for it.
+        decoder: the same of decoding.
+    """
+
+    steps: int = 16
+    temperature: float = 1.0
+    order_temperature: float = 4.5
+    mask: MaskDecoding = "bernoulli"
+    weights: Precision = "fp32"
+    decoder: Precision = "fp32"
+
+    def __post_init__(self) -> None:
+        if not (self.steps >= 1 and self.temperature >= 0 and self.order_temperature >= 0):
+            raise ConfigError(
+                f"steps={self.steps}, temperature={self.temperature}, order_temperature={self.order_temperature}",
+                "steps >= 1, and no negative temperature",
+                "correct the one that is out of bounds",
+            )
+
+
+@dataclass(frozen=True)
+class MaskGitConfig:
+    """The VQ-VAE of LidarGRIT, and a transformer of the same blocks that sees all tokens."""
+
+    tokenizer: VqvaeConfig = field(default_factory=VqvaeConfig)
+    transformer: TransformerConfig = field(default_factory=TransformerConfig)
+
+
+class MaskGit(TokenGenerator):
+    """Parallel decoding of a VQ-VAE's tokens: fewer passes than tokens, at some cost in quality.
+
+    A pass draws every hidden token as if it knew of the others hidden only what is shown; of these it keeps some.
+    What is drawn in one pass does not know of one another, so the scans are not those of an exact model.
+
+    Source:
+        Chang et al., MaskGIT: Masked Generative Image Transformer, CVPR 2022, section 3; order temperature as in
+        google-research/maskgit.
+    """
+
+    Config = MaskGitConfig
+    Sampling = MaskedSampling
+    transformer: MaskedTransformer
+
+    def __init__(self, config: MaskGitConfig, sensor: SensorModel) -> None:
+        super().__init__(config, sensor)
+        height, width = self.tokenizer.grid_size
+        self.transformer = MaskedTransformer(config.transformer, config.tokenizer.num_codes, height * width)
+
+    def objective(self, stage: str) -> nn.Module:
+        """Return the VQ-VAE itself, or the transformer's objective over the frozen VQ-VAE."""
+        return self.tokenizer if stage == "tokenizer" else HiddenTokens(self.tokenizer, self.transformer)
+
+    @torch.no_grad()
+    def sample(self, seeds: Sequence[int], sampling: MaskedSampling | None = None) -> RangeImage:
+        """Write one scan for each seed; a seed gives the same scan whatever the others are."""
+        sampling = sampling or MaskedSampling()
+        self.eval()
+        rngs = [torch.Generator().manual_seed(seed) for seed in seeds]  # on the CPU: the same numbers on every device
+        tokens = fill_in(self.transformer, rngs, sampling)
+        return self.decode(tokens, rngs, sampling.mask, self.tokenizer.for_decoding(sampling.decoder))
+
+    def cost(self, sampling: MaskedSampling | None = None) -> Cost:
+        """Return the passes over all tokens, and one decoding."""
+        sampling = sampling or MaskedSampling()
+        sizes, tokens = self.config.transformer, self.transformer.context_length
+        # Per token and layer: four projections and a perceptron of four times the width, then queries by keys and
+        # weights by values over all tokens.
+        layer = 24 * sizes.width**2 + 4 * sizes.width * tokens
+        one_pass = tokens * (sizes.layers * layer + 2 * sizes.width * self.transformer.num_tokens)
+        passes = len(numbers_hidden(tokens, sampling.steps))
+        return Cost(passes + 1, passes * one_pass + self.decoding_flops())
+
+
+class HiddenTokens(TokenObjective):
+    """The transformer's objective: negative log-likelihood of hidden tokens by those shown, in nats per token."""
+
+    transformer: MaskedTransformer
+
+    def forward(self, images: RangeImage, rng: torch.Generator) -> dict[str, Tensor]:
+        """Return eq. 1 of the paper per hidden token, beside it that of a model which knows only token frequencies."""
+        tokens, unigram_nll = self.encode(images)
+        count, length = tokens.shape
+        # Each scan's progress is uniform in [0, 1); within a batch they are evenly spread, which calms the loss.
+        progress = (
+            torch.rand(1, generator=rng, device=rng.device) + torch.arange(count, device=rng.device) / count
+        ) % 1
+        hidden_each = (share_hidden(progress) * length).ceil().clamp(min=1)
+        rank = torch.rand(tokens.shape, generator=rng, device=rng.device).argsort(dim=1).argsort(dim=1)
+        hidden = (rank < hidden_each[:, None]).to(tokens.device)
+        logits = self.transformer(tokens.masked_fill(hidden, self.transformer.mask_token))
+        loss = F.cross_entropy(logits.float()[hidden], tokens[hidden])
+        return {"loss": loss, "unigram_nll": unigram_nll[hidden].mean()}
+
+
+def share_hidden(progress: Tensor) -> Tensor:
+    """Return the share of tokens that is hidden: all of them at a progress of 0, none at 1.
+
+    Source:
+        Chang et al., MaskGIT, 2022, section 3.3: the cosine schedule.
+    """
+    return (progress * (math.pi / 2)).cos()
+
+
+def numbers_hidden(num_tokens: int, steps: int) -> list[int]:
+    """Return how many tokens are still hidden after each pass, by the cosine schedule.
+
+    Every pass shows at least one, so with as many steps as tokens each shows one.
+    """
+    passes, left = min(steps, num_tokens), num_tokens
+    found = []
+    for done in range(1, passes):
+        left = min(math.ceil(num_tokens * math.cos(math.pi / 2 * done / passes)), left - 1)
+        found.append(left)
+    return [*found, 0]
+
+
+def fill_in(
+    transformer: MaskedTransformer, rngs: Sequence[torch.Generator], sampling: MaskedSampling
+) -> Int[Tensor, "B T"]:
+    """Write one sequence for each generator of random numbers: all hidden at first, some more shown after each pass."""
+    device, length = transformer.head.weight.device, transformer.context_length
+    tokens = torch.full((len(rngs), length), transformer.mask_token, device=device)
+    schedule = numbers_hidden(length, sampling.steps)
+    short = dtype_of(sampling.weights) == torch.bfloat16
+    for done, left in enumerate(schedule, start=1):
+        uniform = torch.stack([torch.rand(2, length, generator=rng) for rng in rngs], dim=1).to(device)
+        with torch.autocast(device.type, torch.bfloat16, enabled=short):
+            logits = transformer(tokens).float()
+        drawn = _draw(logits, uniform[0], sampling.temperature)
+        sureness = logits.log_softmax(dim=-1).gather(-1, drawn[..., None])[..., 0]
+        noise = -(-uniform[1].clamp(1e-9, 1 - 1e-7).log()).log()  # Gumbel's distribution; the bounds keep it finite
+        sureness += sampling.order_temperature * (1 - done / len(schedule)) * noise
+        hidden = tokens == transformer.mask_token
+        kept = sureness.masked_fill(~hidden, torch.inf).topk(length - left, dim=1).indices
+        tokens = tokens.scatter(1, kept, torch.where(hidden, drawn, tokens).gather(1, kept))
+    return tokens
+
+
+def _draw(logits: Tensor, uniform: Tensor, temperature: float) -> Tensor:
+    return logits.argmax(dim=-1) if temperature == 0 else draw_tokens(logits / temperature, uniform)
