@@ -24,7 +24,6 @@ class TokenGenerator(Generator):
 
     stages = ("tokenizer", "transformer")
     capabilities = frozenset({"tokens", "encode"})
-    transformer: Transformer
 
     def __init__(self, config: Any, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
@@ -36,7 +35,8 @@ class TokenGenerator(Generator):
         if stage == "tokenizer":
             self.tokenizer.load_state_dict(objective.state_dict())
         else:
-            self.transformer.load_state_dict(objective.get_submodule("transformer").state_dict())
+            trained = objective.get_submodule("transformer")
+            self.get_submodule("transformer").load_state_dict(trained.state_dict())
 
     def get_tokenizer(self) -> Tokenizer:
         """Return the VQ-VAE."""

@@ -88,7 +88,6 @@ class LidarGrit(TokenGenerator):
     Sampling = TokenSampling
     published_files = tuple(_PUBLISHED_NETWORKS)
     capabilities = TokenGenerator.capabilities | {"likelihood"}
-    transformer: CausalTransformer
 
     def __init__(self, config: LidarGritConfig, sensor: SensorModel) -> None:
         super().__init__(config, sensor)

@@ -77,7 +77,6 @@ class MaskGit(TokenGenerator):
 
     Config = MaskGitConfig
     Sampling = MaskedSampling
-    transformer: MaskedTransformer
 
     def __init__(self, config: MaskGitConfig, sensor: SensorModel) -> None:
         super().__init__(config, sensor)

@@ -1,0 +1,118 @@
+"""Quality against seconds a scan: a LidarGRIT run, token by token, beside a MaskGIT run in several numbers of passes.
+
+    python benchmarks/fewer_steps.py OUT EXACT_RUN MASKED_RUN [-n 256] [--steps 8 16 32 64]
+
+Every system writes the same number of samples, which are scored against simulated scans that none was trained on, by
+three metrics with their 95 % intervals; OUT keeps samples and scores, and the same command goes on there. Seconds are
+of whole scans, seed to range image, the best of the repeats; with OMP_NUM_THREADS=1 they are the processor's, which do
+not count waiting for neighbours. Prints the table and draws the plot.
+"""
+
+import argparse
+import time
+from functools import partial
+from pathlib import Path
+
+import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter, ScalarFormatter
+
+from lidargrit.configuration import override
+from lidargrit.evaluation.comparison import Settings
+from lidargrit.evaluation.contest import Contest, hold
+from lidargrit.evaluation.scorecard import Scorecard
+from lidargrit.generators import Generator, load
+from lidargrit.reporting import TerminalReporter
+
+METRICS = ("sliced_wasserstein", "point_cloud_jsd", "return_rate_per_ring")
+
+
+def seconds_per_scan(generator: Generator, sampling: object, batch: int, repeats: int = 3) -> float:
+    """Return the least of several times; the first call, which prepares, is not counted."""
+    clock = time.process_time if torch.get_num_threads() == 1 else time.perf_counter
+    work, times = partial(generator.sample, range(batch), sampling), []
+    work()
+    for _ in range(repeats):
+        begun = clock()
+        work()
+        times.append((clock() - begun) / batch)
+    return min(times)
+
+
+def draw(rows: list[dict], path: Path, title: str) -> None:
+    """Draw a panel for each metric: its value with the interval over the seconds of one scan at a time."""
+    figure = Figure(figsize=(13.0, 4.2), dpi=100)
+    FigureCanvasAgg(figure)
+    for index, metric in enumerate(METRICS):
+        axes = figure.add_subplot(1, len(METRICS), index + 1)
+        for row in rows:
+            value, low, high, floor = row[metric]
+            exact = row["steps"] is None
+            label = "token by token" if exact else f"{row['steps']}"
+            axes.errorbar(
+                row["seconds"][0],
+                value,
+                [[max(0.0, value - low)], [max(0.0, high - value)]],
+                fmt="s" if exact else "o",
+                color="#26323c" if exact else "#d1495b",
+                capsize=3,
+            )
+            axes.annotate(label, (row["seconds"][0], value), xytext=(6, 6), textcoords="offset points", fontsize=9)
+        axes.axhline(floor, color="#2a8fbd", linestyle=":", label="held-out scans against themselves")
+        axes.set_xscale("log")
+        axes.xaxis.set_major_formatter(ScalarFormatter())
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.set_ylim(bottom=0)
+        axes.set(title=metric, xlabel="seconds a scan, one at a time, one thread", ylabel="distance, lower is better")
+        axes.legend(fontsize=8, loc="lower right")
+    figure.suptitle(title)
+    figure.tight_layout()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)
+
+
+def row_of(name: str, steps: int | None, scores: Path, seconds: list[float]) -> dict:
+    """Return what a line of the table and a point of the plot need."""
+    row: dict = {"name": name, "steps": steps, "seconds": seconds}
+    for score in Scorecard.read(scores).scores:
+        assert score.interval is not None
+        assert score.floor is not None
+        row[score.result.metric] = [score.result.value, score.interval.low, score.interval.high, score.floor.value]
+    return row
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("exact_run", type=Path)
+    parser.add_argument("masked_run", type=Path)
+    parser.add_argument("-n", type=int, default=256)
+    parser.add_argument("--steps", type=int, nargs="+", default=[8, 16, 32, 64])
+    parser.add_argument("--masked", nargs="*", default=[], metavar="NAME=VALUE", help="choices of all masked sampling")
+    parser.add_argument("--batch", type=int, nargs="+", default=[1, 8], help="scans at once, in the timing")
+    parser.add_argument("--picture", type=Path, default=Path("docs/pictures/quality_against_seconds.png"))
+    parser.add_argument("--title", default="")
+    options = parser.parse_args()
+    choices = [[f"steps={steps}", *options.masked] for steps in options.steps]
+    systems = [str(options.exact_run), *(f"{options.masked_run}:{','.join(chosen)}" for chosen in choices)]
+    contest = Contest(f"simulated:{options.n}:test", options.n, Settings(metrics=METRICS))
+    scores = hold(systems, options.out, contest, TerminalReporter())
+    exact, masked = load(options.exact_run), load(options.masked_run)
+    drawn = [(exact, exact.Sampling()), *((masked, override(masked.Sampling(), chosen)) for chosen in choices)]
+    rows = []
+    for (generator, sampling), steps, path in zip(drawn, [None, *options.steps], scores, strict=True):
+        seconds = [seconds_per_scan(generator, sampling, batch) for batch in options.batch]
+        rows.append(row_of(generator.public_name(), steps, path, seconds))
+    heads = [*(f"seconds, batch {batch}" for batch in options.batch), *METRICS]
+    print(f"| {options.n} scans | passes | {' | '.join(heads)} |\n|---|---|{'---|' * len(heads)}")
+    for row in rows:
+        cells = [*(f"{each:.3f}" for each in row["seconds"])]
+        cells += [f"{row[metric][0]:.4f} ({row[metric][1]:.4f} to {row[metric][2]:.4f})" for metric in METRICS]
+        print(f"| {row['name']} | {row['steps'] or 'one a token'} | {' | '.join(cells)} |")
+    print("floor: " + ", ".join(f"{metric} {rows[0][metric][3]:.4f}" for metric in METRICS))
+    draw(rows, options.picture, options.title)
+
+
+if __name__ == "__main__":
+    main()
