@@ -10,6 +10,8 @@ from lidargrit.errors import ConfigError, LidarGritError
 from lidargrit.evaluation.comparison import Settings
 from lidargrit.evaluation.contest import Contest, as_table, hold
 from lidargrit.evaluation.intervals import Resampling
+from lidargrit.generators import load_class
+from lidargrit.nn.flops import flops_of
 from lidargrit.recipes import load_recipe
 from lidargrit.training import training_flops, with_budget
 
@@ -80,3 +82,34 @@ def test_a_budget_scales_all_stages_alike():
     assert with_budget(load_recipe("marginal"), 1.0) == load_recipe("marginal")
     with pytest.raises(ConfigError, match="at least one batch"):
         with_budget(recipe, 1e6)
+
+
+def test_a_run_of_another_recipe_is_not_taken_for_this_one(tmp_path):
+    hold(["marginal"], tmp_path, CONTEST)
+    other = replace(CONTEST, recipe_settings=("data.train=simulated:5:train", *CONTEST.recipe_settings[1:]))
+    with pytest.raises(LidarGritError, match="which holds another run"):
+        hold(["marginal"], tmp_path, other)
+
+
+def test_as_many_are_scored_as_were_asked_for(tmp_path):
+    hold(["marginal"], tmp_path, CONTEST)
+    fewer = hold(["marginal"], tmp_path, replace(CONTEST, num_samples=4))
+    assert json.loads(fewer[0].read_text())["inputs"]["samples"]["scans_used"] == 4
+
+
+@pytest.mark.parametrize("change", [{"reference": "no such folder"}, {"settings": replace(QUICK, protocol="nope")}])
+def test_what_all_are_scored_by_is_looked_at_first(change, tmp_path):
+    with pytest.raises(LidarGritError):
+        hold(["marginal"], tmp_path, replace(CONTEST, **change))
+    assert not list(tmp_path.rglob("*"))
+
+
+def test_attention_counts_in_training_flops():
+    recipe = load_recipe("small", ("data.train=simulated:6:train", *FEW[2:]))
+    flops, scans = training_flops(recipe)["transformer"], recipe.training["transformer"].scans
+    generator = load_class("lidargrit")(recipe.model, recipe.data.load_sensor())
+    tokens, sizes = generator.transformer.context_length, recipe.model.transformer
+    products = 3 * tokens * (24 * sizes.layers * sizes.width**2 + 2 * sizes.width * generator.transformer.num_tokens)
+    attention = 3 * sizes.layers * 4 * sizes.width * tokens**2
+    encoding = flops_of(generator.tokenizer.encoder, (1, 2, recipe.data.load_sensor().height, 64))
+    assert flops / scans == pytest.approx(products + attention + encoding, rel=0.05)

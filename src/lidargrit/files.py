@@ -54,8 +54,16 @@ def is_taken(folder: Path, first_file: str) -> bool:
     return any(not path.name.startswith(f".{first_file}.") for path in folder.iterdir())
 
 
-def refuse_to_overwrite(path: Path | None, overwrite: bool) -> None:
-    """Raise OutputError if something stands where a user's result is to be written, unless that is allowed."""
+def refuse_to_overwrite(path: Path | None, overwrite: bool, ending: str = "") -> None:
+    """Raise OutputError if something stands where a user's result is to be written, unless that is allowed.
+
+    Also if a file stands where its folder should, or if its name has another ending than what will be in it.
+    """
+    above = None if path is None else next((place for place in path.absolute().parents if place.exists()), None)
+    if above is not None and not above.is_dir():
+        raise OutputError(f"{path}, whose folder {above} is a file", "a folder", "choose another place")
+    if path is not None and ending and path.suffix.lower() != ending:
+        raise OutputError(f"{path}, which will hold {ending[1:].upper()}", f"a name in {ending}", "choose another name")
     if path is not None and path.exists() and not overwrite:
         raise OutputError(f"{path}, which is there already", "a new name", "choose another, or add --overwrite")
 

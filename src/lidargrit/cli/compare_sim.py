@@ -33,8 +33,8 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.reporting import TerminalReporter
     from lidargrit.viewer.curves import draw_curves
 
-    for path in (options.out, options.json):
-        refuse_to_overwrite(path, options.overwrite)
+    refuse_to_overwrite(options.out, options.overwrite, ".png")
+    refuse_to_overwrite(options.json, options.overwrite)
     config = DataConfig(bad_points=options.bad_points, bad_scans=options.bad_scans)
     about = {"real": options.real, "count": options.count, "sensor": options.sensor, "fine": options.fine}
     scores = compare_source(

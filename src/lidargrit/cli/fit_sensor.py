@@ -24,15 +24,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Fit, print a table, write the sensor file and perhaps a picture."""
-    from lidargrit.errors import ConfigError
     from lidargrit.files import refuse_to_overwrite, write_json
     from lidargrit.fitting import fit_sensor_to_source
     from lidargrit.fitting.table import as_table
 
-    if options.out.suffix != ".json":
-        raise ConfigError(f"the name {options.out} for a sensor file", "a name that ends in .json", "rename it")
-    for path in (options.out, options.picture):
-        refuse_to_overwrite(path, options.overwrite)
+    refuse_to_overwrite(options.out, options.overwrite, ".json")
+    refuse_to_overwrite(options.picture, options.overwrite, ".png")
     name = options.out.stem if options.name is None else options.name
     fit = fit_sensor_to_source(options.source, name, options.max_scans, options.bad_points)
     print(as_table(fit))

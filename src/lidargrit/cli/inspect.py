@@ -35,7 +35,7 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.sensors import load_sensor
     from lidargrit.viewer.inspection import draw_inspection
 
-    refuse_to_overwrite(options.out, options.overwrite)
+    refuse_to_overwrite(options.out, options.overwrite, ".png")
     refuse_to_overwrite(options.json, options.overwrite)
     name = options.sensor
     if Path(options.scan).is_file():

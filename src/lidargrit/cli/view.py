@@ -30,7 +30,8 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.reporting import TerminalReporter
     from lidargrit.viewer import view
 
-    refuse_to_overwrite(options.out, options.overwrite)
+    ending = ".html" if options.out.suffix.lower() == ".html" else ".png"
+    refuse_to_overwrite(options.out, options.overwrite, ending)
     config = DataConfig(bad_points=options.bad_points, bad_scans=options.bad_scans)
     view(options.places, options.out, options.count, options.seed, config, TerminalReporter())
     print(f"done: look at {options.out}")

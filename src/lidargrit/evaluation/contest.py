@@ -5,20 +5,25 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from lidargrit.configuration import override
+from lidargrit.datasets import open_dataset
 from lidargrit.errors import ConfigError
-from lidargrit.evaluation.comparison import Settings, compare_sources
+from lidargrit.evaluation.comparison import Settings, choices, compare_sources
+from lidargrit.evaluation.protocols import load_protocol
 from lidargrit.evaluation.samples import write_samples
+from lidargrit.evaluation.score import holds_images
 from lidargrit.evaluation.tables import Format, side_by_side
 from lidargrit.files import read_json, write_json
 from lidargrit.generators import Generator, is_run, load, load_class
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
-from lidargrit.training import Recipe, train, training_flops, with_budget
+from lidargrit.training import Recipe, check_folder, train, training_flops, with_budget
 
 COSTS = "costs.json"
 
@@ -44,10 +49,10 @@ class Contest:
     batch_size: int = 8
 
     def __post_init__(self) -> None:
-        if self.num_samples < 2 or self.batch_size < 1 or not self.flops >= 0:
+        if self.num_samples < 2 or self.batch_size < 1 or not 0 <= self.flops < math.inf:
             raise ConfigError(
                 f"{self.num_samples} samples, {self.batch_size} at once, {self.flops:g} operations",
-                "at least 2 samples, at least 1 at once, and no negative budget",
+                "at least 2 samples, at least 1 at once, and a budget from 0 on",
                 "correct the number",
             )
 
@@ -72,15 +77,26 @@ def hold(systems: Sequence[str], folder: Path, contest: Contest, reporter: Repor
         raise ConfigError(
             f"the systems {', '.join(systems) or '(none)'}", "each once, and at least one", "correct them"
         )
-    plans = [_Plan.of(system, contest) for system in systems]  # a wrong word is told before anything is trained
+    # Wrong words and runs of other recipes are told before anything is trained.
+    plans = [_Plan.of(system, folder, contest) for system in systems]
+    settings = replace(contest.settings, max_scans=contest.num_samples)
+    choices(load_protocol(settings.protocol), settings)
+    if not holds_images(contest.reference):
+        open_dataset(contest.reference)
+    if (contest.recipe_settings or contest.flops) and not any(plan.recipe for plan in plans):
+        raise ConfigError("settings or a budget, and no recipe", "a recipe that they are for", "leave them out")
     scores = []
     for name, plan in zip(names, plans, strict=True):
         reporter.message(f"{name}:")
-        run = plan.run if plan.recipe is None else folder / "runs" / str(plan.run)
-        generator = load(run) if plan.recipe is None or is_run(run) else train(plan.recipe, run, reporter)
-        seconds = _sample(generator, run, folder / name / "samples", plan.sampling, contest, reporter)
+        generator = (
+            load(plan.run) if plan.recipe is None or is_run(plan.run) else train(plan.recipe, plan.run, reporter)
+        )
+        generator.to("cuda" if torch.cuda.is_available() else "cpu")
+        seconds = _sample(generator, plan.run, folder / name / "samples", plan.sampling, contest, reporter)
         _write_costs(folder / name / COSTS, plan.recipe, generator, plan.sampling, seconds, contest.num_samples)
-        card, _ = compare_sources(str(folder / name / "samples"), contest.reference, contest.settings, reporter)
+        card, _ = compare_sources(str(folder / name / "samples"), contest.reference, settings, reporter)
+        if card.samples.scans_used < contest.num_samples:
+            reporter.message(f"WARNING: {contest.reference} has but {card.samples.scans_used} scans to compare with")
         scores.append(folder / name / f"{name}.json")
         write_json(scores[-1], card.to_json())
     return scores
@@ -105,7 +121,7 @@ class _Plan:
     """How one system comes about.
 
     Args:
-        run: folder of a finished run, or the name of the run that the recipe gets.
+        run: folder of a finished run, or of the one that the recipe gets.
         recipe: None for a finished run.
         sampling: how it is drawn from, of the generator's own ``Sampling``.
     """
@@ -115,7 +131,7 @@ class _Plan:
     sampling: Any
 
     @classmethod
-    def of(cls, system: str, contest: Contest) -> _Plan:
+    def of(cls, system: str, folder: Path, contest: Contest) -> _Plan:
         name, _, settings = system.partition(":")
         recipe = None if is_run(Path(name)) else load_recipe(name, contest.recipe_settings)
         cls_of = type(load(name)) if recipe is None else load_class(recipe.generator)
@@ -123,7 +139,10 @@ class _Plan:
         sampling = override(cls_of.Sampling(), settings.split(",") if settings else [], owner, cure)
         if recipe is not None and contest.flops:
             recipe = with_budget(recipe, contest.flops)
-        return cls(Path(name), recipe, sampling)
+        if recipe is None:
+            return cls(Path(name), None, sampling)
+        check_folder(folder / "runs" / name, recipe)
+        return cls(folder / "runs" / name, recipe, sampling)
 
 
 def _sample(

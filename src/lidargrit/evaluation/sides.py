@@ -76,7 +76,9 @@ class Side:
     def _sha256(self) -> str:
         content = hashlib.sha256()
         known = self.images.provenance.fingerprints
-        if len(known) == len(self.images):
+        if len(known) == len(self.images):  # of the images with all fine columns: of which some were compared
+            sensor = self.images.sensor
+            content.update(f"{sensor.height}x{sensor.width} {sensor.projection} {self.variant} ".encode())
             for index in self.indices:
                 content.update(known[index].encode())
         else:

@@ -62,6 +62,8 @@ class Marginal(Generator):
     def learn(self, images: RangeImages) -> None:
         """Count the returns of all images."""
         edges = self._edges_m()[1:-1]
+        self.counts.zero_()
+        self.scans.zero_()
         for first in range(0, len(images), _BATCH):
             batch = images.batch(range(first, min(first + _BATCH, len(images))))
             place = torch.bucketize(batch.range_m, edges)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
 from lidargrit.errors import CheckpointError, ConfigError
+from lidargrit.files import load_exactly
 from lidargrit.generators import Cost, Generator, NoSampling
 from lidargrit.loading import RangeImages, spread
 from lidargrit.sensors import SensorModel
@@ -46,7 +48,7 @@ class Memorised(Generator):
         super().__init__(config, sensor)
         self.config, self.sensor = config, sensor
         self.register_buffer("scans", torch.zeros((), dtype=torch.int64))
-        self.register_buffer("range_m", torch.zeros(config.scans, sensor.height, sensor.width))
+        self.register_buffer("range_m", torch.zeros(0, sensor.height, sensor.width))
 
     def objective(self, stage: str) -> nn.Module:
         """Refuse: there is no stage."""
@@ -59,9 +61,21 @@ class Memorised(Generator):
     def learn(self, images: RangeImages) -> None:
         """Keep the images, in an order that does not follow the drive, so that the first seeds are not neighbours."""
         kept = spread(self.config.scans, len(images))
+        self.range_m = torch.zeros(len(kept), self.sensor.height, self.sensor.width)
         for place, index in enumerate(torch.randperm(len(kept), generator=torch.Generator().manual_seed(0)).tolist()):
             self.range_m[place] = images.batch([kept[index]]).range_m[0]
         self.scans.fill_(len(kept))
+
+    @classmethod
+    def from_weights(
+        cls, config: MemorisedConfig, sensor: SensorModel, weights: dict[str, Tensor], source: Path
+    ) -> Memorised:
+        """Make a generator that keeps as many scans as the weights hold."""
+        generator, kept = cls(config, sensor), weights.get("range_m", torch.zeros(0))
+        if kept.ndim == 3:
+            generator.range_m = torch.zeros(len(kept), sensor.height, sensor.width)
+        load_exactly(generator, weights, source)
+        return generator.eval()
 
     @torch.no_grad()
     def sample(self, seeds: Sequence[int], sampling: NoSampling | None = None) -> RangeImage:

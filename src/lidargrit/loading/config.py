@@ -44,6 +44,9 @@ class DataConfig:
     def __post_init__(self) -> None:
         if self.max_scans < 0:
             raise ConfigError(f"max_scans={self.max_scans}", "at least 1, or 0 for all", "raise it")
+        if self.column_stride != 1 and not self.columns:
+            got = f"column_stride={self.column_stride} without columns"
+            raise ConfigError(got, "both, or neither", "say of how many columns it is, as columns=2048")
         if not 1 <= self.workers <= 1024:
             raise ConfigError(f"workers={self.workers}", "1 to 1024", "choose about as many as there are cores")
 

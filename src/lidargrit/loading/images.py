@@ -5,6 +5,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import accumulate
 from typing import Protocol, runtime_checkable
 
@@ -87,12 +88,17 @@ class RangeImages:
             tuple(fingerprint for part in parts for fingerprint in part.fingerprints),
         )
 
+    @cached_property
+    def _all_have_reflectance(self) -> bool:
+        """Tell it by the first image of every store: batches that have it now and then would be of no use."""
+        return all(store.read(0)[1] is not None for store in self._stores)
+
     def batch(self, indices: Sequence[int], first_columns: Sequence[int] | None = None) -> RangeImage:
         """Return the images of these indices as one batch, each from its own first fine column on."""
         first_columns = first_columns or [0] * len(indices)
         pixels = [self._pixels(index, first) for index, first in zip(indices, first_columns, strict=True)]
         range_m = torch.from_numpy(np.stack([one for one, _ in pixels]))
-        known = [reflectance for _, reflectance in pixels if reflectance is not None]
+        known = [reflectance for _, reflectance in pixels if reflectance is not None and self._all_have_reflectance]
         reflectance = torch.from_numpy(np.stack(known)) if known and len(known) == len(pixels) else None
         return RangeImage(range_m, range_m > 0, self.sensor, reflectance)
 

@@ -19,6 +19,7 @@ from lidargrit.loading.batches import spread
 from lidargrit.loading.config import DataConfig
 from lidargrit.loading.images import RangeImages
 from lidargrit.loading.prepared import (
+    FORMAT,
     PLAN_FILE,
     SCANS_FILE,
     Place,
@@ -33,7 +34,6 @@ from lidargrit.loading.workers import make_shards
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel
 
-_FORMAT = 2  # to be raised whenever projection or simulation give other pixels for the same scan
 _SHARD_SCANS = 128  # 12 MB of a KITTI-360 size image: what a killed process loses, and 625 files for 80,000 scans
 _ABANDONED_S = 3600.0  # a half-written file so old was left by a killed process
 _WAIT_S, _PATIENCE_S = 0.5, 1800.0  # for shards that other processes make; a shard takes seconds
@@ -63,7 +63,7 @@ def load_range_images(
     for source in sources:
         if is_prepared(source):
             prepared = PreparedImages(source, config.max_scans)
-            _check_rays(source, prepared.sensor, sensor)
+            _check_way(source, prepared, sensor, config)
         else:
             prepared = PreparedImages(str(prepare(source, config, reporter=reporter, sensor=sensor)))
         for why in prepared.left_out.values():
@@ -212,7 +212,7 @@ def _plan(
         size, time_ns = (status.st_size, status.st_mtime_ns) if status else (0, 0)
         scans.append((name, dataset.recording(index), size, time_ns))
     plan = Plan(
-        format=_FORMAT,
+        format=FORMAT,
         version=__version__,
         source=source,
         sensor=fine.to_json(),
@@ -238,7 +238,10 @@ def _claim(folder: Path, plan: Plan, scans: list[tuple[str, str, int, int]]) -> 
                 "prepare into another folder, or remove this one",
             )
         return
-    if is_taken(folder, SCANS_FILE) and not (folder / SCANS_FILE).exists():
+    half_claimed = (folder / SCANS_FILE).is_file() and (folder / SCANS_FILE).read_text(encoding="utf-8") == json.dumps(
+        scans
+    )
+    if is_taken(folder, SCANS_FILE) and not half_claimed:
         raise OutputError(f"{folder}, which holds something else", "an empty folder", "choose another one")
     write_text(folder / SCANS_FILE, json.dumps(scans))
     write_json(folder / PLAN_FILE, asdict(plan))  # last: it says that the folder is ours
@@ -279,8 +282,17 @@ def _wait_for(folder: Path, shards: list[int], reporter: Reporter) -> None:
             time.sleep(_WAIT_S if still else 0)
 
 
-def _check_rays(source: str, prepared: SensorModel, sensor: SensorModel) -> None:
-    if not prepared.same_rays(sensor.fine()):
+def _check_way(source: str, images: PreparedImages, sensor: SensorModel, config: DataConfig) -> None:
+    """Refuse images that were prepared for other rays, or projected in another way than is wanted."""
+    prepared, wanted = images.sensor, sensor.fine()
+    theirs = (images.plan.variant, prepared.projection, prepared.range_min_m, prepared.range_max_m)
+    ours = (config.variant, wanted.projection, wanted.range_min_m, wanted.range_max_m)
+    if theirs != ours:
+        told = [f"{variant}, {projection}, {near:g} to {far:g} m" for variant, projection, near, far in (theirs, ours)]
+        raise DataError(
+            f"{source}, prepared by the projection {told[0]}", told[1], "ask for what was prepared, or prepare it anew"
+        )
+    if not prepared.same_rays(wanted):
         raise DataError(
             f"{source}, prepared for {prepared.name!r} ({prepared.height}x{prepared.width})",
             f"the rays of {sensor.name!r} ({sensor.fine().height}x{sensor.fine().width} with every fine column)",

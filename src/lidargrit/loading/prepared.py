@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from lidargrit.loading.shards import Bytes, Entry, LocalBytes, read_image, read_
 from lidargrit.sensors import SensorModel
 
 PLAN_FILE, SCANS_FILE = "plan.json", "scans.json"
+FORMAT = 2  # to be raised whenever projection or simulation give other pixels for the same scan
 _PLAN_AT_MOST = 1 << 30  # bytes; the list of a million scans has a quarter of that
 
 
@@ -132,7 +133,14 @@ class _RemoteBytes:
 def read_plan(place: Place) -> Plan:
     """Read the plan of a prepared place, or raise DataError."""
     try:
-        return Plan(**place.read_json(PLAN_FILE))
+        plan = Plan(**place.read_json(PLAN_FILE))
+        for field in fields(Plan):  # the plain types; the sensor checks itself
+            kind = {"int": int, "float": (int, float), "str": str}.get(str(field.type), dict)
+            if not isinstance(getattr(plan, field.name), kind):
+                raise TypeError(f"{field.name} is {getattr(plan, field.name)!r:.40}")
+        if plan.format != FORMAT or min(plan.shard_scans, plan.num_scans) < 1:
+            raise TypeError(f"format {plan.format}, {plan.num_scans} scans by {plan.shard_scans}")
+        return plan
     except TypeError as error:
         raise DataError(
             f"{place.location}/{PLAN_FILE}, which is no plan ({error})", "one of this version", "prepare again"
@@ -160,6 +168,8 @@ class PreparedImages:
         self._open: dict[int, Bytes] = {}
         self._lock = threading.Lock()
         scans = self._place.read_json(SCANS_FILE)
+        if len(scans) != self.plan.num_scans or not all(isinstance(scan, list) and len(scan) >= 2 for scan in scans):
+            raise DataError(f"{location}/{SCANS_FILE}, which is damaged", "the scans of the plan", "prepare again")
         for shard in range(self.plan.num_shards):
             entries, left_out = read_index(self._bytes(shard), shard_name(shard))
             if sorted([*(entry.scan for entry in entries), *left_out]) != list(self.plan.scans_of(shard)):

@@ -98,7 +98,8 @@ def write_drives(
             with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
                 for _ in pool.map(write, missing, chunksize=4):
                     progress.advance(1)
-    _write_sequence_files(out, config, num_scans)
+    there = sum(1 for _ in out.glob("sequences/*/labels/[!.]*.label"))  # an earlier call may have made more
+    _write_sequence_files(out, config, max(num_scans, there))
 
 
 def _claim(out: Path, config: DriveConfig) -> None:

@@ -1,7 +1,7 @@
 """One loop, one optimiser, one checkpoint, whatever the model: recipe → run folder."""
 
 from lidargrit.training.compute import training_flops, with_budget
-from lidargrit.training.run import plan, train
+from lidargrit.training.run import check_folder, plan, train
 from lidargrit.training.settings import FitConfig, Recipe
 
-__all__ = ["FitConfig", "Recipe", "plan", "train", "training_flops", "with_budget"]
+__all__ = ["FitConfig", "Recipe", "check_folder", "plan", "train", "training_flops", "with_budget"]

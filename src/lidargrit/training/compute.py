@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
+from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 from torch.utils.module_tracker import ModuleTracker
 
@@ -25,7 +26,7 @@ def training_flops(recipe: Recipe) -> dict[str, int]:
     Products and convolutions are counted as they are called, two operations for a multiplication with its addition, on
     a few steps with scans that return everywhere at 10 m. Validation and optimiser are left out.
     """
-    with torch.random.fork_rng(devices=[]):
+    with torch.random.fork_rng(range(torch.cuda.device_count())):
         torch.manual_seed(0)
         generator = load_class(recipe.generator)(recipe.model, recipe.data.load_sensor())
         found = {}
@@ -38,7 +39,7 @@ def training_flops(recipe: Recipe) -> dict[str, int]:
 def with_budget(recipe: Recipe, flops: float) -> Recipe:
     """Return the recipe with more or fewer scans, all stages by one factor, so that its training takes ``flops``.
 
-    What is counted in scans besides the budget (warm-up, averages, validation) shrinks or grows alike.
+    What is counted in scans besides the budget (warm-up, validation) shrinks or grows alike; averages only shrink.
 
     Raises:
         ConfigError: a budget that is not even a batch of every stage.
@@ -78,7 +79,8 @@ def _flops_per_scan(objective: torch.nn.Module, config: FitConfig, recipe: Recip
     counter.mod_tracker = (
         _NoModules()
     )  # which module an operation is of is not asked; the tracker stumbles over penalties
-    with counter:
+    # The fused attention of a CPU is no product to the counter.
+    with counter, sdpa_kernel(SDPBackend.MATH):
         for step in range(steps):
             engine.step(images.to(engine.device), step, 0.0)
     return counter.get_total_flops() / (steps * _SCANS)

@@ -39,7 +39,7 @@ def train(recipe: Recipe, folder: Path, reporter: Reporter | None = None) -> Gen
         ConfigError: the tokenizer to be taken from another run is not this recipe's.
     """
     reporter = reporter or Reporter()
-    _check_folder(folder, recipe)
+    check_folder(folder, recipe)
     train_images = load_range_images(recipe.data.train, recipe.data, reporter)
     val_images = load_range_images(recipe.data.val, recipe.data, reporter)
     _warn_of_overlap(train_images, val_images, reporter)
@@ -96,8 +96,8 @@ def _tokenizer_of(donor: Path, generator: Generator) -> Tokenizer:
     return theirs
 
 
-def _check_folder(folder: Path, recipe: Recipe) -> None:
-    """Refuse a folder that is neither free nor this recipe's already."""
+def check_folder(folder: Path, recipe: Recipe) -> None:
+    """Refuse a folder that is neither free nor this recipe's already, with OutputError."""
     if (folder / RUN_FILE).exists():
         about, ours = read_json(folder / RUN_FILE), configuration.to_json(recipe)
         theirs = about.get("recipe") if isinstance(about, dict) else None
