@@ -60,6 +60,10 @@ class TrainingError(LidarGritError):
     """Training cannot go on."""
 
 
+class Terminated(KeyboardInterrupt):  # its kin, so that what cleans up after Ctrl-C does so here
+    """SIGTERM ended the work; nobody's mistake."""
+
+
 def nearest_names(name: str, known: Iterable[str], at_most: int = 3) -> str:
     """Name the known names that look most like one, for a message: "a, b or c"."""
     names = sorted(set(known))

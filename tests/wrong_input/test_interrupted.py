@@ -111,6 +111,41 @@ def test_a_real_interrupt_from_the_keyboard(interrupt, tmp_path):
     assert read_tensors(checkpoint)[1]["scans_seen"] == seen + 8, "two more steps, and the third not to its end"
 
 
+def test_termination_saves_the_step_and_goes_on_to_the_same_weights(uninterrupted, tmp_path):
+    """As a batch scheduler does it; no checkpoint is due before the end of the stage."""
+    words = train_words(tmp_path / "run", *LONG, "training.tokenizer.checkpoint_every=1000000")
+    process = lidargrit(words)
+    assert process.stderr is not None
+    while not process.stderr.readline().startswith("training tokenizer: 8/48"):
+        assert process.poll() is None
+    process.send_signal(signal.SIGTERM)
+    _, told = process.communicate(timeout=200)
+    assert process.returncode == 143, told
+    assert told.endswith("\nlidargrit train: terminated; the same command goes on\n")
+    assert "Traceback" not in told
+    seen = read_tensors(tmp_path / "run" / "tokenizer" / "checkpoint.safetensors")[1]["scans_seen"]
+    assert 8 <= seen < 48
+    assert hidden(tmp_path) == []
+    assert main(words) == 0
+    assert (tmp_path / "run" / "model.safetensors").read_bytes() == uninterrupted
+
+
+def test_termination_before_the_first_step(tmp_path):
+    """While modules are imported the process just ends; from then on it tells how."""
+    folder = tmp_path / "run"
+    process = lidargrit(train_words(folder, *LONG, "data.train=[simulated:2000:train]"))
+    deadline = time.monotonic() + 60
+    cache = Path(os.environ["LIDARGRIT_CACHE"])
+    before = set(cache.glob("*")) if cache.exists() else set()
+    while set(cache.glob("*")) == before and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGTERM)
+    _, told = process.communicate(timeout=60)
+    assert process.returncode == 143, told
+    assert told.endswith("\nlidargrit train: terminated; the same command goes on\n")
+    assert not folder.exists()
+
+
 def test_a_full_disk_during_a_save(interrupt, uninterrupted, tmp_path):
     words = train_words(tmp_path / "run", *LONG)
     assert interrupt(4, words) == 130

@@ -5,11 +5,13 @@ from __future__ import annotations
 import argparse
 import importlib
 import os
+import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 from lidargrit import __version__, _discovery
-from lidargrit.errors import LidarGritError
+from lidargrit.errors import LidarGritError, Terminated
 
 _EXAMPLES = """\
 examples:
@@ -25,7 +27,7 @@ a verb's own examples: lidargrit VERB --help
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one verb; 0 = done, 2 = the user's mistake, told in one line, 130 = interrupted."""
+    """Run one verb; 0 = done, 2 = the user's mistake, told in one line, 130 = interrupted, 143 = terminated."""
     parser = argparse.ArgumentParser(
         prog="lidargrit",
         usage="lidargrit VERB ...",
@@ -50,16 +52,38 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.print_help()
         return 0
     try:
-        options.run(options)
+        with _raising_on_termination():
+            options.run(options)
         sys.stdout.flush()  # here, where a closed pipe is caught, and not when Python ends
     except LidarGritError as error:
         if options.debug:
             raise
         print(f"lidargrit {options.verb}: {error}", file=sys.stderr)
         return 2
+    except Terminated:
+        print(f"\nlidargrit {options.verb}: terminated; the same command goes on", file=sys.stderr)
+        return 143
     except KeyboardInterrupt:
         print(f"\nlidargrit {options.verb}: interrupted; the same command goes on", file=sys.stderr)
         return 130
     except BrokenPipeError:  # the reader of our output, such as head, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return 0
+
+
+@contextmanager
+def _raising_on_termination() -> Iterator[None]:
+    """Let SIGTERM, which batch schedulers send before they kill, end a verb as Ctrl-C does: with its files in order."""
+
+    def terminate(*_: object) -> None:
+        raise Terminated
+
+    try:
+        before = signal.signal(signal.SIGTERM, terminate)
+    except ValueError:  # a caller's thread: signals are the caller's
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from lidargrit.errors import OutputError, TrainingError
+from lidargrit.errors import OutputError, Terminated, TrainingError
 from lidargrit.files import write_text
 from lidargrit.loading import Batches, RangeImages, seed_of, spread
 from lidargrit.reporting import Reporter
@@ -19,6 +19,7 @@ from lidargrit.training.checkpoint import load_checkpoint, save_checkpoint
 from lidargrit.training.engine import Engine
 from lidargrit.training.optimiser import WeightAverage, learning_rate_at, make_optimiser
 from lidargrit.training.settings import FitConfig
+from lidargrit.training.termination import Termination
 
 _LOG_EVERY_STEPS = 20
 
@@ -71,6 +72,7 @@ class Fit:
         Raises:
             TrainingError: the loss is not finite; names the step and the last good checkpoint.
             OutputError: a checkpoint could not be written; the last one still stands.
+            Terminated: SIGTERM was received; the step was finished and saved.
         """
         config = self.config
         batches = Batches(
@@ -84,7 +86,8 @@ class Fit:
             self.workers,
         )
         begun = time.monotonic()
-        with self.reporter.progress(what, config.scans, self.scans_seen) as progress:
+        progress_bar = self.reporter.progress(what, config.scans, self.scans_seen)
+        with Termination() as termination, progress_bar as progress:
             for images in batches.stream(self.scans_seen, config.scans):
                 terms = self._step(images)
                 progress.advance(config.batch_size, f"loss {float(terms['loss']):.4f}")
@@ -92,8 +95,10 @@ class Fit:
                     self._log("train", {name: float(term) for name, term in terms.items()}, time.monotonic() - begun)
                 if self._passed(config.validate_every) or self.scans_seen >= config.scans:
                     self._log("val", self.validate(val), time.monotonic() - begun)
-                if self._passed(config.checkpoint_every) or self.scans_seen >= config.scans:
+                if self._passed(config.checkpoint_every) or self.scans_seen >= config.scans or termination.asked:
                     self._save()
+                if termination.asked:
+                    raise Terminated
         return self.average.objective.eval()
 
     def validate(self, images: RangeImages) -> dict[str, float]:
