@@ -1,11 +1,13 @@
 """Training: batches as a function of scans seen, exact resuming, one real scan learned by heart."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 
 from lidargrit.datasets.kitti_odometry import KittiOdometry
 from lidargrit.errors import TrainingError
@@ -14,9 +16,11 @@ from lidargrit.loading import Batches, DataConfig, load_range_images
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
 from lidargrit.tokenizers.vqvae import Vqvae
-from lidargrit.training import FitConfig, train
+from lidargrit.training import FitConfig, measure, train, training_flops
 from lidargrit.training.fit import Fit
-from lidargrit.training.optimiser import WeightAverage, learning_rate_at
+from lidargrit.training.log import Log
+from lidargrit.training.optimiser import WeightAverage, learning_rate_at, make_optimiser, memory_of_weights
+from lidargrit.viewer import draw_progress
 
 TINY = [
     "data.train=[simulated:6:train]",
@@ -207,3 +211,52 @@ def test_stages_use_their_own_settings():
     assert recipe.training["transformer"].learning_rate == 0.5
     assert recipe.training["tokenizer"] == load_recipe("demo").training["tokenizer"]
     assert replace(recipe, seed=1) != recipe
+
+
+def test_pictures_change_nothing(tmp_path):
+    every = [f"training.{stage}.pictures_every=6" for stage in ("tokenizer", "transformer")]
+    train(load_recipe("demo", TINY), tmp_path / "plain")
+    train(load_recipe("demo", TINY + every), tmp_path / "drawn", draw=draw_progress)
+    plain, drawn = ((tmp_path / name / "model.safetensors").read_bytes() for name in ("plain", "drawn"))
+    assert plain == drawn
+    pictures = {str(path.relative_to(tmp_path / "drawn")): path for path in (tmp_path / "drawn").rglob("*.png")}
+    scans = ("000000006", "000000012")
+    assert pictures.keys() == {f"{s}/pictures/{n}.png" for s in ("tokenizer", "transformer") for n in scans}
+    heights = {name: Image.open(path).height for name, path in pictures.items()}
+    assert heights["transformer/pictures/000000012.png"] > heights["tokenizer/pictures/000000012.png"]
+
+
+def test_the_memory_of_weights_is_what_a_step_leaves_behind(images):
+    vqvae = Vqvae(load_recipe("demo", TINY).model.tokenizer, images.sensor)
+    optimiser = make_optimiser(vqvae, FitConfig(scans=1, batch_size=1, learning_rate=1e-3))
+    average = WeightAverage(vqvae, 1)
+    vqvae(images.batch([0]), torch.Generator())["loss"].backward()
+    optimiser.step()
+    held = [*vqvae.state_dict().values(), *average.objective.state_dict().values()]
+    held += [parameter.grad for parameter in vqvae.parameters() if parameter.grad is not None]
+    held += [value for state in optimiser.state.values() for name, value in state.items() if name != "step"]
+    assert memory_of_weights(vqvae) == sum(tensor.nbytes for tensor in held)
+
+
+def test_a_measured_plan_tells_operations_time_and_memory():
+    recipe = load_recipe("demo", TINY)
+    told = measure(recipe).splitlines()
+    for line, (stage, flops) in zip(told, training_flops(recipe).items(), strict=True):
+        wanted = rf"{stage}: {flops:.2e} floating-point operations at [\d.e+]+ scans/s: [\d.]+ \w+ on cpu, [\d.]+ GiB"
+        assert re.fullmatch(wanted.replace("e+", "e\\+", 1), line)
+
+
+def test_tensorboard_draws_what_the_log_says(tmp_path):
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    log = Log(tmp_path, 0)
+    log.write("train", 4, 1.0, {"loss": 0.5})
+    log.write("train", 8, 2.0, {"loss": 0.25})
+    log.close()
+    again = Log(tmp_path, 4)  # killed after the checkpoint at 4 scans
+    again.write("train", 8, 2.0, {"loss": 0.125})
+    again.close()
+    seen = EventAccumulator(str(tmp_path)).Reload().Scalars("loss/train")
+    assert [(event.step, event.value) for event in seen] == [(4, 0.5), (8, 0.125)]
+    assert [json.loads(line)["loss"] for line in (tmp_path / "log.jsonl").read_text().splitlines()] == [0.5, 0.125]

@@ -19,17 +19,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     settings = "change settings of the recipe"
     parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help=settings)
     parser.add_argument("--dry-run", action="store_true", help="say what would be done, with every setting, and stop")
+    measuring = "as --dry-run, and also take a few steps, and foretell operations, time and memory"
+    parser.add_argument("--measure", action="store_true", help=measuring)
 
 
 def run(options: argparse.Namespace) -> None:
     """Train, or tell the plan."""
     from lidargrit.recipes import load_recipe
     from lidargrit.reporting import TerminalReporter
-    from lidargrit.training import plan, train
+    from lidargrit.training import measure, plan, train
+    from lidargrit.viewer import draw_progress
 
     recipe = load_recipe(options.recipe, options.set)
-    if options.dry_run:
+    if options.dry_run or options.measure:
         print(plan(recipe))
+        if options.measure:
+            print(measure(recipe))
         return
-    train(recipe, options.out, TerminalReporter())
+    train(recipe, options.out, TerminalReporter(), draw_progress)
     print(f"done: the model lies in {options.out}; sample it with: lidargrit sample {options.out} samples -n 16")

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from lidargrit.generators import Generator
 from lidargrit.nn.flops import flops_of
+from lidargrit.nn.processes import sum_over_processes
 from lidargrit.nn.transformer import Transformer
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage, TokenGrid
@@ -94,7 +95,8 @@ class TokenObjective(nn.Module):
             self._frozen[0].to(images.range_m.device)
             tokens = self._frozen[0].encode(images).tokens.flatten(1)
         if self.training:
-            self.token_counts += torch.bincount(tokens.flatten(), minlength=len(self.token_counts))
+            counted = torch.bincount(tokens.flatten(), minlength=len(self.token_counts))
+            self.token_counts += sum_over_processes(counted)
         return tokens, -(self.token_counts / self.token_counts.sum()).log()[tokens]
 
 

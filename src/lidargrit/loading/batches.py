@@ -69,17 +69,20 @@ class Batches:
         """Return this process's share of the batch that follows ``scans_seen`` scans."""
         return self._read(*self._drawn(scans_seen))
 
-    def _drawn(self, scans_seen: int) -> tuple[list[int], int]:
-        """Choose the scans of a batch, and the seed of all else that is random about it."""
+    def _drawn(self, scans_seen: int) -> tuple[list[int], list[int]]:
+        """Choose the scans of a batch, and for each the seed of all else that is random about it."""
         share = self.batch_size // self.world_size
-        first = scans_seen + self.rank * share
-        return [self._draw(position) for position in range(first, first + share)], seed_of(self.seed, 1, first)
+        positions = range(scans_seen + self.rank * share, scans_seen + (self.rank + 1) * share)
+        return [self._draw(position) for position in positions], [seed_of(self.seed, 1, p) for p in positions]
 
-    def _read(self, indices: list[int], seed: int) -> RangeImage:
-        rng = torch.Generator().manual_seed(seed)
-        columns = torch.randint(self.images.sensor.column_stride, (len(indices),), generator=rng).tolist()
+    def _read(self, indices: list[int], seeds: list[int]) -> RangeImage:
+        # Each scan has random numbers of its own: it looks the same however many processes share a batch.
+        rngs = [torch.Generator().manual_seed(seed) for seed in seeds]
+        columns = [int(torch.randint(self.images.sensor.column_stride, (1,), generator=rng)) for rng in rngs]
         images = self.images.batch(indices, columns if self.any_columns else None)
-        return augment(images, self.augmentations, rng)
+        if not self.augmentations:
+            return images
+        return RangeImage.stack([augment(images[i : i + 1], self.augmentations, rng)[0] for i, rng in enumerate(rngs)])
 
     def _draw(self, position: int) -> int:
         epoch, place = divmod(position, len(self.images))

@@ -7,7 +7,9 @@ from typing import Literal, NamedTuple
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
-from torch import Tensor, distributed, nn
+from torch import Tensor, nn
+
+from lidargrit.nn.processes import draw_from_all, sum_over_processes
 
 CodebookLoss = Literal["paper", "reference", "vqvae", "ema"]
 
@@ -87,11 +89,8 @@ class VectorQuantiser(nn.Module):
     def _follow(self, flat: Tensor, tokens: Tensor, rng: torch.Generator | None) -> None:
         """Update how often codes are used, move them if they follow means, restart the dead."""
         num_codes = self.embedding.num_embeddings
-        counts = torch.bincount(tokens, minlength=num_codes).to(flat.dtype)
-        sums = torch.zeros_like(self.code_sums).index_add_(0, tokens, flat)
-        if distributed.is_available() and distributed.is_initialized():
-            distributed.all_reduce(counts)
-            distributed.all_reduce(sums)
+        counts = sum_over_processes(torch.bincount(tokens, minlength=num_codes).to(flat.dtype))
+        sums = sum_over_processes(torch.zeros_like(self.code_sums).index_add_(0, tokens, flat))
         fresh = bool(self.usage.sum() == 0)
         self.usage.copy_(counts if fresh else torch.lerp(counts, self.usage, _EMA_DECAY))
         self.code_sums.copy_(sums if fresh else torch.lerp(sums, self.code_sums, _EMA_DECAY))
@@ -104,10 +103,7 @@ class VectorQuantiser(nn.Module):
 
     def _restart(self, flat: Tensor, rng: torch.Generator | None) -> None:
         dead = self.usage < self._dead_below()
-        picked = torch.randint(len(flat), (len(dead),), generator=rng, device=flat.device)
-        candidates = flat[picked]
-        if distributed.is_available() and distributed.is_initialized():
-            distributed.broadcast(candidates, src=0)
+        candidates = draw_from_all(flat, len(dead), rng)
         even_use = self.usage.mean().expand_as(self.usage)
         self.embedding.weight.copy_(torch.where(dead.unsqueeze(1), candidates, self.embedding.weight))
         self.usage.copy_(torch.where(dead, even_use, self.usage))

@@ -11,6 +11,7 @@ from torch.utils.module_tracker import ModuleTracker
 
 from lidargrit.errors import ConfigError
 from lidargrit.generators import load_class
+from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 from lidargrit.training.engine import Engine
 from lidargrit.training.optimiser import make_optimiser
@@ -67,12 +68,15 @@ def _scaled(config: FitConfig, share: float) -> FitConfig:
     )
 
 
+def same_everywhere(sensor: SensorModel, count: int) -> RangeImage:
+    """Return scans that return everywhere, at 10 m: enough where only the arithmetic matters."""
+    range_m = torch.full((count, sensor.height, sensor.width), 10.0).clamp(sensor.range_min_m, sensor.range_max_m)
+    return RangeImage(range_m, torch.ones_like(range_m, dtype=torch.bool), sensor, torch.full_like(range_m, 0.3))
+
+
 def _flops_per_scan(objective: torch.nn.Module, config: FitConfig, recipe: Recipe) -> float:
-    sensor = recipe.data.load_sensor()
-    range_m = torch.full((_SCANS, sensor.height, sensor.width), 10.0).clamp(sensor.range_min_m, sensor.range_max_m)
-    mask = torch.ones_like(range_m, dtype=torch.bool)
-    images = RangeImage(range_m, mask, sensor, torch.full_like(range_m, 0.3))
-    engine = Engine("fp32")
+    images = same_everywhere(recipe.data.load_sensor(), _SCANS)
+    engine = Engine("fp32", hasattr(objective, "phases"))
     engine.set_up(objective, make_optimiser(objective, config))
     steps = _STEPS if hasattr(objective, "phases") else 1
     counter = FlopCounterMode(display=False)

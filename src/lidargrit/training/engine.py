@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import logging
 import os
+import resource
+import sys
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from lidargrit.errors import LidarGritError
+from lidargrit.loading import place_among, seed_of
 from lidargrit.nn.precision import Precision, dtype_of
 from lidargrit.structures import RangeImage
 
@@ -19,16 +24,25 @@ class Engine:
 
     Args:
         precision: ``fp32``, ``bf16``, or ``auto`` for the second where the machine has instructions for it.
+        players_take_turns: some weights are out of a loss's reach, and no process may wait for their gradients.
     """
 
-    def __init__(self, precision: Precision) -> None:
+    def __init__(self, precision: Precision, players_take_turns: bool = False) -> None:
         from lightning_fabric import Fabric  # noqa: PLC0415  takes a second, and only training needs it
+        from lightning_fabric.plugins.environments import TorchElasticEnvironment  # noqa: PLC0415
+        from lightning_fabric.strategies import DDPStrategy  # noqa: PLC0415
 
         logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # it tells the precision at every start
         # One device, unless a launcher such as torchrun began this process as one of several.
-        launched = "LOCAL_RANK" in os.environ
+        where: dict[str, Any] = {"devices": 1}
+        _, processes = place_among(None, None)
+        if "LOCAL_RANK" in os.environ and processes > 1:
+            here = int(os.environ.get("LOCAL_WORLD_SIZE", processes))
+            strategy = DDPStrategy(find_unused_parameters=players_take_turns)
+            where = {"devices": here, "num_nodes": processes // here, "strategy": strategy}
+            where["plugins"] = [TorchElasticEnvironment()]
         short = dtype_of(precision) == torch.bfloat16
-        self._fabric: Any = Fabric(precision="bf16-mixed" if short else "32-true", devices="auto" if launched else 1)
+        self._fabric: Any = Fabric(precision="bf16-mixed" if short else "32-true", **where)
         self._fabric.launch()
         self.device, self.rank, self.world_size = self._fabric.device, self._fabric.global_rank, self._fabric.world_size
 
@@ -36,25 +50,63 @@ class Engine:
         """Place an objective on the device and spread it over the processes."""
         self._objective, self._optimiser = self._fabric.setup(_Door(objective), optimiser)
 
-    def step(self, images: RangeImage, seed: int, gradient_clip: float) -> dict[str, Tensor]:
-        """Take one step, or one of each player in turn, and return the terms.
+    def by_first(self, action: Callable[[], None]) -> None:
+        """Let the first process alone do something, such as write a file; all raise the error that it met."""
+        error: LidarGritError | None = None
+        if self.rank == 0:
+            try:
+                action()
+            except LidarGritError as raised:
+                error = raised
+        if self.world_size > 1:
+            error = self._fabric.broadcast(error)
+        if error is not None:
+            raise error
 
-        No weight changes by a loss or a gradient that is not finite.
+    def peak_gib(self) -> float:
+        """Return the most memory that this process has held so far: of its GPU, or else of the machine."""
+        if self.device.type == "cuda":
+            return torch.cuda.max_memory_allocated(self.device) / 2**30
+        unit = 1 if sys.platform == "darwin" else 1024  # of ru_maxrss, bytes there and kibibytes elsewhere
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**30
+
+    def any(self, asked: bool) -> bool:
+        """Tell whether it was asked of any process."""
+        return bool(self._mean(torch.tensor(float(asked), device=self.device)) > 0)
+
+    def step(self, images: RangeImage, seed: int, gradient_clip: float, parts: int = 1) -> dict[str, Tensor]:
+        """Take one step, or one of each player in turn, and return the terms, averaged over the processes.
+
+        No weight changes by a loss or a gradient that is not finite in any process.
+
+        Args:
+            images: this process's share of a batch.
+            seed: of its draws.
+            gradient_clip: largest norm of the gradient; 0 for none.
+            parts: gradients of so many parts of the share, one after the other, are added up for one step.
         """
         self._objective.train()
         terms: dict[str, Tensor] = {}
         for phase in _phases(self._objective.objective):
-            found, is_finite = self._step(images, seed, gradient_clip, phase)
+            found, is_finite = self._step(images, seed, gradient_clip, phase, parts)
             terms = _joined(terms, found, phase)
             if not is_finite:
                 break
         return terms
 
-    def _step(self, images: RangeImage, seed: int, gradient_clip: float, phase: str) -> tuple[dict[str, Tensor], bool]:
-        terms = self._objective(lambda: images, seed, phase)
-        if not bool(terms["loss"].isfinite()):
-            return terms, False
-        self._fabric.backward(terms["loss"])
+    def _step(
+        self, images: RangeImage, seed: int, gradient_clip: float, phase: str, parts: int
+    ) -> tuple[dict[str, Tensor], bool]:
+        terms: dict[str, Tensor] = {}
+        for part in range(parts):
+            some = images if parts == 1 else images[part * len(images) // parts : (part + 1) * len(images) // parts]
+            with self._fabric.no_backward_sync(self._objective, enabled=part < parts - 1):
+                found = self._objective(partial(_same, some), seed_of(seed, part) if part else seed, phase)
+                loss = self._mean(found["loss"].detach().clone())
+                if not bool(loss.isfinite()):
+                    return {**found, "loss": loss}, False
+                self._fabric.backward(found["loss"] / parts)
+            terms = {name: terms.get(name, 0.0) + term.detach() / parts for name, term in found.items()}
         if gradient_clip:
             norm = self._fabric.clip_gradients(
                 self._objective, self._optimiser, max_norm=gradient_clip, error_if_nonfinite=False
@@ -63,7 +115,16 @@ class Engine:
                 return {**terms, "loss": norm}, False
         self._optimiser.step()
         self._optimiser.zero_grad()  # to None: the optimiser leaves alone what the next player does not move
-        return {name: term.detach() for name, term in terms.items()}, True
+        return self._means(terms), True
+
+    def _mean(self, number: Tensor) -> Tensor:
+        return number if self.world_size == 1 else self._fabric.all_reduce(number, reduce_op="mean")
+
+    def _means(self, terms: dict[str, Tensor]) -> dict[str, Tensor]:
+        if self.world_size == 1:
+            return terms
+        together = torch.stack([term.to(self.device, torch.float32) for term in terms.values()])
+        return dict(zip(terms, self._mean(together).unbind(), strict=True))
 
     def evaluate(self, objective: nn.Module, images: RangeImage, seed: int) -> dict[str, float]:
         """Return an objective's terms on a batch, in evaluation mode."""
@@ -88,6 +149,10 @@ class _Door(nn.Module):
     def forward(self, images: Callable[[], RangeImage], seed: int, phase: str) -> dict[str, Tensor]:
         device = next(self.objective.parameters()).device
         return _ask(self.objective, images(), torch.Generator(device).manual_seed(seed), phase)
+
+
+def _same(images: RangeImage) -> RangeImage:
+    return images
 
 
 def _phases(objective: nn.Module) -> tuple[str, ...]:

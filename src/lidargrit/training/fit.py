@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import json
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
-from lidargrit.errors import OutputError, Terminated, TrainingError
-from lidargrit.files import write_text
+from lidargrit.errors import ConfigError, Terminated, TrainingError
 from lidargrit.loading import Batches, RangeImages, seed_of, spread
 from lidargrit.reporting import Reporter
 from lidargrit.structures import RangeImage
 from lidargrit.training.checkpoint import load_checkpoint, save_checkpoint
 from lidargrit.training.engine import Engine
+from lidargrit.training.log import Log
 from lidargrit.training.optimiser import WeightAverage, learning_rate_at, make_optimiser
 from lidargrit.training.settings import FitConfig
 from lidargrit.training.termination import Termination
@@ -39,6 +39,7 @@ class Fit:
         reporter: hears of the progress.
         built_on: fingerprint of the earlier stages' weights, which a checkpoint must share.
         workers: threads that read ahead.
+        draw: draws a picture of the averaged objective into the named file.
     """
 
     objective: nn.Module
@@ -48,9 +49,12 @@ class Fit:
     reporter: Reporter
     built_on: str = ""
     workers: int = 1
+    draw: Callable[[nn.Module, Path], None] | None = None
 
     def __post_init__(self) -> None:
-        self.engine = Engine(self.config.precision)
+        takes_turns = hasattr(self.objective, "phases")
+        self.engine = Engine(self.config.precision, takes_turns)
+        _check_parts(self.config, self.engine.world_size, takes_turns)
         self.optimiser = make_optimiser(self.objective, self.config)
         self.engine.set_up(self.objective, self.optimiser)
         self.average = WeightAverage(self.objective, self.config.average_over_scans)
@@ -59,7 +63,7 @@ class Fit:
             self.scans_seen = load_checkpoint(
                 self.checkpoint, self.objective, self.average, self.optimiser, self.built_on
             )
-        self._trim_log()
+        self.engine.by_first(self._open_log)
 
     @property
     def checkpoint(self) -> Path:
@@ -90,15 +94,23 @@ class Fit:
         with Termination() as termination, progress_bar as progress:
             for images in batches.stream(self.scans_seen, config.scans):
                 terms = self._step(images)
-                progress.advance(config.batch_size, f"loss {float(terms['loss']):.4f}")
+                stops = self.engine.any(termination.asked)
+                progress.advance(
+                    config.batch_size, f"loss {float(terms['loss']):.4f}  {self.engine.peak_gib():.1f} GiB"
+                )
                 if self._passed(_LOG_EVERY_STEPS * config.batch_size):
-                    self._log("train", {name: float(term) for name, term in terms.items()}, time.monotonic() - begun)
+                    self._log_terms(
+                        "train", {name: float(term) for name, term in terms.items()}, time.monotonic() - begun
+                    )
                 if self._passed(config.validate_every) or self.scans_seen >= config.scans:
-                    self._log("val", self.validate(val), time.monotonic() - begun)
-                if self._passed(config.checkpoint_every) or self.scans_seen >= config.scans or termination.asked:
+                    self._log_terms("val", self.validate(val), time.monotonic() - begun)
+                if config.pictures_every and self._passed(config.pictures_every):
+                    self.engine.by_first(self._draw)
+                if self._passed(config.checkpoint_every) or self.scans_seen >= config.scans or stops:
                     self._save()
-                if termination.asked:
+                if stops:
                     raise Terminated
+        self.engine.by_first(self.log.close)
         return self.average.objective.eval()
 
     def validate(self, images: RangeImages) -> dict[str, float]:
@@ -113,58 +125,56 @@ class Fit:
         return totals
 
     def _step(self, images: RangeImage) -> dict[str, Tensor]:
+        config = self.config
         for group in self.optimiser.param_groups:
-            group["lr"] = learning_rate_at(self.config, self.scans_seen)
+            group["lr"] = learning_rate_at(config, self.scans_seen)
         seed = seed_of(self.seed, 2, self.scans_seen, self.engine.rank)
         torch.manual_seed(seed)  # dropout draws from the global generator
-        terms = self.engine.step(images.to(self.engine.device), seed, self.config.gradient_clip)
+        terms = self.engine.step(images.to(self.engine.device), seed, config.gradient_clip, config.accumulate)
         if not bool(terms["loss"].isfinite()):
             raise TrainingError(
                 f"a loss or gradient of {float(terms['loss'].detach())} after {self.scans_seen} scans",
                 "finite numbers",
                 f"use a new folder and a lower training.*.learning_rate; the last checkpoint is {self.checkpoint}",
             )
-        self.scans_seen += self.config.batch_size
-        self.average.update(self.objective, self.scans_seen, self.config.batch_size)
+        self.scans_seen += config.batch_size
+        self.average.update(self.objective, self.scans_seen, config.batch_size)
         return terms
+
+    def _open_log(self) -> None:
+        self.log = Log(self.folder, self.scans_seen)
+
+    def _draw(self) -> None:
+        if self.draw is not None:
+            self.draw(self.average.objective, self.folder / "pictures" / f"{self.scans_seen:09d}.png")
 
     def _passed(self, every: int) -> bool:
         return self.scans_seen // every > (self.scans_seen - self.config.batch_size) // every
 
     def _save(self) -> None:
-        if self.engine.rank == 0:
-            save_checkpoint(
-                self.checkpoint, self.objective, self.average, self.optimiser, self.scans_seen, self.built_on
-            )
+        kept = (self.checkpoint, self.objective, self.average, self.optimiser, self.scans_seen, self.built_on)
+        self.engine.by_first(lambda: save_checkpoint(*kept))
 
-    def _log(self, split: str, terms: dict[str, float], seconds: float) -> None:
-        if self.engine.rank:
-            return
-        line = {"scans_seen": self.scans_seen, "split": split, "seconds": round(seconds, 1), **terms}
-        path = self.folder / "log.jsonl"
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with path.open("a", encoding="utf-8") as log:
-                log.write(json.dumps(line) + "\n")
-        except OSError as error:
-            raise OutputError(
-                f"'{error.strerror}' while writing {path}", "a folder with room", "free some space and go on"
-            ) from error
+    def _log_terms(self, split: str, terms: dict[str, float], seconds: float) -> None:
+        self.engine.by_first(lambda: self.log.write(split, self.scans_seen, seconds, terms))
         if split == "val":
             told = "  ".join(f"{name} {value:.4g}" for name, value in terms.items())
             self.reporter.message(f"  after {self.scans_seen} scans, on val: {told}")
             for warning in getattr(self.objective, "warnings", list)():
                 self.reporter.message(f"  WARNING: {warning}")
 
-    def _trim_log(self) -> None:
-        """Forget what was logged after the checkpoint that the stage goes on from: it will be logged again."""
-        log = self.folder / "log.jsonl"
-        if log.is_file() and self.engine.rank == 0:
-            kept = []
-            for line in log.read_text(encoding="utf-8").splitlines():
-                try:
-                    if json.loads(line)["scans_seen"] <= self.scans_seen:
-                        kept.append(line)
-                except ValueError:
-                    continue  # the line that was being written when the process was killed
-            write_text(log, "".join(f"{line}\n" for line in kept))
+
+def _check_parts(config: FitConfig, processes: int, players_take_turns: bool) -> None:
+    """Refuse parts that a share of a batch cannot be taken in."""
+    if config.accumulate > 1 and players_take_turns:
+        raise ConfigError(
+            f"accumulate={config.accumulate} for players who take turns",
+            "1: they count their turns by the batches they see",
+            "lower batch_size instead",
+        )
+    if config.batch_size % (processes * config.accumulate):
+        raise ConfigError(
+            f"batch_size={config.batch_size} on {processes} processes in {config.accumulate} parts each",
+            "a multiple of both",
+            "change one of them",
+        )

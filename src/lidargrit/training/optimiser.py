@@ -24,6 +24,13 @@ def make_optimiser(objective: nn.Module, config: FitConfig) -> torch.optim.AdamW
     )
 
 
+def memory_of_weights(objective: nn.Module) -> int:
+    """Return the bytes of weights and their average, and of the gradients and Adam's two moments of those learned."""
+    tensors = [*objective.parameters(), *objective.buffers()]
+    learned = [parameter for parameter in objective.parameters() if parameter.requires_grad]
+    return 2 * sum(t.nbytes for t in tensors) + 3 * sum(t.nbytes for t in learned)
+
+
 def learning_rate_at(config: FitConfig, scans_seen: int) -> float:
     """Return the learning rate of the step that follows ``scans_seen`` scans."""
     share = min(scans_seen / config.scans, 1.0)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
 import platform
 import subprocess
 import sys
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import nn
 
 from lidargrit import __version__, configuration
 from lidargrit.errors import CheckpointError, ConfigError, OutputError
@@ -20,17 +24,30 @@ from lidargrit.loading import RangeImages, load_range_images, seed_of
 from lidargrit.reporting import Reporter
 from lidargrit.tokenizers import Tokenizer
 from lidargrit.training.checkpoint import fingerprint
+from lidargrit.training.engine import Engine
 from lidargrit.training.fit import Fit
+from lidargrit.training.optimiser import memory_of_weights
 from lidargrit.training.settings import Recipe
 
 RUN_FILE = "run.json"  # ``origin`` in it says that the weights beside it were not trained in this folder
 
 
-def train(recipe: Recipe, folder: Path, reporter: Reporter | None = None) -> Generator:
+Draw = Callable[[Generator, str, RangeImages, Path], None]
+"""Draws a generator in the midst of a stage, with validation scans beside, into a file."""
+
+
+def train(recipe: Recipe, folder: Path, reporter: Reporter | None = None, draw: Draw | None = None) -> Generator:
     """Train every stage of a recipe in a run folder and return the finished generator.
 
     The same call goes on where a stopped one was. The folder holds ``run.json`` (recipe, command, versions) before the
     first step, a folder for each stage (checkpoint, log), and at the end ``config.json`` and ``model.safetensors``.
+    Under a launcher such as torchrun, every process calls it, and the first one writes.
+
+    Args:
+        recipe: what to train.
+        folder: the run's.
+        reporter: hears of the progress.
+        draw: called every ``pictures_every`` scans of a stage.
 
     Raises:
         OutputError: the folder holds something else, or cannot be written.
@@ -38,8 +55,9 @@ def train(recipe: Recipe, folder: Path, reporter: Reporter | None = None) -> Gen
         TrainingError: the loss is not finite.
         ConfigError: the tokenizer to be taken from another run is not this recipe's.
     """
-    reporter = reporter or Reporter()
-    check_folder(folder, recipe)
+    engine = Engine("fp32")  # here only for who is the first of several processes, who alone writes
+    reporter = reporter if reporter and engine.rank == 0 else Reporter()
+    engine.by_first(lambda: check_folder(folder, recipe))
     train_images = load_range_images(recipe.data.train, recipe.data, reporter)
     val_images = load_range_images(recipe.data.val, recipe.data, reporter)
     _warn_of_overlap(train_images, val_images, reporter)
@@ -47,24 +65,32 @@ def train(recipe: Recipe, folder: Path, reporter: Reporter | None = None) -> Gen
         torch.manual_seed(seed_of(recipe.seed, 9))
         generator = load_class(recipe.generator)(recipe.model, recipe.data.load_sensor())
         borrowed = None if recipe.tokenizer_from is None else _tokenizer_of(Path(recipe.tokenizer_from), generator)
-        _claim(folder, recipe, train_images, val_images)
+        engine.by_first(lambda: _claim(folder, recipe, train_images, val_images))
         generator.learn(train_images)
         built_on = ""
         for number, stage in enumerate(generator.stages):
+            trained: nn.Module
             if stage == "tokenizer" and borrowed is not None:
                 trained = borrowed
             else:
-                seed, objective, config = (
-                    seed_of(recipe.seed, number),
-                    generator.objective(stage),
-                    recipe.training[stage],
-                )
-                fit = Fit(objective, config, folder / stage, seed, reporter, built_on, recipe.data.workers)
+                seed, objective = seed_of(recipe.seed, number), generator.objective(stage)
+                picture = None if draw is None else partial(_draw, draw, generator, stage, val_images)
+                workers, config = recipe.data.workers, recipe.training[stage]
+                fit = Fit(objective, config, folder / stage, seed, reporter, built_on, workers, picture)
                 trained = fit.run(train_images, val_images, f"training {stage}")
             generator.finish(stage, trained)
             built_on = fingerprint(trained)
-    generator.save(folder)
+    engine.by_first(lambda: generator.save(folder))
     return generator.cpu().eval()
+
+
+def _draw(
+    draw: Draw, generator: Generator, stage: str, val_images: RangeImages, averaged: nn.Module, path: Path
+) -> None:
+    """Draw a copy that has the averaged weights: those of the generator itself are being trained."""
+    copied = copy.deepcopy(generator)
+    copied.finish(stage, averaged)
+    draw(copied.to(next(averaged.parameters()).device).eval(), stage, val_images, path)
 
 
 def plan(recipe: Recipe) -> str:
@@ -75,9 +101,13 @@ def plan(recipe: Recipe) -> str:
     lines += [f"  {name} = {value}" for name, value in configuration.leaves(recipe).items()]
     lines += ["", f"range images of {sensor.height}x{sensor.width}, {sensor.range_min_m:g} to {sensor.range_max_m:g} m"]
     for stage in generator.stages:
-        count = sum(p.numel() for p in generator.objective(stage).parameters())
+        objective = generator.objective(stage)
+        count = sum(p.numel() for p in objective.parameters())
         budget = recipe.training[stage]
-        lines.append(f"{stage}: {count:,} parameters, {budget.scans:,} scans in batches of {budget.batch_size}")
+        lines.append(
+            f"{stage}: {count:,} parameters, {budget.scans:,} scans in batches of {budget.batch_size}, "
+            f"{memory_of_weights(objective) / 2**20:,.0f} MiB of memory besides activations"
+        )
     return "\n".join(lines)
 
 

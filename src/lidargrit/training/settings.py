@@ -17,6 +17,8 @@ class FitConfig:
     Args:
         scans: the budget.
         batch_size: over all processes.
+        accumulate: each process takes its share of a batch in so many parts, one after the other: less memory, and the
+            same step up to rounding, but for a codebook, which follows or restarts its codes after each part.
         learning_rate: at its highest.
         schedule: ``constant``; ``cosine`` falls to 0 over the budget; ``linear_second_half`` is constant for the first
             half and then falls to 0 (the reference's for its KITTI-360 transformer).
@@ -33,6 +35,7 @@ class FitConfig:
         validate_every: scans between two validations, which take at most ``validation_scans`` scans.
         validation_scans: see above.
         checkpoint_every: scans between two checkpoints.
+        pictures_every: scans between two pictures of what the model makes of validation scans; 0 for none.
     """
 
     scans: int
@@ -44,18 +47,20 @@ class FitConfig:
     weight_decay: float = 0.0
     gradient_clip: float = 1.0
     average_over_scans: int = 1000
+    accumulate: int = 1
     precision: Literal["fp32", "bf16", "auto"] = "fp32"
     augmentations: tuple[Augmentation, ...] = ()
     any_columns: bool = False
     validate_every: int = 1000
     validation_scans: int = 64
     checkpoint_every: int = 1000
+    pictures_every: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("scans", "batch_size", "validate_every", "validation_scans", "checkpoint_every"):
+        for name in ("scans", "batch_size", "accumulate", "validate_every", "validation_scans", "checkpoint_every"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name}={getattr(self, name)}", "at least 1", "raise it")
-        for name in ("warmup_scans", "weight_decay", "gradient_clip", "average_over_scans"):
+        for name in ("warmup_scans", "weight_decay", "gradient_clip", "average_over_scans", "pictures_every"):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"{name}={getattr(self, name)}", "0 or more", "raise it")
         if not all(0 <= beta < 1 for beta in self.betas):

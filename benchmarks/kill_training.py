@@ -1,0 +1,158 @@
+"""Training killed again and again, at random moments and in mid-save: does it end with the weights of a quiet run?
+
+    python benchmarks/kill_training.py
+    python benchmarks/kill_training.py --random 40 --in-save 10
+
+A tiny run of two stages is killed (SIGKILL) at random moments, and while a checkpoint is half written: the first time
+that a hidden file beside a checkpoint is seen. Each time the same command goes on. At the end, its weights and the
+entries of its logs are compared with those of a run that nothing happened to.
+"""
+
+import argparse
+import hashlib
+import json
+import os
+import random
+import shlex
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from contextlib import suppress
+from pathlib import Path
+
+SETTINGS = [  # 24 steps of each stage, a checkpoint after each
+    "data.train=[simulated:4:train]",
+    "data.val=[simulated:1:val]",
+    "data.columns=512",
+    "data.column_stride=8",
+    "model.tokenizer.channel_multipliers=[1,1,1,1]",
+    "model.tokenizer.code_dim=8",
+    "model.tokenizer.num_codes=32",
+    "model.tokenizer.dropout=0.2",
+    "model.transformer.layers=1",
+    "model.transformer.heads=2",
+    "model.transformer.width=16",
+    *[
+        f"training.{stage}.{setting}"
+        for stage in ("tokenizer", "transformer")
+        for setting in ("batch_size=4", "scans=96", "checkpoint_every=4", "validate_every=32")
+    ],
+]
+# Modules are imported once, and each try is a fork of that process: the kills meet training, not imports.
+SERVER = """
+import os, sys
+import lightning_fabric, safetensors.torch
+import lidargrit.cli, lidargrit.generators.lidargrit, lidargrit.recipes, lidargrit.training
+print("ready", flush=True)
+for _ in sys.stdin:
+    child = os.fork()
+    if not child:
+        sys.stderr = open(os.devnull, "w")
+        sys.stdout = open(os.devnull, "w")
+        os._exit(lidargrit.cli.main(sys.argv[1:]))
+    print(child, flush=True)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+"""
+
+
+class Runs:
+    """Starts the same command as often as asked."""
+
+    def __init__(self, folder: Path) -> None:
+        words = ["train", "demo", str(folder), "--set", *SETTINGS]
+        self.folder, self.command = folder, shlex.join(["lidargrit", *words])
+        self._server = subprocess.Popen(
+            [sys.executable, "-c", SERVER, *words], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        assert self._read() == "ready"
+
+    def start(self) -> int:
+        assert self._server.stdin is not None
+        self._server.stdin.write("go\n")
+        self._server.stdin.flush()
+        return int(self._read())
+
+    def wait(self) -> int:
+        return int(self._read())
+
+    def _read(self) -> str:
+        assert self._server.stdout is not None
+        return self._server.stdout.readline().strip()
+
+    def half_written(self) -> set[Path]:
+        return set(self.folder.glob("*/.checkpoint.safetensors.*"))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--random", type=int, default=20, help="kills at random moments")
+    parser.add_argument("--in-save", type=int, default=6, help="kills while a checkpoint is half written")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    rng = random.Random(options.seed)
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["LIDARGRIT_CACHE"] = str(Path(folder) / "cache")
+        whole = Runs(Path(folder) / "whole")
+        begun = time.monotonic()
+        whole.start()
+        assert whole.wait() == 0
+        whole_s = time.monotonic() - begun
+        print(f"a run that nothing happens to: {whole_s:.1f} s")
+        runs = Runs(Path(folder) / "killed")
+        kinds = ["random"] * options.random + ["in mid-save"] * options.in_save
+        rng.shuffle(kinds)
+        met: Counter[str] = Counter()
+        # So short that the run is not over before the last kill, and long enough to come forward between two.
+        longest_s = 2.5 * whole_s / len(kinds)
+        for kind in kinds:
+            met[kill(runs, kind, rng, longest_s)] += 1
+        left = len(runs.half_written())
+        runs.start()
+        assert runs.wait() == 0
+        for what, count in sorted(met.items()):
+            print(f"{count:4d} {what}")
+        print(f"{left} half-written checkpoints were left behind by kills")
+        same_weights = digest(whole.folder) == digest(runs.folder)
+        same_logs = logs(whole.folder) == logs(runs.folder)
+        print(f"weights the same bit for bit: {same_weights}; logs the same but for the time: {same_logs}")
+        sys.exit(0 if same_weights and same_logs else 1)
+
+
+def kill(runs: Runs, kind: str, rng: random.Random, longest_s: float) -> str:
+    """Start, kill, and say what the kill met."""
+    before, begun = runs.half_written(), time.monotonic()
+    child = runs.start()
+    if kind == "random":
+        time.sleep(rng.uniform(0, longest_s))
+    else:
+        while not runs.half_written() - before and time.monotonic() - begun < 60 and not over(runs):
+            time.sleep(0.0005)
+    with suppress(ProcessLookupError):  # the run was over
+        os.kill(child, signal.SIGKILL)
+    status = runs.wait()
+    if status == 0:
+        return f"{kind}: came too late, the run was over"
+    assert status == -signal.SIGKILL, f"a try ended by itself with {status}; the same command tells why: {runs.command}"
+    stage = "second stage" if (runs.folder / "transformer").exists() else "first stage"
+    in_save = ", a checkpoint half written" if runs.half_written() - before else ""
+    return f"{kind}: {stage}{in_save}"
+
+
+def over(runs: Runs) -> bool:
+    return (runs.folder / "config.json").exists()
+
+
+def digest(folder: Path) -> str:
+    return hashlib.sha256((folder / "model.safetensors").read_bytes()).hexdigest()
+
+
+def logs(folder: Path) -> list[dict[str, float]]:
+    lines = [line for path in sorted(folder.glob("*/log.jsonl")) for line in path.read_text().splitlines()]
+    return [{**json.loads(line), "seconds": 0} for line in lines]
+
+
+if __name__ == "__main__":
+    main()

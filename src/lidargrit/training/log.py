@@ -1,0 +1,68 @@
+"""The terms of a stage while it trains → ``log.jsonl``, and TensorBoard's event files where that is installed."""
+
+from __future__ import annotations
+
+import json
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from lidargrit.errors import OutputError
+from lidargrit.files import write_text
+
+
+class Log:
+    """The log of one stage, which forgets what came after the checkpoint that the stage goes on from.
+
+    Args:
+        folder: of the stage.
+        scans_seen: of the checkpoint.
+    """
+
+    def __init__(self, folder: Path, scans_seen: int) -> None:
+        self._path, self._resumed_at = folder / "log.jsonl", scans_seen
+        self._board: Any = None
+        if self._path.is_file():
+            self._trim()
+
+    def write(self, split: str, scans_seen: int, seconds: float, terms: dict[str, float]) -> None:
+        """Add an entry.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        line = {"scans_seen": scans_seen, "split": split, "seconds": round(seconds, 1), **terms}
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            with self._path.open("a", encoding="utf-8") as log:
+                log.write(json.dumps(line) + "\n")
+            if find_spec("tensorboard"):
+                self._draw(split, scans_seen, terms)
+        except OSError as error:
+            raise OutputError(
+                f"'{error.strerror}' while writing {self._path}", "a folder with room", "free some space and go on"
+            ) from error
+
+    def _draw(self, split: str, scans_seen: int, terms: dict[str, float]) -> None:
+        from torch.utils.tensorboard import SummaryWriter  # noqa: PLC0415  optional, and slow to import
+
+        if self._board is None:  # TensorBoard forgets by itself what was drawn from purge_step on
+            self._board = SummaryWriter(str(self._path.parent), purge_step=self._resumed_at + 1)
+        for name, value in terms.items():
+            self._board.add_scalar(f"{name}/{split}", value, scans_seen)
+        self._board.flush()
+
+    def close(self) -> None:
+        """Close TensorBoard's file."""
+        if self._board is not None:
+            self._board.close()
+
+    def _trim(self) -> None:
+        kept = []
+        for line in self._path.read_text(encoding="utf-8").splitlines():
+            try:
+                if json.loads(line)["scans_seen"] <= self._resumed_at:
+                    kept.append(line)
+            except ValueError:
+                continue  # the line that was being written when the process was killed
+        write_text(self._path, "".join(f"{line}\n" for line in kept))

@@ -1,0 +1,50 @@
+"""A recipe → what its training takes on this machine: a few steps of each stage, timed, and the whole foretold."""
+
+from __future__ import annotations
+
+import time
+
+import torch
+
+from lidargrit.generators import load_class
+from lidargrit.training.compute import same_everywhere, training_flops
+from lidargrit.training.engine import Engine
+from lidargrit.training.optimiser import make_optimiser
+from lidargrit.training.settings import Recipe
+
+_WARM_UP_STEPS, _TIMED_STEPS = 1, 3  # the first one allocates and chooses kernels
+
+
+def measure(recipe: Recipe) -> str:
+    """Take a few steps of every stage and foretell its whole training, as lines for a person.
+
+    Reading scans and validation are not in the time; the memory is the most that this process has held so far.
+    """
+    with torch.random.fork_rng(range(torch.cuda.device_count())):
+        torch.manual_seed(0)
+        flops = training_flops(recipe)
+        generator = load_class(recipe.generator)(recipe.model, recipe.data.load_sensor())
+        lines = []
+        for stage in generator.stages:
+            config, objective = recipe.training[stage], generator.objective(stage)
+            engine = Engine(config.precision, hasattr(objective, "phases"))
+            engine.set_up(objective, make_optimiser(objective, config))
+            images = same_everywhere(recipe.data.load_sensor(), config.batch_size // engine.world_size)
+            images = images.to(engine.device)
+            for step in range(_WARM_UP_STEPS + _TIMED_STEPS):
+                if step == _WARM_UP_STEPS:
+                    begun = time.perf_counter()
+                float(engine.step(images, step, config.gradient_clip, config.accumulate)["loss"])  # waits for a GPU
+            per_s = _TIMED_STEPS * config.batch_size / (time.perf_counter() - begun)
+            lines.append(
+                f"{stage}: {flops[stage]:.2e} floating-point operations at {per_s:.3g} scans/s: "
+                f"{_duration(config.scans / per_s)} on {engine.device}, {engine.peak_gib():.1f} GiB"
+            )
+    return "\n".join(lines)
+
+
+def _duration(seconds: float) -> str:
+    for unit, length in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if seconds >= 2 * length:
+            return f"{seconds / length:.1f} {unit}"
+    return f"{seconds:.0f} s"

@@ -1,0 +1,26 @@
+"""A generator that is still in training → a PNG of scans, of what its code keeps of them, and of new ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from lidargrit.generators import Generator
+from lidargrit.loading import RangeImages, spread
+from lidargrit.viewer.pictures import draw_comparison
+
+_SCANS = 2  # a glance; more would take training's time
+
+
+@torch.no_grad()
+def draw_progress(generator: Generator, stage: str, val: RangeImages, path: Path) -> None:
+    """Draw a generator in the midst of a stage; new scans from its last stage on, when there are weights for all."""
+    real = val.batch(spread(_SCANS, len(val)))
+    groups = {"val": real}
+    if "encode" in generator.capabilities:
+        device = next(generator.parameters()).device
+        groups["reconstructed"] = generator.reconstruct(real.to(device)).to("cpu")
+    if stage == generator.stages[-1]:
+        groups["generated"] = generator.sample(range(_SCANS)).to("cpu")
+    draw_comparison(groups, path, title=f"{stage}, {path.stem} scans seen")

@@ -1,0 +1,190 @@
+"""Two processes, or a batch taken in parts, against one process with the whole batch."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from lidargrit.errors import ConfigError
+from lidargrit.files import read_tensors
+from lidargrit.loading import DataConfig, load_range_images
+from lidargrit.recipes import load_recipe
+from lidargrit.reporting import Reporter
+from lidargrit.sensors import load_sensor
+from lidargrit.structures import RangeImage
+from lidargrit.tokenizers.vqvae import Vqvae
+from lidargrit.training import FitConfig
+from lidargrit.training.engine import Engine
+from lidargrit.training.fit import Fit
+from lidargrit.training.optimiser import make_optimiser
+from tiny_runs import train_words
+
+STEADY = [  # nothing that is drawn for a process and not for a scan; codes that restart and follow means
+    "model.tokenizer.dropout=0",
+    *[f"model.transformer.{part}_dropout=0" for part in ("embedding", "attention", "residual")],
+    "training.tokenizer.augmentations=[flip,roll]",
+    *[f"training.{stage}.precision=fp32" for stage in ("tokenizer", "transformer")],
+    "training.tokenizer.scans=96",
+    "training.tokenizer.validate_every=4",
+    "training.transformer.scans=64",
+    "training.transformer.validate_every=8",
+]
+RANK = """
+import sys
+from pathlib import Path
+import torch
+from lidargrit.cli import main
+from test_processes import play, steps_with_a_bad_process
+
+folder, words = Path(sys.argv[1]), sys.argv[2:]
+assert main(words) == 0
+weights, rank = play()
+torch.save(weights, folder / f"game{rank}.pt")
+assert steps_with_a_bad_process() == [False, False]
+assert main([*words, "training.tokenizer.learning_rate=1"]) == 2  # all are told what the first found
+"""
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path_factory, monkeypatch):
+    monkeypatch.setenv("LIDARGRIT_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
+
+
+class Game(torch.nn.Module):
+    """Two players without any chance, of which each step of one must leave the other alone."""
+
+    phases = ("one", "other")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.one, self.other = torch.nn.Linear(8, 1), torch.nn.Linear(8, 1)
+
+    def forward(self, images, rng, phase):
+        seen = images.range_m[:, 0, :8] / 10
+        error = (
+            self.one(seen) - self.other(seen).detach()
+            if phase == "one"
+            else self.other(seen) + seen.sum(1, keepdim=True)
+        )
+        return {"loss": error.square().mean()}
+
+
+class Plain(torch.nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.linear = torch.nn.Linear(8, 1)
+
+    def forward(self, images, rng):
+        return {"loss": self.linear(images.range_m[:, 0, :8]).mean()}
+
+
+def some_images(count):
+    sensor = load_sensor("hdl64e_kitti_odometry")
+    range_m = torch.rand(count, sensor.height, sensor.width, generator=torch.Generator().manual_seed(0)) * 50 + 5
+    return RangeImage(range_m, torch.ones_like(range_m, dtype=torch.bool), sensor)
+
+
+def play():
+    torch.manual_seed(0)
+    game, engine = Game(), Engine("fp32", players_take_turns=True)
+    engine.set_up(game, torch.optim.AdamW(game.parameters(), lr=0.1))
+    share = 4 // engine.world_size
+    for step in range(5):
+        engine.step(some_images(4)[engine.rank * share : (engine.rank + 1) * share], step, gradient_clip=1.0)
+    return game.state_dict(), engine.rank
+
+
+def steps_with_a_bad_process():
+    """Return whether each of two steps, whose loss is not a number in the second process alone, was finite."""
+    plain, engine = Plain(), Engine("fp32")
+    engine.set_up(plain, torch.optim.SGD(plain.parameters(), lr=1.0))
+    images = some_images(2)
+    if engine.rank == 1:
+        images = replace(images, range_m=images.range_m.clone())
+        images.range_m[0, 0, 0] = torch.nan
+    return [bool(engine.step(images, 0, gradient_clip=1.0)["loss"].isfinite()) for _ in range(2)]
+
+
+def losses(folder: Path, stage: str, name: str) -> list[float]:
+    lines = [json.loads(line) for line in (folder / stage / "log.jsonl").read_text().splitlines()]
+    return [line[name] for line in lines if line["split"] == "val"]
+
+
+def launched(processes: int, folder: Path, words: list[str]) -> None:
+    """Run as torchrun does."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    common = {
+        "WORLD_SIZE": str(processes),
+        "MASTER_ADDR": "127.0.0.1",
+        "MASTER_PORT": str(port),
+        "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]),
+    }
+    running = [
+        subprocess.Popen(
+            [sys.executable, "-c", RANK, str(folder), *words],
+            env=os.environ | common | {"RANK": str(rank), "LOCAL_RANK": str(rank)},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        for rank in range(processes)
+    ]
+    told = [process.communicate(timeout=280)[0] for process in running]
+    assert [process.returncode for process in running] == [0] * processes, "\n".join(told)
+
+
+def test_two_processes_learn_what_one_does(tmp_path):
+    """Losses of both stages, the codebook's statistics, a game, a loss that is bad in one process, a refusal."""
+    from lidargrit.cli import main
+
+    assert main(train_words(tmp_path / "one", *STEADY)) == 0
+    launched(2, tmp_path, train_words(tmp_path / "two", *STEADY))
+    for stage, names in (("tokenizer", ("loss", "codebook_perplexity")), ("transformer", ("loss", "unigram_nll"))):
+        for name in names:
+            one, two = (losses(tmp_path / folder, stage, name) for folder in ("one", "two"))
+            assert len(one) >= 8
+            assert two == pytest.approx(one, rel=2e-3), (stage, name)
+    one, two = (read_tensors(tmp_path / name / "tokenizer" / "checkpoint.safetensors")[0] for name in ("one", "two"))
+    assert torch.allclose(one["objective.quantize.usage"], two["objective.quantize.usage"], rtol=0.02, atol=0.5)
+    alone, _ = play()
+    for rank in range(2):
+        together = torch.load(tmp_path / f"game{rank}.pt", weights_only=True)
+        assert all(torch.allclose(alone[name], together[name], atol=1e-5) for name in alone)
+
+
+@pytest.mark.parametrize("parts", [2, 4])
+def test_a_batch_in_parts_takes_the_same_step(tmp_path, parts):
+    recipe = load_recipe("demo", train_words(tmp_path)[4:])
+    config = DataConfig(train=("simulated:4:train",), columns=512, column_stride=8)
+    images = load_range_images(config.train, config)
+    sizes = replace(recipe.model.tokenizer, dropout=0.0, codebook_loss="paper", restart_dead_codes=False)
+    found = []
+    for accumulate in (1, parts):
+        torch.manual_seed(0)
+        vqvae = Vqvae(sizes, images.sensor)
+        learn = FitConfig(scans=4, batch_size=4, learning_rate=1e-3, accumulate=accumulate, average_over_scans=0)
+        optimiser, engine = make_optimiser(vqvae, learn), Engine("fp32")
+        engine.set_up(vqvae, optimiser)
+        terms = engine.step(images.batch(range(4)), 0, 0.0, accumulate)
+        moments = [state["exp_avg"] for state in optimiser.state.values()]
+        found.append((float(terms["loss"]), torch.cat([moment.flatten() for moment in moments])))
+    assert found[1][0] == pytest.approx(found[0][0], rel=1e-5)
+    assert float((found[1][1] - found[0][1]).norm() / found[0][1].norm()) < 1e-4
+
+
+def test_parts_that_cannot_be_are_refused(tmp_path):
+    learn = FitConfig(scans=4, batch_size=4, learning_rate=1e-3, accumulate=3)
+    with pytest.raises(ConfigError, match="batch_size=4 on 1 processes in 3 parts each"):
+        Fit(Plain(), learn, tmp_path, 0, Reporter())
+    with pytest.raises(ConfigError, match="accumulate=2 for players who take turns"):
+        Fit(Game(), replace(learn, accumulate=2), tmp_path, 0, Reporter())
+    with pytest.raises(ConfigError, match="accumulate=0"):
+        replace(learn, accumulate=0)
