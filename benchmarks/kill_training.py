@@ -23,7 +23,10 @@ from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 
-SETTINGS = [  # 24 steps of each stage, a checkpoint after each
+from lidargrit.files import read_tensors
+
+STAGES = ("tokenizer", "transformer")
+SETTINGS = [  # 24 and 48 steps, a checkpoint after each
     "data.train=[simulated:4:train]",
     "data.val=[simulated:1:val]",
     "data.columns=512",
@@ -37,9 +40,11 @@ SETTINGS = [  # 24 steps of each stage, a checkpoint after each
     "model.transformer.width=16",
     *[
         f"training.{stage}.{setting}"
-        for stage in ("tokenizer", "transformer")
-        for setting in ("batch_size=4", "scans=96", "checkpoint_every=4", "validate_every=32")
+        for stage in STAGES
+        for setting in ("batch_size=4", "checkpoint_every=4", "validate_every=32")
     ],
+    "training.tokenizer.scans=96",
+    "training.transformer.scans=192",
 ]
 # Modules are imported once, and each try is a fork of that process: the kills meet training, not imports.
 SERVER = """
@@ -82,6 +87,10 @@ class Runs:
         assert self._server.stdout is not None
         return self._server.stdout.readline().strip()
 
+    def scans_seen(self) -> int:
+        found = [self.folder / stage / "checkpoint.safetensors" for stage in STAGES]
+        return sum(read_tensors(path)[1]["scans_seen"] for path in found if path.exists())
+
     def half_written(self) -> set[Path]:
         return set(self.folder.glob("*/.checkpoint.safetensors.*"))
 
@@ -100,15 +109,18 @@ def main() -> None:
         whole.start()
         assert whole.wait() == 0
         whole_s = time.monotonic() - begun
-        print(f"a run that nothing happens to: {whole_s:.1f} s")
+        stage_s = {stage: logs(whole.folder / stage)[-1]["seconds"] for stage in STAGES}
+        start_s = whole_s - sum(stage_s.values())
+        print(f"a run that nothing happens to: {whole_s:.1f} s, {start_s:.1f} s of it to start")
         runs = Runs(Path(folder) / "killed")
-        kinds = ["random"] * options.random + ["in mid-save"] * options.in_save
-        rng.shuffle(kinds)
         met: Counter[str] = Counter()
-        # So short that the run is not over before the last kill, and long enough to come forward between two.
-        longest_s = 2.5 * whole_s / len(kinds)
-        for kind in kinds:
-            met[kill(runs, kind, rng, longest_s)] += 1
+        for stage in STAGES:
+            wait_for(runs, stage)
+            kinds = ["random"] * (options.random // 2) + ["in mid-save"] * (options.in_save // 2)
+            rng.shuffle(kinds)
+            for kind in kinds:
+                # So early that it may meet the start, and so late that the stage comes forward.
+                met[kill(runs, kind, rng.uniform(start_s / 2, start_s + 1.5 * stage_s[stage] / len(kinds)))] += 1
         left = len(runs.half_written())
         runs.start()
         assert runs.wait() == 0
@@ -116,17 +128,27 @@ def main() -> None:
             print(f"{count:4d} {what}")
         print(f"{left} half-written checkpoints were left behind by kills")
         same_weights = digest(whole.folder) == digest(runs.folder)
-        same_logs = logs(whole.folder) == logs(runs.folder)
+        same_logs = timeless(whole.folder) == timeless(runs.folder)
         print(f"weights the same bit for bit: {same_weights}; logs the same but for the time: {same_logs}")
         sys.exit(0 if same_weights and same_logs else 1)
 
 
-def kill(runs: Runs, kind: str, rng: random.Random, longest_s: float) -> str:
+def wait_for(runs: Runs, stage: str) -> None:
+    """Let the run come to a stage that is not its first."""
+    if stage != STAGES[0] and not (runs.folder / stage).exists():
+        child = runs.start()
+        while not (runs.folder / stage).exists():
+            time.sleep(0.001)
+        os.kill(child, signal.SIGKILL)
+        runs.wait()
+
+
+def kill(runs: Runs, kind: str, after_s: float) -> str:
     """Start, kill, and say what the kill met."""
-    before, begun = runs.half_written(), time.monotonic()
+    before, seen, begun = runs.half_written(), runs.scans_seen(), time.monotonic()
     child = runs.start()
     if kind == "random":
-        time.sleep(rng.uniform(0, longest_s))
+        time.sleep(after_s)
     else:
         while not runs.half_written() - before and time.monotonic() - begun < 60 and not over(runs):
             time.sleep(0.0005)
@@ -136,9 +158,10 @@ def kill(runs: Runs, kind: str, rng: random.Random, longest_s: float) -> str:
     if status == 0:
         return f"{kind}: came too late, the run was over"
     assert status == -signal.SIGKILL, f"a try ended by itself with {status}; the same command tells why: {runs.command}"
-    stage = "second stage" if (runs.folder / "transformer").exists() else "first stage"
-    in_save = ", a checkpoint half written" if runs.half_written() - before else ""
-    return f"{kind}: {stage}{in_save}"
+    stage = "second stage" if (runs.folder / STAGES[1]).exists() else "first stage"
+    if runs.half_written() - before:
+        return f"{kind}: {stage}, a checkpoint half written"
+    return f"{kind}: {stage}, {'after new checkpoints' if runs.scans_seen() > seen else 'before a new checkpoint'}"
 
 
 def over(runs: Runs) -> bool:
@@ -149,9 +172,12 @@ def digest(folder: Path) -> str:
     return hashlib.sha256((folder / "model.safetensors").read_bytes()).hexdigest()
 
 
-def logs(folder: Path) -> list[dict[str, float]]:
-    lines = [line for path in sorted(folder.glob("*/log.jsonl")) for line in path.read_text().splitlines()]
-    return [{**json.loads(line), "seconds": 0} for line in lines]
+def logs(stage: Path) -> list[dict[str, float]]:
+    return [json.loads(line) for line in (stage / "log.jsonl").read_text().splitlines()]
+
+
+def timeless(folder: Path) -> list[dict[str, float]]:
+    return [{**line, "seconds": 0} for stage in STAGES for line in logs(folder / stage)]
 
 
 if __name__ == "__main__":

@@ -29,8 +29,8 @@ class Engine:
 
     def __init__(self, precision: Precision, players_take_turns: bool = False) -> None:
         from lightning_fabric import Fabric  # noqa: PLC0415  takes a second, and only training needs it
-        from lightning_fabric.plugins.environments import TorchElasticEnvironment  # noqa: PLC0415
-        from lightning_fabric.strategies import DDPStrategy  # noqa: PLC0415
+        from lightning_fabric.plugins.environments.torchelastic import TorchElasticEnvironment  # noqa: PLC0415
+        from lightning_fabric.strategies.ddp import DDPStrategy  # noqa: PLC0415
 
         logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # it tells the precision at every start
         # One device, unless a launcher such as torchrun began this process as one of several.

@@ -31,9 +31,9 @@ def measure(recipe: Recipe) -> str:
             engine.set_up(objective, make_optimiser(objective, config))
             images = same_everywhere(recipe.data.load_sensor(), config.batch_size // engine.world_size)
             images = images.to(engine.device)
+            begun = 0.0
             for step in range(_WARM_UP_STEPS + _TIMED_STEPS):
-                if step == _WARM_UP_STEPS:
-                    begun = time.perf_counter()
+                begun = time.perf_counter() if step == _WARM_UP_STEPS else begun
                 float(engine.step(images, step, config.gradient_clip, config.accumulate)["loss"])  # waits for a GPU
             per_s = _TIMED_STEPS * config.batch_size / (time.perf_counter() - begun)
             lines.append(
