@@ -110,7 +110,7 @@ class Fit:
                     self._save()
                 if stops:
                     raise Terminated
-        self.engine.by_first(self.log.close)
+        self.engine.by_first(lambda: self.log.close())  # which the first one alone has
         return self.average.objective.eval()
 
     def validate(self, images: RangeImages) -> dict[str, float]:
