@@ -226,6 +226,7 @@ def test_a_run_that_is_killed_again_and_again_ends_with_the_same_weights(uninter
     killed_often(6, 1.0, words)
     assert main(words) == 0
     assert (tmp_path / "run" / "model.safetensors").read_bytes() == uninterrupted
+    assert hidden(tmp_path / "run" / "tokenizer") == hidden(tmp_path / "run" / "transformer") == []
     for stage in ("tokenizer", "transformer"):
         seen = [
             json.loads(line)["scans_seen"] for line in (tmp_path / "run" / stage / "log.jsonl").read_text().splitlines()

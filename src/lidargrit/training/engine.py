@@ -72,7 +72,7 @@ class Engine:
 
     def any(self, asked: bool) -> bool:
         """Tell whether it was asked of any process."""
-        return bool(self._mean(torch.tensor(float(asked), device=self.device)) > 0)
+        return asked if self.world_size == 1 else bool(self._mean(torch.tensor(float(asked), device=self.device)) > 0)
 
     def step(self, images: RangeImage, seed: int, gradient_clip: float, parts: int = 1) -> dict[str, Tensor]:
         """Take one step, or one of each player in turn, and return the terms, averaged over the processes.

@@ -14,7 +14,7 @@ from lidargrit.errors import ConfigError, Terminated, TrainingError
 from lidargrit.loading import Batches, RangeImages, seed_of, spread
 from lidargrit.reporting import Reporter
 from lidargrit.structures import RangeImage
-from lidargrit.training.checkpoint import load_checkpoint, save_checkpoint
+from lidargrit.training.checkpoint import load_checkpoint, remove_half_written, save_checkpoint
 from lidargrit.training.engine import Engine
 from lidargrit.training.log import Log
 from lidargrit.training.optimiser import WeightAverage, learning_rate_at, make_optimiser
@@ -63,7 +63,7 @@ class Fit:
             self.scans_seen = load_checkpoint(
                 self.checkpoint, self.objective, self.average, self.optimiser, self.built_on
             )
-        self.engine.by_first(self._open_log)
+        self.engine.by_first(self._begin)
 
     @property
     def checkpoint(self) -> Path:
@@ -110,7 +110,9 @@ class Fit:
                     self._save()
                 if stops:
                     raise Terminated
-        self.engine.by_first(lambda: self.log.close())  # which the first one alone has
+        self.engine.by_first(self._close_log)
+        if self.engine.any(termination.asked):  # since the last step
+            raise Terminated
         return self.average.objective.eval()
 
     def validate(self, images: RangeImages) -> dict[str, float]:
@@ -141,8 +143,12 @@ class Fit:
         self.average.update(self.objective, self.scans_seen, config.batch_size)
         return terms
 
-    def _open_log(self) -> None:
-        self.log = Log(self.folder, self.scans_seen)
+    def _begin(self) -> None:
+        remove_half_written(self.checkpoint)
+        self.log = Log(self.folder, self.scans_seen)  # the first process alone has one
+
+    def _close_log(self) -> None:
+        self.log.close()
 
     def _draw(self) -> None:
         if self.draw is not None:
