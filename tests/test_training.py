@@ -246,7 +246,6 @@ def test_a_measured_plan_tells_operations_time_and_memory():
 
 
 def test_tensorboard_draws_what_the_log_says(tmp_path):
-    pytest.importorskip("tensorboard")
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     log = Log(tmp_path, 0)

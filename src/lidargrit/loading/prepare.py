@@ -285,16 +285,16 @@ def _wait_for(folder: Path, shards: list[int], reporter: Reporter) -> None:
 def _check_way(source: str, images: PreparedImages, sensor: SensorModel, config: DataConfig) -> None:
     """Refuse images that were prepared for other rays, or projected in another way than is wanted."""
     prepared, wanted = images.sensor, sensor.fine()
+    if not prepared.same_rays(wanted):
+        raise DataError(
+            f"{source}, prepared for {prepared.name!r} ({prepared.height}x{prepared.width})",
+            f"the rays of {sensor.name!r} ({sensor.fine().height}x{sensor.fine().width} with every fine column)",
+            "name the sensor that it was prepared for, or prepare it for this one",
+        )
     theirs = (images.plan.variant, prepared.projection, prepared.range_min_m, prepared.range_max_m)
     ours = (config.variant, wanted.projection, wanted.range_min_m, wanted.range_max_m)
     if theirs != ours:
         told = [f"{variant}, {projection}, {near:g} to {far:g} m" for variant, projection, near, far in (theirs, ours)]
         raise DataError(
             f"{source}, prepared by the projection {told[0]}", told[1], "ask for what was prepared, or prepare it anew"
-        )
-    if not prepared.same_rays(wanted):
-        raise DataError(
-            f"{source}, prepared for {prepared.name!r} ({prepared.height}x{prepared.width})",
-            f"the rays of {sensor.name!r} ({sensor.fine().height}x{sensor.fine().width} with every fine column)",
-            "name the sensor that it was prepared for, or prepare it for this one",
         )

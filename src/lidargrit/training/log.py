@@ -1,9 +1,8 @@
-"""The terms of a stage while it trains → ``log.jsonl``, and TensorBoard's event files where that is installed."""
+"""The terms of a stage while it trains → ``log.jsonl``, and TensorBoard's event files."""
 
 from __future__ import annotations
 
 import json
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -36,15 +35,14 @@ class Log:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             with self._path.open("a", encoding="utf-8") as log:
                 log.write(json.dumps(line) + "\n")
-            if find_spec("tensorboard"):
-                self._draw(split, scans_seen, terms)
+            self._draw(split, scans_seen, terms)
         except OSError as error:
             raise OutputError(
                 f"'{error.strerror}' while writing {self._path}", "a folder with room", "free some space and go on"
             ) from error
 
     def _draw(self, split: str, scans_seen: int, terms: dict[str, float]) -> None:
-        from torch.utils.tensorboard import SummaryWriter  # noqa: PLC0415  optional, and slow to import
+        from torch.utils.tensorboard import SummaryWriter  # noqa: PLC0415  slow to import, and only training needs it
 
         if self._board is None:  # TensorBoard forgets by itself what was drawn from purge_step on
             self._board = SummaryWriter(str(self._path.parent), purge_step=self._resumed_at + 1)
