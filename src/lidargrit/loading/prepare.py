@@ -276,7 +276,7 @@ def _wait_for(folder: Path, shards: list[int], reporter: Reporter) -> None:
                 raise DataError(
                     f"{len(still)} shards of {folder} still missing after {_PATIENCE_S / 60:.0f} minutes",
                     "the other processes to make them",
-                    "see what became of them; the same command goes on",
+                    "see what became of them, or prepare on each where they share no folder; then go on",
                 )
             shards = still
             time.sleep(_WAIT_S if still else 0)
