@@ -20,6 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--against", default="simulated:256:test", help="real scans (default: simulated:256:test)")
     parser.add_argument("-n", "--count", type=int, default=256, help="samples of each (default: 256)")
     parser.add_argument("--protocol", default="exact", help="see: lidargrit list protocols (default: exact)")
+    parser.add_argument("--metrics", nargs="+", default=[], help="in place of the protocol's: lidargrit list metrics")
     settings = "settings of every recipe, such as data.train=..."
     parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help=settings)
     budget = "operations that the training of each takes (default: each recipe's own budget)"
@@ -37,7 +38,7 @@ def run(options: argparse.Namespace) -> None:
     contest = Contest(
         reference=options.against,
         num_samples=options.count,
-        settings=Settings(protocol=options.protocol),
+        settings=Settings(protocol=options.protocol, metrics=tuple(options.metrics)),
         recipe_settings=tuple(options.set),
         flops=options.flops,
         batch_size=options.batch_size,
