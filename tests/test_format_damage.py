@@ -1,5 +1,6 @@
 """Files that lie about themselves: refused by their headers, before anything is unpacked or given room."""
 
+import itertools
 import re
 import struct
 import tracemalloc
@@ -170,6 +171,24 @@ def test_archives_that_would_unpack_to_far_more(refused, method):
     assert "bytes in one array" in refused(data.replace(true_size, struct.pack("<I", 2**31)), "a.npz")
     if method != zipfile.ZIP_DEFLATED:  # of which zipfile unpacks all at once
         assert f"packed by method {method}" in refused(data, "a.npz")
+
+
+def test_archives_of_many_arrays_that_each_unpack_to_far_more(refused, tmp_path):
+    ones = np.ones(24, "<f4").tobytes()
+    points, column = (
+        npy(f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}}}", ones) for shape in ("(8, 3)", "(8,)")
+    )
+    names = ["".join(letters) for letters in itertools.product("Rr", "Ii", "Nn", "Gg")]
+    for padding in (bytes(5_000_000), b""):
+        with BytesIO() as buffer:
+            with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+                archive.writestr("points.npy", points)
+                for name in names:
+                    archive.writestr(f"{name}.npy", column + padding)
+            if padding:
+                assert "bytes in one array" in refused(buffer.getvalue(), "a.npz")
+            (tmp_path / "b.npz").write_bytes(buffer.getvalue())
+    assert read_scan(tmp_path / "b.npz").ring is not None, "the first of sixteen"
 
 
 def test_archives_whose_directory_is_the_bomb(refused):

@@ -58,9 +58,9 @@ def scan_of_columns(columns: Mapping[str, Num[np.ndarray, "n"]], path: Path, bad
     )
 
 
-def is_known(name: str) -> bool:
-    """Tell whether a column besides x, y and z is one that a scan has room for."""
-    return _plain(name) in (*_REFLECTANCE, *_RING, *_LABEL)
+def known_name(name: str) -> str:
+    """Return the plain name of a column besides x, y and z that a scan has room for; "" if it has none."""
+    return _plain(name) if _plain(name) in (*_REFLECTANCE, *_RING, *_LABEL) else ""
 
 
 def columns_of(scan: Scan) -> dict[str, np.ndarray]:

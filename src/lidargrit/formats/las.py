@@ -14,7 +14,7 @@ import numpy as np
 from lidargrit.errors import OutputError, ScanError
 from lidargrit.files import atomic_path
 from lidargrit.formats import POINTS_AT_MOST, BadPoints, ScanFormat, damaged, first_bytes, read_bytes
-from lidargrit.formats._columns import BYTES_AT_MOST, REFLECTANCE_RULE, columns_of, is_known, scan_of_columns
+from lidargrit.formats._columns import BYTES_AT_MOST, REFLECTANCE_RULE, columns_of, known_name, scan_of_columns
 from lidargrit.structures import Scan
 
 _FORMAT = "an uncompressed LAS file of version 1.0 to 1.4"
@@ -112,7 +112,7 @@ def _columns(points: Any) -> dict[str, np.ndarray]:
         columns["intensity"] = intensity
     for name in points.point_format.extra_dimension_names:
         values = np.asarray(points[name])
-        if is_known(name) and values.ndim == 1:
+        if known_name(name) and values.ndim == 1:
             columns[name] = values
     return columns
 

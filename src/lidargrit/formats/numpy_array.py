@@ -14,11 +14,12 @@ import numpy as np
 from lidargrit.errors import ScanError
 from lidargrit.files import atomic_path
 from lidargrit.formats import POINTS_AT_MOST, BadPoints, ScanFormat, damaged, first_bytes, open_file, read_bytes
-from lidargrit.formats._columns import BYTES_AT_MOST, REFLECTANCE_RULE, columns_of, is_known, scan_of_columns
+from lidargrit.formats._columns import BYTES_AT_MOST, REFLECTANCE_RULE, columns_of, known_name, scan_of_columns
 from lidargrit.structures import Scan
 
 _FORMAT = "an .npy of n rows of 3 to 5 numbers, or an .npz with an array points of n rows"
 _HEADER_BYTES_AT_MOST = 1024  # of an array; numpy writes 118, and reads it as a Python expression
+_VALUE_BYTES_AT_MOST = 16  # numpy's widest number
 _DIRECTORY_BYTES_AT_MOST = 65_536  # of an archive: a thousand arrays
 _ROWS = ("x", "y", "z", "intensity", "ring")
 _POINTS = ("points", "xyz", "points_xyz_m")
@@ -86,19 +87,22 @@ def _archive_columns(archive: zipfile.ZipFile, path: Path) -> dict[str, np.ndarr
     points_name = next((name for name in _POINTS if name in members), None)
     if points_name is None:
         raise _refused(f"the arrays {', '.join(map(ascii, list(members)[:8]))[:120]}", path)
-    columns = _row_columns(_member(archive, members.pop(points_name), path), path)
-    for name, info in members.items():
-        if not is_known(name):  # nor unpacked: what else is in the archive is none of our business
+    columns = _row_columns(_member(archive, members.pop(points_name), BYTES_AT_MOST, path), path)
+    at_most = _VALUE_BYTES_AT_MOST * len(columns["x"]) + _HEADER_BYTES_AT_MOST
+    for member, info in members.items():
+        name = known_name(member)
+        # What else is in the archive is not unpacked, nor the same name again: with other capitals there are hundreds.
+        if not name or name in columns:
             continue
-        columns[name] = _member(archive, info, path)
+        columns[name] = _member(archive, info, at_most, path)
         if columns[name].shape != columns["x"].shape:
             raise _refused(f"{columns['x'].shape[0]} points, but {name} of shape {columns[name].shape}", path)
     return columns
 
 
-def _member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path) -> np.ndarray:
-    """Unpack one array of an archive, after a look at how large it says that it is."""
-    if info.file_size > BYTES_AT_MOST or info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+def _member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, at_most: int, path: Path) -> np.ndarray:
+    """Unpack one array of an archive, after a look at how many bytes it says that it is."""
+    if info.file_size > at_most or info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise _refused(f"{info.file_size:,} bytes in one array, packed by method {info.compress_type}", path)
     try:
         with archive.open(info) as file:
