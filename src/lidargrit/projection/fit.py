@@ -19,9 +19,11 @@ _SECTORS = 36  # of 10 degrees: the coarsest sensor has several columns in each
 _SECTORS_AT_LEAST = 27  # with a return: KITTI's scans have all, a crop to the camera's view a quarter
 
 
-def misfits(scan: Scan, sensor: SensorModel, method: ProjectionName, placed: Placement) -> Iterator[ScanError]:
+def misfits(
+    scan: Scan, sensor: SensorModel, method: ProjectionName, placed: Placement, partial: bool = False
+) -> Iterator[ScanError]:
     """Name each reason for which an exact projection of a scan would be wrong; none for a scan that fits."""
-    for check in (_part_of_a_circle(scan), _wrong_rows(scan, sensor, method, placed)):
+    for check in (None if partial else _part_of_a_circle(scan), _wrong_rows(scan, sensor, method, placed)):
         if check is not None:
             yield check
 

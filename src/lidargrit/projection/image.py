@@ -14,7 +14,11 @@ from lidargrit.structures import RangeImage, Scan
 
 
 def project(
-    scan: Scan, sensor: SensorModel, method: ProjectionName | None = None, variant: Variant = "exact"
+    scan: Scan,
+    sensor: SensorModel,
+    method: ProjectionName | None = None,
+    variant: Variant = "exact",
+    partial: bool = False,
 ) -> RangeImage:
     """Place each point of a scan in the pixel whose ray it lies on; the nearest point wins a pixel.
 
@@ -28,6 +32,8 @@ def project(
         variant: ``exact`` floors, leaves out points beyond the sensor's span or limits before the nearest one wins, and
             refuses a scan that does not fit. ``reference`` repeats LidarGRIT's program: it rounds, clips points outside
             into the border pixels, and loses a pixel whose nearest point is beyond the limits.
+        partial: take a scan of a part of the circle too, which is refused otherwise: where it has no point is then
+            unknown, and not a beam that did not return.
 
     Returns:
         range_m (H, W) in metres and return_mask (H, W), with the reflectance if the scan has it.
@@ -38,7 +44,8 @@ def project(
     Source:
         Haghighi et al., LidarGRIT, 2024, section 3.1; program hamedhaghighi/LidarGRIT@a3f86e7.
     """
-    point_of_pixel, range_m = (pixels[:, :: sensor.column_stride] for pixels in _nearest(scan, sensor, method, variant))
+    nearest = _nearest(scan, sensor, method, variant, partial)
+    point_of_pixel, range_m = (pixels[:, :: sensor.column_stride] for pixels in nearest)
     filled = point_of_pixel >= 0
     if not filled.any():
         raise ScanError(
@@ -68,12 +75,12 @@ def index_map(
 
 
 def _nearest(
-    scan: Scan, sensor: SensorModel, method: ProjectionName | None, variant: Variant
+    scan: Scan, sensor: SensorModel, method: ProjectionName | None, variant: Variant, partial: bool = False
 ) -> tuple[Int32[np.ndarray, "H fine_W"], Float32[np.ndarray, "H fine_W"]]:
     method = method or sensor.projection
     placed = place(scan, sensor, method, variant)
     if variant == "reference":
         return placed.nearest(np.ones(len(scan), dtype=bool))
-    for misfit in misfits(scan, sensor, method, placed):
+    for misfit in misfits(scan, sensor, method, placed, partial):
         raise misfit
     return placed.nearest(placed.in_rows() & within_limits(placed.range_m, sensor))

@@ -29,7 +29,7 @@ from lidargrit.viewer.gathering import Shown
 PAGE_SCANS_AT_MOST = 100  # of each source: about 15 MB of a KITTI-360 size image, which browsers still open at once
 SOURCES_AT_MOST = 8  # browsers keep 8 to 16 WebGL canvases alive
 _FOLDER = Path(__file__).parent / "browser"
-_SCRIPTS = ("scans.js", "camera.js", "points.js", "files.js", "pane.js", "page.js")
+_SCRIPTS = ("scans.js", "camera.js", "points.js", "files.js", "pane.js", "page.js")  # of every page that shows scans
 _RANGE_STEPS = 65_535  # 16 bits, of which 0 is no return
 _CLASSES_AT_MOST = 255  # 8 bits; SemanticKITTI has 34
 _RAMP_STEPS = 64
@@ -72,28 +72,59 @@ def page(shown: Sequence[Shown]) -> str:
         raise ConfigError(
             f"{len(shown)} groups of scans side by side", f"1 to {SOURCES_AT_MOST}", "name fewer, or make two pages"
         )
-    script = '"use strict";\n' + "\n".join(_read(name) for name in _SCRIPTS)
+    script = scripts() + _read("open.js")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     coarsest_m = max(_far_m(one) for one in shown) / _RANGE_STEPS
+    precision = f"Ranges are kept here in steps of {1000 * coarsest_m:.1f} mm. Written by lidargrit {__version__}."
     parts = {
         "title": escape(f"Scans: {', '.join(one.name for one in shown)}"),
-        "style": _read("page.css"),
+        "style": style(),
+        "looking": looking("<h1>Scans</h1>", button("bin", "Save .bin") + button("ply", "Save .ply"), precision),
         "script": script,
         # No other script runs, and nothing is fetched, whatever a file name may hold.
         "script_hash": f"sha256-{digest}",
-        "scans": json.dumps(_told(shown)).replace("<", "\\u003c"),
-        "precision": f"Ranges are kept here in steps of {1000 * coarsest_m:.1f} mm. "
-        f"Written by lidargrit {__version__}.",
+        "scans": json.dumps(told(shown)).replace("<", "\\u003c"),
     }
-    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], _read("page.html"))
+    return filled(_read("page.html"), parts)
+
+
+def scripts() -> str:
+    """Return what every page runs that shows scans; it begins to show them when told to by ``new Page``."""
+    return '"use strict";\n' + "\n".join(_read(name) for name in _SCRIPTS) + "\n"
+
+
+def style() -> str:
+    """Return how such a page looks."""
+    return _read("page.css")
+
+
+def looking(heading: str, buttons: str, note: str) -> str:
+    """Return the elements that the scripts work on: controls, a legend, room for scans, and how to use them.
+
+    Args:
+        heading: before the controls.
+        buttons: of every source.
+        note: at the end of the explanation.
+    """
+    return filled(_read("looking.html"), {"heading": heading, "buttons": buttons, "precision": note})
+
+
+def button(part: str, words: str) -> str:
+    """Return a button of every source, by the name that scripts know it by."""
+    return f'<button type="button" data-part="{part}">{escape(words)}</button>'
+
+
+def filled(text: str, parts: dict[str, str]) -> str:
+    """Return a text with parts in the place of their names in double braces."""
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], text)
 
 
 def _read(name: str) -> str:
     return (_FOLDER / name).read_text(encoding="utf-8")
 
 
-def _told(shown: Sequence[Shown]) -> dict[str, Any]:
-    """Return all that the page needs to know, as plain numbers and words."""
+def told(shown: Sequence[Shown]) -> dict[str, Any]:
+    """Return all that a page needs to know of groups of scans, as plain numbers and words."""
     labels = [one.label[one.images.return_mask] for one in shown if one.label is not None]
     numbers = sorted({int(number) for label in labels for number in label.unique()})
     if len(numbers) > _CLASSES_AT_MOST:

@@ -11,14 +11,12 @@ class Page {
         document.getElementById(id),
       ]),
     );
-    this.panes = told.sources.map((source) => new Pane(new Source(source), this));
-    this.count = Math.max(...this.panes.map((pane) => pane.source.count));
+    this.panes = [];
     this.index = 0;
     this.dark = window.matchMedia("(prefers-color-scheme: dark)");
     this.area = document.getElementById("panes");
-    this.area.append(...this.panes.map((pane) => pane.element));
     document.getElementById("slow").hidden = hasGraphicsCard();
-    this.offerModes();
+    this.arrange(told.sources.map((source) => new Pane(new Source(source), this)));
     this.listen();
   }
 
@@ -30,9 +28,19 @@ class Page {
     return Number(this.control.size.value);
   }
 
+  // Show these panes and no others, in this order.
+  arrange(panes) {
+    this.panes.filter((pane) => !panes.includes(pane)).forEach((pane) => pane.close());
+    panes.filter((pane) => !this.panes.includes(pane)).forEach((pane) => this.area.append(pane.element));
+    this.panes = panes;
+    this.count = Math.max(1, ...panes.map((pane) => pane.source.count));
+    this.index = Math.min(this.index, this.count - 1);
+    this.offerModes();
+  }
+
   // Only what some scan has.
   offerModes() {
-    const has = (name) => this.told.sources.some((source) => source.scans.some((scan) => scan[name]));
+    const has = (name) => this.panes.some((pane) => pane.source.told.scans.some((scan) => scan[name]));
     for (const name of ["reflectance", "label"]) {
       this.control.mode.querySelector(`[value=${name}]`).disabled = !has(name);
     }
@@ -170,6 +178,3 @@ function legendOf(look) {
   }[look.mode];
   return [text(ends[0]), ramp, text(ends[1]), chip(css(look.noReturn), "nothing came back")];
 }
-
-const page = new Page(JSON.parse(document.getElementById("scans").textContent));
-page.go(0);

@@ -124,6 +124,11 @@ class Pane {
     this.placeMarks();
   }
 
+  close() {
+    this.element.remove();
+    this.drawer.close();
+  }
+
   // Point at a pixel in both pictures, and say what it is; -1 for none.
   mark(pixel) {
     if (!this.points) {

@@ -84,6 +84,11 @@ class WebglPoints {
     gl.uniform1f(this.places.dropped, withDropped ? 1 : 0);
     gl.drawArrays(gl.POINTS, 0, this.points.length / 4);
   }
+
+  // Browsers keep few contexts, and give them back late unless they are told.
+  close() {
+    this.gl.getExtension("WEBGL_lose_context")?.loseContext();
+  }
 }
 
 // Each point a small square, the nearest on top.
@@ -92,6 +97,8 @@ class PlainPoints {
     this.canvas = canvas;
     this.context = canvas.getContext("2d");
   }
+
+  close() {}
 
   setPoints(points) {
     this.points = points;

@@ -1,0 +1,199 @@
+// The page that is served: a form whose results appear beside one another.
+
+const PANES_AT_MOST = 4; // more are too small to see anything in
+const ASK_AGAIN_MS = 300;
+const el = (id) => document.getElementById(id);
+
+// A pane whose files are written by the server, as the export writes them.
+class ServedPane extends Pane {
+  constructor(source, page, job, group, scales) {
+    super(source, page);
+    this.scales = scales;
+    for (const kind of ["npz", "ply", "bin"]) {
+      this.part[kind].setAttribute("aria-label", `Save ${source.name} as .${kind}`);
+    }
+    this.part.npz.addEventListener("click", () => this.save("npz"));
+    this.part.remove.setAttribute("aria-label", `Remove ${source.name}`);
+    this.part.remove.addEventListener("click", () => desk.remove(this));
+    this.place = `/jobs/${job}/${group}`;
+  }
+
+  async save(ending) {
+    await desk.trying(async () => {
+      const index = this.source.place(this.page.index);
+      const file = await asked(`${this.place}-${index}.${ending}`);
+      save([await file.arrayBuffer()], `${this.source.name}-${this.scan.name}.${ending}`);
+    });
+  }
+}
+
+// The answer to a request; what is refused is thrown as the words that say why.
+async function asked(path, options) {
+  let answer;
+  try {
+    answer = await fetch(path, options);
+  } catch {
+    throw new Error("The server does not answer. Is it still running?");
+  }
+  if (!answer.ok) {
+    const told = await answer.json().catch(() => ({}));
+    throw new Error(told.error ?? (answer.status === 413 ? "The file is too large." : `The server answered ${answer.status}.`));
+  }
+  return answer;
+}
+
+class Desk {
+  constructor({ models, limits }) {
+    this.models = models;
+    this.limits = limits;
+    el("model").replaceChildren(...models.map((model, place) => new Option(model.name, String(place))));
+    el("count").max = String(limits.scans);
+    el("model").addEventListener("change", () => this.offer());
+    el("wish").addEventListener("submit", (event) => this.submit(event, () => this.generate()));
+    el("own").addEventListener("submit", (event) => this.submit(event, () => this.complete()));
+    this.offer();
+  }
+
+  get model() {
+    return this.models[Number(el("model").value)];
+  }
+
+  // What the chosen model can do, and the numbers that it lets one choose.
+  offer() {
+    const { generator, sensor, choices, upload } = this.model;
+    el("sensor").textContent = `${generator}; ${sensor}`;
+    const [first, ...others] = choices.map(fieldOf); // each generator's own order: what matters most comes first
+    el("first").replaceChildren(...(first ? [first] : []));
+    el("choices").replaceChildren(...others);
+    el("more").hidden = others.length === 0;
+    el("hiding").hidden = upload !== "complete";
+    el("complete").textContent = upload === "encode" ? "Reconstruct it" : "Complete it";
+    el("file").disabled = upload === "";
+    el("unable").hidden = upload !== "";
+    el("unable").textContent = `A ${generator} model can neither complete nor reconstruct scans.`;
+    this.enable();
+  }
+
+  enable() {
+    el("generate").disabled = Boolean(this.busy);
+    el("complete").disabled = Boolean(this.busy) || this.model.upload === "";
+  }
+
+  // Only what was changed: the rest is left to the generator.
+  wish() {
+    const fields = [...el("wish").querySelectorAll("[name]")].filter((field) => field.value !== field.defaultValue);
+    const told = fields.filter((field) => field.value !== "").map((field) => [field.name, Number(field.value)]);
+    return { model: Number(el("model").value), seed: Number(el("seed").value), sampling: Object.fromEntries(told) };
+  }
+
+  generate() {
+    const wish = { ...this.wish(), count: Number(el("count").value) };
+    return asked("/generate", { method: "POST", body: JSON.stringify(wish) });
+  }
+
+  complete() {
+    const [file] = el("file").files;
+    if (file.size > this.limits.uploadBytes) {
+      throw new Error(`The file has ${file.size.toLocaleString("en")} bytes; at most ${this.limits.uploadBytes.toLocaleString("en")} are taken.`);
+    }
+    const wish = { ...this.wish(), name: file.name, hidden: el("hidden").value };
+    return asked(`/complete?wish=${encodeURIComponent(JSON.stringify(wish))}`, { method: "POST", body: file });
+  }
+
+  async submit(event, begin) {
+    event.preventDefault();
+    this.busy = true;
+    this.enable();
+    const touched = Object.entries(this.wish().sampling).map(([name, value]) => `${name}=${value}`);
+    const by = [this.model.name, ...touched].join(", ");
+    await this.trying(async () => {
+      const { job } = await (await begin()).json();
+      const seconds = await this.waited(job);
+      const told = await (await asked(`/jobs/${job}/scans`)).json();
+      await this.show(told, job, by);
+      el("status").textContent = `Drawn in ${seconds} s.`;
+    });
+    this.busy = false;
+    this.enable();
+  }
+
+  // Whatever goes wrong is said in one place.
+  async trying(work) {
+    el("error").hidden = true;
+    try {
+      await work();
+    } catch (error) {
+      el("status").textContent = "";
+      el("error").textContent = error.message;
+      el("error").hidden = false;
+    }
+  }
+
+  async waited(job) {
+    for (;;) {
+      const { state, before, seconds, error } = await (await asked(`/jobs/${job}`)).json();
+      if (state === "done") {
+        return seconds;
+      }
+      if (state === "failed") {
+        throw new Error(error);
+      }
+      el("status").textContent = state === "waiting" ? `Waiting; before you: ${before}` : `Drawing, ${Math.round(seconds)} s`;
+      await new Promise((done) => setTimeout(done, seconds < 5 ? ASK_AGAIN_MS : 4 * ASK_AGAIN_MS));
+    }
+  }
+
+  async show(told, job, by) {
+    el("empty").hidden = true;
+    el("looking").hidden = false;
+    this.page ??= new Page({ ...told, sources: [] });
+    const fresh = told.sources.map((source, group) => {
+      const name = { generated: by, completed: `completed by ${by}`, reconstructed: `reconstructed by ${by}` }[source.name];
+      return new ServedPane(new Source({ ...source, name: name ?? source.name }), this.page, job, group, told.scales);
+    });
+    await this.arrange([...this.page.panes, ...fresh].slice(-Math.max(PANES_AT_MOST, fresh.length)));
+  }
+
+  async remove(pane) {
+    await this.arrange(this.page.panes.filter((one) => one !== pane));
+  }
+
+  // One scale of each colour for all that is shown, wide enough for everything.
+  async arrange(panes) {
+    this.page.arrange(panes);
+    if (panes.length === 0) {
+      [el("empty").hidden, el("looking").hidden] = [false, true];
+      return;
+    }
+    for (const mode of Object.keys(panes[0].scales)) {
+      const ends = panes.map((pane) => pane.scales[mode]);
+      this.page.told.scales[mode] = [Math.min(...ends.map((end) => end[0])), Math.max(...ends.map((end) => end[1]))];
+    }
+    await this.page.go(this.page.index);
+  }
+}
+
+function fieldOf(choice) {
+  const [label, input, about] = ["label", "input", "small"].map((kind) => document.createElement(kind));
+  label.className = "field";
+  Object.assign(input, { type: "number", name: choice.name, step: choice.whole ? "1" : "any", max: String(choice.at_most) });
+  if (choice.whole) {
+    input.min = "0";
+  }
+  input.defaultValue = choice.default === null ? "" : String(choice.default);
+  about.textContent = choice.about.split(/[.;] /)[0].replace(/\.$/, "");
+  input.title = choice.about;
+  label.append(choice.name.replaceAll("_", " "), input, about);
+  return label;
+}
+
+let desk = null;
+asked("/models")
+  .then((answer) => answer.json())
+  .then((told) => {
+    desk = new Desk(told);
+  })
+  .catch((error) => {
+    el("error").textContent = error.message;
+    el("error").hidden = false;
+  });

@@ -1,0 +1,38 @@
+"""The page that is served: a form and the viewer's parts, files in ``browser/`` → HTML, script and style."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lidargrit import __version__
+from lidargrit.serving.wishes import HIDDEN, SEED_AT_MOST
+from lidargrit.viewer import interactive
+from lidargrit.viewer.interactive import button, filled
+
+_FOLDER = Path(__file__).parent / "browser"
+_SAVED = ("npz", "ply", "bin")
+
+
+def page() -> str:
+    """Return the page without anything in it: what there is to choose, its script asks for."""
+    buttons = "".join(button(kind, f".{kind}") for kind in _SAVED) + button("remove", "Remove")
+    parts = {
+        "looking": interactive.looking("", f'<span class="soft">Save</span>{buttons}', f"lidargrit {__version__}."),
+        "hidden": "".join(f'<option value="{name}">{told}</option>' for name, told in HIDDEN.items()),
+        "seed_at_most": str(SEED_AT_MOST),
+    }
+    return filled(_read("serve.html"), parts)
+
+
+def script() -> str:
+    """Return the scripts of the page."""
+    return interactive.scripts() + _read("serve.js")
+
+
+def style() -> str:
+    """Return how the page looks."""
+    return interactive.style() + _read("serve.css")
+
+
+def _read(name: str) -> str:
+    return (_FOLDER / name).read_text(encoding="utf-8")

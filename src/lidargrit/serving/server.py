@@ -1,0 +1,129 @@
+"""Run folders → a page at an address of this machine, until somebody ends it."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import socket
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from waitress.server import create_server
+
+from lidargrit.errors import CheckpointError, ConfigError, OutputError
+from lidargrit.generators import is_run
+from lidargrit.serving.application import LOOPBACK_NAMES, Application
+from lidargrit.serving.limits import Limits
+from lidargrit.serving.work import Work
+
+_THREADS = 4  # that answer requests: each takes milliseconds, for drawing is done elsewhere
+_PORT_AT_MOST = 65_535
+
+
+class Opened(NamedTuple):
+    """A server that listens, and answers while it runs.
+
+    Args:
+        port: that it listens at.
+        work: what draws for it.
+        run: answers until Ctrl-C.
+    """
+
+    port: int
+    work: Work
+    run: Callable[[], None]
+
+
+def serve(
+    runs: Sequence[Path],
+    say: Callable[[str], None],
+    host: str = "127.0.0.1",
+    port: int = 8000,
+    device: str = "",
+    limits: Limits | None = None,
+) -> None:
+    """Serve a page on which everybody who reaches it generates, completes, compares and saves, until Ctrl-C.
+
+    Args:
+        runs: folders of finished runs.
+        say: hears the address, and a warning where others reach it.
+        host: the address to listen at; a loopback one keeps it to this machine.
+        port: to listen at; 0 for any that is free.
+        device: where networks compute; "" for a GPU if there is one.
+        limits: what may be asked for.
+
+    Raises:
+        OutputError: the address is taken, or not this machine's.
+        LidarGritError: a run that cannot be read.
+    """
+    with opened(runs, host, port, device, limits) as server:
+        if host not in LOOPBACK_NAMES:
+            say(
+                f"WARNING: everybody who reaches {host} can use this machine's processor and memory, without a password"
+            )
+        name = f"[{host}]" if ":" in host else host
+        say(f"open http://{name}:{server.port} in a browser; Ctrl-C ends it")
+        server.run()
+
+
+@contextlib.contextmanager
+def opened(
+    runs: Sequence[Path], host: str = "127.0.0.1", port: int = 0, device: str = "", limits: Limits | None = None
+) -> Iterator[Opened]:
+    """Yield a server that is about to run; after the block it, its process and its files are gone.
+
+    Args, Raises: as for :func:`serve`.
+    """
+    limits = limits or Limits()
+    logging.getLogger("waitress.queue").setLevel(logging.ERROR)  # it tells of every request that waits
+    with (
+        contextlib.closing(_listening(host, port)) as bound,
+        tempfile.TemporaryDirectory(prefix="lidargrit-serve-", ignore_cleanup_errors=True) as place,
+        Work(runs, Path(place), device, limits) as work,
+    ):
+        server = create_server(
+            Application(work, host),
+            sockets=[bound],
+            threads=_THREADS,
+            ident="lidargrit",
+            connection_limit=limits.connections,
+            max_request_header_size=16_384,
+            max_request_body_size=limits.upload_bytes + 1,
+            channel_timeout=limits.silent_seconds,
+            cleanup_interval=max(1, limits.silent_seconds // 3),
+        )
+        try:
+            yield Opened(bound.getsockname()[1], work, server.run)
+        finally:
+            server.task_dispatcher.shutdown()
+            server.close()
+
+
+def finished_runs(folder: Path) -> list[Path]:
+    """Return the finished runs of a folder, in the order of their names.
+
+    Raises:
+        CheckpointError: there is none.
+    """
+    found = sorted(path for path in folder.glob("*") if is_run(path))
+    if not found:
+        raise CheckpointError(
+            f"no run to serve, and none in {folder}", "a finished run's folder", "make one with: lidargrit demo"
+        )
+    return found
+
+
+def _listening(host: str, port: int) -> socket.socket:
+    if not 0 <= port <= _PORT_AT_MOST:
+        raise ConfigError(f"--port {port}", f"0 to {_PORT_AT_MOST}", "choose another one")
+    try:
+        return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+    except OSError as error:
+        told = str(error.strerror).partition(" (")[0]
+        raise OutputError(
+            f"{host} port {port}, where nothing can be served ({told})",
+            "an address of this machine, and a port that is free",
+            "choose another one by --port",
+        ) from None

@@ -1,0 +1,318 @@
+"""The page that is served: what can be chosen, and what happens when somebody clicks and types, in a browser."""
+
+import re
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from waitress.server import TcpWSGIServer
+
+import lidargrit
+from browser import CHROMIUM, Browser
+from lidargrit.cli import main
+from lidargrit.errors import ConfigError, ScanError
+from lidargrit.formats import load, read_scan
+from lidargrit.projection import unproject
+from lidargrit.serving import server
+from lidargrit.serving.drawing import draw
+from lidargrit.serving.wishes import Wish, choices_of, read_words, wish_of
+from lidargrit.serving.work import Work
+from lidargrit.structures import Scan
+from served import LIMITS, MODELS, running
+from test_generator_contract import made
+
+QUICK = {"steps": 3, "resamples": 2}
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory):
+    with running(tmp_path_factory.mktemp("runs")) as served:
+        yield served
+        place = served.work._place
+        assert place.is_dir()
+    assert not place.exists(), "nothing is left behind"
+
+
+@pytest.fixture(scope="module")
+def scan_file(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("scans") / "my <b>street.ply"
+    load("ply").write(path, lidargrit.simulate(seed=5))
+    return path
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    if CHROMIUM is None:
+        pytest.skip("needs Chromium")
+    opened = Browser(tmp_path_factory.mktemp("profile"))
+    yield opened
+    opened.close()
+
+
+# What can be chosen.
+
+
+def test_numbers_of_every_generator_can_be_chosen():
+    found = {name: [choice.name for choice in choices_of(made(name)[0].Sampling())] for name in MODELS}
+    assert found == {"lidargrit": ["temperature", "top_k", "top_p"], "marginal": [], "r2dm": ["steps", "resamples"]}
+    choices = {choice.name: choice for choice in choices_of(made("dusty")[0].Sampling())}
+    assert choices["tolerance"].default is None
+    assert not choices["tolerance"].whole
+    assert choices["search_steps"].at_most == 1024
+    assert choices["search_rate"].about == "its learning rate at its highest."
+
+
+GOOD = {"model": 0, "seed": 3, "count": 2, "sampling": {"temperature": 1, "top_k": 5}}
+
+
+@pytest.mark.parametrize(
+    ("changed", "why"),
+    [
+        ({"seed": -1}, "whole number from 0"),
+        ({"seed": 2**32}, "whole number from 0"),
+        ({"seed": 10**400}, "whole number from 0"),
+        ({"seed": True}, "whole number"),
+        ({"seed": 1.0}, "whole number"),
+        ({"seed": "1"}, "whole number"),
+        ({"seed": None}, "whole number"),
+        ({"count": 0}, "from 1 to 8"),
+        ({"count": 10**9}, "from 1 to 8"),
+        ({"model": 3}, "from 0 to 2"),
+        ({"model": -1}, "from 0 to 2"),
+        ({"hidden": ["ahead"]}, "nothing, ahead, rows"),
+        ({"sampling": {"temperature": "hot"}}, "a number up to 100"),
+        ({"sampling": {"temperature": 1e300}}, "a number up to 100"),
+        ({"sampling": {"temperature": False}}, "a number up to 100"),
+        ({"sampling": {"top_k": 1.5}}, "from 0 to 1024"),
+        ({"sampling": {"top_k": 10**30}}, "from 0 to 1024"),
+        ({"sampling": {"tempreature": 1}}, "temperature"),
+        ({"sampling": {"mask": "threshold"}}, "does not have"),
+        ({"sampling": [1]}, "JSON object"),
+        ({"file": "/etc/passwd"}, "one of model, seed"),
+        ({"x" * 9999: 1}, "one of model, seed"),
+    ],
+)
+def test_wishes_out_of_bounds_are_refused(changed, why):
+    choices = [choices_of(made(name)[0].Sampling()) for name in MODELS]
+    wish = wish_of(GOOD, choices, LIMITS)
+    assert (wish.seed, wish.count, wish.sampling) == (3, 2, {"temperature": 1.0, "top_k": 5})
+    with pytest.raises(ConfigError, match=why) as refused:
+        wish_of({**GOOD, **changed}, choices, LIMITS)
+    assert len(str(refused.value)) < 300
+
+
+@pytest.mark.parametrize("data", [b"", b"[]", b"7", b"{", b'{"seed": NaN}', b"\xff", b"[" * 4000, b'{"a":' * 800])
+def test_words_that_are_none_are_refused(data):
+    with pytest.raises(ConfigError, match="no JSON object"):
+        read_words(data)
+
+
+def test_names_of_files_lose_what_could_do_harm():
+    for name, plain in (("../../a b.ply", "a_b.ply"), ("c:\\x\\y.bin", "y.bin"), ("<i>.npz", "_i_.npz"), (7, "")):
+        assert wish_of({"name": name}, [[]], LIMITS).name == plain
+    assert len(wish_of({"name": "n" * 9999}, [[]], LIMITS).name) == 60
+
+
+def test_a_part_of_the_circle_and_rings_that_nobody_told(tmp_path):
+    scan = lidargrit.simulate(seed=5)
+    ahead = scan.points_xyz_m[:, 0] > scan.points_xyz_m[:, 1].abs()
+    shuffled = torch.randperm(int(ahead.sum()), generator=torch.Generator().manual_seed(0))
+    part = Scan(scan.points_xyz_m[ahead][shuffled], scan.reflectance[ahead][shuffled])
+    load("kitti_bin").write(tmp_path / "part.bin", part)
+    wish = Wish(0, sampling=QUICK, file=str(tmp_path / "part.bin"), name="mine.bin")
+    uploaded, completed = draw(made("r2dm")[0], wish)
+    kept = uploaded.images.return_mask
+    assert 0.15 < kept.float().mean() < 0.3
+    assert not kept[:, :, :8].any(), "behind"
+    assert completed.images.return_mask.sum() > kept.sum()
+    assert torch.equal(completed.images.range_m[kept], uploaded.images.range_m[kept])
+    with pytest.raises(ScanError, match=r"degrees of azimuth in mine\.bin"):
+        draw(made("lidargrit")[0], replace(wish, sampling={}))
+
+
+# In a browser.
+
+
+def said(browser: Browser) -> str:
+    return browser.run("document.querySelector('#error:not([hidden])')?.textContent ?? ''")
+
+
+def finish(browser: Browser) -> None:
+    browser.wait("!document.querySelector('#generate').disabled")
+    browser.settle()
+
+
+def fill(browser: Browser, selector: str, value: str) -> None:
+    browser.run(
+        f"((one) => {{ one.value = {value!r}; one.dispatchEvent(new Event('change')); }})"
+        f"(document.querySelector({selector!r}))"
+    )
+
+
+def choose_file(browser: Browser, path: Path) -> None:
+    root = browser.send("DOM.getDocument")["root"]["nodeId"]
+    node = browser.send("DOM.querySelector", nodeId=root, selector="#file")["nodeId"]
+    browser.send("DOM.setFileInputFiles", files=[str(path)], nodeId=node)
+
+
+@pytest.fixture
+def opened(browser, served) -> Browser:
+    browser.events.clear()
+    browser.send("Page.navigate", url=served.url)
+    browser.wait("document.readyState === 'complete' && typeof desk !== 'undefined' && desk !== null")
+    return browser
+
+
+def names(browser: Browser) -> list[str]:
+    return browser.run("[...document.querySelectorAll('[data-part=name]')].map((one) => one.textContent)")
+
+
+def drawn(picture: np.ndarray) -> float:
+    return float((picture != picture[2, 2]).any(axis=2).mean())
+
+
+def test_generate_compare_and_save(opened, served, tmp_path):
+    options = opened.run("[...document.querySelectorAll('#model option')].map((one) => one.textContent)")
+    assert options == [f"tiny-{name}" for name in MODELS]
+    opened.click("#generate")
+    finish(opened)
+    assert opened.run("document.querySelector('#status').textContent").startswith("Drawn in ")
+    fill(opened, "[name=temperature]", "0.5")
+    fill(opened, "#seed", "4")
+    opened.click("#generate")
+    finish(opened)
+    assert names(opened) == ["tiny-lidargrit", "tiny-lidargrit, temperature=0.5"]
+    assert said(opened) == ""
+    for which in range(2):
+        assert drawn(opened.screenshot(".cloud", which)) > 0.005
+        assert drawn(opened.screenshot(".image", which)) > 0.2
+    assert opened.run("document.documentElement.scrollHeight <= innerHeight"), "all is seen at once"
+    opened.send("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
+    opened.click("#next")
+    files = [tmp_path / f"tiny-lidargrit_temperature_0.5-seed_5.{kind}" for kind in ("npz", "ply", "bin")]
+    for kind in ("npz", "ply", "bin"):
+        opened.click(f"[data-part={kind}]", 1)
+    end = time.monotonic() + 20
+    while not all(path.exists() for path in files):
+        assert time.monotonic() < end, sorted(path.name for path in tmp_path.iterdir())
+        time.sleep(0.05)
+    generator = made("lidargrit")[0]
+    wanted = unproject(generator.sample([5], generator.Sampling(temperature=0.5))[0])
+    for path in files:
+        assert torch.allclose(read_scan(path).points_xyz_m, wanted.points_xyz_m, atol=1e-4), path.name
+    opened.click("[data-part=remove]")
+    assert names(opened) == ["tiny-lidargrit, temperature=0.5"]
+    assert opened.troubles() == []
+    assert {url.removeprefix(served.url).split("/")[1] for url in opened.requests()} >= {"", "page.js", "jobs"}
+    assert all(url.startswith(f"{served.url}/") for url in opened.requests())
+
+
+def test_a_scan_that_is_uploaded_is_completed(opened, scan_file):
+    fill(opened, "#model", "2")
+    for name, value in QUICK.items():
+        fill(opened, f"[name={name}]", str(value))
+    fill(opened, "#hidden", "ahead")
+    choose_file(opened, scan_file)
+    opened.click("#complete")
+    finish(opened)
+    assert said(opened) == ""
+    assert names(opened) == ["as uploaded", "what the model saw", "completed by tiny-r2dm, steps=3, resamples=2"]
+    points = opened.run("[...document.querySelectorAll('section .about')].map((one) => one.textContent)")
+    counts = [
+        int(found[1].replace(",", "")) for found in (re.search(r": ([\d,]+) points", text) for text in points) if found
+    ]
+    assert counts[1] < 0.8 * counts[0]
+    assert counts[1] <= counts[2], "what was seen is kept"
+    assert opened.run("document.querySelectorAll('section b').length") == 0, "names are no HTML"
+    fill(opened, "#model", "0")
+    opened.click("#complete")
+    finish(opened)
+    assert names(opened)[-1] == "reconstructed by tiny-lidargrit"
+    assert len(names(opened)) == 4
+    fill(opened, "#model", "1")
+    assert opened.run("document.querySelector('#complete').disabled")
+    assert "can neither complete" in opened.run("document.querySelector('#unable').textContent")
+    assert opened.troubles() == []
+
+
+def test_a_bad_file_is_told_in_one_line(opened, tmp_path):
+    for name, data, why in (
+        ("cut.bin", bytes(17), "17 bytes in cut.bin"),
+        ("text.docx", b"hello", "whose ending we do not know"),
+        ("large.bin", bytes(4_000_016), "at most 4,000,000"),
+    ):
+        (tmp_path / name).write_bytes(data)
+        choose_file(opened, tmp_path / name)
+        opened.click("#complete")
+        finish(opened)
+        assert why in said(opened)
+        assert "/" not in said(opened).replace("/complete", ""), "no place on the server's disk"
+    assert opened.run("document.querySelector('#error').getAttribute('role')") == "alert"
+
+
+def test_everything_is_reached_by_keys_and_has_a_name(opened):
+    opened.click("#generate")
+    finish(opened)
+    opened.run("document.querySelector('#model').focus()")
+    reached = []
+    for _ in range(30):
+        reached.append(
+            opened.run("((one) => one.id || one.name || one.dataset.part || one.tagName)(document.activeElement)")
+        )
+        outline = opened.run("getComputedStyle(document.activeElement).outlineStyle")
+        assert outline == "solid" or reached[-1] == "BODY", reached
+        opened.press("Tab")
+    wanted = (
+        "model",
+        "seed",
+        "count",
+        "temperature",
+        "SUMMARY",
+        "generate",
+        "file",
+        "complete",
+        "mode",
+        "npz",
+        "remove",
+    )
+    assert set(wanted) <= set(reached)
+    nodes = opened.send("Accessibility.getFullAXTree")["nodes"]
+    kinds = ("button", "spinbutton", "combobox", "slider", "checkbox", "img", "image")
+    controls = [one for one in nodes if not one.get("ignored") and one["role"]["value"] in kinds]
+    assert len(controls) > 15
+    assert all(one.get("name", {}).get("value") for one in controls)
+
+
+# The command.
+
+
+class Idle(Work):
+    """Draws nothing."""
+
+    def __init__(self, *_: object) -> None:
+        self.models, self.limits = [], LIMITS
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+
+def test_the_command_says_where_and_to_whom(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["serve"]) == 2
+    assert "none in runs" in capsys.readouterr().err
+    made("marginal")[0].save(tmp_path / "runs" / "tiny")
+    (tmp_path / "runs" / "tiny" / "model.safetensors").write_bytes(b"no weights")
+    assert main(["serve", "--port", "0"]) == 2, "told by the process that draws"
+    assert re.fullmatch(r"lidargrit serve: got \S*model.safetensors.*; wanted .*; .*\n", capsys.readouterr().err)
+    monkeypatch.setattr(server, "Work", Idle)
+    monkeypatch.setattr(TcpWSGIServer, "run", lambda self: None)
+    assert main(["serve", "--port", "0", "--host", "0.0.0.0"]) == 0
+    said = capsys.readouterr().out
+    assert said.startswith("WARNING: everybody who reaches 0.0.0.0 can use this machine")
+    assert re.search(r"open http://0\.0\.0\.0:\d+ in a browser", said)
+    for wrong in (["--seconds", "-1"], ["--port", "99999"], ["--host", "no.such.host.invalid", "--port", "0"]):
+        assert main(["serve", *wrong]) == 2
+        assert capsys.readouterr().err.startswith("lidargrit serve: got ")

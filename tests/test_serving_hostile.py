@@ -1,0 +1,237 @@
+"""Clients of the page that is served who mean no good, or are many: each is answered in one line, and it goes on."""
+
+import io
+import json
+import os
+import pickle
+import re
+import signal
+import threading
+import time
+import urllib.parse
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lidargrit.serving.application import is_own
+from served import LIMITS, running
+
+QUICK = {"steps": 3, "resamples": 2}
+LONG = {"model": 2, "count": 8, "sampling": {"steps": 1024}}
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory):
+    with running(tmp_path_factory.mktemp("runs")) as served:
+        yield served
+
+
+def upload(served, path: Path, wish: dict) -> str:
+    words = urllib.parse.quote(json.dumps({"name": path.name, **wish}))
+    return served.take(f"/complete?wish={words}", path.read_bytes())
+
+
+def test_every_answer_forbids_what_it_does_not_need(served):
+    for path in ("/", "/page.js", "/page.css", "/models", "/nothing"):
+        status, headers, body = served.ask(path)
+        assert status == (404 if path == "/nothing" else 200)
+        assert headers["Content-Security-Policy"].startswith("default-src 'none'; script-src 'self'; style-src 'self'")
+        assert headers["X-Content-Type-Options"] == "nosniff"
+        assert "Access-Control-Allow-Origin" not in headers
+        assert b"http://" not in body
+        assert b"https://" not in body
+    assert b"<script>" not in served.ask("/")[2]
+
+
+@pytest.mark.parametrize(
+    "host",
+    ["evil.example", "evil.example:8000", "127.0.0.1.evil.example", "localhost.evil", "", "[::1", "a b", "127.0.0.2"],
+)
+def test_a_name_that_somebody_else_made_lead_here_is_refused(served, host):
+    for path in ("/", "/models"):
+        assert served.refused(path, Host=host)[0] in (400, 403)
+    assert served.refused("/generate", {}, Host=host, Origin=f"http://{host}")[0] in (400, 403)
+
+
+def test_which_names_are_our_own():
+    for host in ("127.0.0.1", "localhost:9000", "[::1]:8000", "LOCALHOST"):
+        assert is_own(host, "127.0.0.1")
+    assert not is_own("192.168.0.7", "127.0.0.1")
+    assert is_own("192.168.0.7:8000", "0.0.0.0")
+    assert is_own("box.lan", "box.lan")
+    assert not is_own("evil.example", "0.0.0.0")
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "", "https://127.0.0.1", "http://127.0.0.1:1"])
+def test_a_wish_from_another_page_is_refused(served, origin):
+    for path in ("/generate", "/complete"):
+        assert served.refused(path, {}, Origin=origin)[0] == 403
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/../page.js",
+        "/page.js/..",
+        "/%2e%2e/%2e%2e/etc/passwd",
+        "/..%2f..%2fetc%2fpasswd",
+        "//etc/passwd",
+        "/etc/passwd",
+        "/browser/serve.html",
+        "/jobs/../models",
+        "/jobs/%00",
+        "/jobs/x/0-0.ply",
+        "/jobs/" + "x" * 5000,
+        "/C:%5Cx",
+        "/.git",
+    ],
+)
+def test_paths_lead_nowhere_else(served, path):
+    assert served.refused(path)[0] == 404
+
+
+def test_results_are_had_by_their_names_only(served):
+    job = served.take("/generate", {"model": 1, "count": 2})
+    assert served.ended(job)["state"] == "done"
+    assert served.ask(f"{job}/0-1.ply")[0] == 200
+    for name in ("0-2.ply", "1-0.ply", "0-0.pkl", "0-0.npz/..", "999-999.bin", "told.json", "../0-0.ply", "0--1.ply"):
+        assert served.ask(f"{job}/{name}")[0] == 404
+    for method in ("PUT", "DELETE", "OPTIONS", "HEAD", "TRACE"):
+        assert served.ask("/models", method=method)[0] == 405
+    assert served.refused("/models", {})[0] == 405
+
+
+def bombs() -> dict[str, bytes]:
+    """Return files that unpack to far more than they are, that are code, or that say what is not so."""
+    found = {
+        "code.npy": b"",
+        "zip.npz": b"",
+        "many.npz": b"",
+        "head.ply": b"ply\nformat ascii 1.0\nelement vertex 4000000\n",
+    }
+    with io.BytesIO() as buffer:
+        np.save(buffer, np.array([{"a": 1}], dtype=object), allow_pickle=True)
+        found["code.npy"] = buffer.getvalue()
+    found["pickle.npz"] = pickle.dumps({"points": 1})
+    points = io.BytesIO()
+    np.save(points, np.ones((8, 3), np.float32))
+    for name, sizes in (
+        ("zip.npz", {"points": 600_000_000}),
+        ("many.npz", {"points": 0, "i": 99_000_000, "I": 99_000_000}),
+    ):
+        with io.BytesIO() as buffer:
+            with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+                for member, size in sizes.items():
+                    with archive.open(f"{member}.npy", "w") as file:
+                        file.write(points.getvalue())
+                        for _ in range(size // 1_000_000):
+                            file.write(bytes(1_000_000))
+            found[name] = buffer.getvalue()
+    return found
+
+
+def test_hostile_files_are_refused_and_removed(served, tmp_path):
+    status = Path(f"/proc/{served.work._process._process.pid}/status")
+    jobs = {}
+    for name, data in bombs().items():
+        (tmp_path / name).write_bytes(data)
+        assert len(data) < LIMITS.upload_bytes
+        jobs[name] = upload(served, tmp_path / name, {"model": 2, "sampling": QUICK})
+        told = served.ended(jobs[name])
+        assert told["state"] == "failed", name
+        assert name in told["error"]
+        assert str(served.work._place) not in told["error"]
+        assert served.ask(f"{jobs[name]}/scans")[0] == 404
+    if status.exists():
+        most_kb = int(re.search(r"VmHWM:\s+(\d+)", status.read_text())[1])
+        assert most_kb < 1_500_000, "no more than the program takes anyway, and one array"
+    assert not list(served.work._place.rglob("upload*"))
+    assert served.ended(served.take("/generate", {"model": 1}))["state"] == "done", "the same process goes on"
+
+
+def test_too_much_is_cut_off_without_being_read(served):
+    head = f"POST /complete HTTP/1.1\r\nHost: {served.host}\r\nOrigin: {served.url}\r\n"
+    answer, seconds = served.say(f"{head}Content-Length: 99999999999\r\n\r\n".encode() + bytes(1000))
+    assert answer.startswith(b"HTTP/1.1 413")
+    chunk = b"100000\r\n" + bytes(0x100000) + b"\r\n"
+    answer, _ = served.say(f"{head}Transfer-Encoding: chunked\r\n\r\n".encode() + chunk * 5)
+    assert answer.startswith(b"HTTP/1.1 413") or not answer  # the last words may be lost where the line is cut
+    answer, _ = served.say(f"GET / HTTP/1.1\r\nHost: {served.host}\r\nX: {'x' * 20_000}\r\n\r\n".encode())
+    assert b" 431 " in answer[:20]
+    assert served.refused("/generate", {"seed": 1, "hidden": "x" * 5000})[0] == 400
+    assert served.refused("/complete?" + "wish={}&" * 400, b"x")[0] == 400
+    assert served.refused("/complete", b"x")[0] == 400
+    assert seconds < 5
+
+
+def test_quiet_clients_are_hung_up_on(served):
+    found = {}
+
+    def wait(name: str, data: bytes) -> None:
+        found[name] = served.say(data, 20.0)[1]
+
+    half = f"POST /generate HTTP/1.1\r\nHost: {served.host}\r\nOrigin: {served.url}\r\nContent-Length: 100\r\n\r\nhalf"
+    threads = [
+        threading.Thread(target=wait, args=one)
+        for one in (("none", b""), ("head", b"GET / HT"), ("half", half.encode()))
+    ]
+    for thread in threads:
+        thread.start()
+    assert served.ask("/models")[0] == 200, "others are served meanwhile"
+    for thread in threads:
+        thread.join()
+    assert len(found) == 3
+    assert max(found.values()) < 15
+
+
+def test_fifty_clients_at_once(served):
+    holding = served.take("/generate", LONG)
+    answers: list[int] = []
+
+    def client() -> None:
+        page = served.ask("/")[0]
+        wish, _, told = served.ask("/generate", {"model": 1})
+        assert page == 200
+        assert wish == 202 or b"others are waiting already" in told
+        answers.append(wish)
+
+    threads = [threading.Thread(target=client) for _ in range(50)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(answers) == [202] * LIMITS.waiting + [503] * (50 - LIMITS.waiting)
+    served.work.limits = replace(LIMITS, unheard_seconds=0.0)  # nobody asks for theirs
+    os.kill(served.work._process._process.pid, signal.SIGKILL)  # as when memory runs out
+    assert "ended the program" in served.ended(holding)["error"]
+    end = time.monotonic() + 20
+    while served.work._waiting:
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    served.work.limits = LIMITS
+    assert served.ended(served.take("/generate", {"model": 1}))["state"] == "done", "a new process draws"
+
+
+def test_what_takes_too_long_is_ended(served):
+    served.work.limits = replace(LIMITS, seconds=0.4)
+    told = served.ended(served.take("/generate", LONG))
+    served.work.limits = LIMITS
+    assert told["state"] == "failed"
+    assert "takes longer than 0.4 seconds" in told["error"]
+    assert told["seconds"] < 5
+
+
+def test_old_results_are_forgotten(served):
+    served.work.limits = replace(LIMITS, kept=2)
+    jobs = [
+        served.take("/generate", {"model": 9}) if False else served.take("/generate", {"model": 1}) for _ in range(4)
+    ]
+    for job in jobs:
+        served.ended(job)
+    last = served.take("/generate", {"model": 1})
+    assert [served.ask(job)[0] for job in jobs] == [404, 404, 200, 200]
+    served.ended(last)
+    served.work.limits = LIMITS
