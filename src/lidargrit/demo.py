@@ -1,28 +1,41 @@
-"""The main job from end to end: scans → range images → two trained networks → new scans → scores → pictures."""
+"""The main job from end to end: scans → range images → two trained networks → new scans → scores → one page."""
 
 from __future__ import annotations
 
+import json
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
+
+import torch
 
 from lidargrit.configuration import override
 from lidargrit.datasets import open_dataset
 from lidargrit.errors import DataError
 from lidargrit.evaluation.comparison import Settings, compare_sides
+from lidargrit.evaluation.intervals import Resampling
+from lidargrit.evaluation.reconstruction import ReconstructionErrors
 from lidargrit.evaluation.samples import read_samples, write_samples
 from lidargrit.evaluation.score import score_reconstruction
+from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.evaluation.sides import Side, Sides
-from lidargrit.files import write_json
-from lidargrit.generators import Generator
-from lidargrit.loading import DataConfig, RangeImages, load_range_images, spread
+from lidargrit.files import read_json, write_json
+from lidargrit.generators import Generator, load_class
+from lidargrit.loading import DataConfig, Pixels, Provenance, RangeImages, load_range_images, spread
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
-from lidargrit.training import train
+from lidargrit.structures import RangeImage
+from lidargrit.training import check_folder, train
 from lidargrit.viewer import draw_comparison
+from lidargrit.viewer.gathering import Shown
+from lidargrit.viewer.story import Story, write_story
 
-PICTURE = "scans_reconstructed_generated.png"
+PAGE, PICTURE, TIMINGS = "demo.html", "scans_reconstructed_generated.png", "timings.json"
 _NUM_SAMPLES = 16
 _MAX_SCANS = 400  # of the user's: more would not be seen in the demo's few minutes
+_SHOWN = 6  # of each set on the page: enough to step through, and half a megabyte each
 
 
 def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter) -> Path:
@@ -30,7 +43,7 @@ def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter
 
     Args:
         data: a folder of scans or another source; simulated scans if not given.
-        folder: becomes a run folder with ``samples``, ``evaluation.json`` and two pictures besides.
+        folder: becomes a run folder with ``demo.html``, ``samples``, ``evaluation.json`` and two pictures besides.
         settings: of the recipe, as ``--set`` takes them.
         reporter: hears of the progress.
     """
@@ -38,30 +51,82 @@ def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter
     if data is not None:
         recipe = replace(recipe, data=divided(data, reporter))
     recipe = override(recipe, settings)
+    check_folder(folder, recipe)
     reporter.message("lidargrit demo: about 9 minutes on two cores; stop it at any time, the same command goes on")
+    clock = _Clock(folder / TIMINGS)
+    with clock.stage("read the scans and project them" if data else "simulate scans and project them"):
+        real = load_range_images(recipe.data.train, recipe.data, reporter)
+        val = load_range_images(recipe.data.val, recipe.data, reporter)
     generator = train(recipe, folder, reporter)
-    val = load_range_images(recipe.data.val, recipe.data, reporter)
-    real = load_range_images(recipe.data.train, recipe.data, reporter)
-    seeds = range(_NUM_SAMPLES)
-    write_samples(generator, folder, folder / "samples", seeds, reporter=reporter)
+    for stage in generator.stages:
+        clock.add(f"train the {stage}", _trained_s(folder / stage / "log.jsonl"))
+    clock.keep()
+    with clock.stage(f"draw {_NUM_SAMPLES} new scans"):
+        write_samples(generator, folder, folder / "samples", range(_NUM_SAMPLES), reporter=reporter)
     samples = read_samples(folder / "samples", _NUM_SAMPLES)
-    reconstruction = score_reconstruction(generator.get_tokenizer(), val)
-    count = min(len(samples), len(real))
-    sides = Sides(Side("samples", samples, range(count)), Side("train", real, spread(count, len(real))))
-    card = compare_sides(sides, Settings(), reporter)
+    with clock.stage("score reconstruction and new scans"):
+        reconstruction = score_reconstruction(generator.get_tokenizer(), val)
+        cards = _cards(samples, val, real, reporter)
+    clock.keep()
     write_json(
         folder / "evaluation.json",
-        {"reconstruction_on_val": asdict(reconstruction), "generated_against_train": card.to_json()},
+        {"reconstruction_on_val": asdict(reconstruction), "generated_against_train": cards[0].to_json()},
     )
     reporter.message(
         f"reconstruction of {reconstruction.num_scans} scans never trained on: range error "
         f"{reconstruction.range_mae_m:.2f} m, mask accuracy {reconstruction.mask_accuracy:.3f}, dropped rays found "
         f"{reconstruction.drop_recall:.2f} with precision {reconstruction.drop_precision:.2f}"
     )
-    reporter.message(card.as_table())
+    reporter.message(cards[0].as_table())
     reporter.message("(figures of a few minutes on little data; they do not compare with published tables)")
-    _draw(generator, "real" if data else "simulated", val, samples, folder)
+    kind = "real" if data else "simulated"
+    _draw(generator, kind, val, samples, folder)
+    weights = sum(weight.numel() for weight in generator.parameters()) / 1e6
+    facts = (
+        f"LidarGRIT at a small size: {weights:.1f} million weights",
+        f"{len(real):,} {kind} scans to learn from and {len(val):,} held out, of the sensor {generator.sensor.name}",
+    )
+    tell(generator, kind, val, samples, reconstruction, cards, clock.seconds, facts, folder)
     return folder
+
+
+def tell(
+    generator: Generator,
+    kind: str,
+    val: RangeImages,
+    samples: RangeImages,
+    errors: ReconstructionErrors,
+    cards: tuple[Scorecard, Scorecard, Scorecard],
+    seconds: dict[str, float],
+    facts: tuple[str, ...],
+    folder: Path,
+) -> None:
+    """Write the page ``demo.html`` into a run's folder.
+
+    Args:
+        generator: with tokens.
+        kind: of the scans: "real" or "simulated".
+        val: held-out scans, of which the first is followed.
+        samples: what the generator wrote.
+        errors: of reconstruction.
+        cards: scores of the samples, of held-out scans and of single pixels, all against training scans.
+        seconds: that stages took.
+        facts: about model and training.
+        folder: of the run.
+    """
+    tokenizer, shown = generator.get_tokenizer(), val.batch(spread(_SHOWN, len(val)))
+    names = tuple(val.provenance.names[index].rpartition("/")[2] for index in spread(_SHOWN, len(val)))
+    with torch.no_grad():
+        tokens = tokenizer.encode(shown[:1])
+        decoded = tokenizer.decode_parts(tokens)
+        uniform = torch.rand(decoded.range_m.shape, generator=torch.Generator().manual_seed(0))
+        drawn = tokenizer.decode(tokens, "bernoulli", uniform)
+        again = generator.reconstruct(shown)
+    new = samples.batch(range(min(_SHOWN, len(samples))))
+    seeds = tuple(f"seed {seed}" for seed in range(len(new)))
+    sets = (Shown(f"{kind}, held out", shown, names), Shown("reconstructed", again, names), Shown("new", new, seeds))
+    told = errors, *cards, seconds, facts, folder
+    write_story(Story(kind, names[0], shown[:1], tokens, decoded, drawn, sets, *told), folder / PAGE)
 
 
 def divided(data: str, reporter: Reporter) -> DataConfig:
@@ -90,6 +155,72 @@ def divided(data: str, reporter: Reporter) -> DataConfig:
         )
         train, val = f"{place}:{split}[:85%]", f"{place}:{split}[85%:]"
     return DataConfig(train=(train,), val=(val,), sensor=dataset.sensor, max_scans=_MAX_SCANS)
+
+
+def _cards(
+    samples: RangeImages, val: RangeImages, real: RangeImages, reporter: Reporter
+) -> tuple[Scorecard, Scorecard, Scorecard]:
+    """Score new scans, held-out ones and those of single pixels, equally many of each, against training scans."""
+    marginal = load_class("marginal")
+    single = marginal(marginal.Config(), real.sensor)
+    single.learn(real)
+    count = min(len(samples), len(real))
+    pixels = RangeImages(real.sensor, [_Drawn(single.sample(range(count)))])
+    plain = Settings(resampling=Resampling(halves=0))
+    cards = []
+    for name, images, settings in (("samples", samples, Settings()), ("val", val, plain), ("marginal", pixels, plain)):
+        some = min(count, len(images))
+        sides = Sides(Side(name, images, spread(some, len(images))), Side("train", real, spread(some, len(real))))
+        cards.append(compare_sides(sides, settings, reporter if name == "samples" else None))
+    return cards[0], cards[1], cards[2]
+
+
+class _Drawn:
+    """Images in memory as a store."""
+
+    provenance = Provenance()
+
+    def __init__(self, images: RangeImage) -> None:
+        self._range_m = images.range_m.numpy()
+
+    def __len__(self) -> int:
+        return len(self._range_m)
+
+    def read(self, index: int) -> Pixels:
+        return self._range_m[index], None
+
+
+class _Clock:
+    """How long each stage took when it was first done, kept in a file: the same command again does none anew.
+
+    The file is written once there is a run beside it: a folder that holds anything else is refused.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.seconds: dict[str, float] = dict(read_json(path)) if path.is_file() else {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        begun = time.monotonic()
+        yield
+        self.add(name, time.monotonic() - begun)
+
+    def add(self, name: str, seconds: float) -> None:
+        self.seconds.setdefault(name, round(seconds, 1))
+
+    def keep(self) -> None:
+        write_json(self._path, self.seconds)
+
+
+def _trained_s(log: Path) -> float:
+    """Return how long a stage was trained, by its log, whose clock begins anew each time it goes on."""
+    before, total = 0.0, 0.0
+    for line in log.read_text(encoding="utf-8").splitlines():
+        seconds = float(json.loads(line)["seconds"])
+        total += seconds - before if seconds >= before else seconds
+        before = seconds
+    return total
 
 
 def _draw(generator: Generator, kind: str, val: RangeImages, samples: RangeImages, folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""Do everything once: scans, training, new scans, scores, pictures."""
+"""Do everything once: scans, training, new scans, scores, and one page that shows them."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run the demo and say where its results lie."""
-    from lidargrit.demo import PICTURE, demo
+    from lidargrit.demo import PAGE, demo
     from lidargrit.reporting import TerminalReporter
 
     out = options.out or Path("runs") / (
         "demo" if not options.data else f"demo-{Path(options.data.rpartition(':')[0] or options.data).resolve().name}"
     )
     folder = demo(options.data, out, options.set, TerminalReporter())
-    print(f"done: look at {folder / PICTURE}; everything lies in {folder}")
+    print(f"done: look at {folder / PAGE}; everything lies in {folder}")

@@ -72,7 +72,7 @@ def page(shown: Sequence[Shown]) -> str:
         raise ConfigError(
             f"{len(shown)} groups of scans side by side", f"1 to {SOURCES_AT_MOST}", "name fewer, or make two pages"
         )
-    script = scripts() + _read("open.js")
+    script = opening_script()
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     coarsest_m = max(_far_m(one) for one in shown) / _RANGE_STEPS
     precision = f"Ranges are kept here in steps of {1000 * coarsest_m:.1f} mm. Written by lidargrit {__version__}."
@@ -83,7 +83,7 @@ def page(shown: Sequence[Shown]) -> str:
         "script": script,
         # No other script runs, and nothing is fetched, whatever a file name may hold.
         "script_hash": f"sha256-{digest}",
-        "scans": json.dumps(told(shown)).replace("<", "\\u003c"),
+        "scans": as_json(shown),
     }
     return filled(_read("page.html"), parts)
 
@@ -91,6 +91,16 @@ def page(shown: Sequence[Shown]) -> str:
 def scripts() -> str:
     """Return what every page runs that shows scans; it begins to show them when told to by ``new Page``."""
     return '"use strict";\n' + "\n".join(_read(name) for name in _SCRIPTS) + "\n"
+
+
+def opening_script() -> str:
+    """Return the script of a page that holds its own scans, as the JSON of an element called ``scans``."""
+    return scripts() + _read("open.js")
+
+
+def as_json(shown: Sequence[Shown]) -> str:
+    """Return groups of scans as they stand inside a page: no name in them can end their element."""
+    return json.dumps(told(shown)).replace("<", "\\u003c")
 
 
 def style() -> str:

@@ -15,11 +15,19 @@ _CHART_WIDE, _CHART_TALL = 720, 260
 _LEFT, _RIGHT, _TOP, _BOTTOM = 48, 12, 12, 40
 
 
-def score_chart(score: Score) -> str:
-    """Draw a score as a dot on its interval, from 0, with the floor as an upright line; a screen reader hears it."""
-    value, interval, floor = score.result.value, score.interval, score.floor
+def score_chart(score: Score, floor: float | None = None, ceiling: float | None = None) -> str:
+    """Draw a score as a dot on its interval, from 0, with the floor as an upright line; a screen reader hears it.
+
+    Args:
+        score: with the floor that its evaluation found, if it has one.
+        floor: in place of that.
+        ceiling: drawn as a square.
+    """
+    value, interval = score.result.value, score.interval
+    if floor is None and score.floor is not None:
+        floor = score.floor.value
     low, high = (interval.low, interval.high) if interval else (value, value)
-    marks = [low, high, value, *([floor.value] if floor else [])]
+    marks = [low, high, value, *(mark for mark in (floor, ceiling) if mark is not None)]
     if not np.isfinite(marks).all():
         return ""
     first, last = min(0.0, *marks), max(0.0, *marks)
@@ -35,17 +43,30 @@ def score_chart(score: Score) -> str:
     if interval:
         told += f", 95 % interval {figure(low)} to {figure(high)}"
         parts.append(f'<line class="interval" x1="{x(low):.1f}" y1="{middle}" x2="{x(high):.1f}" y2="{middle}"/>')
-    if floor:
-        told += f", floor {figure(floor.value)}"
-        parts.append(
-            f'<line class="floor" x1="{x(floor.value):.1f}" y1="4" x2="{x(floor.value):.1f}" y2="{_TALL - 4}"/>'
-        )
+    if floor is not None:
+        told += f", floor {figure(floor)}"
+        parts.append(f'<line class="floor" x1="{x(floor):.1f}" y1="4" x2="{x(floor):.1f}" y2="{_TALL - 4}"/>')
+    if ceiling is not None:
+        told += f", ceiling {figure(ceiling)}"
+        parts.append(f'<rect class="ceiling" x="{x(ceiling) - 5:.1f}" y="{middle - 5}" width="10" height="10"/>')
     parts.append(f'<circle class="dot" cx="{x(value):.1f}" cy="{middle}" r="5"/>')
     return (
         f'<svg viewBox="0 0 {_WIDE} {_TALL}" width="{_WIDE}" height="{_TALL}" role="img" aria-label="{escape(told)}">'
         + "".join(parts)
         + "</svg>"
     )
+
+
+def bar_chart(bars: Mapping[str, float], unit: str) -> str:
+    """Draw amounts as bars below one another, each with its name before and its figure behind it."""
+    highest = max([*bars.values(), 1e-9])
+    rows = "".join(
+        f'<tr><th scope="row">{escape(name)}</th><td><svg viewBox="0 0 {_WIDE} 14" width="{_WIDE}" height="14" '
+        f'aria-hidden="true"><rect class="bar" width="{max(value / highest * _WIDE, 1):.1f}" height="14" rx="2"/></svg>'
+        f'</td><td class="number">{value:,.1f} {escape(unit)}</td></tr>'
+        for name, value in bars.items()
+    )
+    return f"<table><tbody>{rows}</tbody></table>"
 
 
 def line_chart(lines: Mapping[str, Float[np.ndarray, " n"]], x_label: str, y_label: str, x_ticks: Sequence[int]) -> str:

@@ -33,6 +33,11 @@ def rate_picture(rate: Float[np.ndarray, "H W"]) -> Picture:
     return _picture(_bytes(colormaps["cividis"](Normalize(0, 1)(rate))[..., :3]), (_WIDE, _TALL))
 
 
+def colour_picture(colours: Float[np.ndarray, "H W 3"]) -> Picture:
+    """Draw red, green and blue from 0 to 1."""
+    return _picture(_bytes(colours), (_WIDE, _TALL))
+
+
 def density_picture(density: Float[np.ndarray, "x y"], highest: float) -> Picture:
     """Draw a density seen from above, forward up and left to the left; roots of densities, so that far cells show."""
     colours = colormaps["magma"](PowerNorm(0.4, 0, max(highest, 1e-9), clip=True)(_upright(density)))[..., :3]

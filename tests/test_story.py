@@ -1,0 +1,110 @@
+"""The page of the demo: a scan, its tokens and what comes of them, as it is written and as a browser shows it."""
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from browser import CHROMIUM, Browser
+from lidargrit import demo
+from lidargrit.evaluation.score import score_reconstruction
+from lidargrit.loading import Provenance, RangeImages
+from lidargrit.reporting import Reporter
+from lidargrit.viewer.report_charts import score_chart
+from test_generator_contract import SENSOR, Store, made
+
+SECONDS = {"simulate": 3.0, "train the tokenizer": 154.1}
+
+
+class Named(Store):
+    """Scans whose names would do harm if they were HTML."""
+
+    provenance = Provenance(tuple(f"drive/<b>{index}</b></script>" for index in range(12)))
+
+
+@pytest.fixture(scope="module")
+def cards():
+    images = RangeImages(SENSOR, [Store()])
+    generator = made("lidargrit")[0]
+    drawn = RangeImages(SENSOR, [demo._Drawn(generator.sample(range(12)))])
+    return drawn, demo._cards(drawn, images, images, Reporter())
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory, cards) -> Path:
+    folder = tmp_path_factory.mktemp("run")
+    generator, val = made("lidargrit")[0], RangeImages(SENSOR, [Named()])
+    errors = score_reconstruction(generator.get_tokenizer(), val)
+    demo.tell(generator, "simulated", val, *cards[:1], errors, cards[1], SECONDS, ("a <fact>",), folder)
+    return folder / "demo.html"
+
+
+def test_scores_have_a_floor_and_a_ceiling(cards):
+    drawn, (card, floor, ceiling) = cards
+    assert [one.samples.source for one in (card, floor, ceiling)] == ["samples", "val", "marginal"]
+    assert {one.reference.sha256 for one in (card, floor, ceiling)} == {card.reference.sha256}, "one reference for all"
+    for score, low in zip(card.scores, floor.scores, strict=True):
+        assert low.result.value <= max(score.result.value, 1e-9), "the reference itself, which nothing can beat"
+    drawing = score_chart(card.scores[0], 0.25, 9.0)
+    assert "floor 0.2500, ceiling 9.0000" in drawing
+    assert 'class="ceiling"' not in score_chart(card.scores[0])
+    assert 'class="floor"' in score_chart(card.scores[0])
+    assert 'class="floor"' not in score_chart(replace(card.scores[0], floor=None))
+    assert len(drawn) == 12
+
+
+def test_the_page_tells_all_of_it_and_fetches_nothing(written, cards):
+    text = written.read_text(encoding="utf-8")
+    titles = re.findall(r"<h2>(.*?)</h2>", text)
+    assert [title[:2] for title in titles] == ["1.", "2.", "3.", "4.", "5.", "6.", "7.", "An"]
+    assert not re.search(r"https?://|src=\"(?!data:)|@import|url\(", text)
+    assert text.count("</script>") == 2, "names cannot end a script"
+    assert "<b>0</b>" not in text
+    assert "a &lt;fact&gt;" in text
+    assert "154.1 s" in text
+    generator = made("lidargrit")[0]
+    tokens = generator.get_tokenizer().encode(RangeImages(SENSOR, [Store()]).batch([0])).tokens[0]
+    shown = [int(number) for number in re.findall(r'text-anchor="middle" style="fill:#\w+">(\d+)</text>', text)]
+    assert shown == tokens[1:7].flatten().tolist(), "the middle six of eight rows, as numbers"
+    assert text.count('<th scope="row">') == len(cards[1][0].scores) + len(SECONDS)
+
+
+def test_a_browser_shows_it(written, tmp_path):
+    if CHROMIUM is None:
+        pytest.skip("needs Chromium")
+    browser = Browser(tmp_path)
+    try:
+        browser.open(written)
+        names = browser.run("[...document.querySelectorAll('[data-part=name]')].map((one) => one.textContent)")
+        assert names == ["simulated, held out", "reconstructed", "new"]
+        for which in range(3):
+            for canvas in (".cloud", ".image"):
+                picture = browser.screenshot(canvas, which)
+                assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 20
+        assert browser.run("[...document.images].every((one) => one.complete && one.naturalWidth > 0)")
+        assert browser.run("document.documentElement.scrollWidth <= innerWidth")
+        browser.run("document.querySelector('#next').scrollIntoView()")
+        browser.click("#next")
+        assert browser.run("document.querySelector('#counter').textContent") == "Scan 2 of 6"
+        assert browser.troubles() == []
+        assert browser.requests() == []
+    finally:
+        browser.close()
+
+
+def test_times_are_those_of_the_first_time(tmp_path):
+    log = tmp_path / "log.jsonl"
+    log.write_text("".join(json.dumps({"seconds": one}) + "\n" for one in (3.0, 5.5, 1.0, 4.0)))
+    assert demo._trained_s(log) == 9.5, "stopped after 5.5 s, and 4 s more"
+    clock = demo._Clock(tmp_path / "timings.json")
+    with clock.stage("a"):
+        pass
+    clock.add("b", 7.04)
+    assert not (tmp_path / "timings.json").exists(), "a folder that is not ours is left as it is"
+    clock.keep()
+    again = demo._Clock(tmp_path / "timings.json")
+    again.add("b", 100.0)
+    assert again.seconds["b"] == 7.0
