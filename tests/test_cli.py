@@ -248,7 +248,14 @@ def test_demo_tells_the_whole_story_and_tells_it_again(tmp_path, typed):
     words = ("demo", "--out", tmp_path / "demo", "--set", *TINY)
     assert f"done: look at {tmp_path / 'demo'}" in typed(*words)
     before = contents(tmp_path / "demo")
-    for name in ("demo.html", "timings.json", "scans_reconstructed_generated.png", "generated.png", "samples/00000015.npz", "model.safetensors"):
+    for name in (
+        "demo.html",
+        "timings.json",
+        "scans_reconstructed_generated.png",
+        "generated.png",
+        "samples/00000015.npz",
+        "model.safetensors",
+    ):
         assert name in before
     evaluation = json.loads(before["evaluation.json"])
     assert evaluation["reconstruction_on_val"]["num_scans"] == 2
