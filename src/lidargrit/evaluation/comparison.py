@@ -61,6 +61,21 @@ class Settings:
         if self.max_scans < 0 or self.seed < 0:
             raise ConfigError(f"-n {self.max_scans}, --seed {self.seed}", "0 or more", "correct the number")
 
+    def facts(self) -> dict[str, Any]:
+        """Return what the scorecard tells of them, as plain values."""
+        return {
+            "metrics": list(self.metrics),
+            "variant": self.variant,
+            "projection_variant": self.projection_variant or load_protocol(self.protocol).variant,
+            "max_scans": self.max_scans,
+            "seed": self.seed,
+            "resampling": asdict(self.resampling),
+            "weights": {name: str(path) for name, path in self.weights.items()},
+            "samples_format": self.samples_format,
+            "bad_points": self.data.bad_points,
+            "bad_scans": self.data.bad_scans,
+        }
+
 
 def compare_sources(
     samples: str, reference: str, settings: Settings | None = None, reporter: Reporter | None = None
@@ -79,6 +94,12 @@ def compare_sources(
         LidarGritError: not one metric could be computed; what the first said.
     """
     settings, reporter = settings or Settings(), reporter or Reporter()
+    sides = open_both(samples, reference, settings, reporter)
+    return compare_sides(sides, settings, reporter), sides
+
+
+def open_both(samples: str, reference: str, settings: Settings, reporter: Reporter) -> Sides:
+    """Open the two sets of :func:`compare_sources`, and say what there is to say against comparing them."""
     protocol = load_protocol(settings.protocol)
     choices(protocol, settings)  # refuses unknown names before scans are projected
     variant = settings.projection_variant or protocol.variant
@@ -86,7 +107,7 @@ def compare_sources(
     sides = open_sides(samples, reference, protocol, config, settings.samples_format, reporter)
     for warning in sides.warnings:
         reporter.message(f"WARNING: {warning}")
-    return compare_sides(sides, settings, reporter), sides
+    return sides
 
 
 def compare_sides(sides: Sides, settings: Settings, reporter: Reporter | None = None) -> Scorecard:
@@ -125,18 +146,7 @@ def compare_sides(sides: Sides, settings: Settings, reporter: Reporter | None = 
         tuple(left_out),
         sides.deviations,
         tuple(warnings),
-        {
-            "metrics": list(settings.metrics),
-            "variant": settings.variant,
-            "projection_variant": settings.projection_variant or protocol.variant,
-            "max_scans": settings.max_scans,
-            "seed": settings.seed,
-            "resampling": asdict(settings.resampling),
-            "weights": {name: str(path) for name, path in settings.weights.items()},
-            "samples_format": settings.samples_format,
-            "bad_points": settings.data.bad_points,
-            "bad_scans": settings.data.bad_scans,
-        },
+        settings.facts(),
         {
             "lidargrit": __version__,
             "python": platform.python_version(),

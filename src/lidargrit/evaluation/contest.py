@@ -11,13 +11,15 @@ from typing import Any
 
 import torch
 
+from lidargrit import __version__
 from lidargrit.configuration import override
 from lidargrit.datasets import open_dataset
 from lidargrit.errors import ConfigError
-from lidargrit.evaluation.comparison import Settings, choices, compare_sources
-from lidargrit.evaluation.protocols import load_protocol
+from lidargrit.evaluation.comparison import Settings, choices, compare_sides, open_both
+from lidargrit.evaluation.protocols import load_protocol, public_name
 from lidargrit.evaluation.samples import write_samples
 from lidargrit.evaluation.score import holds_images
+from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.evaluation.tables import Format, side_by_side
 from lidargrit.files import read_json, write_json
 from lidargrit.generators import Generator, is_run, load, load_class
@@ -64,7 +66,7 @@ def hold(systems: Sequence[str], folder: Path, contest: Contest, reporter: Repor
         systems: each a recipe's name or the folder of a finished run, and after a colon, if wanted, how it is drawn
             from: ``r2dm_small:steps=32``. A recipe is trained once, in how many ways ever it is drawn from.
         folder: gets a run folder ``runs/RECIPE``, and for each system ``SYSTEM/samples``, ``SYSTEM/SYSTEM.json`` with
-            its scores and ``SYSTEM/costs.json``. What is there is not made again.
+            its scores and ``SYSTEM/costs.json``. What is there is not made again, nor scored again.
         contest: what all have in common.
         reporter: hears of the progress.
 
@@ -94,11 +96,10 @@ def hold(systems: Sequence[str], folder: Path, contest: Contest, reporter: Repor
         generator.to("cuda" if torch.cuda.is_available() else "cpu")
         seconds = _sample(generator, plan.run, folder / name / "samples", plan.sampling, contest, reporter)
         _write_costs(folder / name / COSTS, plan.recipe, generator, plan.sampling, seconds, contest.num_samples)
-        card, _ = compare_sources(str(folder / name / "samples"), contest.reference, settings, reporter)
+        scores.append(folder / name / f"{name}.json")
+        card = _score(str(folder / name / "samples"), contest.reference, settings, scores[-1], reporter)
         if card.samples.scans_used < contest.num_samples:
             reporter.message(f"WARNING: {contest.reference} has but {card.samples.scans_used} scans to compare with")
-        scores.append(folder / name / f"{name}.json")
-        write_json(scores[-1], card.to_json())
     return scores
 
 
@@ -154,6 +155,21 @@ def _sample(
     write_samples(generator, run, folder, range(contest.num_samples), sampling, contest.batch_size, reporter)
     drawn = contest.num_samples - before
     return (time.perf_counter() - begun) / drawn if drawn > 0 else None
+
+
+def _score(samples: str, reference: str, settings: Settings, path: Path, reporter: Reporter) -> Scorecard:
+    """Return the scores of a file, if they are of these very images by these settings; else score, and write it."""
+    sides = open_both(samples, reference, settings, reporter)
+    told = (settings.facts(), sides.samples.facts(), sides.reference.facts(), __version__)
+    wanted = (public_name(settings.protocol), *told)
+    if path.is_file():
+        there = Scorecard.read(path)
+        if (there.protocol, there.settings, there.samples, there.reference, there.versions.get("lidargrit")) == wanted:
+            reporter.message(f"scores are there already; remove {path} to score again")
+            return there
+    card = compare_sides(sides, settings, reporter)
+    write_json(path, card.to_json())
+    return card
 
 
 def _write_costs(

@@ -1,8 +1,19 @@
 """One loop, one optimiser, one checkpoint, whatever the model: recipe → run folder."""
 
-from lidargrit.training.compute import training_flops, with_budget
+from lidargrit.training.compute import estimated_training_flops, gpu_time, training_flops, with_budget
 from lidargrit.training.measure import measure
 from lidargrit.training.run import check_folder, plan, train
 from lidargrit.training.settings import FitConfig, Recipe
 
-__all__ = ["FitConfig", "Recipe", "check_folder", "measure", "plan", "train", "training_flops", "with_budget"]
+__all__ = [
+    "FitConfig",
+    "Recipe",
+    "check_folder",
+    "estimated_training_flops",
+    "gpu_time",
+    "measure",
+    "plan",
+    "train",
+    "training_flops",
+    "with_budget",
+]

@@ -11,6 +11,7 @@ from torch.utils.module_tracker import ModuleTracker
 
 from lidargrit.errors import ConfigError
 from lidargrit.generators import load_class
+from lidargrit.nn.precision import Precision
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 from lidargrit.training.engine import Engine
@@ -19,6 +20,9 @@ from lidargrit.training.settings import FitConfig, Recipe
 
 _SCANS = 2  # of a counted batch: some objectives compare the scans of a batch, so one alone would not do
 _STEPS = 16  # counted of players who take turns: some of their terms come in every 16th step only
+_A100_FP32_FLOPS_PER_S, _A100_BF16_FLOPS_PER_S = 19.5e12, 312e12
+_SHARE = 0.25  # of a card's peak: a guess for networks as small as these; few scans at once reach less
+_STRIP = 16  # columns: as often as the deepest of our networks halves them
 
 
 def training_flops(recipe: Recipe) -> dict[str, int]:
@@ -27,14 +31,68 @@ def training_flops(recipe: Recipe) -> dict[str, int]:
     Products and convolutions are counted as they are called, two operations for a multiplication with its addition, on
     a few steps with scans that return everywhere at 10 m. Validation and optimiser are left out.
     """
+    return _counted(recipe, recipe.data.load_sensor())
+
+
+def estimated_training_flops(recipe: Recipe) -> dict[str, int]:
+    """Return what :func:`training_flops` does, in seconds and little memory also where images are large.
+
+    A layer's operations grow with the columns of the image, attention's with their square: so those of one, two and
+    three narrow strips of it tell those of the whole, but for layers of R2DM that are made by the number of columns
+    (3 % too much).
+    """
+    sensor = recipe.data.load_sensor()
+    strips = sensor.width / _STRIP
+    if strips <= 6 or sensor.width % _STRIP:
+        return training_flops(recipe)
+    try:
+        narrow = [_counted(recipe, _strip(sensor, number * _STRIP)) for number in (1, 2, 3)]
+    except ConfigError:  # a network that halves the columns more often
+        return training_flops(recipe)
+    # The parabola through three points at 1, 2 and 3 (Lagrange).
+    weights = ((strips - 2) * (strips - 3) / 2, -(strips - 1) * (strips - 3), (strips - 1) * (strips - 2) / 2)
+    return {
+        stage: round(sum(weight * one[stage] for weight, one in zip(weights, narrow, strict=True)))
+        for stage in narrow[0]
+    }
+
+
+def _counted(recipe: Recipe, sensor: SensorModel) -> dict[str, int]:
     with torch.random.fork_rng(range(torch.cuda.device_count())):
         torch.manual_seed(0)
-        generator = load_class(recipe.generator)(recipe.model, recipe.data.load_sensor())
+        generator = load_class(recipe.generator)(recipe.model, sensor)
         found = {}
         for stage in generator.stages:
             config = recipe.training[stage]
-            found[stage] = round(_flops_per_scan(generator.objective(stage), config, recipe) * config.scans)
+            found[stage] = round(_flops_per_scan(generator.objective(stage), config, sensor) * config.scans)
         return found
+
+
+def _strip(sensor: SensorModel, columns: int) -> SensorModel:
+    elevation = sensor.elevation_rad
+    kept = elevation if elevation.shape[1] == 1 else elevation[:, :columns]
+    return replace(sensor, elevation_rad=kept, azimuth_rad=sensor.azimuth_rad[:, :columns])
+
+
+def gpu_time(flops: int, precision: Precision) -> str:
+    """Return the operations and an estimate of the time that a GPU of the paper's day takes for them, for a person.
+
+    Source:
+        Peaks of the card without sparsity: NVIDIA A100 datasheet, 2021.
+    """
+    kind, peak = ("fp32", _A100_FP32_FLOPS_PER_S) if precision == "fp32" else ("bf16", _A100_BF16_FLOPS_PER_S)
+    return (
+        f"{flops:.2e} floating-point operations, by estimate {duration(flops / (_SHARE * peak))} of one A100 "
+        f"at {_SHARE:.0%} of its {peak / 1e12:g} TFLOP/s in {kind}"
+    )
+
+
+def duration(seconds: float) -> str:
+    """Return a time in the unit that suits it, for a person."""
+    for unit, length in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if seconds >= 2 * length:
+            return f"{seconds / length:.1f} {unit}"
+    return f"{seconds:.2g} s" if seconds < 10 else f"{seconds:.0f} s"
 
 
 def with_budget(recipe: Recipe, flops: float) -> Recipe:
@@ -74,8 +132,8 @@ def same_everywhere(sensor: SensorModel, count: int) -> RangeImage:
     return RangeImage(range_m, torch.ones_like(range_m, dtype=torch.bool), sensor, torch.full_like(range_m, 0.3))
 
 
-def _flops_per_scan(objective: torch.nn.Module, config: FitConfig, recipe: Recipe) -> float:
-    images = same_everywhere(recipe.data.load_sensor(), _SCANS)
+def _flops_per_scan(objective: torch.nn.Module, config: FitConfig, sensor: SensorModel) -> float:
+    images = same_everywhere(sensor, _SCANS)
     engine = Engine("fp32", hasattr(objective, "phases"))
     engine.set_up(objective, make_optimiser(objective, config))
     steps = _STEPS if hasattr(objective, "phases") else 1

@@ -7,7 +7,7 @@ import time
 import torch
 
 from lidargrit.generators import load_class
-from lidargrit.training.compute import same_everywhere, training_flops
+from lidargrit.training.compute import duration, same_everywhere, training_flops
 from lidargrit.training.engine import Engine
 from lidargrit.training.optimiser import make_optimiser
 from lidargrit.training.settings import Recipe
@@ -38,13 +38,6 @@ def measure(recipe: Recipe) -> str:
             per_s = _TIMED_STEPS * config.batch_size / (time.perf_counter() - begun)
             lines.append(
                 f"{stage}: {flops[stage]:.2e} floating-point operations at {per_s:.3g} scans/s: "
-                f"{_duration(config.scans / per_s)} on {engine.device}, {engine.peak_gib():.1f} GiB"
+                f"{duration(config.scans / per_s)} on {engine.device}, {engine.peak_gib():.1f} GiB"
             )
     return "\n".join(lines)
-
-
-def _duration(seconds: float) -> str:
-    for unit, length in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
-        if seconds >= 2 * length:
-            return f"{seconds / length:.1f} {unit}"
-    return f"{seconds:.0f} s"

@@ -24,6 +24,7 @@ from lidargrit.loading import RangeImages, load_range_images, seed_of
 from lidargrit.reporting import Reporter
 from lidargrit.tokenizers import Tokenizer
 from lidargrit.training.checkpoint import fingerprint
+from lidargrit.training.compute import estimated_training_flops, gpu_time
 from lidargrit.training.engine import Engine
 from lidargrit.training.fit import Fit
 from lidargrit.training.optimiser import memory_of_weights
@@ -94,7 +95,7 @@ def _draw(
 
 
 def plan(recipe: Recipe) -> str:
-    """Return what a recipe would do, as lines for a person: every setting by its name, sizes and budgets."""
+    """Return what a recipe would do, as lines for a person: every setting, sizes, budgets and estimated cost."""
     sensor = recipe.data.load_sensor()
     generator = load_class(recipe.generator)(recipe.model, sensor)
     lines = [recipe.title, f"published: {recipe.published}" if recipe.published else "published: no figure", ""]
@@ -108,6 +109,8 @@ def plan(recipe: Recipe) -> str:
             f"{stage}: {count:,} parameters, {budget.scans:,} scans in batches of {budget.batch_size}, "
             f"{memory_of_weights(objective) / 2**20:,.0f} MiB of memory besides activations"
         )
+    for stage, flops in estimated_training_flops(recipe).items():
+        lines.append(f"{stage}: {gpu_time(flops, recipe.training[stage].precision)}")
     return "\n".join(lines)
 
 

@@ -1,0 +1,50 @@
+"""Measure a table of the paper anew: prepare, train, sample, score, and set beside the published rows."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+EXAMPLES = """\
+  lidargrit reproduce 3 simulated ablation --small                 a small counterpart, a quarter of an hour
+  lidargrit reproduce 3 /data/kitti_odometry ablation --dry-run    what it would do and cost
+  lidargrit reproduce 1 /data/KITTI-360 table1                     weeks of a GPU; the same command goes on
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Name the options."""
+    parser.add_argument("table", type=int, help="1, 2 or 3, as the paper numbers them")
+    parser.add_argument("root", help="of KITTI-360 (1) or KITTI odometry (2, 3), or the word simulated")
+    parser.add_argument("out", type=Path, help="folder of runs, samples and scores; the same command goes on there")
+    small = "the small recipes, at equal compute, without metrics that need published weights"
+    parser.add_argument("--small", action="store_true", help=small)
+    count = "samples of each system (default: the paper's 5,000; 64 with --small)"
+    parser.add_argument("-n", "--count", type=int, default=0, help=count)
+    budget = "operations that the training of each takes (default: each recipe's own budget; 5e13 with --small)"
+    parser.add_argument("--flops", type=float, help=budget)
+    settings = "settings of every recipe, such as data.workers=16"
+    parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help=settings)
+    parser.add_argument("--batch-size", type=int, default=8, help="scans drawn at once (default: 8)")
+    parser.add_argument("--format", choices=["text", "markdown", "latex"], default="text", help="of the table")
+    parser.add_argument("--dry-run", action="store_true", help="say what would be done and what it costs, and stop")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Reproduce, or tell the plan."""
+    from lidargrit.evaluation.reproduction import Reproduction, plan, reproduce
+    from lidargrit.reporting import TerminalReporter
+
+    wanted = Reproduction(
+        options.table,
+        options.root,
+        options.small,
+        options.count,
+        options.flops,
+        tuple(options.set),
+        options.batch_size,
+    )
+    if options.dry_run:
+        print(plan(wanted, options.out))
+        return
+    print(reproduce(wanted, options.out, TerminalReporter(), options.format))

@@ -1,0 +1,223 @@
+"""A table of the paper, a folder of scans → its systems prepared, trained, sampled, scored; goes on where it stopped."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from lidargrit.datasets import open_dataset
+from lidargrit.errors import ConfigError
+from lidargrit.evaluation.comparison import Settings
+from lidargrit.evaluation.contest import Contest, as_table, hold
+from lidargrit.evaluation.protocols import load_protocol
+from lidargrit.evaluation.score import open_images
+from lidargrit.evaluation.tables import Format
+from lidargrit.generators import is_run, load_class
+from lidargrit.loading import load_range_images
+from lidargrit.metrics import load_metric
+from lidargrit.recipes import load_recipe
+from lidargrit.reporting import Reporter
+from lidargrit.training import Recipe, estimated_training_flops, gpu_time, with_budget
+
+SIMULATED = "simulated"  # in place of a root
+_SIMULATED_SCANS = {"train": 300, "val": 16}  # the demo's: a few minutes of simulating
+_SMALL_FLOPS, _SMALL_COUNT = 5e13, 64  # some minutes of two cores for each system
+
+
+@dataclass(frozen=True)
+class PaperTable:
+    """One table of the paper.
+
+    Args:
+        title: what it compares.
+        protocol: by which its figures are measured.
+        data_set: whose scans.
+        train: split to learn from; ``val`` and ``test`` are called so, and share no drive with it or with each other.
+        images: settings that make the protocol's images of the data set's scans.
+        small_images: the same with fewer columns.
+        rows: the paper's name of each row that there are recipes for: of its size, and a small one.
+        missing: the others, and why.
+        remarks: what a reader of the measured rows must know.
+    """
+
+    title: str
+    protocol: str
+    data_set: str
+    train: str
+    rows: Mapping[str, tuple[str, str]]
+    images: tuple[str, ...] = ()
+    small_images: tuple[str, ...] = ()
+    missing: Mapping[str, str] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
+
+
+_KITTI_360_IMAGES = ("data.sensor=hdl64e_kitti_360", "data.columns=2048", "data.column_stride=2")
+
+TABLES = {
+    1: PaperTable(
+        "systems on KITTI-360",
+        "lidargrit_kitti_360",
+        "kitti_360",
+        "train_without_val",
+        {"R2DM": ("r2dm_kitti_360", "r2dm_small"), "LidarGRIT": ("lidargrit_kitti_360", "small")},
+        _KITTI_360_IMAGES,
+        (*_KITTI_360_IMAGES[:2], "data.column_stride=8"),
+        {
+            "LiDARGen": "no generator here; its own samples can be scored (lidargrit evaluate)",
+            "UltraLiDAR (unofficial program)": "no generator here, and its voxels make no range image",
+        },
+        ("R2DM learns here from the images that it is scored against; the paper's were projected otherwise",),
+    ),
+    2: PaperTable(
+        "systems on KITTI odometry",
+        "lidargrit_kitti_odometry",
+        "kitti_odometry",
+        "train",
+        {
+            "DUSty": ("dusty_kitti_odometry", "dusty_small"),
+            "LidarGRIT": ("lidargrit_kitti_odometry", "small"),
+        },
+        missing={"LidarGAN": "no generator here; nearest is the plain GAN beneath DUSty (model.variant=baseline)"},
+    ),
+    3: PaperTable(
+        "ablation on KITTI odometry",
+        "lidargrit_kitti_odometry",
+        "kitti_odometry",
+        "train",
+        {
+            "without geometric preservation and raydrop loss": ("ablation_neither", "ablation_neither_small"),
+            "with raydrop loss": ("ablation_raydrop", "ablation_raydrop_small"),
+            "with both": ("lidargrit_kitti_odometry", "ablation_both_small"),
+        },
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Reproduction:
+    """What is wanted of a table.
+
+    Args:
+        number: of the table, 1 to 3.
+        root: of its data set, or ``simulated`` for simulated streets.
+        small: by the small recipes, images of 64x256, and only the metrics that need no published weights.
+        count: samples of each system, compared with as many scans; 0 for 5,000, or 64 if small.
+        flops: what the training of each takes; None for the recipes' own budgets, or, if small, 5e13 for each.
+        settings: of every recipe, besides the table's own.
+        batch_size: scans drawn at once.
+    """
+
+    number: int
+    root: str
+    small: bool = False
+    count: int = 0
+    flops: float | None = None
+    settings: tuple[str, ...] = ()
+    batch_size: int = 8
+
+    def __post_init__(self) -> None:
+        if self.number not in TABLES:
+            raise ConfigError(f"table {self.number}", f"one of {', '.join(map(str, TABLES))}", "choose one")
+
+    @property
+    def table(self) -> PaperTable:
+        """The table."""
+        return TABLES[self.number]
+
+    def systems(self) -> dict[str, str]:
+        """Return the recipe of each row."""
+        return {row: recipes[self.small] for row, recipes in self.table.rows.items()}
+
+    def contest(self) -> Contest:
+        """Return what all rows have in common."""
+        protocol = load_protocol(self.table.protocol)
+        count = self.count or (_SMALL_COUNT if self.small else protocol.num_scans)
+        split = {"train": self.table.train}
+        train, val = (f"data.{part}={json.dumps([self.source(split.get(part, part))])}" for part in ("train", "val"))
+        images = self.table.small_images if self.small else self.table.images
+        images = () if self.root == SIMULATED else images
+        metrics = tuple(c.metric for c in protocol.choices if not load_metric(c.metric).needs_weights)
+        flops = self.flops if self.flops is not None else _SMALL_FLOPS if self.small else 0.0
+        return Contest(
+            reference=f"simulated:{count}:test" if self.root == SIMULATED else self.source("test"),
+            num_samples=count,
+            settings=Settings(protocol=self.table.protocol, metrics=metrics if self.small else ()),
+            recipe_settings=(train, val, *images, f"data.variant={protocol.variant}", *self.settings),
+            flops=flops,
+            batch_size=self.batch_size,
+        )
+
+    def source(self, split: str) -> str:
+        """Return where the scans of a split come from."""
+        if self.root == SIMULATED:
+            part = "train" if split == self.table.train else split
+            return f"simulated:{_SIMULATED_SCANS[part]}:{part}"
+        return f"{self.table.data_set}:{self.root}:{split}"
+
+
+def reproduce(wanted: Reproduction, folder: Path, reporter: Reporter | None = None, form: Format = "text") -> str:
+    """Prepare, train, sample and score every row that there is a recipe for, and return the table.
+
+    Args:
+        wanted: the table, and on what.
+        folder: as that of :func:`lidargrit.evaluation.contest.hold`. The same call goes on there: prepared scans (in
+            the cache), checkpoints, samples and scores are not made again.
+        reporter: hears of the progress.
+        form: of the table.
+
+    Raises:
+        DataError: the root does not hold the data set, or a split of it.
+    """
+    reporter = reporter or Reporter()
+    contest, systems = wanted.contest(), wanted.systems()
+    _prepare(contest, list(systems.values()), reporter)
+    scores = hold(list(systems.values()), folder, contest, reporter)
+    return "\n\n".join((as_table(scores, form), *_words(wanted)))
+
+
+def plan(wanted: Reproduction, folder: Path) -> str:
+    """Return what :func:`reproduce` would do and what it would cost, as lines for a person."""
+    contest, table = wanted.contest(), wanted.table
+    recipes = {system: _recipe(system, contest) for system in wanted.systems().values()}
+    data = next(iter(recipes.values())).data
+    counted = {source: len(open_dataset(source)) for source in (*data.train, *data.val, contest.reference)}
+    lines = [f"table {wanted.number} of the paper: {table.title}, protocol {table.protocol}", ""]
+    lines += [f"prepare {source}: {count:,} scans" for source, count in counted.items()]
+    for system, recipe in recipes.items():
+        run = folder / "runs" / system
+        done = "finished" if is_run(run) else "begun" if run.exists() else "to do"
+        generator = load_class(recipe.generator)(recipe.model, recipe.data.load_sensor())
+        cost = generator.cost()
+        lines += ["", f"train {system} ({done}), {recipe.published or 'no published figure'}"]
+        for stage, flops in estimated_training_flops(recipe).items():
+            config = recipe.training[stage]
+            lines.append(f"  {stage}: {config.scans:,} scans, {gpu_time(flops, config.precision)}")
+        operations = f"{cost.flops * contest.num_samples:.2g} floating-point operations"
+        lines.append(f"  sample {contest.num_samples:,} scans: {operations}")
+    return "\n".join([*lines, "", *_words(wanted)])
+
+
+def _recipe(system: str, contest: Contest) -> Recipe:
+    recipe = load_recipe(system, contest.recipe_settings)
+    return with_budget(recipe, contest.flops) if contest.flops else recipe
+
+
+def _prepare(contest: Contest, systems: list[str], reporter: Reporter) -> None:
+    """Project everything before anything is trained: a scan that cannot be used is told now, not after days."""
+    protocol = load_protocol(contest.settings.protocol)
+    for system in systems:
+        data = load_recipe(system, contest.recipe_settings).data
+        load_range_images(data.train, data, reporter)
+        load_range_images(data.val, data, reporter)
+        at_most = min(contest.num_samples, protocol.num_scans)
+        config = replace(contest.settings.data, variant=protocol.variant, max_scans=at_most)
+        open_images(contest.reference, data.load_sensor(), config, reporter)
+
+
+def _words(wanted: Reproduction) -> list[str]:
+    """Return which row is which, and which of the paper's are not here."""
+    lines = [f"the paper's row {row!r} is measured by {system}" for row, system in wanted.systems().items()]
+    lines += [f"not available: {row}: {why}" for row, why in wanted.table.missing.items()]
+    return ["\n".join([*lines, *wanted.table.remarks])]

@@ -1,0 +1,125 @@
+"""The paper's tables from scans to rows: which rows, killed and taken up again, told beforehand."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from lidargrit.cli import main
+from lidargrit.datasets import load
+from lidargrit.errors import ConfigError
+from lidargrit.evaluation import reproduction
+from lidargrit.evaluation.reproduction import TABLES, Reproduction
+from lidargrit.evaluation.tables import published
+from lidargrit.recipes import load_recipe
+from lidargrit.training import train
+from tiny_runs import LONG, MODEL, SIMULATED
+
+NUMBER_OF_SCANS = "4"
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path_factory, monkeypatch):
+    monkeypatch.setenv("LIDARGRIT_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
+
+
+def words_for(folder: Path, *more: str) -> list[str]:
+    few = ["-n", NUMBER_OF_SCANS, "--flops", "0"]
+    return ["reproduce", "3", "simulated", str(folder), "--small", *few, *more, "--set", *MODEL, *SIMULATED, *LONG]
+
+
+def test_a_killed_reproduction_goes_on_and_ends_with_the_table(tmp_path, capsys):
+    folder = tmp_path / "ablation"
+    second = folder / "runs" / "ablation_raydrop_small" / "tokenizer" / "checkpoint.safetensors"
+    command = [sys.executable, "-m", "lidargrit", *words_for(folder)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=dict(os.environ))
+    until = time.monotonic() + 200
+    while not second.exists() and process.poll() is None and time.monotonic() < until:
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    assert process.wait() == -signal.SIGKILL
+    assert second.exists()
+    assert not (folder / "runs" / "ablation_both_small").exists()
+    first = folder / "ablation_neither_small" / "ablation_neither_small.json"
+    scored = first.stat().st_mtime_ns
+
+    assert main(words_for(folder)) == 0
+    told = capsys.readouterr()
+    assert first.stat().st_mtime_ns == scored
+    assert "scores are there already" in told.err
+    for row in ("ablation_neither_small", "ablation_raydrop_small", "ablation_both_small"):
+        assert f"\n{row} " in told.out
+    for metric in ("sliced_wasserstein", "minimum_matching_distance", "point_cloud_jsd"):
+        assert f"{metric} (reference)" in told.out
+    assert "Published figures of lidargrit_kitti_odometry\nleft out, for they do not compare: 4 of the" in told.out
+    assert "61.73" not in told.out
+    assert "the paper's row 'with both' is measured by ablation_both_small" in told.out
+
+    # The killed run went on as if it had not been.
+    recipe = load_recipe("ablation_raydrop_small", reproduction_of(folder).contest().recipe_settings)
+    train(recipe, tmp_path / "whole")
+    weights = [
+        (run / "model.safetensors").read_bytes() for run in (tmp_path / "whole", folder / "runs" / second.parts[-3])
+    ]
+    assert weights[0] == weights[1]
+
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
+    assert main(words_for(folder)) == 0
+    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()} == before
+
+
+def reproduction_of(folder: Path) -> Reproduction:
+    return Reproduction(3, "simulated", small=True, count=4, flops=0.0, settings=(*MODEL, *SIMULATED, *LONG))
+
+
+@pytest.mark.parametrize("number", TABLES)
+def test_every_row_of_the_paper_is_measured_or_said_to_be_missing(number):
+    told, table = published()[number - 1], TABLES[number]
+    assert f"table {number}" in told["source"]
+    assert told["protocol"] == table.protocol
+    assert {row["system"] for row in told["rows"]} == {*table.rows, *table.missing}
+    for recipe, small in table.rows.values():
+        assert "simulated" in load_recipe(small).data.train[0]
+        assert load_recipe(recipe).published
+
+
+@pytest.mark.parametrize("number", TABLES)
+def test_images_are_those_that_the_protocol_wants(number):
+    protocol = reproduction.load_protocol(TABLES[number].protocol)
+    wanted = Reproduction(number, "root")
+    for system in wanted.systems().values():
+        data = load_recipe(system, wanted.contest().recipe_settings).data
+        assert data.load_sensor().same_rays(protocol.load_sensor())
+        assert data.variant == protocol.variant
+    assert wanted.contest().num_samples == protocol.num_scans
+    assert wanted.contest().settings.metrics == ()
+
+
+def test_a_plan_tells_scans_cost_and_what_is_missing(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(reproduction, "estimated_training_flops", lambda recipe: dict.fromkeys(recipe.training, 10**18))
+    load("kitti_360").write_example(tmp_path / "root", 1)
+    (scan,) = (tmp_path / "root").rglob("*.bin")
+    for drive in ("0003", "0005"):
+        other = Path(str(scan).replace("drive_0000", f"drive_{drive}"))
+        other.parent.mkdir(parents=True)
+        other.write_bytes(scan.read_bytes())
+    assert main(["reproduce", "1", str(tmp_path / "root"), str(tmp_path / "out"), "--dry-run"]) == 0
+    told = capsys.readouterr().out
+    for split in ("train_without_val", "val", "test"):
+        assert f"prepare kitti_360:{tmp_path / 'root'}:{split}: 1 scans" in told
+    assert "train r2dm_kitti_360 (to do)" in told
+    assert "1.00e+18 floating-point operations, by estimate" in told
+    assert "sample 5,000 scans" in told
+    assert "not available: LiDARGen" in told
+    assert not (tmp_path / "out").exists()
+
+
+def test_another_number_and_another_place_are_refused(tmp_path, capsys):
+    with pytest.raises(ConfigError, match="one of 1, 2, 3"):
+        Reproduction(4, "simulated")
+    assert main(["reproduce", "2", str(tmp_path), str(tmp_path / "out"), "--dry-run"]) == 2
+    assert "KITTI odometry" in capsys.readouterr().err
