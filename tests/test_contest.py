@@ -13,7 +13,8 @@ from lidargrit.evaluation.intervals import Resampling
 from lidargrit.generators import load_class
 from lidargrit.nn.flops import flops_of
 from lidargrit.recipes import load_recipe
-from lidargrit.training import training_flops, with_budget
+from lidargrit.training import estimated_training_flops, gpu_time, training_flops, with_budget
+from tiny_runs import MODEL
 
 FEW = ("data.train=simulated:6:train", "data.val=simulated:2:val", "data.columns=512", "data.column_stride=8")
 QUICK = Settings(metrics=("bev_jsd",), resampling=Resampling(groups=4, halves=2))
@@ -116,3 +117,12 @@ def test_attention_counts_in_training_flops():
     attention = 3 * sizes.layers * 4 * sizes.width * tokens**2
     encoding = flops_of(generator.tokenizer.encoder, (1, 1, recipe.data.load_sensor().height, 64))
     assert flops / scans == pytest.approx(products + attention + encoding, rel=0.05)
+
+
+def test_narrow_strips_tell_the_operations_of_the_whole_image():
+    recipe = load_recipe("demo", (*MODEL, "data.columns=1024"))  # 64x128, eight strips
+    assert estimated_training_flops(recipe) == pytest.approx(training_flops(recipe), rel=1e-6)
+    deep = load_recipe("demo", (*MODEL, "data.columns=1024", "model.tokenizer.channel_multipliers=[1,1,1,1,1,1]"))
+    assert estimated_training_flops(deep) == training_flops(deep)  # no strip can be halved so often
+    assert "3.9 days of one A100 at 25%" in gpu_time(1643 * 10**15, "fp32")
+    assert "13 s of one A100" in gpu_time(10**15, "auto")

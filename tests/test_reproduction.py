@@ -17,9 +17,13 @@ from lidargrit.evaluation.reproduction import TABLES, Reproduction
 from lidargrit.evaluation.tables import published
 from lidargrit.recipes import load_recipe
 from lidargrit.training import train
-from tiny_runs import LONG, MODEL, SIMULATED
+from tiny_runs import MODEL, SIMULATED
 
-NUMBER_OF_SCANS = "4"
+STEPS = [  # 4 and 2 of them, a checkpoint after each
+    *[f"training.{stage}.scans=16" for stage in ("tokenizer", "transformer")],
+    "training.tokenizer.checkpoint_every=4",
+    "training.transformer.checkpoint_every=8",
+]
 
 
 @pytest.fixture(autouse=True)
@@ -28,8 +32,8 @@ def cache(tmp_path_factory, monkeypatch):
 
 
 def words_for(folder: Path, *more: str) -> list[str]:
-    few = ["-n", NUMBER_OF_SCANS, "--flops", "0"]
-    return ["reproduce", "3", "simulated", str(folder), "--small", *few, *more, "--set", *MODEL, *SIMULATED, *LONG]
+    few = ["-n", "4", "--flops", "0"]
+    return ["reproduce", "3", "simulated", str(folder), "--small", *few, *more, "--set", *MODEL, *SIMULATED, *STEPS]
 
 
 def test_a_killed_reproduction_goes_on_and_ends_with_the_table(tmp_path, capsys):
@@ -73,7 +77,7 @@ def test_a_killed_reproduction_goes_on_and_ends_with_the_table(tmp_path, capsys)
 
 
 def reproduction_of(folder: Path) -> Reproduction:
-    return Reproduction(3, "simulated", small=True, count=4, flops=0.0, settings=(*MODEL, *SIMULATED, *LONG))
+    return Reproduction(3, "simulated", small=True, count=4, flops=0.0, settings=(*MODEL, *SIMULATED, *STEPS))
 
 
 @pytest.mark.parametrize("number", TABLES)

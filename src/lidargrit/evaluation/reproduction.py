@@ -1,4 +1,4 @@
-"""A table of the paper, a folder of scans → its systems prepared, trained, sampled, scored; goes on where it stopped."""
+"""A table of the paper, a folder of scans → its systems prepared, trained, sampled, scored; goes on where stopped."""
 
 from __future__ import annotations
 
