@@ -12,6 +12,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from lidargrit.nn.blocks import Block
+
 Padding = Literal["zero", "wrap"]
 
 
@@ -84,7 +86,7 @@ def group_norm(channels: int) -> nn.GroupNorm:
     return nn.GroupNorm(32, channels, eps=1e-6)
 
 
-class ResidualBlock(nn.Module):
+class ResidualBlock(Block):
     """Norm, swish, convolution, twice, plus the input (through a 1x1 convolution if the channels change).
 
     Source:

@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from lidargrit.errors import ConfigError
+from lidargrit.nn.blocks import Block, Network
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ class TransformerConfig:
                 raise ConfigError(f"{name}={getattr(self, name)}", "a share in [0, 1)", "lower it")
 
 
-class Transformer(nn.Module):
+class Transformer(Network):
     """Pre-norm blocks, learned positions, exact GELU, an untied head without bias.
 
     Args:
@@ -116,7 +117,7 @@ class _Attention(nn.Module):
         return self.proj(mixed.transpose(1, 2).flatten(-2))
 
 
-class _Block(nn.Module):
+class _Block(Block):
     def __init__(self, config: TransformerConfig, causal: bool) -> None:
         super().__init__()
         self.ln1, self.ln2 = nn.LayerNorm(config.width), nn.LayerNorm(config.width)

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from lidargrit.errors import ConfigError
+from lidargrit.nn.blocks import Block, Network
 from lidargrit.nn.convolution import Convolution
 
 Layer = TypeVar("Layer", bound=nn.Module)
@@ -66,7 +67,7 @@ class UnetConfig:
         return any(width % self.attention_heads for width in self.widths()[-2:])
 
 
-class EfficientUnet(nn.Module):
+class EfficientUnet(Network):
     """Predicts noise in range images; azimuth wraps, and every pixel is told where its ray looks.
 
     Args:
@@ -179,7 +180,7 @@ class _Level(nn.Module):
         return self.upsample(self.self_attn_block(x))
 
 
-class _Residual(nn.Module):
+class _Residual(Block):
     def __init__(self, config: UnetConfig, inputs: int, outputs: int) -> None:
         super().__init__()
         self.norm1 = nn.GroupNorm(config.norm_groups, inputs, _EPSILON)

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from lidargrit.errors import ConfigError
+from lidargrit.nn.blocks import Network
 from lidargrit.nn.convolution import (
     Convolution,
     Downsample,
@@ -90,7 +91,7 @@ class VqvaeConfig:
             raise ConfigError(f"dropout={self.dropout}", "a share in [0, 1)", "lower it")
 
 
-class Encoder(nn.Module):
+class Encoder(Network):
     """Encoded range (B, 1, H, W) → latents (B, code_dim, h, w)."""
 
     def __init__(self, config: VqvaeConfig) -> None:
@@ -125,7 +126,7 @@ class Encoder(nn.Module):
         return self.conv_out(F.silu(self.norm_out(x)))
 
 
-class Decoder(nn.Module):
+class Decoder(Network):
     """Latents (B, code_dim, h, w) → encoded range before tanh, and return logits if there is a raydrop head."""
 
     def __init__(self, config: VqvaeConfig) -> None:

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from lidargrit.errors import ConfigError, Terminated, TrainingError
 from lidargrit.loading import Batches, RangeImages, seed_of, spread
+from lidargrit.nn.blocks import prepare_for_training
 from lidargrit.reporting import Reporter
 from lidargrit.structures import RangeImage
 from lidargrit.training.checkpoint import load_checkpoint, remove_half_written, save_checkpoint
@@ -55,6 +56,7 @@ class Fit:
         takes_turns = hasattr(self.objective, "phases")
         self.engine = Engine(self.config.precision, takes_turns)
         _check_parts(self.config, self.engine.world_size, takes_turns)
+        prepare_for_training(self.objective, self.config.recompute, self.config.compile)
         self.optimiser = make_optimiser(self.objective, self.config)
         self.engine.set_up(self.objective, self.optimiser)
         self.average = WeightAverage(self.objective, self.config.average_over_scans)

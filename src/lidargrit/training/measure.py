@@ -7,6 +7,7 @@ import time
 import torch
 
 from lidargrit.generators import load_class
+from lidargrit.nn.blocks import prepare_for_training
 from lidargrit.training.compute import duration, same_everywhere, training_flops
 from lidargrit.training.engine import Engine
 from lidargrit.training.optimiser import make_optimiser
@@ -27,6 +28,7 @@ def measure(recipe: Recipe) -> str:
         lines = []
         for stage in generator.stages:
             config, objective = recipe.training[stage], generator.objective(stage)
+            prepare_for_training(objective, config.recompute, config.compile)
             engine = Engine(config.precision, hasattr(objective, "phases"))
             engine.set_up(objective, make_optimiser(objective, config))
             images = same_everywhere(recipe.data.load_sensor(), config.batch_size // engine.world_size)

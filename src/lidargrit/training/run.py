@@ -141,7 +141,10 @@ def check_folder(folder: Path, recipe: Recipe) -> None:
                 f"{folder}, whose weights were {about['origin']}", "a run of train's", "choose another folder"
             )
         mine, other = configuration.leaves(ours), configuration.leaves(theirs)
-        differing = [name for name in mine.keys() | other.keys() if mine.get(name) != other.get(name)]
+        # A setting that there was not yet when the run began was off.
+        differing = [
+            name for name in mine.keys() | other.keys() if (mine.get(name) or None) != (other.get(name) or None)
+        ]
         if differing:
             name = sorted(differing)[0]
             raise OutputError(

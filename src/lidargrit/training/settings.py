@@ -29,6 +29,9 @@ class FitConfig:
         average_over_scans: half-life of the moving average of the weights that is sampled and scored; 0 for none.
         precision: ``bf16`` runs convolutions and products in 16 bits, sums and losses in 32; ``auto`` does so where the
             machine has instructions for it, for elsewhere it is many times slower.
+        recompute: drop the activations within blocks, and compute them again for the gradients: less memory, the same
+            gradients, about a third more operations.
+        compile: by ``torch.compile``, which needs a C++ compiler, and minutes before the first step.
         augmentations: see lidargrit.augmentation.
         any_columns: where the sensor keeps every n-th column, begin at any of the first n each time a scan is seen: n
             times as many images of the same scans. The reference always keeps the first.
@@ -49,6 +52,8 @@ class FitConfig:
     average_over_scans: int = 1000
     accumulate: int = 1
     precision: Literal["fp32", "bf16", "auto"] = "fp32"
+    recompute: bool = False
+    compile: bool = False
     augmentations: tuple[Augmentation, ...] = ()
     any_columns: bool = False
     validate_every: int = 1000

@@ -1,0 +1,143 @@
+"""Activations computed twice, and compiled networks: the same gradients, less memory, the same bits after a break."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+from lidargrit.errors import ConfigError
+from lidargrit.generators import load_class
+from lidargrit.nn.blocks import Block, Network, prepare_for_training
+from lidargrit.recipes import load_recipe
+from lidargrit.training import FitConfig, train
+from lidargrit.training.compute import same_everywhere
+from tiny_runs import LONG, MODEL, SIMULATED
+
+SETTINGS = (
+    *MODEL,
+    "model.tokenizer.dropout=0.2",
+    *[f"model.transformer.{part}_dropout=0.2" for part in ("embedding", "residual", "attention")],
+)
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path_factory, monkeypatch):
+    monkeypatch.setenv("LIDARGRIT_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
+
+
+def gradients(objective: nn.Module) -> tuple[list[torch.Tensor], int]:
+    """Take one step and return the gradients, and the bytes that were kept for them."""
+    kept: dict[int, int] = {}
+
+    def keep(tensor: torch.Tensor) -> torch.Tensor:
+        kept[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
+        return tensor
+
+    torch.manual_seed(1)
+    images = same_everywhere(objective.sensor, 2)
+    with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
+        loss = objective.train()(images, torch.Generator().manual_seed(2))["loss"]
+        bytes_kept = sum(kept.values())
+    loss.backward()
+    found = [parameter.grad for parameter in objective.parameters() if parameter.grad is not None]
+    objective.zero_grad()
+    return found, bytes_kept
+
+
+def objective_of(recipe: str, stage: str, *settings: str) -> nn.Module:
+    torch.manual_seed(0)
+    loaded = load_recipe(recipe, settings)
+    return load_class(loaded.generator)(loaded.model, loaded.data.load_sensor()).objective(stage)
+
+
+OBJECTIVES = [
+    ("demo", "tokenizer", *SETTINGS),
+    ("demo", "transformer", *SETTINGS, "model.transformer.layers=3"),
+    ("r2dm_small", "diffusion", "data.columns=512", "data.column_stride=8"),
+]
+
+
+@pytest.mark.parametrize("words", OBJECTIVES, ids=lambda words: words[1])
+def test_recomputed_gradients_are_the_same_and_take_less_memory(words):
+    plain, recomputed = objective_of(*words), objective_of(*words)
+    prepare_for_training(recomputed, recompute=True, compiled=False)
+    assert plain.state_dict().keys() == recomputed.state_dict().keys()
+    (wanted, kept), (got, kept_less) = gradients(plain), gradients(recomputed)
+    assert len(wanted) == len(got) > 10
+    assert all(torch.equal(one, other) for one, other in zip(wanted, got, strict=True))
+    assert kept_less < 0.8 * kept
+
+
+def test_what_has_no_blocks_says_so():
+    recipe = load_recipe("dusty_small")
+    objective = load_class("dusty")(recipe.model, recipe.data.load_sensor()).objective("adversarial")
+    for choice in ((True, False), (False, True)):
+        with pytest.raises(ConfigError, match=r"=true for \w+, which cannot"):
+            prepare_for_training(objective, *choice)
+
+
+def trace_in_place_of_compiling() -> list[str]:
+    """Trace networks as the compiler does, and run the trace: no C++ compiler, no minutes."""
+    compiled = []
+
+    def compile_(module: nn.Module) -> None:
+        compiled.append(type(module).__name__)
+        module._compiled_call_impl = torch.compile(module._call_impl, backend="eager")
+
+    nn.Module.compile = compile_
+    return compiled
+
+
+def check_traces() -> None:
+    """Every network is one that the compiler takes as a whole, and its gradients are the same."""
+    compiled = trace_in_place_of_compiling()
+    for words in OBJECTIVES:
+        plain, traced = objective_of(*words), objective_of(*words)
+        before = len(compiled)
+        prepare_for_training(traced, recompute=False, compiled=True)
+        assert len(compiled) > before
+        (wanted, _), (got, _) = gradients(plain), gradients(traced)
+        for one, other in zip(wanted, got, strict=True):
+            torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-6)
+        assert not torch._dynamo.utils.counters["graph_break"], torch._dynamo.utils.counters["graph_break"]
+
+
+def check_resuming(folder: Path) -> None:
+    """A run that recomputes and compiles goes on as if it had not been stopped."""
+    trace_in_place_of_compiling()
+    stages = ("tokenizer", "transformer")
+    both = [f"training.{stage}.{choice}=true" for stage in stages for choice in ("recompute", "compile")]
+    steps = ["training.tokenizer.scans=8", "training.transformer.scans=16", "training.transformer.pictures_every=8"]
+    recipe = load_recipe("demo", (*SETTINGS, *SIMULATED, *LONG, *both, *steps))
+    train(recipe, folder / "whole")
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):  # within the second stage
+        train(recipe, folder / "broken", draw=stop)
+    train(recipe, folder / "broken")
+    weights = [(folder / run / "model.safetensors").read_bytes() for run in ("whole", "broken")]
+    assert weights[0] == weights[1]
+
+
+def test_compiled_networks_have_the_same_gradients_and_resume(tmp_path):
+    """In a process of its own: the type checks of tests are nothing for the compiler."""
+    script = "import sys, test_blocks; from pathlib import Path; test_blocks.check_traces(); "
+    script += "test_blocks.check_resuming(Path(sys.argv[1]))"
+    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    command = [sys.executable, "-c", script, str(tmp_path)]
+    ended = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path}, check=False)
+    assert ended.returncode == 0, ended.stderr[-3000:]
+
+
+def test_both_are_off_unless_asked_for():
+    config = FitConfig(scans=1, batch_size=1, learning_rate=1.0)
+    assert not config.recompute
+    assert not config.compile
+    assert not Block().recomputed
+    assert Network()._compiled_call_impl is None
