@@ -21,6 +21,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help=settings)
     parser.add_argument("--dry-run", action="store_true", help="say what would be done, with every setting, and stop")
     measuring = "as --dry-run, and also take a few steps, and foretell operations, time and memory"
+    tracking = "also log to this project of Weights & Biases (pip install 'lidargrit[wandb]')"
+    parser.add_argument("--wandb", default="", metavar="PROJECT", help=tracking)
     parser.add_argument("--measure", action="store_true", help=measuring)
 
 
@@ -28,7 +30,7 @@ def run(options: argparse.Namespace) -> None:
     """Train, or tell the plan."""
     from lidargrit.recipes import load_recipe
     from lidargrit.reporting import TerminalReporter
-    from lidargrit.training import measure, plan, train
+    from lidargrit.training import measure, plan, tracked, train
     from lidargrit.viewer import draw_progress
 
     recipe = load_recipe(options.recipe, options.set)
@@ -37,5 +39,6 @@ def run(options: argparse.Namespace) -> None:
         if options.measure:
             print(measure(recipe))
         return
-    train(recipe, options.out, TerminalReporter(), draw_progress)
+    with tracked(options.wandb, recipe, options.out):
+        train(recipe, options.out, TerminalReporter(), draw_progress)
     print(f"done: the model lies in {options.out}; sample it with: lidargrit sample {options.out} samples -n 16")

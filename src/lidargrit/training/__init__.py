@@ -4,6 +4,7 @@ from lidargrit.training.compute import estimated_training_flops, gpu_time, train
 from lidargrit.training.measure import measure
 from lidargrit.training.run import check_folder, plan, train
 from lidargrit.training.settings import FitConfig, Recipe
+from lidargrit.training.tracking import tracked
 
 __all__ = [
     "FitConfig",
@@ -13,6 +14,7 @@ __all__ = [
     "gpu_time",
     "measure",
     "plan",
+    "tracked",
     "train",
     "training_flops",
     "with_budget",

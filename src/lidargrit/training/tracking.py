@@ -1,0 +1,51 @@
+"""A run's TensorBoard files → a project on Weights & Biases, by its own synchronisation."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from lidargrit import configuration
+from lidargrit.errors import ConfigError
+from lidargrit.loading import place_among
+from lidargrit.training.settings import Recipe
+
+
+@contextmanager
+def tracked(project: str, recipe: Recipe, folder: Path) -> Iterator[None]:
+    """Send what is logged meanwhile to a project; a run that goes on is the same run there. Nothing if "".
+
+    Raises:
+        ConfigError: the package is missing, or the service refuses.
+    """
+    if not project or place_among(None, None)[0] > 0:  # of several processes the first one logs
+        yield
+        return
+    wanted, cure = "the package wandb", "pip install 'lidargrit[wandb]', or leave --wandb out"
+    try:
+        wandb = importlib.import_module("wandb")  # an extra: nothing else needs it
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        run = wandb.init(
+            project=project,
+            name=folder.name,
+            id=hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:16],
+            resume="allow",
+            config=configuration.to_json(recipe),
+            dir=folder.parent,
+            sync_tensorboard=True,
+        )
+    except ImportError:
+        raise ConfigError(f"--wandb {project}, and no wandb", wanted, cure) from None
+    except Exception as error:  # its client has many kinds, from a missing key to a broken line, and changes them
+        told = f"{type(error).__name__}: {str(error).partition(chr(10))[0][:100]}"
+        cure = "log in with: wandb login, or set WANDB_MODE=offline"
+        raise ConfigError(f"--wandb {project}, where {told}", "a project that can be written to", cure) from None
+    failed = 1
+    try:
+        yield
+        failed = 0
+    finally:
+        run.finish(exit_code=failed)
