@@ -1,21 +1,23 @@
 """Activations computed twice, and compiled networks: the same gradients, less memory, the same bits after a break."""
 
+import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from torch import nn
 
-from lidargrit.errors import ConfigError
+from lidargrit.errors import ConfigError, OutputError
 from lidargrit.generators import load_class
 from lidargrit.nn.blocks import Block, Network, prepare_for_training
 from lidargrit.recipes import load_recipe
 from lidargrit.training import FitConfig, train
 from lidargrit.training.compute import same_everywhere
-from tiny_runs import LONG, MODEL, SIMULATED
+from tiny_runs import LONG, MODEL, SHORT, SIMULATED
 
 SETTINGS = (
     *MODEL,
@@ -133,6 +135,19 @@ def test_compiled_networks_have_the_same_gradients_and_resume(tmp_path):
     command = [sys.executable, "-c", script, str(tmp_path)]
     ended = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path}, check=False)
     assert ended.returncode == 0, ended.stderr[-3000:]
+
+
+def test_a_run_from_before_there_was_the_choice_goes_on(tmp_path):
+    recipe = load_recipe("demo", (*MODEL, *SIMULATED, *SHORT))
+    train(recipe, tmp_path)
+    about = json.loads((tmp_path / "run.json").read_text())
+    for stage in about["recipe"]["training"].values():
+        del stage["recompute"], stage["compile"]
+    (tmp_path / "run.json").write_text(json.dumps(about))
+    train(recipe, tmp_path)
+    on = replace(recipe.training["tokenizer"], recompute=True)
+    with pytest.raises(OutputError, match=r"recompute=None, here True"):
+        train(replace(recipe, training={**recipe.training, "tokenizer": on}), tmp_path)
 
 
 def test_both_are_off_unless_asked_for():

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from lidargrit import configuration
 from lidargrit.cli import main
 from lidargrit.datasets import load
 from lidargrit.errors import ConfigError
@@ -127,3 +128,29 @@ def test_another_number_and_another_place_are_refused(tmp_path, capsys):
         Reproduction(4, "simulated")
     assert main(["reproduce", "2", str(tmp_path), str(tmp_path / "out"), "--dry-run"]) == 2
     assert "KITTI odometry" in capsys.readouterr().err
+
+
+def differing(first: str, second: str) -> set[str]:
+    one, other = (configuration.leaves(load_recipe(name)) for name in (first, second))
+    assert one.keys() == other.keys()
+    return {name for name in one if one[name] != other[name]} - {"title", "published"}
+
+
+@pytest.mark.parametrize("small", [False, True])
+def test_rows_of_the_ablation_differ_in_nothing_but_what_is_ablated(small):
+    neither, raydrop, both = (recipes[small] for recipes in TABLES[3].rows.values())
+    assert differing(neither, raydrop) == {"model.tokenizer.raydrop_loss"}
+    assert differing(raydrop, both) == {"training.tokenizer.augmentations"}
+    assert load_recipe(raydrop).training["tokenizer"].augmentations == ()
+    assert load_recipe(both).training["tokenizer"].augmentations == ("geometric",)
+    assert load_recipe(both).training["transformer"].augmentations == ()
+
+
+def test_released_configurations_differ_in_what_their_files_say():
+    losses = {"model.tokenizer.reconstruction", "model.tokenizer.codebook_loss", "data.variant"}
+    training = {"training.tokenizer.augmentations"}
+    training |= {f"training.{stage}.average_over_scans" for stage in ("tokenizer", "transformer")}
+    columns = {"data.columns", "data.column_stride"}
+    assert differing("lidargrit_kitti_360", "lidargrit_kitti_360_reference") == losses | training | columns
+    weight = {"model.tokenizer.raydrop_weight"}
+    assert differing("lidargrit_kitti_odometry", "lidargrit_kitti_odometry_reference") == losses | training | weight

@@ -27,7 +27,7 @@ def run(options: argparse.Namespace) -> None:
         print(kind)
         for name in _discovery.names(_KINDS[kind]):
             summary = re.sub(r":\w+:`(\w+)`", r"\1", _discovery.summary(_KINDS[kind], name))
-            print(f"  {name.replace('_', '-') if kind == 'protocols' else name:<29}{summary}")
+            print(f"  {name.replace('_', '-') if kind == 'protocols' else name:<36}{summary}")
             for fact in facts(name) if facts else ():
                 print(wrapper.fill(fact))
 
