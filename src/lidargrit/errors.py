@@ -1,6 +1,7 @@
 """One exception tree; every message says what was got, what was wanted, and the cure.
 
 LidarGritError (ValueError)
+├── UsageError        the words of a command are not such as it knows
 ├── ScanError         a scan file, or the points in it, cannot be used
 ├── DataError         a folder or a data source is not what was asked for
 ├── UnknownNameError  no sensor, recipe, metric, ... of that name
@@ -14,7 +15,9 @@ LidarGritError (ValueError)
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+
+_SURELY_MEANT = 0.85  # of difflib's likeness: one letter wrong, missing or doubled in a name of seven
 
 
 class LidarGritError(ValueError):
@@ -26,6 +29,10 @@ class LidarGritError(ValueError):
 
     def __reduce__(self) -> tuple[type[LidarGritError], tuple[str, str, str]]:
         return type(self), (self.got, self.wanted, self.cure)
+
+
+class UsageError(LidarGritError):
+    """The words of a command are not such as it knows."""
 
 
 class ScanError(LidarGritError):
@@ -65,7 +72,20 @@ class Terminated(KeyboardInterrupt):  # its kin, so that what cleans up after Ct
 
 
 def nearest_names(name: str, known: Iterable[str], at_most: int = 3) -> str:
-    """Name the known names that look most like one, for a message: "a, b or c"."""
+    """Name the known names that look most like one, for a message: "a, b or c"; one alone where it surely was meant.
+
+    Example:
+        >>> nearest_names("bev_msd", ["bev_mmd", "bev_jsd", "coverage"])
+        'bev_mmd or bev_jsd'
+        >>> nearest_names("slicd_wasserstein", ["sliced_wasserstein", "lidm_bev_matching"])
+        'sliced_wasserstein'
+    """
     names = sorted(set(known))
     close = difflib.get_close_matches(name, names, n=at_most, cutoff=0.4) or names[:at_most]
-    return close[0] if len(close) == 1 else ", ".join(close[:-1]) + " or " + close[-1]
+    surely = difflib.get_close_matches(name, names, n=2, cutoff=_SURELY_MEANT)
+    return one_of(surely if len(surely) == 1 else close)
+
+
+def one_of(names: Sequence[str]) -> str:
+    """Return names as a message offers them: "a, b or c"."""
+    return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " or " + names[-1]

@@ -9,9 +9,11 @@ import signal
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 from lidargrit import __version__, _discovery
-from lidargrit.errors import LidarGritError, Terminated
+from lidargrit.cli._words import EXIT_CODES, Parser
+from lidargrit.errors import LidarGritError, Terminated, UsageError
 
 _EXAMPLES = """\
 examples:
@@ -28,26 +30,14 @@ a verb's own examples: lidargrit VERB --help
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb; 0 = done, 2 = the user's mistake, told in one line, 130 = interrupted, 143 = terminated."""
-    parser = argparse.ArgumentParser(
-        prog="lidargrit",
-        usage="lidargrit VERB ...",
-        description=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("--version", action="version", version=f"lidargrit {__version__}")
-    verbs = parser.add_subparsers(title="verbs", metavar="", dest="verb", prog="lidargrit")
-    for name in _discovery.names("cli"):
-        verb = importlib.import_module(f"lidargrit.cli.{name}")
-        sub = verbs.add_parser(
-            name.removesuffix("_").replace("_", "-"),
-            help=_discovery.summary("cli", name),
-            description=f"examples:\n{verb.EXAMPLES}",
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-        sub.add_argument("--debug", action="store_true", help="show a full traceback of an error")
-        verb.add_arguments(sub)
-        sub.set_defaults(run=verb.run)
-    options = parser.parse_args(arguments)
+    words = [*(sys.argv[1:] if arguments is None else arguments)]  # list() here is our own verb
+    parser = build_parser()
+    try:
+        options = _parsed(parser, words)
+    except UsageError as error:
+        verb = words[0] if words and words[0].replace("-", "_") in _discovery.names("cli") else ""
+        print(f"lidargrit {verb}".rstrip() + f": {error}", file=sys.stderr)
+        return 2
     if options.verb is None:
         parser.print_help()
         return 0
@@ -69,6 +59,34 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of our output, such as head, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return 0
+
+
+def build_parser() -> Parser:
+    """Return the parser of all verbs; the verbs themselves are not imported beyond their words."""
+    raw: dict[str, Any] = {"formatter_class": argparse.RawDescriptionHelpFormatter, "epilog": EXIT_CODES}
+    parser = Parser(prog="lidargrit", usage="lidargrit VERB ...", description=_EXAMPLES, **raw)
+    parser.add_argument("--version", action="version", version=f"lidargrit {__version__}")
+    verbs = parser.add_subparsers(title="verbs", metavar="", dest="verb", prog="lidargrit")
+    for name in _discovery.names("cli"):
+        verb = importlib.import_module(f"lidargrit.cli.{name}")
+        sub = verbs.add_parser(
+            name.removesuffix("_").replace("_", "-"),
+            help=_discovery.summary("cli", name),
+            description=f"examples:\n{verb.EXAMPLES}",
+            **raw,
+        )
+        sub.add_argument("--debug", action="store_true", help="show a full traceback of an error")
+        verb.add_arguments(sub)
+        sub.set_defaults(run=verb.run, words=sub)
+    return parser
+
+
+def _parsed(parser: Parser, words: list[str]) -> argparse.Namespace:
+    """Return the options that words mean, or raise UsageError."""
+    options, too_many = parser.parse_known_args(words)
+    if too_many:
+        (options.words if options.verb else parser).refuse(too_many[0])
+    return options
 
 
 @contextmanager

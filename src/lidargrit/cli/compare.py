@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from lidargrit.cli._results import add_json, refuse_taken, tell
+
 EXAMPLES = """\
   lidargrit compare table marginal memorised small dusty_small r2dm_small:steps=32
   lidargrit compare table small r2dm_small --flops 2e14 -n 1000      equal compute for all
@@ -27,14 +29,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--flops", type=float, default=0.0, help=budget)
     parser.add_argument("--batch-size", type=int, default=8, help="scans drawn at once (default: 8)")
     parser.add_argument("--format", choices=["text", "markdown", "latex"], default="text", help="of the table")
+    add_json(parser)
 
 
 def run(options: argparse.Namespace) -> None:
     """Hold the contest and print the table."""
     from lidargrit.evaluation.comparison import Settings
-    from lidargrit.evaluation.contest import Contest, as_table, hold
+    from lidargrit.evaluation.contest import Contest, as_json, as_table, hold
     from lidargrit.reporting import TerminalReporter
 
+    refuse_taken(options)
     contest = Contest(
         reference=options.against,
         num_samples=options.count,
@@ -43,4 +47,5 @@ def run(options: argparse.Namespace) -> None:
         flops=options.flops,
         batch_size=options.batch_size,
     )
-    print(as_table(hold(options.systems, options.out, contest, TerminalReporter()), options.format))
+    scores = hold(options.systems, options.out, contest, TerminalReporter())
+    tell(options, as_table(scores, options.format), as_json(scores))

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from lidargrit.cli._results import add_json, refuse_taken, tell
+
 EXAMPLES = """\
   lidargrit compare-sim /data/kitti_odometry
   lidargrit compare-sim kitti_raw:/data/kitti_raw:2011_09_26_drive_0001_sync -n 64 --json curves.json
@@ -19,29 +21,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--fine", action="store_true", help="every column that the sensor fires, not only those kept")
     parser.add_argument("--seed", type=int, default=0, help="of the first simulated scan")
     parser.add_argument("-o", "--out", type=Path, default=Path("compare_sim.png"), help="(default: compare_sim.png)")
-    parser.add_argument("--json", type=Path, help="also write the distances and the curves to this file")
     parser.add_argument("--bad-points", choices=["refuse", "drop"], default="refuse", help="NaN, infinite or at 0")
     parser.add_argument("--bad-scans", choices=["refuse", "skip"], default="refuse", help="that cannot be used")
-    parser.add_argument("--overwrite", action="store_true", help="replace files that are there already")
+    add_json(parser, "the files of --out and --json")
 
 
 def run(options: argparse.Namespace) -> None:
     """Simulate, compare, print a table and draw the curves."""
     from lidargrit.evaluation.realism import as_json, as_table, compare_source
-    from lidargrit.files import refuse_to_overwrite, write_json
+    from lidargrit.files import refuse_to_overwrite
     from lidargrit.loading import DataConfig
     from lidargrit.reporting import TerminalReporter
     from lidargrit.viewer.curves import draw_curves
 
     refuse_to_overwrite(options.out, options.overwrite, ".png")
-    refuse_to_overwrite(options.json, options.overwrite)
+    refuse_taken(options)
     config = DataConfig(bad_points=options.bad_points, bad_scans=options.bad_scans)
     about = {"real": options.real, "count": options.count, "sensor": options.sensor, "fine": options.fine}
     scores = compare_source(
         options.real, options.count, options.sensor, options.fine, options.seed, config, TerminalReporter()
     )
-    print(as_table(scores))
     draw_curves(scores, options.out, f"real: {options.real}")
-    if options.json:
-        write_json(options.json, {**about, "seed": options.seed, "curves": as_json(scores)})
-    print(f"done: look at {options.out}")
+    result = {**about, "seed": options.seed, "curves": as_json(scores)}
+    tell(options, as_table(scores), result, f"done: look at {options.out}")

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import argparse
 
+from lidargrit.cli._results import add_json, refuse_taken, tell
+
 EXAMPLES = """\
   lidargrit doctor
+  lidargrit doctor --json > machine.json            for a bug report
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Name the options: none."""
+    """Name the options."""
+    add_json(parser)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -25,22 +29,25 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.loading import cache_folder
     from lidargrit.nn.precision import has_bf16
 
+    refuse_taken(options)
     existing = next(folder for folder in (cache_folder(), *cache_folder().parents) if folder.exists())
-    memory_gib = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    cards = [torch.cuda.get_device_properties(index) for index in range(torch.cuda.device_count())]
     facts = {
         "lidargrit": version("lidargrit"),
         "python": f"{platform.python_version()} on {platform.system()} {platform.machine()}",
-        "torch": f"{torch.__version__}, {torch.get_num_threads()} threads",
-        "lightning-fabric": version("lightning-fabric"),
-        "processors": f"{os.cpu_count()}",
-        "memory": f"{memory_gib:.1f} GiB",
-        "bfloat16": "yes" if has_bf16() else "no: training takes two to three times as long in 32 bits",
-        "cache": f"{cache_folder()}, {shutil.disk_usage(existing).free / 2**30:.1f} GiB free",
+        "torch": torch.__version__,
+        "threads": torch.get_num_threads(),
+        "lightning_fabric": version("lightning-fabric"),
+        "processors": os.cpu_count(),
+        "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
+        "bfloat16": has_bf16(),
+        "cache": str(cache_folder()),
+        "cache_free_gib": round(shutil.disk_usage(existing).free / 2**30, 1),
+        "gpus": [{"name": card.name, "memory_gib": round(card.total_memory / 2**30)} for card in cards],
     }
-    for index in range(torch.cuda.device_count()):
-        card = torch.cuda.get_device_properties(index)
-        facts[f"gpu {index}"] = f"{card.name}, {card.total_memory / 2**30:.0f} GiB"
-    if not torch.cuda.is_available():
-        facts["gpu"] = "none that torch can use: the small and demo recipes are made for this"
-    for name, fact in facts.items():
-        print(f"{name:<18}{fact}")
+    told = {name.replace("_gib", "").replace("_", " "): fact for name, fact in facts.items()}
+    told |= {name: f"{told[name]:.1f} GiB" for name in ("memory", "cache free")}
+    told["bfloat16"] = "yes" if has_bf16() else "no: training takes two to three times as long in 32 bits"
+    none = "none that torch can use: the small and demo recipes are made for this"
+    told["gpus"] = ", ".join(f"{card['name']}, {card['memory_gib']} GiB" for card in facts["gpus"]) or none
+    tell(options, "\n".join(f"{name:<18}{fact}" for name, fact in told.items()), facts)

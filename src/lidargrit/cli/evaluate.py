@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from lidargrit.cli._results import add_json, refuse_taken, tell
+
 EXAMPLES = """\
   lidargrit evaluate samples /data/held_out --report report.html
   lidargrit evaluate samples kitti_360:/data/kitti_360:test --protocol lidargrit-kitti-360 --json scores.json
@@ -32,9 +34,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--device", default="cpu", help="where trained networks compute: cpu or cuda")
     add("--bad-points", choices=["refuse", "drop"], default="refuse", help="NaN, infinite or at 0")
     add("--bad-scans", choices=["refuse", "skip"], default="refuse", help="that cannot be used")
-    add("--json", type=Path, help="also write scores, hashes and settings to this file")
     add("--report", type=Path, metavar="FILE.html", help="also write one page with scores and pictures")
-    add("--overwrite", action="store_true", help="replace these files if they are there already")
+    add_json(parser, "the files of --json and --report")
     add("--tables", nargs="+", type=Path, metavar="JSON", help="set files of --json side by side, and do nothing else")
     add("--format", choices=["text", "markdown", "latex"], default="text", help="of the table (default: text)")
 
@@ -43,10 +44,13 @@ def run(options: argparse.Namespace) -> None:
     """Score and print a table."""
     from lidargrit.evaluation.command import evaluate
     from lidargrit.evaluation.tables import side_by_side
+    from lidargrit.files import read_json
     from lidargrit.reporting import TerminalReporter
     from lidargrit.viewer.report import write_report
 
+    refuse_taken(options)
     if options.tables:
-        print(side_by_side(options.tables, options.format))
+        table = side_by_side(options.tables, options.format)
+        tell(options, table, {path.stem: read_json(path) for path in options.tables})
         return
-    print(evaluate(options, TerminalReporter(), write_report))
+    tell(options, *evaluate(options, TerminalReporter(), write_report))

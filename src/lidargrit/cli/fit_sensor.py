@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from lidargrit.cli._results import add_json, refuse_taken, tell
+
 EXAMPLES = """\
   lidargrit fit-sensor /data/scans -o my_sensor.json --picture fit.png
   lidargrit train small runs/mine --set data.train=/data/scans data.sensor=my_sensor.json
@@ -19,23 +21,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-n", "--max-scans", type=int, default=20, help="look at so many, evenly spaced (default: 20)")
     parser.add_argument("--name", help="of the sensor (default: the file's)")
     parser.add_argument("--bad-points", choices=["refuse", "drop"], default="refuse", help="NaN, infinite or at 0")
-    parser.add_argument("--overwrite", action="store_true", help="replace files that are there already")
+    add_json(parser, "the files of --out, --picture and --json")
 
 
 def run(options: argparse.Namespace) -> None:
     """Fit, print a table, write the sensor file and perhaps a picture."""
     from lidargrit.files import refuse_to_overwrite, write_json
     from lidargrit.fitting import fit_sensor_to_source
-    from lidargrit.fitting.table import as_table
+    from lidargrit.fitting.table import as_json, as_table
 
     refuse_to_overwrite(options.out, options.overwrite, ".json")
     refuse_to_overwrite(options.picture, options.overwrite, ".png")
+    refuse_taken(options)
     name = options.out.stem if options.name is None else options.name
     fit = fit_sensor_to_source(options.source, name, options.max_scans, options.bad_points)
-    print(as_table(fit))
     if options.picture:
         from lidargrit.viewer.sensor_fit import draw_sensor_fit
 
         draw_sensor_fit(fit, options.picture)
     write_json(options.out, fit.sensor.to_json())
-    print(f"done: {options.out}; use it with data.sensor={options.out} (train), or wherever a sensor is named")
+    done = f"done: {options.out}; use it with data.sensor={options.out} (train), or wherever a sensor is named"
+    tell(options, as_table(fit), {"sensor_file": str(options.out), **as_json(fit)}, done)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from lidargrit.cli._results import add_json, refuse_taken, tell
+
 EXAMPLES = """\
   lidargrit inspect scan.bin                                     with the sensor of ours that looks closest
   lidargrit inspect /data/kitti_odometry --projection spherical  the first scan of a data set
@@ -21,22 +23,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--variant", choices=["exact", "reference"], default="exact", help="of the projection")
     parser.add_argument("--bad-points", choices=["refuse", "drop"], default="refuse", help="NaN, infinite or at 0")
     parser.add_argument("-o", "--out", type=Path, help="also draw a picture, a PNG")
-    parser.add_argument("--json", type=Path, help="also write the figures to this file")
-    parser.add_argument("--overwrite", action="store_true", help="replace files that are there already")
+    add_json(parser, "the files of --out and --json")
 
 
 def run(options: argparse.Namespace) -> None:
     """Project one scan and print what became of it."""
     from lidargrit.api import load_scan
     from lidargrit.datasets import open_dataset
-    from lidargrit.files import refuse_to_overwrite, write_json
+    from lidargrit.files import refuse_to_overwrite
     from lidargrit.projection.fit import closest_sensor
     from lidargrit.projection.inspection import as_json, as_table, inspect
     from lidargrit.sensors import load_sensor
     from lidargrit.viewer.inspection import draw_inspection
 
     refuse_to_overwrite(options.out, options.overwrite, ".png")
-    refuse_to_overwrite(options.json, options.overwrite)
+    refuse_taken(options)
     name = options.sensor
     if Path(options.scan).is_file():
         scan = load_scan(options.scan, bad_points=options.bad_points)
@@ -48,9 +49,6 @@ def run(options: argparse.Namespace) -> None:
     if options.columns is not None:
         sensor = sensor.with_columns(options.columns)
     found = inspect(scan, sensor, options.projection, options.variant)
-    print(as_table(found))
-    if options.json:
-        write_json(options.json, as_json(found))
     if options.out:
         draw_inspection(found, options.out)
-        print(f"\ndone: look at {options.out}")
+    tell(options, as_table(found), as_json(found), f"\ndone: look at {options.out}" if options.out else "")

@@ -3,53 +3,35 @@
 from __future__ import annotations
 
 import argparse
-import re
 import textwrap
 
-EXAMPLES = "  lidargrit list\n  lidargrit list generators\n"
+from lidargrit.catalogue import KINDS
+from lidargrit.cli._results import add_json, refuse_taken, tell
 
-_KINDS = {kind: kind for kind in ("datasets", "formats", "sensors", "tokenizers", "generators", "metrics")}
-_KINDS |= {kind: f"evaluation.{kind}" for kind in ("protocols", "dialects")} | {"recipes": "recipes"}
+EXAMPLES = """\
+  lidargrit list
+  lidargrit list generators
+  lidargrit list datasets --json                    licences, splits and leaks, for programs
+"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
-    parser.add_argument("kind", nargs="?", choices=_KINDS, help="one kind only, with all that is known of it")
+    parser.add_argument("kind", nargs="?", choices=list(KINDS), help="one kind only, with all that is known of it")
+    add_json(parser)
 
 
 def run(options: argparse.Namespace) -> None:
     """Print every name with its one line; of a kind asked for alone, all that is known."""
-    from lidargrit import _discovery
+    from lidargrit.catalogue import entries, lines
 
-    facts = {"datasets": _of_dataset, "formats": _of_format, "generators": _of_generator}.get(options.kind)
+    refuse_taken(options)
+    found = {kind: entries(kind, bool(options.kind)) for kind in ([options.kind] if options.kind else KINDS)}
     wrapper = textwrap.TextWrapper(116, initial_indent=" " * 6, subsequent_indent=" " * 10, break_on_hyphens=False)
-    for kind in (options.kind,) if options.kind else _KINDS:
-        print(kind)
-        for name in _discovery.names(_KINDS[kind]):
-            summary = re.sub(r":\w+:`(\w+)`", r"\1", _discovery.summary(_KINDS[kind], name))
-            print(f"  {name.replace('_', '-') if kind == 'protocols' else name:<36}{summary}")
-            for fact in facts(name) if facts else ():
-                print(wrapper.fill(fact))
-
-
-def _of_dataset(name: str) -> list[str]:
-    from lidargrit.datasets import load
-
-    cls = load(name)
-    facts = [f"layout: {cls.tree}", f"sensor: {cls.sensor}", f"licence: {cls.licence}", f"cite: {cls.citation}"]
-    for number, (scheme, of) in enumerate(cls.schemes.items()):
-        parts = ", ".join(part if number == 0 else f"{scheme}/{part}" for part in of.parts)
-        facts += [f"splits: {parts} ({scheme}: {of.source})", f"    leak: {of.leak}"]
-    return facts
-
-
-def _of_format(name: str) -> list[str]:
-    from lidargrit.formats import load
-
-    return load(name).about()
-
-
-def _of_generator(name: str) -> list[str]:
-    from lidargrit.generators import load_class
-
-    return load_class(name).about()
+    told = []
+    for kind, of_kind in found.items():
+        told.append(kind)
+        for entry in of_kind:
+            told.append(f"  {entry['name']:<36}{entry['summary']}")
+            told += [wrapper.fill(line) for line in (lines(kind, entry) if options.kind else [])]
+    tell(options, "\n".join(told), found)

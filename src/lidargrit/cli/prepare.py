@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from lidargrit.cli._results import add_json, refuse_taken, tell
+
 EXAMPLES = """\
   lidargrit prepare kitti_360:/data/KITTI-360:train -o /fast/kitti_360_train --workers 16
   lidargrit train lidargrit_kitti_360 runs/mine --set data.train=/fast/kitti_360_train data.val=...
@@ -29,6 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rank", type=int, help="which machine this is, from 0")
     parser.add_argument("--world-size", type=int, help="of how many")
     parser.add_argument("--verify", action="store_true", help="also read everything back, and remake what is damaged")
+    add_json(parser)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -37,6 +40,7 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.loading import DataConfig, prepare_and_describe
     from lidargrit.reporting import TerminalReporter
 
+    refuse_taken(options)
     config = DataConfig(
         sensor=options.sensor or open_dataset(options.source, options.bad_points).sensor,
         columns=options.columns,
@@ -49,4 +53,5 @@ def run(options: argparse.Namespace) -> None:
         workers=options.workers,
     )
     reporter, place = TerminalReporter(), (options.rank, options.world_size)
-    print(prepare_and_describe(options.source, config, options.out, reporter, *place, verify=options.verify))
+    made = prepare_and_describe(options.source, config, options.out, reporter, *place, verify=options.verify)
+    tell(options, made.as_line(), made.to_json())

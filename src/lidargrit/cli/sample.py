@@ -37,6 +37,7 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.evaluation.samples import write_samples
     from lidargrit.generators import load
     from lidargrit.loading import place_among
+    from lidargrit.nn.devices import usable_device
     from lidargrit.reporting import TerminalReporter
 
     if options.count < 1 or options.batch_size < 1 or options.seed < 0:
@@ -46,15 +47,12 @@ def run(options: argparse.Namespace) -> None:
             "correct the number",
         )
     rank, world_size = place_among(options.rank, options.world_size)
+    own = f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu"
+    device = usable_device(options.device or own)
     generator = load(options.run_folder)
     owner = f"sampling from {generator.public_name()!r}"
     sampling = override(generator.Sampling(), options.set, owner, "see all with: lidargrit list generators")
-    try:
-        own = f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu"
-        generator.to(options.device or own)
-    except (RuntimeError, AssertionError) as error:  # torch's ways to say: no such device, or not in this build
-        told = str(error).partition("\n")[0]
-        raise ConfigError(f"--device {options.device}", f"cpu or cuda ({told})", "leave it out") from None
+    generator.to(device)
     seeds = range(options.seed, options.seed + options.count)[rank::world_size]
     write_samples(generator, options.run_folder, options.out, seeds, sampling, options.batch_size, TerminalReporter())
     print(f"done: {len(seeds)} scans lie in {options.out}; look at them with: lidargrit view {options.out}")

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from lidargrit.cli._results import add_json, refuse_taken, tell
+
 EXAMPLES = """\
   lidargrit train small runs/mine
   lidargrit train small runs/mine --set data.train=/data/scans data.val=/data/held_out
@@ -24,10 +26,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     tracking = "also log to this project of Weights & Biases (pip install 'lidargrit[wandb]')"
     parser.add_argument("--wandb", default="", metavar="PROJECT", help=tracking)
     parser.add_argument("--measure", action="store_true", help=measuring)
+    add_json(parser)
 
 
 def run(options: argparse.Namespace) -> None:
     """Train, or tell the plan."""
+    from lidargrit.errors import ConfigError
     from lidargrit.recipes import load_recipe
     from lidargrit.reporting import TerminalReporter
     from lidargrit.training import measure, plan, tracked, train
@@ -35,10 +39,15 @@ def run(options: argparse.Namespace) -> None:
 
     recipe = load_recipe(options.recipe, options.set)
     if options.dry_run or options.measure:
-        print(plan(recipe))
-        if options.measure:
-            print(measure(recipe))
+        refuse_taken(options)
+        planned, measured = plan(recipe), measure(recipe) if options.measure else []
+        text = "\n".join([planned.as_text(), *(stage.as_line() for stage in measured)])
+        tell(options, text, {**planned.to_json(), "measured": [vars(stage) for stage in measured]})
         return
+    if options.json:
+        raise ConfigError(
+            "--json for a training", "--dry-run or --measure beside it", "read RUN/STAGE/log.jsonl instead"
+        )
     with tracked(options.wandb, recipe, options.out):
         train(recipe, options.out, TerminalReporter(), draw_progress)
     print(f"done: the model lies in {options.out}; sample it with: lidargrit sample {options.out} samples -n 16")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from lidargrit import _discovery
 from lidargrit.errors import ConfigError, nearest_names
@@ -13,15 +14,18 @@ from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.score import evaluate_run
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.evaluation.sides import Sides
-from lidargrit.files import refuse_to_overwrite, write_json
+from lidargrit.files import refuse_to_overwrite
 from lidargrit.generators import is_run
 from lidargrit.loading import DataConfig
 from lidargrit.metrics import load_metric
+from lidargrit.nn.devices import usable_device
 from lidargrit.reporting import Reporter
 
 
-def evaluate(options: Namespace, reporter: Reporter, write_report: Callable[[Scorecard, Sides, Path], None]) -> str:
-    """Score as the options say, write the files that they name, and return what is to be printed.
+def evaluate(
+    options: Namespace, reporter: Reporter, write_report: Callable[[Scorecard, Sides, Path], None]
+) -> tuple[str, dict[str, Any]]:
+    """Score as the options say, write the report if they name one, and return the result for people and for programs.
 
     Raises:
         ConfigError: an option that is missing or out of its bounds.
@@ -30,18 +34,16 @@ def evaluate(options: Namespace, reporter: Reporter, write_report: Callable[[Sco
         got = f"{options.samples!r} alone" if options.samples else "nothing to score"
         raise ConfigError(got, "samples and what they are compared with", "name two sets, or use --tables")
     settings = settings_of(options)
-    for path in (options.json, options.report):
-        refuse_to_overwrite(path, options.overwrite)
+    refuse_to_overwrite(options.report, options.overwrite)
+    usable_device(settings.device)
     if is_run(Path(options.samples)):
         return _run(options, settings, reporter)
     card, sides = compare_sources(options.samples, options.reference, settings, reporter)
     for warning in card.warnings[len(sides.warnings) :]:
         reporter.message(f"WARNING: {warning}")
-    if options.json:
-        write_json(options.json, card.to_json())
     if options.report:
         write_report(card, sides, options.report)
-    return card.as_table()
+    return card.as_table(), card.to_json()
 
 
 def settings_of(options: Namespace) -> Settings:
@@ -80,7 +82,7 @@ def weights_of(words: list[str]) -> dict[str, Path]:
     return files
 
 
-def _run(options: Namespace, settings: Settings, reporter: Reporter) -> str:
+def _run(options: Namespace, settings: Settings, reporter: Reporter) -> tuple[str, dict[str, Any]]:
     config = DataConfig(
         max_scans=settings.max_scans,
         variant=settings.projection_variant or "exact",
@@ -88,7 +90,6 @@ def _run(options: Namespace, settings: Settings, reporter: Reporter) -> str:
         bad_scans=settings.data.bad_scans,
     )
     errors = evaluate_run(Path(options.samples), options.reference, config, reporter)
-    if options.json:
-        about = {"samples": options.samples, "reference": options.reference, "projection_variant": config.variant}
-        write_json(options.json, {**about, "reconstruction": errors})
-    return "\n".join(f"{name:<20}{value:>10.4g}" for name, value in errors.items())
+    about = {"samples": options.samples, "reference": options.reference, "projection_variant": config.variant}
+    table = "\n".join(f"{name:<20}{value:>10.4g}" for name, value in errors.items())
+    return table, {**about, "reconstruction": errors}

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from lidargrit import __version__, _discovery
-from lidargrit.errors import ConfigError, LidarGritError, ScanError
+from lidargrit.errors import ConfigError, LidarGritError, ScanError, nearest_names
 from lidargrit.evaluation.intervals import Part, Resampling, blocks, floor_of, interval_of, merged
 from lidargrit.evaluation.protocols import DEFAULT, Choice, Protocol, load_protocol, public_name
 from lidargrit.evaluation.scorecard import LeftOut, Score, Scorecard
@@ -160,6 +160,7 @@ def choices(protocol: Protocol, settings: Settings) -> list[Choice]:
 
     Raises:
         UnknownNameError: a metric that the user named and nobody has.
+        ConfigError: a variant that none of the metrics has.
     """
     wanted = list(protocol.choices)
     if settings.metrics:
@@ -171,12 +172,20 @@ def choices(protocol: Protocol, settings: Settings) -> list[Choice]:
             every = [Choice(name, variant) for variant in cls.variants]
             wanted += every if public_name(settings.protocol) == DEFAULT or not its_own else its_own
     if settings.variant:
+        _require_known(settings.variant, wanted)
         wanted = [replace(choice, variant=settings.variant) for choice in wanted]
     kept: list[Choice] = []
     for choice in wanted:
         if choice not in kept:
             kept.append(choice)
     return kept
+
+
+def _require_known(variant: str, wanted: Sequence[Choice]) -> None:
+    """Refuse a variant that no wanted metric has; where some have it, the others are left out and say so."""
+    known = {name for choice in wanted for name in load_metric(choice.metric).variants}
+    if variant not in known:
+        raise ConfigError(f"variant {variant!r}", f"one such as {nearest_names(variant, known)}", "choose one of these")
 
 
 def _score(choice: Choice, sides: Sides, settings: Settings, reporter: Reporter, heard: Callable[[int], None]) -> Score:

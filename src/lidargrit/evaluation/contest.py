@@ -117,6 +117,13 @@ def as_table(scores: Sequence[Path], form: Format = "text") -> str:
     return f"{side_by_side(scores, form)}\n\n" + "\n".join(lines)
 
 
+def as_json(scores: Sequence[Path]) -> list[dict[str, Any]]:
+    """Return of each system its name, what it costs, and its scores as the files hold them."""
+    return [
+        {"system": path.stem, "costs": read_json(path.parent / COSTS), "scores": read_json(path)} for path in scores
+    ]
+
+
 @dataclass(frozen=True)
 class _Plan:
     """How one system comes about.

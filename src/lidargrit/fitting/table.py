@@ -1,8 +1,9 @@
-"""A :class:`SensorFit` → a few lines that say what was found and how well."""
+"""A :class:`SensorFit` → a few lines that say what was found and how well, or the same as plain values."""
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -34,6 +35,25 @@ def as_table(fit: SensorFit) -> str:
         rows.append(f"{row:>4}{seen_deg:>12.3f}{laser_deg:>10.3f}{spread_deg:>9.3f}{fit.points_per_ring[row]:>10}")
     said = [f"note: {warning}" for warning in fit.warnings]
     return "\n".join([*(f"{name:<12}{fact}" for name, fact in facts.items()), "", *rows, *said])
+
+
+def as_json(fit: SensorFit) -> dict[str, Any]:
+    """Return the sensor and what speaks for it, a number for each row where there is one, as plain values."""
+    return {
+        "sensor": fit.sensor.to_json(),
+        "method": fit.method,
+        "num_scans": fit.num_scans,
+        "agree_share": fit.agree_share,
+        "counter_clockwise": fit.counter_clockwise,
+        "start_deg": fit.start_deg,
+        "range_step_m": fit.range_step_m,
+        "coordinate_step_m": fit.coordinate_step_m,
+        "laser_elevation_deg": fit.laser_elevation_deg.tolist(),
+        "laser_height_m": fit.laser_height_m.tolist(),
+        "residual_deg": fit.residual_deg.tolist(),
+        "points_per_ring": fit.points_per_ring.tolist(),
+        "warnings": list(fit.warnings),
+    }
 
 
 def _lasers(fit: SensorFit) -> str:

@@ -8,8 +8,9 @@ import os
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from lidargrit import __version__
 from lidargrit.datasets import ScanDataset, open_dataset
@@ -121,6 +122,41 @@ def prepare(
     return folder
 
 
+@dataclass(frozen=True)
+class Prepared:
+    """What a folder of prepared scans holds.
+
+    Args:
+        folder: where.
+        images: how many.
+        rows: of an image.
+        columns: of an image, those that the sensor's image leaves out among them.
+        size: of all shards, in bytes.
+        seconds: that the work took.
+        left_out: why scans that could not be used were left out, one line each.
+    """
+
+    folder: Path
+    images: int
+    rows: int
+    columns: int
+    size: int
+    seconds: float
+    left_out: tuple[str, ...]
+
+    def as_line(self) -> str:
+        """Return all of it for people."""
+        return (
+            f"{self.images} range images of {self.rows}x{self.columns} in {self.folder}: "
+            f"{self.size / 1e6:.1f} MB, {self.size / 1e3 / max(self.images, 1):.0f} KB each, in {self.seconds:.1f} s"
+            + (f"; {len(self.left_out)} scans left out" if self.left_out else "")
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all of it as plain values."""
+        return {**vars(self), "folder": str(self.folder), "left_out": list(self.left_out)}
+
+
 def prepare_and_describe(
     source: str,
     config: DataConfig,
@@ -129,8 +165,8 @@ def prepare_and_describe(
     rank: int | None = None,
     world_size: int | None = None,
     verify: bool = False,
-) -> str:
-    """Prepare, read everything back if asked to, and say in a line what lies where.
+) -> Prepared:
+    """Prepare, read everything back if asked to, and tell what lies where.
 
     Args, Raises: as for :func:`prepare`.
     """
@@ -145,11 +181,8 @@ def prepare_and_describe(
     for why in images.left_out.values():
         reporter.message(f"left out: {why}")
     size = sum(path.stat().st_size for path in folder.glob("*.shard"))
-    return (
-        f"{len(images)} range images of {images.sensor.height}x{images.sensor.width} in {folder}: "
-        f"{size / 1e6:.1f} MB, {size / 1e3 / max(len(images), 1):.0f} KB each, in {seconds:.1f} s"
-        + (f"; {len(images.left_out)} scans left out" if images.left_out else "")
-    )
+    shape = images.sensor.height, images.sensor.width
+    return Prepared(folder, len(images), *shape, size, seconds, tuple(images.left_out.values()))
 
 
 def damaged_shards(folder: Path, reporter: Reporter | None = None) -> list[int]:

@@ -9,7 +9,7 @@ from typing import ClassVar
 from torch import distributed
 
 from lidargrit import _discovery
-from lidargrit.errors import ConfigError, DataError
+from lidargrit.errors import ConfigError, DataError, nearest_names
 from lidargrit.structures import MetricResult, RangeImage
 
 
@@ -109,7 +109,9 @@ def __getattr__(name: str) -> type[Metric]:
     """Find ``from lidargrit.metrics import SlicedWasserstein`` in ``sliced_wasserstein.py``, when it is asked for."""
     file = re.sub(r"(?<!^)(?=[A-Z])", "_", name).lower()
     if not name[:1].isupper() or file not in _discovery.names("metrics"):
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        meant = "".join(word.title() for word in nearest_names(file, _discovery.names("metrics"), 1).split("_"))
+        hint = f"; did you mean {meant}?" if name[:1].isupper() else ""
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint}")
     return load_metric(file)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 
 import torch
 
@@ -16,8 +17,36 @@ from lidargrit.training.settings import Recipe
 _WARM_UP_STEPS, _TIMED_STEPS = 1, 3  # the first one allocates and chooses kernels
 
 
-def measure(recipe: Recipe) -> str:
-    """Take a few steps of every stage and foretell its whole training, as lines for a person.
+@dataclass(frozen=True)
+class Measured:
+    """What the training of one stage takes on this machine.
+
+    Args:
+        stage: its name.
+        flops: floating-point operations of all its steps.
+        scans_per_s: that this machine trains on.
+        seconds: that all of them will take.
+        device: that computes.
+        peak_gib: the most memory that this process has held so far.
+    """
+
+    stage: str
+    flops: float
+    scans_per_s: float
+    seconds: float
+    device: str
+    peak_gib: float
+
+    def as_line(self) -> str:
+        """Return all of it for a person."""
+        return (
+            f"{self.stage}: {self.flops:.2e} floating-point operations at {self.scans_per_s:.3g} scans/s: "
+            f"{duration(self.seconds)} on {self.device}, {self.peak_gib:.1f} GiB"
+        )
+
+
+def measure(recipe: Recipe) -> list[Measured]:
+    """Take a few steps of every stage and foretell its whole training.
 
     Reading scans and validation are not in the time; the memory is the most that this process has held so far.
     """
@@ -25,7 +54,7 @@ def measure(recipe: Recipe) -> str:
         torch.manual_seed(0)
         flops = training_flops(recipe)
         generator = load_class(recipe.generator)(recipe.model, recipe.data.load_sensor())
-        lines = []
+        found = []
         for stage in generator.stages:
             config, objective = recipe.training[stage], generator.objective(stage)
             prepare_for_training(objective, config.recompute, config.compile)
@@ -38,8 +67,6 @@ def measure(recipe: Recipe) -> str:
                 begun = time.perf_counter() if step == _WARM_UP_STEPS else begun
                 float(engine.step(images, step, config.gradient_clip, config.accumulate)["loss"])  # waits for a GPU
             per_s = _TIMED_STEPS * config.batch_size / (time.perf_counter() - begun)
-            lines.append(
-                f"{stage}: {flops[stage]:.2e} floating-point operations at {per_s:.3g} scans/s: "
-                f"{duration(config.scans / per_s)} on {engine.device}, {engine.peak_gib():.1f} GiB"
-            )
-    return "\n".join(lines)
+            seconds, device = config.scans / per_s, str(engine.device)
+            found.append(Measured(stage, flops[stage], per_s, seconds, device, engine.peak_gib()))
+    return found

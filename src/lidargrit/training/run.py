@@ -24,10 +24,8 @@ from lidargrit.loading import RangeImages, load_range_images, seed_of
 from lidargrit.reporting import Reporter
 from lidargrit.tokenizers import Tokenizer
 from lidargrit.training.checkpoint import fingerprint
-from lidargrit.training.compute import estimated_training_flops, gpu_time
 from lidargrit.training.engine import Engine
 from lidargrit.training.fit import Fit
-from lidargrit.training.optimiser import memory_of_weights
 from lidargrit.training.settings import Recipe
 
 RUN_FILE = "run.json"  # ``origin`` in it says that the weights beside it were not trained in this folder
@@ -92,26 +90,6 @@ def _draw(
     copied = copy.deepcopy(generator)
     copied.finish(stage, averaged)
     draw(copied.to(next(averaged.parameters()).device).eval(), stage, val_images, path)
-
-
-def plan(recipe: Recipe) -> str:
-    """Return what a recipe would do, as lines for a person: every setting, sizes, budgets and estimated cost."""
-    sensor = recipe.data.load_sensor()
-    generator = load_class(recipe.generator)(recipe.model, sensor)
-    lines = [recipe.title, f"published: {recipe.published}" if recipe.published else "published: no figure", ""]
-    lines += [f"  {name} = {value}" for name, value in configuration.leaves(recipe).items()]
-    lines += ["", f"range images of {sensor.height}x{sensor.width}, {sensor.range_min_m:g} to {sensor.range_max_m:g} m"]
-    for stage in generator.stages:
-        objective = generator.objective(stage)
-        count = sum(p.numel() for p in objective.parameters())
-        budget = recipe.training[stage]
-        lines.append(
-            f"{stage}: {count:,} parameters, {budget.scans:,} scans in batches of {budget.batch_size}, "
-            f"{memory_of_weights(objective) / 2**20:,.0f} MiB of memory besides activations"
-        )
-    for stage, flops in estimated_training_flops(recipe).items():
-        lines.append(f"{stage}: {gpu_time(flops, recipe.training[stage].precision)}")
-    return "\n".join(lines)
 
 
 def _tokenizer_of(donor: Path, generator: Generator) -> Tokenizer:

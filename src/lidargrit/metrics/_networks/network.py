@@ -14,10 +14,11 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor, nn
 
-from lidargrit.errors import ConfigError, WeightsError
+from lidargrit.errors import WeightsError
 from lidargrit.metrics._networks.pointnet import POINTNET_WEIGHTS, PointNet
 from lidargrit.metrics._networks.rangenet import RANGENET_WEIGHTS, RangeNet53
 from lidargrit.metrics._networks.weights import PublishedWeights, find_weights, read_weights
+from lidargrit.nn.devices import usable_device
 from lidargrit.reporting import Reporter
 
 NETWORKS: dict[str, tuple[PublishedWeights, Callable[[], nn.Module]]] = {
@@ -118,20 +119,6 @@ def load_network(
 @lru_cache(maxsize=2)  # the two that there are
 def _loaded(name: str, path: Path, device: str, _file: tuple[int, int] | None) -> Network:
     return Network(name, path, device)
-
-
-def usable_device(name: str) -> torch.device:
-    """Return a device by its name, such as "cpu" or "cuda".
-
-    Raises:
-        ConfigError: no such device here.
-    """
-    try:
-        device = torch.device(name)
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError):  # an assertion: PyTorch was built without it
-        raise ConfigError(f"device {name!r}", "one that PyTorch finds on this computer", "try cpu or cuda") from None
-    return device
 
 
 def filled(build: Callable[[], nn.Module], weights: dict[str, Tensor], source: Path) -> nn.Module:

@@ -1,0 +1,71 @@
+"""What a verb found → a table for people, or JSON for programs, on standard output or in a file.
+
+One meaning everywhere: ``--json`` alone prints JSON and nothing else on standard output; ``--json FILE.json`` writes it
+to that file besides the table. Progress, warnings and "done" are then on standard error.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+STANDARD_OUTPUT = Path("-")
+
+
+def add_json(parser: argparse.ArgumentParser, files: str = "the file of --json") -> None:
+    """Add ``--json [FILE.json]``, and ``--overwrite`` for the ``files`` that it may replace."""
+    told = "print the result as JSON, or with a name also write it to that file"
+    place = {"nargs": "?", "const": STANDARD_OUTPUT, "type": _place, "metavar": "FILE.json"}
+    parser.add_argument("--json", help=told, **place)
+    parser.add_argument("--overwrite", action="store_true", help=f"replace {files}, if there already")
+
+
+def refuse_taken(options: argparse.Namespace) -> None:
+    """Refuse, before any work, to replace a file that ``--json`` names, with OutputError."""
+    if options.json in (None, STANDARD_OUTPUT):
+        return
+    from lidargrit.files import refuse_to_overwrite  # brings torch, without which a list is there at once
+
+    refuse_to_overwrite(options.json, options.overwrite, ".json")
+
+
+def tell(options: argparse.Namespace, text: str, result: Any, done: str = "") -> None:
+    """Print what was found as the user wants it, and write it where the user wants it.
+
+    Args:
+        options: with ``json``, as :func:`add_json` has it.
+        text: for people.
+        result: the same for programs; numbers that JSON has no word for become null.
+        done: where further results lie; on standard error if JSON is printed.
+    """
+    if options.json == STANDARD_OUTPUT:
+        print(json.dumps(_plain(result), indent=2, allow_nan=False))
+    else:
+        if options.json:
+            from lidargrit.files import write_json
+
+            write_json(options.json, _plain(result))
+        print(text)
+    if done:
+        print(done, file=sys.stderr if options.json == STANDARD_OUTPUT else sys.stdout)
+
+
+def _plain(value: Any) -> Any:
+    """Return a value with null for numbers that are infinite or none, for which strict JSON has no word."""
+    if isinstance(value, dict):
+        return {name: _plain(of) for name, of in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(of) for of in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _place(word: str) -> Path:
+    if word == str(STANDARD_OUTPUT):
+        return STANDARD_OUTPUT
+    if Path(word).suffix.lower() != ".json":  # a word of the command that came to stand behind --json
+        raise argparse.ArgumentTypeError(f"{word}; a name in .json, or nothing; put --json last")
+    return Path(word)

@@ -1,0 +1,117 @@
+"""Words as a user types them → options, or one line that says which word is wrong and what would be right."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import re
+from pathlib import Path
+from typing import Any, NoReturn
+
+from lidargrit.errors import UsageError, nearest_names, one_of
+
+EXIT_CODES = """\
+exit codes: 0 done, 1 a fault of lidargrit's own (with a traceback), 2 a mistake (told in one line),
+            130 interrupted by Ctrl-C, 143 terminated (SIGTERM)
+"""
+
+_ALL_SHOWN = 9  # choices; of more, those that look most like the word
+_KINDS = {"int": "a whole number", "float": "a number"}
+_ABOUT_ONE = re.compile(r"argument (\S*): (.*)", re.DOTALL)
+# What argparse says, and what to say in its place. Its words differ a little from one Python to the next.
+_SAID = (
+    (re.compile(r"expected (?:one|at least one) argument"), "nothing after {name}", "a value", "write one behind it"),
+    (re.compile(r"invalid (int|float) value: (.*)"), "{name} {1}", "{0}", "correct it"),
+    (re.compile(r"ignored explicit argument (.*)"), "{name} with {0}", "{name} alone", "leave the value out"),
+)
+
+
+class Parser(argparse.ArgumentParser):
+    """argparse's parser, which raises our error in place of printing its usage and leaving."""
+
+    def __init__(self, *words: Any, **options: Any) -> None:
+        super().__init__(*words, **options)
+        self.register("type", Path, a_path)
+
+    def error(self, message: str) -> NoReturn:
+        """Raise what argparse complains of, in our manner."""
+        raise UsageError(*self._told(message))
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:  # pyright: ignore
+        """Parse, but refuse an unknown option first, whatever else may be missing."""
+        for word in itertools.takewhile(lambda word: word != "--", args or ()):
+            name, is_verb = word.partition("=")[0], self._subparsers is not None and not word.startswith("-")
+            if is_verb:
+                break  # what follows is for the verb's own parser
+            if name.startswith("--") and not any(option.startswith(name) for option in self._option_string_actions):
+                self.refuse(name)
+        return super().parse_known_args(args, namespace)
+
+    def verbs(self) -> list[Parser]:
+        """Return the parsers of the verbs below this one."""
+        below = [action for action in self._actions if isinstance(action, argparse._SubParsersAction)]
+        return [parser for action in below for parser in action.choices.values()]
+
+    def refuse(self, word: str) -> NoReturn:
+        """Refuse an option that this parser does not have, or a word too many.
+
+        Raises:
+            UsageError: says so, and names the nearest options.
+        """
+        long = [option for option in self._option_string_actions if option.startswith("--")]
+        option = word.startswith("-")
+        got, wanted = (
+            ("the option", f"one such as {nearest_names(word, long)}") if option else ("a word more,", "fewer")
+        )
+        raise UsageError(f"{got} {word!r}", wanted, self._help())
+
+    def _told(self, message: str) -> tuple[str, str, str]:
+        about_one = _ABOUT_ONE.fullmatch(message)
+        if about_one is None:
+            if missing := re.fullmatch(r"the following arguments are required: (.*)", message):
+                return f"no {missing[1].replace(', ', ' and no ')}", self._wanted(), self._help()
+            if ambiguous := re.fullmatch(r"ambiguous option: (\S+) could match (.*)", message):
+                return ambiguous[1], one_of(ambiguous[2].split(", ")), "write it out"
+            return message, "words as its help shows them", self._help()
+        name, complaint = about_one[1].partition("/")[0], about_one[2]
+        if chosen := re.match(r"invalid choice: '?(.*?)'? \(", complaint):
+            choices = [str(choice) for choice in self._choices(about_one[1])]
+            several = one_of(choices) if len(choices) <= _ALL_SHOWN else nearest_names(chosen[1], choices)
+            wanted = several if len(choices) <= _ALL_SHOWN else f"one such as {several}"
+            got = f"{name} {chosen[1]}" if name.startswith("-") else repr(chosen[1])
+            return got, wanted, "choose one" if len(choices) <= _ALL_SHOWN else self._help()
+        for pattern, *parts in _SAID:
+            if said := pattern.match(complaint):
+                of = [_KINDS.get(group, group.strip("'")) for group in said.groups()]
+                got, wanted, cure = (part.format(*of, name=name) for part in parts)
+                return got, wanted, cure
+        parts = complaint.split("; ")  # what a type of ours says, such as a_path
+        return (f"{name} {parts[0]}", parts[1], parts[2]) if len(parts) == 3 else (message, "other words", self._help())
+
+    def _choices(self, name: str) -> list[Any]:
+        """Return what may stand in the place that argparse calls by this name; the verb's has none."""
+        for action in self._actions:
+            names = ("/".join(action.option_strings), action.metavar, action.dest)
+            if action.choices is not None and name in names:
+                return list(action.choices)
+        return []
+
+    def _wanted(self) -> str:
+        """Return the command with the names that it must have."""
+        needed = [action for action in self._actions if action.required]
+        shown = [[*action.option_strings[:1], str(action.metavar or action.dest).upper()] for action in needed]
+        return " ".join([self.prog, *(word for words in shown for word in words)])
+
+    def _help(self) -> str:
+        return f"see: {self.prog} --help"
+
+
+def a_path(word: str) -> Path:
+    """Return a path; "" is none, though Path takes it for the folder that one stands in.
+
+    Raises:
+        argparse.ArgumentTypeError: an empty word, as an unset variable of the shell leaves behind.
+    """
+    if not word.strip():
+        raise argparse.ArgumentTypeError(f"{word!r}; the name of a file or folder; write one")
+    return Path(word)

@@ -1,0 +1,35 @@
+"""Print what makes a shell complete lidargrit's verbs, options and names: for bash, zsh or fish."""
+
+from __future__ import annotations
+
+import argparse
+
+EXAMPLES = """\
+  lidargrit completion bash > ~/.local/share/bash-completion/completions/lidargrit
+  lidargrit completion zsh > ~/.zfunc/_lidargrit            with fpath+=~/.zfunc before compinit in ~/.zshrc
+  lidargrit completion fish > ~/.config/fish/completions/lidargrit.fish
+"""
+
+_KINDS = {"recipe": "recipes", "sensor": "sensors", "protocol": "protocols", "metrics": "metrics"}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Name the options."""
+    parser.add_argument("shell", choices=["bash", "zsh", "fish"], help="whose words to print; start a new one then")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Print the script."""
+    import shtab
+
+    from lidargrit.catalogue import entries
+    from lidargrit.cli import build_parser
+
+    parser = build_parser()
+    for verb in parser.verbs():
+        for action in verb._actions:
+            if action.dest in _KINDS:
+                action.choices = [entry["name"] for entry in entries(_KINDS[action.dest])]
+            elif action.choices is None and action.nargs != 0 and action.type not in (int, float):  # then a place
+                action.complete = shtab.FILE  # pyright: ignore[reportAttributeAccessIssue]  shtab looks for it there
+    print(shtab.complete(parser, options.shell))

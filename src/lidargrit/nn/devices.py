@@ -1,0 +1,21 @@
+"""A device's name, such as "cpu" or "cuda:1" → the device, once it is known to be there."""
+
+from __future__ import annotations
+
+import torch
+
+from lidargrit.errors import ConfigError
+
+
+def usable_device(name: str) -> torch.device:
+    """Return a device by its name, such as "cpu" or "cuda".
+
+    Raises:
+        ConfigError: no such device here.
+    """
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError):  # an assertion: PyTorch was built without it
+        raise ConfigError(f"device {name!r}", "one that PyTorch finds on this computer", "try cpu or cuda") from None
+    return device

@@ -1,0 +1,155 @@
+"""What is typed, and what programs read: mistakes in the words in one line, JSON on request, completion in shells."""
+
+import json
+import shutil
+import subprocess
+
+import pytest
+
+from lidargrit import _discovery
+from lidargrit.cli import build_parser, main
+from lidargrit.errors import nearest_names
+
+MISTAKES = {
+    "simulte": "lidargrit: got 'simulte'; wanted one such as simulate; see: lidargrit --help",
+    "--verion": "lidargrit: got the option '--verion'; wanted one such as --version; see: lidargrit --help",
+    "train": "got no recipe and no out; wanted lidargrit train RECIPE OUT; see: lidargrit train --help",
+    "simulate here": "got no -n/--num-scans; wanted lidargrit simulate OUT -n NUM_SCANS;",
+    "sample --cuont 3": "got the option '--cuont'; wanted one such as --count; see: lidargrit sample --help",
+    "sample run out more": "got a word more, 'more'; wanted fewer;",
+    "sample run out -x": "got the option '-x'; wanted one such as",
+    "simulate here -n two": "got -n two; wanted a whole number;",
+    "simulate here -n 1 --wet very": "got --wet very; wanted a number;",
+    "evaluate a b --format pdf": "got --format pdf; wanted text, markdown or latex; choose one",
+    "list metric": "got 'metric'; wanted datasets, formats, sensors,",
+    "demo --set": "got nothing after --set; wanted a value;",
+    "evaluate --pr x": "got --pr; wanted --protocol or --projection-variant; write it out",
+    "view a --overwrite=3": "got --overwrite with 3; wanted --overwrite alone;",
+    "list --json datasets": "got --json datasets; wanted a name in .json, or nothing; put --json last",
+    "doctor --json facts.txt": "got --json facts.txt; wanted a name in .json",
+    "train demo run --json": "got --json for a training; wanted --dry-run or --measure beside it;",
+    "completion tcsh": "got 'tcsh'; wanted bash, zsh or fish; choose one",
+    "sample nowhere out --device cuda:99": "got device 'cuda:99'; wanted one that PyTorch finds",
+    "evaluate nowhere nowhere --device abacus": "got device 'abacus'; wanted one that PyTorch finds",
+    "evaluate nowhere nowhere --variant exakt": "got variant 'exakt'; wanted one such as exact or textbook; choose one",
+    "evaluate nowhere nowhere --metrics slicd_wasserstein": "wanted one of sliced_wasserstein; see all",
+    "view .": "got ., an empty folder; wanted one with scans in it;",
+}
+FACTS = {
+    "doctor": "processors",
+    "list": "datasets",
+    "list datasets": "datasets",
+    "train demo nowhere --dry-run": "settings",
+    "inspect simulated:1:test": "points",
+    "prepare simulated:1:test": "images",
+    "fit-sensor simulated:2:test -n 2": "agree_share",
+    "evaluate simulated:2:val simulated:2:test --metrics bev_jsd": "scores",
+}
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path_factory, tmp_path, monkeypatch):
+    monkeypatch.setenv("LIDARGRIT_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.parametrize("words", MISTAKES)
+def test_a_mistake_in_the_words_is_told_in_one_line(words, capsys, tmp_path):
+    assert main(words.split()) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+    assert captured.err.startswith("lidargrit")
+    assert MISTAKES[words] in captured.err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("word", ["", "  "])
+def test_an_empty_name_is_not_the_folder_one_stands_in(word, capsys):
+    assert main(["simulate", word, "-n", "1"]) == 2
+    assert f"got out {word!r}; wanted the name of a file or folder;" in capsys.readouterr().err
+
+
+def test_what_follows_two_dashes_is_no_option(capsys):
+    assert main(["sample", "--", "--run", "--out"]) == 2
+    assert "--run, which holds no finished model" in capsys.readouterr().err
+
+
+def test_the_metric_that_was_meant_is_named():
+    with pytest.raises(ImportError, match="cannot import name 'SlicdWasserstein'"):
+        from lidargrit.metrics import SlicdWasserstein  # noqa: F401
+    import lidargrit.metrics
+
+    with pytest.raises(AttributeError, match="did you mean SlicedWasserstein"):
+        _ = lidargrit.metrics.SlicdWasserstein
+    assert nearest_names("swd", ["bev_jsd", "sliced_wasserstein"], 1)
+
+
+@pytest.mark.parametrize("words", FACTS)
+def test_json_is_all_of_standard_output_or_a_file_besides(words, capsys, tmp_path):
+    assert main([*words.split(), "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
+    assert FACTS[words] in printed
+    for path in tmp_path.glob("*"):
+        path.unlink()  # pictures and sensors are not written twice
+    assert main([*words.split(), "--json", "facts.json"]) == 0
+    assert not capsys.readouterr().out.startswith("{")
+    assert json.loads((tmp_path / "facts.json").read_text()).keys() == printed.keys()
+    for path in set(tmp_path.glob("*")) - {tmp_path / "facts.json"}:
+        path.unlink()
+    assert main([*words.split(), "--json", "facts.json"]) == 2
+    assert "facts.json, which is there already" in capsys.readouterr().err
+
+
+def test_every_verb_that_reports_knows_json():
+    silent = {"completion", "demo", "export", "import-weights", "publish", "sample", "simulate", "view"}
+    parsers = {parser.prog.split()[1]: parser for parser in build_parser().verbs()}
+    assert parsers.keys() == {name.replace("_", "-") for name in _discovery.names("cli")}
+    assert {name for name, parser in parsers.items() if "--json" not in parser.format_help()} <= silent
+
+
+def test_scores_side_by_side_as_json(capsys, tmp_path):
+    words = "evaluate simulated:2:val simulated:2:test --metrics bev_jsd --json one.json"
+    assert main(words.split()) == 0
+    capsys.readouterr()
+    assert main(["evaluate", "--tables", "one.json", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"one": json.loads((tmp_path / "one.json").read_text())}
+
+
+def test_help_tells_the_exit_codes(capsys):
+    for words in (["--help"], ["train", "--help"]):
+        with pytest.raises(SystemExit) as stopped:
+            main(words)
+        assert stopped.value.code == 0
+        told = capsys.readouterr().out
+        assert all(f"{code} " in told.partition("exit codes:")[2] for code in (0, 1, 2, 130, 143))
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_a_shell_learns_all_verbs_and_what_may_follow(shell, capsys, tmp_path):
+    assert main(["completion", shell]) == 0
+    script = tmp_path / "script"
+    script.write_text(capsys.readouterr().out)
+    for word in (*_discovery.names("cli"), *_discovery.names("recipes"), "lidargrit-kitti-360", "dry-run"):
+        assert word in script.read_text().replace("compare-sim", "compare_sim").replace(
+            "fit-sensor", "fit_sensor"
+        ).replace("import-weights", "import_weights")
+    if shutil.which(shell):
+        subprocess.run([shell, "-n", str(script)], check=True)
+
+
+@pytest.mark.skipif(not shutil.which("bash"), reason="needs bash")
+def test_bash_completes(capsys, tmp_path):
+    assert main(["completion", "bash"]) == 0
+    (tmp_path / "script").write_text(capsys.readouterr().out)
+    for words, offered in (
+        ("tra", "train"),
+        ("list met", "metrics"),
+        ("train sma", "small"),
+        ("train --dr", "--dry-run"),
+    ):
+        typed = (
+            f"COMP_WORDS=(lidargrit {words}); COMP_CWORD={len(words.split())}; _shtab_lidargrit; echo ${{COMPREPLY[@]}}"
+        )
+        done = subprocess.run(["bash", "-c", f"source ./script; {typed}"], capture_output=True, text=True, check=True)
+        assert done.stdout.split() == [offered]
