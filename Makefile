@@ -2,11 +2,13 @@
 #   make demo              the main job on simulated streets, about 9 minutes on two cores
 #   make demo DATA=FOLDER  the same on your own KITTI-style scans
 #   make test              all checks and all tests
+#   make docs              the documentation as a site, in site/
+#   make package           a wheel, installed where nothing else is, and tried; minutes, most of them for torch
 
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test check
+.PHONY: demo test check docs package
 
 demo: .venv/.complete
 	$(BIN)/lidargrit demo $(if $(DATA),--data "$(DATA)") $(if $(OUT),--out "$(OUT)")
@@ -15,10 +17,20 @@ test: check
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 check: .venv/.complete
-	$(BIN)/ruff check src tests benchmarks
-	$(BIN)/ruff format --check src tests benchmarks
+	$(BIN)/ruff check src tests benchmarks examples docs
+	$(BIN)/ruff format --check src tests benchmarks examples docs
 	$(BIN)/pyright
 	$(BIN)/lint-imports
+
+docs: .venv/.docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+
+package: .venv/.complete
+	$(BIN)/python tests/package/try_wheel.py
+
+.venv/.docs: .venv/.complete
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[docs]"
+	touch $@
 
 # The mark is made last: an interrupted installation is taken up again.
 .venv/.complete: pyproject.toml constraints.txt

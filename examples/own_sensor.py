@@ -1,0 +1,26 @@
+"""Scans of a sensor that nobody described → a sensor file, and what speaks for it → own_sensor.png."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import lidargrit
+from lidargrit.files import write_json
+from lidargrit.fitting import fit_sensor
+from lidargrit.fitting.table import as_table
+from lidargrit.viewer.sensor_fit import draw_sensor_fit
+
+
+def main(folder: Path, sensor_file: Path | None = None) -> None:
+    """Fit a sensor to ten scans that do not tell their rings, and show the fit."""
+    unknown = lidargrit.load_sensor("vlp16")
+    scans = [replace(lidargrit.simulate(seed, unknown), ring=None) for seed in range(10)]
+    fit = fit_sensor(scans, "mine")
+    print(as_table(fit))
+    draw_sensor_fit(fit, folder / "own_sensor.png")
+    if sensor_file:  # every command that takes the name of a sensor takes this file
+        write_json(sensor_file, fit.sensor.to_json())
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else "docs/pictures"), Path(sys.argv[2]) if len(sys.argv) > 2 else None)

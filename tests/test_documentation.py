@@ -1,0 +1,136 @@
+"""The pages say what is so: links and anchors, commands, quoted messages, pictures and their examples, navigation."""
+
+import ast
+import importlib.util
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+import yaml
+from PIL import Image
+
+from lidargrit.cli import build_parser
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = sorted([*(ROOT / "docs").rglob("*.md"), *ROOT.glob("*.md")])
+TEXTS = {page: page.read_text(encoding="utf-8") for page in PAGES}
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+VERBS = {parser.prog.split()[1]: parser for parser in build_parser().verbs()}
+
+
+def prose(text: str) -> str:
+    """Return a page without its blocks of code, in which brackets and number signs mean other things."""
+    return re.sub(r"^ {4}[^\n]*$|^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
+
+
+def anchors(page: Path) -> set[str]:
+    """Return the anchors of a page's headings, as both GitHub and the site make them of plain words."""
+    titles = re.findall(r"^#+ (.+)$", prose(TEXTS[page]), re.MULTILINE)
+    return {re.sub(r"\s+", "-", re.sub(r"[^\w\s-]", "", title).strip().lower()) for title in titles}
+
+
+def commands(text: str) -> list[str]:
+    """Return the commands of lidargrit that stand in a page's code, with lines joined that a backslash breaks."""
+    text = text.replace("\\\n", " ")
+    typed = re.findall(r"^(?: {4})?(?:\w+=\S+ |torchrun .*-m )?lidargrit ([a-z][^#|>\n]*)", text, re.MULTILINE)
+    return [*typed, *re.findall(r"`lidargrit ([a-z-]+(?: [^`]*)?)`", text)]
+
+
+def test_links_lead_to_pages_and_headings():
+    wrong, count = [], 0
+    for page, text in TEXTS.items():
+        for link in re.findall(r"\]\(([^)\s]+)\)", prose(text)):
+            if re.match(r"[a-z]+:", link):
+                continue
+            count += 1
+            path, _, anchor = link.partition("#")
+            target = (page.parent / path).resolve() if path else page
+            if not target.exists() or (anchor and target in TEXTS and anchor not in anchors(target)):
+                wrong.append(f"{page.name}: {link}")
+    assert wrong == []
+    assert count > 60
+
+
+def test_every_page_is_in_the_navigation():
+    config = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
+
+    def named(entry: object) -> list[str]:
+        if isinstance(entry, str):
+            return [entry]
+        parts = entry if isinstance(entry, list) else list(entry.values()) if isinstance(entry, dict) else []
+        return [name for part in parts for name in named(part)]
+
+    docs, wanted = ROOT / "docs", set()
+    for name in named(config["nav"]):
+        wanted |= set((docs / name).glob("*.md")) if name.endswith("/") else {docs / name}
+    assert wanted == set(docs.rglob("*.md"))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_commands_have_the_options_they_use(page):
+    for command in commands(TEXTS[page]):
+        words = shlex.split(command)
+        if words[0] == "--help":
+            continue
+        known = VERBS[words[0]].format_help()
+        for word in words[1:]:
+            if re.match(r"--?[a-z]", word):
+                assert re.search(rf"(?<![\w-]){re.escape(word.partition('=')[0])}(?![\w-])", known), command
+
+
+def test_programs_that_pages_tell_to_run_are_there():
+    for page, text in TEXTS.items():
+        for path in re.findall(r"\b((?:benchmarks|examples)/\w+\.py)", text):
+            assert (ROOT / path).is_file(), f"{page.name}: {path}"
+
+
+def quoted_in_source() -> str:
+    """Return all strings of the program, with a sign where something is filled in."""
+    found = []
+    for path in (ROOT / "src").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.JoinedStr):
+                found.append("".join(part.value if isinstance(part, ast.Constant) else "\0" for part in node.values))
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                found.append(node.value)
+    return "\n".join(found)
+
+
+def test_messages_that_the_faq_explains_are_the_programs_own():
+    messages = re.findall(r"^### `(.+)`$", TEXTS[ROOT / "docs" / "faq.md"], re.MULTILINE)
+    source = quoted_in_source()
+    assert len(messages) > 25
+    for message in messages:
+        for part in re.split(r"…|; wanted |; | points | in |WARNING: |left out: ", message):
+            words = part.strip(" ():,.")
+            assert words in source, f"{words!r} of {message!r}"
+
+
+def test_pictures_are_small_and_shown():
+    shown = {
+        (page.parent / path).resolve()
+        for page, text in TEXTS.items()
+        for path in re.findall(r"!\[.*?\]\((.+?)\)", text)
+    }
+    pictures = set((ROOT / "docs" / "pictures").glob("*"))
+    assert pictures <= shown
+    assert sum(path.stat().st_size for path in pictures) < 3_000_000
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_examples_run_and_draw_what_is_shown(path, tmp_path, capsys):
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    for name in {"STEPS", "COUNT"} & vars(module).keys():
+        setattr(module, name, 3)  # what is shown takes seconds more
+    module.main(tmp_path)
+    assert capsys.readouterr().out
+    drawn = re.findall(r"→ (\w+\.png)\.", module.__doc__ or "")
+    assert {file.name for file in tmp_path.iterdir()} == set(drawn)
+    for name in drawn:
+        with Image.open(tmp_path / name) as new, Image.open(ROOT / "docs" / "pictures" / name) as shown:
+            assert new.size == shown.size
