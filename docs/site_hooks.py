@@ -4,6 +4,8 @@ import os
 import re
 from pathlib import Path
 
+from lidargrit.cli import build_parser
+
 _ROLE = re.compile(r":(?:class|func|meth|mod):(?=<code>)")  # how our docstrings mark names; the site has no roles
 _COMMANDS = "<!-- every verb's help -->"
 
@@ -35,8 +37,6 @@ def _opened(entry, docs):
 
 
 def _helps():
-    from lidargrit.cli import build_parser
-
     os.environ["COLUMNS"] = "100"
     parts = []
     for parser in build_parser().verbs():

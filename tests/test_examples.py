@@ -4,7 +4,6 @@ import doctest
 import importlib
 import pkgutil
 
-
 import lidargrit
 
 MODULES = [m.name for m in pkgutil.walk_packages(lidargrit.__path__, "lidargrit.") if not m.name.endswith("__main__")]
