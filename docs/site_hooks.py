@@ -37,8 +37,9 @@ def _opened(entry, docs):
 
 
 def _helps():
-    os.environ["COLUMNS"] = "100"
+    os.environ["COLUMNS"] = "92"
     parts = []
     for parser in build_parser().verbs():
+        parser.epilog = None  # exit codes: the page has them once
         parts.append(f"## {parser.prog.split()[1]}\n\n```text\n{parser.format_help().rstrip()}\n```\n")
     return "\n".join(parts)

@@ -33,7 +33,7 @@ MISTAKES = {
     "evaluate nowhere nowhere --device abacus": "got device 'abacus'; wanted one that PyTorch finds",
     "evaluate nowhere nowhere --variant exakt": "got variant 'exakt'; wanted one such as exact or textbook; choose one",
     "evaluate nowhere nowhere --metrics slicd_wasserstein": "wanted one of sliced_wasserstein; see all",
-    "view .": "got ., an empty folder; wanted one with scans in it;",
+    "view .": "got ., which is an empty folder; wanted one with scans in it;",
 }
 FACTS = {
     "doctor": "processors",

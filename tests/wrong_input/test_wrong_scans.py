@@ -103,7 +103,7 @@ def test_a_folder_with_no_scan_in_it(refused, tmp_path):
     (tmp_path / "empty").mkdir()
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "notes.txt").write_text("no scan")
-    for folder, what in (("empty", "holds no layout we know"), ("other", "holds"), ("none", "is not a folder")):
+    for folder, what in (("empty", "is an empty folder"), ("other", "holds"), ("none", "is not a folder")):
         place = tmp_path / folder
         for words in (
             [*train_words(tmp_path / "run"), f"data.train=[{place}]"],
@@ -178,7 +178,7 @@ def test_a_sensor_that_does_not_fit_the_scan(refused, tmp_path):
             r"'temprature', which sampling from 'lidargrit' does not have; wanted one such as temperature; .*list gen",
         ),
         (["sample", "RUN", "OUT", "--set", "mask=never"], r"mask=never; wanted a value of the type .*threshold"),
-        (["sample", "RUN", "OUT", "--device", "gpu"], r"--device gpu; wanted"),
+        (["sample", "RUN", "OUT", "--device", "gpu"], r"device 'gpu'; wanted"),
         (["sample", "nowhere", "OUT"], r"nowhere, which holds no finished model; .*finish the training"),
         (
             ["evaluate", "simulated:1", "simulated:1", "--metrics", "slice"],

@@ -152,13 +152,11 @@ def open_dataset(source: str, bad_points: BadPoints = "refuse") -> ScanDataset:
     root, split = _root_and_split(source)
     name = recognise(root)
     if name is None:
+        cure = "check the path, or see the layouts with: lidargrit list datasets"
         if root.is_dir() and not any(root.iterdir()):
-            raise DataError(f"{root}, an empty folder", "one with scans in it", "check the path, or fill it first")
-        raise DataError(
-            f"{root}, which {'holds no layout we know' if root.is_dir() else 'is not a folder'}",
-            "the root of a data set",
-            "check the path, or see the layouts with: lidargrit list datasets",
-        )
+            raise DataError(f"{root}, which is an empty folder", "one with scans in it", cure)
+        got = "holds no layout we know" if root.is_dir() else "is not a folder"
+        raise DataError(f"{root}, which {got}", "the root of a data set", cure)
     return load(name)(root, split, bad_points)
 
 
