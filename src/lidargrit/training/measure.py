@@ -31,7 +31,7 @@ class Measured:
     """
 
     stage: str
-    flops: float
+    flops: int
     scans_per_s: float
     seconds: float
     device: str
