@@ -86,7 +86,7 @@ def test_sources_with_colons_brackets_and_places_that_do_not_exist(bin_file, tmp
     (tmp_path / "empty").mkdir()
     with pytest.raises(DataError, match="nowhere, which is not a folder; wanted the root of a data set"):
         open_dataset(str(tmp_path / "nowhere"))
-    with pytest.raises(DataError, match="empty, which holds no layout we know"):
+    with pytest.raises(DataError, match="empty, which is an empty folder"):
         open_dataset(str(tmp_path / "empty"))
     monkeypatch.chdir(tmp_path)
     bin_file(ROWS, "kitti_raw/000000.bin")

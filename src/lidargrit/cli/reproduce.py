@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from lidargrit.cli._results import add_json, refuse_taken, tell
+
 EXAMPLES = """\
   lidargrit reproduce 3 simulated ablation --small                 a small counterpart, a quarter of an hour
   lidargrit reproduce 3 /data/kitti_odometry ablation --dry-run    what it would do and cost
@@ -28,13 +30,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--batch-size", type=int, default=8, help="scans drawn at once (default: 8)")
     parser.add_argument("--format", choices=["text", "markdown", "latex"], default="text", help="of the table")
     parser.add_argument("--dry-run", action="store_true", help="say what would be done and what it costs, and stop")
+    add_json(parser)
 
 
 def run(options: argparse.Namespace) -> None:
     """Reproduce, or tell the plan."""
-    from lidargrit.evaluation.reproduction import Reproduction, plan, reproduce
+    from lidargrit.evaluation.contest import as_json
+    from lidargrit.evaluation.reproduction import Reproduction, plan, plan_as_text, reproduce, table_of
     from lidargrit.reporting import TerminalReporter
 
+    refuse_taken(options)
     wanted = Reproduction(
         options.table,
         options.root,
@@ -45,6 +50,8 @@ def run(options: argparse.Namespace) -> None:
         options.batch_size,
     )
     if options.dry_run:
-        print(plan(wanted, options.out))
+        facts = plan(wanted, options.out)
+        tell(options, plan_as_text(wanted, facts), facts)
         return
-    print(reproduce(wanted, options.out, TerminalReporter(), options.format))
+    scores = reproduce(wanted, options.out, TerminalReporter())
+    tell(options, table_of(wanted, scores, options.format), as_json(scores))

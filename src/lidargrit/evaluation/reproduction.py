@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from lidargrit.datasets import open_dataset
 from lidargrit.errors import ConfigError
@@ -19,7 +20,8 @@ from lidargrit.loading import load_range_images
 from lidargrit.metrics import load_metric
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
-from lidargrit.training import Recipe, estimated_training_flops, gpu_time, with_budget
+from lidargrit.training import Recipe, gpu_time, with_budget
+from lidargrit.training import plan as planned
 
 SIMULATED = "simulated"  # in place of a root
 _SIMULATED_SCANS = {"train": 300, "val": 16}  # the demo's: a few minutes of simulating
@@ -157,15 +159,14 @@ class Reproduction:
         return f"{self.table.data_set}:{self.root}:{split}"
 
 
-def reproduce(wanted: Reproduction, folder: Path, reporter: Reporter | None = None, form: Format = "text") -> str:
-    """Prepare, train, sample and score every row that there is a recipe for, and return the table.
+def reproduce(wanted: Reproduction, folder: Path, reporter: Reporter | None = None) -> list[Path]:
+    """Prepare, train, sample and score every row that there is a recipe for, and return the files of scores.
 
     Args:
         wanted: the table, and on what.
         folder: as that of :func:`lidargrit.evaluation.contest.hold`. The same call goes on there: prepared scans (in
             the cache), checkpoints, samples and scores are not made again.
         reporter: hears of the progress.
-        form: of the table.
 
     Raises:
         DataError: the root does not hold the data set, or a split of it.
@@ -173,30 +174,43 @@ def reproduce(wanted: Reproduction, folder: Path, reporter: Reporter | None = No
     reporter = reporter or Reporter()
     contest, systems = wanted.contest(), wanted.systems()
     _prepare(contest, list(systems.values()), reporter)
-    scores = hold(list(systems.values()), folder, contest, reporter)
-    return "\n\n".join((as_table(scores, form), *_words(wanted)))
+    return hold(list(systems.values()), folder, contest, reporter)
 
 
-def plan(wanted: Reproduction, folder: Path) -> str:
-    """Return what :func:`reproduce` would do and what it would cost, as lines for a person."""
-    contest, table = wanted.contest(), wanted.table
+def table_of(wanted: Reproduction, scores: list[Path], form: Format = "text") -> str:
+    """Return the scores side by side, the paper's rows apart, and which row is which."""
+    return "\n\n".join((as_table(scores, form), _words(wanted)))
+
+
+def plan(wanted: Reproduction, folder: Path) -> dict[str, Any]:
+    """Return what :func:`reproduce` would do and what it would cost, as plain values."""
+    contest = wanted.contest()
     recipes = {system: _recipe(system, contest) for system in wanted.systems().values()}
     data = next(iter(recipes.values())).data
     counted = {source: len(open_dataset(source)) for source in (*data.train, *data.val, contest.reference)}
-    lines = [f"table {wanted.number} of the paper: {table.title}, protocol {table.protocol}", ""]
-    lines += [f"prepare {source}: {count:,} scans" for source, count in counted.items()]
+    systems = {}
     for system, recipe in recipes.items():
         run = folder / "runs" / system
-        done = "finished" if is_run(run) else "begun" if run.exists() else "to do"
         generator = load_class(recipe.generator)(recipe.model, recipe.data.load_sensor())
-        cost = generator.cost()
-        lines += ["", f"train {system} ({done}), {recipe.published or 'no published figure'}"]
-        for stage, flops in estimated_training_flops(recipe).items():
-            config = recipe.training[stage]
-            lines.append(f"  {stage}: {config.scans:,} scans, {gpu_time(flops, config.precision)}")
-        operations = f"{cost.flops * contest.num_samples:.2g} floating-point operations"
-        lines.append(f"  sample {contest.num_samples:,} scans: {operations}")
-    return "\n".join([*lines, "", *_words(wanted)])
+        systems[system] = {
+            "state": "finished" if is_run(run) else "begun" if run.exists() else "to do",
+            "plan": planned(recipe).to_json(),
+            "sampling_flops": generator.cost().flops * contest.num_samples,
+        }
+    return {"table": wanted.number, "prepare": counted, "samples": contest.num_samples, "systems": systems}
+
+
+def plan_as_text(wanted: Reproduction, facts: dict[str, Any]) -> str:
+    """Return a plan as lines for a person."""
+    table = wanted.table
+    lines = [f"table {wanted.number} of the paper: {table.title}, protocol {table.protocol}", ""]
+    lines += [f"prepare {source}: {count:,} scans" for source, count in facts["prepare"].items()]
+    for system, of in facts["systems"].items():
+        lines += ["", f"train {system} ({of['state']}), {of['plan']['published'] or 'no published figure'}"]
+        for stage in of["plan"]["stages"]:
+            lines.append(f"  {stage['name']}: {stage['scans']:,} scans, {gpu_time(stage['flops'], stage['precision'])}")
+        lines.append(f"  sample {facts['samples']:,} scans: {of['sampling_flops']:.2g} floating-point operations")
+    return "\n".join([*lines, "", _words(wanted)])
 
 
 def _recipe(system: str, contest: Contest) -> Recipe:
@@ -216,8 +230,8 @@ def _prepare(contest: Contest, systems: list[str], reporter: Reporter) -> None:
         open_images(contest.reference, data.load_sensor(), config, reporter)
 
 
-def _words(wanted: Reproduction) -> list[str]:
+def _words(wanted: Reproduction) -> str:
     """Return which row is which, and which of the paper's are not here."""
     lines = [f"the paper's row {row!r} is measured by {system}" for row, system in wanted.systems().items()]
     lines += [f"not available: {row}: {why}" for row, why in wanted.table.missing.items()]
-    return ["\n".join([*lines, *wanted.table.remarks])]
+    return "\n".join([*lines, *wanted.table.remarks])
