@@ -16,7 +16,7 @@ from pathlib import Path
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter, ScalarFormatter
+from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from lidargrit.configuration import override
 from lidargrit.evaluation.comparison import Settings
@@ -68,6 +68,8 @@ def draw(rows: list[dict], path: Path, title: str) -> None:
             )
         axes.axhline(floor, color="#2a8fbd", linestyle=":", label="held-out scans against themselves")
         axes.set_xscale("log")
+        axes.margins(x=0.15)
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.xaxis.set_major_formatter(ScalarFormatter())
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set_ylim(bottom=0)
