@@ -1,5 +1,5 @@
 # Two commands do everything on a fresh machine: `make demo` and `make test`.
-#   make demo              the main job on simulated streets, about 9 minutes on two cores
+#   make demo              the main job on simulated streets, about 11 minutes on two cores
 #   make demo DATA=FOLDER  the same on your own KITTI-style scans
 #   make test              all checks and all tests
 #   make docs              the documentation as a site, in site/

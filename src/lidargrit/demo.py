@@ -52,7 +52,7 @@ def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter
         recipe = replace(recipe, data=divided(data, reporter))
     recipe = override(recipe, settings)
     check_folder(folder, recipe)
-    reporter.message("lidargrit demo: about 9 minutes on two cores; stop it at any time, the same command goes on")
+    reporter.message("lidargrit demo: about 11 minutes on two cores; stop it at any time, the same command goes on")
     clock = _Clock(folder / TIMINGS)
     with clock.stage("read the scans and project them" if data else "simulate scans and project them"):
         real = load_range_images(recipe.data.train, recipe.data, reporter)

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 EXAMPLES = """\
-  lidargrit demo                                simulated streets, about 9 minutes on two cores
+  lidargrit demo                                simulated streets, about 11 minutes on two cores
   lidargrit demo --data /data/kitti_odometry    your own scans: a KITTI tree, or any folder of .bin
 """
 
