@@ -271,12 +271,11 @@ def _claim(folder: Path, plan: Plan, scans: list[tuple[str, str, int, int]]) -> 
                 "prepare into another folder, or remove this one",
             )
         return
-    half_claimed = (folder / SCANS_FILE).is_file() and (folder / SCANS_FILE).read_text(encoding="utf-8") == json.dumps(
-        scans
-    )
+    told, path = json.dumps(scans), folder / SCANS_FILE
+    half_claimed = path.is_file() and path.read_text(encoding="utf-8") == told
     if is_taken(folder, SCANS_FILE) and not half_claimed:
         raise OutputError(f"{folder}, which holds something else", "an empty folder", "choose another one")
-    write_text(folder / SCANS_FILE, json.dumps(scans))
+    write_text(path, told)
     write_json(folder / PLAN_FILE, asdict(plan))  # last: it says that the folder is ours
 
 
@@ -321,7 +320,7 @@ def _check_way(source: str, images: PreparedImages, sensor: SensorModel, config:
     if not prepared.same_rays(wanted):
         raise DataError(
             f"{source}, prepared for {prepared.name!r} ({prepared.height}x{prepared.width})",
-            f"the rays of {sensor.name!r} ({sensor.fine().height}x{sensor.fine().width} with every fine column)",
+            f"the rays of {sensor.name!r} ({wanted.height}x{wanted.width} with every fine column)",
             "name the sensor that it was prepared for, or prepare it for this one",
         )
     theirs = (images.plan.variant, prepared.projection, prepared.range_min_m, prepared.range_max_m)

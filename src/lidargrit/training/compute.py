@@ -136,9 +136,8 @@ def _flops_per_scan(objective: torch.nn.Module, sensor: SensorModel) -> float:
     engine.set_up(objective, torch.optim.SGD(objective.parameters(), lr=0.0))  # the quickest: it is not counted
     steps = _STEPS if hasattr(objective, "phases") else 1
     counter = FlopCounterMode(display=False)
-    counter.mod_tracker = (
-        _NoModules()
-    )  # which module an operation is of is not asked; the tracker stumbles over penalties
+    # Which module an operation is of is not asked, and the tracker stumbles over penalties.
+    counter.mod_tracker = _NoModules()
     # The fused attention of a CPU is no product to the counter.
     with counter, sdpa_kernel(SDPBackend.MATH):
         for step in range(steps):
