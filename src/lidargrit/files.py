@@ -12,7 +12,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from lidargrit.errors import CheckpointError, OutputError
+from lidargrit.errors import CheckpointError, ConfigError, OutputError
 
 
 @contextmanager
@@ -72,6 +72,18 @@ def write_text(path: Path, text: str) -> None:
     """Write a text file atomically."""
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def read_text(path: Path) -> str:
+    """Read a text file that a user named.
+
+    Raises:
+        ConfigError: it is missing, or not text.
+    """
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path}, which cannot be read ({error})", "a text file in UTF-8", "check the path") from None
 
 
 def write_json(path: Path, data: Any) -> None:

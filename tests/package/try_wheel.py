@@ -23,6 +23,8 @@ COMMANDS = (
     ("inspect", "streets"),
     ("view", "streets", "-n", "1", "-o", "page.html"),
     ("train", "demo", "run", "--dry-run"),
+    ("sample", "pretrained", "samples", "-n", "2"),
+    ("view", "samples", "-o", "samples.html"),
 )
 
 

@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 
 EXAMPLES = """\
+  lidargrit sample                                        16 scans of the model that comes with the package
   lidargrit sample runs/demo samples -n 100
   lidargrit sample runs/demo bolder -n 100 --set temperature=1.1 mask=threshold
   lidargrit sample runs/demo as_released -n 100 --set top_k=100
@@ -16,8 +17,10 @@ EXAMPLES = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
-    parser.add_argument("run_folder", type=Path, metavar="RUN", help="folder of a finished run")
-    parser.add_argument("out", type=Path, help="folder for the samples")
+    own = "folder of a finished run (default: pretrained, the model in the package)"
+    parser.add_argument("run_folder", nargs="?", default="pretrained", metavar="RUN", help=own)
+    out = "folder for the samples (default: samples)"
+    parser.add_argument("out", nargs="?", type=Path, default=Path("samples"), help=out)
     parser.add_argument("-n", "--count", type=int, default=16, help="number of scans (default: 16)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the first; the next have the next seeds")
     parser.add_argument("--batch-size", type=int, default=8, help="scans drawn at once (default: 8)")
@@ -35,7 +38,7 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.configuration import override
     from lidargrit.errors import ConfigError
     from lidargrit.evaluation.samples import write_samples
-    from lidargrit.generators import load
+    from lidargrit.generators import load, locate
     from lidargrit.loading import place_among
     from lidargrit.nn.devices import usable_device
     from lidargrit.reporting import TerminalReporter
@@ -49,10 +52,11 @@ def run(options: argparse.Namespace) -> None:
     rank, world_size = place_among(options.rank, options.world_size)
     own = f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu"
     device = usable_device(options.device or own)
-    generator = load(options.run_folder)
+    run_folder = locate(options.run_folder)
+    generator = load(run_folder)
     owner = f"sampling from {generator.public_name()!r}"
     sampling = override(generator.Sampling(), options.set, owner, "see all with: lidargrit list generators")
     generator.to(device)
     seeds = range(options.seed, options.seed + options.count)[rank::world_size]
-    write_samples(generator, options.run_folder, options.out, seeds, sampling, options.batch_size, TerminalReporter())
+    write_samples(generator, run_folder, options.out, seeds, sampling, options.batch_size, TerminalReporter())
     print(f"done: {len(seeds)} scans lie in {options.out}; look at them with: lidargrit view {options.out}")

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 EXAMPLES = """\
-  lidargrit serve                          all finished runs in runs/, at http://127.0.0.1:8000
+  lidargrit serve                          all finished runs in runs/, and the model in the package
   lidargrit serve runs/demo runs/mine --port 8080
   ssh -L 8000:localhost:8000 MACHINE       and then here: a far machine's page in a browser here
 """
@@ -14,7 +14,8 @@ EXAMPLES = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
-    parser.add_argument("runs", nargs="*", type=Path, metavar="RUN", help="folders of finished runs (default: runs/*)")
+    own = "folders of finished runs (default: runs/* and pretrained, the model in the package)"
+    parser.add_argument("runs", nargs="*", metavar="RUN", help=own)
     others = "let others in: the address to listen at, such as 0.0.0.0 (default: this machine only)"
     parser.add_argument("--host", default="127.0.0.1", help=others)
     parser.add_argument("--port", type=int, default=8000, help="0 for any that is free (default: 8000)")
@@ -24,8 +25,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Serve until interrupted."""
+    from lidargrit.generators import locate
     from lidargrit.serving import Limits, finished_runs, serve
 
-    runs = options.runs or finished_runs(Path("runs"))
+    runs = [locate(run) for run in options.runs] or finished_runs(Path("runs"))
     limits = Limits(seconds=options.seconds)
     serve(runs, lambda text: print(text, flush=True), options.host, options.port, options.device, limits)

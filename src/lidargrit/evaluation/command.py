@@ -15,7 +15,7 @@ from lidargrit.evaluation.score import evaluate_run
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.evaluation.sides import Sides
 from lidargrit.files import refuse_to_overwrite
-from lidargrit.generators import is_run
+from lidargrit.generators import is_run, locate
 from lidargrit.loading import DataConfig
 from lidargrit.metrics import load_metric
 from lidargrit.nn.devices import usable_device
@@ -36,7 +36,7 @@ def evaluate(
     settings = settings_of(options)
     refuse_to_overwrite(options.report, options.overwrite)
     usable_device(settings.device)
-    if is_run(Path(options.samples)):
+    if is_run(locate(options.samples)):
         return _run(options, settings, reporter)
     card, sides = compare_sources(options.samples, options.reference, settings, reporter)
     for warning in card.warnings[len(sides.warnings) :]:
@@ -89,7 +89,7 @@ def _run(options: Namespace, settings: Settings, reporter: Reporter) -> tuple[st
         bad_points=settings.data.bad_points,
         bad_scans=settings.data.bad_scans,
     )
-    errors = evaluate_run(Path(options.samples), options.reference, config, reporter)
+    errors = evaluate_run(locate(options.samples), options.reference, config, reporter)
     about = {"samples": options.samples, "reference": options.reference, "projection_variant": config.variant}
     table = "\n".join(f"{name:<20}{value:>10.4g}" for name, value in errors.items())
     return table, {**about, "reconstruction": errors}

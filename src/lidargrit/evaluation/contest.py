@@ -22,7 +22,7 @@ from lidargrit.evaluation.score import holds_images
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.evaluation.tables import Format, side_by_side
 from lidargrit.files import read_json, write_json
-from lidargrit.generators import Generator, is_run, load, load_class
+from lidargrit.generators import Generator, is_run, load, load_class, locate
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
 from lidargrit.training import Recipe, check_folder, train, training_flops, with_budget
@@ -141,14 +141,15 @@ class _Plan:
     @classmethod
     def of(cls, system: str, folder: Path, contest: Contest) -> _Plan:
         name, _, settings = system.partition(":")
-        recipe = None if is_run(Path(name)) else load_recipe(name, contest.recipe_settings)
+        run = locate(name)
+        recipe = None if is_run(run) else load_recipe(name, contest.recipe_settings)
         cls_of = type(load(name)) if recipe is None else load_class(recipe.generator)
         owner, cure = f"sampling from {name!r}", "see all with: lidargrit list generators"
         sampling = override(cls_of.Sampling(), settings.split(",") if settings else [], owner, cure)
         if recipe is not None and contest.flops:
             recipe = with_budget(recipe, contest.flops)
         if recipe is None:
-            return cls(Path(name), None, sampling)
+            return cls(run, None, sampling)
         check_folder(folder / "runs" / name, recipe)
         return cls(folder / "runs" / name, recipe, sampling)
 

@@ -24,6 +24,8 @@ from lidargrit.tokenizers import Tokenizer
 
 CONFIG_FILE, WEIGHTS_FILE, CARD_FILE = "config.json", "model.safetensors", "README.md"  # the names that the hub knows
 TRAINED_ON_FILE = "trained_on.json"  # in a run's folder and beside its samples: which drives, which pixels
+PRETRAINED = "pretrained"
+"""By this word the model that comes with the package goes, wherever a run is wanted."""
 
 
 @dataclass(frozen=True)
@@ -167,9 +169,12 @@ class Generator(nn.Module, ABC):
         """Return the name of the file that defines the class."""
         return cls.__module__.rpartition(".")[2]
 
-    def save(self, folder: Path) -> None:
-        """Write the weights and, last, the configuration that says they are there."""
-        write_tensors(folder / WEIGHTS_FILE, self.state_dict())
+    def save(self, folder: Path, half: bool = False) -> None:
+        """Write the weights, in 16 bits if ``half``, and, last, the configuration that says they are there."""
+        weights = self.state_dict()
+        if half:
+            weights = {name: _halved(name, weight) for name, weight in weights.items()}
+        write_tensors(folder / WEIGHTS_FILE, weights)
         config = {
             "generator": self.public_name(),
             "config": configuration.to_json(self.config),
@@ -207,7 +212,7 @@ class Generator(nn.Module, ABC):
             "see which generator a recipe has with: lidargrit train RECIPE OUT --dry-run",
         )
 
-    def save_pretrained(self, folder: str | Path, card: str = "") -> None:
+    def save_pretrained(self, folder: str | Path, card: str = "", half: bool = False) -> None:
         """Write what a repository of the Hugging Face hub holds: weights, configuration, and a model card if given.
 
         These are the files of :meth:`save`. ``lidargrit publish`` writes the card from a run.
@@ -215,10 +220,14 @@ class Generator(nn.Module, ABC):
         Args:
             folder: for the files.
             card: Markdown, for ``README.md``.
+            half: round weights to 16 bits; networks compute as before when they are read again.
+
+        Raises:
+            ConfigError: a weight is beyond what 16 bits hold.
         """
         if card:
             write_text(Path(folder) / CARD_FILE, card)
-        self.save(Path(folder))
+        self.save(Path(folder), half)
 
     @classmethod
     def from_pretrained(cls, name: str | Path, revision: str | None = None) -> Generator:
@@ -231,7 +240,8 @@ class Generator(nn.Module, ABC):
         Raises:
             CheckpointError: no such folder or repository, a damaged one, or another kind of generator in it.
         """
-        generator = load(name if Path(name).is_dir() else _downloaded(str(name), revision))
+        here = locate(name)
+        generator = load(here if here.is_dir() else _downloaded(str(name), revision))
         if not isinstance(generator, cls):
             raise CheckpointError(
                 f"{name}, which holds a generator {generator.public_name()!r}",
@@ -241,18 +251,25 @@ class Generator(nn.Module, ABC):
         return generator
 
 
+def locate(run: str | Path) -> Path:
+    """Return the folder of a run: that of the package for the word ``pretrained``, unless a run here has this name."""
+    if str(run) == PRETRAINED and not is_run(Path(run)):
+        return Path(__file__).parents[1] / PRETRAINED
+    return Path(run)
+
+
 def is_run(folder: Path) -> bool:
     """Tell whether a folder is that of a finished run."""
     return (folder / CONFIG_FILE).is_file()
 
 
 def load(folder: str | Path) -> Generator:
-    """Read a trained generator from a run's folder.
+    """Read a trained generator from a run's folder; ``pretrained`` is the one that comes with the package.
 
     Raises:
         CheckpointError: no finished model in the folder, a damaged file, or weights of another configuration.
     """
-    folder = Path(folder)
+    folder = locate(folder)
     if not is_run(folder):
         raise CheckpointError(
             f"{folder}, which holds no finished model",
@@ -280,6 +297,15 @@ def load(folder: str | Path) -> Generator:
 def load_class(name: str) -> type[Generator]:
     """Return the generator class of a name, or raise UnknownNameError."""
     return _discovery.load_class("generators", name, Generator)
+
+
+def _halved(name: str, weight: Tensor) -> Tensor:
+    if not weight.is_floating_point():
+        return weight
+    half = weight.half()
+    if not half.isfinite().all():
+        raise ConfigError(f"weights {name!r} of up to {weight.abs().max():g}", "up to 65,504", "write 32 bits")
+    return half
 
 
 def _downloaded(name: str, revision: str | None) -> Path:

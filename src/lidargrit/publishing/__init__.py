@@ -12,7 +12,7 @@ from lidargrit.errors import CheckpointError, ConfigError, OutputError
 from lidargrit.evaluation.samples import MANIFEST, is_sample_folder, trained_on
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.files import is_taken, read_json, write_json
-from lidargrit.generators import TRAINED_ON_FILE, WEIGHTS_FILE, Generator, load, load_class
+from lidargrit.generators import TRAINED_ON_FILE, WEIGHTS_FILE, Generator, load, load_class, locate
 from lidargrit.publishing.card import data_set_of, model_card
 from lidargrit.recipes import load_recipe
 from lidargrit.training.run import RUN_FILE
@@ -54,7 +54,7 @@ def import_weights(recipe: str, folder: Path, files: Sequence[Path], settings: S
     return generator
 
 
-def publish(run: Path, folder: Path, scores: Path | None = None) -> str:
+def publish(run: Path, folder: Path, scores: Path | None = None, notes: str = "", half: bool = False) -> str:
     """Write what of a run others need, and nothing of where its user keeps things; nothing is uploaded.
 
     Args:
@@ -62,6 +62,8 @@ def publish(run: Path, folder: Path, scores: Path | None = None) -> str:
         folder: gets ``model.safetensors``, ``config.json``, a model card (``README.md``), and the run's recipe and what
             it learned from, without folders and file names. It is a run folder again: all that reads runs reads it.
         scores: of the run's samples, as ``lidargrit evaluate --json`` wrote them.
+        notes: Markdown for the end of the card: what the model is good for, and where it fails.
+        half: round weights to 16 bits.
 
     Returns:
         the card.
@@ -71,6 +73,7 @@ def publish(run: Path, folder: Path, scores: Path | None = None) -> str:
         ConfigError: scores of samples of other weights.
         OutputError: the folder is not empty.
     """
+    run = locate(run)
     generator = load(run)
     if is_taken(folder, RUN_FILE):
         raise OutputError(f"{folder}, which is not empty", "an empty folder", "choose another one")
@@ -85,12 +88,13 @@ def publish(run: Path, folder: Path, scores: Path | None = None) -> str:
         raise CheckpointError(
             f"{run / RUN_FILE}, which cannot be used ({error!r})", "what lidargrit wrote", "restore the file"
         ) from None
+    card = "\n".join(filter(None, [card, notes.strip() and notes.strip() + "\n"]))
     write_json(folder / RUN_FILE, public)
     if learned.recordings or learned.fingerprints:
         # A recording that has no name of its own goes by its folder, which is the user's.
         drives = [recording for recording in learned.recordings if not recording.startswith("#")]
         write_json(folder / TRAINED_ON_FILE, {"recordings": drives, "fingerprints": list(learned.fingerprints)})
-    generator.save_pretrained(folder, card)
+    generator.save_pretrained(folder, card, half)
     return card
 
 

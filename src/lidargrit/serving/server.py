@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 from waitress.server import create_server
 
-from lidargrit.errors import CheckpointError, ConfigError, OutputError
-from lidargrit.generators import is_run
+from lidargrit.errors import ConfigError, OutputError
+from lidargrit.generators import PRETRAINED, is_run, locate
 from lidargrit.serving.application import LOOPBACK_NAMES, Application
 from lidargrit.serving.limits import Limits
 from lidargrit.serving.work import Work
@@ -102,17 +102,8 @@ def opened(
 
 
 def finished_runs(folder: Path) -> list[Path]:
-    """Return the finished runs of a folder, in the order of their names.
-
-    Raises:
-        CheckpointError: there is none.
-    """
-    found = sorted(path for path in folder.glob("*") if is_run(path))
-    if not found:
-        raise CheckpointError(
-            f"no run to serve, and none in {folder}", "a finished run's folder", "make one with: lidargrit demo"
-        )
-    return found
+    """Return the finished runs of a folder, in the order of their names, and last the model in the package."""
+    return [*sorted(path for path in folder.glob("*") if is_run(path)), locate(PRETRAINED)]
 
 
 def _listening(host: str, port: int) -> socket.socket:

@@ -9,6 +9,7 @@ import platform
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ from lidargrit.tokenizers import Tokenizer
 from lidargrit.training.checkpoint import fingerprint
 from lidargrit.training.engine import Engine
 from lidargrit.training.fit import Fit
-from lidargrit.training.settings import Recipe
+from lidargrit.training.settings import FitConfig, Recipe
 
 RUN_FILE = "run.json"  # ``origin`` in it says that the weights beside it were not trained in this folder
 
@@ -118,8 +119,7 @@ def check_folder(folder: Path, recipe: Recipe) -> None:
             raise OutputError(
                 f"{folder}, whose weights were {about['origin']}", "a run of train's", "choose another folder"
             )
-        mine, other = configuration.leaves(ours), configuration.leaves(theirs)
-        # A setting that there was not yet when the run began was off.
+        mine, other = configuration.leaves(ours), {**_defaults(recipe), **configuration.leaves(theirs)}
         differing = [
             name for name in mine.keys() | other.keys() if (mine.get(name) or None) != (other.get(name) or None)
         ]
@@ -136,6 +136,13 @@ def check_folder(folder: Path, recipe: Recipe) -> None:
             "an empty folder, or one that this recipe began",
             "choose another folder",
         )
+
+
+def _defaults(recipe: Recipe) -> dict[str, Any]:
+    """Return the settings of a recipe that changes none: a run that began before there was a setting had this one."""
+    fits = {name: FitConfig(fit.scans, fit.batch_size, fit.learning_rate) for name, fit in recipe.training.items()}
+    plain = replace(recipe, model=type(recipe.model)(), training=fits, published="", tokenizer_from=None)
+    return configuration.leaves(configuration.to_json(plain))
 
 
 def _claim(folder: Path, recipe: Recipe, train_images: RangeImages, val_images: RangeImages) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import torch
 from jaxtyping import Int
@@ -13,7 +12,7 @@ from torch import Tensor
 from lidargrit.datasets import open_dataset
 from lidargrit.errors import ConfigError, DataError, ScanError
 from lidargrit.evaluation.score import holds_images, open_images
-from lidargrit.generators import is_run, load
+from lidargrit.generators import is_run, load, locate
 from lidargrit.loading import DataConfig, spread
 from lidargrit.projection import index_map, project
 from lidargrit.reporting import Reporter
@@ -60,7 +59,7 @@ def gather(
         reporter: hears of scans that are left out.
     """
     config, reporter = config or DataConfig(), reporter or Reporter()
-    generators = {place: load(place) for place in places if is_run(Path(place))}
+    generators = {place: load(place) for place in places if is_run(locate(place))}
     sensor = next((generator.sensor for generator in generators.values()), None)
     shown: list[Shown] = []
     for place in places:
