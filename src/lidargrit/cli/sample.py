@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 
 EXAMPLES = """\
-  lidargrit sample                                        16 scans of the model that comes with the package
+  lidargrit sample pretrained samples                     by the model that comes with the package
   lidargrit sample runs/demo samples -n 100
   lidargrit sample runs/demo bolder -n 100 --set temperature=1.1 mask=threshold
   lidargrit sample runs/demo as_released -n 100 --set top_k=100
@@ -17,10 +17,8 @@ EXAMPLES = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
-    own = "folder of a finished run (default: pretrained, the model in the package)"
-    parser.add_argument("run_folder", nargs="?", default="pretrained", metavar="RUN", help=own)
-    out = "folder for the samples (default: samples)"
-    parser.add_argument("out", nargs="?", type=Path, default=Path("samples"), help=out)
+    parser.add_argument("run_folder", type=Path, metavar="RUN", help="folder of a finished run, or: pretrained")
+    parser.add_argument("out", type=Path, help="folder for the samples")
     parser.add_argument("-n", "--count", type=int, default=16, help="number of scans (default: 16)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the first; the next have the next seeds")
     parser.add_argument("--batch-size", type=int, default=8, help="scans drawn at once (default: 8)")

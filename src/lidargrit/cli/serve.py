@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 EXAMPLES = """\
-  lidargrit serve                          all finished runs in runs/, and the model in the package
+  lidargrit serve                          all runs in runs/ and the model in the package
   lidargrit serve runs/demo runs/mine --port 8080
   ssh -L 8000:localhost:8000 MACHINE       and then here: a far machine's page in a browser here
 """
@@ -14,8 +14,7 @@ EXAMPLES = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
-    own = "folders of finished runs (default: runs/* and pretrained, the model in the package)"
-    parser.add_argument("runs", nargs="*", metavar="RUN", help=own)
+    parser.add_argument("runs", nargs="*", type=Path, metavar="RUN", help="finished runs (default: runs/*, pretrained)")
     others = "let others in: the address to listen at, such as 0.0.0.0 (default: this machine only)"
     parser.add_argument("--host", default="127.0.0.1", help=others)
     parser.add_argument("--port", type=int, default=8000, help="0 for any that is free (default: 8000)")

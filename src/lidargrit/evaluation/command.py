@@ -89,7 +89,7 @@ def _run(options: Namespace, settings: Settings, reporter: Reporter) -> tuple[st
         bad_points=settings.data.bad_points,
         bad_scans=settings.data.bad_scans,
     )
-    errors = evaluate_run(locate(options.samples), options.reference, config, reporter)
+    errors = evaluate_run(Path(options.samples), options.reference, config, reporter)
     about = {"samples": options.samples, "reference": options.reference, "projection_variant": config.variant}
     table = "\n".join(f"{name:<20}{value:>10.4g}" for name, value in errors.items())
     return table, {**about, "reconstruction": errors}

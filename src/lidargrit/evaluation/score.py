@@ -12,7 +12,7 @@ from lidargrit.errors import ConfigError
 from lidargrit.evaluation.dialects import is_tensor_folder, read_tensor_folder
 from lidargrit.evaluation.reconstruction import ReconstructionErrors, ReconstructionScore
 from lidargrit.evaluation.samples import is_sample_folder, read_samples, trained_on
-from lidargrit.generators import is_run, load
+from lidargrit.generators import is_run, load, locate
 from lidargrit.loading import (
     DataConfig,
     PreparedImages,
@@ -78,8 +78,9 @@ def warn_of_overlap(source: str, images: RangeImages | None, reference: RangeIma
 def overlap(source: str, images: RangeImages | None, reference: RangeImages) -> str:
     """Say in a few words what a set, or the model that made it, has in common with the reference; "" if nothing."""
     learned = Provenance() if images is None else images.provenance
-    if is_sample_folder(Path(source)) or is_run(Path(source)):
-        learned = trained_on(Path(source))
+    folder = locate(source)
+    if is_sample_folder(folder) or is_run(folder):
+        learned = trained_on(folder)
     return learned.overlap(reference.provenance)
 
 

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from lidargrit import _discovery, configuration
 from lidargrit.errors import CheckpointError, ConfigError, LidarGritError
-from lidargrit.files import load_exactly, read_json, read_tensors, write_json, write_tensors, write_text
+from lidargrit.files import is_taken, load_exactly, read_json, read_tensors, write_json, write_tensors, write_text
 from lidargrit.loading import RangeImages
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
@@ -169,12 +169,25 @@ class Generator(nn.Module, ABC):
         """Return the name of the file that defines the class."""
         return cls.__module__.rpartition(".")[2]
 
+    def weights(self, half: bool = False) -> dict[str, Tensor]:
+        """Return what is saved of the networks.
+
+        Args:
+            half: round parameters, but no buffers, to 16 bits; networks that are read again compute in 32 as before.
+
+        Raises:
+            ConfigError: a parameter is beyond what 16 bits hold.
+        """
+        halved = {name: weight.detach().half() for name, weight in self.named_parameters()} if half else {}
+        for name, weight in halved.items():
+            if not weight.isfinite().all():
+                largest = self.get_parameter(name).abs().max()
+                raise ConfigError(f"weights {name!r} of up to {largest:g}", "at most 65,504", "leave half out")
+        return {**self.state_dict(), **halved}
+
     def save(self, folder: Path, half: bool = False) -> None:
-        """Write the weights, in 16 bits if ``half``, and, last, the configuration that says they are there."""
-        weights = self.state_dict()
-        if half:
-            weights = {name: _halved(name, weight) for name, weight in weights.items()}
-        write_tensors(folder / WEIGHTS_FILE, weights)
+        """Write :meth:`weights` and, last, the configuration that says they are there."""
+        write_tensors(folder / WEIGHTS_FILE, self.weights(half))
         config = {
             "generator": self.public_name(),
             "config": configuration.to_json(self.config),
@@ -220,14 +233,11 @@ class Generator(nn.Module, ABC):
         Args:
             folder: for the files.
             card: Markdown, for ``README.md``.
-            half: round weights to 16 bits; networks compute as before when they are read again.
-
-        Raises:
-            ConfigError: a weight is beyond what 16 bits hold.
+            half: as for :meth:`weights`.
         """
+        self.save(Path(folder), half)
         if card:
             write_text(Path(folder) / CARD_FILE, card)
-        self.save(Path(folder), half)
 
     @classmethod
     def from_pretrained(cls, name: str | Path, revision: str | None = None) -> Generator:
@@ -252,8 +262,8 @@ class Generator(nn.Module, ABC):
 
 
 def locate(run: str | Path) -> Path:
-    """Return the folder of a run: that of the package for the word ``pretrained``, unless a run here has this name."""
-    if str(run) == PRETRAINED and not is_run(Path(run)):
+    """Return the folder of a run; for the word ``pretrained`` that of the package, unless something here has the name."""
+    if str(run) == PRETRAINED and not is_taken(Path(run), CONFIG_FILE):
         return Path(__file__).parents[1] / PRETRAINED
     return Path(run)
 
@@ -297,15 +307,6 @@ def load(folder: str | Path) -> Generator:
 def load_class(name: str) -> type[Generator]:
     """Return the generator class of a name, or raise UnknownNameError."""
     return _discovery.load_class("generators", name, Generator)
-
-
-def _halved(name: str, weight: Tensor) -> Tensor:
-    if not weight.is_floating_point():
-        return weight
-    half = weight.half()
-    if not half.isfinite().all():
-        raise ConfigError(f"weights {name!r} of up to {weight.abs().max():g}", "up to 65,504", "write 32 bits")
-    return half
 
 
 def _downloaded(name: str, revision: str | None) -> Path:

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from lidargrit import __version__, configuration
 from lidargrit.errors import CheckpointError, ConfigError, OutputError
 from lidargrit.evaluation.samples import MANIFEST, is_sample_folder, trained_on
@@ -63,14 +65,14 @@ def publish(run: Path, folder: Path, scores: Path | None = None, notes: str = ""
             it learned from, without folders and file names. It is a run folder again: all that reads runs reads it.
         scores: of the run's samples, as ``lidargrit evaluate --json`` wrote them.
         notes: Markdown for the end of the card: what the model is good for, and where it fails.
-        half: round weights to 16 bits.
+        half: round parameters to 16 bits.
 
     Returns:
         the card.
 
     Raises:
         CheckpointError: no finished run.
-        ConfigError: scores of samples of other weights.
+        ConfigError: scores of samples of other weights, or weights beyond 16 bits.
         OutputError: the folder is not empty.
     """
     run = locate(run)
@@ -79,11 +81,18 @@ def publish(run: Path, folder: Path, scores: Path | None = None, notes: str = ""
         raise OutputError(f"{folder}, which is not empty", "an empty folder", "choose another one")
     about: Any = read_json(run / RUN_FILE) if (run / RUN_FILE).is_file() else {}
     scored = Scorecard.read(scores) if scores else None
+    weights = generator.weights(half)
     if scored:
         _check_scores(scored, run)
+        if any(not torch.equal(weight, generator.state_dict()[name]) for name, weight in weights.items()):
+            raise ConfigError(
+                "scores of weights that are then rounded",
+                "those of the rounded ones",
+                "publish with --half alone, score that, and publish it with its scores",
+            )
     learned = trained_on(run)
     try:
-        card, public = model_card(generator, about, learned, scored), _without_places(about, generator)
+        card, public = model_card(generator, about, learned, scored, half), _without_places(about, generator)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise CheckpointError(
             f"{run / RUN_FILE}, which cannot be used ({error!r})", "what lidargrit wrote", "restore the file"
@@ -103,7 +112,7 @@ def _without_places(about: dict[str, Any], generator: Generator) -> dict[str, An
     recipe = about.get("recipe", {})
     data = recipe.get("data", {})
     sources = {part: ["::".join(data_set_of(source)) for source in data.get(part, ())] for part in ("train", "val")}
-    recipe = {**recipe, "data": {**data, **sources, "sensor": generator.sensor.name}}
+    recipe = {**recipe, "tokenizer_from": None, "data": {**data, **sources, "sensor": generator.sensor.name}}
     kept = {name: about[name] for name in ("files", "lidargrit", "commit", "torch", "python") if name in about}
     return {"origin": "published", **kept, "recipe": recipe}
 

@@ -23,7 +23,11 @@ _PLACE = re.compile(r"(?<![\w.])(?:~|[A-Za-z]:)?[/\\][^\s,;:)']*")
 
 
 def model_card(
-    generator: Generator, about: dict[str, Any], learned: Provenance, scores: Scorecard | None = None
+    generator: Generator,
+    about: dict[str, Any],
+    learned: Provenance,
+    scores: Scorecard | None = None,
+    half: bool = False,
 ) -> str:
     """Write the card of a model, from what its run folder tells and nothing else.
 
@@ -32,6 +36,7 @@ def model_card(
         about: its ``run.json``; empty if that is not there.
         learned: from which recordings and pixels.
         scores: of its samples.
+        half: whether its parameters are rounded to 16 bits.
 
     Source:
         The head's entries are those of the hub's documentation, "Model cards".
@@ -46,7 +51,7 @@ def model_card(
     }
     parts = [
         "\n".join(["---", *(f"{name}: {json.dumps(of)}" for name, of in head.items()), "---"]),  # JSON is YAML
-        _what(generator),
+        _what(generator, half),
         _how_to_sample(),
         _data(about, learned),
         _licence(about, licences),
@@ -66,14 +71,14 @@ def data_set_of(source: str) -> tuple[str, str]:
         return "", ""
 
 
-def _what(generator: Generator) -> str:
+def _what(generator: Generator, half: bool) -> str:
     sensor, name = generator.sensor, generator.public_name()
     weights = sum(weight.numel() for weight in generator.parameters())
     return (
         f"# {name} for {sensor.name}\n\n"
         f"{_discovery.summary('generators', name)}\n\n"
         f"It writes range images of {sensor.height}x{sensor.width} pixels, {sensor.range_min_m:g} to "
-        f"{sensor.range_max_m:g} m, in the rays of the sensor `{sensor.name}`, and has {weights:,} parameters.\n"
+        f"{sensor.range_max_m:g} m, in the rays of the sensor `{sensor.name}`, and has {weights:,} parameters{', rounded to 16 bits' if half else ''}.\n"
         "It is read by the Python package `lidargrit`; `config.json` holds its sizes and rays."
     )
 

@@ -9,7 +9,6 @@ import platform
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,8 +19,8 @@ from torch import nn
 from lidargrit import __version__, configuration
 from lidargrit.errors import CheckpointError, ConfigError, OutputError
 from lidargrit.files import is_taken, read_json, write_json, write_text
-from lidargrit.generators import TRAINED_ON_FILE, Generator, load, load_class
-from lidargrit.loading import RangeImages, load_range_images, seed_of
+from lidargrit.generators import TRAINED_ON_FILE, Generator, load, load_class, locate
+from lidargrit.loading import DataConfig, RangeImages, load_range_images, seed_of
 from lidargrit.reporting import Reporter
 from lidargrit.tokenizers import Tokenizer
 from lidargrit.training.checkpoint import fingerprint
@@ -141,7 +140,7 @@ def check_folder(folder: Path, recipe: Recipe) -> None:
 def _defaults(recipe: Recipe) -> dict[str, Any]:
     """Return the settings of a recipe that changes none: a run that began before there was a setting had this one."""
     fits = {name: FitConfig(fit.scans, fit.batch_size, fit.learning_rate) for name, fit in recipe.training.items()}
-    plain = replace(recipe, model=type(recipe.model)(), training=fits, published="", tokenizer_from=None)
+    plain = Recipe(recipe.title, recipe.generator, type(recipe.model)(), DataConfig(), fits)
     return configuration.leaves(configuration.to_json(plain))
 
 
@@ -182,7 +181,7 @@ def _write_trained_on(folder: Path, train_images: RangeImages, tokenizer_from: s
         came_from = train_images.provenance
         facts = {"recordings": {*came_from.recordings} - {""}, "fingerprints": {*came_from.fingerprints}}
         if tokenizer_from is not None:  # what the tokenizer learned from, the model has learned from
-            theirs = read_json(Path(tokenizer_from) / TRAINED_ON_FILE)
+            theirs = read_json(locate(tokenizer_from) / TRAINED_ON_FILE)
             facts = {name: known | set(theirs[name]) for name, known in facts.items()}
         write_text(folder / TRAINED_ON_FILE, json.dumps({name: sorted(known) for name, known in facts.items()}) + "\n")
 
