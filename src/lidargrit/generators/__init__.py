@@ -262,7 +262,7 @@ class Generator(nn.Module, ABC):
 
 
 def locate(run: str | Path) -> Path:
-    """Return the folder of a run; for the word ``pretrained`` that of the package, unless something here has the name."""
+    """Return the folder of a run; for the word ``pretrained`` that of the package, unless you have one."""
     if str(run) == PRETRAINED and not is_taken(Path(run), CONFIG_FILE):
         return Path(__file__).parents[1] / PRETRAINED
     return Path(run)
