@@ -78,7 +78,8 @@ def _what(generator: Generator, half: bool) -> str:
         f"# {name} for {sensor.name}\n\n"
         f"{_discovery.summary('generators', name)}\n\n"
         f"It writes range images of {sensor.height}x{sensor.width} pixels, {sensor.range_min_m:g} to "
-        f"{sensor.range_max_m:g} m, in the rays of the sensor `{sensor.name}`, and has {weights:,} parameters{', rounded to 16 bits' if half else ''}.\n"
+        f"{sensor.range_max_m:g} m, in the rays of the sensor `{sensor.name}`, and has {weights:,} parameters"
+        f"{', rounded to 16 bits' if half else ''}.\n"
         "It is read by the Python package `lidargrit`; `config.json` holds its sizes and rays."
     )
 
