@@ -2,13 +2,16 @@
 #   make demo              the main job on simulated streets, about 11 minutes on two cores
 #   make demo DATA=FOLDER  the same on your own KITTI-style scans
 #   make test              all checks and all tests
+#   make environment       .venv alone, which all others make if it is missing
 #   make docs              the documentation as a site, in site/
 #   make package           a wheel, installed where nothing else is, and tried; minutes, most of them for torch
 
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test check docs package
+.PHONY: environment demo test check docs package
+
+environment: .venv/.complete
 
 demo: .venv/.complete
 	$(BIN)/lidargrit demo $(if $(DATA),--data "$(DATA)") $(if $(OUT),--out "$(OUT)")
