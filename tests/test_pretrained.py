@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import lidargrit
-from lidargrit import unproject
+from lidargrit import project, simulate, unproject
 from lidargrit.cli import main
 from lidargrit.errors import CheckpointError
 from lidargrit.evaluation.samples import read_samples
@@ -15,6 +15,7 @@ from lidargrit.files import read_tensors
 from lidargrit.generators import Generator, load, locate
 from lidargrit.recipes import load_recipe
 from lidargrit.serving import finished_runs
+from lidargrit.structures import RangeImage
 from lidargrit.training.compute import same_everywhere
 from tiny_runs import the_one_line
 
@@ -60,8 +61,10 @@ def test_its_networks_compute_what_they_did_when_they_were_scored(model, tmp_pat
     monkeypatch.setenv("LIDARGRIT_CACHE", str(tmp_path / "cache"))
     assert main(["evaluate", "pretrained", "simulated:8:test", "--json"]) == 0
     errors = json.loads(capsys.readouterr().out)["reconstruction"]
-    assert errors["range_mae_m"] < 2.0
-    assert errors["mask_accuracy"] > 0.9
+    assert errors["range_mae_m"] == pytest.approx(1.128, rel=0.02)
+    assert errors["mask_accuracy"] == pytest.approx(0.934, abs=0.004)
+    one = RangeImage.stack([project(simulate(seed=0), model.sensor)])
+    assert model.log_likelihood(one).item() / 256 == pytest.approx(-4.81, abs=0.05)  # a token; untrained -6.9
 
 
 def test_what_a_user_calls_so_goes_first(model, tmp_path, monkeypatch):
