@@ -95,9 +95,12 @@ def test_every_verb_that_takes_a_run_takes_the_word(tmp_path, monkeypatch, capsy
     capsys.readouterr()
 
 
-def test_it_is_served_after_the_users_own(model, tmp_path):
+def test_it_is_served_after_the_users_own(model, tmp_path, monkeypatch):
     assert finished_runs(tmp_path) == [FOLDER]
     model.save(tmp_path / "zebra")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "pretrained").mkdir()
+    (tmp_path / "pretrained" / "samples.json").write_text("{}")  # what a user calls so is no run
     assert finished_runs(tmp_path) == [tmp_path / "zebra", FOLDER]
 
 

@@ -114,6 +114,7 @@ def test_scores_of_other_weights_and_taken_folders_are_refused(run, tmp_path, ca
     finally:
         samples.write_text(before)
     assert "which were not drawn from" in told
+    assert "then rounded" in error(run, tmp_path / "new", "--half", "--scores", run.parent / "scores.json")
     assert not (tmp_path / "new").exists()
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "thesis.tex").write_text("")

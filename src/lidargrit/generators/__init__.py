@@ -24,8 +24,8 @@ from lidargrit.tokenizers import Tokenizer
 
 CONFIG_FILE, WEIGHTS_FILE, CARD_FILE = "config.json", "model.safetensors", "README.md"  # the names that the hub knows
 TRAINED_ON_FILE = "trained_on.json"  # in a run's folder and beside its samples: which drives, which pixels
-PRETRAINED = "pretrained"
-"""By this word the model that comes with the package goes, wherever a run is wanted."""
+PRETRAINED = Path(__file__).parents[1] / "pretrained"
+"""The run that comes with the package; by the folder's name it goes wherever a run is wanted."""
 
 
 @dataclass(frozen=True)
@@ -263,9 +263,7 @@ class Generator(nn.Module, ABC):
 
 def locate(run: str | Path) -> Path:
     """Return the folder of a run; for the word ``pretrained`` that of the package, unless you have one."""
-    if str(run) == PRETRAINED and not is_taken(Path(run), CONFIG_FILE):
-        return Path(__file__).parents[1] / PRETRAINED
-    return Path(run)
+    return PRETRAINED if str(run) == PRETRAINED.name and not is_taken(Path(run), CONFIG_FILE) else Path(run)
 
 
 def is_run(folder: Path) -> bool:

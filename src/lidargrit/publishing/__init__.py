@@ -81,10 +81,10 @@ def publish(run: Path, folder: Path, scores: Path | None = None, notes: str = ""
         raise OutputError(f"{folder}, which is not empty", "an empty folder", "choose another one")
     about: Any = read_json(run / RUN_FILE) if (run / RUN_FILE).is_file() else {}
     scored = Scorecard.read(scores) if scores else None
-    weights = generator.weights(half)
+    whole, written = generator.state_dict(), generator.weights(half)
     if scored:
         _check_scores(scored, run)
-        if any(not torch.equal(weight, generator.state_dict()[name]) for name, weight in weights.items()):
+        if any(not torch.equal(weight, written[name].to(weight.dtype)) for name, weight in whole.items()):
             raise ConfigError(
                 "scores of weights that are then rounded",
                 "those of the rounded ones",

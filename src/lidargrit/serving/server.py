@@ -13,7 +13,7 @@ from typing import NamedTuple
 from waitress.server import create_server
 
 from lidargrit.errors import ConfigError, OutputError
-from lidargrit.generators import PRETRAINED, is_run, locate
+from lidargrit.generators import PRETRAINED, is_run
 from lidargrit.serving.application import LOOPBACK_NAMES, Application
 from lidargrit.serving.limits import Limits
 from lidargrit.serving.work import Work
@@ -103,7 +103,7 @@ def opened(
 
 def finished_runs(folder: Path) -> list[Path]:
     """Return the finished runs of a folder, in the order of their names, and last the model in the package."""
-    return [*sorted(path for path in folder.glob("*") if is_run(path)), locate(PRETRAINED)]
+    return [*sorted(path for path in folder.glob("*") if is_run(path)), PRETRAINED]
 
 
 def _listening(host: str, port: int) -> socket.socket:
