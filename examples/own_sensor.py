@@ -8,7 +8,7 @@ import lidargrit
 from lidargrit.files import write_json
 from lidargrit.fitting import fit_sensor
 from lidargrit.fitting.table import as_table
-from lidargrit.viewer.sensor_fit import draw_sensor_fit
+from lidargrit.viewer.sensor_fit import plot_sensor_fit
 
 
 def main(folder: Path, sensor_file: Path | None = None) -> None:
@@ -17,7 +17,7 @@ def main(folder: Path, sensor_file: Path | None = None) -> None:
     scans = [replace(lidargrit.simulate(seed, unknown), ring=None) for seed in range(10)]
     fit = fit_sensor(scans, "mine")
     print(as_table(fit))
-    draw_sensor_fit(fit, folder / "own_sensor.png")
+    plot_sensor_fit(fit, folder / "own_sensor.png")
     if sensor_file:  # every command that takes the name of a sensor takes this file
         write_json(sensor_file, fit.sensor.to_json())
 

@@ -9,18 +9,18 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from lidargrit.serving import Limits
-from lidargrit.serving.server import opened
+from lidargrit.serving.server import open_server
 from test_generator_contract import made
 
 MODELS = ("lidargrit", "marginal", "r2dm")
-LIMITS = Limits(seconds=60.0, silent_seconds=2, upload_bytes=4_000_000)
+LIMITS = Limits(seconds=60.0, idle_seconds=2, upload_bytes=4_000_000)
 
 
 class Served:
     """A running server, and a client."""
 
     def __init__(self, server) -> None:
-        self.port, self.work = server.port, server.work
+        self.port, self.queue = server.port, server.queue
         self.host = f"127.0.0.1:{self.port}"
         self.url = f"http://{self.host}"
 
@@ -51,7 +51,7 @@ class Served:
         return status, line
 
     def take(self, path: str, body: bytes | dict) -> str:
-        """Have a wish taken on, and return the job's path."""
+        """Have a request taken on, and return the job's path."""
         status, _, told = self.ask(path, body)
         assert status == 202, told
         return f"/jobs/{json.loads(told)['job']}"
@@ -83,7 +83,7 @@ def running(folder: Path):
     """Serve one tiny run of each kind."""
     for name in MODELS:
         made(name)[0].save(folder / f"tiny-{name}")
-    with opened([folder / f"tiny-{name}" for name in MODELS], limits=LIMITS) as server:
+    with open_server([folder / f"tiny-{name}" for name in MODELS], limits=LIMITS) as server:
         thread = threading.Thread(target=server.run, daemon=True)
         thread.start()
         yield Served(server)

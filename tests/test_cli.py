@@ -18,7 +18,7 @@ from lidargrit import _discovery
 from lidargrit.cli import main
 from lidargrit.datasets import load
 from lidargrit.evaluation.samples import read_samples
-from lidargrit.evaluation.scorecard import figure
+from lidargrit.evaluation.scorecard import format_value
 from lidargrit.formats import read_scan as read_bin
 from lidargrit.recipes import load_recipe
 from tiny_runs import MODEL
@@ -187,7 +187,7 @@ def test_evaluate_prints_a_table_and_writes_json(samples, tmp_path, typed):
     assert [score["variant"] for score in scores["scores"]] == [line.split()[1] for line in told[1:]]
     for score, line in zip(scores["scores"], told[1:], strict=True):
         assert score["num_generated"] == score["num_reference"] == 3
-        assert f" {figure(score['value'])} " in line
+        assert f" {format_value(score['value'])} " in line
         assert "lower" in line
 
 

@@ -13,7 +13,7 @@ from lidargrit.errors import ConfigError, DataError, LidarGritError, UnknownName
 from lidargrit.evaluation.comparison import Settings, choices, compare_sources
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.protocols import Choice, Protocol, load_protocol
-from lidargrit.evaluation.scorecard import Scorecard, figure
+from lidargrit.evaluation.scorecard import Scorecard, format_value
 from lidargrit.evaluation.sides import open_sides
 from lidargrit.evaluation.tables import published, side_by_side
 from lidargrit.files import write_json
@@ -264,7 +264,7 @@ def test_published_tables_are_whole():
     ("value", "text"), [(0.0, "0"), (0.12345, "0.1235"), (1.5e-4, "0.00015"), (12345.6, "1.235e+04"), (np.nan, "nan")]
 )
 def test_figures_have_four_digits(value, text):
-    assert figure(value) == text
+    assert format_value(value) == text
 
 
 def test_the_command_line_writes_scores_page_and_table(tmp_path, capsys, sets):

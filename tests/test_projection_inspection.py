@@ -17,7 +17,7 @@ from lidargrit.projection.placement import place
 from lidargrit.sensors import load_sensor
 from lidargrit.simulator import simulate
 from lidargrit.structures import RangeImage, Scan
-from lidargrit.viewer.inspection import draw_inspection
+from lidargrit.viewer.inspection import plot_inspection
 
 
 def messy_scan(seed, count=3000):
@@ -139,7 +139,7 @@ def test_the_closest_sensor_is_the_one_that_made_the_scan(name):
 @pytest.mark.parametrize("scale", [1.0, 1000.0])
 def test_the_picture_is_drawn_even_of_nothing(tmp_path, scale):
     scan = simulate(seed=0, sensor=load_sensor("hdl64e_kitti_360").with_columns(64))
-    draw_inspection(inspect(Scan(scan.points_xyz_m * scale), load_sensor("hdl64e_kitti_360")), tmp_path / "it.png")
+    plot_inspection(inspect(Scan(scan.points_xyz_m * scale), load_sensor("hdl64e_kitti_360")), tmp_path / "it.png")
     assert (tmp_path / "it.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
 
 

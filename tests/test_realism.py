@@ -14,7 +14,7 @@ from lidargrit.loading import DataConfig, load_range_images
 from lidargrit.metrics import load_metric
 from lidargrit.sensors import load_sensor
 from lidargrit.structures import RangeImage
-from lidargrit.viewer.curves import draw_curves
+from lidargrit.viewer.curves import plot_curves
 
 SENSOR = load_sensor("hdl64e_kitti_odometry")
 COUNT = 3
@@ -103,14 +103,14 @@ def test_one_scan_and_other_rays_are_refused(simulated, recorded):
 
 
 def test_the_picture_has_every_panel(scores, tmp_path):
-    draw_curves(scores, tmp_path / "all.png", "title")
-    draw_curves(scores[:1], tmp_path / "one.png")
+    plot_curves(scores, tmp_path / "all.png", "title")
+    plot_curves(scores[:1], tmp_path / "one.png")
     sizes = [(tmp_path / name).read_bytes()[16:24] for name in ("all.png", "one.png")]
     widths, heights = zip(*((int.from_bytes(s[:4]), int.from_bytes(s[4:])) for s in sizes), strict=True)
     assert widths == (1400, 1400)
     assert heights[0] > heights[1] > 300
     with pytest.raises(ConfigError, match="no curve to draw"):
-        draw_curves([], tmp_path / "none.png")
+        plot_curves([], tmp_path / "none.png")
 
 
 def test_the_verb(tmp_path, capsys):

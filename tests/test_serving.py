@@ -17,9 +17,9 @@ from lidargrit.errors import ConfigError, ScanError
 from lidargrit.formats import load, read_scan
 from lidargrit.projection import unproject
 from lidargrit.serving import server
-from lidargrit.serving.drawing import draw
-from lidargrit.serving.wishes import Wish, choices_of, read_words, wish_of
-from lidargrit.serving.work import Work
+from lidargrit.serving.jobs import JobQueue
+from lidargrit.serving.requests import SampleRequest, parse_json_object, parse_request, sampling_settings
+from lidargrit.serving.worker import compute_result
 from lidargrit.structures import Scan
 from served import LIMITS, MODELS, running
 from test_generator_contract import made
@@ -31,7 +31,7 @@ QUICK = {"steps": 3, "resamples": 2}
 def served(tmp_path_factory):
     with running(tmp_path_factory.mktemp("runs")) as served:
         yield served
-        place = served.work._place
+        place = served.queue._folder
         assert place.is_dir()
     assert not place.exists(), "nothing is left behind"
 
@@ -56,13 +56,13 @@ def browser(tmp_path_factory):
 
 
 def test_numbers_of_every_generator_can_be_chosen():
-    found = {name: [choice.name for choice in choices_of(made(name)[0].Sampling())] for name in MODELS}
+    found = {name: [setting.name for setting in sampling_settings(made(name)[0].Sampling())] for name in MODELS}
     assert found == {"lidargrit": ["temperature", "top_k", "top_p"], "marginal": [], "r2dm": ["steps", "resamples"]}
-    choices = {choice.name: choice for choice in choices_of(made("dusty")[0].Sampling())}
-    assert choices["tolerance"].default is None
-    assert not choices["tolerance"].whole
-    assert choices["search_steps"].at_most == 1024
-    assert choices["search_rate"].about == "its learning rate at its highest."
+    settings = {setting.name: setting for setting in sampling_settings(made("dusty")[0].Sampling())}
+    assert settings["tolerance"].default is None
+    assert not settings["tolerance"].whole
+    assert settings["search_steps"].at_most == 1024
+    assert settings["search_rate"].about == "its learning rate at its highest."
 
 
 GOOD = {"model": 0, "seed": 3, "count": 2, "sampling": {"temperature": 1, "top_k": 5}}
@@ -95,25 +95,25 @@ GOOD = {"model": 0, "seed": 3, "count": 2, "sampling": {"temperature": 1, "top_k
         ({"x" * 9999: 1}, "one of model, seed"),
     ],
 )
-def test_wishes_out_of_bounds_are_refused(changed, why):
-    choices = [choices_of(made(name)[0].Sampling()) for name in MODELS]
-    wish = wish_of(GOOD, choices, LIMITS)
-    assert (wish.seed, wish.count, wish.sampling) == (3, 2, {"temperature": 1.0, "top_k": 5})
+def test_requests_out_of_bounds_are_refused(changed, why):
+    settings = [sampling_settings(made(name)[0].Sampling()) for name in MODELS]
+    request = parse_request(GOOD, settings, LIMITS)
+    assert (request.seed, request.count, request.sampling) == (3, 2, {"temperature": 1.0, "top_k": 5})
     with pytest.raises(ConfigError, match=why) as refused:
-        wish_of({**GOOD, **changed}, choices, LIMITS)
+        parse_request({**GOOD, **changed}, settings, LIMITS)
     assert len(str(refused.value)) < 300
 
 
 @pytest.mark.parametrize("data", [b"", b"[]", b"7", b"{", b'{"seed": NaN}', b"\xff", b"[" * 4000, b'{"a":' * 800])
 def test_words_that_are_none_are_refused(data):
     with pytest.raises(ConfigError, match="no JSON object"):
-        read_words(data)
+        parse_json_object(data)
 
 
 def test_names_of_files_lose_what_could_do_harm():
     for name, plain in (("../../a b.ply", "a_b.ply"), ("c:\\x\\y.bin", "y.bin"), ("<i>.npz", "_i_.npz"), (7, "")):
-        assert wish_of({"name": name}, [[]], LIMITS).name == plain
-    assert len(wish_of({"name": "n" * 9999}, [[]], LIMITS).name) == 60
+        assert parse_request({"name": name}, [[]], LIMITS).name == plain
+    assert len(parse_request({"name": "n" * 9999}, [[]], LIMITS).name) == 60
 
 
 def test_a_part_of_the_circle_and_rings_that_nobody_told(tmp_path):
@@ -122,15 +122,15 @@ def test_a_part_of_the_circle_and_rings_that_nobody_told(tmp_path):
     shuffled = torch.randperm(int(ahead.sum()), generator=torch.Generator().manual_seed(0))
     part = Scan(scan.points_xyz_m[ahead][shuffled], scan.reflectance[ahead][shuffled])
     load("kitti_bin").write(tmp_path / "part.bin", part)
-    wish = Wish(0, sampling=QUICK, file=str(tmp_path / "part.bin"), name="mine.bin")
-    uploaded, completed = draw(made("r2dm")[0], wish)
+    request = SampleRequest(0, sampling=QUICK, file=str(tmp_path / "part.bin"), name="mine.bin")
+    uploaded, completed = compute_result(made("r2dm")[0], request)
     kept = uploaded.images.return_mask
     assert 0.15 < kept.float().mean() < 0.3
     assert not kept[:, :, :8].any(), "behind"
     assert completed.images.return_mask.sum() > kept.sum()
     assert torch.equal(completed.images.range_m[kept], uploaded.images.range_m[kept])
     with pytest.raises(ScanError, match=r"degrees of azimuth in mine\.bin"):
-        draw(made("lidargrit")[0], replace(wish, sampling={}))
+        compute_result(made("lidargrit")[0], replace(request, sampling={}))
 
 
 # In a browser.
@@ -289,7 +289,7 @@ def test_everything_is_reached_by_keys_and_has_a_name(opened):
 # The command.
 
 
-class Idle(Work):
+class Idle(JobQueue):
     """Draws nothing."""
 
     def __init__(self, *_: object) -> None:
@@ -305,7 +305,7 @@ def test_the_command_says_where_and_to_whom(tmp_path, capsys, monkeypatch):
     (tmp_path / "runs" / "tiny" / "model.safetensors").write_bytes(b"no weights")
     assert main(["serve", "--port", "0"]) == 2, "told by the process that draws"
     assert re.fullmatch(r"lidargrit serve: got \S*model.safetensors.*; wanted .*; .*\n", capsys.readouterr().err)
-    monkeypatch.setattr(server, "Work", Idle)
+    monkeypatch.setattr(server, "JobQueue", Idle)
     monkeypatch.setattr(TcpWSGIServer, "run", lambda self: None)
     assert main(["serve", "--port", "0", "--host", "0.0.0.0"]) == 0
     said = capsys.readouterr().out

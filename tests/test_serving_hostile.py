@@ -29,9 +29,9 @@ def served(tmp_path_factory):
         yield served
 
 
-def upload(served, path: Path, wish: dict) -> str:
-    words = urllib.parse.quote(json.dumps({"name": path.name, **wish}))
-    return served.take(f"/complete?wish={words}", path.read_bytes())
+def upload(served, path: Path, request: dict) -> str:
+    words = urllib.parse.quote(json.dumps({"name": path.name, **request}))
+    return served.take(f"/complete?request={words}", path.read_bytes())
 
 
 def test_every_answer_forbids_what_it_does_not_need(served):
@@ -66,7 +66,7 @@ def test_which_names_are_our_own():
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", "", "https://127.0.0.1", "http://127.0.0.1:1"])
-def test_a_wish_from_another_page_is_refused(served, origin):
+def test_a_request_from_another_page_is_refused(served, origin):
     for path in ("/generate", "/complete"):
         assert served.refused(path, {}, Origin=origin)[0] == 403
 
@@ -134,7 +134,7 @@ def bombs() -> dict[str, bytes]:
 
 
 def test_hostile_files_are_refused_and_removed(served, tmp_path):
-    status = Path(f"/proc/{served.work._process._process.pid}/status")
+    status = Path(f"/proc/{served.queue._process._process.pid}/status")
     jobs = {}
     for name, data in bombs().items():
         (tmp_path / name).write_bytes(data)
@@ -143,12 +143,12 @@ def test_hostile_files_are_refused_and_removed(served, tmp_path):
         told = served.ended(jobs[name])
         assert told["state"] == "failed", name
         assert name in told["error"]
-        assert str(served.work._place) not in told["error"]
+        assert str(served.queue._folder) not in told["error"]
         assert served.ask(f"{jobs[name]}/scans")[0] == 404
     if status.exists():
         most_kb = int(re.search(r"VmHWM:\s+(\d+)", status.read_text())[1])
         assert most_kb < 1_500_000, "no more than the program takes anyway, and one array"
-    assert not list(served.work._place.rglob("upload*"))
+    assert not list(served.queue._folder.rglob("upload*"))
     assert served.ended(served.take("/generate", {"model": 1}))["state"] == "done", "the same process goes on"
 
 
@@ -162,7 +162,7 @@ def test_too_much_is_cut_off_without_being_read(served):
     answer, _ = served.say(f"GET / HTTP/1.1\r\nHost: {served.host}\r\nX: {'x' * 20_000}\r\n\r\n".encode())
     assert b" 431 " in answer[:20]
     assert served.refused("/generate", {"seed": 1, "hidden": "x" * 5000})[0] == 400
-    assert served.refused("/complete?" + "wish={}&" * 400, b"x")[0] == 400
+    assert served.refused("/complete?" + "request={}&" * 400, b"x")[0] == 400
     assert served.refused("/complete", b"x")[0] == 400
     assert seconds < 5
 
@@ -193,10 +193,10 @@ def test_fifty_clients_at_once(served):
 
     def client() -> None:
         page = served.ask("/")[0]
-        wish, _, told = served.ask("/generate", {"model": 1})
+        request, _, told = served.ask("/generate", {"model": 1})
         assert page == 200
-        assert wish == 202 or b"others are waiting already" in told
-        answers.append(wish)
+        assert request == 202 or b"others are waiting already" in told
+        answers.append(request)
 
     threads = [threading.Thread(target=client) for _ in range(50)]
     for thread in threads:
@@ -204,28 +204,28 @@ def test_fifty_clients_at_once(served):
     for thread in threads:
         thread.join()
     assert sorted(answers) == [202] * LIMITS.waiting + [503] * (50 - LIMITS.waiting)
-    served.work.limits = replace(LIMITS, unheard_seconds=0.0)  # nobody asks for theirs
-    os.kill(served.work._process._process.pid, signal.SIGKILL)  # as when memory runs out
+    served.queue.limits = replace(LIMITS, unpolled_seconds=0.0)  # nobody asks for theirs
+    os.kill(served.queue._process._process.pid, signal.SIGKILL)  # as when memory runs out
     assert "ended the program" in served.ended(holding)["error"]
     end = time.monotonic() + 20
-    while served.work._waiting:
+    while served.queue._waiting:
         assert time.monotonic() < end
         time.sleep(0.02)
-    served.work.limits = LIMITS
+    served.queue.limits = LIMITS
     assert served.ended(served.take("/generate", {"model": 1}))["state"] == "done", "a new process draws"
 
 
 def test_what_takes_too_long_is_ended(served):
-    served.work.limits = replace(LIMITS, seconds=0.4)
+    served.queue.limits = replace(LIMITS, seconds=0.4)
     told = served.ended(served.take("/generate", LONG))
-    served.work.limits = LIMITS
+    served.queue.limits = LIMITS
     assert told["state"] == "failed"
     assert "takes longer than 0.4 seconds" in told["error"]
     assert told["seconds"] < 5
 
 
 def test_old_results_are_forgotten(served):
-    served.work.limits = replace(LIMITS, kept=2)
+    served.queue.limits = replace(LIMITS, kept=2)
     jobs = [
         served.take("/generate", {"model": 9}) if False else served.take("/generate", {"model": 1}) for _ in range(4)
     ]
@@ -234,4 +234,4 @@ def test_old_results_are_forgotten(served):
     last = served.take("/generate", {"model": 1})
     assert [served.ask(job)[0] for job in jobs] == [404, 404, 200, 200]
     served.ended(last)
-    served.work.limits = LIMITS
+    served.queue.limits = LIMITS

@@ -19,7 +19,7 @@ from lidargrit.training import FitConfig, measure, train, training_flops
 from lidargrit.training.fit import Fit
 from lidargrit.training.log import Log
 from lidargrit.training.optimiser import WeightAverage, learning_rate_at, make_optimiser, memory_of_weights
-from lidargrit.viewer import draw_progress
+from lidargrit.viewer import plot_progress
 
 TINY = [
     "data.train=[simulated:6:train]",
@@ -215,7 +215,7 @@ def test_stages_use_their_own_settings():
 def test_pictures_change_nothing(tmp_path):
     every = [f"training.{stage}.pictures_every=6" for stage in ("tokenizer", "transformer")]
     train(load_recipe("demo", TINY), tmp_path / "plain")
-    train(load_recipe("demo", TINY + every), tmp_path / "drawn", draw=draw_progress)
+    train(load_recipe("demo", TINY + every), tmp_path / "drawn", draw=plot_progress)
     plain, drawn = ((tmp_path / name / "model.safetensors").read_bytes() for name in ("plain", "drawn"))
     assert plain == drawn
     pictures = {str(path.relative_to(tmp_path / "drawn")): path for path in (tmp_path / "drawn").rglob("*.png")}

@@ -19,9 +19,9 @@ from lidargrit.loading import DataConfig
 from lidargrit.projection import unproject
 from lidargrit.sensors import load_sensor
 from lidargrit.structures import RangeImage
-from lidargrit.viewer import gathering, interactive
-from lidargrit.viewer.gathering import Shown, gather
+from lidargrit.viewer import interactive, scan_sets
 from lidargrit.viewer.interactive import page, write_page
+from lidargrit.viewer.scan_sets import ScanSet, load_scan_sets
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(256)
 NAMES = ("first <b>scan</b>", "second", "third")
@@ -48,10 +48,10 @@ def labels(images: RangeImage) -> torch.Tensor:
 
 
 @pytest.fixture(scope="module")
-def shown() -> list[Shown]:
+def shown() -> list[ScanSet]:
     real, other = scans(), scans(seed=1)
     plain = RangeImage(other.range_m, other.return_mask, SENSOR)  # as a generator without reflectance draws
-    return [Shown("real </script>", real, NAMES, labels(real)), Shown("generated", plain[:2], ("seed 0", "seed 1"))]
+    return [ScanSet("real </script>", real, NAMES, labels(real)), ScanSet("generated", plain[:2], ("seed 0", "seed 1"))]
 
 
 def told(text: str) -> dict:
@@ -92,12 +92,12 @@ def test_twelve_scans_take_a_few_megabytes():
     images = scans(load_sensor("hdl64e_kitti_360"), 12)
     noisy = images.range_m + 0.02 * torch.randn(images.range_m.shape, generator=torch.Generator().manual_seed(0))
     images = RangeImage.masked(noisy.clamp(min=1.5), images.return_mask, images.sensor)
-    assert len(page([Shown("noisy", images, tuple("abcdefghijkl"))])) < 3_000_000
+    assert len(page([ScanSet("noisy", images, tuple("abcdefghijkl"))])) < 3_000_000
 
 
 def test_pages_of_nothing_and_of_too_much(shown, tmp_path):
     empty = RangeImage(torch.zeros(1, 64, 256), torch.zeros(1, 64, 256, dtype=torch.bool), SENSOR)
-    write_page([Shown("none", empty, ("a",))], tmp_path / "new" / "page.html")
+    write_page([ScanSet("none", empty, ("a",))], tmp_path / "new" / "page.html")
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["page.html"]
     for wrong in ([], shown * 5):
         with pytest.raises(ConfigError, match="1 to 8"):
@@ -112,7 +112,7 @@ def test_scripts_stay_short():
 
 
 def test_labels_stand_where_their_points_are():
-    (one,) = gather(["simulated:1:val"], 1)
+    (one,) = load_scan_sets(["simulated:1:val"], 1)
     assert one.scan_names == ("seed_1000000",)
     assert one.label is not None
     assert not one.label[~one.images.return_mask].any()
@@ -130,11 +130,11 @@ def test_scans_that_cannot_be_used_are_refused_or_left_out(tmp_path):
     KittiBin.write(tmp_path / "0.bin", type(scan)(scan.points_xyz_m[order], scan.reflectance[order]))
     (tmp_path / "1.bin").write_bytes(b"no scan at all")
     with pytest.raises(ScanError, match=r"1\.bin"):
-        gather([str(tmp_path)], 2)
-    (one,) = gather([str(tmp_path)], 2, config=DataConfig(bad_scans="skip"))
+        load_scan_sets([str(tmp_path)], 2)
+    (one,) = load_scan_sets([str(tmp_path)], 2, config=DataConfig(bad_scans="skip"))
     assert one.scan_names == ("0",)
     assert one.label is None
-    assert gathering._short("x" * 99) == "..." + "x" * 37
+    assert scan_sets._short("x" * 99) == "..." + "x" * 37
 
 
 def test_the_command_writes_a_page(tmp_path, capsys):

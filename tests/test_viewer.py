@@ -10,7 +10,7 @@ import torch
 from lidargrit.errors import ConfigError, OutputError
 from lidargrit.sensors import load_sensor
 from lidargrit.structures import RangeImage
-from lidargrit.viewer import draw_comparison, pictures
+from lidargrit.viewer import pictures, plot_comparison
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def size_of_png(path):
 
 
 def test_picture_of_two_groups(images, tmp_path):
-    draw_comparison({"real": images, "generated": images[0]}, tmp_path / "new" / "a.png", 80.0, "title")
+    plot_comparison({"real": images, "generated": images[0]}, tmp_path / "new" / "a.png", 80.0, "title")
     width, height = size_of_png(tmp_path / "new" / "a.png")
     assert width == 1400
     assert 900 < height < 1300  # three rows: two real, one generated
@@ -38,27 +38,27 @@ def test_picture_of_two_groups(images, tmp_path):
 def test_other_sensors_labels_and_empty_images(images, tmp_path):
     sensor = load_sensor("hdl64e_kitti_360")
     nothing = RangeImage(torch.zeros(64, 1024), torch.zeros(64, 1024, dtype=torch.bool), sensor)
-    draw_comparison({"one": images[:1], "none": nothing}, tmp_path / "a.png", labels=["crossing"])
-    draw_comparison({"none": nothing}, tmp_path / "b.png")
+    plot_comparison({"one": images[:1], "none": nothing}, tmp_path / "a.png", labels=["crossing"])
+    plot_comparison({"none": nothing}, tmp_path / "b.png")
     assert size_of_png(tmp_path / "a.png")[1] > size_of_png(tmp_path / "b.png")[1]
 
 
 def test_images_in_training_can_be_drawn(images, tmp_path):
     leaf = RangeImage(images.range_m.clone().requires_grad_(), images.return_mask, images.sensor)
-    draw_comparison({"reconstructed": leaf[:1]}, tmp_path / "a.png")
+    plot_comparison({"reconstructed": leaf[:1]}, tmp_path / "a.png")
     assert (tmp_path / "a.png").is_file()
 
 
 def test_global_state_is_left_alone(images, tmp_path):
     before = dict(mpl.rcParams), "matplotlib.pyplot" in sys.modules
-    draw_comparison({"real": images[0]}, tmp_path / "a.png")
+    plot_comparison({"real": images[0]}, tmp_path / "a.png")
     after = dict(mpl.rcParams), "matplotlib.pyplot" in sys.modules
     assert before == after
 
 
 def test_older_picture_is_replaced_in_one_step(images, tmp_path, monkeypatch):
     path = tmp_path / "a.png"
-    draw_comparison({"real": images[0]}, path)
+    plot_comparison({"real": images[0]}, path)
     whole = path.read_bytes()
 
     def fail_half_way(self, target, **kwargs):
@@ -67,7 +67,7 @@ def test_older_picture_is_replaced_in_one_step(images, tmp_path, monkeypatch):
 
     monkeypatch.setattr(pictures.Figure, "savefig", fail_half_way)
     with pytest.raises(OutputError, match="No space left on device"):
-        draw_comparison({"real": images[1]}, path)
+        plot_comparison({"real": images[1]}, path)
     assert path.read_bytes() == whole
     assert [p.name for p in tmp_path.iterdir()] == ["a.png"]
 
@@ -75,18 +75,18 @@ def test_older_picture_is_replaced_in_one_step(images, tmp_path, monkeypatch):
 def test_place_below_a_file_is_refused(images, tmp_path):
     (tmp_path / "file").write_text("taken")
     with pytest.raises(OutputError, match="while writing"):
-        draw_comparison({"real": images[0]}, tmp_path / "file" / "a.png")
+        plot_comparison({"real": images[0]}, tmp_path / "file" / "a.png")
 
 
 def test_what_cannot_be_drawn_is_refused(images, tmp_path):
     path = tmp_path / "a.png"
     with pytest.raises(ConfigError, match="no group of range images"):
-        draw_comparison({}, path)
+        plot_comparison({}, path)
     nine = RangeImage.stack([images[0]] * 9)
     with pytest.raises(ConfigError, match="of 1 to 8"):
-        draw_comparison({"real": nine}, path)
+        plot_comparison({"real": nine}, path)
     with pytest.raises(ConfigError, match="more than 0 m"):
-        draw_comparison({"real": images}, path, max_range_m=-1.0)
+        plot_comparison({"real": images}, path, max_range_m=-1.0)
     with pytest.raises(ConfigError, match="1 labels"):
-        draw_comparison({"real": images}, path, labels=["only one"])
+        plot_comparison({"real": images}, path, labels=["only one"])
     assert not path.exists()

@@ -28,9 +28,9 @@ from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
 from lidargrit.structures import RangeImage
 from lidargrit.training import check_folder, train
-from lidargrit.viewer import draw_comparison
-from lidargrit.viewer.gathering import Shown
-from lidargrit.viewer.story import Story, write_story
+from lidargrit.viewer import plot_comparison
+from lidargrit.viewer.demo_page import DemoPage, write_demo_page
+from lidargrit.viewer.scan_sets import ScanSet
 
 PAGE, PICTURE, TIMINGS = "demo.html", "scans_reconstructed_generated.png", "timings.json"
 _NUM_SAMPLES = 16
@@ -124,9 +124,13 @@ def tell(
         again = generator.reconstruct(shown)
     new = samples.batch(range(min(_SHOWN, len(samples))))
     seeds = tuple(f"seed {seed}" for seed in range(len(new)))
-    sets = (Shown(f"{kind}, held out", shown, names), Shown("reconstructed", again, names), Shown("new", new, seeds))
+    sets = (
+        ScanSet(f"{kind}, held out", shown, names),
+        ScanSet("reconstructed", again, names),
+        ScanSet("new", new, seeds),
+    )
     told = errors, *cards, seconds, facts, folder
-    write_story(Story(kind, names[0], shown[:1], tokens, decoded, drawn, sets, *told), folder / PAGE)
+    write_demo_page(DemoPage(kind, names[0], shown[:1], tokens, decoded, drawn, sets, *told), folder / PAGE)
 
 
 def divided(data: str, reporter: Reporter) -> DataConfig:
@@ -226,9 +230,9 @@ def _trained_s(log: Path) -> float:
 def _draw(generator: Generator, kind: str, val: RangeImages, samples: RangeImages, folder: Path) -> None:
     real = val.batch(spread(3, len(val)))
     title = f"{kind} scans never trained on, what the tokens keep of them, and new scans"
-    draw_comparison(
+    plot_comparison(
         {kind: real, "reconstructed": generator.reconstruct(real), "generated": samples.batch(range(3))},
         folder / PICTURE,
         title=title,
     )
-    draw_comparison({"generated": samples.batch(range(3, 11))}, folder / "generated.png", title="generated scans")
+    plot_comparison({"generated": samples.batch(range(3, 11))}, folder / "generated.png", title="generated scans")

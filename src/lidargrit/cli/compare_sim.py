@@ -32,7 +32,7 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.files import refuse_to_overwrite
     from lidargrit.loading import DataConfig
     from lidargrit.reporting import TerminalReporter
-    from lidargrit.viewer.curves import draw_curves
+    from lidargrit.viewer.curves import plot_curves
 
     refuse_to_overwrite(options.out, options.overwrite, ".png")
     refuse_taken(options)
@@ -41,6 +41,6 @@ def run(options: argparse.Namespace) -> None:
     scores = compare_source(
         options.real, options.count, options.sensor, options.fine, options.seed, config, TerminalReporter()
     )
-    draw_curves(scores, options.out, f"real: {options.real}")
+    plot_curves(scores, options.out, f"real: {options.real}")
     result = {**about, "seed": options.seed, "curves": as_json(scores)}
     tell(options, as_table(scores), result, f"done: look at {options.out}")

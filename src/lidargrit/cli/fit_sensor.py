@@ -36,9 +36,9 @@ def run(options: argparse.Namespace) -> None:
     name = options.out.stem if options.name is None else options.name
     fit = fit_sensor_to_source(options.source, name, options.max_scans, options.bad_points)
     if options.picture:
-        from lidargrit.viewer.sensor_fit import draw_sensor_fit
+        from lidargrit.viewer.sensor_fit import plot_sensor_fit
 
-        draw_sensor_fit(fit, options.picture)
+        plot_sensor_fit(fit, options.picture)
     write_json(options.out, fit.sensor.to_json())
     done = f"done: {options.out}; use it with data.sensor={options.out} (train), or wherever a sensor is named"
     tell(options, as_table(fit), {"sensor_file": str(options.out), **as_json(fit)}, done)

@@ -34,7 +34,7 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.projection.fit import closest_sensor
     from lidargrit.projection.inspection import as_json, as_table, inspect
     from lidargrit.sensors import load_sensor
-    from lidargrit.viewer.inspection import draw_inspection
+    from lidargrit.viewer.inspection import plot_inspection
 
     refuse_to_overwrite(options.out, options.overwrite, ".png")
     refuse_taken(options)
@@ -50,5 +50,5 @@ def run(options: argparse.Namespace) -> None:
         sensor = sensor.with_columns(options.columns)
     found = inspect(scan, sensor, options.projection, options.variant)
     if options.out:
-        draw_inspection(found, options.out)
+        plot_inspection(found, options.out)
     tell(options, as_table(found), as_json(found), f"\ndone: look at {options.out}" if options.out else "")

@@ -35,7 +35,7 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.recipes import load_recipe
     from lidargrit.reporting import TerminalReporter
     from lidargrit.training import measure, plan, tracked, train
-    from lidargrit.viewer import draw_progress
+    from lidargrit.viewer import plot_progress
 
     recipe = load_recipe(options.recipe, options.set)
     if options.dry_run or options.measure:
@@ -49,5 +49,5 @@ def run(options: argparse.Namespace) -> None:
             "--json for a training", "--dry-run or --measure beside it", "read RUN/STAGE/log.jsonl instead"
         )
     with tracked(options.wandb, recipe, options.out):
-        train(recipe, options.out, TerminalReporter(), draw_progress)
+        train(recipe, options.out, TerminalReporter(), plot_progress)
     print(f"done: the model lies in {options.out}; sample it with: lidargrit sample {options.out} samples -n 16")

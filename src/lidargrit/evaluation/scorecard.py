@@ -174,7 +174,7 @@ class Scorecard:
         return "\n".join(lines)
 
 
-def figure(value: float) -> str:
+def format_value(value: float) -> str:
     """Return a number with four digits that count."""
     if value == 0 or not math.isfinite(value):
         return f"{value:g}"
@@ -186,9 +186,9 @@ def _row(score: Score) -> tuple[str, ...]:
     return (
         result.metric,
         result.variant,
-        figure(result.value),
-        f"{figure(interval.low)} .. {figure(interval.high)}" if interval else "-",
-        f"{figure(floor.value)} (n={floor.num_scans})" if floor else "-",
+        format_value(result.value),
+        f"{format_value(interval.low)} .. {format_value(interval.high)}" if interval else "-",
+        f"{format_value(floor.value)} (n={floor.num_scans})" if floor else "-",
         "higher" if result.higher_is_better else "lower",
         f"{result.num_generated} v {result.num_reference}",
     )

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from lidargrit.errors import DataError
-from lidargrit.evaluation.scorecard import Score, Scorecard, figure
+from lidargrit.evaluation.scorecard import Score, Scorecard, format_value
 
 Format = Literal["text", "markdown", "latex"]
 Column = tuple[str, str]  # metric, variant
@@ -69,7 +69,7 @@ def _measured(cards: Sequence[tuple[str, Scorecard]]) -> Block:
     floors = {_column(score): score.floor for score in card.scores if score.floor}
     if floors:
         count = next(iter(floors.values())).num_scans
-        cells = tuple(figure(floors[column].value) if column in floors else "" for column in columns)
+        cells = tuple(format_value(floors[column].value) if column in floors else "" for column in columns)
         rows.append((f"(floor: the reference's halves, n = {count})", cells))
     title = (
         f"Measured, protocol {card.protocol}, {card.reference.scans_used:,} scans each, "
@@ -118,8 +118,10 @@ def _column(score: Score) -> Column:
 
 def _cell(score: Score) -> str:
     if score.interval is None:
-        return figure(score.result.value)
-    return f"{figure(score.result.value)} [{figure(score.interval.low)}, {figure(score.interval.high)}]"
+        return format_value(score.result.value)
+    return (
+        f"{format_value(score.result.value)} [{format_value(score.interval.low)}, {format_value(score.interval.high)}]"
+    )
 
 
 def _grid(block: Block) -> list[list[str]]:

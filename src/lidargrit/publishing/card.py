@@ -11,7 +11,7 @@ from lidargrit import _discovery
 from lidargrit.datasets import load as load_dataset
 from lidargrit.datasets import without_place
 from lidargrit.errors import LidarGritError
-from lidargrit.evaluation.scorecard import Scorecard, figure
+from lidargrit.evaluation.scorecard import Scorecard, format_value
 from lidargrit.generators import Generator
 from lidargrit.loading import Provenance
 from lidargrit.loading.prepared import Place, is_prepared, read_plan
@@ -175,11 +175,11 @@ def _scores(card: Scorecard) -> str:
     ]
     for score in card.scores:
         interval, result = score.interval, score.result
-        between = f"{figure(interval.low)} to {figure(interval.high)}" if interval else "-"
-        floor = figure(score.floor.value) if score.floor else "-"
+        between = f"{format_value(interval.low)} to {format_value(interval.high)}" if interval else "-"
+        floor = format_value(score.floor.value) if score.floor else "-"
         better = "higher" if result.higher_is_better else "lower"
         lines.append(
-            f"| {result.metric} | {result.variant} | {figure(result.value)} | {between} | {floor} | {better} |"
+            f"| {result.metric} | {result.variant} | {format_value(result.value)} | {between} | {floor} | {better} |"
         )
     notes = [f"- not the protocol: {each}" for each in card.deviations] + [
         f"- warning: {each}" for each in card.warnings

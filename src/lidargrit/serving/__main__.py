@@ -4,10 +4,10 @@ import json
 import sys
 from pathlib import Path
 
-from lidargrit.serving.drawing import work
+from lidargrit.serving.worker import run_worker
 
 asked = json.loads(sys.argv[1])
 try:
-    work([Path(run) for run in asked["runs"]], asked["device"])
+    run_worker([Path(run) for run in asked["runs"]], asked["device"])
 except (KeyboardInterrupt, BrokenPipeError):
     sys.exit(130)

@@ -1,4 +1,4 @@
-"""Requests → answers, by WSGI: the page and its scripts, models, wishes, results, and files to save.
+"""Requests → answers, by WSGI: the page and its scripts, models, requests, results, and files to save.
 
 No path of a request is ever a path on disk: it is compared with a handful of routes. Whoever is not asked for by a
 name of ours is refused, so that no web page elsewhere can talk to this one through somebody's browser.
@@ -26,10 +26,10 @@ from lidargrit.errors import ConfigError, LidarGritError
 from lidargrit.formats import candidates
 from lidargrit.projection import unproject
 from lidargrit.sensors import SensorModel
-from lidargrit.serving.drawing import PAGE_FILE, PIXELS_FILE
+from lidargrit.serving.jobs import Job, JobQueue
 from lidargrit.serving.page import page, script, style
-from lidargrit.serving.wishes import read_words, wish_of
-from lidargrit.serving.work import Job, Work
+from lidargrit.serving.requests import parse_json_object, parse_request
+from lidargrit.serving.worker import PAGE_FILE, PIXELS_FILE
 from lidargrit.structures import RangeImage
 
 LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
@@ -52,7 +52,7 @@ _HEADERS = [
 Environment = dict[str, Any]
 
 
-class Answer(NamedTuple):
+class Response(NamedTuple):
     """What a request gets.
 
     Args:
@@ -68,83 +68,83 @@ class Answer(NamedTuple):
     name: str = ""
 
 
-class RefusedError(Exception):
+class RefusedRequestError(Exception):
     """A request that gets no answer but why."""
 
     def __init__(self, status: str, why: str) -> None:
         super().__init__(why)
-        self.answer = Answer(status, json.dumps({"error": why}).encode())
+        self.answer = Response(status, json.dumps({"error": why}).encode())
 
 
 class Application:
     """Answers requests.
 
     Args:
-        work: draws.
+        queue: runs the jobs.
         host: at which it is served; names of this machine's own are known besides.
     """
 
-    def __init__(self, work: Work, host: str = "127.0.0.1") -> None:
-        self._work, self._host = work, host
-        models = [{name: of for name, of in model.items() if name != "rays"} for model in work.models]
-        limits = {"scans": work.limits.scans, "uploadBytes": work.limits.upload_bytes}
+    def __init__(self, queue: JobQueue, host: str = "127.0.0.1") -> None:
+        self._queue, self._host = queue, host
+        models = [{name: of for name, of in model.items() if name != "rays"} for model in queue.models]
+        limits = {"scans": queue.limits.scans, "uploadBytes": queue.limits.upload_bytes}
         self._fixed = {
-            "/": Answer("200 OK", page().encode(), "text/html; charset=utf-8"),
-            "/page.js": Answer("200 OK", script().encode(), "text/javascript; charset=utf-8"),
-            "/page.css": Answer("200 OK", style().encode(), "text/css; charset=utf-8"),
-            "/models": Answer("200 OK", json.dumps({"models": models, "limits": limits}).encode()),
+            "/": Response("200 OK", page().encode(), "text/html; charset=utf-8"),
+            "/page.js": Response("200 OK", script().encode(), "text/javascript; charset=utf-8"),
+            "/page.css": Response("200 OK", style().encode(), "text/css; charset=utf-8"),
+            "/models": Response("200 OK", json.dumps({"models": models, "limits": limits}).encode()),
         }
-        self._choices = work.choices()
+        self._settings = queue.settings()
 
     def __call__(self, environment: Environment, start: Callable[[str, list[tuple[str, str]]], Any]) -> Iterable[bytes]:
         """Answer a request, as WSGI wants it."""
         try:
             answer = self._answer(environment)
-        except RefusedError as refused:
+        except RefusedRequestError as refused:
             answer = refused.answer
         except LidarGritError as error:
-            answer = RefusedError("400 Bad Request", str(error)).answer
+            answer = RefusedRequestError("400 Bad Request", str(error)).answer
         headers = [("Content-Type", answer.kind), ("Content-Length", str(len(answer.body))), *_HEADERS]
         if answer.name:
             headers.append(("Content-Disposition", f'attachment; filename="{answer.name}"'))
         start(answer.status, headers)
         return [answer.body]
 
-    def _answer(self, environment: Environment) -> Answer:
+    def _answer(self, environment: Environment) -> Response:
         host = environment.get("HTTP_HOST", "")
         if not is_own(host, self._host):
-            raise RefusedError("403 Forbidden", "This address is not one that this page is served at.")
+            raise RefusedRequestError("403 Forbidden", "This address is not one that this page is served at.")
         method, path = environment["REQUEST_METHOD"], environment["PATH_INFO"]
         if method == "GET":
             return self._get(path)
         if method != "POST" or path not in ("/generate", "/complete"):
-            raise RefusedError("405 Method Not Allowed", "This page takes GET, and POST of a wish.")
+            raise RefusedRequestError("405 Method Not Allowed", "This page takes GET, and POST of a request.")
         if environment.get("HTTP_ORIGIN", "") != f"http://{host}":
-            raise RefusedError("403 Forbidden", "A wish comes from the page itself, and from no other.")
+            raise RefusedRequestError("403 Forbidden", "A request comes from the page itself, and from no other.")
         return self._taken_on(environment, path)
 
-    def _get(self, path: str) -> Answer:
+    def _get(self, path: str) -> Response:
         if path in self._fixed:
             return self._fixed[path]
         named = _RESULT.fullmatch(path)
-        job = self._work.job(named[1]) if named else None
+        job = self._queue.job(named[1]) if named else None
         if named is None or job is None:
-            raise RefusedError("404 Not Found", "There is nothing here, or it is no longer kept.")
+            raise RefusedRequestError("404 Not Found", "There is nothing here, or it is no longer kept.")
         if not named[2]:
-            told = {"state": job.state, "before": self._work.before(job), "seconds": round(job.seconds(), 1)}
-            return Answer("200 OK", json.dumps({**told, "error": job.error}).encode())
+            told = {"state": job.state, "before": self._queue.before(job), "seconds": round(job.seconds(), 1)}
+            return Response("200 OK", json.dumps({**told, "error": job.error}).encode())
         try:
             if job.state == "done" and named[2] == "scans":
-                return Answer("200 OK", (job.folder / PAGE_FILE).read_bytes())
+                return Response("200 OK", (job.folder / PAGE_FILE).read_bytes())
             if job.state == "done" and named[5] in _WRITERS:
                 return self._file(job, int(named[3]), int(named[4]), named[5])
         except (OSError, KeyError, IndexError):  # forgotten meanwhile, or never there
             pass
-        raise RefusedError("404 Not Found", "There is no such scan, or it is no longer kept.")
+        raise RefusedRequestError("404 Not Found", "There is no such scan, or it is no longer kept.")
 
-    def _file(self, job: Job, group: int, index: int, kind: str) -> Answer:
+    def _file(self, job: Job, group: int, index: int, kind: str) -> Response:
         """Write a scan as other programs read it."""
-        sensor = SensorModel.from_json(self._work.models[job.wish.model]["rays"])
+        sensor = SensorModel.from_json(self._queue.models[job.request.model]["rays"])
         with np.load(job.folder / PIXELS_FILE, allow_pickle=False) as pixels:
             range_m = torch.from_numpy(pixels[f"range_m_{group}"][index])
             reflectance = pixels.get(f"reflectance_{group}")
@@ -153,34 +153,36 @@ class Application:
         with tempfile.TemporaryDirectory(dir=job.folder) as folder:
             path = Path(folder) / f"scan.{kind}"
             formats.load(_WRITERS[kind]).write(path, scan)
-            return Answer("200 OK", path.read_bytes(), "application/octet-stream", path.name)
+            return Response("200 OK", path.read_bytes(), "application/octet-stream", path.name)
 
-    def _taken_on(self, environment: Environment, path: str) -> Answer:
-        """Check a wish, and let it wait for its turn."""
+    def _taken_on(self, environment: Environment, path: str) -> Response:
+        """Check a request, and let it wait for its turn."""
         body, size = environment["wsgi.input"], int(environment.get("CONTENT_LENGTH") or 0)
         if path == "/generate":
-            words = body.read(min(size, self._work.limits.words_bytes))  # what is longer is cut, and no JSON any more
-            wish = wish_of(read_words(words), self._choices, self._work.limits)
+            words = body.read(min(size, self._queue.limits.request_bytes))
+            request = parse_request(parse_json_object(words), self._settings, self._queue.limits)
         else:
-            words = environment.get("QUERY_STRING", "")[: self._work.limits.words_bytes].removeprefix("wish=")
-            wish = wish_of(read_words(urllib.parse.unquote_to_bytes(words)), self._choices, self._work.limits)
-            self._check_upload(wish.model, wish.name, size)
-        folder = self._work.new_folder()
+            words = environment.get("QUERY_STRING", "")[: self._queue.limits.request_bytes].removeprefix("request=")
+            request = parse_request(
+                parse_json_object(urllib.parse.unquote_to_bytes(words)), self._settings, self._queue.limits
+            )
+            self._check_upload(request.model, request.name, size)
+        folder = self._queue.new_folder()
         if path == "/complete":
-            wish = dataclasses.replace(wish, file=str(folder / f"upload{_suffix(wish.name)}"))
-            with Path(wish.file).open("wb") as file:
+            request = dataclasses.replace(request, file=str(folder / f"upload{_suffix(request.name)}"))
+            with Path(request.file).open("wb") as file:
                 shutil.copyfileobj(body, file)
-        name = self._work.submit(wish, folder)
+        name = self._queue.submit(request, folder)
         if name is None:
             shutil.rmtree(folder, ignore_errors=True)
-            waiting = self._work.limits.waiting
-            raise RefusedError(
+            waiting = self._queue.limits.waiting
+            raise RefusedRequestError(
                 "503 Service Unavailable", f"{waiting} others are waiting already: try again in a minute."
             )
-        return Answer("202 Accepted", json.dumps({"job": name}).encode())
+        return Response("202 Accepted", json.dumps({"job": name}).encode())
 
     def _check_upload(self, model: int, name: str, size: int) -> None:
-        about = self._work.models[model]
+        about = self._queue.models[model]
         if not about["upload"]:
             raise ConfigError(
                 f"a scan for {about['name']}, which can neither complete nor reconstruct one",
@@ -191,8 +193,8 @@ class Application:
             raise ConfigError(
                 f"the file {name or 'without a name'!r}, whose ending we do not know", _known(), "convert it"
             )
-        if not 0 < size <= self._work.limits.upload_bytes:
-            most = f"1 to {self._work.limits.upload_bytes:,} bytes"
+        if not 0 < size <= self._queue.limits.upload_bytes:
+            most = f"1 to {self._queue.limits.upload_bytes:,} bytes"
             raise ConfigError(f"a file of {size:,} bytes", most, "choose one revolution")
 
 

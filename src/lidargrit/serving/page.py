@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from lidargrit import __version__
-from lidargrit.serving.wishes import HIDDEN, SEED_AT_MOST
+from lidargrit.serving.requests import HIDDEN, SEED_AT_MOST
 from lidargrit.viewer import interactive
 from lidargrit.viewer.interactive import button, filled
 

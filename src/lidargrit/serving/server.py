@@ -15,24 +15,24 @@ from waitress.server import create_server
 from lidargrit.errors import ConfigError, OutputError
 from lidargrit.generators import PRETRAINED, is_run
 from lidargrit.serving.application import LOOPBACK_NAMES, Application
+from lidargrit.serving.jobs import JobQueue
 from lidargrit.serving.limits import Limits
-from lidargrit.serving.work import Work
 
 _THREADS = 4  # that answer requests: each takes milliseconds, for drawing is done elsewhere
 _PORT_AT_MOST = 65_535
 
 
-class Opened(NamedTuple):
+class RunningServer(NamedTuple):
     """A server that listens, and answers while it runs.
 
     Args:
         port: that it listens at.
-        work: what draws for it.
+        queue: what draws for it.
         run: answers until Ctrl-C.
     """
 
     port: int
-    work: Work
+    queue: JobQueue
     run: Callable[[], None]
 
 
@@ -58,7 +58,7 @@ def serve(
         OutputError: the address is taken, or not this machine's.
         LidarGritError: a run that cannot be read.
     """
-    with opened(runs, host, port, device, limits) as server:
+    with open_server(runs, host, port, device, limits) as server:
         if host not in LOOPBACK_NAMES:
             say(
                 f"WARNING: everybody who reaches {host} can use this machine's processor and memory, without a password"
@@ -69,9 +69,9 @@ def serve(
 
 
 @contextlib.contextmanager
-def opened(
+def open_server(
     runs: Sequence[Path], host: str = "127.0.0.1", port: int = 0, device: str = "", limits: Limits | None = None
-) -> Iterator[Opened]:
+) -> Iterator[RunningServer]:
     """Yield a server that is about to run; after the block it, its process and its files are gone.
 
     Args, Raises: as for :func:`serve`.
@@ -80,22 +80,22 @@ def opened(
     logging.getLogger("waitress.queue").setLevel(logging.ERROR)  # it tells of every request that waits
     with (
         contextlib.closing(_listening(host, port)) as bound,
-        tempfile.TemporaryDirectory(prefix="lidargrit-serve-", ignore_cleanup_errors=True) as place,
-        Work(runs, Path(place), device, limits) as work,
+        tempfile.TemporaryDirectory(prefix="lidargrit-serve-", ignore_cleanup_errors=True) as folder,
+        JobQueue(runs, Path(folder), device, limits) as queue,
     ):
         server = create_server(
-            Application(work, host),
+            Application(queue, host),
             sockets=[bound],
             threads=_THREADS,
             ident="lidargrit",
             connection_limit=limits.connections,
             max_request_header_size=16_384,
             max_request_body_size=limits.upload_bytes + 1,
-            channel_timeout=limits.silent_seconds,
-            cleanup_interval=max(1, limits.silent_seconds // 3),
+            channel_timeout=limits.idle_seconds,
+            cleanup_interval=max(1, limits.idle_seconds // 3),
         )
         try:
-            yield Opened(bound.getsockname()[1], work, server.run)
+            yield RunningServer(bound.getsockname()[1], queue, server.run)
         finally:
             server.task_dispatcher.shutdown()
             server.close()

@@ -1,7 +1,7 @@
 """Pictures of scans: range images → PNG."""
 
-from lidargrit.viewer.pictures import draw_comparison
-from lidargrit.viewer.progress import draw_progress
+from lidargrit.viewer.pictures import plot_comparison
+from lidargrit.viewer.progress import plot_progress
 from lidargrit.viewer.side_by_side import view
 
-__all__ = ["draw_comparison", "draw_progress", "view"]
+__all__ = ["plot_comparison", "plot_progress", "view"]

@@ -28,7 +28,7 @@ _SIDES = {
 _TICKS_M = (1, 2, 5, 10, 20, 50, 100)
 
 
-def draw_curves(scores: Sequence[CurveScore], path: Path, title: str = "") -> None:
+def plot_curves(scores: Sequence[CurveScore], path: Path, title: str = "") -> None:
     """Draw the curves of real scans, of simulated ones and of a coin: a panel for each score.
 
     Curves with two axes, such as a histogram for every row, get one image for each side, and the mean over rows where
@@ -57,9 +57,9 @@ def draw_curves(scores: Sequence[CurveScore], path: Path, title: str = "") -> No
     )  # fmt: skip
     figure.text(0.5, 1 - 0.3 / height, title, ha="center", va="center", fontsize=15)
     for index, score in enumerate(flat):
-        _draw_lines(figure.add_subplot(grid[index // 2, index % 2]), score)
+        _plot_lines(figure.add_subplot(grid[index // 2, index % 2]), score)
     for index, score in enumerate(deep):
-        _draw_images(figure, grid[rows - len(deep) + index, :], score)
+        _plot_images(figure, grid[rows - len(deep) + index, :], score)
     with atomic_path(path) as unfinished:
         figure.savefig(unfinished, format="png", dpi=_DOTS_PER_INCH)
 
@@ -75,7 +75,7 @@ def _title(score: CurveScore) -> str:
     return f"{name}\ndistance of real from {distances}"
 
 
-def _draw_lines(axes: Axes, score: CurveScore) -> None:
+def _plot_lines(axes: Axes, score: CurveScore) -> None:
     details = score.simulated.details
     axis, label = np.array(details["axis"], dtype=float), details["axis_label"]
     lags = axis[0] < 0  # rows and columns share the axis: no line of numbers
@@ -101,7 +101,7 @@ def _log_axis(axes: Axes) -> None:
     axes.xaxis.set_minor_formatter(NullFormatter())
 
 
-def _draw_images(figure: Figure, place: SubplotSpec, score: CurveScore) -> None:
+def _plot_images(figure: Figure, place: SubplotSpec, score: CurveScore) -> None:
     """Draw one image for each side on one scale, with the mean over rows beside them where rows share an axis."""
     details = score.simulated.details
     axis = np.array(details["axis"], dtype=float)

@@ -30,7 +30,7 @@ _COLOURS = {
 _DOTS_AT_MOST = 20_000  # of one fate in a view; more hide one another and take seconds to draw
 
 
-def draw_inspection(inspection: Inspection, path: Path) -> None:
+def plot_inspection(inspection: Inspection, path: Path) -> None:
     """Draw where points collide, which are lost, and how their elevations lie to the sensor's rows.
 
     Args:
@@ -50,15 +50,15 @@ def draw_inspection(inspection: Inspection, path: Path) -> None:
         f"{Path(inspection.scan.source).name}: {inspection.method}, {inspection.variant}, to "
         f"{sensor.height}x{sensor.width} of {sensor.name}"
     )
-    _draw_range(figure, panels["range"], inspection)
-    _draw_collisions(figure, panels["collisions"], inspection)
-    _draw_lost(panels["above"], panels["side"], inspection)
-    _draw_rows(panels["rows"], inspection)
+    _plot_range(figure, panels["range"], inspection)
+    _plot_collisions(figure, panels["collisions"], inspection)
+    _plot_lost(panels["above"], panels["side"], inspection)
+    _plot_rows(panels["rows"], inspection)
     with atomic_path(path) as unfinished:
         figure.savefig(unfinished, format="png", dpi=_DOTS_PER_INCH)
 
 
-def _draw_range(figure: Figure, axes: Axes, inspection: Inspection) -> None:
+def _plot_range(figure: Figure, axes: Axes, inspection: Inspection) -> None:
     shown = np.ma.masked_where(~inspection.filled(), inspection.range_m)
     colours = colormaps["viridis_r"].with_extremes(bad=_NO_RETURN)
     norm = LogNorm(inspection.sensor.range_min_m, inspection.sensor.range_max_m)
@@ -68,7 +68,7 @@ def _draw_range(figure: Figure, axes: Axes, inspection: Inspection) -> None:
     axes.set_ylabel("row")
 
 
-def _draw_collisions(figure: Figure, axes: Axes, inspection: Inspection) -> None:
+def _plot_collisions(figure: Figure, axes: Axes, inspection: Inspection) -> None:
     # 0 grey, 1 white, and from 2 on ever darker red.
     colours = ListedColormap([_NO_RETURN, "white", "#fcae91", "#fb6a4a", "#cb181d", "#67000d"])
     norm = BoundaryNorm([0, 1, 2, 3, 4, 6, 1000], colours.N)
@@ -80,7 +80,7 @@ def _draw_collisions(figure: Figure, axes: Axes, inspection: Inspection) -> None
     axes.set(ylabel="row", xlabel="column, from straight behind by the left to straight ahead and the right")
 
 
-def _draw_lost(above: Axes, side: Axes, inspection: Inspection) -> None:
+def _plot_lost(above: Axes, side: Axes, inspection: Inspection) -> None:
     """Draw every point from above and from the side, the lost ones in the colour of their fate."""
     x, y, z = inspection.scan.points_xyz_m.numpy().T
     away = np.hypot(x, y)
@@ -102,7 +102,7 @@ def _draw_lost(above: Axes, side: Axes, inspection: Inspection) -> None:
     side.legend(loc="upper right", fontsize=8)
 
 
-def _draw_rows(axes: Axes, inspection: Inspection) -> None:
+def _plot_rows(axes: Axes, inspection: Inspection) -> None:
     """Draw how many points lie at each elevation, over lines where the sensor has its rows."""
     rows_deg = np.degrees(row_elevation_rad(inspection.sensor))
     points_deg = elevations_deg(inspection.scan.points_xyz_m)

@@ -24,7 +24,7 @@ from lidargrit.errors import ConfigError
 from lidargrit.files import write_text
 from lidargrit.projection import points_of_pixels
 from lidargrit.viewer.classes import name_and_colour
-from lidargrit.viewer.gathering import Shown
+from lidargrit.viewer.scan_sets import ScanSet
 
 PAGE_SCANS_AT_MOST = 100  # of each source: about 15 MB of a KITTI-360 size image, which browsers still open at once
 SOURCES_AT_MOST = 8  # browsers keep 8 to 16 WebGL canvases alive
@@ -52,7 +52,7 @@ _NO_RETURN = {"dark": (72, 81, 90), "light": (214, 220, 225)}
 _UNKNOWN = {"dark": (140, 150, 160), "light": (110, 120, 130)}
 
 
-def write_page(shown: Sequence[Shown], path: Path) -> None:
+def write_page(shown: Sequence[ScanSet], path: Path) -> None:
     """Write a page with groups of scans side by side, on one scale of each colour.
 
     Args:
@@ -66,7 +66,7 @@ def write_page(shown: Sequence[Shown], path: Path) -> None:
     write_text(path, page(shown))
 
 
-def page(shown: Sequence[Shown]) -> str:
+def page(shown: Sequence[ScanSet]) -> str:
     """Return the page as text. Whatever comes from outside, such as names of files, is escaped."""
     if not 1 <= len(shown) <= SOURCES_AT_MOST:
         raise ConfigError(
@@ -98,7 +98,7 @@ def opening_script() -> str:
     return scripts() + _read("open.js")
 
 
-def as_json(shown: Sequence[Shown]) -> str:
+def as_json(shown: Sequence[ScanSet]) -> str:
     """Return groups of scans as they stand inside a page: no name in them can end their element."""
     return json.dumps(told(shown)).replace("<", "\\u003c")
 
@@ -133,7 +133,7 @@ def _read(name: str) -> str:
     return (_FOLDER / name).read_text(encoding="utf-8")
 
 
-def told(shown: Sequence[Shown]) -> dict[str, Any]:
+def told(shown: Sequence[ScanSet]) -> dict[str, Any]:
     """Return all that a page needs to know of groups of scans, as plain numbers and words."""
     labels = [one.label[one.images.return_mask] for one in shown if one.label is not None]
     numbers = sorted({int(number) for label in labels for number in label.unique()})
@@ -155,7 +155,7 @@ def told(shown: Sequence[Shown]) -> dict[str, Any]:
     }
 
 
-def _source(shown: Shown, numbers: list[int]) -> dict[str, Any]:
+def _source(shown: ScanSet, numbers: list[int]) -> dict[str, Any]:
     """Return one group: its rays once, and the pixels of every scan."""
     images = shown.images.to("cpu")
     step_m = _far_m(shown) / _RANGE_STEPS
@@ -181,7 +181,7 @@ def _source(shown: Shown, numbers: list[int]) -> dict[str, Any]:
     }
 
 
-def _far_m(shown: Shown) -> float:
+def _far_m(shown: ScanSet) -> float:
     return max(float(shown.images.range_m.max()), 1.0)
 
 
@@ -189,7 +189,7 @@ def _packed(values: np.ndarray) -> str:
     return base64.b64encode(gzip.compress(values.tobytes(), mtime=0)).decode()
 
 
-def _scales(shown: Sequence[Shown]) -> dict[str, tuple[float, float]]:
+def _scales(shown: Sequence[ScanSet]) -> dict[str, tuple[float, float]]:
     """Find ends of the colours that hold all but the outermost returns of all groups."""
     ranges = np.concatenate([one.images.range_m[one.images.return_mask].detach().cpu().numpy() for one in shown])
     heights = np.concatenate(

@@ -25,7 +25,7 @@ _WIDTH, _ROW, _HEAD, _FOOT = 14.0, 2.95, 0.75, 0.95  # inches: the picture, one 
 _NO_RETURN = "#e4e4e4"  # near white: no colour of the range scale comes near it
 
 
-def draw_comparison(
+def plot_comparison(
     groups: dict[str, RangeImage],
     path: Path,
     max_range_m: float | None = None,
@@ -63,8 +63,8 @@ def draw_comparison(
     if title:
         figure.text(0.5, 1 - 0.42 / height, title, ha="center", va="center", fontsize=17)
     for row, panel in enumerate(panels):
-        _draw_row(figure, height, _FOOT + _ROW * (len(panels) - 1 - row), panel, scales)
-    _draw_scales(figure, height, scales)
+        _plot_row(figure, height, _FOOT + _ROW * (len(panels) - 1 - row), panel, scales)
+    _plot_scales(figure, height, scales)
     with atomic_path(path) as unfinished:
         figure.savefig(unfinished, format="png", dpi=_DOTS_PER_INCH)
 
@@ -139,7 +139,7 @@ def _panel(images: RangeImage, index: int, title: str) -> _Panel:
     )
 
 
-def _draw_row(figure: Figure, height: float, bottom: float, panel: _Panel, scales: _Scales) -> None:
+def _plot_row(figure: Figure, height: float, bottom: float, panel: _Panel, scales: _Scales) -> None:
     """Draw the range image above the mask, and the bird's-eye view to their right; places in inches."""
 
     def axes(left: float, up: float, wide: float, tall: float) -> Axes:
@@ -178,7 +178,7 @@ def _draw_row(figure: Figure, height: float, bottom: float, panel: _Panel, scale
     view.set_xlabel("left [m]", fontsize=10, labelpad=0)
 
 
-def _draw_scales(figure: Figure, height: float, scales: _Scales) -> None:
+def _plot_scales(figure: Figure, height: float, scales: _Scales) -> None:
     """Draw the two colour bars, and what the flat colour means, along the foot."""
     at = 0.55 / height, 0.14 / height
     bar = figure.add_axes((0.75 / _WIDTH, at[0], 6.6 / _WIDTH, at[1]))

@@ -8,13 +8,13 @@ import torch
 
 from lidargrit.generators import Generator
 from lidargrit.loading import RangeImages, spread
-from lidargrit.viewer.pictures import draw_comparison
+from lidargrit.viewer.pictures import plot_comparison
 
 _SCANS = 2  # a glance; more would take training's time
 
 
 @torch.no_grad()
-def draw_progress(generator: Generator, stage: str, val: RangeImages, path: Path) -> None:
+def plot_progress(generator: Generator, stage: str, val: RangeImages, path: Path) -> None:
     """Draw a generator in the midst of a stage; new scans from its last stage on, when there are weights for all."""
     real = val.batch(spread(_SCANS, len(val)))
     groups = {"val": real}
@@ -23,4 +23,4 @@ def draw_progress(generator: Generator, stage: str, val: RangeImages, path: Path
         groups["reconstructed"] = generator.reconstruct(real.to(device)).to("cpu")
     if stage == generator.stages[-1]:
         groups["generated"] = generator.sample(range(_SCANS)).to("cpu")
-    draw_comparison(groups, path, title=f"{stage}, {path.stem} scans seen")
+    plot_comparison(groups, path, title=f"{stage}, {path.stem} scans seen")

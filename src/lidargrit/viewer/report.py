@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from lidargrit.evaluation.profiles import HALF_VIEW_M, Match, Profile, matches, profile
-from lidargrit.evaluation.scorecard import Input, Score, Scorecard, figure
+from lidargrit.evaluation.scorecard import Input, Score, Scorecard, format_value
 from lidargrit.evaluation.sides import Side, Sides
 from lidargrit.files import write_text
 from lidargrit.loading import spread
@@ -135,12 +135,13 @@ def _verdict(card: Scorecard) -> str:
 
 def _score_row(score: Score) -> str:
     result, interval, floor = score.result, score.interval, score.floor
-    told = f"{figure(interval.low)} to {figure(interval.high)}" if interval else "not known"
-    ground = f"{figure(floor.value)} <small>(n = {floor.num_scans:,})</small>" if floor else "not known"
+    told = f"{format_value(interval.low)} to {format_value(interval.high)}" if interval else "not known"
+    ground = f"{format_value(floor.value)} <small>(n = {floor.num_scans:,})</small>" if floor else "not known"
     title = escape(load_metric(result.metric).title)
     return (
         f'<tr><th scope="row">{title}<br><small>{escape(result.metric)}, {escape(result.variant)}</small></th>'
-        f'<td class="number">{figure(result.value)}</td><td class="number">{told}</td><td class="number">{ground}</td>'
+        f'<td class="number">{format_value(result.value)}</td><td class="number">{told}</td>'
+        f'<td class="number">{ground}</td>'
         f"<td>{score_chart(score)}</td><td>{'higher' if result.higher_is_better else 'lower'}</td></tr>"
     )
 

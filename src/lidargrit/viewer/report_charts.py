@@ -8,7 +8,7 @@ from html import escape
 import numpy as np
 from jaxtyping import Float
 
-from lidargrit.evaluation.scorecard import Score, figure
+from lidargrit.evaluation.scorecard import Score, format_value
 
 _WIDE, _TALL = 320, 34  # a score's drawing
 _CHART_WIDE, _CHART_TALL = 720, 260
@@ -37,17 +37,17 @@ def score_chart(score: Score, floor: float | None = None, ceiling: float | None 
         return 10 + (at - first) / spread * (_WIDE - 20)
 
     middle = _TALL / 2
-    told = f"score {figure(value)}"
+    told = f"score {format_value(value)}"
     parts = [f'<line class="axis" x1="10" y1="{middle}" x2="{_WIDE - 10}" y2="{middle}"/>']
     parts.append(f'<line class="axis" x1="{x(0.0):.1f}" y1="{middle - 5}" x2="{x(0.0):.1f}" y2="{middle + 5}"/>')
     if interval:
-        told += f", 95 % interval {figure(low)} to {figure(high)}"
+        told += f", 95 % interval {format_value(low)} to {format_value(high)}"
         parts.append(f'<line class="interval" x1="{x(low):.1f}" y1="{middle}" x2="{x(high):.1f}" y2="{middle}"/>')
     if floor is not None:
-        told += f", floor {figure(floor)}"
+        told += f", floor {format_value(floor)}"
         parts.append(f'<line class="floor" x1="{x(floor):.1f}" y1="4" x2="{x(floor):.1f}" y2="{_TALL - 4}"/>')
     if ceiling is not None:
-        told += f", ceiling {figure(ceiling)}"
+        told += f", ceiling {format_value(ceiling)}"
         parts.append(f'<rect class="ceiling" x="{x(ceiling) - 5:.1f}" y="{middle - 5}" width="10" height="10"/>')
     parts.append(f'<circle class="dot" cx="{x(value):.1f}" cy="{middle}" r="5"/>')
     return (

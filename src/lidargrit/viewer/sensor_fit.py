@@ -17,7 +17,7 @@ _POINT, _ROW, _BAD = "#3b6ea5", "#d95f02", "#b2182b"
 _BINS_PER_ROW = 12  # of the histogram of elevations: enough to see a gap between rows, few enough to see peaks
 
 
-def draw_sensor_fit(fit: SensorFit, path: Path) -> None:
+def plot_sensor_fit(fit: SensorFit, path: Path) -> None:
     """Draw elevations with the fitted rows, the spread and the number of points of each ring, and firing steps.
 
     Args:
@@ -38,15 +38,15 @@ def draw_sensor_fit(fit: SensorFit, path: Path) -> None:
         [["tall", "upper"], ["tall", "lower"], ["tall", "steps"]]
     ).values()
     rows_deg = np.degrees(sensor.elevation_rad.double().numpy()[:, 0])
-    _draw_elevations(tall, fit, rows_deg)
-    _draw_spread(upper, fit, rows_deg)
-    _draw_counts(lower, fit)
-    _draw_steps(steps, fit)
+    _plot_elevations(tall, fit, rows_deg)
+    _plot_spread(upper, fit, rows_deg)
+    _plot_counts(lower, fit)
+    _plot_steps(steps, fit)
     with atomic_path(path) as unfinished:
         figure.savefig(unfinished, format="png", dpi=_DOTS_PER_INCH)
 
 
-def _draw_elevations(axes: Axes, fit: SensorFit, rows_deg: np.ndarray) -> None:
+def _plot_elevations(axes: Axes, fit: SensorFit, rows_deg: np.ndarray) -> None:
     margin = max(1.0, 0.05 * float(np.ptp(rows_deg)))
     low, high = float(rows_deg.min()) - margin, float(rows_deg.max()) + margin
     bins = min(2000, _BINS_PER_ROW * len(rows_deg))
@@ -67,7 +67,7 @@ def _draw_elevations(axes: Axes, fit: SensorFit, rows_deg: np.ndarray) -> None:
     axes.legend(loc="lower right")
 
 
-def _draw_spread(axes: Axes, fit: SensorFit, rows_deg: np.ndarray) -> None:
+def _plot_spread(axes: Axes, fit: SensorFit, rows_deg: np.ndarray) -> None:
     row = np.arange(len(rows_deg))
     gap = np.abs(np.diff(rows_deg))
     nearest = np.minimum(np.append(gap, np.inf), np.insert(gap, 0, np.inf))
@@ -81,14 +81,14 @@ def _draw_spread(axes: Axes, fit: SensorFit, rows_deg: np.ndarray) -> None:
     axes.legend(loc="best", ncols=3, fontsize="small")
 
 
-def _draw_counts(axes: Axes, fit: SensorFit) -> None:
+def _plot_counts(axes: Axes, fit: SensorFit) -> None:
     axes.bar(np.arange(len(fit.points_per_ring)), fit.points_per_ring / fit.num_scans, width=0.8, color=_POINT)
     axes.axhline(fit.sensor.width, color=_ROW, linewidth=1, label="columns")
     axes.set(xlabel="row, 0 = the highest", ylabel="points a scan", title="how many points each ring has")
     axes.legend(loc="lower right")
 
 
-def _draw_steps(axes: Axes, fit: SensorFit) -> None:
+def _plot_steps(axes: Axes, fit: SensorFit) -> None:
     step_deg = 360 / fit.sensor.width
     axes.hist(fit.steps_deg, bins=200, range=(0, 4.5 * step_deg), color=_POINT, log=True)
     for multiple in range(1, 5):

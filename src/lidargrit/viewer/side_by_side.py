@@ -8,9 +8,9 @@ from pathlib import Path
 from lidargrit.errors import ConfigError
 from lidargrit.loading import DataConfig
 from lidargrit.reporting import Reporter
-from lidargrit.viewer.gathering import gather
 from lidargrit.viewer.interactive import PAGE_SCANS_AT_MOST, write_page
-from lidargrit.viewer.pictures import SCANS_AT_MOST, draw_comparison
+from lidargrit.viewer.pictures import SCANS_AT_MOST, plot_comparison
+from lidargrit.viewer.scan_sets import load_scan_sets
 
 
 def view(
@@ -37,8 +37,8 @@ def view(
     at_most = PAGE_SCANS_AT_MOST if is_page else SCANS_AT_MOST
     if not 1 <= count <= at_most:
         raise ConfigError(f"{count} scans of each to draw", f"1 to {at_most}", "correct the number")
-    shown = gather(places, count, seed, config, reporter)
+    shown = load_scan_sets(places, count, seed, config, reporter)
     if is_page:
         write_page(shown, out)
     else:
-        draw_comparison({one.name: one.images for one in shown}, out)
+        plot_comparison({one.name: one.images for one in shown}, out)

@@ -49,7 +49,7 @@ class Desk {
     el("model").replaceChildren(...models.map((model, place) => new Option(model.name, String(place))));
     el("count").max = String(limits.scans);
     el("model").addEventListener("change", () => this.offer());
-    el("wish").addEventListener("submit", (event) => this.submit(event, () => this.generate()));
+    el("request").addEventListener("submit", (event) => this.submit(event, () => this.generate()));
     el("own").addEventListener("submit", (event) => this.submit(event, () => this.complete()));
     this.offer();
   }
@@ -60,11 +60,11 @@ class Desk {
 
   // What the chosen model can do, and the numbers that it lets one choose.
   offer() {
-    const { generator, sensor, choices, upload } = this.model;
+    const { generator, sensor, settings, upload } = this.model;
     el("sensor").textContent = `${generator}; ${sensor}`;
-    const [first, ...others] = choices.map(fieldOf); // each generator's own order: what matters most comes first
+    const [first, ...others] = settings.map(fieldOf); // each generator's own order: what matters most comes first
     el("first").replaceChildren(...(first ? [first] : []));
-    el("choices").replaceChildren(...others);
+    el("settings").replaceChildren(...others);
     el("more").hidden = others.length === 0;
     el("hiding").hidden = upload !== "complete";
     el("complete").textContent = upload === "encode" ? "Reconstruct it" : "Complete it";
@@ -80,15 +80,15 @@ class Desk {
   }
 
   // Only what was changed: the rest is left to the generator.
-  wish() {
-    const fields = [...el("wish").querySelectorAll("[name]")].filter((field) => field.value !== field.defaultValue);
+  request() {
+    const fields = [...el("request").querySelectorAll("[name]")].filter((field) => field.value !== field.defaultValue);
     const told = fields.filter((field) => field.value !== "").map((field) => [field.name, Number(field.value)]);
     return { model: Number(el("model").value), seed: Number(el("seed").value), sampling: Object.fromEntries(told) };
   }
 
   generate() {
-    const wish = { ...this.wish(), count: Number(el("count").value) };
-    return asked("/generate", { method: "POST", body: JSON.stringify(wish) });
+    const request = { ...this.request(), count: Number(el("count").value) };
+    return asked("/generate", { method: "POST", body: JSON.stringify(request) });
   }
 
   complete() {
@@ -96,15 +96,15 @@ class Desk {
     if (file.size > this.limits.uploadBytes) {
       throw new Error(`The file has ${file.size.toLocaleString("en")} bytes; at most ${this.limits.uploadBytes.toLocaleString("en")} are taken.`);
     }
-    const wish = { ...this.wish(), name: file.name, hidden: el("hidden").value };
-    return asked(`/complete?wish=${encodeURIComponent(JSON.stringify(wish))}`, { method: "POST", body: file });
+    const request = { ...this.request(), name: file.name, hidden: el("hidden").value };
+    return asked(`/complete?request=${encodeURIComponent(JSON.stringify(request))}`, { method: "POST", body: file });
   }
 
   async submit(event, begin) {
     event.preventDefault();
     this.busy = true;
     this.enable();
-    const touched = Object.entries(this.wish().sampling).map(([name, value]) => `${name}=${value}`);
+    const touched = Object.entries(this.request().sampling).map(([name, value]) => `${name}=${value}`);
     const by = [this.model.name, ...touched].join(", ");
     await this.trying(async () => {
       const { job } = await (await begin()).json();
@@ -173,17 +173,17 @@ class Desk {
   }
 }
 
-function fieldOf(choice) {
+function fieldOf(setting) {
   const [label, input, about] = ["label", "input", "small"].map((kind) => document.createElement(kind));
   label.className = "field";
-  Object.assign(input, { type: "number", name: choice.name, step: choice.whole ? "1" : "any", max: String(choice.at_most) });
-  if (choice.whole) {
+  Object.assign(input, { type: "number", name: setting.name, step: setting.whole ? "1" : "any", max: String(setting.at_most) });
+  if (setting.whole) {
     input.min = "0";
   }
-  input.defaultValue = choice.default === null ? "" : String(choice.default);
-  about.textContent = choice.about.split(/[.;] /)[0].replace(/\.$/, "");
-  input.title = choice.about;
-  label.append(choice.name.replaceAll("_", " "), input, about);
+  input.defaultValue = setting.default === null ? "" : String(setting.default);
+  about.textContent = setting.about.split(/[.;] /)[0].replace(/\.$/, "");
+  input.title = setting.about;
+  label.append(setting.name.replaceAll("_", " "), input, about);
   return label;
 }
 

@@ -1,6 +1,6 @@
 """Wishes → range images on disk, in a process of its own that can be ended at any moment.
 
-It reads a wish a line and answers a line, both JSON: no pickle passes, and the process that serves strangers never
+It reads a request a line and answers a line, both JSON: no pickle passes, and the process that serves strangers never
 computes. A scan that takes too long, or takes the memory, is ended with its process, and the next one begins anew.
 """
 
@@ -27,16 +27,16 @@ from lidargrit.files import write_text
 from lidargrit.generators import Generator, load
 from lidargrit.projection import project
 from lidargrit.sensors import SensorModel
-from lidargrit.serving.wishes import Wish, choices_of
+from lidargrit.serving.requests import SampleRequest, sampling_settings
 from lidargrit.structures import RangeImage
-from lidargrit.viewer.gathering import Shown
 from lidargrit.viewer.interactive import told
+from lidargrit.viewer.scan_sets import ScanSet
 
 PAGE_FILE, PIXELS_FILE = "told.json", "pixels.npz"  # of a result: for the page, and for files to save
 
 
-def work(runs: Sequence[Path], device: str) -> None:
-    """Say what the runs can do, then fulfil wishes from standard input until it ends."""
+def run_worker(runs: Sequence[Path], device: str) -> None:
+    """Say what the runs can do, then fulfil requests from standard input until it ends."""
     answers = sys.stdout
     sys.stdout = sys.stderr  # whatever a library prints is no answer
     try:
@@ -47,14 +47,17 @@ def work(runs: Sequence[Path], device: str) -> None:
     except (RuntimeError, AssertionError) as error:  # torch's ways to say: no such device, or not in this build
         _say(answers, {"error": ["ConfigError", f"--device {device} ({_first(error)})", "cpu or cuda", "leave it out"]})
         return
-    _say(answers, {"models": [about(run.resolve().name, one) for run, one in zip(runs, generators, strict=True)]})
+    _say(
+        answers,
+        {"models": [describe_model(run.resolve().name, one) for run, one in zip(runs, generators, strict=True)]},
+    )
     for line in sys.stdin:
         asked = json.loads(line)
-        wish = Wish(**asked["wish"])
-        _say(answers, _fulfilled(generators[wish.model], wish, Path(asked["folder"])))
+        request = SampleRequest(**asked["request"])
+        _say(answers, _answer_request(generators[request.model], request, Path(asked["folder"])))
 
 
-def about(name: str, generator: Generator) -> dict[str, Any]:
+def describe_model(name: str, generator: Generator) -> dict[str, Any]:
     """Return what a page needs to know of a model."""
     sensor = generator.sensor
     return {
@@ -62,43 +65,43 @@ def about(name: str, generator: Generator) -> dict[str, Any]:
         "generator": generator.public_name(),
         "sensor": f"{sensor.name}, {sensor.height} x {sensor.width}",
         "upload": next((able for able in ("complete", "encode") if able in generator.capabilities), ""),
-        "choices": [dataclasses.asdict(choice) for choice in choices_of(generator.Sampling())],
+        "settings": [dataclasses.asdict(setting) for setting in sampling_settings(generator.Sampling())],
         "rays": sensor.to_json(),
     }
 
 
-def draw(generator: Generator, wish: Wish) -> list[Shown]:
+def compute_result(generator: Generator, request: SampleRequest) -> list[ScanSet]:
     """Draw what is wanted: new scans, or what the model makes of an uploaded one.
 
     Raises:
         LidarGritError: a file that cannot be used, or a setting out of its bounds.
     """
     # What nobody touched is left to the generator, which may complete by other numbers than it samples by.
-    sampling = dataclasses.replace(generator.Sampling(), **wish.sampling) if wish.sampling else None
+    sampling = dataclasses.replace(generator.Sampling(), **request.sampling) if request.sampling else None
     device = next(iter(generator.state_dict().values())).device
-    if not wish.file:
-        seeds = range(wish.seed, wish.seed + wish.count)
+    if not request.file:
+        seeds = range(request.seed, request.seed + request.count)
         names = tuple(f"seed {seed}" for seed in seeds)
-        return [Shown("generated", generator.sample(seeds, sampling).to("cpu"), names)]
-    image = _uploaded(wish, generator.sensor, partial="complete" in generator.capabilities)
-    shown = [Shown("as uploaded", image, (wish.name,))]
+        return [ScanSet("generated", generator.sample(seeds, sampling).to("cpu"), names)]
+    image = _uploaded(request, generator.sensor, partial="complete" in generator.capabilities)
+    shown = [ScanSet("as uploaded", image, (request.name,))]
     image = image.to(device)
     if "complete" not in generator.capabilities:
-        return [*shown, Shown("reconstructed", generator.reconstruct(image).to("cpu"), (wish.name,))]
-    hidden = _hidden(wish.hidden, image)
-    if wish.hidden != "nothing":
-        shown.append(Shown("what the model saw", _without(image, hidden).to("cpu"), (wish.name,)))
-    seeds = range(wish.seed, wish.seed + wish.count)
-    images = RangeImage.stack([image[0]] * wish.count)
+        return [*shown, ScanSet("reconstructed", generator.reconstruct(image).to("cpu"), (request.name,))]
+    hidden = _hidden(request.hidden, image)
+    if request.hidden != "nothing":
+        shown.append(ScanSet("what the model saw", _without(image, hidden).to("cpu"), (request.name,)))
+    seeds = range(request.seed, request.seed + request.count)
+    images = RangeImage.stack([image[0]] * request.count)
     drawn = generator.complete(images, ~hidden.expand_as(images.return_mask), seeds, sampling)
-    return [*shown, Shown("completed", drawn.to("cpu"), tuple(f"{wish.name}, seed {seed}" for seed in seeds))]
+    return [*shown, ScanSet("completed", drawn.to("cpu"), tuple(f"{request.name}, seed {seed}" for seed in seeds))]
 
 
-def _uploaded(wish: Wish, sensor: SensorModel, partial: bool) -> RangeImage:
+def _uploaded(request: SampleRequest, sensor: SensorModel, partial: bool) -> RangeImage:
     """Read and project a file, whose place no message names; of a scan without rings, rows are told by elevation."""
-    path = Path(wish.file)
+    path = Path(request.file)
     try:
-        scan = dataclasses.replace(formats.read_scan(path, bad_points="drop"), source=wish.name)
+        scan = dataclasses.replace(formats.read_scan(path, bad_points="drop"), source=request.name)
         try:
             image = project(scan, sensor, partial=partial)
         except ScanError:
@@ -108,7 +111,7 @@ def _uploaded(wish: Wish, sensor: SensorModel, partial: bool) -> RangeImage:
                 return RangeImage.stack([project(scan, sensor, "spherical", partial=partial)])
             raise
     except LidarGritError as error:
-        told = [part.replace(str(path), wish.name) for part in (error.got, error.wanted, error.cure)]
+        told = [part.replace(str(path), request.name) for part in (error.got, error.wanted, error.cure)]
         raise type(error)(*told) from None
     return RangeImage.stack([image])
 
@@ -131,10 +134,10 @@ def _without(image: RangeImage, hidden: Bool[Tensor, "1 H W"]) -> RangeImage:
     return RangeImage(image.range_m * kept, kept, image.sensor, reflectance)
 
 
-def _fulfilled(generator: Generator, wish: Wish, folder: Path) -> dict[str, Any]:
+def _answer_request(generator: Generator, request: SampleRequest, folder: Path) -> dict[str, Any]:
     """Write a result into a folder, and return what is to be answered."""
     try:
-        shown = draw(generator, wish)
+        shown = compute_result(generator, request)
         write_text(folder / PAGE_FILE, json.dumps(told(shown)))
         pixels: dict[str, Any] = {}
         for place, one in enumerate(shown):

@@ -25,7 +25,7 @@ _NAME_LETTERS = 40  # of a place: what fits above a picture
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class ScanSet:
     """Some scans of one place.
 
     Args:
@@ -41,13 +41,13 @@ class Shown:
     label: Int[Tensor, "B H W"] | None = None
 
 
-def gather(
+def load_scan_sets(
     places: Sequence[str],
     count: int,
     seed: int = 0,
     config: DataConfig | None = None,
     reporter: Reporter | None = None,
-) -> list[Shown]:
+) -> list[ScanSet]:
     """Read scans and samples, and draw from runs; the sensor of the first run is everybody's.
 
     Args:
@@ -61,7 +61,7 @@ def gather(
     config, reporter = config or DataConfig(), reporter or Reporter()
     generators = {place: load(place) for place in places if is_run(locate(place))}
     sensor = next((generator.sensor for generator in generators.values()), None)
-    shown: list[Shown] = []
+    shown: list[ScanSet] = []
     for place in places:
         if place not in generators:
             read = _of_images if holds_images(place) else _of_scans
@@ -71,11 +71,11 @@ def gather(
         if scans is not None and "encode" in generator.capabilities:
             images = scans.images
             again = _joined(generator.reconstruct(images[part]) for part in _parts(len(images)))
-            shown.append(Shown(f"{_short(place)}: reconstructed", again, scans.scan_names))
+            shown.append(ScanSet(f"{_short(place)}: reconstructed", again, scans.scan_names))
         seeds = range(seed, seed + count)
         names = tuple(f"seed {one}" for one in seeds)
         drawn = _joined(generator.sample(seeds[part]) for part in _parts(count))
-        shown.append(Shown(f"{_short(place)}: generated", drawn, names))
+        shown.append(ScanSet(f"{_short(place)}: generated", drawn, names))
     if not shown:
         raise ConfigError("nothing to draw", "a scan, a folder or a run", "name at least one")
     return shown
@@ -89,14 +89,14 @@ def _joined(batches: Iterable[RangeImage]) -> RangeImage:
     return RangeImage.stack([batch[index].to("cpu") for batch in batches for index in range(len(batch))])
 
 
-def _of_images(place: str, count: int, sensor: SensorModel | None, config: DataConfig, reporter: Reporter) -> Shown:
+def _of_images(place: str, count: int, sensor: SensorModel | None, config: DataConfig, reporter: Reporter) -> ScanSet:
     images = open_images(place, sensor, config, reporter)
     indices = spread(count, len(images))
     names = images.provenance.names
-    return Shown(place, images.batch(indices), tuple(names[index].rpartition("/")[2] for index in indices))
+    return ScanSet(place, images.batch(indices), tuple(names[index].rpartition("/")[2] for index in indices))
 
 
-def _of_scans(place: str, count: int, sensor: SensorModel | None, config: DataConfig, reporter: Reporter) -> Shown:
+def _of_scans(place: str, count: int, sensor: SensorModel | None, config: DataConfig, reporter: Reporter) -> ScanSet:
     dataset = open_dataset(place, config.bad_points)
     sensor = sensor or load_sensor(dataset.sensor)
     images, names, labels = [], [], []
@@ -115,7 +115,7 @@ def _of_scans(place: str, count: int, sensor: SensorModel | None, config: DataCo
         raise DataError(f"no usable scan in {place}", "at least one", "see the messages above")
     known = [label for label in labels if label is not None]
     label = torch.stack(known) if len(known) == len(images) else None
-    return Shown(place, RangeImage.stack(images), tuple(names), label)
+    return ScanSet(place, RangeImage.stack(images), tuple(names), label)
 
 
 def _label_of_pixels(scan: Scan, image: RangeImage, config: DataConfig) -> Int[Tensor, "H W"] | None:

@@ -16,17 +16,17 @@ from matplotlib import colormaps
 
 from lidargrit import __version__
 from lidargrit.evaluation.reconstruction import ReconstructionErrors
-from lidargrit.evaluation.scorecard import Scorecard, figure
+from lidargrit.evaluation.scorecard import Scorecard, format_value
 from lidargrit.files import write_text
 from lidargrit.metrics import load_metric
 from lidargrit.structures import RangeImage, TokenGrid
 from lidargrit.tokenizers import Decoded
 from lidargrit.viewer import interactive
-from lidargrit.viewer.gathering import Shown
 from lidargrit.viewer.interactive import button
 from lidargrit.viewer.report_charts import bar_chart, score_chart
 from lidargrit.viewer.report_pictures import colour_picture, range_picture, rate_picture
 from lidargrit.viewer.report_style import STYLE
+from lidargrit.viewer.scan_sets import ScanSet
 
 _PIECE = 6, 16  # rows and columns of tokens that are shown as numbers: as many as can be read
 _CELL = 44, 24  # of a number on the page, in pixels
@@ -54,7 +54,7 @@ code{overflow-wrap:anywhere}
 
 
 @dataclass(frozen=True, eq=False)
-class Story:
+class DemoPage:
     """What there is to tell.
 
     Args:
@@ -80,7 +80,7 @@ class Story:
     tokens: TokenGrid
     decoded: Decoded
     drawn: RangeImage
-    shown: Sequence[Shown]
+    shown: Sequence[ScanSet]
     errors: ReconstructionErrors
     card: Scorecard
     floor: Scorecard
@@ -90,7 +90,7 @@ class Story:
     run: Path
 
 
-def write_story(story: Story, path: Path) -> None:
+def write_demo_page(story: DemoPage, path: Path) -> None:
     """Write the page; it needs no network and no other file.
 
     Raises:
@@ -99,7 +99,7 @@ def write_story(story: Story, path: Path) -> None:
     write_text(path, page(story))
 
 
-def page(story: Story) -> str:
+def page(story: DemoPage) -> str:
     """Return the page as text. Whatever comes from outside, such as names of files, is escaped."""
     script = interactive.opening_script()
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
@@ -119,7 +119,7 @@ def page(story: Story) -> str:
     )
 
 
-def _lead(story: Story) -> str:
+def _lead(story: DemoPage) -> str:
     facts = "".join(f"<li>{escape(fact)}</li>" for fact in story.facts)
     return (
         "<h1>A LiDAR scan, its tokens, and new scans</h1>\n"
@@ -138,19 +138,19 @@ def _figure(drawn: str, told: str) -> str:
     return f'<figure><img src="{drawn}" alt="{escape(told)}"><figcaption>{escape(told)}</figcaption></figure>'
 
 
-def _limits_m(story: Story) -> tuple[float, float]:
+def _limits_m(story: DemoPage) -> tuple[float, float]:
     ranges = story.scan.range_m[story.scan.return_mask].numpy()
     near, far = (float(edge) for edge in np.quantile(ranges, (0.005, 0.995))) if len(ranges) else (1.0, 80.0)
     return near, max(far, 2 * near)
 
 
-def _ranges(story: Story, image: RangeImage, told: str) -> str:
+def _ranges(story: DemoPage, image: RangeImage, told: str) -> str:
     share = float(image.return_mask.float().mean())
     drawn = range_picture(image.range_m[0].numpy(), image.return_mask[0].numpy(), _limits_m(story))
     return _figure(drawn, f"{told}; {share:.0%} of rays returned")
 
 
-def _the_scan(story: Story) -> str:
+def _the_scan(story: DemoPage) -> str:
     rows, columns = story.scan.range_m.shape[1:]
     near, far = _limits_m(story)
     text = (
@@ -161,7 +161,7 @@ def _the_scan(story: Story) -> str:
     return _step("1. A scan", text, _ranges(story, story.scan, f"{story.kind} scan {story.name}"))
 
 
-def _its_tokens(story: Story) -> str:
+def _its_tokens(story: DemoPage) -> str:
     tokens = story.tokens.tokens[0].numpy()
     colours = _colours(story)
     top = (tokens.shape[0] - _PIECE[0]) // 2
@@ -197,7 +197,7 @@ def _grid(colours: Float[np.ndarray, "h w 3"], rows: slice, columns: slice) -> s
     )
 
 
-def _colours(story: Story) -> Float[np.ndarray, "h w 3"]:
+def _colours(story: DemoPage) -> Float[np.ndarray, "h w 3"]:
     """Return a colour for each token: codes in the order of the range that is decoded from them, on a scale."""
     tokens = story.tokens.tokens[0]
     blocks = torch.nn.functional.adaptive_avg_pool2d(story.decoded.range_m[:1], (tokens.shape[0], tokens.shape[1]))[0]
@@ -229,7 +229,7 @@ def _numbers(tokens: Int[np.ndarray, "h w"], colours: Float[np.ndarray, "h w 3"]
     )
 
 
-def _its_reconstruction(story: Story) -> str:
+def _its_reconstruction(story: DemoPage) -> str:
     clean_m = story.decoded.range_m[0].numpy()
     every = range_picture(clean_m, np.ones(clean_m.shape, dtype=bool), _limits_m(story))
     text = (
@@ -240,7 +240,7 @@ def _its_reconstruction(story: Story) -> str:
     return _step("3. Its reconstruction", text, _figure(every, "decoded range, before any ray is dropped"))
 
 
-def _its_raydrop(story: Story) -> str:
+def _its_raydrop(story: DemoPage) -> str:
     likely = story.decoded.return_logits[0].sigmoid().numpy()
     text = (
         "Beside the distance the decoder tells, for each pixel, how likely a return is. Whether there is one is then "
@@ -257,7 +257,7 @@ def _its_raydrop(story: Story) -> str:
     return _step("4. Its raydrop", text, f'<div class="three">{pictures}</div>{both}')
 
 
-def _new_scans(story: Story) -> str:
+def _new_scans(story: DemoPage) -> str:
     text = (
         "The second network, a transformer, writes such tokens one by one, each by the odds of what came before; the "
         "decoder makes scans of them. Drag to turn, use the wheel to zoom, and step through the sets with the arrows."
@@ -268,7 +268,7 @@ def _new_scans(story: Story) -> str:
     )
 
 
-def _scores(story: Story) -> str:
+def _scores(story: DemoPage) -> str:
     floors, ceilings = (
         {(score.result.metric, score.result.variant): score.result.value for score in card.scores}
         for card in (story.floor, story.ceiling)
@@ -277,12 +277,12 @@ def _scores(story: Story) -> str:
     for score in story.card.scores:
         name = score.result.metric, score.result.variant
         floor, ceiling, interval = floors.get(name), ceilings.get(name), score.interval
-        told = f"<br><small>{figure(interval.low)} to {figure(interval.high)}</small>" if interval else ""
+        told = f"<br><small>{format_value(interval.low)} to {format_value(interval.high)}</small>" if interval else ""
         rows.append(
             f'<tr><th scope="row">{escape(load_metric(name[0]).title)}</th>'
-            f'<td class="number">{"" if floor is None else figure(floor)}</td>'
-            f'<td class="number">{figure(score.result.value)}{told}</td>'
-            f'<td class="number">{"" if ceiling is None else figure(ceiling)}</td>'
+            f'<td class="number">{"" if floor is None else format_value(floor)}</td>'
+            f'<td class="number">{format_value(score.result.value)}{told}</td>'
+            f'<td class="number">{"" if ceiling is None else format_value(ceiling)}</td>'
             f"<td>{score_chart(score, floor, ceiling)}</td></tr>"
         )
     text = (
@@ -302,12 +302,12 @@ def _scores(story: Story) -> str:
     )
 
 
-def _timings(story: Story) -> str:
+def _timings(story: DemoPage) -> str:
     text = "On the machine that made this page, when each stage was first done there."
     return _step("7. How long it took", text, bar_chart(story.seconds, "s"))
 
 
-def _next(story: Story) -> str:
+def _next(story: DemoPage) -> str:
     run = escape(str(story.run))
     commands = (
         (f"lidargrit serve {run}", "draw more in the browser: other seeds, other temperatures, scans of your own"),

@@ -24,7 +24,7 @@ _FRACTION_AT_MOST = 100.0  # temperatures and the like: far beyond, everything i
 
 
 @dataclass(frozen=True)
-class Choice:
+class SamplingSetting:
     """A number that a generator lets one choose when it draws.
 
     Args:
@@ -43,7 +43,7 @@ class Choice:
 
 
 @dataclass(frozen=True)
-class Wish:
+class SampleRequest:
     """What somebody wants drawn.
 
     Args:
@@ -65,7 +65,7 @@ class Wish:
     name: str = ""
 
 
-def choices_of(sampling: Any) -> list[Choice]:
+def sampling_settings(sampling: Any) -> list[SamplingSetting]:
     """Return the numbers among the fields of a generator's ``Sampling``."""
     hints = get_type_hints(type(sampling))
     found = []
@@ -75,7 +75,7 @@ def choices_of(sampling: Any) -> list[Choice]:
             continue
         whole = kind in (int, int | None)
         at_most = max(_WHOLE_AT_MOST if whole else _FRACTION_AT_MOST, default or 0)
-        found.append(Choice(one.name, whole, default, at_most, _about(type(sampling), one.name)))
+        found.append(SamplingSetting(one.name, whole, default, at_most, _about(type(sampling), one.name)))
     return found
 
 
@@ -86,7 +86,7 @@ def _about(sampling: type, name: str) -> str:
     return " ".join(said[1].split()).replace("``", "") if said else ""
 
 
-def read_words(data: bytes) -> dict[str, Any]:
+def parse_json_object(data: bytes) -> dict[str, Any]:
     """Read JSON of an object.
 
     Raises:
@@ -101,12 +101,12 @@ def read_words(data: bytes) -> dict[str, Any]:
     return words
 
 
-def wish_of(words: dict[str, Any], choices: list[list[Choice]], limits: Limits) -> Wish:
-    """Check every word of a wish.
+def parse_request(words: dict[str, Any], settings: list[list[SamplingSetting]], limits: Limits) -> SampleRequest:
+    """Check every word of a request.
 
     Args:
         words: by name; what is not said has its default.
-        choices: of each model that is served.
+        settings: of each model that is served.
         limits: what may be asked for.
 
     Raises:
@@ -116,19 +116,19 @@ def wish_of(words: dict[str, Any], choices: list[list[Choice]], limits: Limits) 
     for name in words:
         if name not in known:
             raise ConfigError(f"the word {name[:40]!r}", f"one of {', '.join(known)}", "use the page")
-    model = _whole("model", words.get("model", 0), 0, len(choices) - 1)
+    model = _whole("model", words.get("model", 0), 0, len(settings) - 1)
     hidden = words.get("hidden", "nothing")
     if not isinstance(hidden, str) or hidden not in HIDDEN:
         raise ConfigError(f"hidden={str(hidden)[:40]!r}", f"one of {', '.join(HIDDEN)}", "choose one")
     asked = words.get("sampling", {})
     if not isinstance(asked, dict):
         raise ConfigError("sampling that is no JSON object", "numbers by name", "use the page")
-    of_name = {choice.name: choice for choice in choices[model]}
+    of_name = {setting.name: setting for setting in settings[model]}
     for name in asked:
         if name not in of_name:
             wanted = f"one such as {nearest_names(name[:40], of_name)}" if of_name else "none: it has no such settings"
             raise ConfigError(f"the setting {name[:40]!r}, which this model does not have", wanted, "use the page")
-    return Wish(
+    return SampleRequest(
         model,
         _whole("seed", words.get("seed", 0), 0, SEED_AT_MOST),
         _whole("count", words.get("count", 1), 1, limits.scans),
@@ -148,11 +148,11 @@ def _whole(name: str, value: Any, at_least: int, at_most: int) -> int:
     return value
 
 
-def _number(choice: Choice, value: Any) -> int | float:
-    if choice.whole:
-        return _whole(choice.name, value, 0, int(choice.at_most))
-    if type(value) not in (int, float) or not (abs(value) <= choice.at_most and math.isfinite(value)):
-        raise ConfigError(f"{choice.name}={str(value)[:40]}", f"a number up to {choice.at_most:g}", "correct it")
+def _number(setting: SamplingSetting, value: Any) -> int | float:
+    if setting.whole:
+        return _whole(setting.name, value, 0, int(setting.at_most))
+    if type(value) not in (int, float) or not (abs(value) <= setting.at_most and math.isfinite(value)):
+        raise ConfigError(f"{setting.name}={str(value)[:40]}", f"a number up to {setting.at_most:g}", "correct it")
     return float(value)
 
 

@@ -1,4 +1,4 @@
-"""One drawing at a time for whoever asks: wishes → results on disk, with a bounded queue and a limit of time."""
+"""One drawing at a time for whoever asks: requests → results on disk, with a bounded queue and a limit of time."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from typing import Any, Literal
 from lidargrit import errors
 from lidargrit.errors import DataError
 from lidargrit.serving.limits import Limits
-from lidargrit.serving.wishes import Choice, Wish
+from lidargrit.serving.requests import SampleRequest, SamplingSetting
 
 State = Literal["waiting", "working", "done", "failed"]
 
 
 class Job:
-    """One wish, and what has become of it."""
+    """One request, and what has become of it."""
 
-    def __init__(self, wish: Wish, folder: Path) -> None:
-        self.wish, self.folder = wish, folder
+    def __init__(self, request: SampleRequest, folder: Path) -> None:
+        self.request, self.folder = request, folder
         self.state: State = "waiting"
         self.error = ""
         self.heard = time.monotonic()
@@ -42,12 +42,12 @@ class Job:
         return (self.ended or time.monotonic()) - self.begun if self.begun else 0.0
 
 
-class Work:
+class JobQueue:
     """Whoever asks first is drawn for first.
 
     Args:
         runs: folders of finished runs.
-        place: an empty folder for files that are needed only while this lives.
+        folder: an empty folder for files that are needed only while this lives.
         device: where networks compute; "" for a GPU if there is one.
         limits: what may be asked for.
 
@@ -55,9 +55,9 @@ class Work:
         LidarGritError: a run that cannot be read.
     """
 
-    def __init__(self, runs: Sequence[Path], place: Path, device: str = "", limits: Limits | None = None) -> None:
+    def __init__(self, runs: Sequence[Path], folder: Path, device: str = "", limits: Limits | None = None) -> None:
         self.limits = limits or Limits()
-        self._place, self._asked = place, {"runs": [str(run) for run in runs], "device": device}
+        self._folder, self._asked = folder, {"runs": [str(run) for run in runs], "device": device}
         self._jobs: dict[str, Job] = {}  # the oldest first
         self._waiting: deque[Job] = deque()
         self._changed = threading.Condition()
@@ -65,10 +65,10 @@ class Work:
         self._numbers = itertools.count()
         self._process = _Process(self._asked)
         self.models = self._ready()
-        self._thread = threading.Thread(target=self._work, daemon=True)
+        self._thread = threading.Thread(target=self._run_jobs, daemon=True)
         self._thread.start()
 
-    def __enter__(self) -> Work:
+    def __enter__(self) -> JobQueue:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
@@ -78,23 +78,23 @@ class Work:
         self._process.end()
         self._thread.join()
 
-    def choices(self) -> list[list[Choice]]:
+    def settings(self) -> list[list[SamplingSetting]]:
         """Return the numbers that can be chosen, of each model."""
-        return [[Choice(**choice) for choice in model["choices"]] for model in self.models]
+        return [[SamplingSetting(**setting) for setting in model["settings"]] for model in self.models]
 
     def new_folder(self) -> Path:
         """Make an empty folder, for a result and what it is made of."""
-        folder = self._place / str(next(self._numbers))
+        folder = self._folder / str(next(self._numbers))
         folder.mkdir()
         return folder
 
-    def submit(self, wish: Wish, folder: Path) -> str | None:
-        """Take on a wish and return the name to ask for it by; None if too many are waiting already."""
+    def submit(self, request: SampleRequest, folder: Path) -> str | None:
+        """Take on a request and return the name to ask for it by; None if too many are waiting already."""
         with self._changed:
             if len(self._waiting) >= self.limits.waiting:
                 return None
             name = secrets.token_urlsafe(12)  # nobody guesses another's
-            self._jobs[name] = job = Job(wish, folder)
+            self._jobs[name] = job = Job(request, folder)
             self._waiting.append(job)
             self._forget()
             self._changed.notify()
@@ -119,7 +119,7 @@ class Work:
         for name in ended[: max(0, len(ended) - self.limits.kept)]:
             shutil.rmtree(self._jobs.pop(name).folder, ignore_errors=True)
 
-    def _work(self) -> None:
+    def _run_jobs(self) -> None:
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._waiting or self._closed)
@@ -127,7 +127,7 @@ class Work:
                     return
                 job = self._waiting.popleft()
                 job.state = "working"
-            if time.monotonic() - job.heard > self.limits.unheard_seconds:
+            if time.monotonic() - job.heard > self.limits.unpolled_seconds:
                 self._end(job, "nobody asked for it any more")
                 continue
             self._end(job, self._drawn(job))
@@ -139,7 +139,7 @@ class Work:
                 self._process = _Process(self._asked)
                 self._ready()
             job.begun = time.monotonic()
-            self._process.say({"wish": dataclasses.asdict(job.wish), "folder": str(job.folder)})
+            self._process.say({"request": dataclasses.asdict(job.request), "folder": str(job.folder)})
             return self._process.answer(self.limits.seconds).get("refused", "")
         except TimeoutError:
             self._process.end()
@@ -150,8 +150,8 @@ class Work:
             return "got a drawing that ended the program, perhaps for lack of memory; wanted a result; ask for less"
 
     def _end(self, job: Job, error: str) -> None:
-        if job.wish.file:
-            Path(job.wish.file).unlink(missing_ok=True)
+        if job.request.file:
+            Path(job.request.file).unlink(missing_ok=True)
         with self._changed:
             job.ended, job.error, job.state = time.monotonic(), error, "failed" if error else "done"
 
@@ -205,7 +205,7 @@ class _Process:
         self._process.kill()
         self._process.wait()
         assert self._process.stdin is not None
-        with contextlib.suppress(OSError):  # a wish that it did not read
+        with contextlib.suppress(OSError):  # a request that it did not read
             self._process.stdin.close()
 
     def _listen(self) -> None:
