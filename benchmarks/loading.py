@@ -57,20 +57,20 @@ def main() -> None:
 def repeat(few: Path, many: Path, count: int) -> Path:
     """Write the images of a prepared folder again and again."""
     store = PreparedImages(str(few))
-    plan = replace(store.plan, num_scans=count, digest=hashlib.sha256(b"repeated").hexdigest())
+    spec = replace(store.spec, num_scans=count, digest=hashlib.sha256(b"repeated").hexdigest())
     many.mkdir()
-    write_text(many / SCANS_FILE, json.dumps([[f"image {place}", "", 0, 0] for place in range(count)]))
-    write_json(many / PLAN_FILE, asdict(plan))
+    write_text(many / SCANS_FILE, json.dumps([[f"image {index}", "", 0, 0] for index in range(count)]))
+    write_json(many / PLAN_FILE, asdict(spec))
     pixels = [RangeImages(store.sensor, [store]).batch([index]) for index in range(len(store))]
     images = [
         RangeImage(one.range_m[0], one.return_mask[0], one.sensor, None if (r := one.reflectance) is None else r[0])
         for one in pixels
     ]
-    for shard in range(plan.num_shards):
+    for shard in range(spec.num_shards):
         with (many / shard_name(shard)).open("wb") as file:
-            writer = ShardWriter(file, plan.range_step_m)
-            for place in plan.scans_of(shard):
-                writer.add(place, images[place % len(images)])
+            writer = ShardWriter(file, spec.range_step_m)
+            for index in spec.scans_of(shard):
+                writer.add(index, images[index % len(images)])
             writer.finish()
     return many
 

@@ -121,7 +121,7 @@ def check_resuming(folder: Path) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):  # within the second stage
-        train(recipe, folder / "broken", draw=stop)
+        train(recipe, folder / "broken", plot=stop)
     train(recipe, folder / "broken")
     weights = [(folder / run / "model.safetensors").read_bytes() for run in ("whole", "broken")]
     assert weights[0] == weights[1]
@@ -143,14 +143,15 @@ def test_a_run_from_before_there_was_the_choice_goes_on(tmp_path):
     about = json.loads((tmp_path / "run.json").read_text())
     for stage in about["recipe"]["training"].values():
         del stage["recompute"], stage["compile"], stage["accumulate"]
-    del about["recipe"]["model"]["tokenizer"]["restart_dead_codes"], about["recipe"]["data"]["variant"]
+    del about["recipe"]["model"]["tokenizer"]["restart_dead_codes"]
+    about["recipe"]["data"]["variant"] = about["recipe"]["data"].pop("projection_variant")  # its former name
     (tmp_path / "run.json").write_text(json.dumps(about))
     train(recipe, tmp_path)
     on = replace(recipe.training["tokenizer"], recompute=True)
     with pytest.raises(OutputError, match=r"recompute=False, here True"):
         train(replace(recipe, training={**recipe.training, "tokenizer": on}), tmp_path)
-    with pytest.raises(OutputError, match=r"data.variant=exact, here reference"):
-        train(replace(recipe, data=replace(recipe.data, variant="reference")), tmp_path)
+    with pytest.raises(OutputError, match=r"data.projection_variant=exact, here reference"):
+        train(replace(recipe, data=replace(recipe.data, projection_variant="reference")), tmp_path)
 
 
 def test_both_are_off_unless_asked_for():

@@ -171,3 +171,9 @@ def test_settings_of_a_recipe_are_checked_with_the_words_of_their_class():
         load_recipe("small", ["training.tokenizer.batch_size=0"])
     with pytest.raises(ConfigError, match=r"^got learning_rate=nan; wanted a positive number"):
         load_recipe("small", ["training.tokenizer.learning_rate=.nan"])
+
+
+def test_a_setting_is_known_by_its_former_name():
+    recipe = load_recipe("small", ["data.variant=reference"])
+    assert recipe.data.projection_variant == "reference"
+    assert leaves({"data": {"variant": "reference"}}) == {"data.projection_variant": "reference"}

@@ -99,7 +99,7 @@ def test_images_are_those_that_the_protocol_wants(number):
     for system in wanted.systems().values():
         data = load_recipe(system, wanted.contest().recipe_settings).data
         assert data.load_sensor().same_rays(protocol.load_sensor())
-        assert data.variant == protocol.variant
+        assert data.projection_variant == protocol.variant
     assert wanted.contest().num_samples == protocol.num_scans
     assert wanted.contest().settings.metrics == ()
 
@@ -148,7 +148,7 @@ def test_rows_of_the_ablation_differ_in_nothing_but_what_is_ablated(small):
 
 
 def test_released_configurations_differ_in_what_their_files_say():
-    losses = {"model.tokenizer.reconstruction", "model.tokenizer.codebook_loss", "data.variant"}
+    losses = {"model.tokenizer.reconstruction", "model.tokenizer.codebook_loss", "data.projection_variant"}
     training = {"training.tokenizer.augmentations"}
     training |= {f"training.{stage}.average_over_scans" for stage in ("tokenizer", "transformer")}
     columns = {"data.columns", "data.column_stride"}

@@ -215,7 +215,7 @@ def test_stages_use_their_own_settings():
 def test_pictures_change_nothing(tmp_path):
     every = [f"training.{stage}.pictures_every=6" for stage in ("tokenizer", "transformer")]
     train(load_recipe("demo", TINY), tmp_path / "plain")
-    train(load_recipe("demo", TINY + every), tmp_path / "drawn", draw=plot_progress)
+    train(load_recipe("demo", TINY + every), tmp_path / "drawn", plot=plot_progress)
     plain, drawn = ((tmp_path / name / "model.safetensors").read_bytes() for name in ("plain", "drawn"))
     assert plain == drawn
     pictures = {str(path.relative_to(tmp_path / "drawn")): path for path in (tmp_path / "drawn").rglob("*.png")}

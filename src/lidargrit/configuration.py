@@ -11,6 +11,8 @@ from lidargrit.errors import ConfigError, nearest_names
 
 T = TypeVar("T")
 
+_RENAMED = {"data.variant": "data.projection_variant"}  # run folders have the former name, and users may type it
+
 
 def to_json(config: Any) -> Any:
     """Return a configuration as plain JSON values (tuples become lists)."""
@@ -59,7 +61,7 @@ def override(config: T, settings: Iterable[str], owner: str = "this recipe", cur
         path, equals, text = setting.partition("=")
         if not equals:
             raise ConfigError(f"the setting {setting!r}", "NAME=VALUE", f"e.g. --set {next(iter(known), 'name')}=...")
-        values[path.strip()] = text
+        values[_RENAMED.get(path.strip(), path.strip())] = text
     unknown = [path for path in values if path not in known]
     if unknown:
         raise ConfigError(
@@ -71,11 +73,12 @@ def override(config: T, settings: Iterable[str], owner: str = "this recipe", cur
 
 
 def leaves(config: Any, prefix: str = "") -> dict[str, Any]:
-    """Return every setting of a configuration by its dotted name."""
+    """Return every setting of a configuration, or of its JSON, by its dotted name."""
     found: dict[str, Any] = {}
     for name, value in _children(config).items():
         nested = dataclasses.is_dataclass(value) or isinstance(value, dict)
-        found |= leaves(value, f"{prefix}{name}.") if nested else {f"{prefix}{name}": value}
+        path = f"{prefix}{name}"
+        found |= leaves(value, f"{path}.") if nested else {_RENAMED.get(path, path): value}
     return found
 
 

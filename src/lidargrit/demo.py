@@ -13,6 +13,7 @@ import torch
 
 from lidargrit.configuration import override
 from lidargrit.datasets import open_dataset
+from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import DataError
 from lidargrit.evaluation.comparison import Settings, compare_sides
 from lidargrit.evaluation.intervals import Resampling
@@ -23,7 +24,7 @@ from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.evaluation.sides import Side, Sides
 from lidargrit.files import read_json, write_json
 from lidargrit.generators import Generator, load_class
-from lidargrit.loading import DataConfig, Pixels, Provenance, RangeImages, load_range_images, spread
+from lidargrit.loading import DataConfig, Pixels, Provenance, RangeImages, load_range_images
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
 from lidargrit.structures import RangeImage
@@ -114,8 +115,8 @@ def tell(
         facts: about model and training.
         folder: of the run.
     """
-    tokenizer, shown = generator.get_tokenizer(), val.batch(spread(_SHOWN, len(val)))
-    names = tuple(val.provenance.names[index].rpartition("/")[2] for index in spread(_SHOWN, len(val)))
+    tokenizer, shown = generator.get_tokenizer(), val.batch(evenly_spaced(_SHOWN, len(val)))
+    names = tuple(val.provenance.names[index].rpartition("/")[2] for index in evenly_spaced(_SHOWN, len(val)))
     with torch.no_grad():
         tokens = tokenizer.encode(shown[:1])
         decoded = tokenizer.decode_parts(tokens)
@@ -174,7 +175,9 @@ def _cards(
     cards = []
     for name, images, settings in (("samples", samples, Settings()), ("val", val, plain), ("marginal", pixels, plain)):
         some = min(count, len(images))
-        sides = Sides(Side(name, images, spread(some, len(images))), Side("train", real, spread(some, len(real))))
+        sides = Sides(
+            Side(name, images, evenly_spaced(some, len(images))), Side("train", real, evenly_spaced(some, len(real)))
+        )
         cards.append(compare_sides(sides, settings, reporter if name == "samples" else None))
     return cards[0], cards[1], cards[2]
 
@@ -228,7 +231,7 @@ def _trained_s(log: Path) -> float:
 
 
 def _draw(generator: Generator, kind: str, val: RangeImages, samples: RangeImages, folder: Path) -> None:
-    real = val.batch(spread(3, len(val)))
+    real = val.batch(evenly_spaced(3, len(val)))
     title = f"{kind} scans never trained on, what the tokens keep of them, and new scans"
     plot_comparison(
         {kind: real, "reconstructed": generator.reconstruct(real), "generated": samples.batch(range(3))},

@@ -11,12 +11,13 @@ from typing import Any
 
 from lidargrit import _discovery, formats
 from lidargrit.datasets import ScanDataset, open_dataset
+from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import DataError, OutputError, ScanError, UnknownNameError, nearest_names
 from lidargrit.evaluation.score import holds_images, open_images
 from lidargrit.files import atomic_path, is_taken, read_json, write_json
 from lidargrit.formats import ScanFormat
 from lidargrit.formats.kitti_bin import KittiBin
-from lidargrit.loading import DataConfig, RangeImages, spread
+from lidargrit.loading import DataConfig, RangeImages
 from lidargrit.projection import unproject
 from lidargrit.reporting import Reporter
 from lidargrit.structures import Scan
@@ -127,7 +128,7 @@ def _open(source: str, config: DataConfig) -> _OfDataset | _OfImages:
     if holds_images(source):
         return _OfImages(open_images(source, None, config))
     dataset = open_dataset(source, config.bad_points)
-    return _OfDataset(dataset, spread(config.max_scans or len(dataset), len(dataset)))
+    return _OfDataset(dataset, evenly_spaced(config.max_scans or len(dataset), len(dataset)))
 
 
 class _Flat:

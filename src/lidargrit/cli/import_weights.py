@@ -7,7 +7,7 @@ from pathlib import Path
 
 EXAMPLES = """\
   lidargrit import-weights lidargrit_kitti_360 runs/published vqvae.pth transformer.pth \\
-      --set data.variant=reference data.columns=2048 data.column_stride=2
+      --set data.projection_variant=reference data.columns=2048 data.column_stride=2
   lidargrit import-weights r2dm_kitti_360 runs/r2dm r2dm-h-kitti360-300k.pth
   lidargrit import-weights dusty_kitti_odometry runs/dusty dusty1.pth
 """

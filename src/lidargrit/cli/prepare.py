@@ -46,7 +46,7 @@ def run(options: argparse.Namespace) -> None:
         columns=options.columns,
         column_stride=options.column_stride,
         projection=options.projection,
-        variant=options.projection_variant,
+        projection_variant=options.projection_variant,
         max_scans=options.max_scans,
         bad_points=options.bad_points,
         bad_scans=options.bad_scans,

@@ -37,8 +37,8 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.errors import ConfigError
     from lidargrit.evaluation.samples import write_samples
     from lidargrit.generators import load, locate
-    from lidargrit.loading import place_among
     from lidargrit.nn.devices import usable_device
+    from lidargrit.processes import rank_and_world_size
     from lidargrit.reporting import TerminalReporter
 
     if options.count < 1 or options.batch_size < 1 or options.seed < 0:
@@ -47,7 +47,7 @@ def run(options: argparse.Namespace) -> None:
             "at least one scan, at least one at once, and no negative seed",
             "correct the number",
         )
-    rank, world_size = place_among(options.rank, options.world_size)
+    rank, world_size = rank_and_world_size(options.rank, options.world_size)
     own = f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu"
     device = usable_device(options.device or own)
     run_folder = locate(options.run_folder)

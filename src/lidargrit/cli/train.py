@@ -34,13 +34,13 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.errors import ConfigError
     from lidargrit.recipes import load_recipe
     from lidargrit.reporting import TerminalReporter
-    from lidargrit.training import measure, plan, tracked, train
+    from lidargrit.training import measure, plan_training, tracked, train
     from lidargrit.viewer import plot_progress
 
     recipe = load_recipe(options.recipe, options.set)
     if options.dry_run or options.measure:
         refuse_taken(options)
-        planned, measured = plan(recipe), measure(recipe) if options.measure else []
+        planned, measured = plan_training(recipe), measure(recipe) if options.measure else []
         text = "\n".join([planned.as_text(), *(stage.as_line() for stage in measured)])
         tell(options, text, {**planned.to_json(), "measured": [vars(stage) for stage in measured]})
         return

@@ -85,11 +85,15 @@ def weights_of(words: list[str]) -> dict[str, Path]:
 def _run(options: Namespace, settings: Settings, reporter: Reporter) -> tuple[str, dict[str, Any]]:
     config = DataConfig(
         max_scans=settings.max_scans,
-        variant=settings.projection_variant or "exact",
+        projection_variant=settings.projection_variant or "exact",
         bad_points=settings.data.bad_points,
         bad_scans=settings.data.bad_scans,
     )
     errors = evaluate_run(Path(options.samples), options.reference, config, reporter)
-    about = {"samples": options.samples, "reference": options.reference, "projection_variant": config.variant}
+    about = {
+        "samples": options.samples,
+        "reference": options.reference,
+        "projection_variant": config.projection_variant,
+    }
     table = "\n".join(f"{name:<20}{value:>10.4g}" for name, value in errors.items())
     return table, {**about, "reconstruction": errors}

@@ -103,7 +103,7 @@ def open_both(samples: str, reference: str, settings: Settings, reporter: Report
     protocol = load_protocol(settings.protocol)
     choices(protocol, settings)  # refuses unknown names before scans are projected
     variant = settings.projection_variant or protocol.variant
-    config = replace(settings.data, variant=variant, max_scans=settings.max_scans)
+    config = replace(settings.data, projection_variant=variant, max_scans=settings.max_scans)
     sides = open_sides(samples, reference, protocol, config, settings.samples_format, reporter)
     for warning in sides.warnings:
         reporter.message(f"WARNING: {warning}")

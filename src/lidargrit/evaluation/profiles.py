@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float64
 
+from lidargrit.determinism import evenly_spaced
 from lidargrit.evaluation.sides import Side
-from lidargrit.loading import spread
 from lidargrit.projection import points_of_pixels
 
 HALF_VIEW_M = 50.0  # beyond it a 64-row sensor sees little but walls
@@ -76,7 +76,7 @@ def matches(samples: Side, reference: Side) -> list[Match]:
 
     Of many scans 500 generated and 2,000 real ones are compared, evenly spaced.
     """
-    chosen, known = spread(_GENERATED_AT_MOST, len(samples)), spread(_REAL_AT_MOST, len(reference))
+    chosen, known = evenly_spaced(_GENERATED_AT_MOST, len(samples)), evenly_spaced(_REAL_AT_MOST, len(reference))
     distance = torch.cdist(_outlines(samples, chosen), _outlines(reference, known), p=1) / (_ROWS * _COLUMNS)
     nearest = distance.min(dim=1)
     found = [

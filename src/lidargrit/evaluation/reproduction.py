@@ -20,8 +20,7 @@ from lidargrit.loading import load_range_images
 from lidargrit.metrics import load_metric
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
-from lidargrit.training import Recipe, gpu_time, with_budget
-from lidargrit.training import plan as planned
+from lidargrit.training import Recipe, gpu_time, plan_training, with_budget
 
 SIMULATED = "simulated"  # in place of a root
 _SIMULATED_SCANS = {"train": 300, "val": 16}  # the demo's: a few minutes of simulating
@@ -146,7 +145,7 @@ class Reproduction:
             reference=f"simulated:{count}:test" if self.root == SIMULATED else self.source("test"),
             num_samples=count,
             settings=Settings(protocol=self.table.protocol, metrics=metrics if self.small else ()),
-            recipe_settings=(train, val, *images, f"data.variant={protocol.variant}", *self.settings),
+            recipe_settings=(train, val, *images, f"data.projection_variant={protocol.variant}", *self.settings),
             flops=flops,
             batch_size=self.batch_size,
         )
@@ -194,7 +193,7 @@ def plan(wanted: Reproduction, folder: Path) -> dict[str, Any]:
         generator = load_class(recipe.generator)(recipe.model, recipe.data.load_sensor())
         systems[system] = {
             "state": "finished" if is_run(run) else "begun" if run.exists() else "to do",
-            "plan": planned(recipe).to_json(),
+            "plan": plan_training(recipe).to_json(),
             "sampling_flops": generator.cost().flops * contest.num_samples,
         }
     return {"table": wanted.number, "prepare": counted, "samples": contest.num_samples, "systems": systems}
@@ -226,7 +225,7 @@ def _prepare(contest: Contest, systems: list[str], reporter: Reporter) -> None:
         load_range_images(data.train, data, reporter)
         load_range_images(data.val, data, reporter)
         at_most = min(contest.num_samples, protocol.num_scans)
-        config = replace(contest.settings.data, variant=protocol.variant, max_scans=at_most)
+        config = replace(contest.settings.data, projection_variant=protocol.variant, max_scans=at_most)
         open_images(contest.reference, data.load_sensor(), config, reporter)
 
 

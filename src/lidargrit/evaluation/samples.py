@@ -21,7 +21,7 @@ from lidargrit.generators import TRAINED_ON_FILE, WEIGHTS_FILE, Generator
 from lidargrit.loading import Pixels, Provenance, RangeImages
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel
-from lidargrit.training.run import RUN_FILE
+from lidargrit.training.run import RUN_FILE, recipe_settings
 
 MANIFEST = "samples.json"
 _LATER_ENTRIES = ("projection_variant", "generator")  # not in folders of before they existed
@@ -119,13 +119,14 @@ def projection_of(folder: Path) -> str:
 
     "" where that is not known.
     """
-    about, place = folder / RUN_FILE, ("recipe", "data", "variant")
-    if is_sample_folder(folder):
-        about, place = folder / MANIFEST, ("projection_variant",)
-    found: Any = read_json(about) if about.is_file() else {}
-    for name in place:
-        found = found.get(name) if isinstance(found, dict) else None
-    return found if isinstance(found, str) else ""
+    is_samples = is_sample_folder(folder)
+    path = folder / (MANIFEST if is_samples else RUN_FILE)
+    about: Any = read_json(path) if path.is_file() else {}
+    if is_samples:
+        variant = about.get("projection_variant") if isinstance(about, dict) else None
+    else:
+        variant = recipe_settings(about).get("data.projection_variant")
+    return variant if isinstance(variant, str) else ""
 
 
 def trained_on(folder: Path) -> Provenance:

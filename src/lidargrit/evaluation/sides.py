@@ -10,13 +10,14 @@ from pathlib import Path
 import torch
 
 from lidargrit.datasets import open_dataset
+from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import LidarGritError
 from lidargrit.evaluation.dialects import is_tensor_folder, load_dialect, recognise
 from lidargrit.evaluation.protocols import Protocol
 from lidargrit.evaluation.samples import is_sample_folder, projection_of
 from lidargrit.evaluation.score import open_images, overlap, require_same_rays
 from lidargrit.evaluation.scorecard import Input
-from lidargrit.loading import DataConfig, PreparedImages, RangeImages, is_prepared, spread
+from lidargrit.loading import DataConfig, PreparedImages, RangeImages, is_prepared
 from lidargrit.reporting import Reporter
 from lidargrit.structures import RangeImage
 
@@ -134,7 +135,7 @@ def open_sides(
     require_same_rays(first, second)
     count = min(len(first), len(second), at_most or len(first))
     pair = [
-        Side(source, images, spread(count, len(images)), protocol.range_m, *known_of(source, config, form))
+        Side(source, images, evenly_spaced(count, len(images)), protocol.range_m, *known_of(source, config, form))
         for source, images, form in ((samples, first, samples_format), (reference, second, ""))
     ]
     sides = Sides(pair[0], pair[1])
@@ -151,12 +152,12 @@ def known_of(source: str, config: DataConfig, samples_format: str = "") -> tuple
         return "samples", name, load_dialect(name).variant
     try:
         if is_prepared(source):
-            plan = PreparedImages(source).plan
-            return *known_of(plan.source, config)[:2], plan.variant
+            spec = PreparedImages(source).spec
+            return *known_of(spec.source, config)[:2], spec.variant
         dataset = open_dataset(source, config.bad_points)
     except LidarGritError:  # a prepared place outlives the scans that it was made of
         return "", "", ""
-    return dataset.public_name(), dataset.split, config.variant
+    return dataset.public_name(), dataset.split, config.projection_variant
 
 
 def deviations(sides: Sides, protocol: Protocol) -> tuple[str, ...]:

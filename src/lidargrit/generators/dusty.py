@@ -13,10 +13,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.func import functional_call
 
+from lidargrit.determinism import derive_seed
 from lidargrit.errors import CheckpointError, ConfigError
 from lidargrit.files import load_exactly
 from lidargrit.generators import Cost, Generator
-from lidargrit.loading import seed_of
 from lidargrit.nn.dcgan import LEVELS, Discriminator, Synthesis, Widths, from_published
 from lidargrit.nn.differentiable_augmentation import (
     AugmentationDefect,
@@ -192,7 +192,7 @@ class Dusty(Generator):
         """Return what is added to logits, whose signs then are draws; numbers of their own for each seed."""
         if sampling.mask == "threshold":
             return self._latent_like(torch.zeros(()))
-        rngs = [torch.Generator().manual_seed(seed_of(seed, sampling.raydrop_seed)) for seed in seeds]
+        rngs = [torch.Generator().manual_seed(derive_seed(seed, sampling.raydrop_seed)) for seed in seeds]
         return self._latent_like(torch.stack([logistic_noise(_size(self.sensor), rng) for rng in rngs]))
 
     def _normal(self, seeds: Sequence[int], count: int) -> Float[Tensor, "B count D"]:

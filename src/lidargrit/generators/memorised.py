@@ -9,10 +9,11 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import CheckpointError, ConfigError
 from lidargrit.files import load_exactly
 from lidargrit.generators import Cost, Generator, NoSampling
-from lidargrit.loading import RangeImages, spread
+from lidargrit.loading import RangeImages
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
@@ -60,7 +61,7 @@ class Memorised(Generator):
 
     def learn(self, images: RangeImages) -> None:
         """Keep the images, in an order that does not follow the drive, so that the first seeds are not neighbours."""
-        kept = spread(self.config.scans, len(images))
+        kept = evenly_spaced(self.config.scans, len(images))
         self.range_m = torch.zeros(len(kept), self.sensor.height, self.sensor.width)
         for place, index in enumerate(torch.randperm(len(kept), generator=torch.Generator().manual_seed(0)).tolist()):
             self.range_m[place] = images.batch([kept[index]]).range_m[0]

@@ -12,10 +12,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import CheckpointError, ConfigError
 from lidargrit.files import load_exactly
 from lidargrit.generators import Cost, Generator
-from lidargrit.loading import RangeImages, spread
+from lidargrit.loading import RangeImages
 from lidargrit.nn import diffusion
 from lidargrit.nn.diffusion import Sampler, SeededNoise
 from lidargrit.nn.flops import flops_of
@@ -105,7 +106,7 @@ class R2dm(Generator):
 
     def learn(self, images: RangeImages) -> None:
         """Count how many of the training scans' rays return."""
-        chosen = spread(_SHARE_SCANS, len(images))
+        chosen = evenly_spaced(_SHARE_SCANS, len(images))
         shares = [
             images.batch(chosen[first : first + _BATCH]).return_mask.float().mean((1, 2))
             for first in range(0, len(chosen), _BATCH)

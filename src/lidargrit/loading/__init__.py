@@ -1,13 +1,12 @@
 """Data sources → batches of range images: projected once, kept on disk, drawn and augmented by seed."""
 
-from lidargrit.loading.batches import Batches, seed_of, spread
+from lidargrit.loading.batches import Batches
 from lidargrit.loading.config import DataConfig
 from lidargrit.loading.images import ImageStore, Pixels, Provenance, RangeImages
 from lidargrit.loading.prepare import (
     cache_folder,
     damaged_shards,
     load_range_images,
-    place_among,
     prepare,
     prepare_and_describe,
 )
@@ -25,9 +24,6 @@ __all__ = [
     "damaged_shards",
     "is_prepared",
     "load_range_images",
-    "place_among",
     "prepare",
     "prepare_and_describe",
-    "seed_of",
-    "spread",
 ]

@@ -6,10 +6,10 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 
-import numpy as np
 import torch
 
 from lidargrit.augmentation import Augmentation, augment
+from lidargrit.determinism import derive_seed
 from lidargrit.errors import ConfigError
 from lidargrit.loading.images import RangeImages
 from lidargrit.structures import RangeImage
@@ -57,7 +57,7 @@ class Batches:
         with ThreadPoolExecutor(self.workers, thread_name_prefix="reading scans") as pool:
             try:
                 for position in range(scans_seen, until, self.batch_size):
-                    waiting.append(pool.submit(self._read, *self._drawn(position)))
+                    waiting.append(pool.submit(self._read, *self._chosen(position)))
                     if len(waiting) > 2 * self.workers:  # enough for none to idle, and few enough to hold in memory
                         yield waiting.popleft().result()
                 while waiting:
@@ -67,13 +67,13 @@ class Batches:
 
     def at(self, scans_seen: int) -> RangeImage:
         """Return this process's share of the batch that follows ``scans_seen`` scans."""
-        return self._read(*self._drawn(scans_seen))
+        return self._read(*self._chosen(scans_seen))
 
-    def _drawn(self, scans_seen: int) -> tuple[list[int], list[int]]:
+    def _chosen(self, scans_seen: int) -> tuple[list[int], list[int]]:
         """Choose the scans of a batch, and for each the seed of all else that is random about it."""
         share = self.batch_size // self.world_size
         positions = range(scans_seen + self.rank * share, scans_seen + (self.rank + 1) * share)
-        return [self._draw(position) for position in positions], [seed_of(self.seed, 1, p) for p in positions]
+        return [self._scan_at(position) for position in positions], [derive_seed(self.seed, 1, p) for p in positions]
 
     def _read(self, indices: list[int], seeds: list[int]) -> RangeImage:
         # Each scan has random numbers of its own: it looks the same however many processes share a batch.
@@ -84,20 +84,9 @@ class Batches:
             return images
         return RangeImage.stack([augment(images[i : i + 1], self.augmentations, rng)[0] for i, rng in enumerate(rngs)])
 
-    def _draw(self, position: int) -> int:
-        epoch, place = divmod(position, len(self.images))
+    def _scan_at(self, position: int) -> int:
+        epoch, index = divmod(position, len(self.images))
         if epoch != self._epoch:
-            rng = torch.Generator().manual_seed(seed_of(self.seed, 0, epoch))
+            rng = torch.Generator().manual_seed(derive_seed(self.seed, 0, epoch))
             self._epoch, self._order = epoch, torch.randperm(len(self.images), generator=rng)
-        return int(self._order[place])
-
-
-def seed_of(*parts: int) -> int:
-    """Mix whole numbers into one seed: near numbers give seeds that have nothing in common."""
-    return int(np.random.SeedSequence(parts).generate_state(1, np.uint64)[0] >> np.uint64(1))
-
-
-def spread(count: int, total: int) -> list[int]:
-    """Return at most ``count`` of ``total`` indices, evenly spaced: neighbours in time are nearly the same scan."""
-    count = min(count, total)
-    return [index * total // count for index in range(count)]
+        return int(self._order[index])

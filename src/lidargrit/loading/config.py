@@ -22,7 +22,7 @@ class DataConfig:
         columns: fine columns of the circle; 0 for the sensor's own.
         column_stride: keep every n-th of them.
         projection: ``sensor`` for the sensor's own, ``spherical`` or ``unfolding``.
-        variant: ``exact``, or ``reference`` to repeat the released program's projection.
+        projection_variant: ``exact``, or ``reference`` to repeat the released program's projection.
         max_scans: of each source, evenly spaced over it; 0 for all.
         bad_points: ``refuse`` scans with NaN, infinite or origin points, or ``drop`` these points.
         bad_scans: ``refuse`` to go on after a scan that cannot be used, or ``skip`` it and say so.
@@ -35,7 +35,7 @@ class DataConfig:
     columns: int = 0
     column_stride: int = 1
     projection: Literal["sensor", "spherical", "unfolding"] = "sensor"
-    variant: Variant = "exact"
+    projection_variant: Variant = "exact"
     max_scans: int = 0
     bad_points: BadPoints = "refuse"
     bad_scans: Literal["refuse", "skip"] = "refuse"

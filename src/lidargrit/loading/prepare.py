@@ -14,24 +14,24 @@ from typing import Any
 
 from lidargrit import __version__
 from lidargrit.datasets import ScanDataset, open_dataset
-from lidargrit.errors import ConfigError, DataError, OutputError
+from lidargrit.determinism import evenly_spaced
+from lidargrit.errors import DataError, OutputError
 from lidargrit.files import is_taken, write_json, write_text
-from lidargrit.loading.batches import spread
 from lidargrit.loading.config import DataConfig
 from lidargrit.loading.images import RangeImages
 from lidargrit.loading.prepared import (
     FORMAT,
     PLAN_FILE,
     SCANS_FILE,
-    Place,
-    Plan,
+    PreparedFolder,
     PreparedImages,
+    PreparedSpec,
     is_prepared,
-    read_plan,
     shard_name,
 )
 from lidargrit.loading.shards import LocalBytes, range_step_m, read_index
 from lidargrit.loading.workers import make_shards
+from lidargrit.processes import rank_and_world_size
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel
 
@@ -105,19 +105,19 @@ def prepare(
         ScanError: a scan that cannot be used; names it.
     """
     reporter, sensor = reporter or Reporter(), sensor or config.load_sensor()
-    rank, world_size = place_among(rank, world_size)
+    rank, world_size = rank_and_world_size(rank, world_size)
     dataset = open_dataset(source, config.bad_points)
     if dataset.sensor != sensor.name and not config.sensor.endswith(".json"):
         reporter.message(f"WARNING: {source} was made by {dataset.sensor}, and is imaged as {sensor.name}")
-    plan, scans = _plan(source, dataset, sensor, config)
-    facts = json.dumps(asdict(plan), sort_keys=True).encode()
+    spec, scans = _spec(source, dataset, sensor, config)
+    facts = json.dumps(asdict(spec), sort_keys=True).encode()
     folder = folder or cache_folder() / hashlib.sha256(facts).hexdigest()[:24]
-    _claim(folder, plan, scans)
-    missing = [shard for shard in range(plan.num_shards) if not _is_whole(folder, shard)]
+    _claim(folder, spec, scans)
+    missing = [shard for shard in range(spec.num_shards) if not _is_whole(folder, shard)]
     if missing:
         _remove_abandoned(folder)
         mine = [shard for shard in missing if shard % world_size == rank]
-        make_shards(folder, plan, mine, dataset, config.workers, reporter)
+        make_shards(folder, spec, mine, dataset, config.workers, reporter)
         _wait_for(folder, [shard for shard in missing if shard % world_size != rank], reporter)
     return folder
 
@@ -206,32 +206,12 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "lidargrit"
 
 
-def place_among(rank: int | None, world_size: int | None) -> tuple[int, int]:
-    """Return which process this is, and of how many: as given, or as a launcher such as torchrun says, or 0 of 1.
-
-    Raises:
-        ConfigError: numbers that contradict each other.
-    """
-    rank, world_size = _from_environment("RANK", rank, 0), _from_environment("WORLD_SIZE", world_size, 1)
-    if not 0 <= rank < world_size:
-        raise ConfigError(f"rank {rank} of {world_size}", "0 <= rank < world size", "number the machines from 0")
-    return rank, world_size
-
-
-def _from_environment(name: str, given: int | None, default: int) -> int:
-    """Return what a launcher such as torchrun says, unless a number is given."""
-    text = os.environ.get(name, str(default)) if given is None else str(given)
-    if not text.isdecimal():
-        raise ConfigError(f"{name}={text!r}", "a whole number from 0", "correct it")
-    return int(text)
-
-
-def _plan(
+def _spec(
     source: str, dataset: ScanDataset, sensor: SensorModel, config: DataConfig
-) -> tuple[Plan, list[tuple[str, str, int, int]]]:
-    """Return the plan and its scans: what identifies each, its drive, and its file's size and time."""
+) -> tuple[PreparedSpec, list[tuple[str, str, int, int]]]:
+    """Return what the images depend on, and of every scan its name, its drive, and its file's size and time."""
     fine, scans = sensor.fine(), []
-    for index in spread(config.max_scans or len(dataset), len(dataset)):
+    for index in evenly_spaced(config.max_scans or len(dataset), len(dataset)):
         path = dataset.path(index)
         try:
             status = None if path is None else path.stat()
@@ -244,12 +224,12 @@ def _plan(
         )
         size, time_ns = (status.st_size, status.st_mtime_ns) if status else (0, 0)
         scans.append((name, dataset.recording(index), size, time_ns))
-    plan = Plan(
+    spec = PreparedSpec(
         format=FORMAT,
         version=__version__,
         source=source,
         sensor=fine.to_json(),
-        variant=config.variant,
+        variant=config.projection_variant,
         bad_points=config.bad_points,
         bad_scans=config.bad_scans,
         max_scans=config.max_scans,
@@ -258,13 +238,13 @@ def _plan(
         num_scans=len(scans),
         digest=hashlib.sha256(json.dumps(scans).encode()).hexdigest(),
     )
-    return plan, scans
+    return spec, scans
 
 
-def _claim(folder: Path, plan: Plan, scans: list[tuple[str, str, int, int]]) -> None:
-    """Write the plan into a free folder, or find that the folder's is the same."""
+def _claim(folder: Path, spec: PreparedSpec, scans: list[tuple[str, str, int, int]]) -> None:
+    """Write the specification into a free folder, or find that the folder's is the same."""
     if (folder / PLAN_FILE).exists():
-        if differing := plan.differences(read_plan(Place(str(folder)))):
+        if differing := spec.differences(PreparedFolder(str(folder)).read_spec()):
             raise OutputError(
                 f"{folder}, which is stale: prepared with another {', '.join(differing)}",
                 "an empty folder, or what was prepared from these very scans in this very way",
@@ -276,7 +256,7 @@ def _claim(folder: Path, plan: Plan, scans: list[tuple[str, str, int, int]]) -> 
     if is_taken(folder, SCANS_FILE) and not half_claimed:
         raise OutputError(f"{folder}, which holds something else", "an empty folder", "choose another one")
     write_text(path, told)
-    write_json(folder / PLAN_FILE, asdict(plan))  # last: it says that the folder is ours
+    write_json(folder / PLAN_FILE, asdict(spec))  # last: it says that the folder is ours
 
 
 def _is_whole(folder: Path, shard: int) -> bool:
@@ -323,8 +303,8 @@ def _check_way(source: str, images: PreparedImages, sensor: SensorModel, config:
             f"the rays of {sensor.name!r} ({wanted.height}x{wanted.width} with every fine column)",
             "name the sensor that it was prepared for, or prepare it for this one",
         )
-    theirs = (images.plan.variant, prepared.projection, prepared.range_min_m, prepared.range_max_m)
-    ours = (config.variant, wanted.projection, wanted.range_min_m, wanted.range_max_m)
+    theirs = (images.spec.variant, prepared.projection, prepared.range_min_m, prepared.range_max_m)
+    ours = (config.projection_variant, wanted.projection, wanted.range_min_m, wanted.range_max_m)
     if theirs != ours:
         told = [f"{variant}, {projection}, {near:g} to {far:g} m" for variant, projection, near, far in (theirs, ours)]
         raise DataError(

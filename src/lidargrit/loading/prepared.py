@@ -8,8 +8,8 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import DataError
-from lidargrit.loading.batches import spread
 from lidargrit.loading.images import Pixels, Provenance
 from lidargrit.loading.shards import Bytes, Entry, LocalBytes, read_image, read_index
 from lidargrit.sensors import SensorModel
@@ -20,7 +20,7 @@ _PLAN_AT_MOST = 1 << 30  # bytes; the list of a million scans has a quarter of t
 
 
 @dataclass(frozen=True)
-class Plan:
+class PreparedSpec:
     """Everything that the pixels depend on, so that one look tells whether they are still right.
 
     Args:
@@ -57,11 +57,11 @@ class Plan:
         return -(-self.num_scans // self.shard_scans)
 
     def scans_of(self, shard: int) -> range:
-        """Return the places in the plan of one shard's scans."""
+        """Return the indices of one shard's scans among all scans."""
         return range(shard * self.shard_scans, min((shard + 1) * self.shard_scans, self.num_scans))
 
-    def differences(self, other: Plan) -> list[str]:
-        """Name what differs from another plan."""
+    def differences(self, other: PreparedSpec) -> list[str]:
+        """Return the names of the fields that differ from another's."""
         mine, theirs = asdict(self), asdict(other)
         return [name for name in mine if mine[name] != theirs[name]]
 
@@ -72,14 +72,14 @@ def shard_name(shard: int) -> str:
 
 
 def is_prepared(source: str) -> bool:
-    """Tell whether a source is a place that prepared scans lie in: a URL, or a folder with a plan."""
+    """Tell whether a source is where prepared scans lie: a URL, or a folder with a plan."""
     try:
         return "://" in source or (Path(source).expanduser() / PLAN_FILE).is_file()
     except OSError:  # a name longer than names can be
         return False
 
 
-class Place:
+class PreparedFolder:
     """A folder of this machine, or any that fsspec reaches by a URL such as s3://bucket/scans."""
 
     def __init__(self, location: str) -> None:
@@ -120,6 +120,22 @@ class Place:
                 f"{self.location}/{name}, which is damaged ({error})", "what lidargrit prepare wrote", "prepare again"
             ) from None
 
+    def read_spec(self) -> PreparedSpec:
+        """Read what the images were prepared from and how, or raise DataError."""
+        try:
+            spec = PreparedSpec(**self.read_json(PLAN_FILE))
+            for field in fields(PreparedSpec):  # the plain types; the sensor checks itself
+                kind = {"int": int, "float": (int, float), "str": str}.get(str(field.type), dict)
+                if not isinstance(getattr(spec, field.name), kind):
+                    raise TypeError(f"{field.name} is {getattr(spec, field.name)!r:.40}")
+            if spec.format != FORMAT or min(spec.shard_scans, spec.num_scans) < 1:
+                raise TypeError(f"format {spec.format}, {spec.num_scans} scans by {spec.shard_scans}")
+            return spec
+        except TypeError as error:
+            raise DataError(
+                f"{self.location}/{PLAN_FILE}, which is no plan ({error})", "one of this version", "prepare again"
+            ) from None
+
 
 class _RemoteBytes:
     def __init__(self, files: Any, path: str) -> None:
@@ -128,23 +144,6 @@ class _RemoteBytes:
 
     def read(self, start: int, end: int) -> bytes:
         return self._files.cat_file(self._path, start, end)
-
-
-def read_plan(place: Place) -> Plan:
-    """Read the plan of a prepared place, or raise DataError."""
-    try:
-        plan = Plan(**place.read_json(PLAN_FILE))
-        for field in fields(Plan):  # the plain types; the sensor checks itself
-            kind = {"int": int, "float": (int, float), "str": str}.get(str(field.type), dict)
-            if not isinstance(getattr(plan, field.name), kind):
-                raise TypeError(f"{field.name} is {getattr(plan, field.name)!r:.40}")
-        if plan.format != FORMAT or min(plan.shard_scans, plan.num_scans) < 1:
-            raise TypeError(f"format {plan.format}, {plan.num_scans} scans by {plan.shard_scans}")
-        return plan
-    except TypeError as error:
-        raise DataError(
-            f"{place.location}/{PLAN_FILE}, which is no plan ({error})", "one of this version", "prepare again"
-        ) from None
 
 
 class PreparedImages:
@@ -159,25 +158,25 @@ class PreparedImages:
     """
 
     def __init__(self, location: str, max_scans: int = 0) -> None:
-        self._place = Place(location)
-        self.plan = read_plan(self._place)
-        self.sensor = SensorModel.from_json(self.plan.sensor)
+        self._folder = PreparedFolder(location)
+        self.spec = self._folder.read_spec()
+        self.sensor = SensorModel.from_json(self.spec.sensor)
         self._shape = (self.sensor.height, self.sensor.width)
         self._entries: list[tuple[int, Entry]] = []
         self.left_out: dict[int, str] = {}
         self._open: dict[int, Bytes] = {}
         self._lock = threading.Lock()
-        scans = self._place.read_json(SCANS_FILE)
-        if len(scans) != self.plan.num_scans or not all(isinstance(scan, list) and len(scan) >= 2 for scan in scans):
+        scans = self._folder.read_json(SCANS_FILE)
+        if len(scans) != self.spec.num_scans or not all(isinstance(scan, list) and len(scan) >= 2 for scan in scans):
             raise DataError(f"{location}/{SCANS_FILE}, which is damaged", "the scans of the plan", "prepare again")
-        for shard in range(self.plan.num_shards):
+        for shard in range(self.spec.num_shards):
             entries, left_out = read_index(self._bytes(shard), shard_name(shard))
-            if sorted([*(entry.scan for entry in entries), *left_out]) != list(self.plan.scans_of(shard)):
+            if sorted([*(entry.scan for entry in entries), *left_out]) != list(self.spec.scans_of(shard)):
                 raise DataError(f"{shard_name(shard)} with other scans", "those of the plan", "prepare again")
             self._entries += [(shard, entry) for entry in entries]
             self.left_out |= left_out
         if max_scans:
-            self._entries = [self._entries[index] for index in spread(max_scans, len(self._entries))]
+            self._entries = [self._entries[index] for index in evenly_spaced(max_scans, len(self._entries))]
         self.provenance = Provenance(
             tuple(scans[entry.scan][0] for _, entry in self._entries),
             tuple(scans[entry.scan][1] for _, entry in self._entries),
@@ -190,8 +189,8 @@ class PreparedImages:
     def read(self, index: int, verify: bool = False) -> Pixels:
         """Return the pixels of one image; ``verify`` compares them with their fingerprint."""
         shard, entry = self._entries[index]
-        name = f"{self._place.location}/{shard_name(shard)}"
-        return read_image(self._bytes(shard), entry, self._shape, self.plan.range_step_m, name, verify)
+        name = f"{self._folder.location}/{shard_name(shard)}"
+        return read_image(self._bytes(shard), entry, self._shape, self.spec.range_step_m, name, verify)
 
     def shard_of(self, index: int) -> int:
         """Return which shard holds an image."""
@@ -200,5 +199,5 @@ class PreparedImages:
     def _bytes(self, shard: int) -> Bytes:
         with self._lock:
             if shard not in self._open:
-                self._open[shard] = self._place.open(shard_name(shard))
+                self._open[shard] = self._folder.open(shard_name(shard))
             return self._open[shard]

@@ -18,10 +18,10 @@ from pathlib import Path
 
 from lidargrit import errors
 from lidargrit.datasets import ScanDataset, open_dataset
+from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import DataError, LidarGritError, ScanError
 from lidargrit.files import atomic_path
-from lidargrit.loading.batches import spread
-from lidargrit.loading.prepared import Place, Plan, read_plan, shard_name
+from lidargrit.loading.prepared import PreparedFolder, PreparedSpec, shard_name
 from lidargrit.loading.shards import ShardWriter
 from lidargrit.projection import project
 from lidargrit.reporting import Reporter
@@ -29,49 +29,49 @@ from lidargrit.sensors import SensorModel
 
 
 def make_shards(
-    folder: Path, plan: Plan, shards: list[int], dataset: ScanDataset, workers: int, reporter: Reporter
+    folder: Path, spec: PreparedSpec, shards: list[int], dataset: ScanDataset, workers: int, reporter: Reporter
 ) -> None:
     """Make shards, in this process if there is one only, else in as many as are wanted.
 
     Raises:
         LidarGritError: what one of the processes met; the others are stopped.
     """
-    total = sum(len(plan.scans_of(shard)) for shard in shards)
-    done = plan.num_scans - total
-    with reporter.progress("projecting scans", plan.num_scans, done) as progress:
+    total = sum(len(spec.scans_of(shard)) for shard in shards)
+    done = spec.num_scans - total
+    with reporter.progress("projecting scans", spec.num_scans, done) as progress:
         if min(workers, len(shards)) <= 1:
             for shard in shards:
-                make_shard(folder, plan, shard, dataset)
-                progress.advance(len(plan.scans_of(shard)))
+                make_shard(folder, spec, shard, dataset)
+                progress.advance(len(spec.scans_of(shard)))
             return
         for shard in _made_by_processes(folder, [shards[first::workers] for first in range(min(workers, len(shards)))]):
-            progress.advance(len(plan.scans_of(shard)))
+            progress.advance(len(spec.scans_of(shard)))
 
 
-def make_shard(folder: Path, plan: Plan, shard: int, dataset: ScanDataset) -> None:
-    """Project the scans of one shard of a plan.
+def make_shard(folder: Path, spec: PreparedSpec, shard: int, dataset: ScanDataset) -> None:
+    """Project the scans of one shard.
 
     Raises:
         ScanError: a scan that cannot be used, unless such scans are skipped.
-        DataError: the source no longer holds the scans of the plan.
+        DataError: the source no longer holds the scans that were planned.
     """
-    wanted = spread(plan.max_scans or len(dataset), len(dataset))
-    if len(wanted) != plan.num_scans:
-        raise DataError(f"{len(wanted)} scans in {plan.source}", f"the {plan.num_scans} planned", "prepare again")
-    sensor = SensorModel.from_json(plan.sensor)
+    wanted = evenly_spaced(spec.max_scans or len(dataset), len(dataset))
+    if len(wanted) != spec.num_scans:
+        raise DataError(f"{len(wanted)} scans in {spec.source}", f"the {spec.num_scans} planned", "prepare again")
+    sensor = SensorModel.from_json(spec.sensor)
     with atomic_path(folder / shard_name(shard)) as temporary, temporary.open("wb") as file:
-        writer = ShardWriter(file, plan.range_step_m)
-        for place in plan.scans_of(shard):
+        writer = ShardWriter(file, spec.range_step_m)
+        for index in spec.scans_of(shard):
             try:
-                scan = dataset.scan(wanted[place])
-                image = project(scan, sensor, variant="reference" if plan.variant == "reference" else "exact")
+                scan = dataset.scan(wanted[index])
+                image = project(scan, sensor, variant="reference" if spec.variant == "reference" else "exact")
             except ScanError as error:
-                if plan.bad_scans == "refuse":
+                if spec.bad_scans == "refuse":
                     leave_out = "leave such scans out by --set data.bad_scans=skip (train) or --bad-scans skip"
                     raise ScanError(error.got, error.wanted, f"{error.cure}, or {leave_out}") from None
-                writer.leave_out(place, str(error))
+                writer.leave_out(index, str(error))
             else:
-                writer.add(place, image)
+                writer.add(index, image)
         writer.finish()
 
 
@@ -121,13 +121,13 @@ def _error_of(line: str) -> LidarGritError:
 def work(folder: Path, parent: int, shards: list[int]) -> int:
     """Make shards while the process that wants them lives; print the number of each, or the error."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that a half-written shard is removed
-    plan = read_plan(Place(str(folder)))
-    dataset = open_dataset(plan.source, "drop" if plan.bad_points == "drop" else "refuse")
+    spec = PreparedFolder(str(folder)).read_spec()
+    dataset = open_dataset(spec.source, "drop" if spec.bad_points == "drop" else "refuse")
     for shard in shards:
         if os.getppid() != parent:
             return 1  # whoever wanted the shards is gone
         try:
-            make_shard(folder, plan, shard, dataset)
+            make_shard(folder, spec, shard, dataset)
         except LidarGritError as error:
             print(json.dumps({"error": [type(error).__name__, error.got, error.wanted, error.cure]}), flush=True)
             return 2

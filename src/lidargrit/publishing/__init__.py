@@ -27,7 +27,7 @@ def import_weights(recipe: str, folder: Path, files: Sequence[Path], settings: S
         recipe: says which generator, of which sizes, and the sensor; nothing is trained.
         folder: gets ``run.json``, ``model.safetensors`` and ``config.json``, as after training.
         files: of ``torch.save``, in the order of the generator's ``published_files``; code in them is not run.
-        settings: of the recipe, changed as in ``data.variant=reference``.
+        settings: of the recipe, changed as in ``data.projection_variant=reference``.
 
     Raises:
         ConfigError: as many files as the generator's weights do not come in.

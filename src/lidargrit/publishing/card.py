@@ -14,7 +14,8 @@ from lidargrit.errors import LidarGritError
 from lidargrit.evaluation.scorecard import Scorecard, format_value
 from lidargrit.generators import Generator
 from lidargrit.loading import Provenance
-from lidargrit.loading.prepared import Place, is_prepared, read_plan
+from lidargrit.loading.prepared import PreparedFolder, is_prepared
+from lidargrit.training.run import recipe_settings
 
 _PIPELINE = "unconditional-image-generation"  # of the hub's tasks the nearest; it has none for scans
 _CREATIVE_COMMONS = re.compile(r"CC ([A-Z-]+) (\d\.\d) \([a-z-]+\)")  # without terms beside it
@@ -66,7 +67,7 @@ def data_set_of(source: str) -> tuple[str, str]:
     if "://" in source:  # where it lies is nobody's business, and asking there may take long
         return "", ""
     try:
-        return without_place(read_plan(Place(source)).source if is_prepared(source) else source)
+        return without_place(PreparedFolder(source).read_spec().source if is_prepared(source) else source)
     except LidarGritError:
         return "", ""
 
@@ -117,8 +118,8 @@ def _data(about: dict[str, Any], learned: Provenance) -> str:
             lines.append(f"| {part} | {name or 'unnamed scans'} | {split or '-'} | {licence} |")
             leaks += _leaks(name, split)
     lines += ["", *dict.fromkeys(leaks)]
-    if data.get("variant"):
-        lines.append(f"Scans are to become images by the `{data['variant']}` projection, as those it learned from.")
+    if variant := recipe_settings(about).get("data.projection_variant"):
+        lines.append(f"Scans are to become images by the `{variant}` projection, as those it learned from.")
     if learned.fingerprints:
         lines.append(f"It learned from {len(learned.fingerprints):,} different images.")
     return "\n".join(lines)

@@ -31,7 +31,7 @@ RECIPE = replace(
         _PAPER.model,
         tokenizer=replace(_PAPER.model.tokenizer, reconstruction="reference", codebook_loss="reference"),
     ),
-    data=replace(_PAPER.data, columns=2048, column_stride=2, variant="reference"),
+    data=replace(_PAPER.data, columns=2048, column_stride=2, projection_variant="reference"),
     training={
         stage: replace(config, augmentations=(), average_over_scans=0) for stage, config in _PAPER.training.items()
     },

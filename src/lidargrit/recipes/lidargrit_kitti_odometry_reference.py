@@ -30,7 +30,7 @@ RECIPE = replace(
             _PAPER.model.tokenizer, reconstruction="reference", codebook_loss="reference", raydrop_weight=1e-4
         ),
     ),
-    data=replace(_PAPER.data, variant="reference"),
+    data=replace(_PAPER.data, projection_variant="reference"),
     training={
         stage: replace(config, augmentations=(), average_over_scans=0) for stage, config in _PAPER.training.items()
     },

@@ -1,22 +1,22 @@
 """One loop, one optimiser, one checkpoint, whatever the model: recipe → run folder."""
 
 from lidargrit.training.compute import estimated_training_flops, gpu_time, training_flops, with_budget
+from lidargrit.training.config import FitConfig, Recipe
 from lidargrit.training.measure import Measured, measure
-from lidargrit.training.plan import Plan, plan
+from lidargrit.training.plan import TrainingPlan, plan_training
 from lidargrit.training.run import check_folder, train
-from lidargrit.training.settings import FitConfig, Recipe
 from lidargrit.training.tracking import tracked
 
 __all__ = [
     "FitConfig",
     "Measured",
-    "Plan",
     "Recipe",
+    "TrainingPlan",
     "check_folder",
     "estimated_training_flops",
     "gpu_time",
     "measure",
-    "plan",
+    "plan_training",
     "tracked",
     "train",
     "training_flops",

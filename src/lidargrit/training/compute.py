@@ -14,8 +14,8 @@ from lidargrit.generators import load_class
 from lidargrit.nn.precision import Precision
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
+from lidargrit.training.config import FitConfig, Recipe
 from lidargrit.training.engine import Engine
-from lidargrit.training.settings import FitConfig, Recipe
 
 _SCANS = 2  # of a counted batch: some objectives compare the scans of a batch, so one alone would not do
 _STEPS = 16  # counted of players who take turns: some of their terms come in every 16th step only

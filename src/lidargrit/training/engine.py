@@ -13,9 +13,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from lidargrit.determinism import derive_seed
 from lidargrit.errors import LidarGritError
-from lidargrit.loading import place_among, seed_of
 from lidargrit.nn.precision import Precision, dtype_of
+from lidargrit.processes import rank_and_world_size
 from lidargrit.structures import RangeImage
 
 
@@ -35,7 +36,7 @@ class Engine:
         logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # it tells the precision at every start
         # One device, unless a launcher such as torchrun began this process as one of several.
         where: dict[str, Any] = {"devices": 1}
-        _, processes = place_among(None, None)
+        _, processes = rank_and_world_size(None, None)
         if "LOCAL_RANK" in os.environ and processes > 1:
             here = int(os.environ.get("LOCAL_WORLD_SIZE", processes))
             strategy = DDPStrategy(find_unused_parameters=players_take_turns)
@@ -101,7 +102,7 @@ class Engine:
         for part in range(parts):
             some = images if parts == 1 else images[part * len(images) // parts : (part + 1) * len(images) // parts]
             with self._fabric.no_backward_sync(self._objective, enabled=part < parts - 1):
-                found = self._objective(partial(_same, some), seed_of(seed, part) if part else seed, phase)
+                found = self._objective(partial(_same, some), derive_seed(seed, part) if part else seed, phase)
                 loss = self._mean(found["loss"].detach().clone())
                 if not bool(loss.isfinite()):
                     return {**found, "loss": loss}, False

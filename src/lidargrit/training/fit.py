@@ -10,16 +10,17 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from lidargrit.determinism import derive_seed, evenly_spaced
 from lidargrit.errors import ConfigError, Terminated, TrainingError
-from lidargrit.loading import Batches, RangeImages, seed_of, spread
+from lidargrit.loading import Batches, RangeImages
 from lidargrit.nn.blocks import prepare_for_training
 from lidargrit.reporting import Reporter
 from lidargrit.structures import RangeImage
 from lidargrit.training.checkpoint import load_checkpoint, remove_half_written, save_checkpoint
+from lidargrit.training.config import FitConfig
 from lidargrit.training.engine import Engine
 from lidargrit.training.log import Log
 from lidargrit.training.optimiser import WeightAverage, learning_rate_at, make_optimiser
-from lidargrit.training.settings import FitConfig
 from lidargrit.training.termination import Termination
 
 _LOG_EVERY_STEPS = 20
@@ -40,7 +41,7 @@ class Fit:
         reporter: hears of the progress.
         built_on: fingerprint of the earlier stages' weights, which a checkpoint must share.
         workers: threads that read ahead.
-        draw: draws a picture of the averaged objective into the named file.
+        plot: plots the averaged objective into the named file.
     """
 
     objective: nn.Module
@@ -50,7 +51,7 @@ class Fit:
     reporter: Reporter
     built_on: str = ""
     workers: int = 1
-    draw: Callable[[nn.Module, Path], None] | None = None
+    plot: Callable[[nn.Module, Path], None] | None = None
 
     def __post_init__(self) -> None:
         takes_turns = hasattr(self.objective, "phases")
@@ -107,7 +108,7 @@ class Fit:
                 if self._passed(config.validate_every) or self.scans_seen >= config.scans:
                     self._log_terms("val", self.validate(val), time.monotonic() - begun)
                 if config.pictures_every and self._passed(config.pictures_every):
-                    self.engine.by_first(self._draw)
+                    self.engine.by_first(self._plot)
                 if self._passed(config.checkpoint_every) or self.scans_seen >= config.scans or stops:
                     self._save()
                 if stops:
@@ -119,11 +120,13 @@ class Fit:
 
     def validate(self, images: RangeImages) -> dict[str, float]:
         """Return the mean terms of the averaged objective over validation scans, evenly spaced."""
-        chosen = spread(self.config.validation_scans, len(images))
+        chosen = evenly_spaced(self.config.validation_scans, len(images))
         totals: dict[str, float] = {}
         for first in range(0, len(chosen), self.config.batch_size):
             indices = chosen[first : first + self.config.batch_size]
-            terms = self.engine.evaluate(self.average.objective, images.batch(indices), seed_of(self.seed, 3, first))
+            terms = self.engine.evaluate(
+                self.average.objective, images.batch(indices), derive_seed(self.seed, 3, first)
+            )
             for name, value in terms.items():
                 totals[name] = totals.get(name, 0.0) + value * len(indices) / len(chosen)
         return totals
@@ -132,7 +135,7 @@ class Fit:
         config = self.config
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate_at(config, self.scans_seen)
-        seed = seed_of(self.seed, 2, self.scans_seen, self.engine.rank)
+        seed = derive_seed(self.seed, 2, self.scans_seen, self.engine.rank)
         torch.manual_seed(seed)  # dropout draws from the global generator
         terms = self.engine.step(images.to(self.engine.device), seed, config.gradient_clip, config.accumulate)
         if not bool(terms["loss"].isfinite()):
@@ -152,9 +155,9 @@ class Fit:
     def _close_log(self) -> None:
         self.log.close()
 
-    def _draw(self) -> None:
-        if self.draw is not None:
-            self.draw(self.average.objective, self.folder / "pictures" / f"{self.scans_seen:09d}.png")
+    def _plot(self) -> None:
+        if self.plot is not None:
+            self.plot(self.average.objective, self.folder / "pictures" / f"{self.scans_seen:09d}.png")
 
     def _passed(self, every: int) -> bool:
         return self.scans_seen // every > (self.scans_seen - self.config.batch_size) // every

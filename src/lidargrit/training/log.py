@@ -35,16 +35,16 @@ class Log:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             with self._path.open("a", encoding="utf-8") as log:
                 log.write(json.dumps(line) + "\n")
-            self._draw(split, scans_seen, terms)
+            self._plot(split, scans_seen, terms)
         except OSError as error:
             raise OutputError(
                 f"'{error.strerror}' while writing {self._path}", "a folder with room", "free some space and go on"
             ) from error
 
-    def _draw(self, split: str, scans_seen: int, terms: dict[str, float]) -> None:
+    def _plot(self, split: str, scans_seen: int, terms: dict[str, float]) -> None:
         from torch.utils.tensorboard import SummaryWriter  # noqa: PLC0415  slow to import, and only training needs it
 
-        if self._board is None:  # TensorBoard forgets by itself what was drawn from purge_step on
+        if self._board is None:  # TensorBoard forgets by itself what was logged from purge_step on
             self._board = SummaryWriter(str(self._path.parent), purge_step=self._resumed_at + 1)
         for name, value in terms.items():
             self._board.add_scalar(f"{name}/{split}", value, scans_seen)

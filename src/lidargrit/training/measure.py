@@ -10,9 +10,9 @@ import torch
 from lidargrit.generators import load_class
 from lidargrit.nn.blocks import prepare_for_training
 from lidargrit.training.compute import duration, same_everywhere, training_flops
+from lidargrit.training.config import Recipe
 from lidargrit.training.engine import Engine
 from lidargrit.training.optimiser import make_optimiser
-from lidargrit.training.settings import Recipe
 
 _WARM_UP_STEPS, _TIMED_STEPS = 1, 3  # the first one allocates and chooses kernels
 

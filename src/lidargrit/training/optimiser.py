@@ -8,7 +8,7 @@ import math
 import torch
 from torch import nn
 
-from lidargrit.training.settings import FitConfig
+from lidargrit.training.config import FitConfig
 
 
 def make_optimiser(objective: nn.Module, config: FitConfig) -> torch.optim.AdamW:

@@ -9,8 +9,8 @@ from lidargrit import configuration
 from lidargrit.generators import load_class
 from lidargrit.nn.precision import Precision
 from lidargrit.training.compute import estimated_training_flops, gpu_time
+from lidargrit.training.config import Recipe
 from lidargrit.training.optimiser import memory_of_weights
-from lidargrit.training.settings import Recipe
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class StagePlan:
 
 
 @dataclass(frozen=True)
-class Plan:
+class TrainingPlan:
     """What a recipe would do.
 
     Args:
@@ -77,7 +77,7 @@ class Plan:
         return asdict(self)
 
 
-def plan(recipe: Recipe) -> Plan:
+def plan_training(recipe: Recipe) -> TrainingPlan:
     """Return what a recipe would do; nothing is read or written."""
     sensor = recipe.data.load_sensor()
     generator = load_class(recipe.generator)(recipe.model, sensor)
@@ -87,7 +87,7 @@ def plan(recipe: Recipe) -> Plan:
         parameters = sum(weight.numel() for weight in objective.parameters())
         size = (parameters, budget.scans, budget.batch_size, memory_of_weights(objective))
         stages.append(StagePlan(name, *size, flops[name], budget.precision))
-    return Plan(
+    return TrainingPlan(
         recipe.title,
         recipe.published,
         configuration.leaves(recipe),

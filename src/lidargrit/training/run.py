@@ -17,25 +17,28 @@ import torch
 from torch import nn
 
 from lidargrit import __version__, configuration
+from lidargrit.determinism import derive_seed
 from lidargrit.errors import CheckpointError, ConfigError, OutputError
 from lidargrit.files import is_taken, read_json, write_json, write_text
 from lidargrit.generators import TRAINED_ON_FILE, Generator, load, load_class, locate
-from lidargrit.loading import DataConfig, RangeImages, load_range_images, seed_of
+from lidargrit.loading import DataConfig, RangeImages, load_range_images
 from lidargrit.reporting import Reporter
 from lidargrit.tokenizers import Tokenizer
 from lidargrit.training.checkpoint import fingerprint
+from lidargrit.training.config import FitConfig, Recipe
 from lidargrit.training.engine import Engine
 from lidargrit.training.fit import Fit
-from lidargrit.training.settings import FitConfig, Recipe
 
 RUN_FILE = "run.json"  # ``origin`` in it says that the weights beside it were not trained in this folder
 
 
-Draw = Callable[[Generator, str, RangeImages, Path], None]
-"""Draws a generator in the midst of a stage, with validation scans beside, into a file."""
+PlotProgress = Callable[[Generator, str, RangeImages, Path], None]
+"""Plots what a half-trained generator makes at a stage, beside validation scans, into a file."""
 
 
-def train(recipe: Recipe, folder: Path, reporter: Reporter | None = None, draw: Draw | None = None) -> Generator:
+def train(
+    recipe: Recipe, folder: Path, reporter: Reporter | None = None, plot: PlotProgress | None = None
+) -> Generator:
     """Train every stage of a recipe in a run folder and return the finished generator.
 
     The same call goes on where a stopped one was. The folder holds ``run.json`` (recipe, command, versions) before the
@@ -46,7 +49,7 @@ def train(recipe: Recipe, folder: Path, reporter: Reporter | None = None, draw: 
         recipe: what to train.
         folder: the run's.
         reporter: hears of the progress.
-        draw: called every ``pictures_every`` scans of a stage.
+        plot: function that plots the progress, called every ``pictures_every`` scans of a stage.
 
     Raises:
         OutputError: the folder holds something else, or cannot be written.
@@ -61,7 +64,7 @@ def train(recipe: Recipe, folder: Path, reporter: Reporter | None = None, draw: 
     val_images = load_range_images(recipe.data.val, recipe.data, reporter)
     _warn_of_overlap(train_images, val_images, reporter)
     with torch.random.fork_rng(range(torch.cuda.device_count())):  # the caller's random numbers are the caller's
-        torch.manual_seed(seed_of(recipe.seed, 9))
+        torch.manual_seed(derive_seed(recipe.seed, 9))
         generator = load_class(recipe.generator)(recipe.model, recipe.data.load_sensor())
         borrowed = None if recipe.tokenizer_from is None else _tokenizer_of(Path(recipe.tokenizer_from), generator)
         engine.by_first(lambda: _claim(folder, recipe, train_images, val_images))
@@ -72,8 +75,8 @@ def train(recipe: Recipe, folder: Path, reporter: Reporter | None = None, draw: 
             if stage == "tokenizer" and borrowed is not None:
                 trained = borrowed
             else:
-                seed, objective = seed_of(recipe.seed, number), generator.objective(stage)
-                picture = None if draw is None else partial(_draw, draw, generator, stage, val_images)
+                seed, objective = derive_seed(recipe.seed, number), generator.objective(stage)
+                picture = None if plot is None else partial(_plot, plot, generator, stage, val_images)
                 workers, config = recipe.data.workers, recipe.training[stage]
                 fit = Fit(objective, config, folder / stage, seed, reporter, built_on, workers, picture)
                 trained = fit.run(train_images, val_images, f"training {stage}")
@@ -83,13 +86,13 @@ def train(recipe: Recipe, folder: Path, reporter: Reporter | None = None, draw: 
     return generator.cpu().eval()
 
 
-def _draw(
-    draw: Draw, generator: Generator, stage: str, val_images: RangeImages, averaged: nn.Module, path: Path
+def _plot(
+    plot: PlotProgress, generator: Generator, stage: str, val_images: RangeImages, averaged: nn.Module, path: Path
 ) -> None:
-    """Draw a copy that has the averaged weights: those of the generator itself are being trained."""
+    """Plot a copy that has the averaged weights: those of the generator itself are being trained."""
     copied = copy.deepcopy(generator)
     copied.finish(stage, averaged)
-    draw(copied.to(next(averaged.parameters()).device).eval(), stage, val_images, path)
+    plot(copied.to(next(averaged.parameters()).device).eval(), stage, val_images, path)
 
 
 def _tokenizer_of(donor: Path, generator: Generator) -> Tokenizer:
@@ -111,14 +114,13 @@ def check_folder(folder: Path, recipe: Recipe) -> None:
     """Refuse a folder that is neither free nor this recipe's already, with OutputError."""
     if (folder / RUN_FILE).exists():
         about, ours = read_json(folder / RUN_FILE), configuration.to_json(recipe)
-        theirs = about.get("recipe") if isinstance(about, dict) else None
-        if not isinstance(theirs, dict):
+        if not (theirs := recipe_settings(about)):
             raise CheckpointError(f"{folder / RUN_FILE} without a recipe", "what lidargrit wrote", "restore the file")
         if "origin" in about:
             raise OutputError(
                 f"{folder}, whose weights were {about['origin']}", "a run of train's", "choose another folder"
             )
-        mine, other = configuration.leaves(ours), {**_defaults(recipe), **configuration.leaves(theirs)}
+        mine, other = configuration.leaves(ours), {**_defaults(recipe), **theirs}
         differing = [
             name for name in mine.keys() | other.keys() if (mine.get(name) or None) != (other.get(name) or None)
         ]
@@ -135,6 +137,11 @@ def check_folder(folder: Path, recipe: Recipe) -> None:
             "an empty folder, or one that this recipe began",
             "choose another folder",
         )
+
+
+def recipe_settings(about: Any) -> dict[str, Any]:
+    """Return every setting of the recipe in a ``run.json`` by its name of today; none where there is no recipe."""
+    return configuration.leaves(about.get("recipe") if isinstance(about, dict) else {})
 
 
 def _defaults(recipe: Recipe) -> dict[str, Any]:

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from lidargrit import configuration
 from lidargrit.errors import ConfigError
-from lidargrit.loading import place_among
-from lidargrit.training.settings import Recipe
+from lidargrit.processes import rank_and_world_size
+from lidargrit.training.config import Recipe
 
 
 @contextmanager
@@ -21,7 +21,7 @@ def tracked(project: str, recipe: Recipe, folder: Path) -> Iterator[None]:
     Raises:
         ConfigError: the package is missing, or the service refuses.
     """
-    if not project or place_among(None, None)[0] > 0:  # of several processes the first one logs
+    if not project or rank_and_world_size(None, None)[0] > 0:  # of several processes the first one logs
         yield
         return
     wanted, cure = "the package wandb", "pip install 'lidargrit[wandb]', or leave --wandb out"

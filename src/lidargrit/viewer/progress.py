@@ -6,8 +6,9 @@ from pathlib import Path
 
 import torch
 
+from lidargrit.determinism import evenly_spaced
 from lidargrit.generators import Generator
-from lidargrit.loading import RangeImages, spread
+from lidargrit.loading import RangeImages
 from lidargrit.viewer.pictures import plot_comparison
 
 _SCANS = 2  # a glance; more would take training's time
@@ -16,7 +17,7 @@ _SCANS = 2  # a glance; more would take training's time
 @torch.no_grad()
 def plot_progress(generator: Generator, stage: str, val: RangeImages, path: Path) -> None:
     """Draw a generator in the midst of a stage; new scans from its last stage on, when there are weights for all."""
-    real = val.batch(spread(_SCANS, len(val)))
+    real = val.batch(evenly_spaced(_SCANS, len(val)))
     groups = {"val": real}
     if "encode" in generator.capabilities:
         device = next(generator.parameters()).device

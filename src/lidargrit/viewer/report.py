@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
+from lidargrit.determinism import evenly_spaced
 from lidargrit.evaluation.profiles import HALF_VIEW_M, Match, Profile, matches, profile
 from lidargrit.evaluation.scorecard import Input, Score, Scorecard, format_value
 from lidargrit.evaluation.sides import Side, Sides
 from lidargrit.files import write_text
-from lidargrit.loading import spread
 from lidargrit.metrics import load_metric
 from lidargrit.viewer.report_charts import line_chart, score_chart
 from lidargrit.viewer.report_pictures import (
@@ -148,7 +148,7 @@ def _score_row(score: Score) -> str:
 
 def _limits_m(sides: Sides) -> tuple[float, float]:
     """Return a scale of range that holds nearly all returns of both sets."""
-    some = [side.batch(spread(16, len(side))) for side in (sides.samples, sides.reference)]
+    some = [side.batch(evenly_spaced(16, len(side))) for side in (sides.samples, sides.reference)]
     ranges = np.concatenate([images.range_m[images.return_mask].numpy() for images in some] + [np.array([1.0, 80.0])])
     near, far = (float(edge) for edge in np.quantile(ranges, (0.005, 0.999)))
     return near, max(far, near * 2)
@@ -251,7 +251,7 @@ def _densities(both: tuple[Profile, Profile]) -> str:
 
 
 def _sheet(side: Side, limits_m: tuple[float, float]) -> str:
-    figures = "".join(_scan(side, place, limits_m, _name(side, place)) for place in spread(_SHEET, len(side)))
+    figures = "".join(_scan(side, place, limits_m, _name(side, place)) for place in evenly_spaced(_SHEET, len(side)))
     return f'<section><h2>Samples</h2><p>Evenly spaced, not chosen.</p><div class="pair">{figures}</div></section>'
 
 

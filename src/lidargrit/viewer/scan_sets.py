@@ -10,10 +10,11 @@ from jaxtyping import Int
 from torch import Tensor
 
 from lidargrit.datasets import open_dataset
+from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import ConfigError, DataError, ScanError
 from lidargrit.evaluation.score import holds_images, open_images
 from lidargrit.generators import is_run, load, locate
-from lidargrit.loading import DataConfig, spread
+from lidargrit.loading import DataConfig
 from lidargrit.projection import index_map, project
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel, load_sensor
@@ -91,7 +92,7 @@ def _joined(batches: Iterable[RangeImage]) -> RangeImage:
 
 def _of_images(place: str, count: int, sensor: SensorModel | None, config: DataConfig, reporter: Reporter) -> ScanSet:
     images = open_images(place, sensor, config, reporter)
-    indices = spread(count, len(images))
+    indices = evenly_spaced(count, len(images))
     names = images.provenance.names
     return ScanSet(place, images.batch(indices), tuple(names[index].rpartition("/")[2] for index in indices))
 
@@ -100,10 +101,10 @@ def _of_scans(place: str, count: int, sensor: SensorModel | None, config: DataCo
     dataset = open_dataset(place, config.bad_points)
     sensor = sensor or load_sensor(dataset.sensor)
     images, names, labels = [], [], []
-    for index in spread(count, len(dataset)):
+    for index in evenly_spaced(count, len(dataset)):
         try:
             scan = dataset.scan(index)
-            images.append(project(scan, sensor, variant=config.variant))
+            images.append(project(scan, sensor, variant=config.projection_variant))
         except ScanError as error:
             if config.bad_scans == "refuse":
                 raise
@@ -121,7 +122,7 @@ def _of_scans(place: str, count: int, sensor: SensorModel | None, config: DataCo
 def _label_of_pixels(scan: Scan, image: RangeImage, config: DataConfig) -> Int[Tensor, "H W"] | None:
     if scan.label is None:
         return None
-    point_of_pixel = index_map(scan, image.sensor, variant=config.variant)[:, :: image.sensor.column_stride]
+    point_of_pixel = index_map(scan, image.sensor, variant=config.projection_variant)[:, :: image.sensor.column_stride]
     label = scan.label[torch.from_numpy(point_of_pixel).long().clamp(min=0)] & _CLASS_BITS
     return torch.where(image.return_mask, label, 0)
 
