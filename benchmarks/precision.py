@@ -16,18 +16,18 @@ import torch
 import torch.nn.functional as F
 
 from lidargrit.generators import load
-from lidargrit.generators.lidargrit import LidarGrit, TokenSampling, after_start, choose
+from lidargrit.generators.lidargrit import LidarGrit, TokenSampling, after_start, sample_token
 from lidargrit.loading import DataConfig, load_range_images
-from lidargrit.nn.writing import TokenWriter
+from lidargrit.nn.decoding import CachedDecoder
 from lidargrit.structures import TokenGrid
 
 
 def stepwise_logits(generator: LidarGrit, tokens: torch.Tensor, precision: str) -> torch.Tensor:
-    """Return the logits (B, T, K) that the writer computes when it is given the tokens one by one."""
-    chooser = partial(choose, sampling=TokenSampling())
-    writer = TokenWriter(generator.transformer, len(tokens), chooser, precision=precision)
+    """Return the logits (B, T, K) that the decoder computes when it is given the tokens one by one."""
+    chooser = partial(sample_token, sampling=TokenSampling())
+    decoder = CachedDecoder(generator.transformer, len(tokens), chooser, precision=precision)
     inputs = after_start(tokens[:, :-1])
-    return torch.stack([writer.next_logits(inputs[:, at], at) for at in range(inputs.shape[1])], dim=1)
+    return torch.stack([decoder.next_logits(inputs[:, at], at) for at in range(inputs.shape[1])], dim=1)
 
 
 def compare_odds(generator: LidarGrit, tokens: torch.Tensor) -> None:
@@ -46,10 +46,10 @@ def compare_odds(generator: LidarGrit, tokens: torch.Tensor) -> None:
 
 def compare_decoding(generator: LidarGrit, grid: TokenGrid) -> None:
     """Print how far decoded ranges and returns move by each precision."""
-    plain = generator.tokenizer.decode_parts(grid)
+    plain = generator.tokenizer.decode(grid)
     uniform = torch.rand(plain.range_m.shape, generator=torch.Generator().manual_seed(0))
     for precision in ("fp32", "bf16"):
-        quick = generator.tokenizer.for_decoding(precision).decode_parts(grid)
+        quick = generator.tokenizer.for_decoding(precision).decode(grid)
         both = (plain.return_logits >= 0) & (quick.return_logits >= 0)
         error_m = (plain.range_m - quick.range_m).abs()[both]
         flipped = ((plain.return_logits >= 0) != (quick.return_logits >= 0)).float().mean()

@@ -17,10 +17,10 @@ from functools import partial
 
 import torch
 
-from lidargrit.generators.lidargrit import LidarGrit, TokenSampling, choose
+from lidargrit.generators.lidargrit import LidarGrit, TokenSampling, sample_token
+from lidargrit.nn.decoding import CachedDecoder
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.transformer import CausalTransformer
-from lidargrit.nn.writing import TokenWriter
 from lidargrit.recipes import load_recipe
 
 PRECISIONS = ("fp32", "bf16", "int8")
@@ -93,8 +93,10 @@ def compare_tokens(transformer: CausalTransformer, batch: int, rates: dict[str, 
     repeats = 3 if batch == 1 else 1
     recomputed = recomputing(transformer, batch, repeats) if beside else float("nan")
     for precision in PRECISIONS:
-        writer = TokenWriter(transformer, batch, partial(choose, sampling=TokenSampling()), precision=precision)
-        taken = seconds(partial(writer.write, uniform), repeats)
+        decoder = CachedDecoder(
+            transformer, batch, partial(sample_token, sampling=TokenSampling()), precision=precision
+        )
+        taken = seconds(partial(decoder.generate, uniform), repeats)
         flop_rate = rates["product fp32" if precision == "fp32" else "product bf16"]
         bytes_, flops = step_bytes(transformer, batch, precision), step_flops(transformer, batch)
         reading = bytes_ / rates["40 MB" if batch == 1 else "400 MB"]

@@ -44,7 +44,7 @@ def main(folder: Path) -> None:
     tokenizer.eval()
     with torch.no_grad():
         tokens = tokenizer.encode(street)
-        decoded = tokenizer.decode_parts(tokens)
+        decoded = tokenizer.decode(tokens)
     shape = "x".join(map(str, tokens.tokens.shape[1:]))
     print(f"{shape} tokens of {tokens.num_codes}; range error in training {float(terms['range_mae_m']):.1f} m")
 

@@ -7,9 +7,9 @@ import pytest
 import torch
 from scipy import stats
 
-from lidargrit.generators.lidargrit import START_TOKEN, TokenSampling, after_start, choose, sample_by_recomputing
+from lidargrit.generators.lidargrit import START_TOKEN, TokenSampling, after_start, sample_by_recomputing, sample_token
+from lidargrit.nn.decoding import CachedDecoder
 from lidargrit.nn.transformer import CausalTransformer, TransformerConfig
-from lidargrit.nn.writing import TokenWriter
 from reference_weights import seeded_weights
 
 GREEDY = TokenSampling(temperature=0.0)
@@ -60,11 +60,11 @@ def test_logits_and_loss_are_the_programs(golden_transformer):
 @pytest.mark.shared
 def test_greedy_steps_with_the_cache_are_the_programs(golden_transformer):
     model, data = golden_transformer
-    writer = TokenWriter(model, 2, partial(choose, sampling=GREEDY))
+    decoder = CachedDecoder(model, 2, partial(sample_token, sampling=GREEDY))
     tokens, chosen = torch.tensor([0, 3]), []
     with torch.no_grad():
         for position in range(30):
-            tokens = choose(writer.next_logits(tokens, position), torch.zeros(2), GREEDY)
+            tokens = sample_token(decoder.next_logits(tokens, position), torch.zeros(2), GREEDY)
             chosen.append(tokens)
     assert np.array_equal(torch.stack(chosen, 1).numpy(), data["greedy_from_sos_0_and_3"])
 
@@ -75,7 +75,7 @@ def test_top_k_keeps_what_the_program_keeps(golden_transformer):
     logits = torch.from_numpy(data["logits"][0])
     kept = torch.zeros_like(logits, dtype=torch.bool)
     for uniform in torch.linspace(0, 0.9999, 4000):
-        kept.scatter_(1, choose(logits, uniform.expand(len(logits)), TokenSampling(top_k=5))[:, None], True)
+        kept.scatter_(1, sample_token(logits, uniform.expand(len(logits)), TokenSampling(top_k=5))[:, None], True)
     theirs = torch.from_numpy(data["topk5_of_logits0"])
     # Every token that can be drawn is among the program's; one too unlikely for 4,000 steps may be missing.
     assert bool((~kept | theirs.isfinite()).all())
@@ -83,16 +83,18 @@ def test_top_k_keeps_what_the_program_keeps(golden_transformer):
 
 
 def write(transformer, uniform, sampling, **options):
-    return TokenWriter(transformer, len(uniform), partial(choose, sampling=sampling), **options).write(uniform)
+    return CachedDecoder(transformer, len(uniform), partial(sample_token, sampling=sampling), **options).generate(
+        uniform
+    )
 
 
 @pytest.mark.parametrize(("precision", "tolerance"), [("fp32", 1e-5), ("bf16", 0.2), ("int8", 0.2)])
 def test_steps_give_the_logits_of_the_whole_prefix(transformer, precision, tolerance):
     tokens = torch.randint(20, (3, 24), generator=torch.Generator().manual_seed(0))
-    writer = TokenWriter(transformer, 3, partial(choose, sampling=GREEDY), precision=precision)
+    decoder = CachedDecoder(transformer, 3, partial(sample_token, sampling=GREEDY), precision=precision)
     with torch.no_grad():
         whole = transformer(tokens)
-        stepwise = torch.stack([writer.next_logits(tokens[:, i], i) for i in range(24)], dim=1)
+        stepwise = torch.stack([decoder.next_logits(tokens[:, i], i) for i in range(24)], dim=1)
     assert whole.std() > 1
     assert float((whole - stepwise).abs().max()) < tolerance
 
@@ -122,19 +124,20 @@ def test_a_writer_may_write_again_and_further_than_one_recording(static):
     torch.manual_seed(0)
     longer = CausalTransformer(TransformerConfig(layers=1, heads=2, width=16), num_tokens=8, context_length=140).eval()
     torch.nn.init.normal_(longer.pos_emb)
-    writer = TokenWriter(longer, 2, partial(choose, sampling=TokenSampling()), static=static)
+    decoder = CachedDecoder(longer, 2, partial(sample_token, sampling=TokenSampling()), static=static)
     one, other = torch.rand((2, 2, 140), generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
         expected = [sample_by_recomputing(longer, uniform, TokenSampling()) for uniform in (one, other, one)]
     assert all(
-        torch.equal(writer.write(uniform), tokens) for uniform, tokens in zip((one, other, one), expected, strict=True)
+        torch.equal(decoder.generate(uniform), tokens)
+        for uniform, tokens in zip((one, other, one), expected, strict=True)
     )
 
 
 def test_tokens_are_drawn_with_their_probability():
     logits = torch.tensor([[0.0, 1.0, 2.0, -1.0, 0.5]])
     uniform = torch.rand(20_000, generator=torch.Generator().manual_seed(0))
-    drawn = choose(logits.expand(20_000, -1), uniform, TokenSampling(top_k=0))
+    drawn = sample_token(logits.expand(20_000, -1), uniform, TokenSampling(top_k=0))
     expected = logits[0].double().softmax(0).numpy() * 20_000
     assert stats.chisquare(torch.bincount(drawn, minlength=5).numpy(), expected).pvalue > 1e-3
 
@@ -143,7 +146,7 @@ def test_top_p_keeps_the_smallest_set_that_holds_the_share():
     logits = torch.tensor([[0.5, 0.3, 0.15, 0.05]]).log()
     uniform = torch.linspace(0, 0.9999, 1000)
     for top_p, kept in ((0.4, {0}), (0.5, {0}), (0.6, {0, 1}), (0.81, {0, 1, 2}), (1.0, {0, 1, 2, 3})):
-        drawn = choose(logits.expand(1000, -1), uniform, TokenSampling(top_k=0, top_p=top_p))
+        drawn = sample_token(logits.expand(1000, -1), uniform, TokenSampling(top_k=0, top_p=top_p))
         assert set(drawn.tolist()) == kept
 
 
@@ -175,12 +178,14 @@ def test_a_changed_weight_is_noticed_and_surprise_sums_to_the_likelihood():
     first = generator.sample([0])
     assert torch.equal(generator.sample([0]).range_m, first.range_m)
     with torch.no_grad():
-        surprise = generator.surprise(first)
+        token_nll_bits = generator.token_nll_bits(first)
         tokens = generator.tokenizer.encode(first)
         odds = generator.transformer(after_start(tokens.tokens.flatten(1)[:, :-1])).softmax(-1)
         for place in (0, 7, 255):
             share = odds[0, place, tokens.tokens.flatten()[place]]
-            assert float(surprise.flatten()[place]) == pytest.approx(-np.log2(float(share)), abs=1e-4)
-        assert float(generator.log_likelihood(first)) == pytest.approx(-float(surprise.sum()) * np.log(2), rel=1e-5)
+            assert float(token_nll_bits.flatten()[place]) == pytest.approx(-np.log2(float(share)), abs=1e-4)
+        assert float(generator.log_likelihood(first)) == pytest.approx(
+            -float(token_nll_bits.sum()) * np.log(2), rel=1e-5
+        )
         generator.transformer.head.weight.mul_(-30)
     assert not torch.equal(generator.sample([0]).range_m, first.range_m)

@@ -134,8 +134,8 @@ def test_padding_around_the_circle_commutes_with_turning_the_car():
         for padding, commutes in (("wrap", True), ("zero", False)):
             vqvae = Vqvae(replace(SMALL, padding=padding), sensor).eval()
             tokens, turned_tokens = vqvae.encode(images).tokens, vqvae.encode(turned).tokens
-            decoded = vqvae.decode_parts(TokenGrid(tokens, 16)).range_m
-            again = vqvae.decode_parts(TokenGrid(tokens.roll(4, -1), 16)).range_m
+            decoded = vqvae.decode(TokenGrid(tokens, 16)).range_m
+            again = vqvae.decode(TokenGrid(tokens.roll(4, -1), 16)).range_m
             assert torch.allclose(decoded.roll(8, -1), again, atol=1e-3) == commutes
             if commutes:
                 assert float((tokens.roll(4, -1) == turned_tokens).float().mean()) > 0.99
@@ -158,8 +158,8 @@ def test_what_only_decodes_decodes_the_same(padding):
     before = {name: weight.clone() for name, weight in vqvae.state_dict().items()}
     tokens = TokenGrid(torch.randint(16, (2, 4, 8)), 16)
     with torch.no_grad():
-        plain, exact = vqvae.decode_parts(tokens), vqvae.for_decoding("fp32").decode_parts(tokens)
-        short = vqvae.for_decoding("bf16").decode_parts(tokens)
+        plain, exact = vqvae.decode(tokens), vqvae.for_decoding("fp32").decode(tokens)
+        short = vqvae.for_decoding("bf16").decode(tokens)
     assert torch.allclose(plain.range_m, exact.range_m, atol=1e-3)
     assert torch.allclose(plain.return_logits, exact.return_logits, atol=1e-4)
     assert 0 < float((plain.range_m - short.range_m).abs().mean()) < 1.5  # ranges of an untrained network
@@ -172,16 +172,16 @@ def test_threshold_and_bernoulli_masks():
     vqvae = Vqvae(SMALL, sensor).eval()
     with torch.no_grad():
         tokens = vqvae.encode(images_of(sensor))
-        probability = vqvae.decode_parts(tokens).return_logits.sigmoid()
-        threshold = vqvae.decode(tokens).return_mask
-        rng = torch.Generator().manual_seed(0)
-        uniforms = [torch.rand(probability.shape, generator=rng) for _ in range(300)]
-        draws = torch.stack([vqvae.decode(tokens, "bernoulli", u).return_mask for u in uniforms]).float().mean(0)
-    with pytest.raises(ConfigError, match="without random numbers"):
-        vqvae.decode(tokens, "bernoulli")
-    assert torch.equal(threshold, probability >= 0.5)
-    assert float((draws - probability).abs().max()) < 0.2  # five standard errors of 300 draws are 0.14
-    assert float((draws - probability).mean()) == pytest.approx(0, abs=0.01)
+        probability = vqvae.decode(tokens).return_logits.sigmoid()
+        rngs = [torch.Generator().manual_seed(seed) for seed in (0, 1)]
+        sampled = torch.stack([vqvae.sample(tokens, rngs).return_mask for _ in range(300)]).float().mean(0)
+        alone = vqvae.sample(TokenGrid(tokens.tokens[1:], 16), [torch.Generator().manual_seed(1)])
+        beside = vqvae.sample(tokens, [torch.Generator().manual_seed(seed) for seed in (0, 1)])
+        threshold = vqvae.sample(tokens, rngs, "threshold")
+    assert torch.equal(threshold.return_mask, probability >= 0.5)
+    assert float((sampled - probability).abs().max()) < 0.2  # five standard errors of 300 samples are 0.14
+    assert float((sampled - probability).mean()) == pytest.approx(0, abs=0.01)
+    assert float((alone.return_mask == beside.return_mask[1:]).float().mean()) > 0.999  # its own random numbers
 
 
 def test_sizes_that_cannot_be_halved_are_refused():

@@ -5,18 +5,40 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Iterable
-from typing import Any, TypeVar, get_origin, get_type_hints
+from typing import Any, ClassVar, TypeVar, get_origin, get_type_hints
 
-from lidargrit.errors import ConfigError, nearest_names
+from lidargrit import _discovery
+from lidargrit.errors import ConfigError, UnknownNameError, nearest_names
 
 T = TypeVar("T")
 
 _RENAMED = {"data.variant": "data.projection_variant"}  # run folders have the former name, and users may type it
 
 
+@dataclasses.dataclass(frozen=True)
+class NamedConfig:
+    """Base of configurations of which there are several kinds, each defined by one file of a folder of ours.
+
+    Where a field's type is such a base, JSON says the kind under ``name``; without a name it is of the default kind,
+    which is written without one.
+
+    Attributes:
+        package: the folder.
+        default_name: file of the default kind.
+    """
+
+    package: ClassVar[str]
+    default_name: ClassVar[str]
+
+    @classmethod
+    def name(cls) -> str:
+        """Return the name of the file that defines the class."""
+        return cls.__module__.rpartition(".")[2]
+
+
 def to_json(config: Any) -> Any:
     """Return a configuration as plain JSON values (tuples become lists)."""
-    return json.loads(json.dumps(dataclasses.asdict(config)))
+    return json.loads(json.dumps(_plain(config)))
 
 
 def from_json(cls: type[T], data: Any, source: str) -> T:
@@ -24,21 +46,30 @@ def from_json(cls: type[T], data: Any, source: str) -> T:
 
     Raises:
         ConfigError: a value of another type, an unknown or a missing name; ``source`` names the file.
+        UnknownNameError: a kind that there is not.
     """
-    parser = _parser()
-    parser.add_argument("--config", type=cls)
     try:
         if not isinstance(data, dict):  # the parser would take the defaults
             raise TypeError(f"{str(data)[:40]!r} in place of settings by name")
-        return parser.instantiate(parser.parse_object({"config": data})).config
+        concrete, data = _concrete(cls, data)
+        parser = _parser()
+        parser.add_argument("--config", type=concrete)
+        made = parser.instantiate(parser.parse_object({"config": data})).config
+        return made if concrete is cls else cls(**_children(made))
     except (Exception, SystemExit) as error:  # the parser raises many kinds, for one cause: the file is not a cls
-        if isinstance(error, ConfigError):
+        if isinstance(error, ConfigError | UnknownNameError):
             raise
         raise ConfigError(
             f"a configuration in {source} that does not fit ({_first_line(error)})",
             f"what this version writes for {cls.__name__}",
             "use the version that wrote it, or make the run anew",
         ) from None
+
+
+def defaults(config: T) -> T:
+    """Return a configuration of the same kinds, down to the last, in which every setting has its default."""
+    nested = {name: defaults(value) for name, value in _children(config).items() if dataclasses.is_dataclass(value)}
+    return type(config)(**nested)
 
 
 def override(config: T, settings: Iterable[str], owner: str = "this recipe", cure: str = "see all with --dry-run") -> T:
@@ -113,6 +144,37 @@ def _parser() -> Any:
     from jsonargparse import ArgumentParser  # noqa: PLC0415  only recipes need it, and --help should be quick
 
     return ArgumentParser(exit_on_error=False)
+
+
+def _plain(node: Any) -> Any:
+    if dataclasses.is_dataclass(node):
+        settings = {key: _plain(value) for key, value in _children(node).items()}
+        return settings if _kind(node) == "" else {"name": _kind(node), **settings}
+    if isinstance(node, dict):
+        return {key: _plain(value) for key, value in node.items()}
+    return [_plain(value) for value in node] if isinstance(node, tuple | list) else node
+
+
+def _kind(node: Any) -> str:
+    """Return the name that JSON says of a configuration: none of the default kind."""
+    return node.name() if isinstance(node, NamedConfig) and node.name() != node.default_name else ""
+
+
+def _concrete(cls: type, data: dict[str, Any]) -> tuple[type, dict[str, Any]]:
+    """Return a class like ``cls`` whose fields are of the kinds that the data name, and the data without those names.
+
+    The parser knows the types of fields from the class alone.
+    """
+    kinds: dict[str, type] = {}
+    for key, hint in get_type_hints(cls).items():
+        if isinstance(hint, type) and issubclass(hint, NamedConfig) and isinstance(data.get(key), dict):
+            settings = {**data[key]}
+            kinds[key] = _discovery.load_class(hint.package, str(settings.pop("name", hint.default_name)), hint)
+            data = {**data, key: settings}
+    if not kinds:
+        return cls, data
+    fields = [(key, kind, dataclasses.field(default_factory=kind)) for key, kind in kinds.items()]
+    return dataclasses.make_dataclass(cls.__name__, fields, bases=(cls,), frozen=True), data
 
 
 def _children(node: Any) -> dict[str, Any]:

@@ -119,9 +119,8 @@ def tell(
     names = tuple(val.provenance.names[index].rpartition("/")[2] for index in evenly_spaced(_SHOWN, len(val)))
     with torch.no_grad():
         tokens = tokenizer.encode(shown[:1])
-        decoded = tokenizer.decode_parts(tokens)
-        uniform = torch.rand(decoded.range_m.shape, generator=torch.Generator().manual_seed(0))
-        drawn = tokenizer.decode(tokens, "bernoulli", uniform)
+        decoded = tokenizer.decode(tokens)
+        drawn = tokenizer.sample(tokens, [torch.Generator().manual_seed(0)])
         again = generator.reconstruct(shown)
     new = samples.batch(range(min(_SHOWN, len(samples))))
     seeds = tuple(f"seed {seed}" for seed in range(len(new)))

@@ -1,12 +1,14 @@
-"""The four nouns that cross folder borders: scan, range image, token grid, metric result; each valid once it exists.
+"""The nouns that cross folder borders: scan, range image, token grid, decoded scans, metric result.
 
-Ranges are always metres and the return mask is always True = a return. Normalised tensors live inside one model.
+Each is valid once it exists. Ranges are always metres and the return mask is always True = a return. Normalised
+tensors live inside one model.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -14,6 +16,9 @@ from torch import Tensor
 
 from lidargrit.errors import ConfigError, ScanError
 from lidargrit.sensors import SensorModel
+
+MaskDecoding = Literal["bernoulli", "threshold"]
+"""How returns are decided from their probabilities: each at random, or wherever a return is likelier than none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,20 +135,34 @@ class RangeImage:
 
     @classmethod
     def masked(
-        cls, range_m: Float[Tensor, "*batch H W"], return_mask: Bool[Tensor, "*batch H W"], sensor: SensorModel
+        cls,
+        range_m: Float[Tensor, "*batch H W"],
+        return_mask: Bool[Tensor, "*batch H W"],
+        sensor: SensorModel,
+        reflectance: Float[Tensor, "*batch H W"] | None = None,
     ) -> RangeImage:
-        """Make a range image of a clean range and a mask: the range is set to 0 where nothing returned."""
-        return cls(torch.where(return_mask, range_m, 0.0), return_mask, sensor)
+        """Make a range image of a clean range and a mask: range and reflectance are set to 0 where nothing returned."""
+        kept = None if reflectance is None else torch.where(return_mask, reflectance, 0.0)
+        return cls(torch.where(return_mask, range_m, 0.0), return_mask, sensor, kept)
 
     @classmethod
-    def stack(cls, images: list[RangeImage]) -> RangeImage:
-        """Make one batch of images of one sensor; reflectance is kept where every image has it."""
+    def stack(cls, images: Sequence[RangeImage]) -> RangeImage:
+        """Make one batch of single images of one sensor; reflectance is kept if every image has it."""
+        return cls._joined(images, torch.stack)
+
+    @classmethod
+    def cat(cls, batches: Sequence[RangeImage]) -> RangeImage:
+        """Make one batch of several batches of one sensor; reflectance is kept if every batch has it."""
+        return cls._joined(batches, torch.cat)
+
+    @classmethod
+    def _joined(cls, images: Sequence[RangeImage], join: Callable[[list[Tensor]], Tensor]) -> RangeImage:
         reflectance = [image.reflectance for image in images if image.reflectance is not None]
         return cls(
-            torch.stack([image.range_m for image in images]),
-            torch.stack([image.return_mask for image in images]),
+            join([image.range_m for image in images]),
+            join([image.return_mask for image in images]),
             images[0].sensor,
-            torch.stack(reflectance) if len(reflectance) == len(images) else None,
+            join(reflectance) if len(reflectance) == len(images) else None,
         )
 
     def __len__(self) -> int:
@@ -188,8 +207,43 @@ class TokenGrid:
             raise ConfigError(
                 f"tokens from {int(self.tokens.min())} to {int(self.tokens.max())}",
                 f"tokens of a codebook of {self.num_codes} codes",
-                "use the tokenizer that wrote them",
+                "use the tokenizer that made them",
             )
+
+
+@dataclass(frozen=True, eq=False)
+class Decoded:
+    """What a decoder tells of every pixel of a batch of scans, before it is decided which beams return.
+
+    Args:
+        range_m: metres, range of the surface that the beam meets, whether or not it returns.
+        return_logits: logits of the probability that the beam returns.
+        sensor: rays of the pixels.
+        reflectance: in [0, 1], of that surface; None from a decoder without reflectance.
+        features: what the decoder knows of each pixel, for networks that decode further; None if it gives none.
+    """
+
+    range_m: Float[Tensor, "B H W"]
+    return_logits: Float[Tensor, "B H W"]
+    sensor: SensorModel
+    reflectance: Float[Tensor, "B H W"] | None = None
+    features: Float[Tensor, "B C H W"] | None = None
+
+    def threshold(self) -> RangeImage:
+        """Return the scans in which every beam returns whose probability is at least 0.5."""
+        return self._masked(self.return_logits >= 0)
+
+    def sample(self, rngs: Sequence[torch.Generator]) -> RangeImage:
+        """Return scans in which every beam returns with its probability, independently of the others.
+
+        Args:
+            rngs: random generators on the CPU, one for each scan, so that no scan depends on its neighbours.
+        """
+        uniform = torch.stack([torch.rand(self.range_m.shape[1:], generator=rng) for rng in rngs])
+        return self._masked(uniform.to(self.return_logits.device) < self.return_logits.sigmoid())
+
+    def _masked(self, return_mask: Bool[Tensor, "B H W"]) -> RangeImage:
+        return RangeImage.masked(self.range_m, return_mask, self.sensor, self.reflectance)
 
 
 @dataclass(frozen=True)

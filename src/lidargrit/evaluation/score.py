@@ -100,7 +100,7 @@ def score_reconstruction(tokenizer: Tokenizer, images: RangeImages) -> Reconstru
     score = ReconstructionScore()
     for first in range(0, len(images), _BATCH):
         batch = images.batch(range(first, min(first + _BATCH, len(images))))
-        clean = tokenizer.decode_parts(tokenizer.encode(batch))
+        clean = tokenizer.decode(tokenizer.encode(batch))
         score.update(batch, clean.range_m, clean.return_logits >= 0)
     return score.compute()
 

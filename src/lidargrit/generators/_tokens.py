@@ -1,7 +1,8 @@
-"""What systems that write the tokens of a VQ-VAE have in common, in whatever order they write them."""
+"""What generators of tokens have in common, whatever their tokenizer and in whatever order they sample its tokens."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -9,27 +10,40 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from lidargrit.generators import Generator
-from lidargrit.nn.flops import flops_of
 from lidargrit.nn.processes import sum_over_processes
-from lidargrit.nn.transformer import Transformer
+from lidargrit.nn.transformer import Transformer, TransformerConfig
 from lidargrit.sensors import SensorModel
-from lidargrit.structures import RangeImage, TokenGrid
-from lidargrit.tokenizers import MaskDecoding, Tokenizer
-from lidargrit.tokenizers.vqvae import Vqvae
+from lidargrit.structures import MaskDecoding, RangeImage, TokenGrid
+from lidargrit.tokenizers import Tokenizer, TokenizerConfig, make_tokenizer
+from lidargrit.tokenizers.vqvae import VqvaeConfig
 
-_DECODED_AT_ONCE = 4  # enough to keep a GPU busy; more would only take memory, 35 MB a scan and layer at 64x1024
+_DECODED_AT_ONCE = 4  # scans; enough to keep a GPU busy, and more would only take memory: 35 MB a layer at 64x1024
+
+
+@dataclass(frozen=True)
+class TokenGeneratorConfig:
+    """The two networks of a generator of tokens.
+
+    Args:
+        tokenizer: configuration of any tokenizer.
+        transformer: sizes of the transformer over its tokens.
+    """
+
+    tokenizer: TokenizerConfig = field(default_factory=VqvaeConfig)
+    transformer: TransformerConfig = field(default_factory=TransformerConfig)
 
 
 class TokenGenerator(Generator):
-    """A VQ-VAE, trained first, and a ``transformer`` over its tokens, trained over the frozen VQ-VAE."""
+    """A tokenizer, trained first, and a ``transformer`` over its tokens, trained over the frozen tokenizer."""
 
+    Config = TokenGeneratorConfig
     stages = ("tokenizer", "transformer")
     capabilities = frozenset({"tokens", "encode"})
 
     def __init__(self, config: Any, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
         self.config, self.sensor = config, sensor
-        self.tokenizer = Vqvae(config.tokenizer, sensor)
+        self.tokenizer = make_tokenizer(config.tokenizer, sensor)
 
     def finish(self, stage: str, objective: nn.Module) -> None:
         """Take over a stage's trained weights."""
@@ -40,40 +54,31 @@ class TokenGenerator(Generator):
             self.get_submodule("transformer").load_state_dict(trained.state_dict())
 
     def get_tokenizer(self) -> Tokenizer:
-        """Return the VQ-VAE."""
+        """Return the tokenizer."""
         return self.tokenizer
 
     @torch.no_grad()
     def reconstruct(self, images: RangeImage) -> RangeImage:
         """Return what the tokens keep of a batch of scans, the mask by threshold."""
-        return self.tokenizer.decode(self.tokenizer.encode(images))
+        return self.tokenizer.reconstruct(images)
 
     def decode(
-        self, tokens: Int[Tensor, "B T"], rngs: list[torch.Generator], mask: MaskDecoding, tokenizer: Vqvae
+        self, tokens: Int[Tensor, "B T"], rngs: list[torch.Generator], mask: MaskDecoding, tokenizer: Tokenizer
     ) -> RangeImage:
-        """Return the scans of written tokens.
+        """Return the scans of sampled tokens.
 
         Args:
             tokens: in raster order.
-            rngs: on the CPU, one for each scan, from which returns are drawn.
+            rngs: random generators on the CPU, one for each scan.
             mask: how returns are decided.
-            tokenizer: the VQ-VAE, or what it gives for decoding only.
+            tokenizer: the generator's own, or what that gives for decoding only.
         """
-        size = (self.sensor.height, self.sensor.width)
         images = []
         for first in range(0, len(tokens), _DECODED_AT_ONCE):
             some = slice(first, first + _DECODED_AT_ONCE)
             grid = TokenGrid(tokens[some].unflatten(1, tokenizer.grid_size), tokenizer.num_codes)
-            uniform = torch.stack([torch.rand(size, generator=rng) for rng in rngs[some]]).to(tokens.device)
-            part = tokenizer.decode(grid, mask, uniform)
-            images += [part[index] for index in range(len(part))]
-        return RangeImage.stack(images)
-
-    def decoding_flops(self) -> int:
-        """Count the operations of decoding the tokens of one scan."""
-        latents = (1, self.tokenizer.config.code_dim, *self.tokenizer.grid_size)
-        decoder = self.tokenizer.decoder.prepared("fp32")
-        return flops_of(self.tokenizer.post_quant_conv, latents) + flops_of(decoder, latents)
+            images.append(tokenizer.sample(grid, rngs[some], mask))
+        return RangeImage.cat(images)
 
 
 class TokenObjective(nn.Module):
@@ -100,8 +105,8 @@ class TokenObjective(nn.Module):
         return tokens, -(self.token_counts / self.token_counts.sum()).log()[tokens]
 
 
-def draw_tokens(logits: Float[Tensor, "*B K"], uniform: Float[Tensor, "*B"]) -> Int[Tensor, "*B"]:
-    """Draw one token for each row of logits: where the distribution function first exceeds its uniform number."""
+def sample_tokens(logits: Float[Tensor, "*B K"], uniform: Float[Tensor, "*B"]) -> Int[Tensor, "*B"]:
+    """Sample one token for each row of logits: where the distribution function first exceeds its uniform number."""
     distribution = logits.double().softmax(dim=-1).cumsum(dim=-1)
     threshold = uniform.double()[..., None] * distribution[..., -1:]  # the sum may miss 1 by a rounding error
     return torch.searchsorted(distribution, threshold, right=True)[..., 0].clamp(max=logits.shape[-1] - 1)

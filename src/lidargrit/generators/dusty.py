@@ -29,8 +29,7 @@ from lidargrit.nn.published import read_checkpoint
 from lidargrit.nn.raydrop import logistic_noise, straight_through
 from lidargrit.projection import RangeEncoding
 from lidargrit.sensors import SensorModel, load_sensor
-from lidargrit.structures import RangeImage
-from lidargrit.tokenizers import MaskDecoding
+from lidargrit.structures import MaskDecoding, RangeImage
 
 Variant = Literal["dusty_1", "dusty_2", "baseline"]
 

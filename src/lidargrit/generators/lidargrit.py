@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -17,15 +17,14 @@ from torch import Tensor, nn
 from lidargrit.errors import ConfigError
 from lidargrit.files import load_exactly
 from lidargrit.generators import Cost
-from lidargrit.generators._tokens import TokenGenerator, TokenObjective, draw_tokens
+from lidargrit.generators._tokens import TokenGenerator, TokenGeneratorConfig, TokenObjective, sample_tokens
+from lidargrit.nn.decoding import CachedDecoder, WeightPrecision
 from lidargrit.nn.precision import Precision
 from lidargrit.nn.published import read_checkpoint
-from lidargrit.nn.transformer import CausalTransformer, TransformerConfig
-from lidargrit.nn.writing import TokenWriter, WeightPrecision
+from lidargrit.nn.transformer import CausalTransformer
 from lidargrit.sensors import SensorModel
-from lidargrit.structures import RangeImage
-from lidargrit.tokenizers import MaskDecoding
-from lidargrit.tokenizers.vqvae import Vqvae, VqvaeConfig
+from lidargrit.structures import MaskDecoding, RangeImage
+from lidargrit.tokenizers import Tokenizer
 
 START_TOKEN = 0  # the reference prepends an ordinary token, shared with the first code, not one of its own
 _PUBLISHED_BYTES_AT_MOST = 2 << 30  # the first release's transformer of 126 M weights, with its optimiser, takes 1.6 GB
@@ -70,11 +69,8 @@ class TokenSampling:
 
 
 @dataclass(frozen=True)
-class LidarGritConfig:
-    """The two networks of the paper."""
-
-    tokenizer: VqvaeConfig = field(default_factory=VqvaeConfig)
-    transformer: TransformerConfig = field(default_factory=TransformerConfig)
+class LidarGritConfig(TokenGeneratorConfig):
+    """The two networks of the paper; with other tokenizers than its VQ-VAE, of systems like it."""
 
 
 class LidarGrit(TokenGenerator):
@@ -92,7 +88,7 @@ class LidarGrit(TokenGenerator):
     def __init__(self, config: LidarGritConfig, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
         height, width = self.tokenizer.grid_size
-        self.transformer = CausalTransformer(config.transformer, config.tokenizer.num_codes, height * width)
+        self.transformer = CausalTransformer(config.transformer, self.tokenizer.num_codes, height * width)
         self._prepared: _Prepared | None = None
 
     def objective(self, stage: str) -> nn.Module:
@@ -107,12 +103,12 @@ class LidarGrit(TokenGenerator):
         device = self.transformer.head.weight.device
         rngs = [torch.Generator().manual_seed(seed) for seed in seeds]  # on the CPU: the same numbers on every device
         uniform = torch.stack([torch.rand(self.transformer.context_length, generator=rng) for rng in rngs])
-        writer, tokenizer = self._prepare(len(seeds), sampling)
-        tokens = writer.write(uniform.to(device))
+        decoder, tokenizer = self._prepare(len(seeds), sampling)
+        tokens = decoder.generate(uniform.to(device))
         return self.decode(tokens, rngs, sampling.mask, tokenizer)
 
     @torch.no_grad()
-    def surprise(self, images: RangeImage) -> Float[Tensor, "B h w"]:
+    def token_nll_bits(self, images: RangeImage) -> Float[Tensor, "B h w"]:
         """Return how many bits each token of each scan takes after those before it, by one pass over all of them."""
         self.eval()
         tokens = self.tokenizer.encode(images).tokens
@@ -122,7 +118,7 @@ class LidarGrit(TokenGenerator):
 
     def log_likelihood(self, images: RangeImage) -> Float[Tensor, "B"]:
         """Return the log-likelihood of each scan's tokens in nats; what is lost in encoding is not counted."""
-        return -self.surprise(images).double().sum(dim=(1, 2)).mul(math.log(2)).float()
+        return -self.token_nll_bits(images).double().sum(dim=(1, 2)).mul(math.log(2)).float()
 
     def cost(self, sampling: TokenSampling | None = None) -> Cost:
         """Return one step of the transformer for each token, with those before it in a cache, and one decoding."""
@@ -131,18 +127,18 @@ class LidarGrit(TokenGenerator):
         # weights by values over all tokens so far.
         products = sizes.layers * (24 * sizes.width**2 * tokens + 2 * sizes.width * tokens * (tokens + 1))
         head = 2 * sizes.width * self.transformer.num_tokens * tokens
-        return Cost(tokens + 1, products + head + self.decoding_flops())
+        return Cost(tokens + 1, products + head + self.tokenizer.decoding_flops())
 
-    def _prepare(self, batch_size: int, sampling: TokenSampling) -> tuple[TokenWriter, Vqvae]:
+    def _prepare(self, batch_size: int, sampling: TokenSampling) -> tuple[CachedDecoder, Tokenizer]:
         """Return what draws tokens and what decodes them, kept from the last time if nothing has changed since."""
         weights = tuple((weight.data_ptr(), weight._version) for weight in self.parameters())
         key = (batch_size, sampling, weights)
         if self._prepared is None or self._prepared.key != key:
             self._prepared = None  # its cache is given back before the next is taken
-            chooser = partial(choose, sampling=sampling)
-            writer = TokenWriter(self.transformer, batch_size, chooser, START_TOKEN, sampling.weights)
-            self._prepared = _Prepared(key, writer, self.tokenizer.for_decoding(sampling.decoder))
-        return self._prepared.writer, self._prepared.tokenizer
+            chooser = partial(sample_token, sampling=sampling)
+            decoder = CachedDecoder(self.transformer, batch_size, chooser, START_TOKEN, sampling.weights)
+            self._prepared = _Prepared(key, decoder, self.tokenizer.for_decoding(sampling.decoder))
+        return self._prepared.decoder, self._prepared.tokenizer
 
     @classmethod
     def from_published(cls, files: Sequence[Path], config: LidarGritConfig, sensor: SensorModel) -> LidarGrit:
@@ -165,8 +161,8 @@ class LidarGrit(TokenGenerator):
 
 class _Prepared(NamedTuple):
     key: object
-    writer: TokenWriter
-    tokenizer: Vqvae
+    decoder: CachedDecoder
+    tokenizer: Tokenizer
 
 
 class NextToken(TokenObjective):
@@ -190,7 +186,7 @@ def sample_by_recomputing(
 ) -> Int[Tensor, "B T"]:
     """Draw token sequences in raster order as the released program does: every step reads the whole prefix again.
 
-    This is the plain statement of what :class:`TokenWriter` does quicker, and what it is tested against.
+    This is the plain statement of what :class:`CachedDecoder` does quicker, and what it is tested against.
 
     Args:
         transformer: what to draw from.
@@ -199,12 +195,14 @@ def sample_by_recomputing(
     """
     tokens = torch.full((len(uniform), 1), START_TOKEN, dtype=torch.long, device=uniform.device)
     for step in range(uniform.shape[1]):
-        chosen = choose(transformer(tokens)[:, -1], uniform[:, step], sampling)
+        chosen = sample_token(transformer(tokens)[:, -1], uniform[:, step], sampling)
         tokens = torch.cat((tokens, chosen[:, None]), dim=1)
     return tokens[:, 1:]
 
 
-def choose(logits: Float[Tensor, "B K"], uniform: Float[Tensor, "B"], sampling: TokenSampling) -> Int[Tensor, "B"]:
+def sample_token(
+    logits: Float[Tensor, "B K"], uniform: Float[Tensor, "B"], sampling: TokenSampling
+) -> Int[Tensor, "B"]:
     """Choose one token for each row of logits by its uniform number."""
     if sampling.temperature == 0:
         return logits.argmax(dim=1)
@@ -216,4 +214,4 @@ def choose(logits: Float[Tensor, "B K"], uniform: Float[Tensor, "B"], sampling: 
         ordered, order = logits.softmax(dim=1).sort(dim=1, descending=True)
         spare = ordered.cumsum(dim=1) - ordered >= sampling.top_p  # those before it already hold enough
         logits = logits.masked_fill(torch.zeros_like(spare).scatter(1, order, spare), -torch.inf)
-    return draw_tokens(logits, uniform)
+    return sample_tokens(logits, uniform)

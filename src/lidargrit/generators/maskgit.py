@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -13,13 +13,11 @@ from torch import Tensor, nn
 
 from lidargrit.errors import ConfigError
 from lidargrit.generators import Cost
-from lidargrit.generators._tokens import TokenGenerator, TokenObjective, draw_tokens
+from lidargrit.generators._tokens import TokenGenerator, TokenGeneratorConfig, TokenObjective, sample_tokens
 from lidargrit.nn.precision import Precision, dtype_of
-from lidargrit.nn.transformer import MaskedTransformer, TransformerConfig
+from lidargrit.nn.transformer import MaskedTransformer
 from lidargrit.sensors import SensorModel
-from lidargrit.structures import RangeImage
-from lidargrit.tokenizers import MaskDecoding
-from lidargrit.tokenizers.vqvae import VqvaeConfig
+from lidargrit.structures import MaskDecoding, RangeImage
 
 
 @dataclass(frozen=True)
@@ -57,11 +55,8 @@ class MaskedSampling:
 
 
 @dataclass(frozen=True)
-class MaskGitConfig:
-    """The VQ-VAE of LidarGRIT, and a transformer of the same blocks that sees all tokens."""
-
-    tokenizer: VqvaeConfig = field(default_factory=VqvaeConfig)
-    transformer: TransformerConfig = field(default_factory=TransformerConfig)
+class MaskGitConfig(TokenGeneratorConfig):
+    """The tokenizer of LidarGRIT, and a transformer of the same blocks that sees all tokens."""
 
 
 class MaskGit(TokenGenerator):
@@ -81,7 +76,7 @@ class MaskGit(TokenGenerator):
     def __init__(self, config: MaskGitConfig, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
         height, width = self.tokenizer.grid_size
-        self.transformer = MaskedTransformer(config.transformer, config.tokenizer.num_codes, height * width)
+        self.transformer = MaskedTransformer(config.transformer, self.tokenizer.num_codes, height * width)
 
     def objective(self, stage: str) -> nn.Module:
         """Return the VQ-VAE itself, or the transformer's objective over the frozen VQ-VAE."""
@@ -105,7 +100,7 @@ class MaskGit(TokenGenerator):
         layer = 24 * sizes.width**2 + 4 * sizes.width * tokens
         one_pass = tokens * (sizes.layers * layer + 2 * sizes.width * self.transformer.num_tokens)
         passes = len(numbers_hidden(tokens, sampling.steps))
-        return Cost(passes + 1, passes * one_pass + self.decoding_flops())
+        return Cost(passes + 1, passes * one_pass + self.tokenizer.decoding_flops())
 
 
 class HiddenTokens(TokenObjective):
@@ -174,4 +169,4 @@ def fill_in(
 
 
 def _draw(logits: Tensor, uniform: Tensor, temperature: float) -> Tensor:
-    return logits.argmax(dim=-1) if temperature == 0 else draw_tokens(logits / temperature, uniform)
+    return logits.argmax(dim=-1) if temperature == 0 else sample_tokens(logits / temperature, uniform)

@@ -14,7 +14,7 @@ def sum_over_processes(counted: Shaped[Tensor, "*shape"]) -> Shaped[Tensor, "*sh
     return counted
 
 
-def draw_from_all(rows: Float[Tensor, "n D"], count: int, rng: torch.Generator | None) -> Float[Tensor, "count D"]:
+def sample_from_all(rows: Float[Tensor, "n D"], count: int, rng: torch.Generator | None) -> Float[Tensor, "count D"]:
     """Draw rows, with repetition, from those of all processes; all get the rows that the first one's ``rng`` draws.
 
     The rows of the processes count as following one another, as the shares of a batch do.

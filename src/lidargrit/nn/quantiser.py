@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from lidargrit.nn.processes import draw_from_all, sum_over_processes
+from lidargrit.nn.processes import sample_from_all, sum_over_processes
 
 CodebookLoss = Literal["paper", "reference", "vqvae", "ema"]
 
@@ -103,7 +103,7 @@ class VectorQuantiser(nn.Module):
 
     def _restart(self, flat: Tensor, rng: torch.Generator | None) -> None:
         dead = self.usage < self._dead_below()
-        candidates = draw_from_all(flat, len(dead), rng)
+        candidates = sample_from_all(flat, len(dead), rng)
         even_use = self.usage.mean().expand_as(self.usage)
         self.embedding.weight.copy_(torch.where(dead.unsqueeze(1), candidates, self.embedding.weight))
         self.usage.copy_(torch.where(dead, even_use, self.usage))

@@ -1,6 +1,6 @@
 """Transformers over tokens: those so far → logits of the next; or some of them → logits of the rest.
 
-They read whole sequences; ``nn.writing`` writes them token by token. Parameter names follow the reference's state dict
+They read whole sequences; ``nn.decoding`` writes them token by token. Parameter names follow the reference's state dict
 (a minGPT), so that published weights load.
 """
 

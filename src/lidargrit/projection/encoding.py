@@ -42,9 +42,9 @@ class RangeEncoding:
             curve = -1 / curve
         return curve.clamp(self.range_min_m, self.range_max_m)
 
-    def unit_range(self, encoded: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-        """Return what the linear encoding of the same range would be."""
-        return (self.decode(encoded) - self.range_min_m) * (2 / (self.range_max_m - self.range_min_m)) - 1
+    def unit_range(self, range_m: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+        """Map metres linearly to [-1, 1], whatever the kind of the encoding: the unit of errors in metres."""
+        return (range_m - self.range_min_m) * (2 / (self.range_max_m - self.range_min_m)) - 1
 
     def _curve(self, range_m: float) -> float:
         return {"linear": range_m, "log": math.log2(1 + range_m), "inverse": -1 / range_m}[self.kind]

@@ -1,70 +1,103 @@
-"""Range image ⇄ tokens: the contract of a tokenizer."""
+"""Range images ⇄ tokens: the contract of a tokenizer, and how a configuration names its kind."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Literal, NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Generic, TypeVar
 
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 
-from lidargrit.errors import ConfigError
+from lidargrit import _discovery
+from lidargrit.configuration import NamedConfig
+from lidargrit.nn.precision import Precision
 from lidargrit.sensors import SensorModel
-from lidargrit.structures import RangeImage, TokenGrid
-
-MaskDecoding = Literal["bernoulli", "threshold"]
+from lidargrit.structures import Decoded, MaskDecoding, RangeImage, TokenGrid
 
 
-class Decoded(NamedTuple):
-    """What a decoder says of every pixel: a clean range in metres, and the logit that a beam came back at all."""
+@dataclass(frozen=True)
+class TokenizerConfig(NamedConfig):
+    """Base of the tokenizers' configurations; the file that defines one, and the tokenizer with it, is its name."""
 
-    range_m: Float[Tensor, "B H W"]
-    return_logits: Float[Tensor, "B H W"]
+    package: ClassVar[str] = "tokenizers"
+    default_name: ClassVar[str] = "vqvae"
 
 
-class Tokenizer(nn.Module, ABC):
-    """Turns range images of one sensor into a grid of tokens and back."""
+Config = TypeVar("Config", bound=TokenizerConfig)
 
-    sensor: SensorModel
+
+class Tokenizer(nn.Module, ABC, Generic[Config]):
+    """Turns range images of one sensor into a grid of tokens and back; an objective of training as it stands.
+
+    A new tokenizer is one file of this folder with two public classes: a ``TokenizerConfig`` and the ``Tokenizer`` that
+    is made of it and a sensor. Every generator over tokens takes it by its configuration.
+
+    Attributes:
+        config: its configuration.
+        sensor: the rays and limits of its range images.
+        num_codes: number of different tokens.
+        grid_size: rows and columns of the token grid.
+        num_features: channels of ``Decoded.features``; 0 if ``decode`` gives none.
+    """
+
     num_codes: int
     grid_size: tuple[int, int]
+    num_features: int = 0
+
+    def __init__(self, config: Config, sensor: SensorModel) -> None:
+        super().__init__()
+        self.config, self.sensor = config, sensor
 
     @abstractmethod
     def forward(self, images: RangeImage, rng: torch.Generator) -> dict[str, Tensor]:
-        """Return the training objective as ``loss``, and beside it what is worth watching."""
+        """Return the training objective as ``loss``, and further terms for the log."""
 
     @abstractmethod
     def encode(self, images: RangeImage) -> TokenGrid:
         """Return the tokens (B, h, w) of a batch."""
 
     @abstractmethod
-    def decode_parts(self, tokens: TokenGrid) -> Decoded:
-        """Return clean range and return logits of a batch of tokens, before any mask is drawn."""
+    def decode(self, tokens: TokenGrid) -> Decoded:
+        """Return what a batch of tokens (B, h, w) tells of every pixel."""
 
-    def decode(
-        self, tokens: TokenGrid, mask: MaskDecoding = "threshold", uniform: Float[Tensor, "B H W"] | None = None
+    @abstractmethod
+    def decoding_flops(self) -> int:
+        """Return the floating-point operations of decoding one scan as :meth:`for_decoding` does."""
+
+    def for_decoding(self, precision: Precision) -> Self:
+        """Return a tokenizer with the same weights that only decodes, perhaps quicker or in 16 bits."""
+        return self
+
+    def sample(
+        self, tokens: TokenGrid, rngs: Sequence[torch.Generator], mask: MaskDecoding = "bernoulli"
     ) -> RangeImage:
-        """Return range images of a batch of tokens.
+        """Return one scan for each token grid of a batch, its random numbers from its own generator.
 
         Args:
             tokens: (B, h, w).
-            mask: ``threshold`` keeps a pixel whose P(return) is at least 0.5 (the paper); ``bernoulli`` draws it with
-                that probability (the authors' program).
-            uniform: the random numbers in [0, 1) that ``bernoulli`` compares with.
-
-        Raises:
-            ConfigError: ``bernoulli`` without random numbers.
+            rngs: random generators on the CPU, one for each scan.
+            mask: ``bernoulli`` samples each return with its probability (the authors' program); ``threshold`` keeps a
+                return whose probability is at least 0.5 (the paper).
         """
-        range_m, return_logits = self.decode_parts(tokens)
-        if mask == "threshold":
-            return_mask = return_logits >= 0
-        elif uniform is None:
-            raise ConfigError(
-                "a Bernoulli mask without random numbers",
-                "uniform (B, H, W) in [0, 1)",
-                "e.g. torch.rand(size, generator=rng)",
-            )
-        else:
-            return_mask = uniform < return_logits.sigmoid()
-        return RangeImage.masked(range_m, return_mask, self.sensor)
+        decoded = self.decode(tokens)
+        return decoded.threshold() if mask == "threshold" else decoded.sample(rngs)
+
+    @torch.no_grad()
+    def reconstruct(self, images: RangeImage) -> RangeImage:
+        """Return what the tokens keep of a batch of scans, nothing of it at random."""
+        return self.decode(self.encode(images)).threshold()
+
+    def warnings(self) -> list[str]:
+        """Return what a person should know of the training so far, one line each."""
+        return []
+
+
+def make_tokenizer(config: TokenizerConfig, sensor: SensorModel) -> Tokenizer[Any]:
+    """Return a tokenizer of the kind that the configuration is of, with fresh weights."""
+    return _load_class(config.name())(config, sensor)
+
+
+def _load_class(name: str) -> type[Tokenizer[Any]]:
+    return _discovery.load_class("tokenizers", name, Tokenizer)

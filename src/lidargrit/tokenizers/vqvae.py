@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import copy
 import math
+from collections import OrderedDict
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
 import torch
@@ -23,19 +25,20 @@ from lidargrit.nn.convolution import (
     Upsample,
     group_norm,
 )
+from lidargrit.nn.flops import flops_of
 from lidargrit.nn.precision import Precision, dtype_of
 from lidargrit.nn.quantiser import CodebookLoss, VectorQuantiser
 from lidargrit.projection import RangeEncoding
 from lidargrit.sensors import SensorModel
-from lidargrit.structures import RangeImage, TokenGrid
-from lidargrit.tokenizers import Decoded, Tokenizer
+from lidargrit.structures import Decoded, RangeImage, TokenGrid
+from lidargrit.tokenizers import Tokenizer, TokenizerConfig
 
 _COLLAPSED_BELOW = 0.05  # of the codes in effect used; healthy codebooks of ours keep above half
 _NO_RETURN_BELOW = -0.9  # without a raydrop head, an encoded range below this is read as no return (the program's rule)
 
 
 @dataclass(frozen=True)
-class VqvaeConfig:
+class VqvaeConfig(TokenizerConfig):
     """Sizes and losses of the VQ-VAE; the defaults are the paper's for KITTI odometry.
 
     Args:
@@ -91,39 +94,65 @@ class VqvaeConfig:
             raise ConfigError(f"dropout={self.dropout}", "a share in [0, 1)", "lower it")
 
 
+class Level(nn.Module):
+    """One resolution of the encoder or the decoder: residual blocks, then perhaps a change of resolution.
+
+    Args:
+        config: dropout and padding.
+        inputs: channels of the input.
+        width: channels of the output.
+        num_blocks: number of residual blocks.
+        downsamples: halve rows and columns after the blocks.
+        upsamples: double rows and columns after the blocks.
+    """
+
+    def __init__(
+        self,
+        config: VqvaeConfig,
+        inputs: int,
+        width: int,
+        num_blocks: int,
+        downsamples: bool = False,
+        upsamples: bool = False,
+    ) -> None:
+        super().__init__()
+        widths = [inputs, *[width] * num_blocks]
+        self.block = nn.ModuleList(
+            ResidualBlock(before, after, config.dropout, config.padding) for before, after in pairwise(widths)
+        )
+        self.downsample = Downsample(width, config.padding) if downsamples else None
+        self.upsample: Upsample | FoldedUpsample | None = Upsample(width, config.padding) if upsamples else None
+
+    def forward(self, x: Float[Tensor, "B C H W"]) -> Float[Tensor, "B D h w"]:
+        """Return the feature maps of the next level."""
+        for block in self.block:
+            x = block(x)
+        if self.downsample is not None:
+            x = self.downsample(x)
+        return x if self.upsample is None else self.upsample(x)
+
+
 class Encoder(Network):
     """Encoded range (B, 1, H, W) → latents (B, code_dim, h, w)."""
 
     def __init__(self, config: VqvaeConfig) -> None:
         super().__init__()
-        c, padding = config, config.padding
-        widths = [c.channels * m for m in c.channel_multipliers]
-        self.conv_in = Convolution(1, c.channels, padding)
-        self.down = nn.ModuleList()
-        inputs = c.channels
-        for level, width in enumerate(widths):
-            stage = nn.Module()
-            blocks = [
-                ResidualBlock(inputs if i == 0 else width, width, c.dropout, padding) for i in range(c.residual_blocks)
-            ]
-            stage.add_module("block", nn.ModuleList(blocks))
-            if level < len(widths) - 1:
-                stage.add_module("downsample", Downsample(width, padding))
-            self.down.append(stage)
-            inputs = width
-        self.mid = _middle(inputs, c.dropout, padding)
-        self.norm_out = group_norm(inputs)
-        self.conv_out = Convolution(inputs, c.code_dim, padding)
+        c, widths = config, _widths(config)
+        self.conv_in = Convolution(1, c.channels, c.padding)
+        self.down = nn.ModuleList(
+            Level(c, inputs, width, c.residual_blocks, downsamples=level < len(widths) - 1)
+            for level, (inputs, width) in enumerate(pairwise([c.channels, *widths]))
+        )
+        self.mid = _middle(c)
+        self.norm_out = group_norm(widths[-1])
+        self.conv_out = Convolution(widths[-1], c.code_dim, c.padding)
 
     def forward(self, x: Float[Tensor, "B 1 H W"]) -> Float[Tensor, "B D h w"]:
         """Shrink the image to its latents."""
         x = self.conv_in(x)
-        for stage in self.down:
-            for layer in [*stage.get_submodule("block").children(), *_named(stage, "downsample")]:
-                x = layer(x)
-        for block in self.mid.children():
-            x = block(x)
-        return self.conv_out(F.silu(self.norm_out(x)))
+        for level in self.down:
+            x = level(x)
+        return self.conv_out(F.silu(self.norm_out(self.mid(x))))
 
 
 class Decoder(Network):
@@ -131,36 +160,29 @@ class Decoder(Network):
 
     def __init__(self, config: VqvaeConfig) -> None:
         super().__init__()
-        c, padding = config, config.padding
-        widths = [c.channels * m for m in c.channel_multipliers]
-        inputs = widths[-1]
-        self.conv_in = Convolution(c.code_dim, inputs, padding)
-        self.mid = _middle(inputs, c.dropout, padding)
-        stages: list[nn.Module] = []
-        for level, width in reversed(list(enumerate(widths))):
-            stage = nn.Module()
-            blocks = [
-                ResidualBlock(inputs if i == 0 else width, width, c.dropout, padding)
-                for i in range(c.residual_blocks + 1)
-            ]
-            stage.add_module("block", nn.ModuleList(blocks))
-            if level > 0:
-                stage.add_module("upsample", Upsample(width, padding))
-            stages.insert(0, stage)  # the reference numbers its levels from the finest
-            inputs = width
-        self.up = nn.ModuleList(stages)
-        self.norm_out = group_norm(inputs)
-        self.conv_out = Convolution(inputs, 2 if c.raydrop_loss else 1, padding)
+        c, widths = config, _widths(config)
+        self.conv_in = Convolution(c.code_dim, widths[-1], c.padding)
+        self.mid = _middle(c)
+        coarse_to_fine = [
+            Level(c, inputs, width, c.residual_blocks + 1, upsamples=level > 0)
+            for level, (inputs, width) in zip(
+                reversed(range(len(widths))), pairwise([widths[-1], *reversed(widths)]), strict=True
+            )
+        ]
+        self.up = nn.ModuleList(reversed(coarse_to_fine))  # the reference numbers its levels from the finest
+        self.norm_out = group_norm(widths[0])
+        self.conv_out = Convolution(widths[0], 2 if c.raydrop_loss else 1, c.padding)
 
     def forward(self, z: Float[Tensor, "B D h w"]) -> Float[Tensor, "B heads H W"]:
         """Grow the latents to an image."""
-        x = self.conv_in(z.to(self.conv_in.weight))
-        for block in self.mid.children():
-            x = block(x)
-        for stage in reversed(list(self.up)):
-            for layer in [*stage.get_submodule("block").children(), *_named(stage, "upsample")]:
-                x = layer(x)
-        return self.conv_out(F.silu(self.norm_out(x.to(self.conv_out.weight.dtype))))
+        return self.conv_out(self.features(z))
+
+    def features(self, z: Float[Tensor, "B D h w"]) -> Float[Tensor, "B C H W"]:
+        """Return what the last convolution reads: in the type of its weights, at the image's full resolution."""
+        x = self.mid(self.conv_in(z.to(self.conv_in.weight)))
+        for level in reversed(self.up):
+            x = level(x)
+        return F.silu(self.norm_out(x.to(self.conv_out.weight.dtype)))
 
     def prepared(self, precision: Precision) -> Decoder:
         """Return a copy for decoding only, quicker: channels last, upsampling folded, perhaps in 16 bits.
@@ -168,10 +190,10 @@ class Decoder(Network):
         The last layers stay in 32 bits: 16 would leave 8 of them for a range, steps of 0.2 m at 80 m.
         """
         fast = copy.deepcopy(self).eval().requires_grad_(False)
-        for stage in fast.up:
-            for upsample in _named(stage, "upsample"):
-                assert isinstance(upsample, Upsample)
-                stage.add_module("upsample", FoldedUpsample(upsample))
+        for level in fast.up:
+            assert isinstance(level, Level)
+            if isinstance(level.upsample, Upsample):
+                level.upsample = FoldedUpsample(level.upsample)
         for layer in (fast.conv_in, fast.mid, fast.up):
             layer.to(dtype_of(precision))
         for weight in fast.parameters():
@@ -180,7 +202,7 @@ class Decoder(Network):
         return fast
 
 
-class Vqvae(Tokenizer):
+class Vqvae(Tokenizer[VqvaeConfig]):
     """The adapted VQ-VAE of LidarGRIT.
 
     Args:
@@ -196,7 +218,7 @@ class Vqvae(Tokenizer):
     """
 
     def __init__(self, config: VqvaeConfig, sensor: SensorModel) -> None:
-        super().__init__()
+        super().__init__(config, sensor)
         factor = 2 ** (len(config.channel_multipliers) - 1)
         if sensor.height % factor or sensor.width % factor:
             raise ConfigError(
@@ -204,8 +226,9 @@ class Vqvae(Tokenizer):
                 f"both sizes divisible by {factor}, for {len(config.channel_multipliers)} levels",
                 "use fewer channel_multipliers, or another number of columns",
             )
-        self.config, self.sensor, self.num_codes = config, sensor, config.num_codes
+        self.num_codes = config.num_codes
         self.grid_size = (sensor.height // factor, sensor.width // factor)
+        self.num_features = _widths(config)[0]
         self.range_encoding = RangeEncoding(config.range_encoding, sensor.range_min_m, sensor.range_max_m)
         self.encoder, self.decoder = Encoder(config), Decoder(config)
         self.quantize = VectorQuantiser(
@@ -227,10 +250,11 @@ class Vqvae(Tokenizer):
         tokens = self.quantize.nearest(z.movedim(1, -1).flatten(0, -2)).unflatten(0, (len(z), *z.shape[2:]))
         return TokenGrid(tokens, self.num_codes)
 
-    def decode_parts(self, tokens: TokenGrid) -> Decoded:
-        """Return clean range and return logits of a batch of tokens."""
-        encoded, return_logits = self._heads(self.quantize.lookup(tokens.tokens))
-        return Decoded(self.range_encoding.decode(encoded), return_logits)
+    def decode(self, tokens: TokenGrid) -> Decoded:
+        """Return clean range and return logits of a batch of tokens, with what the decoder's last layer reads."""
+        features = self.decoder.features(self.post_quant_conv(self.quantize.lookup(tokens.tokens)))
+        encoded, return_logits = self._heads(self.decoder.conv_out(features))
+        return Decoded(self.range_encoding.decode(encoded), return_logits, self.sensor, features=features)
 
     def for_decoding(self, precision: Precision) -> Vqvae:
         """Return a tokenizer with the same weights that only decodes, quicker; see :meth:`Decoder.prepared`."""
@@ -238,15 +262,23 @@ class Vqvae(Tokenizer):
         fast._modules = {**self._modules, "decoder": self.decoder.prepared(precision)}
         return fast
 
+    def decoding_flops(self) -> int:
+        """Return the floating-point operations of decoding one scan as :meth:`for_decoding` does."""
+        latents = (1, self.config.code_dim, *self.grid_size)
+        return flops_of(self.post_quant_conv, latents) + flops_of(self.decoder.prepared("fp32"), latents)
+
     def forward(self, images: RangeImage, rng: torch.Generator) -> dict[str, Tensor]:
         """Return the loss of eq. 5 of the paper and its terms, with the error in metres and the mask's accuracy."""
         z = self.quantize(self.latents(images), rng)
-        encoded, return_logits = self._heads(z.latents)
-        target, mask = self.range_encoding.encode(images.range_m, images.return_mask), images.return_mask
-        terms = {"commitment": z.loss, "codebook_perplexity": torch.tensor(self.quantize.perplexity())}
-        pair = (encoded, target)
+        encoded, return_logits = self._heads(self.decoder(self.post_quant_conv(z.latents)))
+        mask, encoding = images.return_mask, self.range_encoding
+        range_m = encoding.decode(encoded)
         if self.config.error_unit == "metres":
-            pair = (self.range_encoding.unit_range(encoded), self.range_encoding.unit_range(target))
+            target_m = images.range_m.clamp(encoding.range_min_m, encoding.range_max_m)
+            pair = encoding.unit_range(range_m), torch.where(mask, encoding.unit_range(target_m), -1.0)
+        else:
+            pair = encoded, encoding.encode(images.range_m, mask)
+        terms = {"commitment": z.loss, "codebook_perplexity": torch.tensor(self.quantize.perplexity())}
         if self.config.raydrop_loss:
             kind = self.config.reconstruction
             kept = torch.bernoulli(return_logits.detach().sigmoid(), generator=rng) > 0 if kind == "reference" else mask
@@ -257,7 +289,7 @@ class Vqvae(Tokenizer):
             terms["reconstruction"] = (pair[0] - pair[1]).abs().mean()  # holes are learned as the range -1
             loss = terms["reconstruction"] + z.loss
         with torch.no_grad():
-            error_m = (self.range_encoding.decode(encoded) - images.range_m).abs()
+            error_m = (range_m - images.range_m).abs()
             terms["range_mae_m"] = (error_m * mask).sum() / mask.sum().clamp(min=1)
             terms["mask_accuracy"] = ((return_logits >= 0) == mask).float().mean()
         return {"loss": loss, **terms}
@@ -277,8 +309,9 @@ class Vqvae(Tokenizer):
             f"the remedy: {remedy}"
         ]
 
-    def _heads(self, latents: Float[Tensor, "B D h w"]) -> tuple[Float[Tensor, "B H W"], Float[Tensor, "B H W"]]:
-        raw = self.decoder(self.post_quant_conv(latents)).float()
+    def _heads(self, raw: Float[Tensor, "B heads H W"]) -> tuple[Float[Tensor, "B H W"], Float[Tensor, "B H W"]]:
+        """Return encoded range and return logits of what the decoder's last layer gives."""
+        raw = raw.float()
         encoded = raw[:, 0].tanh()
         if self.config.raydrop_loss:
             return encoded, raw[:, 1]
@@ -306,12 +339,15 @@ def reconstruction_loss(
     return (error.sum((1, 2)) / return_mask.sum((1, 2)).clamp(min=1)).mean()
 
 
-def _middle(channels: int, dropout: float, padding: Padding) -> nn.Module:
-    middle = nn.Module()
-    for name in ("block_1", "block_2"):
-        middle.add_module(name, ResidualBlock(channels, channels, dropout, padding))
-    return middle
+def _widths(config: VqvaeConfig) -> list[int]:
+    """Return the channels of every level, from fine to coarse."""
+    return [config.channels * multiplier for multiplier in config.channel_multipliers]
 
 
-def _named(stage: nn.Module, name: str) -> list[nn.Module]:
-    return [module for key, module in stage.named_children() if key == name]
+def _middle(config: VqvaeConfig) -> nn.Sequential:
+    width = _widths(config)[-1]
+    return nn.Sequential(
+        OrderedDict(
+            (name, ResidualBlock(width, width, config.dropout, config.padding)) for name in ("block_1", "block_2")
+        )
+    )

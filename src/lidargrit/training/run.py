@@ -98,7 +98,7 @@ def _plot(
 def _tokenizer_of(donor: Path, generator: Generator) -> Tokenizer:
     """Return the tokenizer of a finished run, once it is known to be of the generator's own sizes and sensor."""
     ours, theirs = generator.get_tokenizer(), load(donor).get_tokenizer()
-    mine, other = (configuration.leaves(tokenizer.config) for tokenizer in (ours, theirs))
+    mine, other = ({"name": each.config.name(), **configuration.leaves(each.config)} for each in (ours, theirs))
     differing = [name for name in mine if mine[name] != other.get(name)]
     if differing or not ours.sensor.same_rays(theirs.sensor):
         setting = f"model.tokenizer.{differing[0]}={other.get(differing[0])}" if differing else "data.sensor"
@@ -147,7 +147,7 @@ def recipe_settings(about: Any) -> dict[str, Any]:
 def _defaults(recipe: Recipe) -> dict[str, Any]:
     """Return the settings of a recipe that changes none: a run that began before there was a setting had this one."""
     fits = {name: FitConfig(fit.scans, fit.batch_size, fit.learning_rate) for name, fit in recipe.training.items()}
-    plain = Recipe(recipe.title, recipe.generator, type(recipe.model)(), DataConfig(), fits)
+    plain = Recipe(recipe.title, recipe.generator, configuration.defaults(recipe.model), DataConfig(), fits)
     return configuration.leaves(configuration.to_json(plain))
 
 

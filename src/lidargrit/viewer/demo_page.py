@@ -19,8 +19,7 @@ from lidargrit.evaluation.reconstruction import ReconstructionErrors
 from lidargrit.evaluation.scorecard import Scorecard, format_value
 from lidargrit.files import write_text
 from lidargrit.metrics import load_metric
-from lidargrit.structures import RangeImage, TokenGrid
-from lidargrit.tokenizers import Decoded
+from lidargrit.structures import Decoded, RangeImage, TokenGrid
 from lidargrit.viewer import interactive
 from lidargrit.viewer.interactive import button
 from lidargrit.viewer.report_charts import bar_chart, score_chart

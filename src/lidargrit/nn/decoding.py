@@ -1,4 +1,4 @@
-"""Sequences written token by token, as fast as memory is read: (transformer, uniform numbers) → tokens.
+"""Sequences generated token by token, with a cache of keys and values: (transformer, uniform numbers) → tokens.
 
 The transformer itself reads whole sequences, for training and for likelihoods. Here its weights are laid out for one
 token at a time, and every step costs Python and the machine as little as can be: query, key and value come from one
@@ -21,19 +21,19 @@ from lidargrit.errors import ConfigError
 from lidargrit.nn.transformer import CausalTransformer
 
 WeightPrecision = Literal["fp32", "bf16", "int8"]
-Choose = Callable[[Tensor, Tensor], Tensor]
+SampleToken = Callable[[Tensor, Tensor], Tensor]
 
-_SPAN = 128  # where shapes must not change, attention reads a multiple of so many positions: 8 graphs for 1,024 tokens
+_POSITIONS_PER_GRAPH = 128  # with static shapes, attention reads a multiple of it: 8 graphs for 1,024 tokens
 
 
-class TokenWriter:
-    """Writes sequences of the transformer's longest length, ``batch_size`` at once, from one set of weights.
+class CachedDecoder:
+    """Generates sequences of the transformer's longest length, ``batch_size`` at once, from one set of weights.
 
     Args:
         transformer: in evaluation; later changes of its weights may go unnoticed.
         batch_size: number of sequences.
-        choose: (logits (B, K), uniform numbers (B,)) → tokens (B,).
-        start: the token that every sequence begins after.
+        sample_token: (logits (B, K), uniform numbers (B,)) → tokens (B,).
+        start: token before the first one.
         precision: ``fp32`` writes what the transformer writes when it reads the whole prefix for every token. ``bf16``
             keeps weights, activations and cache in 16 bits. ``int8`` keeps the weights of the blocks in 8 bits, with
             one scale a row, and the rest in 16; only on CPUs.
@@ -48,7 +48,7 @@ class TokenWriter:
         self,
         transformer: CausalTransformer,
         batch_size: int,
-        choose: Choose,
+        sample_token: SampleToken,
         start: int = 0,
         precision: WeightPrecision = "fp32",
         static: bool | None = None,
@@ -56,7 +56,7 @@ class TokenWriter:
         self._device = transformer.head.weight.device
         if precision == "int8" and self._device.type != "cpu":
             raise ConfigError(f"8-bit weights on {self._device.type}", "a CPU", "use bf16 there")
-        self._choose, self._start, self._length = choose, start, transformer.context_length
+        self._sample_token, self._start, self._length = sample_token, start, transformer.context_length
         self._static = self._device.type == "cuda" if static is None else static
         dtype = torch.float32 if precision == "fp32" else torch.bfloat16
         heads, width = transformer.config.heads, transformer.config.width
@@ -73,45 +73,47 @@ class TokenWriter:
         self._fused, self._query = fused, fused[:, :width].view(batch_size, heads, 1, width // heads)
         self._newest = fused[:, width:].view(batch_size, 2, heads, width // heads).transpose(0, 1)
         self._tokens = torch.zeros(batch_size, dtype=torch.long, device=self._device)
-        self._written = torch.zeros(batch_size, self._length, dtype=torch.long, device=self._device)
+        self._generated = torch.zeros(batch_size, self._length, dtype=torch.long, device=self._device)
         self._uniform = torch.zeros(batch_size, self._length, device=self._device)
         self._position = torch.zeros(1, dtype=torch.long, device=self._device)
         self._graphs: dict[int, Callable[[], None]] = {}
 
     @torch.no_grad()
-    def write(self, uniform: Float[Tensor, "B T"]) -> Int[Tensor, "B T"]:
-        """Write one sequence for each row of uniform numbers in [0, 1), one number a token."""
+    def generate(self, uniform: Float[Tensor, "B T"]) -> Int[Tensor, "B T"]:
+        """Generate one sequence for each row of uniform numbers in [0, 1), one number a token."""
         length = uniform.shape[1]
         if self._static:
             self._record_graphs(length)
             self._uniform[:, :length] = uniform
             self._rewind()
             for step in range(length):
-                self._graphs[step // _SPAN]()
+                self._graphs[step // _POSITIONS_PER_GRAPH]()
         else:
             self._tokens.fill_(self._start)
             for step in range(length):
-                self._tokens = self._choose(self.next_logits(self._tokens, step), uniform[:, step])
-                self._written[:, step] = self._tokens
-        return self._written[:, :length].clone()
+                self._tokens = self._sample_token(self.next_logits(self._tokens, step), uniform[:, step])
+                self._generated[:, step] = self._tokens
+        return self._generated[:, :length].clone()
 
     @torch.no_grad()
     def next_logits(self, tokens: Int[Tensor, "B"], position: int) -> Float[Tensor, "B K"]:
         """Return the logits that follow a token, which comes after ``position`` others that were given before."""
         slots = self._slots[:, :, :, :, position].unbind()
 
-        def remember(layer: int) -> None:
+        def write_cache(layer: int) -> None:
             slots[layer].copy_(self._newest)
 
         x = F.embedding(tokens, self._embedding) + self._positions[position]
-        return self._logits(x, self._cache[:, :, :, : position + 1], remember)
+        return self._logits(x, self._cache[:, :, :, : position + 1], write_cache)
 
-    def _logits(self, x: Tensor, past: Tensor, remember: Callable[[int], None], unseen: Tensor | None = None) -> Tensor:
+    def _logits(
+        self, x: Tensor, past: Tensor, write_cache: Callable[[int], None], future: Tensor | None = None
+    ) -> Tensor:
         keys, values = (each.unbind() for each in past.unflatten(2, self._query.shape[:2]).unbind(1))
         for layer, block in enumerate(self._blocks):
             block.query_key_value(block.norm1(x), self._fused)
-            remember(layer)
-            x.add_(block.proj(_mix(self._query, keys[layer], values[layer], unseen).view_as(x), None))
+            write_cache(layer)
+            x.add_(block.proj(_attend(self._query, keys[layer], values[layer], future).view_as(x), None))
             x.add_(block.contract(F.gelu(block.expand(block.norm2(x), None)), None))
         return F.linear(self._last_norm(x), self._head).float()
 
@@ -119,15 +121,15 @@ class TokenWriter:
         """Write one token at the position that a tensor holds, and advance it; no shape depends on the position."""
         slots = self._slots.unbind()
 
-        def remember(layer: int) -> None:
+        def write_cache(layer: int) -> None:
             slots[layer].index_copy_(3, self._position, self._newest.unsqueeze(3))
 
         x = F.embedding(self._tokens, self._embedding) + self._positions.index_select(0, self._position)
-        unseen = torch.arange(span, device=self._device) > self._position
-        logits = self._logits(x, self._cache[:, :, :, :span], remember, unseen)
-        chosen = self._choose(logits, self._uniform.index_select(1, self._position)[:, 0])
+        future = torch.arange(span, device=self._device) > self._position
+        logits = self._logits(x, self._cache[:, :, :, :span], write_cache, future)
+        chosen = self._sample_token(logits, self._uniform.index_select(1, self._position)[:, 0])
         self._tokens.copy_(chosen)
-        self._written.index_copy_(1, self._position, chosen[:, None])
+        self._generated.index_copy_(1, self._position, chosen[:, None])
         self._position.add_(1)
 
     def _rewind(self) -> None:
@@ -135,8 +137,8 @@ class TokenWriter:
         self._position.zero_()
 
     def _record_graphs(self, length: int) -> None:
-        for index in range(len(self._graphs), math.ceil(length / _SPAN)):
-            span = min((index + 1) * _SPAN, self._length)
+        for index in range(len(self._graphs), math.ceil(length / _POSITIONS_PER_GRAPH)):
+            span = min((index + 1) * _POSITIONS_PER_GRAPH, self._length)
             if self._device.type != "cuda":
                 self._graphs[index] = lambda span=span: self._static_step(span)
                 continue
@@ -193,9 +195,9 @@ def _product(weight: Tensor, bias: Tensor, precision: WeightPrecision) -> Callab
     return lambda x, out: torch.addmm(bias, x, columns, out=out)
 
 
-def _mix(query: Tensor, keys: Tensor, values: Tensor, unseen: Tensor | None) -> Tensor:
+def _attend(query: Tensor, keys: Tensor, values: Tensor, future: Tensor | None) -> Tensor:
     """Return the values (B, heads, 1, d), weighted by how well their keys fit the query, whose scale is in it."""
     if query.dtype != torch.float32:
-        return F.scaled_dot_product_attention(query, keys, values, None if unseen is None else ~unseen[None], scale=1.0)
+        return F.scaled_dot_product_attention(query, keys, values, None if future is None else ~future[None], scale=1.0)
     fit = query @ keys.transpose(2, 3)  # for a single query in 32 bits two products beat the fused kernel on CPUs
-    return (fit if unseen is None else fit.masked_fill_(unseen, -torch.inf)).softmax(dim=-1) @ values
+    return (fit if future is None else fit.masked_fill_(future, -torch.inf)).softmax(dim=-1) @ values
