@@ -168,7 +168,7 @@ def test_the_cost_is_what_torch_counts():
     assert generator.cost().network_evaluations == 256 + 1
 
 
-def test_a_changed_weight_is_noticed_and_surprise_sums_to_the_likelihood():
+def test_a_changed_weight_is_noticed_and_token_bits_sum_to_the_likelihood():
     from lidargrit.generators.lidargrit import LidarGrit
     from lidargrit.recipes import load_recipe
 
