@@ -66,7 +66,7 @@ class Tokenizer(nn.Module, ABC, Generic[Config]):
     def decoding_flops(self) -> int:
         """Return the floating-point operations of decoding one scan as :meth:`for_decoding` does."""
 
-    def for_decoding(self, precision: Precision) -> Self:
+    def for_decoding(self, precision: Precision) -> Tokenizer[Config]:
         """Return a tokenizer with the same weights that only decodes, perhaps quicker or in 16 bits."""
         return self
 

@@ -1,0 +1,81 @@
+"""Seconds of a command on an idle machine and beside busy processes, by how its threads wait for one another.
+
+    python benchmarks/neighbours.py [--words "sample pretrained" -n 8 32] [--busy 0 1 2] [--repeats 2]
+
+Each row is one way of waiting: as the command arranges it, with OpenMP's own default (threads spin), and with one
+thread. A busy process is a Python loop that never ends. Seconds are of the whole command, its start included, the least
+of the repeats; beside them how much of the processors others took during it, which should be the busy processes alone.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+WAYS = {  # name → environment variables; the command leaves what is set already as it is
+    "as the command arranges it": {},
+    "threads spin": {"OMP_WAIT_POLICY": "ACTIVE", "GOMP_SPINCOUNT": "30000000000"},
+    "one thread": {"OMP_NUM_THREADS": "1"},
+}
+
+
+@contextmanager
+def busy(count: int):
+    """Keep so many processors busy meanwhile."""
+    neighbours = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for neighbour in neighbours:
+            neighbour.kill()
+            neighbour.wait()
+
+
+def busy_jiffies() -> int:
+    """Return how long all processors have worked since the machine started, in hundredths of a second."""
+    fields = [int(field) for field in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:]]
+    return sum(fields) - fields[3] - fields[4]
+
+
+def timed(words: list[str], environment: dict[str, str]) -> tuple[float, float, float]:
+    """Return the seconds of a command, those of its processors, and the processors that others took."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(("OMP_", "GOMP_"))}
+    begun, before, used = time.monotonic(), busy_jiffies(), os.times()
+    subprocess.run(
+        [sys.executable, "-m", "lidargrit", *words], env=kept | environment, check=True, stdout=subprocess.DEVNULL
+    )
+    seconds, after = time.monotonic() - begun, os.times()
+    own = after.children_user + after.children_system - used.children_user - used.children_system
+    return seconds, own, ((busy_jiffies() - before) / 100 - own) / seconds
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--words", default="sample pretrained", help="a verb that takes a folder and -n")
+    parser.add_argument("-n", type=int, nargs="*", default=[8, 32], help="how many scans")
+    parser.add_argument("--busy", type=int, nargs="*", default=[0, 1, 2], help="how many busy processes")
+    parser.add_argument("--repeats", type=int, default=2)
+    parser.add_argument("--ways", nargs="*", default=list(WAYS), choices=list(WAYS))
+    options = parser.parse_args()
+    for count in options.n:
+        for neighbours in options.busy:
+            for name in options.ways:
+                found = []
+                for _ in range(options.repeats):
+                    with tempfile.TemporaryDirectory() as folder, busy(neighbours):
+                        words = [*options.words.split(), f"{folder}/out", "-n", str(count)]
+                        found.append(timed(words, WAYS[name]))
+                seconds, own, others = min(found)
+                print(
+                    f"-n {count:<4}{neighbours} busy  {name:<28}{seconds:8.1f} s  {own:8.1f} s of processors, "
+                    f"others took {others:.2f}",
+                    flush=True,
+                )
+
+
+if __name__ == "__main__":
+    main()
