@@ -14,7 +14,7 @@ from lidargrit.datasets import ScanDataset, open_dataset
 from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import DataError, OutputError, ScanError, UnknownNameError, nearest_names
 from lidargrit.evaluation.score import holds_images, open_images
-from lidargrit.files import atomic_path, is_taken, read_json, write_json
+from lidargrit.files import atomic_path, claim_folder, is_taken, read_json, write_json
 from lidargrit.formats import ScanFormat
 from lidargrit.formats.kitti_bin import KittiBin
 from lidargrit.loading import DataConfig, RangeImages
@@ -58,22 +58,23 @@ def export_scans(
     scans = _open(source, config)
     files = layout.files([scans.name(index) for index in range(len(scans))])
     identities = [scans.identity(index) for index in range(len(scans))]
-    _claim(out, {"source": source, "format": kind, "scans": dict(zip(files, identities, strict=True))})
-    missing = [index for index, file in enumerate(files) if not layout.is_there(file)]
-    left_out = 0
-    with reporter.progress("exporting", len(files), len(files) - len(missing)) as progress:
-        for index in missing:
-            try:
-                layout.write(files[index], scans.scan(index))
-            except ScanError as error:
-                if config.bad_scans == "refuse":
-                    raise
-                reporter.message(f"left out: {error}")
-                left_out += 1
-            progress.advance(1)
-    if left_out == len(files):
-        raise DataError(f"no usable scan in {source}", "at least one", "see the messages above")
-    return len(files) - left_out
+    with claim_folder(out):
+        _claim(out, {"source": source, "format": kind, "scans": dict(zip(files, identities, strict=True))})
+        missing = [index for index, file in enumerate(files) if not layout.is_there(file)]
+        left_out = 0
+        with reporter.progress("exporting", len(files), len(files) - len(missing)) as progress:
+            for index in missing:
+                try:
+                    layout.write(files[index], scans.scan(index))
+                except ScanError as error:
+                    if config.bad_scans == "refuse":
+                        raise
+                    reporter.message(f"left out: {error}")
+                    left_out += 1
+                progress.advance(1)
+        if left_out == len(files):
+            raise DataError(f"no usable scan in {source}", "at least one", "see the messages above")
+        return len(files) - left_out
 
 
 def kinds() -> list[str]:
@@ -199,7 +200,7 @@ def _claim(out: Path, facts: dict[str, Any]) -> None:
     escaping = [file for file in facts["scans"] if file.startswith("/") or ".." in PurePosixPath(file).parts]
     if escaping:
         raise OutputError(f"a scan that would lie outside, in {escaping[0]}", "names below a folder", "rename it")
-    if is_taken(out, MANIFEST) and not (out / MANIFEST).is_file():
+    if is_taken(out) and not (out / MANIFEST).is_file():
         raise OutputError(f"{out}, which is not empty and holds no export", "an empty folder", "choose another one")
     if (out / MANIFEST).is_file():
         there = read_json(out / MANIFEST)

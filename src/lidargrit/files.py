@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
+import socket
+import stat
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -14,44 +17,166 @@ from torch import Tensor, nn
 
 from lidargrit.errors import CheckpointError, ConfigError, OutputError
 
+_PARTIALS = f".lidargrit-partial-{os.getuid()}"  # one a user: a shared folder such as /tmp has files of many
+_LOCK = "lock"  # among the partial files, held by the commands that write into the folder
+
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside ``path``; it takes the place of ``path`` if the block ends well, else it vanishes.
+    """Yield a temporary path; its file is renamed to ``path`` if the block ends well, and removed if it fails.
+
+    Until then it lies in a hidden folder beside ``path`` and is called ``*.partial``, so that no program takes it for
+    a finished file. What a killed process left there is removed by the next write into the same folder.
 
     Raises:
         OutputError: the disk is full or the folder cannot be written to; what stood at ``path`` still stands.
     """
-    temporary: Path | None = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=path.suffix, dir=path.parent)
-        os.close(handle)
-        temporary = Path(name)
-        yield temporary
-        with temporary.open("rb") as written:
-            os.fsync(written.fileno())
-        mask = os.umask(0)
-        os.umask(mask)
-        temporary.chmod(0o666 & ~mask)  # mkstemp keeps files private; ours are ordinary ones
-        temporary.replace(path)
+        with _partial_file(path.parent) as temporary:
+            yield temporary
+            with temporary.open("rb") as written:
+                os.fsync(written.fileno())
+            mask = os.umask(0)
+            os.umask(mask)
+            temporary.chmod(0o666 & ~mask)  # mkstemp keeps files private; ours are ordinary ones
+            temporary.replace(path)
     except OSError as error:
         raise OutputError(
             f"'{error.strerror or error}' while writing {path}",
             "a folder with room that may be written to",
             "free some space or choose another folder; nothing that was there is lost",
         ) from error
+
+
+@contextmanager
+def claim_folder(folder: Path, shared: bool = False) -> Iterator[None]:
+    """Hold a folder of results while a command writes into it; at the end no partial file is left below it.
+
+    Args:
+        folder: folder of results; made if it is missing.
+        shared: allow others that claim it as shared too, such as several processes that sample into one folder.
+
+    Raises:
+        OutputError: another process holds the folder, or it cannot be written to.
+    """
+    is_new = not folder.exists()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = _lock(folder, fcntl.LOCK_SH if shared else fcntl.LOCK_EX)
+    except OSError as error:
+        raise OutputError(
+            f"'{error.strerror or error}' for {folder}", "a folder that may be written to", "choose another folder"
+        ) from error
+    try:
+        yield
     finally:
-        if temporary is not None:
+        os.close(lock)
+        remove_partials(folder)
+        if is_new:
+            with suppress(OSError):  # it holds results, as it should
+                folder.rmdir()
+
+
+def remove_partials(folder: Path) -> None:
+    """Remove what killed processes left half-written anywhere below a folder; what living ones are writing stays."""
+    for here, below, _ in os.walk(folder):
+        for name in [name for name in below if is_partial(name)]:
+            below.remove(name)
+            _sweep(Path(here, name))
+
+
+def is_partial(name: str) -> bool:
+    """Tell whether a name in a folder is that of the hidden folder of partial files."""
+    return name.startswith(_PARTIALS[: _PARTIALS.rindex("-")])
+
+
+@contextmanager
+def _partial_file(folder: Path) -> Iterator[Path]:
+    """Yield the path of a new file among the partial ones, locked while it is written."""
+    path, lock = None, None
+    try:
+        while path is None:
+            with suppress(FileNotFoundError):  # another process has just removed the hidden folder, empty
+                lock, name = tempfile.mkstemp(suffix=".partial", dir=_hidden(folder))
+                with suppress(OSError):  # a file system without locks, or a process that removes the file as abandoned
+                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if Path(name).exists():
+                    path = Path(name)
+                else:
+                    os.close(lock)
+                    lock = None
+        yield path
+    finally:
+        if path is not None:
             with suppress(OSError):
-                temporary.unlink(missing_ok=True)
+                path.unlink(missing_ok=True)
+        if lock is not None:
+            os.close(lock)
+        _sweep(folder / _PARTIALS)
 
 
-def is_taken(folder: Path, first_file: str) -> bool:
-    """Tell whether something lies in a folder's place that is more than what a killed write of its first file left."""
+def _lock(folder: Path, kind: int) -> int:
+    """Lock a folder for this process and return the open lock file.
+
+    Raises:
+        OutputError: another process holds it.
+    """
+    while True:
+        with suppress(FileNotFoundError):  # as in _partial_file
+            lock = os.open(_hidden(folder) / _LOCK, os.O_RDWR | os.O_CREAT, 0o666)
+            try:
+                fcntl.flock(lock, kind | fcntl.LOCK_NB)
+            except BlockingIOError:
+                holder = os.pread(lock, 200, 0).decode(errors="replace") or "another command"
+                os.close(lock)
+                raise OutputError(
+                    f"{folder}, which {holder} is writing",
+                    "a folder that no other process writes",
+                    "wait for its end, or choose another folder",
+                ) from None
+            except OSError:  # a file system without locks
+                return lock
+            if os.fstat(lock).st_nlink:
+                alone = kind == fcntl.LOCK_EX
+                holder = f"process {os.getpid()} on {socket.gethostname()}" if alone else "another command"
+                os.ftruncate(lock, 0)
+                os.pwrite(lock, holder.encode(), 0)
+                return lock
+            os.close(lock)  # it was removed between the two calls
+
+
+def _hidden(folder: Path) -> Path:
+    """Return the hidden folder, made if it is missing; it may vanish again at once: see _sweep."""
+    if not folder.is_dir():
+        raise OSError("the folder has been removed")
+    hidden = folder / _PARTIALS
+    with suppress(FileExistsError):
+        hidden.mkdir()
+    if folder.stat().st_mode & stat.S_ISVTX and hidden.lstat().st_uid != os.getuid():  # in /tmp strangers may set traps
+        raise PermissionError(f"{hidden} belongs to another user")
+    return hidden
+
+
+def _sweep(hidden: Path) -> None:
+    """Remove the files in a hidden folder that no living process has locked, then the folder if it is empty."""
+    with suppress(OSError):
+        for path in hidden.iterdir():
+            with suppress(OSError):
+                file = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK)
+                try:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    path.unlink()
+                finally:
+                    os.close(file)
+        hidden.rmdir()
+
+
+def is_taken(folder: Path) -> bool:
+    """Tell whether a folder holds anything but partial files, or is no folder at all."""
     if not folder.is_dir():
         return folder.exists()
-    return any(not path.name.startswith(f".{first_file}.") for path in folder.iterdir())
+    return any(not is_partial(path.name) for path in folder.iterdir())
 
 
 def refuse_to_overwrite(path: Path | None, overwrite: bool, ending: str = "") -> None:

@@ -244,10 +244,17 @@ def test_sampling_that_is_killed_again_and_again_ends_with_the_same_scans(finish
     assert (new.batch(range(24)).range_m == one.batch(range(24)).range_m).all()
 
 
+def leave_half_written(folder: Path) -> None:
+    """Leave what a killed process leaves of a file that it was writing."""
+    hidden = folder / f".lidargrit-partial-{os.getuid()}"
+    hidden.mkdir(parents=True, exist_ok=True)
+    (hidden / "abc12345.partial").write_bytes(b"half")
+
+
 def test_what_a_killed_process_leaves_half_written_breaks_nothing(refused, run_folder, samples, tmp_path):
     for path in (*samples.iterdir(), *run_folder.rglob("*.*")):
         if path.is_file():
-            path.with_name(f".{path.name}.abc12345{path.suffix}").write_bytes(b"half")
+            leave_half_written(path.parent)
     assert len(read_samples(samples)) == 2
     for words in (
         train_words(run_folder),
@@ -261,6 +268,5 @@ def test_what_a_killed_process_leaves_half_written_breaks_nothing(refused, run_f
 @pytest.mark.parametrize("name", ["run.json", "samples.json"])
 def test_a_process_killed_while_it_wrote_its_very_first_file(run_folder, tmp_path, name):
     folder = tmp_path / "new"
-    folder.mkdir()
-    (folder / f".{name}.abc12345.json").write_bytes(b"half")
+    leave_half_written(folder)
     assert main(train_words(folder) if name == "run.json" else ["sample", str(run_folder), str(folder), "-n", "1"]) == 0

@@ -8,6 +8,7 @@ import os
 import zipfile
 import zlib
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ import numpy as np
 
 from lidargrit import configuration
 from lidargrit.errors import CheckpointError, ConfigError, DataError, OutputError, ScanError
-from lidargrit.files import atomic_path, is_taken, read_json, write_json, write_text
+from lidargrit.files import atomic_path, claim_folder, is_taken, read_json, remove_partials, write_json, write_text
 from lidargrit.generators import TRAINED_ON_FILE, WEIGHTS_FILE, Generator
 from lidargrit.loading import Pixels, Provenance, RangeImages
 from lidargrit.reporting import Reporter
@@ -74,7 +75,7 @@ def write_samples(
                 "an empty folder, or one that this very command began",
                 "choose another folder",
             )
-    elif is_taken(folder, MANIFEST) and not (folder / MANIFEST).exists():  # another process may just have begun it
+    elif is_taken(folder) and not (folder / MANIFEST).exists():  # another process may just have begun it
         raise OutputError(f"{folder}, which is not empty and holds no samples", "an empty folder", "choose another one")
     else:
         write_json(folder / MANIFEST, manifest)
@@ -82,14 +83,18 @@ def write_samples(
         write_text(folder / TRAINED_ON_FILE, (run_folder / TRAINED_ON_FILE).read_text(encoding="utf-8"))
     there = {entry.name for entry in os.scandir(folder)}
     missing = [seed for seed in seeds if _file(folder, seed).name not in there]
-    with (reporter or Reporter()).progress("sampling", len(seeds), len(seeds) - len(missing)) as progress:
+    with (
+        claim_folder(folder, shared=True) if missing else nullcontext(),
+        (reporter or Reporter()).progress("sampling", len(seeds), len(seeds) - len(missing)) as progress,
+    ):
         for seed, image in zip(missing, generator.stream(missing, sampling, batch_size), strict=True):
             pixels: dict[str, Any] = {"range_m": image.range_m.cpu().numpy()}
             if image.reflectance is not None:
                 pixels["reflectance"] = image.reflectance.cpu().numpy()
-            with atomic_path(_file(folder, seed)) as temporary:
-                np.savez_compressed(temporary, **pixels)
+            with atomic_path(_file(folder, seed)) as temporary, temporary.open("wb") as file:
+                np.savez_compressed(file, **pixels)
             progress.advance(1)
+    remove_partials(folder)
 
 
 def read_samples(folder: Path, count: int | None = None) -> RangeImages:

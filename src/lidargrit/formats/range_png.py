@@ -69,7 +69,7 @@ class RangePng(ScanFormat):
         image = project(scan, load_sensor(cls.sensor).with_columns(_COLUMNS_WRITTEN))
         values = (image.range_m * _VALUES_PER_M).round().clamp(max=65_535)
         with atomic_path(path) as temporary:
-            Image.fromarray(values.numpy().astype(np.uint16)).save(temporary)
+            Image.fromarray(values.numpy().astype(np.uint16)).save(temporary, format="PNG")
 
 
 def _rays(columns: int) -> SensorModel:

@@ -263,7 +263,7 @@ class Generator(nn.Module, ABC):
 
 def locate(run: str | Path) -> Path:
     """Return the folder of a run; for the word ``pretrained`` that of the package, unless you have one."""
-    return PRETRAINED if str(run) == PRETRAINED.name and not is_taken(Path(run), CONFIG_FILE) else Path(run)
+    return PRETRAINED if str(run) == PRETRAINED.name and not is_taken(Path(run)) else Path(run)
 
 
 def is_run(folder: Path) -> bool:

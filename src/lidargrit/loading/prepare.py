@@ -7,7 +7,6 @@ import json
 import os
 import time
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from lidargrit import __version__
 from lidargrit.datasets import ScanDataset, open_dataset
 from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import DataError, OutputError
-from lidargrit.files import is_taken, write_json, write_text
+from lidargrit.files import claim_folder, is_taken, remove_partials, write_json, write_text
 from lidargrit.loading.config import DataConfig
 from lidargrit.loading.images import RangeImages
 from lidargrit.loading.prepared import (
@@ -36,7 +35,6 @@ from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel
 
 _SHARD_SCANS = 128  # 12 MB of a KITTI-360 size image: what a killed process loses, and 625 files for 80,000 scans
-_ABANDONED_S = 3600.0  # a half-written file so old was left by a killed process
 _WAIT_S, _PATIENCE_S = 0.5, 1800.0  # for shards that other processes make; a shard takes seconds
 
 
@@ -114,11 +112,12 @@ def prepare(
     folder = folder or cache_folder() / hashlib.sha256(facts).hexdigest()[:24]
     _claim(folder, spec, scans)
     missing = [shard for shard in range(spec.num_shards) if not _is_whole(folder, shard)]
-    if missing:
-        _remove_abandoned(folder)
-        mine = [shard for shard in missing if shard % world_size == rank]
-        make_shards(folder, spec, mine, dataset, config.workers, reporter)
-        _wait_for(folder, [shard for shard in missing if shard % world_size != rank], reporter)
+    if missing:  # a complete folder may be one that this user can only read
+        with claim_folder(folder, shared=True):  # with other machines, and with whoever needs the same cache
+            mine = [shard for shard in missing if shard % world_size == rank]
+            make_shards(folder, spec, mine, dataset, config.workers, reporter)
+            _wait_for(folder, [shard for shard in missing if shard % world_size != rank], reporter)
+    remove_partials(folder)
     return folder
 
 
@@ -253,7 +252,7 @@ def _claim(folder: Path, spec: PreparedSpec, scans: list[tuple[str, str, int, in
         return
     told, path = json.dumps(scans), folder / SCANS_FILE
     half_claimed = path.is_file() and path.read_text(encoding="utf-8") == told
-    if is_taken(folder, SCANS_FILE) and not half_claimed:
+    if is_taken(folder) and not half_claimed:
         raise OutputError(f"{folder}, which holds something else", "an empty folder", "choose another one")
     write_text(path, told)
     write_json(folder / PLAN_FILE, asdict(spec))  # last: it says that the folder is ours
@@ -266,13 +265,6 @@ def _is_whole(folder: Path, shard: int) -> bool:
     except (OSError, ValueError):  # ValueError: an empty file, and our own errors
         return False
     return True
-
-
-def _remove_abandoned(folder: Path) -> None:
-    for path in folder.glob(".*.shard.*"):
-        with suppress(OSError):
-            if time.time() - path.stat().st_mtime > _ABANDONED_S:
-                path.unlink()
 
 
 def _wait_for(folder: Path, shards: list[int], reporter: Reporter) -> None:

@@ -49,7 +49,7 @@ def import_weights(recipe: str, folder: Path, files: Sequence[Path], settings: S
         "recipe": configuration.to_json(made_of),
         "lidargrit": __version__,
     }
-    if is_taken(folder, RUN_FILE) and not ((folder / RUN_FILE).is_file() and read_json(folder / RUN_FILE) == about):
+    if is_taken(folder) and not ((folder / RUN_FILE).is_file() and read_json(folder / RUN_FILE) == about):
         raise OutputError(f"{folder}, which is not empty", "an empty folder", "choose another one")
     write_json(folder / RUN_FILE, about)
     generator.save(folder)
@@ -77,7 +77,7 @@ def publish(run: Path, folder: Path, scores: Path | None = None, notes: str = ""
     """
     run = locate(run)
     generator = load(run)
-    if is_taken(folder, RUN_FILE):
+    if is_taken(folder):
         raise OutputError(f"{folder}, which is not empty", "an empty folder", "choose another one")
     about: Any = read_json(run / RUN_FILE) if (run / RUN_FILE).is_file() else {}
     scored = Scorecard.read(scores) if scores else None

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from lidargrit.errors import ConfigError, OutputError
-from lidargrit.files import atomic_path, is_taken, read_json, write_json, write_text
+from lidargrit.files import atomic_path, claim_folder, is_taken, read_json, write_json, write_text
 from lidargrit.formats.kitti_bin import KittiBin
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel
@@ -86,20 +86,21 @@ def write_drives(
     """
     if num_scans < 1 or workers < 1:
         raise ConfigError(f"{num_scans} scans by {workers} processes", "at least one of each", "correct it")
-    _claim(out, config)
-    missing = [scan for scan in range(num_scans) if not _label_file(out, config, scan).exists()]
-    write = partial(_write_scan, out, config)
-    with (reporter or Reporter()).progress("simulating", num_scans, num_scans - len(missing)) as progress:
-        if min(workers, len(missing)) <= 1:
-            for scan in missing:
-                write(scan)
-                progress.advance(1)
-        else:
-            with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
-                for _ in pool.map(write, missing, chunksize=4):
+    with claim_folder(out):
+        _claim(out, config)
+        missing = [scan for scan in range(num_scans) if not _label_file(out, config, scan).exists()]
+        write = partial(_write_scan, out, config)
+        with (reporter or Reporter()).progress("simulating", num_scans, num_scans - len(missing)) as progress:
+            if min(workers, len(missing)) <= 1:
+                for scan in missing:
+                    write(scan)
                     progress.advance(1)
-    there = sum(1 for _ in out.glob("sequences/*/labels/[!.]*.label"))  # an earlier call may have made more
-    _write_sequence_files(out, config, max(num_scans, there))
+            else:
+                with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
+                    for _ in pool.map(write, missing, chunksize=4):
+                        progress.advance(1)
+        there = sum(1 for _ in out.glob("sequences/*/labels/[!.]*.label"))  # an earlier call may have made more
+        _write_sequence_files(out, config, max(num_scans, there))
 
 
 def _claim(out: Path, config: DriveConfig) -> None:
@@ -109,7 +110,7 @@ def _claim(out: Path, config: DriveConfig) -> None:
             raise OutputError(
                 f"{out}, which holds scans simulated in another way", "an empty folder", "choose another folder"
             )
-    elif is_taken(out, MANIFEST):
+    elif is_taken(out):
         raise OutputError(f"{out}, which is not empty and holds no simulation", "an empty folder", "choose another")
     else:
         write_json(out / MANIFEST, facts)
@@ -125,9 +126,9 @@ def _write_scan(out: Path, config: DriveConfig, scan: int) -> None:
     folder, name = label_file.parent.parent, label_file.stem
     KittiBin.write(folder / "velodyne" / f"{name}.bin", points)
     if config.clean:
-        with atomic_path(folder / "observation" / f"{name}.npz") as temporary:
+        with atomic_path(folder / "observation" / f"{name}.npz") as temporary, temporary.open("wb") as file:
             np.savez_compressed(
-                temporary,
+                file,
                 clean_range_m=seen.clean_range_m,
                 return_probability=seen.return_probability.astype(np.float16),
                 return_mask=seen.return_mask,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from contextlib import suppress
 from pathlib import Path
 
 import torch
@@ -29,13 +28,6 @@ def save_checkpoint(
     for index, state in optimiser.state_dict()["state"].items():
         tensors |= {f"optimiser.{index}.{name}": torch.as_tensor(value) for name, value in state.items()}
     write_tensors(path, tensors, {"scans_seen": scans_seen, "built_on": built_on})
-
-
-def remove_half_written(path: Path) -> None:
-    """Remove what killed processes left of checkpoints: each may be gigabytes, and nothing reads it."""
-    for left in path.parent.glob(f".{path.name}.*"):
-        with suppress(OSError):
-            left.unlink()
 
 
 def load_checkpoint(

@@ -12,11 +12,12 @@ from torch import Tensor, nn
 
 from lidargrit.determinism import derive_seed, evenly_spaced
 from lidargrit.errors import ConfigError, Terminated, TrainingError
+from lidargrit.files import remove_partials
 from lidargrit.loading import Batches, RangeImages
 from lidargrit.nn.blocks import prepare_for_training
 from lidargrit.reporting import Reporter
 from lidargrit.structures import RangeImage
-from lidargrit.training.checkpoint import load_checkpoint, remove_half_written, save_checkpoint
+from lidargrit.training.checkpoint import load_checkpoint, save_checkpoint
 from lidargrit.training.config import FitConfig
 from lidargrit.training.engine import Engine
 from lidargrit.training.log import Log
@@ -149,7 +150,7 @@ class Fit:
         return terms
 
     def _begin(self) -> None:
-        remove_half_written(self.checkpoint)
+        remove_partials(self.checkpoint.parent)
         self.log = Log(self.folder, self.scans_seen)  # the first process alone has one
 
     def _close_log(self) -> None:

@@ -131,7 +131,7 @@ def check_folder(folder: Path, recipe: Recipe) -> None:
                 "an empty folder, or the folder of this very recipe",
                 "choose another folder, or use the settings that the run began with",
             )
-    elif is_taken(folder, RUN_FILE):
+    elif is_taken(folder):
         raise OutputError(
             f"{folder}, which is not empty and holds no run",
             "an empty folder, or one that this recipe began",

@@ -1,0 +1,174 @@
+"""Files that appear whole or not at all: killed writers, several writers, folders that a command holds."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from lidargrit.errors import OutputError
+from lidargrit.files import atomic_path, claim_folder, is_taken, remove_partials, write_text
+
+WRITE_AND_WAIT = """
+import sys, time
+from pathlib import Path
+from lidargrit.files import atomic_path, claim_folder
+with atomic_path(Path(sys.argv[1])) as temporary:
+    temporary.write_bytes(b"half")
+    print("written", flush=True)
+    time.sleep(600)
+"""
+CLAIM_AND_WAIT = """
+import sys, time
+from pathlib import Path
+from lidargrit.files import claim_folder
+with claim_folder(Path(sys.argv[1]), shared=len(sys.argv) > 2):
+    print("claimed", flush=True)
+    time.sleep(600)
+"""
+
+
+@pytest.fixture
+def started():
+    """Return a function that runs a script until it has printed a line; kills it at the end."""
+    processes = []
+
+    def start(script: str, *words: object) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-c", script, *map(str, words)]
+        processes.append(process := subprocess.Popen(command, stdout=subprocess.PIPE))
+        assert process.stdout is not None
+        assert process.stdout.readline()
+        return process
+
+    yield start
+    for process in processes:
+        process.kill()
+        process.communicate()
+
+
+def everything_in(folder: Path) -> list[str]:
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+def kill(process: subprocess.Popen[bytes]) -> None:
+    process.kill()
+    assert process.wait() == -signal.SIGKILL
+
+
+def test_a_killed_write_leaves_nothing_that_a_reader_takes_for_a_file(tmp_path, started):
+    kill(started(WRITE_AND_WAIT, tmp_path / "000002.bin"))
+    assert not [path for path in tmp_path.iterdir() if path.is_file()]
+    (left,) = [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert left.suffix == ".partial"
+    assert left.parent.name.startswith(".")
+    assert not is_taken(tmp_path)
+
+
+def test_the_next_write_into_the_folder_removes_what_a_killed_one_left(tmp_path, started):
+    kill(started(WRITE_AND_WAIT, tmp_path / "000002.bin"))
+    write_text(tmp_path / "another.txt", "whole")
+    assert everything_in(tmp_path) == ["another.txt"]
+
+
+def test_what_a_living_process_is_writing_stays(tmp_path, started):
+    process = started(WRITE_AND_WAIT, tmp_path / "000002.bin")
+    write_text(tmp_path / "another.txt", "whole")
+    remove_partials(tmp_path)
+    assert [path.read_bytes() for path in tmp_path.rglob("*.partial")] == [b"half"]
+    kill(process)
+    remove_partials(tmp_path)
+    assert everything_in(tmp_path) == ["another.txt"]
+
+
+def test_the_end_of_a_command_leaves_no_partial_file_anywhere_in_its_folder(tmp_path, started):
+    for name in ("sequences/00/velodyne/000000.bin", "sequences/01/velodyne/000000.bin"):
+        kill(started(WRITE_AND_WAIT, tmp_path / "out" / name))
+    with claim_folder(tmp_path / "out"):
+        write_text(tmp_path / "out" / "sequences" / "00" / "velodyne" / "000000.bin", "whole")
+    files = [path.name for path in (tmp_path / "out").rglob("*") if path.is_file() or path.name.startswith(".")]
+    assert files == ["000000.bin"]
+
+
+def test_a_folder_is_claimed_by_one_command_that_says_who_it_is(tmp_path, started):
+    holder = started(CLAIM_AND_WAIT, tmp_path / "out")
+    with (
+        pytest.raises(OutputError, match=f"which process {holder.pid} on .* is writing"),
+        claim_folder(tmp_path / "out"),
+    ):
+        pytest.fail("two commands hold the folder")
+    kill(holder)
+    with claim_folder(tmp_path / "out"):
+        write_text(tmp_path / "out" / "file.txt", "whole")
+    assert everything_in(tmp_path / "out") == ["file.txt"]
+
+
+def test_commands_that_share_a_folder_keep_out_only_those_that_do_not(tmp_path, started):
+    started(CLAIM_AND_WAIT, tmp_path / "out", "shared")
+    with claim_folder(tmp_path / "out", shared=True):
+        write_text(tmp_path / "out" / "file.txt", "whole")
+    with pytest.raises(OutputError, match="which another command is writing"), claim_folder(tmp_path / "out"):
+        pytest.fail("it is held by another")
+
+
+def test_a_claim_that_comes_to_nothing_leaves_no_folder(tmp_path):
+    with pytest.raises(KeyError), claim_folder(tmp_path / "new" / "out"):
+        raise KeyError
+    assert everything_in(tmp_path) == ["new"]
+
+
+def test_many_threads_write_into_one_folder_and_leave_their_files_alone(tmp_path):
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda index: write_text(tmp_path / f"{index}.txt", f"{index}"), range(400)))
+    assert sorted(os.listdir(tmp_path)) == sorted(f"{index}.txt" for index in range(400))
+    assert all((tmp_path / f"{index}.txt").read_text() == f"{index}" for index in range(400))
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):
+    write_text(tmp_path / "a.txt", "old")
+    with pytest.raises(KeyError), atomic_path(tmp_path / "a.txt") as temporary:  # noqa: PT012
+        temporary.write_text("new")
+        raise KeyError
+    assert everything_in(tmp_path) == ["a.txt"]
+    assert (tmp_path / "a.txt").read_text() == "old"
+
+
+def test_a_folder_that_is_removed_meanwhile_ends_the_write_in_one_line(tmp_path):
+    with pytest.raises(OutputError, match="while writing"), atomic_path(tmp_path / "out" / "a.txt") as temporary:  # noqa: PT012
+        temporary.write_text("new")
+        (tmp_path / "out").rename(tmp_path / "elsewhere")
+
+
+def test_a_name_as_long_as_the_disk_allows_is_written(tmp_path):
+    name = "x" * 251 + ".txt"
+    write_text(tmp_path / name, "whole")
+    assert os.listdir(tmp_path) == [name]
+    with pytest.raises(OutputError, match="too long"):
+        write_text(tmp_path / f"x{name}", "whole")
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        "from lidargrit.simulator.drives import DriveConfig, write_drives; from lidargrit.sensors import load_sensor;"
+        "write_drives(out, 6, DriveConfig(load_sensor('vlp16')))",
+        "from lidargrit.export import export_scans; export_scans('simulated:6', out, 'pcd')",
+        "from lidargrit.loading import DataConfig, prepare; prepare('simulated:6', DataConfig(workers=1), out)",
+    ],
+    ids=["simulate", "export", "prepare"],
+)
+def test_the_command_that_finishes_a_killed_one_leaves_whole_files_alone(tmp_path, call):
+    script = f"import sys; from pathlib import Path; out = Path(sys.argv[1]); {call}"
+    for delay_s in (0.0, 0.15, 0.3):
+        process = subprocess.Popen([sys.executable, "-c", script, str(tmp_path / "out")])
+        began = time.monotonic()
+        while not (tmp_path / "out").exists() and process.poll() is None and time.monotonic() - began < 60:
+            time.sleep(0.005)
+        time.sleep(delay_s)
+        process.kill()
+        process.wait()
+    subprocess.run([sys.executable, "-c", script, str(tmp_path / "out")], check=True)
+    assert not [name for name in everything_in(tmp_path / "out") if name.startswith(".") or "/." in name]
