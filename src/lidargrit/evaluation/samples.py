@@ -22,6 +22,7 @@ from lidargrit.generators import TRAINED_ON_FILE, WEIGHTS_FILE, Generator
 from lidargrit.loading import Pixels, Provenance, RangeImages
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel
+from lidargrit.structures import RangeImage
 from lidargrit.training.run import RUN_FILE, recipe_settings
 
 MANIFEST = "samples.json"
@@ -88,11 +89,7 @@ def write_samples(
         (reporter or Reporter()).progress("sampling", len(seeds), len(seeds) - len(missing)) as progress,
     ):
         for seed, image in zip(missing, generator.stream(missing, sampling, batch_size), strict=True):
-            pixels: dict[str, Any] = {"range_m": image.range_m.cpu().numpy()}
-            if image.reflectance is not None:
-                pixels["reflectance"] = image.reflectance.cpu().numpy()
-            with atomic_path(_file(folder, seed)) as temporary, temporary.open("wb") as file:
-                np.savez_compressed(file, **pixels)
+            _write_image(_file(folder, seed), image)
             progress.advance(1)
     remove_partials(folder)
 
@@ -201,6 +198,14 @@ def _drawn_as(manifest: dict[str, Any]) -> str:
     """Return what two sets of samples share if equal seeds in them are the same scans: model and settings."""
     drawn = [manifest.get("weights_sha256"), manifest.get("sampling")]
     return hashlib.sha256(json.dumps(drawn, sort_keys=True).encode()).hexdigest()[:8]
+
+
+def _write_image(path: Path, image: RangeImage) -> None:
+    pixels: dict[str, Any] = {"range_m": image.range_m.cpu().numpy()}
+    if image.reflectance is not None:
+        pixels["reflectance"] = image.reflectance.cpu().numpy()
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, **pixels)
 
 
 def _file(folder: Path, seed: int) -> Path:
