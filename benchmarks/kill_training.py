@@ -70,7 +70,7 @@ class Runs:
         words = ["train", "demo", str(folder), "--set", *SETTINGS]
         self.folder, self.command = folder, shlex.join(["lidargrit", *words])
         self._server = subprocess.Popen(
-            [sys.executable, "-c", SERVER, *words], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+            [sys.executable, "-P", "-c", SERVER, *words], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
         assert self._read() == "ready"
 

@@ -11,7 +11,6 @@ import os
 import queue
 import signal
 import subprocess
-import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,6 +22,7 @@ from lidargrit.errors import DataError, LidarGritError, ScanError
 from lidargrit.files import atomic_path
 from lidargrit.loading.prepared import PreparedFolder, PreparedSpec, shard_name
 from lidargrit.loading.shards import ShardWriter
+from lidargrit.processes import module_command
 from lidargrit.projection import project
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel
@@ -78,7 +78,7 @@ def make_shard(folder: Path, spec: PreparedSpec, shard: int, dataset: ScanDatase
 def _made_by_processes(folder: Path, shares: list[list[int]]) -> Iterator[int]:
     """Yield each shard's number when it is there."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}  # one core each: threads of several would fight for them
-    command = [sys.executable, "-m", "lidargrit.loading", str(folder), str(os.getpid())]
+    command = module_command("lidargrit.loading", str(folder), str(os.getpid()))
     processes = [
         subprocess.Popen([*command, *map(str, share)], stdout=subprocess.PIPE, text=True, env=environment)
         for share in shares

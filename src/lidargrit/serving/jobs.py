@@ -10,7 +10,6 @@ import queue
 import secrets
 import shutil
 import subprocess
-import sys
 import threading
 import time
 from collections import deque
@@ -21,6 +20,7 @@ from typing import Any, Literal
 
 from lidargrit import errors
 from lidargrit.errors import DataError
+from lidargrit.processes import module_command
 from lidargrit.serving.limits import Limits
 from lidargrit.serving.requests import SampleRequest, SamplingSetting
 
@@ -176,7 +176,7 @@ class _Process:
     """The process that draws."""
 
     def __init__(self, asked: dict[str, Any]) -> None:
-        command = [sys.executable, "-m", "lidargrit.serving", json.dumps(asked)]
+        command = module_command("lidargrit.serving", json.dumps(asked))
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
         )

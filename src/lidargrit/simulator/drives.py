@@ -15,6 +15,7 @@ from jaxtyping import Float64
 from lidargrit.errors import ConfigError, OutputError
 from lidargrit.files import atomic_path, claim_folder, is_taken, read_json, write_json, write_text
 from lidargrit.formats.kitti_bin import KittiBin
+from lidargrit.processes import safe_multiprocessing
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel
 from lidargrit.simulator import observe, scene_of
@@ -96,7 +97,8 @@ def write_drives(
                     write(scan)
                     progress.advance(1)
             else:
-                with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
+                spawn = multiprocessing.get_context("spawn")
+                with safe_multiprocessing(), ProcessPoolExecutor(workers, spawn) as pool:
                     for _ in pool.map(write, missing, chunksize=4):
                         progress.advance(1)
         there = sum(1 for _ in out.glob("sequences/*/labels/[!.]*.label"))  # an earlier call may have made more
