@@ -67,11 +67,10 @@ def repeat(few: Path, many: Path, count: int) -> Path:
         for one in pixels
     ]
     for shard in range(spec.num_shards):
-        with (many / shard_name(shard)).open("wb") as file:
-            writer = ShardWriter(file, spec.range_step_m)
-            for index in spec.scans_of(shard):
-                writer.add(index, images[index % len(images)])
-            writer.finish()
+        writer = ShardWriter(spec.range_step_m)
+        for index in spec.scans_of(shard):
+            writer.add(index, images[index % len(images)])
+        writer.write(many / shard_name(shard))
     return many
 
 

@@ -177,7 +177,7 @@ def test_a_sensor_of_another_data_set_is_warned_of(tree):
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_processes_make_the_same_shards(tmp_path, small_shards, count):
+def test_processes_make_the_same_shards_and_count_every_scan(tmp_path, small_shards, count):
     alone = prepare("simulated:7", SIMULATED, tmp_path / "alone")
     together = prepare("simulated:7", DataConfig(workers=count), tmp_path / "together")
     names = sorted(path.name for path in alone.glob("*.shard"))
@@ -228,6 +228,43 @@ def test_killed_at_any_moment_it_goes_on_and_ends_the_same(tmp_path):
     shard_files = sorted(path.name for path in (tmp_path / "whole").glob("*.shard"))
     assert len(shard_files) == 8
     assert same(tmp_path / "killed", tmp_path / "whole")
+
+
+class StopsAfter:
+    """Projects some scans, and then is interrupted; tells how many it was asked for."""
+
+    def __init__(self, count):
+        self.count, self.asked = count, 0
+
+    def __call__(self, *arguments, **settings):
+        if self.asked == self.count:
+            raise KeyboardInterrupt
+        self.asked += 1
+        return project(*arguments, **settings)
+
+
+def test_a_shard_is_taken_up_where_a_process_was_stopped(tmp_path, monkeypatch):
+    monkeypatch.setattr(workers, "_KEEP_EVERY_S", -1.0)  # after every scan
+    folder = tmp_path / "stopped"
+    monkeypatch.setattr(workers, "project", StopsAfter(4))
+    with pytest.raises(KeyboardInterrupt):
+        prepare("simulated:6", SIMULATED, folder)
+    assert sorted(path.name for path in folder.glob("0*")) == ["000000.unfinished"]
+    monkeypatch.setattr(workers, "project", rest := StopsAfter(6))
+    prepare("simulated:6", SIMULATED, folder)
+    assert rest.asked == 2, "only the scans that were not done"
+    monkeypatch.setattr(workers, "project", project)
+    assert same(folder, prepare("simulated:6", SIMULATED, tmp_path / "whole"))
+    assert sorted(path.name for path in folder.iterdir()) == ["000000.shard", "plan.json", "scans.json"]
+
+
+@pytest.mark.parametrize("damage", [b"", b"noise" * 99])
+def test_a_damaged_unfinished_shard_is_made_anew(tmp_path, damage):
+    folder = prepare("simulated:2", SIMULATED, tmp_path / "out")
+    (folder / "000000.shard").unlink()
+    (folder / "000000.unfinished").write_bytes(damage)
+    assert same(prepare("simulated:2", SIMULATED, folder), prepare("simulated:2", SIMULATED, tmp_path / "whole"))
+    assert not (folder / "000000.unfinished").exists()
 
 
 def test_damage_is_found_and_made_good(tmp_path, small_shards):

@@ -4,7 +4,6 @@ from lidargrit.loading.batches import Batches
 from lidargrit.loading.config import DataConfig
 from lidargrit.loading.images import ImageStore, Pixels, Provenance, RangeImages
 from lidargrit.loading.prepare import (
-    cache_folder,
     damaged_shards,
     load_range_images,
     prepare,
@@ -20,7 +19,6 @@ __all__ = [
     "Provenance",
     "PreparedImages",
     "RangeImages",
-    "cache_folder",
     "damaged_shards",
     "is_prepared",
     "load_range_images",

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from typing import Any
 from lidargrit import __version__
 from lidargrit.datasets import ScanDataset, open_dataset
 from lidargrit.determinism import evenly_spaced
+from lidargrit.environment import cache_folder
 from lidargrit.errors import DataError, OutputError
 from lidargrit.files import claim_folder, is_taken, remove_partials, write_json, write_text
 from lidargrit.loading.config import DataConfig
@@ -118,6 +119,9 @@ def prepare(
             make_shards(folder, spec, mine, dataset, config.workers, reporter)
             _wait_for(folder, [shard for shard in missing if shard % world_size != rank], reporter)
     remove_partials(folder)
+    for left in folder.glob("*.unfinished"):  # by a process that was killed after it had written the shard
+        with suppress(OSError):  # of a folder that this user can only read
+            left.unlink()
     return folder
 
 
@@ -196,13 +200,6 @@ def damaged_shards(folder: Path, reporter: Reporter | None = None) -> list[int]:
                 damaged.add(images.shard_of(index))
             progress.advance(1)
     return sorted(damaged)
-
-
-def cache_folder() -> Path:
-    """Return where projected scans are kept."""
-    if "LIDARGRIT_CACHE" in os.environ:
-        return Path(os.environ["LIDARGRIT_CACHE"])
-    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "lidargrit"
 
 
 def _spec(

@@ -71,6 +71,11 @@ def shard_name(shard: int) -> str:
     return f"{shard:06d}.shard"
 
 
+def unfinished_name(shard: int) -> str:
+    """Return the file name of what is done of a shard that does not yet hold all of its scans."""
+    return f"{shard:06d}.unfinished"
+
+
 def is_prepared(source: str) -> bool:
     """Tell whether a source is where prepared scans lie: a URL, or a folder with a plan."""
     try:

@@ -1,7 +1,7 @@
 """One file of many range images ⇄ pixels: range in whole steps, reflectance in bytes, each image compressed alone.
 
 A shard is the magic, the compressed images one after another, an index in JSON, the index's length in 8 bytes, and the
-magic again; so it is written in one go, is whole or not there, and one image is read by one seek, here or far away.
+magic again. A file that was cut short is recognised by its end, and one image is read by one seek, here or far away.
 """
 
 from __future__ import annotations
@@ -10,14 +10,15 @@ import hashlib
 import json
 import math
 import mmap
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import BinaryIO, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numcodecs.blosc import SHUFFLE, Blosc
 
 from lidargrit.errors import DataError
+from lidargrit.files import atomic_path
 from lidargrit.loading.images import Pixels
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
@@ -36,11 +37,11 @@ class Entry:
     """Where one image lies in a shard.
 
     Args:
-        scan: which of the planned scans it is.
-        offset: of its first byte in the file.
-        range_bytes: length of its compressed range.
-        reflectance_bytes: length of its compressed reflectance, which follows; 0 if it has none.
-        fingerprint: of its pixels before compression.
+        scan: index of the image's scan among all scans of the prepared folder.
+        offset: position of the image's first byte in the file.
+        range_bytes: length of the compressed range.
+        reflectance_bytes: length of the compressed reflectance, which follows the range; 0 if there is none.
+        fingerprint: hash of the pixels before compression.
     """
 
     scan: int
@@ -52,7 +53,7 @@ class Entry:
 
 @runtime_checkable
 class Bytes(Protocol):
-    """A file to read pieces of, on this machine or on another."""
+    """A file, on this machine or on another, of which pieces can be read."""
 
     size: int
 
@@ -75,43 +76,66 @@ class LocalBytes:
 
 
 def range_step_m(sensor: SensorModel) -> float:
-    """Return the step in which ranges of a sensor are kept: 2 mm, or as many more as its reach needs."""
+    """Return the step in which ranges of a sensor are kept: 2 mm, or a multiple that its reach needs."""
     needed = math.ceil(sensor.range_max_m / (_FINEST_STEP_M * np.iinfo(np.uint16).max))
     return _FINEST_STEP_M * max(1, needed)
 
 
 class ShardWriter:
-    """Writes images and then the index into an open file."""
+    """Collects compressed images in memory and writes them as one file.
 
-    def __init__(self, file: BinaryIO, step_m: float) -> None:
-        self._file, self._step_m = file, step_m
+    Args:
+        step_m: step in which ranges are kept, in metres.
+    """
+
+    def __init__(self, step_m: float) -> None:
+        self._step_m = step_m
         self._entries: list[Entry] = []
+        self._blobs: list[bytes] = []  # of the same images, each its range and then its reflectance
         self._left_out: dict[int, str] = {}
-        self._offset = file.write(_MAGIC)
+        self._end = len(_MAGIC)
+
+    @property
+    def scans(self) -> set[int]:
+        """Indices of the scans that have been added or left out."""
+        return {entry.scan for entry in self._entries} | self._left_out.keys()
 
     def add(self, scan: int, image: RangeImage) -> None:
-        """Write one image."""
+        """Add the image of a scan."""
         steps = np.rint(image.range_m.numpy() / np.float32(self._step_m)).astype(np.uint16)
         steps[image.return_mask.numpy() & (steps == 0)] = 1  # a return stays one
-        known = image.reflectance is not None
-        levels = np.rint(image.reflectance.numpy() * 255).astype(np.uint8) if image.reflectance is not None else None
-        range_blob = _compress(steps)
-        reflectance_blob = _compress(levels) if levels is not None else b""
-        fingerprint = hashlib.blake2b(steps.tobytes(), digest_size=8)
-        fingerprint.update(levels.tobytes() if levels is not None else b"")
-        self._entries.append(
-            Entry(scan, self._offset, len(range_blob), len(reflectance_blob) * known, fingerprint.hexdigest())
-        )
-        self._offset += self._file.write(range_blob) + self._file.write(reflectance_blob)
+        levels = None if image.reflectance is None else np.rint(image.reflectance.numpy() * 255).astype(np.uint8)
+        range_blob, reflectance_blob = _compress(steps), b"" if levels is None else _compress(levels)
+        lengths = len(range_blob), len(reflectance_blob)
+        self._append(Entry(scan, self._end, *lengths, _fingerprint(steps, levels)), range_blob + reflectance_blob)
+
+    def add_from(self, file: Bytes, name: str) -> None:
+        """Add all that another file of this class holds.
+
+        Raises:
+            DataError: the file is not whole.
+        """
+        entries, left_out = read_index(file, name)
+        for entry in entries:
+            blob = file.read(entry.offset, entry.offset + entry.range_bytes + entry.reflectance_bytes)
+            self._append(replace(entry, offset=self._end), bytes(blob))
+        self._left_out |= left_out
 
     def leave_out(self, scan: int, why: str) -> None:
         """Note that a scan cannot be used."""
         self._left_out[scan] = why
 
-    def finish(self) -> None:
-        """Write the index."""
-        index = json.dumps({"entries": [asdict(e) for e in self._entries], "left_out": self._left_out}).encode()
-        self._file.write(index + len(index).to_bytes(8, "little") + _MAGIC)
+    def write(self, path: Path) -> None:
+        """Write all of it into a file, which appears whole; more may be added afterwards."""
+        told = {"entries": [asdict(entry) for entry in self._entries], "left_out": self._left_out}
+        index = json.dumps(told).encode()
+        with atomic_path(path) as temporary, temporary.open("wb") as file:
+            file.writelines((_MAGIC, *self._blobs, index, len(index).to_bytes(8, "little"), _MAGIC))
+
+    def _append(self, entry: Entry, blob: bytes) -> None:
+        self._entries.append(entry)
+        self._blobs.append(blob)
+        self._end += len(blob)
 
 
 def read_index(file: Bytes, name: str) -> tuple[list[Entry], dict[int, str]]:
@@ -154,13 +178,16 @@ def read_image(
             levels = _decompress(file.read(middle, middle + entry.reflectance_bytes), shape, np.uint8)
     except (OSError, ValueError, RuntimeError, TypeError) as error:
         raise _damaged(name, error) from None
-    if verify:
-        fingerprint = hashlib.blake2b(steps.tobytes(), digest_size=8)
-        fingerprint.update(levels.tobytes() if levels is not None else b"")
-        if fingerprint.hexdigest() != entry.fingerprint:
-            raise _damaged(name, ValueError("pixels that differ from their fingerprint"))
+    if verify and _fingerprint(steps, levels) != entry.fingerprint:
+        raise _damaged(name, ValueError("pixels that differ from their fingerprint"))
     range_m = np.multiply(steps, np.float32(step_m), dtype=np.float32)
     return range_m, None if levels is None else np.multiply(levels, np.float32(1 / 255), dtype=np.float32)
+
+
+def _fingerprint(steps: np.ndarray, levels: np.ndarray | None) -> str:
+    digest = hashlib.blake2b(steps.tobytes(), digest_size=8)
+    digest.update(b"" if levels is None else levels.tobytes())
+    return digest.hexdigest()
 
 
 def _compress(pixels: np.ndarray) -> bytes:

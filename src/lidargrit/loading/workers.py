@@ -1,4 +1,4 @@
-"""Shards of a plan, made by several processes at once: ``python -m lidargrit.loading FOLDER PARENT SHARD...``.
+"""Shards of a prepared folder, made by several processes: ``python -m lidargrit.loading FOLDER PARENT SHARD...``.
 
 Processes of their own rather than a pool: they need nothing but the plan in the folder, a caller's script needs no
 guard against being imported again, and none is left at work when the caller dies.
@@ -12,44 +12,55 @@ import queue
 import signal
 import subprocess
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 from lidargrit import errors
 from lidargrit.datasets import ScanDataset, open_dataset
 from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import DataError, LidarGritError, ScanError
-from lidargrit.files import atomic_path
-from lidargrit.loading.prepared import PreparedFolder, PreparedSpec, shard_name
-from lidargrit.loading.shards import ShardWriter
+from lidargrit.loading.prepared import PreparedFolder, PreparedSpec, shard_name, unfinished_name
+from lidargrit.loading.shards import LocalBytes, ShardWriter
 from lidargrit.processes import module_command
 from lidargrit.projection import project
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel
 
+_KEEP_EVERY_S = 5.0  # what a killed process loses at most; a shard of real scans takes about as long
+
 
 def make_shards(
     folder: Path, spec: PreparedSpec, shards: list[int], dataset: ScanDataset, workers: int, reporter: Reporter
 ) -> None:
-    """Make shards, in this process if there is one only, else in as many as are wanted.
+    """Make shards, in this process if one is enough, else in several.
 
     Raises:
         LidarGritError: what one of the processes met; the others are stopped.
     """
     total = sum(len(spec.scans_of(shard)) for shard in shards)
-    done = spec.num_scans - total
-    with reporter.progress("projecting scans", spec.num_scans, done) as progress:
-        if min(workers, len(shards)) <= 1:
+    workers = min(workers, len(shards))
+    with reporter.progress("projecting scans", spec.num_scans, spec.num_scans - total) as progress:
+        if workers <= 1:
             for shard in shards:
-                make_shard(folder, spec, shard, dataset)
-                progress.advance(len(spec.scans_of(shard)))
+                make_shard(folder, spec, shard, dataset, progress.advance)
             return
-        for shard in _made_by_processes(folder, [shards[first::workers] for first in range(min(workers, len(shards)))]):
-            progress.advance(len(spec.scans_of(shard)))
+        for count in _made_by_processes(folder, [shards[first::workers] for first in range(workers)]):
+            progress.advance(count)
 
 
-def make_shard(folder: Path, spec: PreparedSpec, shard: int, dataset: ScanDataset) -> None:
-    """Project the scans of one shard.
+def make_shard(
+    folder: Path, spec: PreparedSpec, shard: int, dataset: ScanDataset, advance: Callable[[int], None]
+) -> None:
+    """Project the scans of one shard; go on from what an interrupted process has kept of it.
+
+    Args:
+        folder: prepared folder.
+        spec: what the folder is to hold.
+        shard: number of the shard.
+        dataset: source of the scans.
+        advance: function that is told how many scans more are done.
 
     Raises:
         ScanError: a scan that cannot be used, unless such scans are skipped.
@@ -59,24 +70,32 @@ def make_shard(folder: Path, spec: PreparedSpec, shard: int, dataset: ScanDatase
     if len(wanted) != spec.num_scans:
         raise DataError(f"{len(wanted)} scans in {spec.source}", f"the {spec.num_scans} planned", "prepare again")
     sensor = SensorModel.from_json(spec.sensor)
-    with atomic_path(folder / shard_name(shard)) as temporary, temporary.open("wb") as file:
-        writer = ShardWriter(file, spec.range_step_m)
-        for index in spec.scans_of(shard):
-            try:
-                scan = dataset.scan(wanted[index])
-                image = project(scan, sensor, variant="reference" if spec.variant == "reference" else "exact")
-            except ScanError as error:
-                if spec.bad_scans == "refuse":
-                    leave_out = "leave such scans out by --set data.bad_scans=skip (train) or --bad-scans skip"
-                    raise ScanError(error.got, error.wanted, f"{error.cure}, or {leave_out}") from None
-                writer.leave_out(index, str(error))
-            else:
-                writer.add(index, image)
-        writer.finish()
+    unfinished, writer = folder / unfinished_name(shard), ShardWriter(spec.range_step_m)
+    with suppress(OSError, ValueError):  # not there, or damaged
+        writer.add_from(LocalBytes(unfinished), unfinished.name)
+    advance(len(writer.scans))
+    kept_at = time.monotonic()
+    for index in sorted(set(spec.scans_of(shard)) - writer.scans):
+        try:
+            scan = dataset.scan(wanted[index])
+            image = project(scan, sensor, variant="reference" if spec.variant == "reference" else "exact")
+        except ScanError as error:
+            if spec.bad_scans == "refuse":
+                leave_out = "leave such scans out by --set data.bad_scans=skip (train) or --bad-scans skip"
+                raise ScanError(error.got, error.wanted, f"{error.cure}, or {leave_out}") from None
+            writer.leave_out(index, str(error))
+        else:
+            writer.add(index, image)
+        advance(1)
+        if time.monotonic() - kept_at > _KEEP_EVERY_S:
+            writer.write(unfinished)
+            kept_at = time.monotonic()
+    writer.write(folder / shard_name(shard))
+    unfinished.unlink(missing_ok=True)
 
 
 def _made_by_processes(folder: Path, shares: list[list[int]]) -> Iterator[int]:
-    """Yield each shard's number when it is there."""
+    """Yield how many scans more are done, each time that one of the processes says so."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}  # one core each: threads of several would fight for them
     command = module_command("lidargrit.loading", str(folder), str(os.getpid()))
     processes = [
@@ -119,17 +138,16 @@ def _error_of(line: str) -> LidarGritError:
 
 
 def work(folder: Path, parent: int, shards: list[int]) -> int:
-    """Make shards while the process that wants them lives; print the number of each, or the error."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that a half-written shard is removed
+    """Make shards while the process that wants them lives; print a line for every scan, or the error."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that a half-written file is removed
     spec = PreparedFolder(str(folder)).read_spec()
     dataset = open_dataset(spec.source, "drop" if spec.bad_points == "drop" else "refuse")
     for shard in shards:
         if os.getppid() != parent:
             return 1  # whoever wanted the shards is gone
         try:
-            make_shard(folder, spec, shard, dataset)
+            make_shard(folder, spec, shard, dataset, lambda count: print(count, flush=True))
         except LidarGritError as error:
             print(json.dumps({"error": [type(error).__name__, error.got, error.wanted, error.cure]}), flush=True)
             return 2
-        print(shard, flush=True)
     return 0

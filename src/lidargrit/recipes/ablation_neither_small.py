@@ -2,12 +2,10 @@
 
 from dataclasses import replace
 
+from lidargrit.configuration import override
 from lidargrit.recipes import ablation_raydrop_small
 
-_WITH = ablation_raydrop_small.RECIPE
-
 RECIPE = replace(
-    _WITH,
+    override(ablation_raydrop_small.RECIPE, ["model.tokenizer.raydrop_loss=false"]),
     title="the ablation, small, row 1: without raydrop loss and geometric preservation",
-    model=replace(_WITH.model, tokenizer=replace(_WITH.model.tokenizer, raydrop_loss=False)),
 )

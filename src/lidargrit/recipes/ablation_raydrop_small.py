@@ -2,12 +2,10 @@
 
 from dataclasses import replace
 
+from lidargrit.configuration import override
 from lidargrit.recipes import ablation_both_small
 
-_BOTH = ablation_both_small.RECIPE
-
 RECIPE = replace(
-    _BOTH,
+    override(ablation_both_small.RECIPE, ["training.tokenizer.augmentations=[]"]),
     title="the ablation, small, row 2: with raydrop loss, without geometric preservation",
-    training={**_BOTH.training, "tokenizer": replace(_BOTH.training["tokenizer"], augmentations=())},
 )

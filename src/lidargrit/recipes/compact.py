@@ -2,21 +2,14 @@
 
 from dataclasses import replace
 
+from lidargrit.configuration import override
 from lidargrit.recipes import small
 
-_VQVAE, _TRANSFORMER = small.RECIPE.training["tokenizer"], small.RECIPE.training["transformer"]
+# A quarter of the tokens of ``small`` for little of its detail: the transformer learns, and generates, sooner.
+_FEWER_TOKENS = ("model.tokenizer.channel_multipliers=1,1,2,4", "model.tokenizer.num_codes=1024")
+_TRANSFORMER = ("model.transformer.layers=5", "model.transformer.width=256")
 
 RECIPE = replace(
-    small.RECIPE,
+    override(small.RECIPE, [*_FEWER_TOKENS, *_TRANSFORMER, "training.tokenizer.scans=8000"]),
     title="the model in the package: 64x256 in 256 tokens, for one CPU core and an hour",
-    model=replace(
-        small.RECIPE.model,
-        # A quarter of the tokens of ``small`` for little of its detail: so the transformer learns, and writes, sooner.
-        tokenizer=replace(small.RECIPE.model.tokenizer, channel_multipliers=(1, 1, 2, 4), num_codes=1024),
-        transformer=replace(small.RECIPE.model.transformer, layers=5, width=256),
-    ),
-    training={
-        "tokenizer": replace(_VQVAE, scans=8_000),
-        "transformer": replace(_TRANSFORMER, scans=20_000),
-    },
 )

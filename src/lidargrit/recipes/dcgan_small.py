@@ -2,10 +2,10 @@
 
 from dataclasses import replace
 
+from lidargrit.configuration import override
 from lidargrit.recipes import dusty_small
 
 RECIPE = replace(
-    dusty_small.RECIPE,
+    override(dusty_small.RECIPE, ["model.variant=baseline"]),
     title="DCGAN, small: DUSty's baseline, which reads far pixels as no return",
-    model=replace(dusty_small.RECIPE.model, variant="baseline"),
 )

@@ -7,7 +7,6 @@ import hashlib
 import http.client
 import io
 import math
-import os
 import tarfile
 import time
 import urllib.error
@@ -20,9 +19,9 @@ from pathlib import Path
 
 from torch import Tensor
 
+from lidargrit.environment import cache_folder, folder_in
 from lidargrit.errors import WeightsError
 from lidargrit.files import atomic_path
-from lidargrit.loading import cache_folder
 from lidargrit.nn.published import RefusedFileError, float_tensors, unpickle
 from lidargrit.reporting import Reporter
 
@@ -73,7 +72,7 @@ def find_weights(published: PublishedWeights, given: Path | None = None, reporte
     """
     if given is not None:
         return given
-    folders = [Path(folder) for folder in [os.environ.get(FOLDER_VARIABLE)] if folder] + [cache_folder() / "weights"]
+    folders = [folder for folder in (folder_in(FOLDER_VARIABLE), cache_folder() / "weights") if folder]
     for folder in folders:
         if (folder / published.file_name).exists():
             return folder / published.file_name

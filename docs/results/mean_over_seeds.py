@@ -1,6 +1,6 @@
 """Errors of reconstruction of several seeds of several rows → one table: mean over seeds, and what seeds alone change.
 
-    python benchmarks/seeds.py NAME=SCORES.json,SCORES.json,... [NAME=...]
+    python docs/results/mean_over_seeds.py NAME=SCORES.json,SCORES.json,... [NAME=...]
 
 The files are those of ``lidargrit evaluate RUN SCANS --json``. The interval is Student's, 95 %, over the seeds: with
 three of them it is 2.5 standard deviations wide to either side, so what it leaves apart is apart.
@@ -33,6 +33,7 @@ def summary(values: list[float]) -> str:
 
 
 def main() -> None:
+    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("rows", nargs="+", metavar="NAME=FILES")
     print(f"| | seeds | {' | '.join(SHOWN.values())} |")
