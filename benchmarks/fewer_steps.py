@@ -19,8 +19,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from lidargrit.configuration import override
-from lidargrit.evaluation.comparison import Settings
-from lidargrit.evaluation.contest import Contest, hold
+from lidargrit.evaluation.benchmark import Benchmark
+from lidargrit.evaluation.benchmark import run as run_benchmark
+from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.generators import Generator, load
 from lidargrit.reporting import TerminalReporter
@@ -88,8 +89,9 @@ def row_of(name: str, steps: int | None, scores: Path, seconds: list[float]) -> 
         if score.result.variant != METRICS[score.result.metric]:
             continue
         assert score.interval is not None
-        assert score.floor is not None
-        row[score.result.metric] = [score.result.value, score.interval.low, score.interval.high, score.floor.value]
+        reference = score.real_against_real
+        assert reference is not None
+        row[score.result.metric] = [score.result.value, score.interval.low, score.interval.high, reference.value]
     return row
 
 
@@ -107,8 +109,8 @@ def main() -> None:
     options = parser.parse_args()
     choices = [[f"steps={steps}", *options.masked] for steps in options.steps]
     systems = [str(options.exact_run), *(f"{options.masked_run}:{','.join(chosen)}" for chosen in choices)]
-    contest = Contest(f"simulated:{options.n}:test", options.n, Settings(metrics=tuple(METRICS)))
-    scores = hold(systems, options.out, contest, TerminalReporter())
+    benchmark = Benchmark(f"simulated:{options.n}:test", options.n, EvalConfig(metrics=tuple(METRICS)))
+    scores = run_benchmark(systems, options.out, benchmark, TerminalReporter())
     exact, masked = load(options.exact_run), load(options.masked_run)
     drawn = [(exact, exact.Sampling()), *((masked, override(masked.Sampling(), chosen)) for chosen in choices)]
     rows = []

@@ -17,10 +17,10 @@ import lidargrit
 from lidargrit import _discovery
 from lidargrit.cli import main
 from lidargrit.datasets import load
-from lidargrit.evaluation.samples import read_samples
 from lidargrit.evaluation.scorecard import format_value
 from lidargrit.formats import read_scan as read_bin
 from lidargrit.recipes import load_recipe
+from lidargrit.sources.samples import read_samples
 from tiny_runs import MODEL
 
 TINY = [
@@ -181,7 +181,19 @@ def test_samples_tell_what_they_cost_and_those_from_before_go_on(run_folder, tmp
 
 def test_evaluate_prints_a_table_and_writes_json(samples, tmp_path, typed):
     told = typed("evaluate", samples, "simulated:3:test", "--json", tmp_path / "deep" / "scores.json").splitlines()
-    assert told[0].split() == ["metric", "variant", "score", "95", "%", "interval", "floor", "better", "scans"]
+    assert told[0].split() == [
+        "metric",
+        "variant",
+        "score",
+        "95",
+        "%",
+        "interval",
+        "real",
+        "against",
+        "real",
+        "better",
+        "scans",
+    ]
     scores = json.loads((tmp_path / "deep" / "scores.json").read_text())
     assert scores["reference"] == "simulated:3:test"
     assert [score["variant"] for score in scores["scores"]] == [line.split()[1] for line in told[1:]]
@@ -234,7 +246,8 @@ def test_list_names_everything_there_is(typed):
     assert "sample --set: temperature=1.0, top_k=0, top_p=1.0, mask=bernoulli" in typed("list", "generators")
     assert "licence: " in typed("list", "datasets")
     assert "  lidargrit-kitti-360 " in typed("list", "protocols")
-    assert "  lidargen " in typed("list", "dialects")
+    assert "  lidargen " in typed("list", "sample-formats")
+    assert typed("list", "dialects") == typed("list", "sample-formats"), "the former word still works"
 
 
 def test_doctor_tells_versions_and_room(typed):

@@ -10,7 +10,7 @@ import pytest
 
 from browser import CHROMIUM, Browser
 from lidargrit import demo
-from lidargrit.evaluation.score import score_reconstruction
+from lidargrit.evaluation.reconstruction import score_reconstruction
 from lidargrit.loading import Provenance, RangeImages
 from lidargrit.reporting import Reporter
 from lidargrit.viewer.report_charts import score_chart

@@ -10,11 +10,11 @@ import torch
 from lidargrit import _discovery
 from lidargrit.cli import main
 from lidargrit.errors import ConfigError, DataError, LidarGritError, UnknownNameError
-from lidargrit.evaluation.comparison import Settings, choices, compare_sources
+from lidargrit.evaluation.comparison import EvalConfig, chosen_metrics, compare_sources
 from lidargrit.evaluation.intervals import Resampling
-from lidargrit.evaluation.protocols import Choice, Protocol, load_protocol
+from lidargrit.evaluation.pairs import pair_for_protocol
+from lidargrit.evaluation.protocols import MetricChoice, Protocol, load_protocol
 from lidargrit.evaluation.scorecard import Scorecard, format_value
-from lidargrit.evaluation.sides import open_sides
 from lidargrit.evaluation.tables import published, side_by_side
 from lidargrit.files import write_json
 from lidargrit.loading import DataConfig
@@ -57,7 +57,7 @@ def sets(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def card(sets):
-    return compare_sources(*sets, Settings(metrics=CHEAP))[0]
+    return compare_sources(*sets, EvalConfig(metrics=CHEAP))[0]
 
 
 @pytest.mark.parametrize("name", PROTOCOLS)
@@ -65,7 +65,7 @@ def test_a_protocol_asks_for_what_there_is(name):
     protocol = load_protocol(name.replace("_", "-").upper())
     assert protocol.title
     assert protocol.source
-    for choice in protocol.choices:
+    for choice in protocol.metrics:
         assert choice.variant in load_metric(choice.metric).variants
     sensor = protocol.load_sensor()
     assert (sensor is None) == (name == "exact")
@@ -108,15 +108,15 @@ def test_a_scorecard_tells_all_that_is_needed_to_repeat_it(card):
 
 
 def test_the_same_again_gives_the_same(card, sets):
-    again = compare_sources(*sets, Settings(metrics=CHEAP))[0]
+    again = compare_sources(*sets, EvalConfig(metrics=CHEAP))[0]
     without = [replace(score, seconds=0.0) for score in card.scores]
     assert [replace(score, seconds=0.0) for score in again.scores] == without
     assert again.samples == card.samples
 
 
 def test_no_intervals_where_none_are_wanted(card, sets):
-    plain = compare_sources(*sets, Settings(metrics=CHEAP, resampling=Resampling(halves=0)))[0]
-    assert all(score.interval is None and score.floor is None for score in plain.scores)
+    plain = compare_sources(*sets, EvalConfig(metrics=CHEAP, resampling=Resampling(halves=0)))[0]
+    assert all(score.interval is None and score.real_against_real is None for score in plain.scores)
     assert [s.result.value for s in plain.scores] == pytest.approx([s.result.value for s in card.scores])
     assert "0.0" in plain.as_table()
 
@@ -124,7 +124,7 @@ def test_no_intervals_where_none_are_wanted(card, sets):
 def test_a_metric_that_cannot_be_had_leaves_the_others(monkeypatch, tmp_path, sets):
     monkeypatch.setenv("LIDARGRIT_WEIGHTS", str(tmp_path))
     missing = tmp_path / "none.pth"
-    settings = Settings(
+    settings = EvalConfig(
         metrics=(*CHEAP, "frechet_pointcloud_distance"), weights={"pointnet": missing}, resampling=Resampling(halves=0)
     )
     card = compare_sources(*sets, settings)[0]
@@ -138,53 +138,53 @@ def test_a_metric_that_cannot_be_had_leaves_the_others(monkeypatch, tmp_path, se
 
 
 def test_what_is_not_as_the_protocol_wants_is_told():
-    sides = open_sides(
+    pair = pair_for_protocol(
         "simulated:3:train", "simulated:3:test", load_protocol("lidargrit-kitti-odometry"), DataConfig(max_scans=2)
     )
-    told = " | ".join(sides.deviations)
+    told = " | ".join(pair.deviations)
     assert "2 of the 5,000 scans" in told
     assert "the reference is simulated, not kitti_odometry" in told
     assert "projected by 'exact', not by 'reference'" in told
-    assert len(sides.samples) == len(sides.reference) == 2
-    other = open_sides("simulated:3:train", "simulated:3:test", load_protocol("exact"), DataConfig())
+    assert len(pair.samples) == len(pair.reference) == 2
+    other = pair_for_protocol("simulated:3:train", "simulated:3:test", load_protocol("exact"), DataConfig())
     assert other.deviations == ()
 
 
 def test_returns_outside_the_window_are_none(sets):
-    protocol = Protocol("t", "s", (Choice("sliced_wasserstein"),), range_m=(5.0, 20.0))
-    batch = open_sides(*sets, protocol, DataConfig()).samples.batch([0, 1])
+    protocol = Protocol("t", "s", (MetricChoice("sliced_wasserstein"),), range_m=(5.0, 20.0))
+    batch = pair_for_protocol(*sets, protocol, DataConfig()).samples.batch([0, 1])
     returned = batch.range_m[batch.return_mask]
     assert float(returned.min()) > 5
     assert float(returned.max()) < 20
 
 
 def test_sets_that_overlap_and_roads_that_differ_are_told(sets, tmp_path):
-    plain = Settings(metrics=CHEAP, resampling=Resampling(halves=0))
+    plain = EvalConfig(metrics=CHEAP, resampling=Resampling(halves=0))
     same, _ = compare_sources(sets[0], sets[0], plain)
     assert any("overlap (12 scans are in both)" in warning for warning in same.warnings)
     assert [score.result.value for score in same.scores] == [0.0, 0.0]
     ours = [write_scans(tmp_path / name, 4, 5, variant=name) for name in ("exact", "reference")]
     for samples, differs in zip(ours, (True, False), strict=True):
-        card, sides = compare_sources(samples, sets[1], plain)
+        card, pair = compare_sources(samples, sets[1], plain)
         assert any("different roads" in warning for warning in card.warnings) == differs
-        assert sides.samples.facts().projection == f"unfolding, {'exact' if differs else 'reference'}"
+        assert pair.samples.facts().projection == f"unfolding, {'exact' if differs else 'reference'}"
 
 
 def test_metrics_by_name_take_the_protocols_definitions():
     protocol = load_protocol("r2dm")
-    by_name = choices(protocol, Settings("r2dm", metrics=("bev-jsd", "sliced_wasserstein", "bev_jsd")))
+    by_name = chosen_metrics(protocol, EvalConfig("r2dm", metrics=("bev-jsd", "sliced_wasserstein", "bev_jsd")))
     assert [(c.metric, c.variant) for c in by_name] == [
         ("bev_jsd", "r2dm"),
         ("sliced_wasserstein", "reference"),
         ("sliced_wasserstein", "textbook"),
     ]
-    every = choices(load_protocol("exact"), Settings(metrics=("sliced_wasserstein",)))
+    every = chosen_metrics(load_protocol("exact"), EvalConfig(metrics=("sliced_wasserstein",)))
     assert [c.variant for c in every] == ["reference", "textbook"]
-    assert choices(protocol, Settings("r2dm", variant="exact"))[0].variant == "exact"
+    assert chosen_metrics(protocol, EvalConfig("r2dm", variant="exact"))[0].variant == "exact"
     with pytest.raises(UnknownNameError, match="bev_jsd"):
-        choices(protocol, Settings(metrics=("bev_jds",)))
+        chosen_metrics(protocol, EvalConfig(metrics=("bev_jds",)))
     with pytest.raises(ConfigError, match="0 or more"):
-        Settings(seed=-1)
+        EvalConfig(seed=-1)
 
 
 def test_a_scorecard_is_read_back_and_nothing_else_is(card, tmp_path):
@@ -209,7 +209,7 @@ def test_a_scorecard_is_read_back_and_nothing_else_is(card, tmp_path):
 def as_if(card, protocol, deviations=(), sha256="ab" * 32):
     scores = tuple(
         replace(score, result=replace(score.result, metric=choice.metric, variant=choice.variant))
-        for score, choice in zip(card.scores, load_protocol(protocol).choices, strict=False)
+        for score, choice in zip(card.scores, load_protocol(protocol).metrics, strict=False)
     )
     reference = replace(card.reference, sha256=sha256)
     return replace(card, protocol=protocol, deviations=deviations, scores=scores, reference=reference)
@@ -255,7 +255,7 @@ def test_published_tables_are_whole():
     for table in published():
         protocol = load_protocol(table["protocol"])
         columns = [(column["metric"], column["variant"]) for column in table["columns"]]
-        assert columns == [(choice.metric, choice.variant) for choice in protocol.choices]
+        assert columns == [(choice.metric, choice.variant) for choice in protocol.metrics]
         assert "table" in table["source"]
         assert all(len(row["printed"]) == len(columns) for row in table["rows"])
 
@@ -272,7 +272,19 @@ def test_the_command_line_writes_scores_page_and_table(tmp_path, capsys, sets):
     files = ["--json", str(tmp_path / "s.json"), "--report", str(tmp_path / "s.html")]
     assert main([*words, *files]) == 0
     head, *rows = capsys.readouterr().out.splitlines()
-    assert head.split() == ["metric", "variant", "score", "95", "%", "interval", "floor", "better", "scans"]
+    assert head.split() == [
+        "metric",
+        "variant",
+        "score",
+        "95",
+        "%",
+        "interval",
+        "real",
+        "against",
+        "real",
+        "better",
+        "scans",
+    ]
     assert len(rows) == 2
     assert (tmp_path / "s.html").read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
     assert main(["evaluate", "--tables", str(tmp_path / "s.json"), "--format", "latex"]) == 0

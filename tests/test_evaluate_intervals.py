@@ -8,7 +8,7 @@ import torch
 
 from lidargrit import _discovery
 from lidargrit.errors import ConfigError
-from lidargrit.evaluation.intervals import Part, Resampling, around, blocks, floor_of, interval_of, merged
+from lidargrit.evaluation.intervals import Part, Resampling, around, blocks, interval_of, merged, real_against_real
 from lidargrit.metrics import Metric, load_metric
 from lidargrit.sensors import load_sensor
 from lidargrit.structures import MetricResult, RangeImage
@@ -119,7 +119,7 @@ def test_the_floor_is_the_mean_of_halves_against_halves():
     rng = np.random.default_rng(3)
     numbers = rng.gamma(4, 1, 400)
     groups = blocks(400, 16)
-    found = floor_of(parts(numbers, groups, True), parts(numbers, groups, False), [25] * 16, Resampling())
+    found = real_against_real(parts(numbers, groups, True), parts(numbers, groups, False), [25] * 16, Resampling())
     assert found.num_scans == 200
     assert found.halvings == 5
     assert found.value == pytest.approx(1.0, abs=0.1)
@@ -131,7 +131,7 @@ def test_too_few_scans_have_neither():
     sides = parts(numbers, groups, False), parts(numbers, groups, True)
     result = merged(*sides).compute()
     assert interval_of(result, *sides, Resampling()) is None
-    assert floor_of(sides[1], sides[0], [1, 1], Resampling()) is None
+    assert real_against_real(sides[1], sides[0], [1, 1], Resampling()) is None
 
 
 @pytest.mark.parametrize(("groups", "halves"), [(2, 20), (16, 1), (0, 5)])

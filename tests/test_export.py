@@ -10,12 +10,12 @@ import torch
 from lidargrit.cli import main
 from lidargrit.datasets import open_dataset
 from lidargrit.errors import ConfigError, DataError, OutputError, ScanError, UnknownNameError
-from lidargrit.evaluation.score import open_images
 from lidargrit.export import MANIFEST, export_scans, kinds
 from lidargrit.formats import read_scan
 from lidargrit.loading import DataConfig, prepare
 from lidargrit.projection import unproject
 from lidargrit.sensors import load_sensor
+from lidargrit.sources import open_images
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(512, 8)
 

@@ -10,11 +10,11 @@ import lidargrit
 from lidargrit import project, simulate, unproject
 from lidargrit.cli import main
 from lidargrit.errors import CheckpointError
-from lidargrit.evaluation.samples import read_samples
 from lidargrit.files import read_tensors
 from lidargrit.generators import Generator, load, locate
 from lidargrit.recipes import load_recipe
 from lidargrit.serving import finished_runs
+from lidargrit.sources.samples import read_samples
 from lidargrit.structures import RangeImage
 from lidargrit.training.compute import same_everywhere
 from tiny_runs import the_one_line

@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from lidargrit.errors import CheckpointError, ConfigError
-from lidargrit.evaluation.samples import read_samples, write_samples
 from lidargrit.generators.r2dm import DiffusionSampling, R2dm, R2dmConfig, encode, load_published
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.unet import EfficientUnet, UnetConfig
 from lidargrit.sensors import load_sensor
+from lidargrit.sources.samples import read_samples, write_samples
 from lidargrit.structures import RangeImage
 from reference_unet import SlowUnet
 

@@ -72,9 +72,13 @@ def test_scans_are_nearer_to_the_simulator_that_made_them_than_to_a_coin(simulat
     for score in scores:
         assert score.simulated.value < 0.02
         assert score.simulated.value < score.bernoulli.value
-        assert score.floor.value > score.simulated.value
+        assert score.real_against_real.value > score.simulated.value
         assert score.ratio == score.simulated.value / score.bernoulli.value
-        assert (score.simulated.num_generated, score.floor.num_generated, score.floor.num_reference) == (3, 1, 2)
+        assert (
+            score.simulated.num_generated,
+            score.real_against_real.num_generated,
+            score.real_against_real.num_reference,
+        ) == (3, 1, 2)
 
 
 def test_distances_are_those_of_the_metrics(simulated, recorded, scores):

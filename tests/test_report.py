@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from lidargrit.evaluation.comparison import Settings, compare_sources
-from lidargrit.evaluation.intervals import Floor, Interval
+from lidargrit.evaluation.comparison import EvalConfig, compare_sources
+from lidargrit.evaluation.intervals import Interval, RealAgainstReal
 from lidargrit.evaluation.profiles import matches, profile
 from lidargrit.evaluation.scorecard import LeftOut, Score
 from lidargrit.projection import points_of_pixels
@@ -31,7 +31,7 @@ def _cache(tmp_path_factory):
 @pytest.fixture(scope="module")
 def evaluated():
     # Of real streets only a few: simulating them takes most of the time.
-    return compare_sources("simulated:4:train", "simulated:4:test", Settings(metrics=("return_rate_per_ring",)))
+    return compare_sources("simulated:4:train", "simulated:4:test", EvalConfig(metrics=("return_rate_per_ring",)))
 
 
 class Reader(HTMLParser):
@@ -96,7 +96,7 @@ def test_the_page_can_be_heard_and_walked(evaluated):
 
 
 def test_whatever_comes_from_outside_is_escaped(evaluated):
-    card, sides = evaluated
+    card, pair = evaluated
     bad = replace(card.samples, source=EVIL, split=EVIL, sensor=EVIL)
     evil = replace(
         card,
@@ -109,7 +109,7 @@ def test_whatever_comes_from_outside_is_escaped(evaluated):
         settings={EVIL: EVIL},
         scores=(replace(card.scores[0], result=replace(card.scores[0].result, variant=EVIL)),),
     )
-    text = page(evil, sides)
+    text = page(evil, pair)
     assert "<script" not in text
     assert "alert(" in text
     assert "script" not in read(text).tags
@@ -117,7 +117,7 @@ def test_whatever_comes_from_outside_is_escaped(evaluated):
 
 def test_a_chart_puts_marks_where_the_numbers_are():
     result = MetricResult("bev_jsd", 0.2, False, 9, 9, "exact")
-    drawn = score_chart(Score(result, Interval(0.1, 0.3, 0.05, 20), Floor(0.4, 4, 5)))
+    drawn = score_chart(Score(result, Interval(0.1, 0.3, 0.05, 20), RealAgainstReal(0.4, 4, 5)))
     assert 'aria-label="score 0.2000, 95 % interval 0.1000 to 0.3000, floor 0.4000"' in drawn
     assert 'cx="160.0"' in drawn  # half-way between 0, at 10, and the largest mark, the floor, at 310
     assert 'class="interval" x1="85.0"' in drawn
@@ -143,15 +143,15 @@ def test_profiles_are_means_by_a_slow_loop(evaluated):
 
 
 def test_a_scan_is_its_own_nearest(evaluated):
-    sides = evaluated[1]
-    found = matches(sides.samples, sides.samples)
+    pair = evaluated[1]
+    found = matches(pair.samples, pair.samples)
     assert [match.distance for match in found] == [0.0] * 4
     assert all(match.generated == match.real for match in found)
-    other = matches(sides.samples, sides.reference)
+    other = matches(pair.samples, pair.reference)
     assert [match.distance for match in other] == sorted(match.distance for match in other)
-    rows = torch.linspace(0, sides.samples.images.sensor.height - 1, 32).round().long()
-    columns = torch.linspace(0, sides.samples.images.sensor.width - 1, 128).round().long()
+    rows = torch.linspace(0, pair.samples.images.sensor.height - 1, 32).round().long()
+    columns = torch.linspace(0, pair.samples.images.sensor.width - 1, 128).round().long()
     pair = [side.batch([place])[0].range_m for side, place in
-            ((sides.samples, other[0].generated), (sides.reference, other[0].real))]  # fmt: skip
+            ((pair.samples, other[0].generated), (pair.reference, other[0].real))]  # fmt: skip
     apart = [torch.log2(1 + one[rows][:, columns]) for one in pair]
     assert other[0].distance == pytest.approx(float((apart[0] - apart[1]).abs().mean()), rel=1e-4)

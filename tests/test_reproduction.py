@@ -65,7 +65,7 @@ def test_a_killed_reproduction_goes_on_and_ends_with_the_table(tmp_path, capsys)
     assert "the paper's row 'with both' is measured by ablation_both_small" in told.out
 
     # The killed run went on as if it had not been.
-    recipe = load_recipe("ablation_raydrop_small", reproduction_of(folder).contest().recipe_settings)
+    recipe = load_recipe("ablation_raydrop_small", reproduction_of(folder).benchmark().recipe_settings)
     train(recipe, tmp_path / "whole")
     weights = [
         (run / "model.safetensors").read_bytes() for run in (tmp_path / "whole", folder / "runs" / second.parts[-3])
@@ -97,11 +97,11 @@ def test_images_are_those_that_the_protocol_wants(number):
     protocol = load_protocol(TABLES[number].protocol)
     wanted = Reproduction(number, "root")
     for system in wanted.systems().values():
-        data = load_recipe(system, wanted.contest().recipe_settings).data
+        data = load_recipe(system, wanted.benchmark().recipe_settings).data
         assert data.load_sensor().same_rays(protocol.load_sensor())
         assert data.projection_variant == protocol.variant
-    assert wanted.contest().num_samples == protocol.num_scans
-    assert wanted.contest().settings.metrics == ()
+    assert wanted.benchmark().num_samples == protocol.num_scans
+    assert wanted.benchmark().settings.metrics == ()
 
 
 def test_a_plan_tells_scans_cost_and_what_is_missing(tmp_path, capsys, monkeypatch):

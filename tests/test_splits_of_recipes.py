@@ -64,10 +64,10 @@ def test_train_val_and_test_share_no_scan_and_no_drive(recipe, roots):
 @pytest.mark.parametrize("number", TABLES)
 def test_a_reproduction_takes_the_very_splits_of_its_recipes(number):
     wanted = Reproduction(number, "ROOT")
-    assert wanted.contest().reference == f"{TABLES[number].data_set}:ROOT:test"
+    assert wanted.benchmark().reference == f"{TABLES[number].data_set}:ROOT:test"
     assert "test" in load_protocol(TABLES[number].protocol).splits
     for recipe in wanted.systems().values():
-        own, taken = load_recipe(recipe).data, load_recipe(recipe, wanted.contest().recipe_settings).data
+        own, taken = load_recipe(recipe).data, load_recipe(recipe, wanted.benchmark().recipe_settings).data
         for mine, theirs in ((own.train, taken.train), (own.val, taken.val)):
             assert [source.rpartition(":")[2] for source in mine] == [s.rpartition(":")[2] for s in theirs]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import importlib
-import importlib.util
 import pkgutil
 from pathlib import Path
 from typing import Any, TypeVar
@@ -46,10 +45,9 @@ def load_instance(package: str, name: str, base: type[T]) -> T:
 
 
 def _folder(package: str) -> Path:
-    spec = importlib.util.find_spec(f"lidargrit.{package}")
-    folders = spec.submodule_search_locations if spec else None
-    assert folders, package
-    return Path(folders[0])
+    folder = Path(__file__).parent.joinpath(*package.split("."))  # importlib would import the packages above it
+    assert folder.is_dir(), package
+    return folder
 
 
 def _the_one(package: str, name: str, fits: Any) -> Any:

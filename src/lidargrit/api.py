@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lidargrit import formats
-from lidargrit.evaluation.comparison import Settings, compare_sources
+from lidargrit.evaluation.comparison import EvalConfig, compare_sources
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.formats import BadPoints
 from lidargrit.generators import load
@@ -47,5 +47,5 @@ def evaluate(
     Returns:
         scores with intervals and floors; ``print(card.as_table())``, or each of ``card.scores``.
     """
-    settings = Settings(protocol=protocol, metrics=tuple(metrics), max_scans=max_scans)
+    settings = EvalConfig(protocol=protocol, metrics=tuple(metrics), max_scans=max_scans)
     return compare_sources(generated, reference, settings)[0]

@@ -8,8 +8,10 @@ from typing import Any
 from lidargrit import _discovery
 
 KINDS = {kind: kind for kind in ("datasets", "formats", "sensors", "tokenizers", "generators", "metrics")}
-KINDS |= {kind: f"evaluation.{kind}" for kind in ("protocols", "dialects")} | {"recipes": "recipes"}
-"""Each kind as a user calls it, and the folder that holds it."""
+KINDS |= {"protocols": "evaluation.protocols", "sample-formats": "sources.sample_formats", "recipes": "recipes"}
+"""Each kind as a user types it, and the folder that defines it."""
+FORMER_KINDS = {"dialects": "sample-formats"}
+"""Former names of kinds, which still work, and their names of today."""
 
 
 def entries(kind: str, in_full: bool = False) -> list[dict[str, Any]]:

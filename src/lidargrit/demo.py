@@ -15,18 +15,17 @@ from lidargrit.configuration import override
 from lidargrit.datasets import open_dataset
 from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import DataError
-from lidargrit.evaluation.comparison import Settings, compare_sides
+from lidargrit.evaluation.comparison import EvalConfig, compare_pair
 from lidargrit.evaluation.intervals import Resampling
-from lidargrit.evaluation.reconstruction import ReconstructionErrors
-from lidargrit.evaluation.samples import read_samples, write_samples
-from lidargrit.evaluation.score import score_reconstruction
+from lidargrit.evaluation.pairs import EvalPair, EvalSet
+from lidargrit.evaluation.reconstruction import ReconstructionErrors, score_reconstruction
 from lidargrit.evaluation.scorecard import Scorecard
-from lidargrit.evaluation.sides import Side, Sides
 from lidargrit.files import read_json, write_json
 from lidargrit.generators import Generator, load_class
 from lidargrit.loading import DataConfig, Pixels, Provenance, RangeImages, load_range_images
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
+from lidargrit.sources.samples import read_samples, write_samples
 from lidargrit.structures import RangeImage
 from lidargrit.training import check_folder, train
 from lidargrit.viewer import plot_comparison
@@ -170,14 +169,13 @@ def _cards(
     single.learn(real)
     count = min(len(samples), len(real))
     pixels = RangeImages(real.sensor, [_Drawn(single.sample(range(count)))])
-    plain = Settings(resampling=Resampling(halves=0))
+    plain = EvalConfig(resampling=Resampling(halves=0))
     cards = []
-    for name, images, settings in (("samples", samples, Settings()), ("val", val, plain), ("marginal", pixels, plain)):
+    for name, images, config in (("samples", samples, EvalConfig()), ("val", val, plain), ("marginal", pixels, plain)):
         some = min(count, len(images))
-        sides = Sides(
-            Side(name, images, evenly_spaced(some, len(images))), Side("train", real, evenly_spaced(some, len(real)))
-        )
-        cards.append(compare_sides(sides, settings, reporter if name == "samples" else None))
+        reference = EvalSet("train", real, evenly_spaced(some, len(real)))
+        pair = EvalPair(EvalSet(name, images, evenly_spaced(some, len(images))), reference)
+        cards.append(compare_pair(pair, config, reporter if name == "samples" else None))
     return cards[0], cards[1], cards[2]
 
 

@@ -13,13 +13,13 @@ from lidargrit import _discovery, formats
 from lidargrit.datasets import ScanDataset, open_dataset
 from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import DataError, OutputError, ScanError, UnknownNameError, nearest_names
-from lidargrit.evaluation.score import holds_images, open_images
 from lidargrit.files import atomic_path, claim_folder, is_taken, read_json, write_json
 from lidargrit.formats import ScanFormat
 from lidargrit.formats.kitti_bin import KittiBin
 from lidargrit.loading import DataConfig, RangeImages
 from lidargrit.projection import unproject
 from lidargrit.reporting import Reporter
+from lidargrit.sources import holds_images, open_images
 from lidargrit.structures import Scan
 
 MANIFEST = "export.json"

@@ -16,8 +16,8 @@ import pytest
 
 from lidargrit import reporting
 from lidargrit.cli import main
-from lidargrit.evaluation.samples import read_samples
 from lidargrit.files import read_tensors
+from lidargrit.sources.samples import read_samples
 from tiny_runs import LONG, contents, the_one_line, train_words
 
 
@@ -200,7 +200,7 @@ def test_a_full_disk_while_logging(tmp_path, interrupt):
 KILLER = """
 import os, random, signal, sys, time
 import lightning_fabric, safetensors.torch
-import lidargrit.cli, lidargrit.evaluation.samples, lidargrit.generators.lidargrit
+import lidargrit.cli, lidargrit.sources.samples, lidargrit.generators.lidargrit
 import lidargrit.recipes, lidargrit.training
 
 rng = random.Random(int(sys.argv[1]))

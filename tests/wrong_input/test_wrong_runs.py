@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from lidargrit.cli import main
-from lidargrit.evaluation.samples import read_samples
 from lidargrit.loading import DataConfig, load_range_images
+from lidargrit.sources.samples import read_samples
 from tiny_runs import the_one_line, train_words
 
 

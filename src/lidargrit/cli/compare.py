@@ -33,19 +33,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Hold the contest and print the table."""
-    from lidargrit.evaluation.comparison import Settings
-    from lidargrit.evaluation.contest import Contest, as_json, as_table, hold
+    """Run the benchmark and print the table."""
+    from lidargrit.evaluation.benchmark import Benchmark, as_json, as_table
+    from lidargrit.evaluation.benchmark import run as run_benchmark
+    from lidargrit.evaluation.comparison import EvalConfig
     from lidargrit.reporting import TerminalReporter
 
     refuse_taken(options)
-    contest = Contest(
+    benchmark = Benchmark(
         reference=options.against,
         num_samples=options.count,
-        settings=Settings(protocol=options.protocol, metrics=tuple(options.metrics)),
+        settings=EvalConfig(protocol=options.protocol, metrics=tuple(options.metrics)),
         recipe_settings=tuple(options.set),
         flops=options.flops,
         batch_size=options.batch_size,
     )
-    scores = hold(options.systems, options.out, contest, TerminalReporter())
+    scores = run_benchmark(options.systems, options.out, benchmark, TerminalReporter())
     tell(options, as_table(scores, options.format), as_json(scores))

@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Reproduce, or tell the plan."""
-    from lidargrit.evaluation.contest import as_json
+    from lidargrit.evaluation.benchmark import as_json
     from lidargrit.evaluation.reproduction import Reproduction, plan, plan_as_text, reproduce, table_of
     from lidargrit.reporting import TerminalReporter
 

@@ -35,11 +35,11 @@ def run(options: argparse.Namespace) -> None:
 
     from lidargrit.configuration import override
     from lidargrit.errors import ConfigError
-    from lidargrit.evaluation.samples import write_samples
     from lidargrit.generators import load, locate
     from lidargrit.nn.devices import usable_device
     from lidargrit.processes import rank_and_world_size
     from lidargrit.reporting import TerminalReporter
+    from lidargrit.sources.samples import write_samples
 
     if options.count < 1 or options.batch_size < 1 or options.seed < 0:
         raise ConfigError(

@@ -9,11 +9,11 @@ from typing import Any
 
 from lidargrit import _discovery
 from lidargrit.errors import ConfigError, nearest_names
-from lidargrit.evaluation.comparison import Settings, compare_sources
+from lidargrit.evaluation.comparison import EvalConfig, compare_sources
 from lidargrit.evaluation.intervals import Resampling
-from lidargrit.evaluation.score import evaluate_run
+from lidargrit.evaluation.pairs import EvalPair
+from lidargrit.evaluation.reconstruction import evaluate_run
 from lidargrit.evaluation.scorecard import Scorecard
-from lidargrit.evaluation.sides import Sides
 from lidargrit.files import refuse_to_overwrite
 from lidargrit.generators import is_run, locate
 from lidargrit.loading import DataConfig
@@ -23,7 +23,7 @@ from lidargrit.reporting import Reporter
 
 
 def evaluate(
-    options: Namespace, reporter: Reporter, write_report: Callable[[Scorecard, Sides, Path], None]
+    options: Namespace, reporter: Reporter, write_report: Callable[[Scorecard, EvalPair, Path], None]
 ) -> tuple[str, dict[str, Any]]:
     """Score as the options say, write the report if they name one, and return the result for people and for programs.
 
@@ -38,17 +38,17 @@ def evaluate(
     usable_device(settings.device)
     if is_run(locate(options.samples)):
         return _run(options, settings, reporter)
-    card, sides = compare_sources(options.samples, options.reference, settings, reporter)
-    for warning in card.warnings[len(sides.warnings) :]:
+    card, pair = compare_sources(options.samples, options.reference, settings, reporter)
+    for warning in card.warnings[len(pair.warnings) :]:
         reporter.message(f"WARNING: {warning}")
     if options.report:
-        write_report(card, sides, options.report)
+        write_report(card, pair, options.report)
     return card.as_table(), card.to_json()
 
 
-def settings_of(options: Namespace) -> Settings:
+def settings_of(options: Namespace) -> EvalConfig:
     """Return the settings that a user's words name."""
-    return Settings(
+    return EvalConfig(
         protocol=options.protocol,
         metrics=tuple(options.metrics),
         variant=options.variant,
@@ -82,7 +82,7 @@ def weights_of(words: list[str]) -> dict[str, Path]:
     return files
 
 
-def _run(options: Namespace, settings: Settings, reporter: Reporter) -> tuple[str, dict[str, Any]]:
+def _run(options: Namespace, settings: EvalConfig, reporter: Reporter) -> tuple[str, dict[str, Any]]:
     config = DataConfig(
         max_scans=settings.max_scans,
         projection_variant=settings.projection_variant or "exact",

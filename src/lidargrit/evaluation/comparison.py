@@ -13,22 +13,22 @@ from typing import Any
 
 from lidargrit import __version__, _discovery
 from lidargrit.errors import ConfigError, LidarGritError, ScanError, nearest_names
-from lidargrit.evaluation.intervals import Part, Resampling, blocks, floor_of, interval_of, merged
-from lidargrit.evaluation.protocols import DEFAULT, Choice, Protocol, load_protocol, public_name
+from lidargrit.evaluation.intervals import Part, Resampling, blocks, interval_of, merged, real_against_real
+from lidargrit.evaluation.pairs import EvalPair, EvalSet, pair_for_protocol
+from lidargrit.evaluation.protocols import DEFAULT, MetricChoice, Protocol, load_protocol, public_name
 from lidargrit.evaluation.scorecard import LeftOut, Score, Scorecard
-from lidargrit.evaluation.sides import Side, Sides, open_sides
 from lidargrit.loading import DataConfig
 from lidargrit.metrics import Metric, load_metric
 from lidargrit.projection import Variant
 from lidargrit.reporting import Reporter
 
 _BATCH = 16
-_FEW = 100  # scans: below that the interval itself rests on too little, and most metrics are mostly floor
+_FEW = 100  # scans: below that the interval itself rests on too little, and values hardly differ from real against real
 _ORDER_MATTERS = frozenset({"sliced_wasserstein"})  # its program draws patches batch by batch: parts draw others
 
 
 @dataclass(frozen=True)
-class Settings:
+class EvalConfig:
     """How two sets are compared.
 
     Args:
@@ -38,9 +38,9 @@ class Settings:
         projection_variant: of real scans, in place of the protocol's.
         max_scans: of each set at most; 0 for the protocol's.
         seed: of whatever a metric draws.
-        resampling: of intervals and floors.
+        resampling: how intervals and real against real are computed.
         weights: files by the name of their network.
-        samples_format: the dialect of a folder of tensors.
+        samples_format: the sample_format of a folder of tensors.
         device: where networks compute.
         data: how scans are read.
     """
@@ -78,8 +78,8 @@ class Settings:
 
 
 def compare_sources(
-    samples: str, reference: str, settings: Settings | None = None, reporter: Reporter | None = None
-) -> tuple[Scorecard, Sides]:
+    samples: str, reference: str, settings: EvalConfig | None = None, reporter: Reporter | None = None
+) -> tuple[Scorecard, EvalPair]:
     """Score a folder of samples, or any source of scans, against another.
 
     Args:
@@ -93,35 +93,35 @@ def compare_sources(
         UnknownNameError: no such protocol or metric.
         LidarGritError: not one metric could be computed; what the first said.
     """
-    settings, reporter = settings or Settings(), reporter or Reporter()
-    sides = open_both(samples, reference, settings, reporter)
-    return compare_sides(sides, settings, reporter), sides
+    settings, reporter = settings or EvalConfig(), reporter or Reporter()
+    pair = open_pair(samples, reference, settings, reporter)
+    return compare_pair(pair, settings, reporter), pair
 
 
-def open_both(samples: str, reference: str, settings: Settings, reporter: Reporter) -> Sides:
+def open_pair(samples: str, reference: str, settings: EvalConfig, reporter: Reporter) -> EvalPair:
     """Open the two sets of :func:`compare_sources`, and say what there is to say against comparing them."""
     protocol = load_protocol(settings.protocol)
-    choices(protocol, settings)  # refuses unknown names before scans are projected
+    chosen_metrics(protocol, settings)  # refuses unknown names before scans are projected
     variant = settings.projection_variant or protocol.variant
     config = replace(settings.data, projection_variant=variant, max_scans=settings.max_scans)
-    sides = open_sides(samples, reference, protocol, config, settings.samples_format, reporter)
-    for warning in sides.warnings:
+    pair = pair_for_protocol(samples, reference, protocol, config, settings.samples_format, reporter)
+    for warning in pair.warnings:
         reporter.message(f"WARNING: {warning}")
-    return sides
+    return pair
 
 
-def compare_sides(sides: Sides, settings: Settings, reporter: Reporter | None = None) -> Scorecard:
+def compare_pair(pair: EvalPair, settings: EvalConfig, reporter: Reporter | None = None) -> Scorecard:
     """Score two opened sets, one metric after the other, so that only one's memory is held."""
     reporter, protocol = reporter or Reporter(), load_protocol(settings.protocol)
     scores: list[Score] = []
     left_out: list[LeftOut] = []
     errors: list[LidarGritError] = []
-    wanted = choices(protocol, settings)
-    with reporter.progress("scoring", 2 * len(sides.samples) * len(wanted)) as progress:
+    wanted = chosen_metrics(protocol, settings)
+    with reporter.progress("scoring", 2 * len(pair.samples) * len(wanted)) as progress:
         for choice in wanted:
             heard = partial(progress.advance, note=choice.metric)
             try:
-                scores.append(_score(choice, sides, settings, reporter, heard))
+                scores.append(_score(choice, pair, settings, reporter, heard))
             except ScanError:  # a damaged file, which spoils all metrics alike
                 raise
             except LidarGritError as error:  # no weights, no reflectance, too few scans: the others may do without
@@ -129,7 +129,7 @@ def compare_sides(sides: Sides, settings: Settings, reporter: Reporter | None = 
                 left_out.append(LeftOut(choice.metric, choice.variant, str(error)))
     if errors and not scores:
         raise errors[0]
-    warnings = [*sides.warnings, *_doubts(sides, scores, settings.resampling)]
+    warnings = [*pair.warnings, *_doubts(pair, scores, settings.resampling)]
     return Scorecard(
         public_name(settings.protocol),
         {
@@ -140,11 +140,11 @@ def compare_sides(sides: Sides, settings: Settings, reporter: Reporter | None = 
             "data_set": protocol.data_set,
             "departures": list(protocol.departures),
         },
-        sides.samples.facts(),
-        sides.reference.facts(),
+        pair.samples.facts(),
+        pair.reference.facts(),
         tuple(scores),
         tuple(left_out),
-        sides.deviations,
+        pair.deviations,
         tuple(warnings),
         settings.facts(),
         {
@@ -155,68 +155,72 @@ def compare_sides(sides: Sides, settings: Settings, reporter: Reporter | None = 
     )
 
 
-def choices(protocol: Protocol, settings: Settings) -> list[Choice]:
+def chosen_metrics(protocol: Protocol, settings: EvalConfig) -> list[MetricChoice]:
     """Return what is to be computed: the protocol's numbers, or those of the metrics that the user named.
 
     Raises:
         UnknownNameError: a metric that the user named and nobody has.
         ConfigError: a variant that none of the metrics has.
     """
-    wanted = list(protocol.choices)
+    wanted = list(protocol.metrics)
     if settings.metrics:
         wanted = []
         for name in map(public_name, settings.metrics):
             cls = load_metric(name)
-            its_own = [choice for choice in protocol.choices if choice.metric == name]
+            its_own = [choice for choice in protocol.metrics if choice.metric == name]
             # Of the default protocol all definitions are shown: whoever asks for one metric wants to see them.
-            every = [Choice(name, variant) for variant in cls.variants]
+            every = [MetricChoice(name, variant) for variant in cls.variants]
             wanted += every if public_name(settings.protocol) == DEFAULT or not its_own else its_own
     if settings.variant:
         _require_known(settings.variant, wanted)
         wanted = [replace(choice, variant=settings.variant) for choice in wanted]
-    kept: list[Choice] = []
+    kept: list[MetricChoice] = []
     for choice in wanted:
         if choice not in kept:
             kept.append(choice)
     return kept
 
 
-def _require_known(variant: str, wanted: Sequence[Choice]) -> None:
+def _require_known(variant: str, wanted: Sequence[MetricChoice]) -> None:
     """Refuse a variant that no wanted metric has; where some have it, the others are left out and say so."""
     known = {name for choice in wanted for name in load_metric(choice.metric).variants}
     if variant not in known:
         raise ConfigError(f"variant {variant!r}", f"one such as {nearest_names(variant, known)}", "choose one of these")
 
 
-def _score(choice: Choice, sides: Sides, settings: Settings, reporter: Reporter, heard: Callable[[int], None]) -> Score:
-    """Compute one number with its interval and floor."""
+def _score(
+    choice: MetricChoice, pair: EvalPair, settings: EvalConfig, reporter: Reporter, heard: Callable[[int], None]
+) -> Score:
+    """Compute one number with its interval and its reference row."""
     begun, resampling = time.perf_counter(), settings.resampling
     make, options = _maker(choice, settings, reporter)
     make()  # a variant that it does not have, or weights that are not there, are told before scans are read
-    groups = blocks(len(sides.samples), resampling.groups if resampling.halves else 1)
-    generated = [Part(_fed(make(), sides.samples, group, heard)) for group in groups]
+    groups = blocks(len(pair.samples), resampling.groups if resampling.halves else 1)
+    generated = [Part(_fed(make(), pair.samples, group, heard)) for group in groups]
     real, real_as_generated = [], []
     for group in groups:
         metric, again = make(), make() if resampling.halves else None
-        _fed(metric, sides.reference, group, heard, real=True, also_as_generated=again)
+        _fed(metric, pair.reference, group, heard, real=True, also_as_generated=again)
         real.append(Part(metric))
         real_as_generated += [] if again is None else [Part(again)]
     if choice.metric in _ORDER_MATTERS and len(groups) > 1:
         whole = make()
-        _fed(whole, sides.samples, range(len(sides.samples)))
-        _fed(whole, sides.reference, range(len(sides.reference)), real=True)
+        _fed(whole, pair.samples, range(len(pair.samples)))
+        _fed(whole, pair.reference, range(len(pair.reference)), real=True)
         result = whole.compute()
         del whole
     else:
         result = merged(generated, real).compute()
-    interval = floor = None
+    interval = reference_row = None
     if resampling.halves:
         interval = interval_of(result, generated, real, resampling)
-        floor = floor_of(real, real_as_generated, [len(group) for group in groups], resampling)
-    return Score(result, interval, floor, options, time.perf_counter() - begun)
+        reference_row = real_against_real(real, real_as_generated, [len(group) for group in groups], resampling)
+    return Score(result, interval, reference_row, options, time.perf_counter() - begun)
 
 
-def _maker(choice: Choice, settings: Settings, reporter: Reporter) -> tuple[Callable[[], Metric], dict[str, Any]]:
+def _maker(
+    choice: MetricChoice, settings: EvalConfig, reporter: Reporter
+) -> tuple[Callable[[], Metric], dict[str, Any]]:
     """Return what makes an empty metric, and its options as they are told."""
     if choice.metric not in _discovery.names("metrics"):
         raise ConfigError(f"the metric {choice.metric!r}", "one that this version has", "see: lidargrit list metrics")
@@ -230,7 +234,7 @@ def _maker(choice: Choice, settings: Settings, reporter: Reporter) -> tuple[Call
 
 def _fed(
     metric: Metric,
-    side: Side,
+    side: EvalSet,
     places: Sequence[int],
     heard: Callable[[int], None] | None = None,
     *,
@@ -248,12 +252,12 @@ def _fed(
     return metric
 
 
-def _doubts(sides: Sides, scores: Sequence[Score], resampling: Resampling) -> list[str]:
+def _doubts(pair: EvalPair, scores: Sequence[Score], resampling: Resampling) -> list[str]:
     """Return what is to be said against the numbers themselves."""
     found = []
-    count = len(sides.samples)
+    count = len(pair.samples)
     if count < _FEW:
-        found.append(f"{count} scans of each set: values are mostly floor, and intervals rest on little")
+        found.append(f"{count} scans of each set: too few to tell from real against real, and intervals rest on little")
     if resampling.halves and any(score.interval is None for score in scores):
         without = [score.result.metric for score in scores if score.interval is None]
         found.append(f"too few scans for the intervals of {', '.join(dict.fromkeys(without))}")

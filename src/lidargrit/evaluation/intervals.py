@@ -1,4 +1,4 @@
-"""How far a score would move with other scans: parts of two sets → 95 % interval, and the floor of the reference.
+"""How far a score would move with other scans: parts of two sets → 95 % interval, and real against real.
 
 A set is cut into groups of neighbouring scans, and each group is fed to a metric of its own. Random halves of the
 groups of both sets, taken without replacement, are merged and computed. The spread of these values about their mean is
@@ -44,7 +44,7 @@ class Resampling:
 
     Args:
         groups: into which each set is cut, 4 or more; fewer where there are fewer scans.
-        halves: random halves from which the standard error is taken; 0 for no interval and no floor.
+        halves: random halves from which the standard error is taken; 0 for neither interval nor real against real.
         seed: of the choice of halves, the same for every metric.
     """
 
@@ -80,12 +80,12 @@ class Interval:
 
 
 @dataclass(frozen=True)
-class Floor:
+class RealAgainstReal:
     """What a perfect generator would score: one half of the reference against the other.
 
     Args:
         value: mean over halvings.
-        num_scans: in each half. Most metrics fall as sets grow, so the floor of the whole sets is a little lower.
+        num_scans: in each half. Most metrics fall as sets grow, so that of the whole sets is a little lower.
         halvings: how many there were.
     """
 
@@ -130,7 +130,7 @@ class Part:
 
 
 def merged(generated: Sequence[Part], real: Sequence[Part]) -> Metric:
-    """Return a new metric that has seen what the parts of both sides have seen, in their order."""
+    """Return a new metric that has seen what the parts of both pair have seen, in their order."""
     whole = real[0].copy()
     for part in (*generated, *real[1:]):
         whole.merge(part.metric())
@@ -177,12 +177,12 @@ def around(result: MetricResult, half_values: Sequence[float], groups: int) -> I
     return Interval(low, min(high, _HIGHEST.get(result.metric, math.inf)), error, len(half_values))
 
 
-def floor_of(
+def real_against_real(
     real: Sequence[Part],
     real_as_generated: Sequence[Part],
     sizes: Sequence[int],
     resampling: Resampling,
-) -> Floor | None:
+) -> RealAgainstReal | None:
     """Return the mean score of one half of the reference against the other; None if there are too few scans.
 
     Args:
@@ -204,4 +204,4 @@ def floor_of(
         except DataError:
             return None
         scans.append(sum(sizes[index] for index in half))
-    return Floor(float(np.mean(values)), min(scans), _HALVINGS)
+    return RealAgainstReal(float(np.mean(values)), min(scans), _HALVINGS)

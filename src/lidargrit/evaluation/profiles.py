@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Float64
 
 from lidargrit.determinism import evenly_spaced
-from lidargrit.evaluation.sides import Side
+from lidargrit.evaluation.pairs import EvalSet
 from lidargrit.projection import points_of_pixels
 
 HALF_VIEW_M = 50.0  # beyond it a 64-row sensor sees little but walls
@@ -53,7 +53,7 @@ class Match:
 
 
 @torch.no_grad()
-def profile(side: Side) -> Profile:
+def profile(side: EvalSet) -> Profile:
     """Return the means over all compared scans of a set."""
     sensor = side.images.sensor
     total = torch.zeros(sensor.height, sensor.width, dtype=torch.float64)
@@ -71,7 +71,7 @@ def profile(side: Side) -> Profile:
     return Profile(mean.numpy(), (returns / len(side)).numpy(), (cells / len(side)).view(_CELLS, _CELLS).numpy())
 
 
-def matches(samples: Side, reference: Side) -> list[Match]:
+def matches(samples: EvalSet, reference: EvalSet) -> list[Match]:
     """Return the nearest reference scan of every generated one, the most alike first.
 
     Of many scans 500 generated and 2,000 real ones are compared, evenly spaced.
@@ -86,7 +86,7 @@ def matches(samples: Side, reference: Side) -> list[Match]:
     return sorted(found, key=lambda match: match.distance)
 
 
-def _outlines(side: Side, places: list[int]) -> Float[torch.Tensor, "n pixels"]:
+def _outlines(side: EvalSet, places: list[int]) -> Float[torch.Tensor, "n pixels"]:
     """Return some pixels of each scan, as logarithms: a metre matters more nearby."""
     sensor = side.images.sensor
     rows = torch.linspace(0, sensor.height - 1, _ROWS).round().long()

@@ -11,12 +11,12 @@ import torch
 
 from lidargrit.datasets import open_dataset
 from lidargrit.errors import ConfigError, DataError
-from lidargrit.evaluation.score import open_images
 from lidargrit.loading import DataConfig, RangeImages
 from lidargrit.metrics import load_metric
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel, load_sensor
 from lidargrit.simulator import Observation, observe
+from lidargrit.sources import open_images
 from lidargrit.structures import MetricResult, RangeImage
 
 CURVES = (
@@ -54,12 +54,12 @@ class CurveScore:
     Args:
         simulated: from simulated scans, the generated side of the result.
         bernoulli: from clean simulated ranges with each return dropped by a coin of one constant rate.
-        floor: the first half of the real scans from the second: how much real scans differ.
+        real_against_real: from the second half of the real scans to the first, which tells how much real scans differ.
     """
 
     simulated: MetricResult
     bernoulli: MetricResult
-    floor: MetricResult
+    real_against_real: MetricResult
 
     @property
     def ratio(self) -> float:
@@ -193,7 +193,8 @@ def _distance(
 
 def as_json(scores: Sequence[CurveScore]) -> list[dict[str, Any]]:
     """Return scores with their curves for a file."""
-    return [{**asdict(score), "ratio": score.ratio} for score in scores]
+    facts = [{**asdict(score), "ratio": score.ratio} for score in scores]
+    return [{"floor" if name == "real_against_real" else name: of for name, of in each.items()} for each in facts]
 
 
 def as_table(scores: Sequence[CurveScore]) -> str:
@@ -201,5 +202,5 @@ def as_table(scores: Sequence[CurveScore]) -> str:
     lines = [f"{'distance of real scans from':<28}{'simulated':>10}{'coin':>10}{'ratio':>8}{'real':>10}"]
     for score in scores:
         values = f"{score.simulated.value:>10.4f}{score.bernoulli.value:>10.4f}{score.ratio:>8.2f}"
-        lines.append(f"{score.simulated.metric:<28}{values}{score.floor.value:>10.4f}")
+        lines.append(f"{score.simulated.metric:<28}{values}{score.real_against_real.value:>10.4f}")
     return "\n".join(lines)

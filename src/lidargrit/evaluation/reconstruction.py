@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from lidargrit.errors import ConfigError, DataError, ScanError
+from lidargrit.generators import load
+from lidargrit.loading import DataConfig, RangeImages
+from lidargrit.reporting import Reporter
+from lidargrit.sources import open_images, warn_of_overlap
 from lidargrit.structures import RangeImage
+from lidargrit.tokenizers import Tokenizer
+
+_BATCH = 16
 
 
 @dataclass(frozen=True)
@@ -59,7 +67,7 @@ class ReconstructionScore:
             return_mask: which pixels it decoded as a return.
 
         Raises:
-            ConfigError: the two sides differ in shape.
+            ConfigError: the two pair differ in shape.
             ScanError: a decoded range is not a number where the real scan has a return.
         """
         if not real.range_m.shape == clean_range_m.shape == return_mask.shape:
@@ -116,6 +124,30 @@ class ReconstructionScore:
 
 def _share(part: int, whole: int) -> float:
     return part / whole if whole else 1.0
+
+
+@torch.no_grad()
+def score_reconstruction(tokenizer: Tokenizer, images: RangeImages) -> ReconstructionErrors:
+    """Return how well a tokenizer gives back every scan of a set, its mask decoded by threshold."""
+    score = ReconstructionScore()
+    for first in range(0, len(images), _BATCH):
+        batch = images.batch(range(first, min(first + _BATCH, len(images))))
+        clean = tokenizer.decode(tokenizer.encode(batch))
+        score.update(batch, clean.range_m, clean.return_logits >= 0)
+    return score.compute()
+
+
+def evaluate_run(run_folder: Path, source: str, config: DataConfig, reporter: Reporter) -> dict[str, float]:
+    """Return how well the tokenizer of a finished run gives back scans, by the name of each error.
+
+    Raises:
+        ConfigError: a run whose generator has no tokenizer.
+    """
+    generator = load(run_folder)
+    tokenizer = generator.get_tokenizer()
+    images = open_images(source, generator.sensor, config, reporter)
+    warn_of_overlap(str(run_folder), None, images, reporter)
+    return asdict(score_reconstruction(tokenizer, images))
 
 
 # The measures of monocular depth estimation (Eigen et al., Depth map prediction from a single image, NeurIPS 2014,

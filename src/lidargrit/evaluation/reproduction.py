@@ -10,16 +10,17 @@ from typing import Any
 
 from lidargrit.datasets import open_dataset
 from lidargrit.errors import ConfigError
-from lidargrit.evaluation.comparison import Settings
-from lidargrit.evaluation.contest import Contest, as_table, hold
+from lidargrit.evaluation.benchmark import Benchmark, as_table
+from lidargrit.evaluation.benchmark import run as run_benchmark
+from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.evaluation.protocols import load_protocol
-from lidargrit.evaluation.score import open_images
 from lidargrit.evaluation.tables import Format
 from lidargrit.generators import is_run, load_class
 from lidargrit.loading import load_range_images
 from lidargrit.metrics import load_metric
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
+from lidargrit.sources import open_images
 from lidargrit.training import Recipe, gpu_time, plan_training, with_budget
 
 SIMULATED = "simulated"  # in place of a root
@@ -131,7 +132,7 @@ class Reproduction:
         """Return the recipe of each row."""
         return {row: recipes[self.small] for row, recipes in self.table.rows.items()}
 
-    def contest(self) -> Contest:
+    def benchmark(self) -> Benchmark:
         """Return what all rows have in common."""
         protocol = load_protocol(self.table.protocol)
         count = self.count or (_SMALL_COUNT if self.small else protocol.num_scans)
@@ -139,12 +140,12 @@ class Reproduction:
         train, val = (f"data.{part}={json.dumps([self.source(split.get(part, part))])}" for part in ("train", "val"))
         images = self.table.small_images if self.small else self.table.images
         images = () if self.root == SIMULATED else images
-        metrics = tuple(c.metric for c in protocol.choices if not load_metric(c.metric).needs_weights)
+        metrics = tuple(c.metric for c in protocol.metrics if not load_metric(c.metric).needs_weights)
         flops = self.flops if self.flops is not None else _SMALL_FLOPS if self.small else 0.0
-        return Contest(
+        return Benchmark(
             reference=f"simulated:{count}:test" if self.root == SIMULATED else self.source("test"),
             num_samples=count,
-            settings=Settings(protocol=self.table.protocol, metrics=metrics if self.small else ()),
+            settings=EvalConfig(protocol=self.table.protocol, metrics=metrics if self.small else ()),
             recipe_settings=(train, val, *images, f"data.projection_variant={protocol.variant}", *self.settings),
             flops=flops,
             batch_size=self.batch_size,
@@ -163,7 +164,7 @@ def reproduce(wanted: Reproduction, folder: Path, reporter: Reporter | None = No
 
     Args:
         wanted: the table, and on what.
-        folder: as that of :func:`lidargrit.evaluation.contest.hold`. The same call goes on there: prepared scans (in
+        folder: as that of :func:`lidargrit.evaluation.benchmark.run`. The same call goes on there: prepared scans (in
             the cache), checkpoints, samples and scores are not made again.
         reporter: hears of the progress.
 
@@ -171,9 +172,9 @@ def reproduce(wanted: Reproduction, folder: Path, reporter: Reporter | None = No
         DataError: the root does not hold the data set, or a split of it.
     """
     reporter = reporter or Reporter()
-    contest, systems = wanted.contest(), wanted.systems()
-    _prepare(contest, list(systems.values()), reporter)
-    return hold(list(systems.values()), folder, contest, reporter)
+    benchmark, systems = wanted.benchmark(), wanted.systems()
+    _prepare(benchmark, list(systems.values()), reporter)
+    return run_benchmark(list(systems.values()), folder, benchmark, reporter)
 
 
 def table_of(wanted: Reproduction, scores: list[Path], form: Format = "text") -> str:
@@ -183,10 +184,10 @@ def table_of(wanted: Reproduction, scores: list[Path], form: Format = "text") ->
 
 def plan(wanted: Reproduction, folder: Path) -> dict[str, Any]:
     """Return what :func:`reproduce` would do and what it would cost, as plain values."""
-    contest = wanted.contest()
-    recipes = {system: _recipe(system, contest) for system in wanted.systems().values()}
+    benchmark = wanted.benchmark()
+    recipes = {system: _recipe(system, benchmark) for system in wanted.systems().values()}
     data = next(iter(recipes.values())).data
-    counted = {source: len(open_dataset(source)) for source in (*data.train, *data.val, contest.reference)}
+    counted = {source: len(open_dataset(source)) for source in (*data.train, *data.val, benchmark.reference)}
     systems = {}
     for system, recipe in recipes.items():
         run = folder / "runs" / system
@@ -194,9 +195,9 @@ def plan(wanted: Reproduction, folder: Path) -> dict[str, Any]:
         systems[system] = {
             "state": "finished" if is_run(run) else "begun" if run.exists() else "to do",
             "plan": plan_training(recipe).to_json(),
-            "sampling_flops": generator.cost().flops * contest.num_samples,
+            "sampling_flops": generator.cost().flops * benchmark.num_samples,
         }
-    return {"table": wanted.number, "prepare": counted, "samples": contest.num_samples, "systems": systems}
+    return {"table": wanted.number, "prepare": counted, "samples": benchmark.num_samples, "systems": systems}
 
 
 def plan_as_text(wanted: Reproduction, facts: dict[str, Any]) -> str:
@@ -212,21 +213,21 @@ def plan_as_text(wanted: Reproduction, facts: dict[str, Any]) -> str:
     return "\n".join([*lines, "", _words(wanted)])
 
 
-def _recipe(system: str, contest: Contest) -> Recipe:
-    recipe = load_recipe(system, contest.recipe_settings)
-    return with_budget(recipe, contest.flops) if contest.flops else recipe
+def _recipe(system: str, benchmark: Benchmark) -> Recipe:
+    recipe = load_recipe(system, benchmark.recipe_settings)
+    return with_budget(recipe, benchmark.flops) if benchmark.flops else recipe
 
 
-def _prepare(contest: Contest, systems: list[str], reporter: Reporter) -> None:
+def _prepare(benchmark: Benchmark, systems: list[str], reporter: Reporter) -> None:
     """Project everything before anything is trained: a scan that cannot be used is told now, not after days."""
-    protocol = load_protocol(contest.settings.protocol)
+    protocol = load_protocol(benchmark.settings.protocol)
     for system in systems:
-        data = load_recipe(system, contest.recipe_settings).data
+        data = load_recipe(system, benchmark.recipe_settings).data
         load_range_images(data.train, data, reporter)
         load_range_images(data.val, data, reporter)
-        at_most = min(contest.num_samples, protocol.num_scans)
-        config = replace(contest.settings.data, projection_variant=protocol.variant, max_scans=at_most)
-        open_images(contest.reference, data.load_sensor(), config, reporter)
+        at_most = min(benchmark.num_samples, protocol.num_scans)
+        config = replace(benchmark.settings.data, projection_variant=protocol.variant, max_scans=at_most)
+        open_images(benchmark.reference, data.load_sensor(), config, reporter)
 
 
 def _words(wanted: Reproduction) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from lidargrit.errors import DataError
-from lidargrit.evaluation.intervals import Floor, Interval
+from lidargrit.evaluation.intervals import Interval, RealAgainstReal
 from lidargrit.structures import MetricResult
 
 _FILE_BYTES_AT_MOST = 200_000_000  # curves of a dozen metrics take a few MB
@@ -22,14 +22,14 @@ class Score:
     Args:
         result: of the metric.
         interval: 95 %, if wanted and possible.
-        floor: if wanted and possible.
+        real_against_real: score of one half of the reference against the other half; None if it was not computed.
         options: of the metric, besides variant and seed.
-        seconds: that it took, interval and floor included.
+        seconds: time that the metric, its interval and the reference row took.
     """
 
     result: MetricResult
     interval: Interval | None = None
-    floor: Floor | None = None
+    real_against_real: RealAgainstReal | None = None
     options: dict[str, Any] = field(default_factory=dict)
     seconds: float = 0.0
 
@@ -50,7 +50,7 @@ class LeftOut:
 
 
 @dataclass(frozen=True)
-class Input:
+class SetFacts:
     """One of the two sets.
 
     Args:
@@ -93,8 +93,8 @@ class Scorecard:
 
     protocol: str
     about: dict[str, Any]
-    samples: Input
-    reference: Input
+    samples: SetFacts
+    reference: SetFacts
     scores: tuple[Score, ...]
     left_out: tuple[LeftOut, ...] = ()
     deviations: tuple[str, ...] = ()
@@ -118,7 +118,7 @@ class Scorecard:
                     **asdict(score.result),
                     "options": score.options,
                     "interval": score.interval and asdict(score.interval),
-                    "floor": score.floor and asdict(score.floor),
+                    "floor": score.real_against_real and asdict(score.real_against_real),
                     "seconds": round(score.seconds, 3),
                 }
                 for score in self.scores
@@ -158,7 +158,7 @@ class Scorecard:
 
     def as_table(self) -> str:
         """Return the scores as lines for a terminal."""
-        cells = [("metric", "variant", "score", "95 % interval", "floor", "better", "scans")]
+        cells = [("metric", "variant", "score", "95 % interval", "real against real", "better", "scans")]
         cells += [_row(score) for score in self.scores]
         cells += [(each.metric, each.variant or "-", "left out", *[""] * 4) for each in self.left_out]
         widths = [max(len(row[column]) for row in cells) for column in range(len(cells[0]))]
@@ -182,21 +182,21 @@ def format_value(value: float) -> str:
 
 
 def _row(score: Score) -> tuple[str, ...]:
-    result, interval, floor = score.result, score.interval, score.floor
+    result, interval, real = score.result, score.interval, score.real_against_real
     return (
         result.metric,
         result.variant,
         format_value(result.value),
         f"{format_value(interval.low)} .. {format_value(interval.high)}" if interval else "-",
-        f"{format_value(floor.value)} (n={floor.num_scans})" if floor else "-",
+        f"{format_value(real.value)} (n={real.num_scans})" if real else "-",
         "higher" if result.higher_is_better else "lower",
         f"{result.num_generated} v {result.num_reference}",
     )
 
 
-def _input(data: dict[str, Any]) -> Input:
+def _input(data: dict[str, Any]) -> SetFacts:
     words = {name: str(data[name]) for name in ("source", "data_set", "split", "sensor", "projection", "sha256")}
-    return Input(**words, scans=int(data["scans"]), scans_used=int(data["scans_used"]))
+    return SetFacts(**words, scans=int(data["scans"]), scans_used=int(data["scans_used"]))
 
 
 def _score(data: dict[str, Any]) -> Score:
@@ -209,7 +209,7 @@ def _score(data: dict[str, Any]) -> Score:
         str(data["variant"]),
         dict(data["details"]),
     )
-    interval, floor = data["interval"], data["floor"]
+    interval, real = data["interval"], data["floor"]
     return Score(
         result,
         interval
@@ -219,7 +219,7 @@ def _score(data: dict[str, Any]) -> Score:
             float(interval["standard_error"]),
             int(interval["halves"]),
         ),
-        floor and Floor(float(floor["value"]), int(floor["num_scans"]), int(floor["halvings"])),
+        real and RealAgainstReal(float(real["value"]), int(real["num_scans"]), int(real["halvings"])),
         dict(data["options"]),
         float(data["seconds"]),
     )

@@ -66,11 +66,13 @@ def _measured(cards: Sequence[tuple[str, Scorecard]]) -> Block:
         rows.append((name, tuple(_cell(scores[column]) if column in scores else "" for column in columns)))
         notes += [f"{name}: {text}" for text in (*card.deviations, *card.warnings)]
     card = cards[0][1]
-    floors = {_column(score): score.floor for score in card.scores if score.floor}
-    if floors:
-        count = next(iter(floors.values())).num_scans
-        cells = tuple(format_value(floors[column].value) if column in floors else "" for column in columns)
-        rows.append((f"(floor: the reference's halves, n = {count})", cells))
+    reference_row = {_column(score): score.real_against_real for score in card.scores if score.real_against_real}
+    if reference_row:
+        count = next(iter(reference_row.values())).num_scans
+        cells = tuple(
+            format_value(reference_row[column].value) if column in reference_row else "" for column in columns
+        )
+        rows.append((f"(real against real: halves of the reference, n = {count})", cells))
     title = (
         f"Measured, protocol {card.protocol}, {card.reference.scans_used:,} scans each, "
         f"against {card.reference.source} (sha256 {card.reference.sha256[:8]})"
@@ -92,7 +94,7 @@ def _published(cards: Sequence[tuple[str, Scorecard]]) -> list[Block]:
             f"Published, not measured here: {table['title']}",
             tuple((column["metric"], column["variant"]) for column in table["columns"]),
             tuple((row["system"], _printed(row["printed"], table["columns"])) for row in table["rows"]),
-            (f"source: {table['source']}", "these figures have neither interval nor floor"),
+            (f"source: {table['source']}", "these figures have neither an interval nor a real-against-real row"),
         )
         for table in tables
     ]

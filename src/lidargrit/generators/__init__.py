@@ -23,6 +23,7 @@ from lidargrit.structures import RangeImage
 from lidargrit.tokenizers import Tokenizer
 
 CONFIG_FILE, WEIGHTS_FILE, CARD_FILE = "config.json", "model.safetensors", "README.md"  # the names that the hub knows
+RUN_FILE = "run.json"  # ``origin`` in it says that the weights beside it were not trained in this folder
 TRAINED_ON_FILE = "trained_on.json"  # in a run's folder and beside its samples: which drives, which pixels
 PRETRAINED = Path(__file__).parents[1] / "pretrained"
 """The run that comes with the package; by the folder's name it goes wherever a run is wanted."""
@@ -269,6 +270,11 @@ def locate(run: str | Path) -> Path:
 def is_run(folder: Path) -> bool:
     """Tell whether a folder is that of a finished run."""
     return (folder / CONFIG_FILE).is_file()
+
+
+def recipe_settings(about: Any) -> dict[str, Any]:
+    """Return every setting of the recipe in a ``run.json`` by its name of today; none where there is no recipe."""
+    return configuration.leaves(about.get("recipe") if isinstance(about, dict) else {})
 
 
 def load(folder: str | Path) -> Generator:

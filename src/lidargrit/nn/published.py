@@ -78,7 +78,7 @@ def unpickle(data: bytes) -> Any:
     elif not data.startswith(_PICKLE):
         raise RefusedFileError("which is no file of torch.save")
     try:
-        with warnings.catch_warnings(action="ignore"):  # of pickles in another dialect, which fail or load all the same
+        with warnings.catch_warnings(action="ignore"):  # of pickles of another protocol: they fail or load
             return torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except Exception as error:  # whatever a stranger's file does to the reader, it is the file's fault
         raise RefusedFileError(f"which does not hold tensors only ({type(error).__name__})") from None

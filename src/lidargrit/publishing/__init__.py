@@ -11,13 +11,12 @@ import torch
 
 from lidargrit import __version__, configuration
 from lidargrit.errors import CheckpointError, ConfigError, OutputError
-from lidargrit.evaluation.samples import MANIFEST, is_sample_folder, trained_on
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.files import is_taken, read_json, write_json
-from lidargrit.generators import TRAINED_ON_FILE, WEIGHTS_FILE, Generator, load, load_class, locate
+from lidargrit.generators import RUN_FILE, TRAINED_ON_FILE, WEIGHTS_FILE, Generator, load, load_class, locate
 from lidargrit.publishing.card import data_set_of, model_card
 from lidargrit.recipes import load_recipe
-from lidargrit.training.run import RUN_FILE
+from lidargrit.sources.samples import MANIFEST, is_sample_folder, trained_on
 
 
 def import_weights(recipe: str, folder: Path, files: Sequence[Path], settings: Sequence[str] = ()) -> Generator:

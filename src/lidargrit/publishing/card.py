@@ -12,10 +12,9 @@ from lidargrit.datasets import load as load_dataset
 from lidargrit.datasets import without_place
 from lidargrit.errors import LidarGritError
 from lidargrit.evaluation.scorecard import Scorecard, format_value
-from lidargrit.generators import Generator
+from lidargrit.generators import Generator, recipe_settings
 from lidargrit.loading import Provenance
 from lidargrit.loading.prepared import PreparedFolder, is_prepared
-from lidargrit.training.run import recipe_settings
 
 _PIPELINE = "unconditional-image-generation"  # of the hub's tasks the nearest; it has none for scans
 _CREATIVE_COMMONS = re.compile(r"CC ([A-Z-]+) (\d\.\d) \([a-z-]+\)")  # without terms beside it
@@ -95,7 +94,7 @@ lidargrit view samples
 
 ```python
 from lidargrit import unproject
-from lidargrit.generators import Generator
+from lidargrit.generators import Generator, recipe_settings
 
 model = Generator.from_pretrained("FOLDER")  # or "USER/NAME", with the extra lidargrit[hub]
 scans = model.sample(seeds=[0, 1, 2, 3])  # one for each seed
@@ -177,7 +176,7 @@ def _scores(card: Scorecard) -> str:
     for score in card.scores:
         interval, result = score.interval, score.result
         between = f"{format_value(interval.low)} to {format_value(interval.high)}" if interval else "-"
-        floor = format_value(score.floor.value) if score.floor else "-"
+        floor = format_value(score.real_against_real.value) if score.real_against_real else "-"
         better = "higher" if result.higher_is_better else "lower"
         lines.append(
             f"| {result.metric} | {result.variant} | {format_value(result.value)} | {between} | {floor} | {better} |"

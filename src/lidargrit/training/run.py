@@ -20,7 +20,7 @@ from lidargrit import __version__, configuration
 from lidargrit.determinism import derive_seed
 from lidargrit.errors import CheckpointError, ConfigError, OutputError
 from lidargrit.files import is_taken, read_json, write_json, write_text
-from lidargrit.generators import TRAINED_ON_FILE, Generator, load, load_class, locate
+from lidargrit.generators import RUN_FILE, TRAINED_ON_FILE, Generator, load, load_class, locate, recipe_settings
 from lidargrit.loading import DataConfig, RangeImages, load_range_images
 from lidargrit.reporting import Reporter
 from lidargrit.tokenizers import Tokenizer
@@ -28,9 +28,6 @@ from lidargrit.training.checkpoint import fingerprint
 from lidargrit.training.config import FitConfig, Recipe
 from lidargrit.training.engine import Engine
 from lidargrit.training.fit import Fit
-
-RUN_FILE = "run.json"  # ``origin`` in it says that the weights beside it were not trained in this folder
-
 
 PlotProgress = Callable[[Generator, str, RangeImages, Path], None]
 """Plots what a half-trained generator makes at a stage, beside validation scans, into a file."""
@@ -137,11 +134,6 @@ def check_folder(folder: Path, recipe: Recipe) -> None:
             "an empty folder, or one that this recipe began",
             "choose another folder",
         )
-
-
-def recipe_settings(about: Any) -> dict[str, Any]:
-    """Return every setting of the recipe in a ``run.json`` by its name of today; none where there is no recipe."""
-    return configuration.leaves(about.get("recipe") if isinstance(about, dict) else {})
 
 
 def _defaults(recipe: Recipe) -> dict[str, Any]:

@@ -71,8 +71,8 @@ def _curve(score: CurveScore, side: str) -> Float64[np.ndarray, "*rows n"]:
 
 def _title(score: CurveScore) -> str:
     name = score.simulated.metric.replace("_", " ")
-    distances = f"simulated {score.simulated.value:.3f}, coin {score.bernoulli.value:.3f}, real {score.floor.value:.3f}"
-    return f"{name}\ndistance of real from {distances}"
+    distances = f"simulated {score.simulated.value:.3f}, coin {score.bernoulli.value:.3f}"
+    return f"{name}\ndistance of real from {distances}, real {score.real_against_real.value:.3f}"
 
 
 def _plot_lines(axes: Axes, score: CurveScore) -> None:

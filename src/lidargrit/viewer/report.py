@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from lidargrit.determinism import evenly_spaced
+from lidargrit.evaluation.pairs import EvalPair, EvalSet
 from lidargrit.evaluation.profiles import HALF_VIEW_M, Match, Profile, matches, profile
-from lidargrit.evaluation.scorecard import Input, Score, Scorecard, format_value
-from lidargrit.evaluation.sides import Side, Sides
+from lidargrit.evaluation.scorecard import Score, Scorecard, SetFacts, format_value
 from lidargrit.files import write_text
 from lidargrit.metrics import load_metric
 from lidargrit.viewer.report_charts import line_chart, score_chart
@@ -30,35 +30,35 @@ _SHEET = 12  # samples on the sheet
 _NAME = 48  # letters: what fits below half of the page
 
 
-def write_report(card: Scorecard, sides: Sides, path: Path) -> None:
+def write_report(card: Scorecard, pair: EvalPair, path: Path) -> None:
     """Write a page with scores, pictures and the recipe; it needs no network, no script and no other file.
 
     Args:
         card: what was found.
-        sides: the sets that it was found on.
+        pair: the sets that it was found on.
         path: of the page; an older one there is replaced, in one step.
 
     Raises:
         OutputError: the page cannot be written.
     """
-    write_text(path, page(card, sides))
+    write_text(path, page(card, pair))
 
 
-def page(card: Scorecard, sides: Sides) -> str:
+def page(card: Scorecard, pair: EvalPair) -> str:
     """Return the page as text. Whatever comes from outside, such as names of files, is escaped."""
-    limits_m = _limits_m(sides)
-    both = profile(sides.samples), profile(sides.reference)
-    found = matches(sides.samples, sides.reference)
+    limits_m = _limits_m(pair)
+    both = profile(pair.samples), profile(pair.reference)
+    found = matches(pair.samples, pair.reference)
     parts = [
         _head(card),
         _notes("Read this first", [*card.warnings], "warning"),
         _notes(f"Not as the protocol {card.protocol} wants it", [*card.deviations], "warning"),
         _scores(card),
-        _matches(found, sides, limits_m),
+        _matches(found, pair, limits_m),
         _means(both, limits_m),
         _rings(both),
         _densities(both),
-        _sheet(sides.samples, limits_m),
+        _sheet(pair.samples, limits_m),
         _recipe(card),
     ]
     title = escape(f"{card.samples.source} against {card.reference.source}")
@@ -91,7 +91,7 @@ def _head(card: Scorecard) -> str:
     )
 
 
-def _kind(side: Input) -> str:
+def _kind(side: SetFacts) -> str:
     return " ".join(word for word in (side.data_set or "not known", side.split) if word)
 
 
@@ -122,10 +122,10 @@ def _verdict(card: Scorecard) -> str:
     """Say of which scores the whole interval is on the bad side of the floor."""
     known, worse = 0, []
     for score in card.scores:
-        if score.interval and score.floor:
+        if score.interval and (real := score.real_against_real):
             known += 1
             higher = score.result.higher_is_better
-            if score.interval.high < score.floor.value if higher else score.interval.low > score.floor.value:
+            if score.interval.high < real.value if higher else score.interval.low > real.value:
                 worse.append(f"{score.result.metric} ({score.result.variant})")
     if not known:
         return ""
@@ -134,7 +134,7 @@ def _verdict(card: Scorecard) -> str:
 
 
 def _score_row(score: Score) -> str:
-    result, interval, floor = score.result, score.interval, score.floor
+    result, interval, floor = score.result, score.interval, score.real_against_real
     told = f"{format_value(interval.low)} to {format_value(interval.high)}" if interval else "not known"
     ground = f"{format_value(floor.value)} <small>(n = {floor.num_scans:,})</small>" if floor else "not known"
     title = escape(load_metric(result.metric).title)
@@ -146,15 +146,15 @@ def _score_row(score: Score) -> str:
     )
 
 
-def _limits_m(sides: Sides) -> tuple[float, float]:
+def _limits_m(pair: EvalPair) -> tuple[float, float]:
     """Return a scale of range that holds nearly all returns of both sets."""
-    some = [side.batch(evenly_spaced(16, len(side))) for side in (sides.samples, sides.reference)]
+    some = [side.batch(evenly_spaced(16, len(side))) for side in (pair.samples, pair.reference)]
     ranges = np.concatenate([images.range_m[images.return_mask].numpy() for images in some] + [np.array([1.0, 80.0])])
     near, far = (float(edge) for edge in np.quantile(ranges, (0.005, 0.999)))
     return near, max(far, near * 2)
 
 
-def _scan(side: Side, place: int, limits_m: tuple[float, float], told: str) -> str:
+def _scan(side: EvalSet, place: int, limits_m: tuple[float, float], told: str) -> str:
     image = side.batch([place])[0]
     share = float(image.return_mask.float().mean())
     drawn = range_picture(image.range_m.numpy(), image.return_mask.numpy(), limits_m)
@@ -166,7 +166,7 @@ def _figure(drawn: str, spoken: str, told: str) -> str:
     return f'<figure><img src="{drawn}" alt="{escape(spoken)}"><figcaption>{escape(told)}</figcaption></figure>'
 
 
-def _name(side: Side, place: int) -> str:
+def _name(side: EvalSet, place: int) -> str:
     """Name a scan by the end of its path: what stands before it is the same for all, and long."""
     names = side.images.provenance.names
     index = side.indices[place]
@@ -176,18 +176,18 @@ def _name(side: Side, place: int) -> str:
     return name[-_NAME:]
 
 
-def _matches(found: Sequence[Match], sides: Sides, limits_m: tuple[float, float]) -> str:
+def _matches(found: Sequence[Match], pair: EvalPair, limits_m: tuple[float, float]) -> str:
     """Show the samples that are most and least like any reference scan."""
 
     def pairs(some: Sequence[Match]) -> str:
         return "".join(
             '<div class="pair">'
-            + _scan(sides.samples, match.generated, limits_m, _name(sides.samples, match.generated))
+            + _scan(pair.samples, match.generated, limits_m, _name(pair.samples, match.generated))
             + _scan(
-                sides.reference,
+                pair.reference,
                 match.real,
                 limits_m,
-                f"nearest, at {match.distance:.3f}: {_name(sides.reference, match.real)}",
+                f"nearest, at {match.distance:.3f}: {_name(pair.reference, match.real)}",
             )
             + "</div>"
             for match in some
@@ -250,7 +250,7 @@ def _densities(both: tuple[Profile, Profile]) -> str:
     )
 
 
-def _sheet(side: Side, limits_m: tuple[float, float]) -> str:
+def _sheet(side: EvalSet, limits_m: tuple[float, float]) -> str:
     figures = "".join(_scan(side, place, limits_m, _name(side, place)) for place in evenly_spaced(_SHEET, len(side)))
     return f'<section><h2>Samples</h2><p>Evenly spaced, not chosen.</p><div class="pair">{figures}</div></section>'
 

@@ -24,8 +24,8 @@ def score_chart(score: Score, floor: float | None = None, ceiling: float | None 
         ceiling: drawn as a square.
     """
     value, interval = score.result.value, score.interval
-    if floor is None and score.floor is not None:
-        floor = score.floor.value
+    if floor is None and score.real_against_real is not None:
+        floor = score.real_against_real.value
     low, high = (interval.low, interval.high) if interval else (value, value)
     marks = [low, high, value, *(mark for mark in (floor, ceiling) if mark is not None)]
     if not np.isfinite(marks).all():

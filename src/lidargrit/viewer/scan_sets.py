@@ -12,12 +12,12 @@ from torch import Tensor
 from lidargrit.datasets import open_dataset
 from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import ConfigError, DataError, ScanError
-from lidargrit.evaluation.score import holds_images, open_images
 from lidargrit.generators import is_run, load, locate
 from lidargrit.loading import DataConfig
 from lidargrit.projection import index_map, project
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel, load_sensor
+from lidargrit.sources import holds_images, open_images
 from lidargrit.structures import RangeImage, Scan
 
 _CLASS_BITS = 0xFFFF  # of a label; the instance stands above them

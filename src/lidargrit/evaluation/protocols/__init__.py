@@ -15,7 +15,7 @@ DEFAULT = "exact"
 
 
 @dataclass(frozen=True)
-class Choice:
+class MetricChoice:
     """One number that a protocol asks for.
 
     Args:
@@ -36,7 +36,7 @@ class Protocol:
     Args:
         title: one line.
         source: whose it is: a paper, or a program and its commit.
-        choices: the numbers that it asks for.
+        metrics: numbers that it asks for, in the order of its table.
         sensor: whose rays the images have; that of the samples or the scans if empty.
         columns: fine columns of the circle; 0 for the sensor's own.
         column_stride: every n-th of them is kept.
@@ -50,7 +50,7 @@ class Protocol:
 
     title: str
     source: str
-    choices: tuple[Choice, ...]
+    metrics: tuple[MetricChoice, ...]
     sensor: str = ""
     columns: int = 0
     column_stride: int = 1

@@ -1,17 +1,17 @@
 """Ours, the default: plain definitions of what needs no trained network, on images of the sets' own sensor."""
 
-from lidargrit.evaluation.protocols import Choice, Protocol
+from lidargrit.evaluation.protocols import MetricChoice, Protocol
 
 exact = Protocol(
     title="plain definitions, exact projection, any data set",
     source="this project",
-    choices=(
-        Choice("sliced_wasserstein", "textbook"),
-        Choice("bev_jsd", "exact"),
-        Choice("bev_mmd", "exact"),
-        Choice("point_cloud_jsd", "exact"),
-        Choice("range_histogram_per_ring", "exact"),
-        Choice("return_rate_per_ring", "exact"),
-        Choice("drop_run_lengths", "exact"),
+    metrics=(
+        MetricChoice("sliced_wasserstein", "textbook"),
+        MetricChoice("bev_jsd", "exact"),
+        MetricChoice("bev_mmd", "exact"),
+        MetricChoice("point_cloud_jsd", "exact"),
+        MetricChoice("range_histogram_per_ring", "exact"),
+        MetricChoice("return_rate_per_ring", "exact"),
+        MetricChoice("drop_run_lengths", "exact"),
     ),
 )

@@ -1,14 +1,14 @@
 """LiDARGen's program on KITTI-360: 1,000 samples against drives 0 and 2, 64x1024."""
 
-from lidargrit.evaluation.protocols import Choice, Protocol
+from lidargrit.evaluation.protocols import MetricChoice, Protocol
 
 lidargen = Protocol(
     title="LiDARGen on KITTI-360, 64x1024",
     source="vzyrianov/lidargen@4c3226c, its evaluation scripts",
-    choices=(
-        Choice("bev_mmd", "lidargen"),
-        Choice("bev_jsd", "lidargen"),
-        Choice("frechet_range_distance", "exact"),
+    metrics=(
+        MetricChoice("bev_mmd", "lidargen"),
+        MetricChoice("bev_jsd", "lidargen"),
+        MetricChoice("frechet_range_distance", "exact"),
     ),
     sensor="hdl64e_kitti_360",
     num_scans=1000,  # what others who used its program report; its own scripts take as many scans as there are samples

@@ -1,15 +1,15 @@
 """LidarGRIT's tables on KITTI-360: 5,000 samples against 5,000 test scans, 64x1024 of 2048 rounded columns."""
 
-from lidargrit.evaluation.protocols import Choice, Protocol
+from lidargrit.evaluation.protocols import MetricChoice, Protocol
 
 lidargrit_kitti_360 = Protocol(
     title="LidarGRIT on KITTI-360, 64x1024",
     source="Haghighi et al., LidarGRIT, 2024, table 1; hamedhaghighi/LidarGRIT@a3f86e7",
-    choices=(
-        Choice("sliced_wasserstein", "reference"),
-        Choice("bev_mmd", "lidargrit"),
-        Choice("bev_jsd", "lidargrit"),
-        Choice("frechet_pointcloud_distance", "lidargrit"),
+    metrics=(
+        MetricChoice("sliced_wasserstein", "reference"),
+        MetricChoice("bev_mmd", "lidargrit"),
+        MetricChoice("bev_jsd", "lidargrit"),
+        MetricChoice("frechet_pointcloud_distance", "lidargrit"),
     ),
     sensor="hdl64e_kitti_360",
     columns=2048,

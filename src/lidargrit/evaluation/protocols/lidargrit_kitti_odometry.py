@@ -1,15 +1,15 @@
 """LidarGRIT's tables on KITTI odometry: 5,000 samples against 5,000 test scans, 64x256 of 2048 rounded columns."""
 
-from lidargrit.evaluation.protocols import Choice, Protocol
+from lidargrit.evaluation.protocols import MetricChoice, Protocol
 
 lidargrit_kitti_odometry = Protocol(
     title="LidarGRIT on KITTI odometry, 64x256",
     source="Haghighi et al., LidarGRIT, 2024, tables 2 and 3; hamedhaghighi/LidarGRIT@a3f86e7",
-    choices=(
-        Choice("sliced_wasserstein", "reference"),
-        Choice("minimum_matching_distance", "reference"),
-        Choice("point_cloud_jsd", "reference"),
-        Choice("frechet_pointcloud_distance", "lidargrit"),
+    metrics=(
+        MetricChoice("sliced_wasserstein", "reference"),
+        MetricChoice("minimum_matching_distance", "reference"),
+        MetricChoice("point_cloud_jsd", "reference"),
+        MetricChoice("frechet_pointcloud_distance", "lidargrit"),
     ),
     sensor="hdl64e_kitti_odometry",
     variant="reference",

@@ -1,11 +1,11 @@
 """LiDAR Diffusion's toolbox on KITTI-360: 2,000 samples against drive 3, 64x1024, 1 to 56 m."""
 
-from lidargrit.evaluation.protocols import Choice, Protocol
+from lidargrit.evaluation.protocols import MetricChoice, Protocol
 
 lidm = Protocol(
     title="LiDAR Diffusion's toolbox on KITTI-360, 64x1024",
     source="hancyran/LiDAR-Diffusion@4c94f10, its evaluation toolbox",
-    choices=(Choice("lidm_bev_jsd", "exact"), Choice("lidm_bev_matching", "exact")),
+    metrics=(MetricChoice("lidm_bev_jsd", "exact"), MetricChoice("lidm_bev_matching", "exact")),
     sensor="hdl64e_kitti_360",
     range_m=(1.0, 56.0),
     num_scans=2000,

@@ -1,16 +1,16 @@
 """R2DM's program on KITTI-360: 10,000 samples against all scans, 64x1024, 0.5 to 63 m."""
 
-from lidargrit.evaluation.protocols import Choice, Protocol
+from lidargrit.evaluation.protocols import MetricChoice, Protocol
 
 r2dm = Protocol(
     title="R2DM on KITTI-360, 64x1024",
     source="kazuto1011/r2dm@ad66e71, evaluate.py with its defaults",
-    choices=(
-        Choice("frechet_range_distance", "r2dm"),
-        Choice("frechet_pointcloud_distance", "r2dm"),
-        Choice("kernel_pointcloud_distance", "r2dm"),
-        Choice("bev_jsd", "r2dm"),
-        Choice("bev_mmd", "r2dm"),
+    metrics=(
+        MetricChoice("frechet_range_distance", "r2dm"),
+        MetricChoice("frechet_pointcloud_distance", "r2dm"),
+        MetricChoice("kernel_pointcloud_distance", "r2dm"),
+        MetricChoice("bev_jsd", "r2dm"),
+        MetricChoice("bev_mmd", "r2dm"),
     ),
     sensor="hdl64e_kitti_360",
     range_m=(0.5, 63.0),

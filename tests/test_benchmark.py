@@ -7,8 +7,9 @@ import pytest
 
 from lidargrit.cli import main
 from lidargrit.errors import ConfigError, LidarGritError
-from lidargrit.evaluation.comparison import Settings
-from lidargrit.evaluation.contest import Contest, as_table, hold
+from lidargrit.evaluation.benchmark import Benchmark, as_table
+from lidargrit.evaluation.benchmark import run as run_benchmark
+from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.generators import load_class
 from lidargrit.nn.flops import flops_of
@@ -17,24 +18,24 @@ from lidargrit.training import estimated_training_flops, gpu_time, training_flop
 from tiny_runs import MODEL
 
 FEW = ("data.train=simulated:6:train", "data.val=simulated:2:val", "data.columns=512", "data.column_stride=8")
-QUICK = Settings(metrics=("bev_jsd",), resampling=Resampling(groups=4, halves=2))
-CONTEST = Contest("simulated:8:test", 8, QUICK, (*FEW, "seed=3"), batch_size=4)
+QUICK = EvalConfig(metrics=("bev_jsd",), resampling=Resampling(groups=4, halves=2))
+BENCHMARK = Benchmark("simulated:8:test", 8, QUICK, (*FEW, "seed=3"), batch_size=4)
 
 
 def test_systems_are_made_once_and_set_side_by_side(tmp_path):
     systems = ["marginal", "memorised"]
-    scores = hold(systems, tmp_path, CONTEST)
+    scores = run_benchmark(systems, tmp_path, BENCHMARK)
     table = as_table(scores)
     assert all(name in table for name in systems)
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npz")}
     assert len(before) == 16
-    assert hold(systems, tmp_path, CONTEST) == scores
+    assert run_benchmark(systems, tmp_path, BENCHMARK) == scores
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npz")} == before
     costs = json.loads((tmp_path / "marginal" / "costs.json").read_text())
     assert costs["training_flops"] == 0
     assert costs["seconds_per_scan"] > 0
     finished = [str(tmp_path / "runs" / "marginal")]
-    again = hold(finished, tmp_path / "again", replace(CONTEST, recipe_settings=()))
+    again = run_benchmark(finished, tmp_path / "again", replace(BENCHMARK, recipe_settings=()))
     assert json.loads(again[0].read_text())["scores"][0]["value"] == pytest.approx(
         json.loads(scores[0].read_text())["scores"][0]["value"]
     )
@@ -62,7 +63,7 @@ def test_a_recipe_is_trained_once_in_how_many_ways_ever_it_is_drawn_from(tmp_pat
 )
 def test_wrong_words_are_told_before_anything_is_trained(systems, told, tmp_path):
     with pytest.raises(LidarGritError, match=told):
-        hold(systems, tmp_path, CONTEST)
+        run_benchmark(systems, tmp_path, BENCHMARK)
     assert not list(tmp_path.rglob("*"))
 
 
@@ -89,22 +90,22 @@ def test_a_budget_scales_all_stages_alike():
 
 
 def test_a_run_of_another_recipe_is_not_taken_for_this_one(tmp_path):
-    hold(["marginal"], tmp_path, CONTEST)
-    other = replace(CONTEST, recipe_settings=("data.train=simulated:5:train", *CONTEST.recipe_settings[1:]))
+    run_benchmark(["marginal"], tmp_path, BENCHMARK)
+    other = replace(BENCHMARK, recipe_settings=("data.train=simulated:5:train", *BENCHMARK.recipe_settings[1:]))
     with pytest.raises(LidarGritError, match="which holds another run"):
-        hold(["marginal"], tmp_path, other)
+        run_benchmark(["marginal"], tmp_path, other)
 
 
 def test_as_many_are_scored_as_were_asked_for(tmp_path):
-    hold(["marginal"], tmp_path, CONTEST)
-    fewer = hold(["marginal"], tmp_path, replace(CONTEST, num_samples=4))
+    run_benchmark(["marginal"], tmp_path, BENCHMARK)
+    fewer = run_benchmark(["marginal"], tmp_path, replace(BENCHMARK, num_samples=4))
     assert json.loads(fewer[0].read_text())["inputs"]["samples"]["scans_used"] == 4
 
 
 @pytest.mark.parametrize("change", [{"reference": "no such folder"}, {"settings": replace(QUICK, protocol="nope")}])
 def test_what_all_are_scored_by_is_looked_at_first(change, tmp_path):
     with pytest.raises(LidarGritError):
-        hold(["marginal"], tmp_path, replace(CONTEST, **change))
+        run_benchmark(["marginal"], tmp_path, replace(BENCHMARK, **change))
     assert not list(tmp_path.rglob("*"))
 
 

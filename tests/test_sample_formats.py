@@ -9,15 +9,15 @@ import torch
 
 from lidargrit import _discovery
 from lidargrit.errors import DataError, ScanError, UnknownNameError
-from lidargrit.evaluation.dialects import (
+from lidargrit.projection import unproject
+from lidargrit.sources import open_images
+from lidargrit.sources.sample_formats import (
     is_tensor_folder,
-    load_dialect,
+    load_sample_format,
     read_tensor,
     read_tensor_folder,
     recognise,
 )
-from lidargrit.evaluation.score import open_images
-from lidargrit.projection import unproject
 
 SIZE = (64, 1024)
 
@@ -47,11 +47,11 @@ def lidargrit(range_m, reflectance):
 WRITERS = {"r2dm": r2dm, "lidargen": lidargen, "lidargrit": lidargrit}
 
 
-def test_every_dialect_is_tested():
-    assert sorted(WRITERS) == _discovery.names("evaluation.dialects")
+def test_every_sample_format_is_tested():
+    assert sorted(WRITERS) == _discovery.names("sources.sample_formats")
     for name in WRITERS:
-        assert load_dialect(name).source
-        assert 20 < len(_discovery.summary("evaluation.dialects", name)) < 180
+        assert load_sample_format(name).source
+        assert 20 < len(_discovery.summary("sources.sample_formats", name)) < 180
 
 
 @pytest.mark.parametrize("name", WRITERS)
@@ -112,7 +112,7 @@ def test_no_code_of_a_stranger_runs(tmp_path, capsys):
 
 @pytest.mark.parametrize("what", ["text", "cut", "no tensor", "swollen", "bomb", "whole numbers", "empty", "sparse"])
 def test_what_is_no_tensor_is_refused(what, tmp_path, monkeypatch):
-    monkeypatch.setattr("lidargrit.evaluation.dialects._BYTES_AT_MOST", 16 << 20)
+    monkeypatch.setattr("lidargrit.sources.sample_formats._BYTES_AT_MOST", 16 << 20)
     path = tmp_path / "0.pth"
     contents = {
         "no tensor": {"a": 1},
@@ -153,7 +153,7 @@ def test_other_sizes_numbers_and_names_are_refused(tmp_path):
     with pytest.raises(DataError, match=r"no \.pth file"):
         read_tensor_folder(tmp_path, "r2dm")
     with pytest.raises(UnknownNameError, match="lidargen"):
-        load_dialect("lidagen")
+        load_sample_format("lidagen")
     torch.save(torch.zeros(5, 32, 1024), tmp_path / "0.pth")
     with pytest.raises(ScanError, match="wanted 5x64x1024"):
         read_tensor_folder(tmp_path)

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from lidargrit.evaluation.dialects import Decoded, Dialect
+from lidargrit.sources.sample_formats import Decoded, SampleFormat
 
 _NEAR_M, _FAR_M = 0.5, 63.0  # the widest window of its scores; there is no other sign of a missing return
 
@@ -15,7 +15,7 @@ def decode(scan: Tensor) -> Decoded:
     return torch.where(returned, range_m, 0), torch.where(returned, scan[1], 0)
 
 
-lidargen = Dialect(
+lidargen = SampleFormat(
     title="LiDARGen's sampler",
     source="vzyrianov/lidargen@b88030b: LiDARGen/runners/ncsn_runner.py, metrics/histogram/hist_utils.py",
     channels=2,

@@ -28,7 +28,7 @@ Decoded = tuple[Float[Tensor, "H W"], Float[Tensor, "H W"] | None]
 
 
 @dataclass(frozen=True)
-class Dialect:
+class SampleFormat:
     """How one program writes a scan.
 
     Args:
@@ -57,12 +57,12 @@ class Dialect:
         return None
 
 
-def load_dialect(name: str) -> Dialect:
-    """Return a dialect by its name, or raise UnknownNameError."""
-    name, known = name.replace("-", "_"), _discovery.names("evaluation.dialects")
+def load_sample_format(name: str) -> SampleFormat:
+    """Return a sample_format by its name, or raise UnknownNameError."""
+    name, known = name.replace("-", "_"), _discovery.names("sources.sample_formats")
     if name not in known:
         raise UnknownNameError(f"samples of {name!r}", f"those of {nearest_names(name, known, 9)}", "choose one")
-    return _discovery.load_instance("evaluation.dialects", name, Dialect)
+    return _discovery.load_instance("sources.sample_formats", name, SampleFormat)
 
 
 def is_tensor_folder(folder: Path) -> bool:
@@ -81,7 +81,7 @@ def recognise(folder: Path) -> str:
     """
     path = _paths(folder)[0]
     shape = tuple(read_tensor(path).shape)
-    known = {load_dialect(name).channels: name for name in _discovery.names("evaluation.dialects")}
+    known = {load_sample_format(name).channels: name for name in _discovery.names("sources.sample_formats")}
     if len(shape) < 3 or shape[-3] not in known:
         wanted = ", ".join(f"{channels} channels ({name})" for channels, name in sorted(known.items()))
         raise ScanError(f"a tensor of {shape} in {path}", wanted, "name what wrote it with --samples-format")
@@ -93,15 +93,15 @@ def read_tensor_folder(folder: Path, name: str = "", count: int | None = None) -
 
     Args:
         folder: of ``.pth`` files, one scan or one batch of scans each.
-        name: of the dialect; told from the number of channels if empty.
+        name: of the sample_format; told from the number of channels if empty.
         count: at most so many, the first.
 
     Raises:
         DataError: no tensor in the folder.
-        ScanError: a file that is damaged, too large, more than a tensor, or not of this dialect.
+        ScanError: a file that is damaged, too large, more than a tensor, or not of this sample_format.
     """
-    dialect = load_dialect(name or recognise(folder))
-    store = _Tensors(_paths(folder), dialect, count)
+    form = load_sample_format(name or recognise(folder))
+    store = _Tensors(_paths(folder), form, count)
     return RangeImages(store.sensor, [store])
 
 
@@ -133,8 +133,8 @@ def read_tensor(path: Path) -> Tensor:
 class _Tensors:
     """Files of tensors as a store of images."""
 
-    def __init__(self, paths: list[Path], dialect: Dialect, count: int | None) -> None:
-        self._dialect, self._last = dialect, (Path(), torch.empty(0))
+    def __init__(self, paths: list[Path], form: SampleFormat, count: int | None) -> None:
+        self._format, self._last = form, (Path(), torch.empty(0))
         first = self._tensor(paths[0])
         self.sensor = self._sensor(first, paths[0])
         self._places: list[tuple[Path, int | None]] = []
@@ -155,10 +155,10 @@ class _Tensors:
         path, place = self._places[index]
         tensor = self._tensor(path)
         scan = tensor if place is None else tensor[place]
-        if tuple(scan.shape) != (self._dialect.channels, self.sensor.height, self.sensor.width):
-            wanted = f"{self._dialect.channels}x{self.sensor.height}x{self.sensor.width}, as the first"
+        if tuple(scan.shape) != (self._format.channels, self.sensor.height, self.sensor.width):
+            wanted = f"{self._format.channels}x{self.sensor.height}x{self.sensor.width}, as the first"
             raise ScanError(f"a tensor of {tuple(scan.shape)} in {path}", wanted, "remove the file")
-        range_m, reflectance = self._dialect.decode(scan)
+        range_m, reflectance = self._format.decode(scan)
         if not bool(((range_m >= 0) & (range_m < math.inf)).all()):
             raise ScanError(f"ranges that are negative or no number in {path}", "metres", "check what wrote it")
         return _array(range_m), None if reflectance is None else _array(reflectance.nan_to_num().clamp(0, 1))
@@ -172,16 +172,16 @@ class _Tensors:
 
     def _sensor(self, first: Tensor, path: Path) -> SensorModel:
         shape = tuple(first.shape)
-        fits = len(shape) in {3, 4} and shape[-3] == self._dialect.channels
-        sensor = self._dialect.sensor_of(*shape[-2:]) if fits else None
+        fits = len(shape) in {3, 4} and shape[-3] == self._format.channels
+        sensor = self._format.sensor_of(*shape[-2:]) if fits else None
         if sensor is None:
-            sizes = " or ".join(f"{self._dialect.channels}x{h}x{w}" for h, w in self._sizes())
-            raise ScanError(f"a tensor of {shape} in {path}", f"{sizes}: {self._dialect.title}", "check the format")
+            sizes = " or ".join(f"{self._format.channels}x{h}x{w}" for h, w in self._sizes())
+            raise ScanError(f"a tensor of {shape} in {path}", f"{sizes}: {self._format.title}", "check the format")
         return sensor
 
     def _sizes(self) -> list[tuple[int, int]]:
         found = []
-        for name, fine_columns, stride in self._dialect.sensors:
+        for name, fine_columns, stride in self._format.sensors:
             sensor = load_sensor(name)
             found.append((sensor.height, fine_columns // stride if fine_columns else sensor.width))
         return found

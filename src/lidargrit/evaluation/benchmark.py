@@ -15,23 +15,23 @@ from lidargrit import __version__
 from lidargrit.configuration import override
 from lidargrit.datasets import open_dataset
 from lidargrit.errors import ConfigError
-from lidargrit.evaluation.comparison import Settings, choices, compare_sides, open_both
+from lidargrit.evaluation.comparison import EvalConfig, chosen_metrics, compare_pair, open_pair
 from lidargrit.evaluation.protocols import load_protocol, public_name
-from lidargrit.evaluation.samples import write_samples
-from lidargrit.evaluation.score import holds_images
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.evaluation.tables import Format, side_by_side
 from lidargrit.files import read_json, write_json
 from lidargrit.generators import Generator, is_run, load, load_class, locate
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
+from lidargrit.sources import holds_images
+from lidargrit.sources.samples import write_samples
 from lidargrit.training import Recipe, check_folder, train, training_flops, with_budget
 
 COSTS = "costs.json"
 
 
 @dataclass(frozen=True)
-class Contest:
+class Benchmark:
     """What all systems have in common.
 
     Args:
@@ -45,7 +45,7 @@ class Contest:
 
     reference: str
     num_samples: int = 256
-    settings: Settings = field(default_factory=Settings)
+    settings: EvalConfig = field(default_factory=EvalConfig)
     recipe_settings: tuple[str, ...] = ()
     flops: float = 0.0
     batch_size: int = 8
@@ -59,7 +59,7 @@ class Contest:
             )
 
 
-def hold(systems: Sequence[str], folder: Path, contest: Contest, reporter: Reporter | None = None) -> list[Path]:
+def run(systems: Sequence[str], folder: Path, benchmark: Benchmark, reporter: Reporter | None = None) -> list[Path]:
     """Train or load each system, draw its samples and score them, and return the files of scores.
 
     Args:
@@ -67,7 +67,7 @@ def hold(systems: Sequence[str], folder: Path, contest: Contest, reporter: Repor
             from: ``r2dm_small:steps=32``. A recipe is trained once, in how many ways ever it is drawn from.
         folder: gets a run folder ``runs/RECIPE``, and for each system ``SYSTEM/samples``, ``SYSTEM/SYSTEM.json`` with
             its scores and ``SYSTEM/costs.json``. What is there is not made again, nor scored again.
-        contest: what all have in common.
+        benchmark: what all have in common.
         reporter: hears of the progress.
 
     Raises:
@@ -80,12 +80,12 @@ def hold(systems: Sequence[str], folder: Path, contest: Contest, reporter: Repor
             f"the systems {', '.join(systems) or '(none)'}", "each once, and at least one", "correct them"
         )
     # Wrong words and runs of other recipes are told before anything is trained.
-    plans = [_Plan.of(system, folder, contest) for system in systems]
-    settings = replace(contest.settings, max_scans=contest.num_samples)
-    choices(load_protocol(settings.protocol), settings)
-    if not holds_images(contest.reference):
-        open_dataset(contest.reference)
-    if (contest.recipe_settings or contest.flops) and not any(plan.recipe for plan in plans):
+    plans = [_Plan.of(system, folder, benchmark) for system in systems]
+    settings = replace(benchmark.settings, max_scans=benchmark.num_samples)
+    chosen_metrics(load_protocol(settings.protocol), settings)
+    if not holds_images(benchmark.reference):
+        open_dataset(benchmark.reference)
+    if (benchmark.recipe_settings or benchmark.flops) and not any(plan.recipe for plan in plans):
         raise ConfigError("settings or a budget, and no recipe", "a recipe that they are for", "leave them out")
     scores = []
     for name, plan in zip(names, plans, strict=True):
@@ -94,12 +94,12 @@ def hold(systems: Sequence[str], folder: Path, contest: Contest, reporter: Repor
             load(plan.run) if plan.recipe is None or is_run(plan.run) else train(plan.recipe, plan.run, reporter)
         )
         generator.to("cuda" if torch.cuda.is_available() else "cpu")
-        seconds = _sample(generator, plan.run, folder / name / "samples", plan.sampling, contest, reporter)
-        _write_costs(folder / name / COSTS, plan.recipe, generator, plan.sampling, seconds, contest.num_samples)
+        seconds = _sample(generator, plan.run, folder / name / "samples", plan.sampling, benchmark, reporter)
+        _write_costs(folder / name / COSTS, plan.recipe, generator, plan.sampling, seconds, benchmark.num_samples)
         scores.append(folder / name / f"{name}.json")
-        card = _score(str(folder / name / "samples"), contest.reference, settings, scores[-1], reporter)
-        if card.samples.scans_used < contest.num_samples:
-            reporter.message(f"WARNING: {contest.reference} has but {card.samples.scans_used} scans to compare with")
+        card = _score(str(folder / name / "samples"), benchmark.reference, settings, scores[-1], reporter)
+        if card.samples.scans_used < benchmark.num_samples:
+            reporter.message(f"WARNING: {benchmark.reference} has but {card.samples.scans_used} scans to compare with")
     return scores
 
 
@@ -139,15 +139,15 @@ class _Plan:
     sampling: Any
 
     @classmethod
-    def of(cls, system: str, folder: Path, contest: Contest) -> _Plan:
+    def of(cls, system: str, folder: Path, benchmark: Benchmark) -> _Plan:
         name, _, settings = system.partition(":")
         run = locate(name)
-        recipe = None if is_run(run) else load_recipe(name, contest.recipe_settings)
+        recipe = None if is_run(run) else load_recipe(name, benchmark.recipe_settings)
         cls_of = type(load(name)) if recipe is None else load_class(recipe.generator)
         owner, cure = f"sampling from {name!r}", "see all with: lidargrit list generators"
         sampling = override(cls_of.Sampling(), settings.split(",") if settings else [], owner, cure)
-        if recipe is not None and contest.flops:
-            recipe = with_budget(recipe, contest.flops)
+        if recipe is not None and benchmark.flops:
+            recipe = with_budget(recipe, benchmark.flops)
         if recipe is None:
             return cls(run, None, sampling)
         check_folder(folder / "runs" / name, recipe)
@@ -155,27 +155,27 @@ class _Plan:
 
 
 def _sample(
-    generator: Generator, run: Path, folder: Path, sampling: Any, contest: Contest, reporter: Reporter
+    generator: Generator, run: Path, folder: Path, sampling: Any, benchmark: Benchmark, reporter: Reporter
 ) -> float | None:
     """Draw what is not there yet, and return the seconds for a scan; None if all was there."""
     before = len(list(folder.glob("[!.]*.npz"))) if folder.is_dir() else 0
     begun = time.perf_counter()
-    write_samples(generator, run, folder, range(contest.num_samples), sampling, contest.batch_size, reporter)
-    drawn = contest.num_samples - before
+    write_samples(generator, run, folder, range(benchmark.num_samples), sampling, benchmark.batch_size, reporter)
+    drawn = benchmark.num_samples - before
     return (time.perf_counter() - begun) / drawn if drawn > 0 else None
 
 
-def _score(samples: str, reference: str, settings: Settings, path: Path, reporter: Reporter) -> Scorecard:
+def _score(samples: str, reference: str, settings: EvalConfig, path: Path, reporter: Reporter) -> Scorecard:
     """Return the scores of a file, if they are of these very images by these settings; else score, and write it."""
-    sides = open_both(samples, reference, settings, reporter)
-    told = (settings.facts(), sides.samples.facts(), sides.reference.facts(), __version__)
+    pair = open_pair(samples, reference, settings, reporter)
+    told = (settings.facts(), pair.samples.facts(), pair.reference.facts(), __version__)
     wanted = (public_name(settings.protocol), *told)
     if path.is_file():
         there = Scorecard.read(path)
         if (there.protocol, there.settings, there.samples, there.reference, there.versions.get("lidargrit")) == wanted:
             reporter.message(f"scores are there already; remove {path} to score again")
             return there
-    card = compare_sides(sides, settings, reporter)
+    card = compare_pair(pair, settings, reporter)
     write_json(path, card.to_json())
     return card
 

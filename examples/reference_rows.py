@@ -1,4 +1,4 @@
-"""What three metrics say of real scans, of learned ones, and of scans spoiled in known ways → floor_and_ceiling.png."""
+"""What three metrics say of real scans, of learned ones, and of scans spoiled in known ways → reference_rows.png."""
 
 import sys
 from pathlib import Path
@@ -41,7 +41,7 @@ def main(folder: Path) -> None:
         axis.set_title(metric, fontsize=10)
         axis.set_xlabel("lower is better")
     axes[0].invert_yaxis()
-    figure.savefig(folder / "floor_and_ceiling.png", dpi=100, metadata={"Software": None})
+    figure.savefig(folder / "reference_rows.png", dpi=100, metadata={"Software": None})
     plt.close(figure)
 
 

@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from lidargrit.evaluation.dialects import Decoded, Dialect
+from lidargrit.sources.sample_formats import Decoded, SampleFormat
 
 
 def decode(scan: Tensor) -> Decoded:
@@ -11,7 +11,7 @@ def decode(scan: Tensor) -> Decoded:
     return range_m, scan[4] * (range_m > 0)
 
 
-r2dm = Dialect(
+r2dm = SampleFormat(
     title="R2DM's sample_and_save.py",
     source="kazuto1011/r2dm@004a1e4: sample_and_save.py, utils/lidar.py",
     channels=5,

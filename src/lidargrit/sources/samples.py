@@ -18,12 +18,11 @@ import numpy as np
 from lidargrit import configuration
 from lidargrit.errors import CheckpointError, ConfigError, DataError, OutputError, ScanError
 from lidargrit.files import atomic_path, claim_folder, is_taken, read_json, remove_partials, write_json, write_text
-from lidargrit.generators import TRAINED_ON_FILE, WEIGHTS_FILE, Generator
+from lidargrit.generators import RUN_FILE, TRAINED_ON_FILE, WEIGHTS_FILE, Generator, recipe_settings
 from lidargrit.loading import Pixels, Provenance, RangeImages
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
-from lidargrit.training.run import RUN_FILE, recipe_settings
 
 MANIFEST = "samples.json"
 _LATER_ENTRIES = ("projection_variant", "generator")  # not in folders of before they existed

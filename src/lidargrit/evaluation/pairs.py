@@ -11,21 +11,21 @@ import torch
 
 from lidargrit.datasets import open_dataset
 from lidargrit.determinism import evenly_spaced
-from lidargrit.errors import LidarGritError
-from lidargrit.evaluation.dialects import is_tensor_folder, load_dialect, recognise
+from lidargrit.errors import ConfigError, LidarGritError
 from lidargrit.evaluation.protocols import Protocol
-from lidargrit.evaluation.samples import is_sample_folder, projection_of
-from lidargrit.evaluation.score import open_images, overlap, require_same_rays
-from lidargrit.evaluation.scorecard import Input
+from lidargrit.evaluation.scorecard import SetFacts
 from lidargrit.loading import DataConfig, PreparedImages, RangeImages, is_prepared
 from lidargrit.reporting import Reporter
+from lidargrit.sources import open_images, overlap
+from lidargrit.sources.sample_formats import is_tensor_folder, load_sample_format, recognise
+from lidargrit.sources.samples import is_sample_folder, projection_of
 from lidargrit.structures import RangeImage
 
 _BATCH = 16
 
 
 @dataclass(frozen=True, eq=False)
-class Side:
+class EvalSet:
     """One set of range images.
 
     Args:
@@ -60,10 +60,10 @@ class Side:
         kept = RangeImage.masked(images.range_m, mask, images.sensor)
         return kept if reflectance is None else replace(kept, reflectance=torch.where(mask, reflectance, 0))
 
-    def facts(self) -> Input:
+    def facts(self) -> SetFacts:
         """Return what the scorecard tells of the set, with the hash of what was compared."""
         sensor = self.images.sensor
-        return Input(
+        return SetFacts(
             self.source,
             self.data_set,
             self.split,
@@ -90,7 +90,7 @@ class Side:
 
 
 @dataclass(frozen=True, eq=False)
-class Sides:
+class EvalPair:
     """Samples and what they are compared with, equally many of both, and what there is to say against it.
 
     Args:
@@ -100,28 +100,28 @@ class Sides:
         warnings: why their scores may flatter, or say something else than one thinks.
     """
 
-    samples: Side
-    reference: Side
+    samples: EvalSet
+    reference: EvalSet
     deviations: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
 
-def open_sides(
+def pair_for_protocol(
     samples: str,
     reference: str,
     protocol: Protocol,
     config: DataConfig,
     samples_format: str = "",
     reporter: Reporter | None = None,
-) -> Sides:
+) -> EvalPair:
     """Open two sets as a protocol wants them.
 
     Args:
-        samples: a folder of samples of ours or in a known dialect, or a source of scans.
+        samples: a folder of samples of ours or in a known sample_format, or a source of scans.
         reference: likewise; scans are projected with the sensor of the samples.
         protocol: which sensor, window, data set and number of scans are wanted.
         config: how scans are read and projected; ``max_scans`` further limits how many.
-        samples_format: the dialect of a folder of tensors; recognised if empty.
+        samples_format: the sample_format of a folder of tensors; recognised if empty.
         reporter: hears of the projection.
 
     Raises:
@@ -134,12 +134,12 @@ def open_sides(
     second = open_images(reference, first.sensor, config, reporter)
     require_same_rays(first, second)
     count = min(len(first), len(second), at_most or len(first))
-    pair = [
-        Side(source, images, evenly_spaced(count, len(images)), protocol.range_m, *known_of(source, config, form))
+    both = [
+        EvalSet(source, images, evenly_spaced(count, len(images)), protocol.range_m, *known_of(source, config, form))
         for source, images, form in ((samples, first, samples_format), (reference, second, ""))
     ]
-    sides = Sides(pair[0], pair[1])
-    return replace(sides, deviations=deviations(sides, protocol), warnings=warnings(sides))
+    pair = EvalPair(both[0], both[1])
+    return replace(pair, deviations=deviations(pair, protocol), warnings=warnings(pair))
 
 
 def known_of(source: str, config: DataConfig, samples_format: str = "") -> tuple[str, str, str]:
@@ -149,7 +149,7 @@ def known_of(source: str, config: DataConfig, samples_format: str = "") -> tuple
         return "samples", "", projection_of(folder)
     if samples_format or is_tensor_folder(folder):
         name = samples_format or recognise(folder)
-        return "samples", name, load_dialect(name).variant
+        return "samples", name, load_sample_format(name).variant
     try:
         if is_prepared(source):
             spec = PreparedImages(source).spec
@@ -160,12 +160,12 @@ def known_of(source: str, config: DataConfig, samples_format: str = "") -> tuple
     return dataset.public_name(), dataset.split, config.projection_variant
 
 
-def deviations(sides: Sides, protocol: Protocol) -> tuple[str, ...]:
+def deviations(pair: EvalPair, protocol: Protocol) -> tuple[str, ...]:
     """Say in which ways two sets are not what a protocol wants."""
     found = []
-    reference, sensor, wanted = sides.reference, sides.samples.images.sensor, protocol.load_sensor()
-    if protocol.num_scans and len(sides.samples) != protocol.num_scans:
-        found.append(f"{len(sides.samples):,} of the {protocol.num_scans:,} scans of each set that it wants")
+    reference, sensor, wanted = pair.reference, pair.samples.images.sensor, protocol.load_sensor()
+    if protocol.num_scans and len(pair.samples) != protocol.num_scans:
+        found.append(f"{len(pair.samples):,} of the {protocol.num_scans:,} scans of each set that it wants")
     if wanted is not None and not wanted.same_rays(sensor):
         found.append(
             f"images of {sensor.name} {sensor.height}x{sensor.width}, not of {wanted.name} "
@@ -180,10 +180,10 @@ def deviations(sides: Sides, protocol: Protocol) -> tuple[str, ...]:
     return tuple(found)
 
 
-def warnings(sides: Sides) -> tuple[str, ...]:
+def warnings(pair: EvalPair) -> tuple[str, ...]:
     """Say what flatters the scores of two sets, or makes them measure something else."""
     found = []
-    first, second = sides.samples, sides.reference
+    first, second = pair.samples, pair.reference
     if shared := overlap(first.source, first.images, second.images):
         found.append(f"{first.source} and the reference overlap ({shared}): the scores flatter it")
     if first.variant and second.variant and first.variant != second.variant:
@@ -192,3 +192,13 @@ def warnings(sides: Sides) -> tuple[str, ...]:
             f"reference by {second.variant!r}; scores mix this with what the model does"
         )
     return tuple(found)
+
+
+def require_same_rays(generated: RangeImages, reference: RangeImages) -> None:
+    """Refuse two sets that look along different rays, with ConfigError."""
+    if not generated.sensor.same_rays(reference.sensor):
+        raise ConfigError(
+            f"range images of {generated.sensor.name!r} ({generated.sensor.height}x{generated.sensor.width})",
+            f"the rays of {reference.sensor.name!r} ({reference.sensor.height}x{reference.sensor.width})",
+            "project the scans with the samples' sensor: give the samples first, the scans second",
+        )

@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from lidargrit.evaluation.dialects import Decoded, Dialect
+from lidargrit.sources.sample_formats import Decoded, SampleFormat
 
 
 def decode(scan: Tensor) -> Decoded:
@@ -10,7 +10,7 @@ def decode(scan: Tensor) -> Decoded:
     return scan[0], None
 
 
-lidargrit = Dialect(
+lidargrit = SampleFormat(
     title="the samples that LidarGRIT's program saves",
     source="hamedhaghighi/LidarGRIT@a3f86e7",
     channels=1,

@@ -1,18 +1,12 @@
-"""Two sets of range images → scores: whichever of them are samples, scans on disk, or simulated."""
+"""What a user names as a source → range images: samples, prepared scans, scans on disk, or simulated."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
-import torch
-
 from lidargrit.datasets import open_dataset
-from lidargrit.errors import ConfigError
-from lidargrit.evaluation.dialects import is_tensor_folder, read_tensor_folder
-from lidargrit.evaluation.reconstruction import ReconstructionErrors, ReconstructionScore
-from lidargrit.evaluation.samples import is_sample_folder, read_samples, trained_on
-from lidargrit.generators import is_run, load, locate
+from lidargrit.generators import is_run, locate
 from lidargrit.loading import (
     DataConfig,
     PreparedImages,
@@ -23,9 +17,8 @@ from lidargrit.loading import (
 )
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel
-from lidargrit.tokenizers import Tokenizer
-
-_BATCH = 16
+from lidargrit.sources.sample_formats import is_tensor_folder, read_tensor_folder
+from lidargrit.sources.samples import is_sample_folder, read_samples, trained_on
 
 
 def open_images(
@@ -82,37 +75,3 @@ def overlap(source: str, images: RangeImages | None, reference: RangeImages) -> 
     if is_sample_folder(folder) or is_run(folder):
         learned = trained_on(folder)
     return learned.overlap(reference.provenance)
-
-
-def require_same_rays(generated: RangeImages, reference: RangeImages) -> None:
-    """Refuse two sets that look along different rays, with ConfigError."""
-    if not generated.sensor.same_rays(reference.sensor):
-        raise ConfigError(
-            f"range images of {generated.sensor.name!r} ({generated.sensor.height}x{generated.sensor.width})",
-            f"the rays of {reference.sensor.name!r} ({reference.sensor.height}x{reference.sensor.width})",
-            "project the scans with the samples' sensor: give the samples first, the scans second",
-        )
-
-
-@torch.no_grad()
-def score_reconstruction(tokenizer: Tokenizer, images: RangeImages) -> ReconstructionErrors:
-    """Return how well a tokenizer gives back every scan of a set, its mask decoded by threshold."""
-    score = ReconstructionScore()
-    for first in range(0, len(images), _BATCH):
-        batch = images.batch(range(first, min(first + _BATCH, len(images))))
-        clean = tokenizer.decode(tokenizer.encode(batch))
-        score.update(batch, clean.range_m, clean.return_logits >= 0)
-    return score.compute()
-
-
-def evaluate_run(run_folder: Path, source: str, config: DataConfig, reporter: Reporter) -> dict[str, float]:
-    """Return how well the tokenizer of a finished run gives back scans, by the name of each error.
-
-    Raises:
-        ConfigError: a run whose generator has no tokenizer.
-    """
-    generator = load(run_folder)
-    tokenizer = generator.get_tokenizer()
-    images = open_images(source, generator.sensor, config, reporter)
-    warn_of_overlap(str(run_folder), None, images, reporter)
-    return asdict(score_reconstruction(tokenizer, images))
