@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from lidargrit.errors import CheckpointError
-from lidargrit.generators.dusty import Dusty, DustyConfig, Game, load_published
+from lidargrit.generators.dusty import AdversarialObjective, Dusty, DustyConfig, load_published
 from lidargrit.nn.dcgan import Discriminator, Synthesis, Widths
 from lidargrit.nn.flops import flops_of
 from lidargrit.sensors import load_sensor
@@ -25,7 +25,7 @@ def test_networks_have_the_published_sizes(variant, parameters):
     with torch.device("meta"):
         generator = Dusty(DustyConfig(variant=variant), SENSOR)
         game = generator.objective("adversarial")
-    assert isinstance(game, Game)
+    assert isinstance(game, AdversarialObjective)
     assert sum(weight.numel() for weight in generator.parameters()) == parameters
     assert sum(weight.numel() for weight in game.discriminator.parameters()) == 2_788_289
     assert generator.cost().network_evaluations == 1

@@ -148,7 +148,7 @@ def test_losses_are_the_formulas(images):
     with torch.no_grad():
         real = game.discriminator(game.encoding.encode(images))
         drawn = game.discriminator(game._draw(4, rng())[0])
-    found = {phase: loss_of(game, images, phase) for phase in game.phases}
+    found = {phase: loss_of(game, images, phase) for phase in game.players}
     of_discriminator = (-real.sigmoid().log()).mean() - (1 - drawn.sigmoid()).log().mean()
     assert found["discriminator"] == pytest.approx(float(of_discriminator), rel=1e-5)
     assert found["generator"] == pytest.approx(float(-drawn.sigmoid().log().mean()), rel=1e-5)

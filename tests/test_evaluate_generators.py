@@ -38,7 +38,7 @@ def store():
 @pytest.fixture(scope="module")
 def marginal(store):
     generator = Marginal(MarginalConfig(), SENSOR)
-    generator.learn(RangeImages(SENSOR, [store]))
+    generator.fit_statistics(RangeImages(SENSOR, [store]))
     return generator
 
 
@@ -61,12 +61,12 @@ def test_marginal_knows_pixels_one_by_one(store, marginal):
 
 def test_memorised_gives_every_scan_once(store):
     generator = Memorised(MemorisedConfig(scans=200), SENSOR)
-    generator.learn(RangeImages(SENSOR, [store]))
+    generator.fit_statistics(RangeImages(SENSOR, [store]))
     drawn = generator.sample(range(1000, 1200)).range_m
     assert sorted(drawn.sum((1, 2)).tolist()) == pytest.approx(sorted(store.range_m.sum((1, 2)).tolist()))
     assert not torch.equal(generator.sample(range(200)).range_m, store.range_m), "neighbours in time are not together"
     few = Memorised(MemorisedConfig(scans=3), SENSOR)
-    few.learn(RangeImages(SENSOR, [store]))
+    few.fit_statistics(RangeImages(SENSOR, [store]))
     assert torch.equal(few.sample([1]).range_m, few.sample([4]).range_m)
 
 
@@ -75,7 +75,7 @@ def test_they_are_saved_and_loaded_and_obey_seeds(make, store, tmp_path):
     generator = make(make.Config(), SENSOR)
     with pytest.raises(CheckpointError, match="no scan"):
         generator.sample([0])
-    generator.learn(RangeImages(SENSOR, [store]))
+    generator.fit_statistics(RangeImages(SENSOR, [store]))
     generator.save(tmp_path)
     again = load(tmp_path)
     alone, together = again.sample([7], NoSampling()), generator.sample([5, 7])

@@ -72,7 +72,7 @@ def made(name):
     with torch.random.fork_rng():
         torch.manual_seed(0)
         generator = cls(configuration.override(cls.Config(), SIZES[name][0].split()), SENSOR)
-        generator.learn(IMAGES)
+        generator.fit_statistics(IMAGES)
     return generator.eval(), configuration.override(cls.Sampling(), SIZES[name][1].split())
 
 
@@ -179,9 +179,9 @@ def test_an_objective_has_a_finite_loss_and_gradients(name):
     generator, _ = made(name)
     for stage in generator.stages:
         objective = generator.objective(stage).train()
-        for phase in getattr(objective, "phases", ("",)):  # a player's name, where several take turns
+        for player in objective.players or ("",):
             rng = torch.Generator().manual_seed(0)
-            objective(IMAGES.batch([0, 1]), rng, *filter(None, [phase]))["loss"].backward()
+            objective(IMAGES.batch([0, 1]), rng, player)["loss"].backward()
         gradients = [weight.grad for weight in objective.parameters() if weight.grad is not None]
         assert gradients
         assert all(bool(gradient.isfinite().all()) for gradient in gradients)

@@ -7,6 +7,7 @@ import torch
 from torch import nn
 
 from lidargrit.loading import DataConfig, load_range_images
+from lidargrit.nn.objective import Objective
 from lidargrit.recipes import load_recipe
 from lidargrit.tokenizers.vqvae import Vqvae
 from lidargrit.training import FitConfig
@@ -60,12 +61,12 @@ def test_the_loss_is_the_papers_sum(images, weight):
 
 
 def test_gradients_are_clipped_and_infinite_ones_change_nothing(images):
-    class Steep(nn.Module):
+    class Steep(Objective):
         def __init__(self):
-            super().__init__()
-            self.sensor, self.weight, self.slope = images.sensor, nn.Parameter(torch.zeros(2)), 1e6
+            super().__init__(images.sensor)
+            self.weight, self.slope = nn.Parameter(torch.zeros(2)), 1e6
 
-        def forward(self, images, rng):
+        def forward(self, images, rng, player):
             return {"loss": (self.weight * self.slope).sum()}
 
     steep = Steep()
@@ -81,12 +82,12 @@ def test_gradients_are_clipped_and_infinite_ones_change_nothing(images):
 
 
 def test_ranges_reach_the_objective_unrounded(images):
-    class Listening(nn.Module):
+    class Listening(Objective):
         def __init__(self):
-            super().__init__()
-            self.sensor, self.weight, self.heard = images.sensor, nn.Parameter(torch.zeros(1)), None
+            super().__init__(images.sensor)
+            self.weight, self.heard = nn.Parameter(torch.zeros(1)), None
 
-        def forward(self, images, rng):
+        def forward(self, images, rng, player):
             self.heard = images.range_m
             return {"loss": self.weight.sum()}
 

@@ -14,6 +14,7 @@ import torch
 from lidargrit.errors import ConfigError
 from lidargrit.files import read_tensors
 from lidargrit.loading import DataConfig, load_range_images
+from lidargrit.nn.objective import Objective
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import load_sensor
@@ -24,6 +25,8 @@ from lidargrit.training.engine import Engine
 from lidargrit.training.fit import Fit
 from lidargrit.training.optimiser import make_optimiser
 from tiny_runs import train_words
+
+SENSOR = load_sensor("hdl64e_kitti_odometry")
 
 STEADY = [  # nothing that is drawn for a process and not for a scan; codes that restart and follow means
     "model.tokenizer.dropout=0",
@@ -56,38 +59,37 @@ def cache(tmp_path_factory, monkeypatch):
     monkeypatch.setenv("LIDARGRIT_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
 
 
-class Game(torch.nn.Module):
+class Game(Objective):
     """Two players without any chance, of which each step of one must leave the other alone."""
 
-    phases = ("one", "other")
+    players = ("one", "other")
 
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__(SENSOR)
         self.one, self.other = torch.nn.Linear(8, 1), torch.nn.Linear(8, 1)
 
-    def forward(self, images, rng, phase):
+    def forward(self, images, rng, player):
         seen = images.range_m[:, 0, :8] / 10
         error = (
             self.one(seen) - self.other(seen).detach()
-            if phase == "one"
+            if player == "one"
             else self.other(seen) + seen.sum(1, keepdim=True)
         )
         return {"loss": error.square().mean()}
 
 
-class Plain(torch.nn.Module):
+class Plain(Objective):
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__(SENSOR)
         self.linear = torch.nn.Linear(8, 1)
 
-    def forward(self, images, rng):
+    def forward(self, images, rng, player):
         return {"loss": self.linear(images.range_m[:, 0, :8]).mean()}
 
 
 def some_images(count):
-    sensor = load_sensor("hdl64e_kitti_odometry")
-    range_m = torch.rand(count, sensor.height, sensor.width, generator=torch.Generator().manual_seed(0)) * 50 + 5
-    return RangeImage(range_m, torch.ones_like(range_m, dtype=torch.bool), sensor)
+    range_m = torch.rand(count, SENSOR.height, SENSOR.width, generator=torch.Generator().manual_seed(0)) * 50 + 5
+    return RangeImage(range_m, torch.ones_like(range_m, dtype=torch.bool), SENSOR)
 
 
 def play():

@@ -81,7 +81,7 @@ class ToyTokenizer(Tokenizer[ToyConfig]):
         """Return 0: nothing is multiplied."""
         return 0
 
-    def forward(self, images: RangeImage, rng: torch.Generator) -> dict[str, Tensor]:
+    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the error of the ranges' logarithms and the cross-entropy of returns."""
         decoded, mask = self.decode(self.encode(images)), images.return_mask
         error = (decoded.range_m.log() - images.range_m.clamp(self.sensor.range_min_m).log()).abs()[mask].mean()

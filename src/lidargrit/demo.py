@@ -166,7 +166,7 @@ def _cards(
     """Score new scans, held-out ones and those of single pixels, equally many of each, against training scans."""
     marginal = load_class("marginal")
     single = marginal(marginal.Config(), real.sensor)
-    single.learn(real)
+    single.fit_statistics(real)
     count = min(len(samples), len(real))
     pixels = RangeImages(real.sensor, [_Drawn(single.sample(range(count)))])
     plain = EvalConfig(resampling=Resampling(halves=0))

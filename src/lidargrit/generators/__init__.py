@@ -18,6 +18,7 @@ from lidargrit import _discovery, configuration
 from lidargrit.errors import CheckpointError, ConfigError, LidarGritError
 from lidargrit.files import is_taken, load_exactly, read_json, read_tensors, write_json, write_tensors, write_text
 from lidargrit.loading import RangeImages
+from lidargrit.nn.objective import Objective
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 from lidargrit.tokenizers import Tokenizer
@@ -77,15 +78,15 @@ class Generator(nn.Module, ABC):
     def __init__(self, config: Any, sensor: SensorModel) -> None:
         super().__init__()
 
-    def learn(self, images: RangeImages) -> None:
+    def fit_statistics(self, images: RangeImages) -> None:
         """Take from the training scans what needs no objective, such as counts; called once, before the stages."""
 
     @abstractmethod
-    def objective(self, stage: str) -> nn.Module:
+    def objective(self, stage: str) -> Objective:
         """Return what a stage trains: a module (images, rng) → terms with ``loss``; its weights are ours."""
 
     @abstractmethod
-    def finish(self, stage: str, objective: nn.Module) -> None:
+    def load_stage(self, stage: str, objective: Objective) -> None:
         """Take over the weights of a stage's trained objective."""
 
     @abstractmethod

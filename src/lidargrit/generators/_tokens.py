@@ -7,9 +7,10 @@ from typing import Any
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
 from lidargrit.generators import Generator
+from lidargrit.nn.objective import Objective
 from lidargrit.nn.processes import sum_over_processes
 from lidargrit.nn.transformer import Transformer, TransformerConfig
 from lidargrit.sensors import SensorModel
@@ -45,7 +46,7 @@ class TokenGenerator(Generator):
         self.config, self.sensor = config, sensor
         self.tokenizer = make_tokenizer(config.tokenizer, sensor)
 
-    def finish(self, stage: str, objective: nn.Module) -> None:
+    def load_stage(self, stage: str, objective: Objective) -> None:
         """Take over a stage's trained weights."""
         if stage == "tokenizer":
             self.tokenizer.load_state_dict(objective.state_dict())
@@ -81,14 +82,14 @@ class TokenGenerator(Generator):
         return RangeImage.cat(images)
 
 
-class TokenObjective(nn.Module):
+class TokenObjective(Objective):
     """What a transformer over the tokens of a frozen tokenizer learns from."""
 
     token_counts: Tensor
 
     def __init__(self, tokenizer: Tokenizer, transformer: Transformer) -> None:
-        super().__init__()
-        self.transformer, self.sensor = transformer, tokenizer.sensor
+        super().__init__(tokenizer.sensor)
+        self.transformer = transformer
         self._frozen = [tokenizer.eval().requires_grad_(False)]  # in a list: its weights are not this stage's
         self.register_buffer("token_counts", torch.ones(transformer.num_tokens))
 

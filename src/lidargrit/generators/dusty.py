@@ -10,7 +10,7 @@ from typing import Literal
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from torch import Tensor
 from torch.func import functional_call
 
 from lidargrit.determinism import derive_seed
@@ -25,6 +25,7 @@ from lidargrit.nn.differentiable_augmentation import (
 )
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.latent_search import search_latents
+from lidargrit.nn.objective import Objective
 from lidargrit.nn.published import read_checkpoint
 from lidargrit.nn.raydrop import logistic_noise, straight_through
 from lidargrit.projection import RangeEncoding
@@ -130,13 +131,13 @@ class Dusty(Generator):
         self.encoding = InverseRange(sensor)
         self.synthesis = Synthesis(config.latent_dim, _widths(config), _size(sensor), _LOGITS[config.variant])
 
-    def objective(self, stage: str) -> nn.Module:
+    def objective(self, stage: str) -> Objective:
         """Return the game of the network against a discriminator."""
-        return Game(self.synthesis, self.config, self.sensor)
+        return AdversarialObjective(self.synthesis, self.config, self.sensor)
 
-    def finish(self, stage: str, objective: nn.Module) -> None:
+    def load_stage(self, stage: str, objective: Objective) -> None:
         """Take over the trained network; its discriminator has done its work."""
-        assert isinstance(objective, Game)
+        assert isinstance(objective, AdversarialObjective)
         self.synthesis.load_state_dict(objective.synthesis.state_dict())
 
     @torch.no_grad()
@@ -235,7 +236,7 @@ class InverseRange:
         return self._nearest_first.decode(-encoded)
 
 
-class Game(nn.Module):
+class AdversarialObjective(Objective):
     """What DUSty trains: two players who take turns, each with the same random numbers.
 
     The discriminator learns to tell real scans from drawn ones, the network to be taken for real (the non-saturating
@@ -243,18 +244,18 @@ class Game(nn.Module):
     Mescheder et al., 2018). It sees the composed image only, never the mask.
     """
 
-    phases = ("discriminator", "generator")
+    players = ("discriminator", "generator")
     turns: Tensor
 
     def __init__(self, synthesis: Synthesis, config: DustyConfig, sensor: SensorModel) -> None:
-        super().__init__()
-        self.config, self.sensor, self.encoding = config, sensor, InverseRange(sensor)
+        super().__init__(sensor)
+        self.config, self.encoding = config, InverseRange(sensor)
         self.synthesis, self.discriminator = synthesis, Discriminator(_widths(config), _size(sensor))
         self.register_buffer("turns", torch.zeros((), dtype=torch.int64))  # of the discriminator
 
-    def forward(self, images: RangeImage, rng: torch.Generator, phase: str) -> dict[str, Tensor]:
+    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return a player's loss; the other one's weights are out of its reach."""
-        if phase == "discriminator":
+        if player == "discriminator":
             with torch.no_grad():
                 drawn, _ = self._draw(len(images), rng)
             return self._discriminate(self.encoding.encode(images), drawn, rng)

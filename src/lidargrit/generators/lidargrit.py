@@ -12,13 +12,14 @@ from typing import NamedTuple
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
 from lidargrit.errors import ConfigError
 from lidargrit.files import load_exactly
 from lidargrit.generators import Cost
 from lidargrit.generators._tokens import TokenGenerator, TokenGeneratorConfig, TokenObjective, sample_tokens
 from lidargrit.nn.decoding import CachedDecoder, WeightPrecision
+from lidargrit.nn.objective import Objective
 from lidargrit.nn.precision import Precision
 from lidargrit.nn.published import read_checkpoint
 from lidargrit.nn.transformer import CausalTransformer
@@ -91,7 +92,7 @@ class LidarGrit(TokenGenerator):
         self.transformer = CausalTransformer(config.transformer, self.tokenizer.num_codes, height * width)
         self._prepared: _Prepared | None = None
 
-    def objective(self, stage: str) -> nn.Module:
+    def objective(self, stage: str) -> Objective:
         """Return the VQ-VAE itself, or the transformer's objective over the frozen VQ-VAE."""
         return self.tokenizer if stage == "tokenizer" else NextToken(self.tokenizer, self.transformer)
 
@@ -168,7 +169,7 @@ class _Prepared(NamedTuple):
 class NextToken(TokenObjective):
     """The transformer's objective: negative log-likelihood of each token after those before it, in nats per token."""
 
-    def forward(self, images: RangeImage, rng: torch.Generator) -> dict[str, Tensor]:
+    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return eq. 6 of the paper per token, beside it that of a model which knows only how often tokens occur."""
         tokens, unigram_nll = self.encode(images)
         logits = self.transformer(after_start(tokens[:, :-1]))

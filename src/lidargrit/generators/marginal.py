@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from lidargrit.errors import CheckpointError, ConfigError
 from lidargrit.generators import Cost, Generator, NoSampling
 from lidargrit.loading import RangeImages
+from lidargrit.nn.objective import Objective
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
@@ -37,7 +38,7 @@ class Marginal(Generator):
     """Knows of each pixel how often it returns and how far, and nothing of how pixels hang together.
 
     A metric that gives it a good score does not look at shapes. It has no stage to train by an objective: it counts,
-    see :meth:`learn`.
+    see :meth:`fit_statistics`.
     """
 
     Config = MarginalConfig
@@ -51,15 +52,15 @@ class Marginal(Generator):
         self.register_buffer("scans", torch.zeros((), dtype=torch.int64))
         self.register_buffer("counts", torch.zeros(config.bins, sensor.height, sensor.width, dtype=torch.int32))
 
-    def objective(self, stage: str) -> nn.Module:
+    def objective(self, stage: str) -> Objective:
         """Refuse: there is no stage."""
         raise NotImplementedError(stage)
 
-    def finish(self, stage: str, objective: nn.Module) -> None:
+    def load_stage(self, stage: str, objective: Objective) -> None:
         """Refuse: there is no stage."""
         raise NotImplementedError(stage)
 
-    def learn(self, images: RangeImages) -> None:
+    def fit_statistics(self, images: RangeImages) -> None:
         """Count the returns of all images."""
         edges = self._edges_m()[1:-1]
         self.counts.zero_()
@@ -79,7 +80,7 @@ class Marginal(Generator):
             CheckpointError: nothing was counted yet.
         """
         if not int(self.scans):
-            raise CheckpointError("a generator that has counted no scan", "one that has", "call learn(images) first")
+            raise CheckpointError("a generator that has counted no scan", "one that has", "call fit_statistics first")
         edges = self._edges_m().to(self.counts.device)
         total = self.counts.cumsum(dim=0)
         images = []

@@ -9,11 +9,12 @@ from dataclasses import dataclass
 import torch
 import torch.nn.functional as F
 from jaxtyping import Int
-from torch import Tensor, nn
+from torch import Tensor
 
 from lidargrit.errors import ConfigError
 from lidargrit.generators import Cost
 from lidargrit.generators._tokens import TokenGenerator, TokenGeneratorConfig, TokenObjective, sample_tokens
+from lidargrit.nn.objective import Objective
 from lidargrit.nn.precision import Precision, dtype_of
 from lidargrit.nn.transformer import MaskedTransformer
 from lidargrit.sensors import SensorModel
@@ -78,7 +79,7 @@ class MaskGit(TokenGenerator):
         height, width = self.tokenizer.grid_size
         self.transformer = MaskedTransformer(config.transformer, self.tokenizer.num_codes, height * width)
 
-    def objective(self, stage: str) -> nn.Module:
+    def objective(self, stage: str) -> Objective:
         """Return the VQ-VAE itself, or the transformer's objective over the frozen VQ-VAE."""
         return self.tokenizer if stage == "tokenizer" else HiddenTokens(self.tokenizer, self.transformer)
 
@@ -108,7 +109,7 @@ class HiddenTokens(TokenObjective):
 
     transformer: MaskedTransformer
 
-    def forward(self, images: RangeImage, rng: torch.Generator) -> dict[str, Tensor]:
+    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return eq. 1 of the paper per hidden token, beside it that of a model which knows only token frequencies."""
         tokens, unigram_nll = self.encode(images)
         count, length = tokens.shape

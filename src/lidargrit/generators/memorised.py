@@ -7,13 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import CheckpointError, ConfigError
 from lidargrit.files import load_exactly
 from lidargrit.generators import Cost, Generator, NoSampling
 from lidargrit.loading import RangeImages
+from lidargrit.nn.objective import Objective
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
@@ -37,7 +38,7 @@ class Memorised(Generator):
     """Gives back what it was shown: the best that a generator without a thought of its own can score.
 
     A generator that scores better on held-out scans has learned something; one that scores the same may have learned
-    them by heart. It has no stage to train by an objective: it keeps scans, see :meth:`learn`.
+    them by heart. It has no stage to train by an objective: it keeps scans, see :meth:`fit_statistics`.
     """
 
     Config = MemorisedConfig
@@ -51,15 +52,15 @@ class Memorised(Generator):
         self.register_buffer("scans", torch.zeros((), dtype=torch.int64))
         self.register_buffer("range_m", torch.zeros(0, sensor.height, sensor.width))
 
-    def objective(self, stage: str) -> nn.Module:
+    def objective(self, stage: str) -> Objective:
         """Refuse: there is no stage."""
         raise NotImplementedError(stage)
 
-    def finish(self, stage: str, objective: nn.Module) -> None:
+    def load_stage(self, stage: str, objective: Objective) -> None:
         """Refuse: there is no stage."""
         raise NotImplementedError(stage)
 
-    def learn(self, images: RangeImages) -> None:
+    def fit_statistics(self, images: RangeImages) -> None:
         """Keep the images, in an order that does not follow the drive, so that the first seeds are not neighbours."""
         kept = evenly_spaced(self.config.scans, len(images))
         self.range_m = torch.zeros(len(kept), self.sensor.height, self.sensor.width)
@@ -86,7 +87,7 @@ class Memorised(Generator):
             CheckpointError: nothing was kept yet.
         """
         if not int(self.scans):
-            raise CheckpointError("a generator that has kept no scan", "one that has", "call learn(images) first")
+            raise CheckpointError("a generator that has kept no scan", "one that has", "call fit_statistics first")
         range_m = self.range_m[torch.tensor([seed % int(self.scans) for seed in seeds])]
         return RangeImage(range_m, range_m > 0, self.sensor)
 

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import CheckpointError, ConfigError
@@ -20,6 +20,7 @@ from lidargrit.loading import RangeImages
 from lidargrit.nn import diffusion
 from lidargrit.nn.diffusion import Sampler, SeededNoise
 from lidargrit.nn.flops import flops_of
+from lidargrit.nn.objective import Objective
 from lidargrit.nn.published import RefusedFileError, float_tensors, read_everything
 from lidargrit.nn.unet import EfficientUnet, UnetConfig
 from lidargrit.sensors import SensorModel, load_sensor
@@ -104,7 +105,7 @@ class R2dm(Generator):
         self.register_buffer("return_share", torch.tensor(math.nan))
         self.register_buffer("return_threshold", torch.tensor(math.nan))
 
-    def learn(self, images: RangeImages) -> None:
+    def fit_statistics(self, images: RangeImages) -> None:
         """Count how many of the training scans' rays return."""
         chosen = evenly_spaced(_SHARE_SCANS, len(images))
         shares = [
@@ -113,11 +114,11 @@ class R2dm(Generator):
         ]
         self.return_share.fill_(float(torch.cat(shares).mean()))
 
-    def objective(self, stage: str) -> nn.Module:
+    def objective(self, stage: str) -> Objective:
         """Return the denoising of the network."""
         return Denoising(self.network, self.sensor)
 
-    def finish(self, stage: str, objective: nn.Module) -> None:
+    def load_stage(self, stage: str, objective: Objective) -> None:
         """Take over the trained network, and fit the threshold of the calibrated raydrop."""
         assert isinstance(objective, Denoising)
         self.network.load_state_dict(objective.network.state_dict())
@@ -244,14 +245,14 @@ def encode(images: RangeImage, with_reflectance: bool) -> Float[Tensor, "B C H W
     return torch.stack((level, 2 * images.reflectance * images.return_mask - 1), dim=1)
 
 
-class Denoising(nn.Module):
+class Denoising(Objective):
     """The objective: the squared error of the predicted noise at a random time, weighed by min-SNR."""
 
     def __init__(self, network: EfficientUnet, sensor: SensorModel) -> None:
-        super().__init__()
-        self.network, self.sensor = network, sensor
+        super().__init__(sensor)
+        self.network = network
 
-    def forward(self, images: RangeImage, rng: torch.Generator) -> dict[str, Tensor]:
+    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the weighed error as ``loss``, and the plain one beside it."""
         clean = encode(images, with_reflectance=self.network.out_conv.out_channels > 1)
         time = torch.rand(len(clean), generator=rng, device=clean.device, dtype=torch.float64)

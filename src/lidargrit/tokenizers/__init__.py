@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, TypeVar
 
 import torch
-from torch import Tensor, nn
 
 from lidargrit import _discovery
 from lidargrit.configuration import NamedConfig
+from lidargrit.nn.objective import Objective
 from lidargrit.nn.precision import Precision
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import Decoded, MaskDecoding, RangeImage, TokenGrid
@@ -28,7 +28,7 @@ class TokenizerConfig(NamedConfig):
 Config = TypeVar("Config", bound=TokenizerConfig)
 
 
-class Tokenizer(nn.Module, ABC, Generic[Config]):
+class Tokenizer(Objective, Generic[Config]):
     """Turns range images of one sensor into a grid of tokens and back; an objective of training as it stands.
 
     A new tokenizer is one file of this folder with two public classes: a ``TokenizerConfig`` and the ``Tokenizer`` that
@@ -47,12 +47,8 @@ class Tokenizer(nn.Module, ABC, Generic[Config]):
     num_features: int = 0
 
     def __init__(self, config: Config, sensor: SensorModel) -> None:
-        super().__init__()
-        self.config, self.sensor = config, sensor
-
-    @abstractmethod
-    def forward(self, images: RangeImage, rng: torch.Generator) -> dict[str, Tensor]:
-        """Return the training objective as ``loss``, and further terms for the log."""
+        super().__init__(sensor)
+        self.config = config
 
     @abstractmethod
     def encode(self, images: RangeImage) -> TokenGrid:
@@ -88,10 +84,6 @@ class Tokenizer(nn.Module, ABC, Generic[Config]):
     def reconstruct(self, images: RangeImage) -> RangeImage:
         """Return what the tokens keep of a batch of scans, nothing of it at random."""
         return self.decode(self.encode(images)).threshold()
-
-    def warnings(self) -> list[str]:
-        """Return what a person should know of the training so far, one line each."""
-        return []
 
 
 def make_tokenizer(config: TokenizerConfig, sensor: SensorModel) -> Tokenizer[Any]:

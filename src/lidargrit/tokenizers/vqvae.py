@@ -267,7 +267,7 @@ class Vqvae(Tokenizer[VqvaeConfig]):
         latents = (1, self.config.code_dim, *self.grid_size)
         return flops_of(self.post_quant_conv, latents) + flops_of(self.decoder.prepared("fp32"), latents)
 
-    def forward(self, images: RangeImage, rng: torch.Generator) -> dict[str, Tensor]:
+    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the loss of eq. 5 of the paper and its terms, with the error in metres and the mask's accuracy."""
         z = self.quantize(self.latents(images), rng)
         encoded, return_logits = self._heads(self.decoder(self.post_quant_conv(z.latents)))

@@ -11,6 +11,7 @@ from torch.utils.module_tracker import ModuleTracker
 
 from lidargrit.errors import ConfigError
 from lidargrit.generators import load_class
+from lidargrit.nn.objective import Objective
 from lidargrit.nn.precision import Precision
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
@@ -130,11 +131,11 @@ def same_everywhere(sensor: SensorModel, count: int) -> RangeImage:
     return RangeImage(range_m, torch.ones_like(range_m, dtype=torch.bool), sensor, torch.full_like(range_m, 0.3))
 
 
-def _flops_per_scan(objective: torch.nn.Module, sensor: SensorModel) -> float:
+def _flops_per_scan(objective: Objective, sensor: SensorModel) -> float:
     images = same_everywhere(sensor, _SCANS)
-    engine = Engine("fp32", hasattr(objective, "phases"))
+    engine = Engine("fp32", bool(objective.players))
     engine.set_up(objective, torch.optim.SGD(objective.parameters(), lr=0.0))  # the quickest: it is not counted
-    steps = _STEPS if hasattr(objective, "phases") else 1
+    steps = _STEPS if objective.players else 1
     counter = FlopCounterMode(display=False)
     # Which module an operation is of is not asked, and the tracker stumbles over penalties.
     counter.mod_tracker = _NoModules()

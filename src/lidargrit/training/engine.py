@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from lidargrit.determinism import derive_seed
 from lidargrit.errors import LidarGritError
+from lidargrit.nn.objective import Objective
 from lidargrit.nn.precision import Precision, dtype_of
 from lidargrit.processes import rank_and_world_size
 from lidargrit.structures import RangeImage
@@ -47,9 +48,9 @@ class Engine:
         self._fabric.launch()
         self.device, self.rank, self.world_size = self._fabric.device, self._fabric.global_rank, self._fabric.world_size
 
-    def set_up(self, objective: nn.Module, optimiser: torch.optim.Optimizer) -> None:
+    def set_up(self, objective: Objective, optimiser: torch.optim.Optimizer) -> None:
         """Place an objective on the device and spread it over the processes."""
-        self._objective, self._optimiser = self._fabric.setup(_Door(objective), optimiser)
+        self._objective, self._optimiser = self._fabric.setup(_UncastInputs(objective), optimiser)
 
     def by_first(self, action: Callable[[], None]) -> None:
         """Let the first process alone do something, such as write a file; all raise the error that it met."""
@@ -88,21 +89,21 @@ class Engine:
         """
         self._objective.train()
         terms: dict[str, Tensor] = {}
-        for phase in _phases(self._objective.objective):
-            found, is_finite = self._step(images, seed, gradient_clip, phase, parts)
-            terms = _joined(terms, found, phase)
+        for player in _turns(self._objective.objective):
+            found, is_finite = self._step(images, seed, gradient_clip, player, parts)
+            terms = _joined(terms, found, player)
             if not is_finite:
                 break
         return terms
 
     def _step(
-        self, images: RangeImage, seed: int, gradient_clip: float, phase: str, parts: int
+        self, images: RangeImage, seed: int, gradient_clip: float, player: str, parts: int
     ) -> tuple[dict[str, Tensor], bool]:
         terms: dict[str, Tensor] = {}
         for part in range(parts):
             some = images if parts == 1 else images[part * len(images) // parts : (part + 1) * len(images) // parts]
             with self._fabric.no_backward_sync(self._objective, enabled=part < parts - 1):
-                found = self._objective(partial(_same, some), derive_seed(seed, part) if part else seed, phase)
+                found = self._objective(partial(_same, some), derive_seed(seed, part) if part else seed, player)
                 loss = self._mean(found["loss"].detach().clone())
                 if not bool(loss.isfinite()):
                     return {**found, "loss": loss}, False
@@ -127,47 +128,46 @@ class Engine:
         together = torch.stack([term.to(self.device, torch.float32) for term in terms.values()])
         return dict(zip(terms, self._mean(together).unbind(), strict=True))
 
-    def evaluate(self, objective: nn.Module, images: RangeImage, seed: int) -> dict[str, float]:
+    def evaluate(self, objective: Objective, images: RangeImage, seed: int) -> dict[str, float]:
         """Return an objective's terms on a batch, in evaluation mode."""
         was_training = objective.training
         objective.eval()
         terms: dict[str, Tensor] = {}
         with torch.no_grad(), self._fabric.autocast():
-            for phase in _phases(objective):
+            for player in _turns(objective):
                 rng = torch.Generator(self.device).manual_seed(seed)
-                terms = _joined(terms, _ask(objective, images.to(self.device), rng, phase), phase)
+                terms = _joined(terms, objective(images.to(self.device), rng, player), player)
         objective.train(was_training)
         return {name: float(term) for name, term in terms.items()}
 
 
-class _Door(nn.Module):
-    """Takes a function that returns the images: the engine would round tensors, and so all ranges, to its precision."""
+class _UncastInputs(nn.Module):
+    """Hands images to an objective unrounded: Fabric rounds every tensor argument to the training precision.
 
-    def __init__(self, objective: nn.Module) -> None:
+    The images are passed as a function that returns them.
+    """
+
+    def __init__(self, objective: Objective) -> None:
         super().__init__()
         self.objective = objective
 
-    def forward(self, images: Callable[[], RangeImage], seed: int, phase: str) -> dict[str, Tensor]:
+    def forward(self, images: Callable[[], RangeImage], seed: int, player: str) -> dict[str, Tensor]:
         device = next(self.objective.parameters()).device
-        return _ask(self.objective, images(), torch.Generator(device).manual_seed(seed), phase)
+        return self.objective(images(), torch.Generator(device).manual_seed(seed), player)
 
 
 def _same(images: RangeImage) -> RangeImage:
     return images
 
 
-def _phases(objective: nn.Module) -> tuple[str, ...]:
-    """Return the names of an objective's players, who take turns; one without a name where it has none."""
-    return getattr(objective, "phases", ("",))
+def _turns(objective: Objective) -> tuple[str, ...]:
+    """Return the players of an objective, or one without a name where it has none."""
+    return objective.players or ("",)
 
 
-def _ask(objective: nn.Module, images: RangeImage, rng: torch.Generator, phase: str) -> dict[str, Tensor]:
-    return objective(images, rng, phase) if phase else objective(images, rng)
-
-
-def _joined(terms: dict[str, Tensor], found: dict[str, Tensor], phase: str) -> dict[str, Tensor]:
+def _joined(terms: dict[str, Tensor], found: dict[str, Tensor], player: str) -> dict[str, Tensor]:
     """Add a player's terms under its name to those of the players before it, and its loss to theirs."""
-    if not phase:
+    if not player:
         return found
     loss = found["loss"] + terms.get("loss", 0.0)
-    return {**terms, "loss": loss, **{f"{phase}_{name}": term for name, term in found.items()}}
+    return {**terms, "loss": loss, **{f"{player}_{name}": term for name, term in found.items()}}

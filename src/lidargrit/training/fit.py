@@ -8,13 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from lidargrit.determinism import derive_seed, evenly_spaced
 from lidargrit.errors import ConfigError, Terminated, TrainingError
 from lidargrit.files import remove_partials
 from lidargrit.loading import Batches, RangeImages
 from lidargrit.nn.blocks import prepare_for_training
+from lidargrit.nn.objective import Objective
 from lidargrit.reporting import Reporter
 from lidargrit.structures import RangeImage
 from lidargrit.training.checkpoint import load_checkpoint, save_checkpoint
@@ -32,10 +33,7 @@ class Fit:
     """The state of one stage of a run.
 
     Args:
-        objective: a module that turns (range image, random generator) into terms, one of them ``loss``; it has a
-            ``sensor`` and may have ``warnings()``, lines that a person should see. One of several players names them in
-            ``phases``; every step asks it once for each, with the name as third argument, and moves the weights that
-            this player's loss reaches before it asks for the next.
+        objective: what the stage minimises.
         config: how it learns.
         folder: where ``checkpoint.safetensors`` and ``log.jsonl`` lie.
         seed: of order, augmentation, dropout and draws.
@@ -45,17 +43,17 @@ class Fit:
         plot: plots the averaged objective into the named file.
     """
 
-    objective: nn.Module
+    objective: Objective
     config: FitConfig
     folder: Path
     seed: int
     reporter: Reporter
     built_on: str = ""
     workers: int = 1
-    plot: Callable[[nn.Module, Path], None] | None = None
+    plot: Callable[[Objective, Path], None] | None = None
 
     def __post_init__(self) -> None:
-        takes_turns = hasattr(self.objective, "phases")
+        takes_turns = bool(self.objective.players)
         self.engine = Engine(self.config.precision, takes_turns)
         _check_parts(self.config, self.engine.world_size, takes_turns)
         prepare_for_training(self.objective, self.config.recompute, self.config.compile)
@@ -74,7 +72,7 @@ class Fit:
         """The one file from which the stage goes on."""
         return self.folder / "checkpoint.safetensors"
 
-    def run(self, train: RangeImages, val: RangeImages, what: str) -> nn.Module:
+    def run(self, train: RangeImages, val: RangeImages, what: str) -> Objective:
         """Learn until the budget is spent and return the objective with its averaged weights.
 
         Raises:
@@ -172,7 +170,7 @@ class Fit:
         if split == "val":
             told = "  ".join(f"{name} {value:.4g}" for name, value in terms.items())
             self.reporter.message(f"  after {self.scans_seen} scans, on val: {told}")
-            for warning in getattr(self.objective, "warnings", list)():
+            for warning in self.objective.warnings():
                 self.reporter.message(f"  WARNING: {warning}")
 
 

@@ -58,7 +58,7 @@ def measure(recipe: Recipe) -> list[Measured]:
         for stage in generator.stages:
             config, objective = recipe.training[stage], generator.objective(stage)
             prepare_for_training(objective, config.recompute, config.compile)
-            engine = Engine(config.precision, hasattr(objective, "phases"))
+            engine = Engine(config.precision, bool(objective.players))
             engine.set_up(objective, make_optimiser(objective, config))
             images = same_everywhere(recipe.data.load_sensor(), config.batch_size // engine.world_size)
             images = images.to(engine.device)

@@ -8,6 +8,7 @@ import math
 import torch
 from torch import nn
 
+from lidargrit.nn.objective import Objective
 from lidargrit.training.config import FitConfig
 
 
@@ -53,7 +54,7 @@ class WeightAverage:
         Karras et al., EDM2, 2023: half-lives in samples, with a ramp.
     """
 
-    def __init__(self, objective: nn.Module, half_life_scans: int) -> None:
+    def __init__(self, objective: Objective, half_life_scans: int) -> None:
         self.objective = copy.deepcopy(objective).requires_grad_(False)
         self.half_life_scans = half_life_scans
 

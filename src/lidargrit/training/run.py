@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
 
 from lidargrit import __version__, configuration
 from lidargrit.determinism import derive_seed
@@ -22,6 +21,7 @@ from lidargrit.errors import CheckpointError, ConfigError, OutputError
 from lidargrit.files import is_taken, read_json, write_json, write_text
 from lidargrit.generators import RUN_FILE, TRAINED_ON_FILE, Generator, load, load_class, locate, recipe_settings
 from lidargrit.loading import DataConfig, RangeImages, load_range_images
+from lidargrit.nn.objective import Objective
 from lidargrit.reporting import Reporter
 from lidargrit.tokenizers import Tokenizer
 from lidargrit.training.checkpoint import fingerprint
@@ -65,10 +65,10 @@ def train(
         generator = load_class(recipe.generator)(recipe.model, recipe.data.load_sensor())
         borrowed = None if recipe.tokenizer_from is None else _tokenizer_of(Path(recipe.tokenizer_from), generator)
         engine.by_first(lambda: _claim(folder, recipe, train_images, val_images))
-        generator.learn(train_images)
+        generator.fit_statistics(train_images)
         built_on = ""
         for number, stage in enumerate(generator.stages):
-            trained: nn.Module
+            trained: Objective
             if stage == "tokenizer" and borrowed is not None:
                 trained = borrowed
             else:
@@ -77,18 +77,18 @@ def train(
                 workers, config = recipe.data.workers, recipe.training[stage]
                 fit = Fit(objective, config, folder / stage, seed, reporter, built_on, workers, picture)
                 trained = fit.run(train_images, val_images, f"training {stage}")
-            generator.finish(stage, trained)
+            generator.load_stage(stage, trained)
             built_on = fingerprint(trained)
     engine.by_first(lambda: generator.save(folder))
     return generator.cpu().eval()
 
 
 def _plot(
-    plot: PlotProgress, generator: Generator, stage: str, val_images: RangeImages, averaged: nn.Module, path: Path
+    plot: PlotProgress, generator: Generator, stage: str, val_images: RangeImages, averaged: Objective, path: Path
 ) -> None:
     """Plot a copy that has the averaged weights: those of the generator itself are being trained."""
     copied = copy.deepcopy(generator)
-    copied.finish(stage, averaged)
+    copied.load_stage(stage, averaged)
     plot(copied.to(next(averaged.parameters()).device).eval(), stage, val_images, path)
 
 

@@ -1,0 +1,45 @@
+"""What a stage of training minimises: (range images, random numbers) → the terms of a loss."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import torch
+from torch import Tensor, nn
+
+from lidargrit.sensors import SensorModel
+from lidargrit.structures import RangeImage
+
+
+class Objective(nn.Module, ABC):
+    """A loss over batches of range images; its parameters are what the stage trains.
+
+    Args:
+        sensor: sensor whose range images the objective takes.
+    """
+
+    sensor: SensorModel
+    players: tuple[str, ...] = ()
+    """Names of the players of an adversarial objective, in their order; empty where there is one loss only.
+
+    Every step asks the objective once for each player, and moves the weights that this player's loss reaches before it
+    asks for the next. The objective itself keeps the other players' weights out of a player's reach.
+    """
+
+    def __init__(self, sensor: SensorModel) -> None:
+        super().__init__()
+        self.sensor = sensor
+
+    @abstractmethod
+    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+        """Return the terms of the loss as scalars: ``loss``, which is minimised, and beside it what is worth logging.
+
+        Args:
+            images: batch of range images (B, H, W).
+            rng: random numbers, on the device of the images.
+            player: one of ``players``; "" where there are none.
+        """
+
+    def warnings(self) -> list[str]:
+        """Return lines that a person should read after a validation, such as that a codebook has collapsed."""
+        return []
