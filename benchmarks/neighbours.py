@@ -2,9 +2,9 @@
 
     python benchmarks/neighbours.py [--words "sample pretrained" -n 8 32] [--busy 0 1 2] [--repeats 2]
 
-Each row is one way of waiting: as the command arranges it, with OpenMP's own default (threads spin), and with one
+Each row is one way of waiting: as the command arranges it, as OpenMP does by itself (threads spin), and with one
 thread. A busy process is a Python loop that never ends. Seconds are of the whole command, its start included, the least
-of the repeats; beside them how much of the processors others took during it, which should be the busy processes alone.
+of the repeats; beside them how many processors others took during it, which should be the busy processes alone.
 """
 
 import argparse
@@ -13,12 +13,12 @@ import subprocess
 import sys
 import tempfile
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 WAYS = {  # name → environment variables; the command leaves what is set already as it is
     "as the command arranges it": {},
-    "threads spin": {"OMP_WAIT_POLICY": "ACTIVE", "GOMP_SPINCOUNT": "30000000000"},
+    "as OpenMP does by itself": {"GOMP_SPINCOUNT": "300000"},
     "one thread": {"OMP_NUM_THREADS": "1"},
 }
 
@@ -41,13 +41,19 @@ def busy_jiffies() -> int:
     return sum(fields) - fields[3] - fields[4]
 
 
-def timed(words: list[str], environment: dict[str, str]) -> tuple[float, float, float]:
-    """Return the seconds of a command, those of its processors, and the processors that others took."""
+def timed(python: str, words: list[str], environment: dict[str, str], limit_s: float) -> tuple[float, float, float]:
+    """Return the seconds of a command, at most the limit, those of its processors, and the processors others took."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("OMP_", "GOMP_"))}
     begun, before, used = time.monotonic(), busy_jiffies(), os.times()
-    subprocess.run(
-        [sys.executable, "-m", "lidargrit", *words], env=kept | environment, check=True, stdout=subprocess.DEVNULL
-    )
+    with suppress(subprocess.TimeoutExpired):
+        subprocess.run(
+            [python, "-m", "lidargrit", *words],
+            env=kept | environment,
+            check=True,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            timeout=limit_s,
+        )
     seconds, after = time.monotonic() - begun, os.times()
     own = after.children_user + after.children_system - used.children_user - used.children_system
     return seconds, own, ((busy_jiffies() - before) / 100 - own) / seconds
@@ -60,6 +66,10 @@ def main() -> None:
     parser.add_argument("--busy", type=int, nargs="*", default=[0, 1, 2], help="how many busy processes")
     parser.add_argument("--repeats", type=int, default=2)
     parser.add_argument("--ways", nargs="*", default=list(WAYS), choices=list(WAYS))
+    parser.add_argument(
+        "--python", default=sys.executable, help="of an environment with another version of the program"
+    )
+    parser.add_argument("--limit", type=float, default=300, help="seconds after which a command is ended")
     options = parser.parse_args()
     for count in options.n:
         for neighbours in options.busy:
@@ -68,10 +78,11 @@ def main() -> None:
                 for _ in range(options.repeats):
                     with tempfile.TemporaryDirectory() as folder, busy(neighbours):
                         words = [*options.words.split(), f"{folder}/out", "-n", str(count)]
-                        found.append(timed(words, WAYS[name]))
+                        found.append(timed(options.python, words, WAYS[name], options.limit))
                 seconds, own, others = min(found)
+                bound = ">" if seconds >= options.limit else " "
                 print(
-                    f"-n {count:<4}{neighbours} busy  {name:<28}{seconds:8.1f} s  {own:8.1f} s of processors, "
+                    f"-n {count:<4}{neighbours} busy  {name:<28}{bound}{seconds:7.1f} s  {own:8.1f} s of processors, "
                     f"others took {others:.2f}",
                     flush=True,
                 )

@@ -11,7 +11,14 @@ from hypothesis import strategies as st
 
 from lidargrit.configuration import override
 from lidargrit.errors import ConfigError
-from lidargrit.generators.maskgit import HiddenTokens, MaskedSampling, MaskGit, fill_in, numbers_hidden, share_hidden
+from lidargrit.generators.maskgit import (
+    HiddenTokens,
+    MaskedSampling,
+    MaskGit,
+    generate_tokens,
+    numbers_hidden,
+    share_hidden,
+)
 from lidargrit.nn.transformer import CausalTransformer, MaskedTransformer, TransformerConfig
 from lidargrit.recipes import load_recipe
 from lidargrit.structures import RangeImage
@@ -56,7 +63,7 @@ def test_every_pass_shows_some_and_the_last_all(num_tokens, steps):
 def test_every_token_is_decided_once_and_stays(transformer):
     seen = []
     transformer.register_forward_hook(lambda module, given, found: seen.append(given[0].clone()))
-    written = fill_in(transformer, rngs(0, 1), MaskedSampling(steps=5))
+    written = generate_tokens(transformer, rngs(0, 1), MaskedSampling(steps=5))
     assert len(seen) == 5
     assert bool((seen[0] == transformer.mask_token).all())
     for before, after in zip(seen, [*seen[1:], written], strict=True):
@@ -79,13 +86,15 @@ def test_greedy_with_a_pass_for_each_token_is_a_slow_loop(transformer):
             )
             assert surest > 0
             tokens[0, place] = token
-        assert torch.equal(fill_in(transformer, rngs(0), GREEDY), tokens)
+        assert torch.equal(generate_tokens(transformer, rngs(0), GREEDY), tokens)
 
 
 def test_one_pass_draws_every_token_with_its_own_probability(transformer):
     with torch.no_grad():
         odds = transformer(torch.full((1, 24), transformer.mask_token))[0].softmax(-1)
-        written = torch.cat([fill_in(transformer, rngs(*range(i, i + 500)), MaskedSampling(1)) for i in (0, 500, 1000)])
+        written = torch.cat(
+            [generate_tokens(transformer, rngs(*range(i, i + 500)), MaskedSampling(1)) for i in (0, 500, 1000)]
+        )
     for place in (0, 11, 23):
         share = torch.bincount(written[:, place], minlength=20) / len(written)
         assert float((share - odds[place]).abs().max()) < 0.06  # 5 standard deviations of a share of a half
@@ -94,16 +103,16 @@ def test_one_pass_draws_every_token_with_its_own_probability(transformer):
 def test_a_high_order_temperature_shows_tokens_in_any_order(transformer):
     seen = []
     transformer.register_forward_hook(lambda module, given, found: seen.append(given[0].clone()))
-    fill_in(transformer, rngs(*range(400)), MaskedSampling(steps=2, order_temperature=1e6))
+    generate_tokens(transformer, rngs(*range(400)), MaskedSampling(steps=2, order_temperature=1e6))
     shown = (seen[1] != transformer.mask_token).float().mean(0)
     assert float((shown - (1 - numbers_hidden(24, 2)[0] / 24)).abs().max()) < 0.12  # 5 standard deviations
 
 
 def test_a_seed_gives_the_same_tokens_whatever_the_batch(transformer):
-    together = fill_in(transformer, rngs(3, 4, 5), MaskedSampling(steps=6))
-    assert torch.equal(fill_in(transformer, rngs(4), MaskedSampling(steps=6)), together[1:2])
+    together = generate_tokens(transformer, rngs(3, 4, 5), MaskedSampling(steps=6))
+    assert torch.equal(generate_tokens(transformer, rngs(4), MaskedSampling(steps=6)), together[1:2])
     assert not torch.equal(together[0], together[1])
-    assert not torch.equal(fill_in(transformer, rngs(4), MaskedSampling(steps=7)), together[1:2])
+    assert not torch.equal(generate_tokens(transformer, rngs(4), MaskedSampling(steps=7)), together[1:2])
 
 
 def test_a_masked_transformer_sees_both_sides_and_a_causal_one_does_not():
@@ -157,8 +166,8 @@ def test_the_cost_is_what_torch_counts():
 
 
 def test_short_numbers_change_the_odds_a_little(transformer):
-    exact = fill_in(transformer, rngs(*range(40)), MaskedSampling(steps=1))
-    short = fill_in(transformer, rngs(*range(40)), MaskedSampling(steps=1, weights="bf16"))
+    exact = generate_tokens(transformer, rngs(*range(40)), MaskedSampling(steps=1))
+    short = generate_tokens(transformer, rngs(*range(40)), MaskedSampling(steps=1, weights="bf16"))
     assert 0.9 < float((exact == short).float().mean()) < 1
 
 

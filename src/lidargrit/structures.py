@@ -26,11 +26,11 @@ class Scan:
     """The points of one revolution, in the sensor's frame (x forward, y left, z up).
 
     Args:
-        points_xyz_m: metres.
-        reflectance: in [0, 1].
-        ring: laser of every point, 0 = the highest.
+        points_xyz_m: coordinates in metres.
+        reflectance: reflectance of every point, in [0, 1].
+        ring: index of the laser of every point, 0 = the highest.
         label: class of every point by SemanticKITTI's numbers, with its instance in the upper 16 of 32 bits.
-        source: where the scan comes from, for messages.
+        source: file or other origin of the scan, for messages.
 
     Raises:
         ScanError: no point, a coordinate that is not finite, a point at the origin, or a reflectance outside [0, 1].
@@ -87,10 +87,10 @@ class RangeImage:
     """One range image or a batch: row 0 is the highest elevation, column 0 the azimuth +pi, falling to the right.
 
     Args:
-        range_m: Euclidean distance to the return in metres; 0 where there is none.
-        return_mask: True = the beam came back.
-        sensor: the rays of the pixels.
-        reflectance: in [0, 1]; 0 where there is no return.
+        range_m: Euclidean distance to the return, in metres; 0 where there is none.
+        return_mask: whether the beam came back.
+        sensor: sensor whose rays the pixels are.
+        reflectance: reflectance of the return, in [0, 1]; 0 where there is none.
 
     Raises:
         ScanError: a range that is not finite, not positive on a return, or not 0 elsewhere.
@@ -193,7 +193,7 @@ class TokenGrid:
 
     Args:
         tokens: indices of codes.
-        num_codes: size of the codebook; every token is below it.
+        num_codes: number of codes in the codebook; every token is below it.
 
     Raises:
         ConfigError: a token outside [0, num_codes).
@@ -216,11 +216,11 @@ class Decoded:
     """What a decoder tells of every pixel of a batch of scans, before it is decided which beams return.
 
     Args:
-        range_m: metres, range of the surface that the beam meets, whether or not it returns.
+        range_m: range of the surface that the beam meets, in metres, whether or not it returns.
         return_logits: logits of the probability that the beam returns.
-        sensor: rays of the pixels.
-        reflectance: in [0, 1], of that surface; None from a decoder without reflectance.
-        features: what the decoder knows of each pixel, for networks that decode further; None if it gives none.
+        sensor: sensor whose rays the pixels are.
+        reflectance: reflectance of that surface, in [0, 1]; None from a decoder without reflectance.
+        features: feature maps of the decoder, for networks that decode further; None if it gives none.
     """
 
     range_m: Float[Tensor, "B H W"]
@@ -251,13 +251,13 @@ class MetricResult:
     """A number with everything needed to read it.
 
     Args:
-        metric: the metric's name.
-        value: the number.
-        higher_is_better: its direction.
-        num_generated: how many generated scans went in.
-        num_reference: how many real ones.
-        variant: which definition was used, e.g. ``exact`` or ``reference``.
-        details: further numbers, such as the value at every level.
+        metric: name of the metric.
+        value: the number, in the metric's unit.
+        higher_is_better: whether a larger value is better.
+        num_generated: number of generated scans.
+        num_reference: number of real scans.
+        variant: name of the definition, such as ``exact`` or ``reference``.
+        details: further numbers by name, such as the value at every level.
     """
 
     metric: str

@@ -83,7 +83,7 @@ class TokenGenerator(Generator):
 
 
 class TokenObjective(Objective):
-    """What a transformer over the tokens of a frozen tokenizer learns from."""
+    """Base of the objectives of transformers over the tokens of a frozen tokenizer."""
 
     token_counts: Tensor
 
@@ -95,8 +95,8 @@ class TokenObjective(Objective):
 
     @torch.no_grad()
     def encode(self, images: RangeImage) -> tuple[Int[Tensor, "B T"], Float[Tensor, "B T"]]:
-        """Return the tokens, and the nats that each takes from a model which knows only how often tokens occur."""
-        # Tokens are made in full precision, as they are when a scan is encoded outside of training.
+        """Return the tokens, and their negative log-likelihood in nats by a model that knows only token frequencies."""
+        # Tokens are computed in full precision, as when a scan is encoded outside of training.
         with torch.autocast(images.range_m.device.type, enabled=False):
             self._frozen[0].to(images.range_m.device)
             tokens = self._frozen[0].encode(images).tokens.flatten(1)

@@ -1,4 +1,4 @@
-"""LidarGRIT: a transformer writes the tokens of a VQ-VAE one by one; seeds → range images."""
+"""LidarGRIT: a transformer generates the tokens of a VQ-VAE one by one, and its decoder makes range images of them."""
 
 from __future__ import annotations
 
@@ -38,19 +38,20 @@ _COUNTERS = ("quantize.usage", "quantize.code_sums")  # of our training, which o
 
 @dataclass(frozen=True)
 class TokenSampling:
-    """How tokens are drawn, and returns.
+    """How tokens and returns are sampled.
 
     Args:
-        temperature: above 1 bolder, below 1 safer than the model's own probabilities; 0 takes the likeliest token.
-        top_k: draw among the k likeliest tokens only; 0 for all, the model's own distribution, since the paper names no
-            other. The released program's is 100, which makes a barely trained model bland.
-        top_p: draw among the likeliest tokens that together hold this probability; 1 for all.
-        mask: ``bernoulli`` draws each return with its probability (the released program, so what the paper's scores
-            were computed with); ``threshold`` keeps what is at least as likely as not (the paper's eq. 1).
-        weights: of the transformer. ``fp32`` is exact; ``bf16`` and ``int8`` (CPUs only) read less memory for a token
-            and change the odds a little, see docs/performance.md.
-        decoder: ``fp32`` gives the same scan on every machine; ``bf16`` is quicker and moves ranges a little, ``auto``
-            is that where the machine has instructions for it.
+        temperature: divisor of the logits: above 1 scans vary more than the model's own, below 1 less; 0 takes the
+            likeliest token.
+        top_k: number of the likeliest tokens that are sampled from; 0 for all, the model's own distribution, since the
+            paper names no other. The released program takes 100, which makes a barely trained model bland.
+        top_p: probability that the likeliest tokens, which alone are sampled from, hold together; 1 for all.
+        mask: ``bernoulli`` samples each return with its probability, as the released program does, so the paper's
+            scores too; ``threshold`` keeps a return that is at least as likely as not (the paper's eq. 1).
+        weights: number type of the transformer's weights. ``fp32`` is exact; ``bf16`` and ``int8`` (CPUs only) read
+            less memory for a token and change probabilities a little, see docs/performance.md.
+        decoder: number type of the decoder. ``fp32`` is exact; ``bf16`` is quicker and moves ranges a little; ``auto``
+            is ``bf16`` where the machine has instructions for it.
     """
 
     temperature: float = 1.0
@@ -110,7 +111,7 @@ class LidarGrit(TokenGenerator):
 
     @torch.no_grad()
     def token_nll_bits(self, images: RangeImage) -> Float[Tensor, "B h w"]:
-        """Return how many bits each token of each scan takes after those before it, by one pass over all of them."""
+        """Return the negative log-likelihood of each token given those before it, in bits."""
         self.eval()
         tokens = self.tokenizer.encode(images).tokens
         logits = self.transformer(after_start(tokens.flatten(1)[:, :-1]))
@@ -122,7 +123,7 @@ class LidarGrit(TokenGenerator):
         return -self.token_nll_bits(images).double().sum(dim=(1, 2)).mul(math.log(2)).float()
 
     def cost(self, sampling: TokenSampling | None = None) -> Cost:
-        """Return one step of the transformer for each token, with those before it in a cache, and one decoding."""
+        """Return the cost of one step of the transformer for each token, with a cache, and of one decoding."""
         sizes, tokens = self.config.transformer, self.transformer.context_length
         # Per token and layer: four projections and a perceptron of four times the width, then queries by keys and
         # weights by values over all tokens so far.
@@ -131,22 +132,22 @@ class LidarGrit(TokenGenerator):
         return Cost(tokens + 1, products + head + self.tokenizer.decoding_flops())
 
     def _prepare(self, batch_size: int, sampling: TokenSampling) -> tuple[CachedDecoder, Tokenizer]:
-        """Return what draws tokens and what decodes them, kept from the last time if nothing has changed since."""
+        """Return what generates tokens and what decodes them, kept from the last call if nothing has changed since."""
         weights = tuple((weight.data_ptr(), weight._version) for weight in self.parameters())
         key = (batch_size, sampling, weights)
         if self._prepared is None or self._prepared.key != key:
             self._prepared = None  # its cache is given back before the next is taken
-            chooser = partial(sample_token, sampling=sampling)
-            decoder = CachedDecoder(self.transformer, batch_size, chooser, START_TOKEN, sampling.weights)
+            by_choices = partial(sample_token, sampling=sampling)
+            decoder = CachedDecoder(self.transformer, batch_size, by_choices, START_TOKEN, sampling.weights)
             self._prepared = _Prepared(key, decoder, self.tokenizer.for_decoding(sampling.decoder))
         return self._prepared.decoder, self._prepared.tokenizer
 
     @classmethod
     def from_published(cls, files: Sequence[Path], config: LidarGritConfig, sensor: SensorModel) -> LidarGrit:
-        """Make a generator of a VQ-VAE's and a transformer's checkpoint, whose names of weights are ours.
+        """Make a generator of a VQ-VAE's and a transformer's checkpoint, in which weights have the names of ours.
 
-        The files do not tell the heads of attention, nor the order of tokens: only that of the paper, row by row over
-        the whole image, is known here.
+        The files tell neither the number of attention heads nor the order of tokens: only the order of the paper, row
+        by row over the whole image, is known here.
 
         Source:
             hamedhaghighi/LidarGRIT@a3f86e7, models/base_model.py.
@@ -185,13 +186,13 @@ def after_start(tokens: Int[Tensor, "B T"]) -> Int[Tensor, "B T+1"]:
 def sample_by_recomputing(
     transformer: CausalTransformer, uniform: Float[Tensor, "B T"], sampling: TokenSampling
 ) -> Int[Tensor, "B T"]:
-    """Draw token sequences in raster order as the released program does: every step reads the whole prefix again.
+    """Sample token sequences in raster order as the released program does: every step reads the whole prefix again.
 
-    This is the plain statement of what :class:`CachedDecoder` does quicker, and what it is tested against.
+    :class:`CachedDecoder` gives the same tokens in less time, and is tested against this function.
 
     Args:
-        transformer: what to draw from.
-        uniform: random numbers in [0, 1); the token is where the distribution function first exceeds its number.
+        transformer: model of the next token.
+        uniform: random numbers in [0, 1), one for each token; see :func:`sample_tokens`.
         sampling: temperature, top-k and top-p.
     """
     tokens = torch.full((len(uniform), 1), START_TOKEN, dtype=torch.long, device=uniform.device)
@@ -204,7 +205,7 @@ def sample_by_recomputing(
 def sample_token(
     logits: Float[Tensor, "B K"], uniform: Float[Tensor, "B"], sampling: TokenSampling
 ) -> Int[Tensor, "B"]:
-    """Choose one token for each row of logits by its uniform number."""
+    """Sample one token for each row of logits, by its uniform number in [0, 1)."""
     if sampling.temperature == 0:
         return logits.argmax(dim=1)
     logits = logits.double() / sampling.temperature
@@ -213,6 +214,6 @@ def sample_token(
         logits = logits.masked_fill(logits < weakest, -torch.inf)  # ties with the weakest are kept, as in the program
     if sampling.top_p < 1:
         ordered, order = logits.softmax(dim=1).sort(dim=1, descending=True)
-        spare = ordered.cumsum(dim=1) - ordered >= sampling.top_p  # those before it already hold enough
+        spare = ordered.cumsum(dim=1) - ordered >= sampling.top_p  # the likelier ones hold enough
         logits = logits.masked_fill(torch.zeros_like(spare).scatter(1, order, spare), -torch.inf)
     return sample_tokens(logits, uniform)

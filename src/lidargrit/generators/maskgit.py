@@ -1,4 +1,4 @@
-"""MaskGIT over LidarGRIT's tokens: a transformer fills in many at once, in few passes; seeds → range images."""
+"""MaskGIT over LidarGRIT's tokens: a transformer generates many of them at once, in few passes."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from lidargrit.structures import MaskDecoding, RangeImage
 
 @dataclass(frozen=True)
 class MaskedSampling:
-    """How tokens are drawn, and returns.
+    """How tokens and returns are sampled.
 
     Args:
-        steps: passes of the transformer; at most one a token.
-        temperature: of the tokens, above 1 bolder, below 1 safer than the model's own probabilities; 0 takes the
+        steps: number of passes of the transformer; at most one for each token.
+        temperature: divisor of the logits: above 1 scans vary more than the model's own, below 1 less; 0 takes the
             likeliest token.
-        order_temperature: of which tokens a pass keeps: the Gumbel noise that is added to the logarithm of a token's
-            probability, falling to 0 with the last pass. 0 keeps the surest; the more, the nearer to any order. The
-            default is that of the authors' program.
-        mask: ``bernoulli`` draws each return with its probability; ``threshold`` keeps what is at least as likely as
-            not.
-        weights: ``fp32`` is exact; ``bf16`` computes the transformer's products in 16 bits, as training does where it
-            is quicker; ``auto`` is that where the machine has instructions for it.
-        decoder: the same of decoding.
+        order_temperature: scale of the Gumbel noise in the choice of the tokens that a pass keeps. It is added to the
+            logarithm of a token's probability and falls to 0 with the last pass; 0 keeps the likeliest tokens, and the
+            larger it is, the more random the order. The default is that of the authors' program.
+        mask: ``bernoulli`` samples each return with its probability; ``threshold`` keeps a return that is at least as
+            likely as not.
+        weights: number type of the transformer's products. ``fp32`` is exact; ``bf16`` computes them in 16 bits, as
+            training does where that is quicker; ``auto`` is ``bf16`` where the machine has instructions for it.
+        decoder: number type of the decoder, with the same choices.
     """
 
     steps: int = 16
@@ -61,10 +61,10 @@ class MaskGitConfig(TokenGeneratorConfig):
 
 
 class MaskGit(TokenGenerator):
-    """Parallel decoding of a VQ-VAE's tokens: fewer passes than tokens, at some cost in quality.
+    """Parallel generation of tokens: fewer passes than tokens, at some cost in quality.
 
-    A pass draws every hidden token as if it knew of the others hidden only what is shown; of these it keeps some.
-    What is drawn in one pass does not know of one another, so the scans are not those of an exact model.
+    A pass samples every hidden token given those that are shown, and shows some of them. Tokens of one pass are sampled
+    independently of one another, so the scans are not those of an exact model.
 
     Source:
         Chang et al., MaskGIT: Masked Generative Image Transformer, CVPR 2022, section 3; order temperature as in
@@ -89,11 +89,11 @@ class MaskGit(TokenGenerator):
         sampling = sampling or MaskedSampling()
         self.eval()
         rngs = [torch.Generator().manual_seed(seed) for seed in seeds]  # on the CPU: the same numbers on every device
-        tokens = fill_in(self.transformer, rngs, sampling)
+        tokens = generate_tokens(self.transformer, rngs, sampling)
         return self.decode(tokens, rngs, sampling.mask, self.tokenizer.for_decoding(sampling.decoder))
 
     def cost(self, sampling: MaskedSampling | None = None) -> Cost:
-        """Return the passes over all tokens, and one decoding."""
+        """Return the cost of the passes over all tokens and of one decoding."""
         sampling = sampling or MaskedSampling()
         sizes, tokens = self.config.transformer, self.transformer.context_length
         # Per token and layer: four projections and a perceptron of four times the width, then queries by keys and
@@ -105,12 +105,12 @@ class MaskGit(TokenGenerator):
 
 
 class HiddenTokens(TokenObjective):
-    """The transformer's objective: negative log-likelihood of hidden tokens by those shown, in nats per token."""
+    """The transformer's objective: negative log-likelihood of hidden tokens given those shown, in nats per token."""
 
     transformer: MaskedTransformer
 
     def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
-        """Return eq. 1 of the paper per hidden token, beside it that of a model which knows only token frequencies."""
+        """Return the paper's eq. 1 per hidden token, and the same of a model that knows only token frequencies."""
         tokens, unigram_nll = self.encode(images)
         count, length = tokens.shape
         # Each scan's progress is uniform in [0, 1); within a batch they are evenly spread, which calms the loss.
@@ -126,7 +126,7 @@ class HiddenTokens(TokenObjective):
 
 
 def share_hidden(progress: Tensor) -> Tensor:
-    """Return the share of tokens that is hidden: all of them at a progress of 0, none at 1.
+    """Return the share of tokens that is hidden: 1 at a progress of 0, 0 at a progress of 1.
 
     Source:
         Chang et al., MaskGIT, 2022, section 3.3: the cosine schedule.
@@ -135,9 +135,9 @@ def share_hidden(progress: Tensor) -> Tensor:
 
 
 def numbers_hidden(num_tokens: int, steps: int) -> list[int]:
-    """Return how many tokens are still hidden after each pass, by the cosine schedule.
+    """Return the number of tokens still hidden after each pass, by the cosine schedule.
 
-    Every pass shows at least one, so with as many steps as tokens each shows one.
+    Every pass shows at least one token; with as many steps as tokens, each shows one.
     """
     passes, left = min(steps, num_tokens), num_tokens
     found = []
@@ -147,10 +147,10 @@ def numbers_hidden(num_tokens: int, steps: int) -> list[int]:
     return [*found, 0]
 
 
-def fill_in(
+def generate_tokens(
     transformer: MaskedTransformer, rngs: Sequence[torch.Generator], sampling: MaskedSampling
 ) -> Int[Tensor, "B T"]:
-    """Write one sequence for each generator of random numbers: all hidden at first, some more shown after each pass."""
+    """Generate one sequence for each random generator; all tokens are hidden at first, fewer after each pass."""
     device, length = transformer.head.weight.device, transformer.context_length
     tokens = torch.full((len(rngs), length), transformer.mask_token, device=device)
     schedule = numbers_hidden(length, sampling.steps)
@@ -159,15 +159,15 @@ def fill_in(
         uniform = torch.stack([torch.rand(2, length, generator=rng) for rng in rngs], dim=1).to(device)
         with torch.autocast(device.type, torch.bfloat16, enabled=short):
             logits = transformer(tokens).float()
-        drawn = _draw(logits, uniform[0], sampling.temperature)
-        sureness = logits.log_softmax(dim=-1).gather(-1, drawn[..., None])[..., 0]
+        sampled = _sample(logits, uniform[0], sampling.temperature)
+        confidence = logits.log_softmax(dim=-1).gather(-1, sampled[..., None])[..., 0]
         noise = -(-uniform[1].clamp(1e-9, 1 - 1e-7).log()).log()  # Gumbel's distribution; the bounds keep it finite
-        sureness += sampling.order_temperature * (1 - done / len(schedule)) * noise
+        confidence += sampling.order_temperature * (1 - done / len(schedule)) * noise
         hidden = tokens == transformer.mask_token
-        kept = sureness.masked_fill(~hidden, torch.inf).topk(length - left, dim=1).indices
-        tokens = tokens.scatter(1, kept, torch.where(hidden, drawn, tokens).gather(1, kept))
+        kept = confidence.masked_fill(~hidden, torch.inf).topk(length - left, dim=1).indices
+        tokens = tokens.scatter(1, kept, torch.where(hidden, sampled, tokens).gather(1, kept))
     return tokens
 
 
-def _draw(logits: Tensor, uniform: Tensor, temperature: float) -> Tensor:
+def _sample(logits: Tensor, uniform: Tensor, temperature: float) -> Tensor:
     return logits.argmax(dim=-1) if temperature == 0 else sample_tokens(logits / temperature, uniform)

@@ -1,4 +1,4 @@
-"""Networks and the blocks they repeat: activations kept → computed twice instead; layer by layer → compiled."""
+"""Base classes of networks and of the blocks they repeat, and how training has them compute."""
 
 from __future__ import annotations
 
@@ -12,40 +12,40 @@ from lidargrit.errors import ConfigError
 
 
 class Network(nn.Module):
-    """Tensors of fixed sizes in, tensors out, and nothing besides: what ``torch.compile`` takes as a whole."""
+    """A module that only maps tensors of fixed sizes to tensors, so that ``torch.compile`` can take all of it."""
 
 
 class Block(nn.Module):
-    """What a network repeats. While it is trained, its activations may be dropped and computed again for gradients."""
+    """A part that a network repeats; in training its activations may be dropped and computed again for gradients."""
 
     recomputed = False
 
     def __call__(self, *inputs: Any) -> Any:
-        """Compute, as every module does."""
+        """Call ``forward``, which keeps the inputs only if activations are to be recomputed."""
         if self.recomputed and self.training and torch.is_grad_enabled():
             return checkpoint(super().__call__, *inputs, use_reentrant=False)
         return super().__call__(*inputs)
 
 
 def prepare_for_training(objective: nn.Module, recompute: bool, compiled: bool) -> None:
-    """Arrange how an objective's networks compute while they are trained; names and weights stay as they are.
+    """Set how an objective's networks compute in training; the names and values of weights stay the same.
 
     Args:
-        objective: whose they are.
-        recompute: let every block compute its activations again in place of keeping them. Gradients stay the same,
-            dropout included.
-        compiled: have every network compiled when it is first called.
+        objective: objective of a training stage.
+        recompute: whether every block drops its activations and computes them again for the gradients, which stay the
+            same, dropout included.
+        compiled: whether every network is compiled when it is first called.
 
     Raises:
-        ConfigError: there is nothing in it that could.
+        ConfigError: the objective has no block to recompute, or no network to compile.
     """
-    for block in _those(objective, Block, "recompute") if recompute else ():
+    for block in _parts(objective, Block, "recompute") if recompute else ():
         block.recomputed = True
-    for network in _those(objective, Network, "compile") if compiled else ():
+    for network in _parts(objective, Network, "compile") if compiled else ():
         network.compile()
 
 
-def _those(objective: nn.Module, kind: type[nn.Module], setting: str) -> list[Any]:
+def _parts(objective: nn.Module, kind: type[nn.Module], setting: str) -> list[Any]:
     found = [module for module in objective.modules() if isinstance(module, kind)]
     if not found:
         raise ConfigError(

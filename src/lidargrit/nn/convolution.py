@@ -1,4 +1,4 @@
-"""Convolutions and residual blocks over range images, whose azimuth may wrap: feature maps → feature maps.
+"""Convolutions and residual blocks over range images, whose columns may close the circle of azimuth.
 
 Parameter names follow the reference's state dict, so that published weights load.
 """
@@ -58,7 +58,7 @@ class Upsample(nn.Module):
 
 
 class FoldedUpsample(nn.Module):
-    """What :class:`Upsample` computes, in 4/9 of its operations and without the repeated pixels.
+    """The same function as :class:`Upsample` in 4/9 of the operations, without the repeated pixels.
 
     A repeated pixel meets the sum of neighbouring weights: an output pixel sees only 2x2 different inputs. Together the
     four kernels, one for each output pixel of an input's, are one transposed convolution of 4x4 weights and stride 2.

@@ -1,8 +1,8 @@
 """Sequences generated token by token, with a cache of keys and values: (transformer, uniform numbers) → tokens.
 
 The transformer itself reads whole sequences, for training and for likelihoods. Here its weights are laid out for one
-token at a time, and every step costs Python and the machine as little as can be: query, key and value come from one
-product, the cache is memory taken once, and residuals are added in place. In 32 bits all of it is exact algebra.
+token at a time, and a step takes few operations: query, key and value come from one product, the cache is allocated
+once, and residuals are added in place. In 32 bits the result is the transformer's own but for rounding.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from lidargrit.errors import ConfigError
+from lidargrit.nn.threads import threads_for
 from lidargrit.nn.transformer import CausalTransformer
 
 WeightPrecision = Literal["fp32", "bf16", "int8"]
@@ -30,15 +31,15 @@ class CachedDecoder:
     """Generates sequences of the transformer's longest length, ``batch_size`` at once, from one set of weights.
 
     Args:
-        transformer: in evaluation; later changes of its weights may go unnoticed.
+        transformer: transformer in evaluation mode; later changes of its weights may have no effect here.
         batch_size: number of sequences.
-        sample_token: (logits (B, K), uniform numbers (B,)) → tokens (B,).
+        sample_token: function of logits (B, K) and uniform numbers (B,) that returns tokens (B,).
         start: token before the first one.
-        precision: ``fp32`` writes what the transformer writes when it reads the whole prefix for every token. ``bf16``
-            keeps weights, activations and cache in 16 bits. ``int8`` keeps the weights of the blocks in 8 bits, with
-            one scale a row, and the rest in 16; only on CPUs.
-        static: compute with shapes that do not change from token to token, recorded into CUDA graphs on a GPU; what a
-            GPU wants, and its default.
+        precision: number type. ``fp32`` gives the logits of the transformer that reads the whole prefix for every
+            token. ``bf16`` keeps weights, activations and cache in 16 bits. ``int8`` keeps the weights of the blocks in
+            8 bits, with one scale a row, and the rest in 16; only on CPUs.
+        static: whether shapes stay the same from token to token, so that a GPU can replay recorded CUDA graphs; by
+            default only on a GPU.
 
     Raises:
         ConfigError: 8 bits on a device that is not a CPU.
@@ -77,6 +78,8 @@ class CachedDecoder:
         self._uniform = torch.zeros(batch_size, self._length, device=self._device)
         self._position = torch.zeros(1, dtype=torch.long, device=self._device)
         self._graphs: dict[int, Callable[[], None]] = {}
+        # The products of a step: four projections and a perceptron of four times the width in each block, and the head.
+        self._step_flops = 2 * batch_size * (12 * len(self._blocks) * width**2 + self._head.numel())
 
     @torch.no_grad()
     def generate(self, uniform: Float[Tensor, "B T"]) -> Int[Tensor, "B T"]:
@@ -90,14 +93,15 @@ class CachedDecoder:
                 self._graphs[step // _POSITIONS_PER_GRAPH]()
         else:
             self._tokens.fill_(self._start)
-            for step in range(length):
-                self._tokens = self._sample_token(self.next_logits(self._tokens, step), uniform[:, step])
-                self._generated[:, step] = self._tokens
+            with threads_for(self._step_flops):
+                for step in range(length):
+                    self._tokens = self._sample_token(self.next_logits(self._tokens, step), uniform[:, step])
+                    self._generated[:, step] = self._tokens
         return self._generated[:, :length].clone()
 
     @torch.no_grad()
     def next_logits(self, tokens: Int[Tensor, "B"], position: int) -> Float[Tensor, "B K"]:
-        """Return the logits that follow a token, which comes after ``position`` others that were given before."""
+        """Return the logits after a token at a position, whose predecessors were given by earlier calls."""
         slots = self._slots[:, :, :, :, position].unbind()
 
         def write_cache(layer: int) -> None:
@@ -118,7 +122,7 @@ class CachedDecoder:
         return F.linear(self._last_norm(x), self._head).float()
 
     def _static_step(self, span: int) -> None:
-        """Write one token at the position that a tensor holds, and advance it; no shape depends on the position."""
+        """Generate the token at the position that a tensor holds, and advance it; no shape depends on the position."""
         slots = self._slots.unbind()
 
         def write_cache(layer: int) -> None:
@@ -155,7 +159,7 @@ class CachedDecoder:
 
 
 class _Block:
-    """One block's weights, laid out for single tokens; the scale of attention is already in the query's."""
+    """The weights of one block, laid out for single tokens; those of the query hold the scale of attention."""
 
     def __init__(self, block: nn.Module, heads: int, precision: WeightPrecision) -> None:
         attention, perceptron = block.get_submodule("attn"), block.get_submodule("mlp")
@@ -180,7 +184,7 @@ def _norm(norm: nn.Module, dtype: torch.dtype) -> Callable[[Tensor], Tensor]:
 
 
 def _product(weight: Tensor, bias: Tensor, precision: WeightPrecision) -> Callable[[Tensor, Tensor | None], Tensor]:
-    """Return (x, where to) → x @ weight.T + bias."""
+    """Return a function that computes x @ weight.T + bias, into a given tensor or a new one."""
     if precision == "int8":
         scale = weight.abs().amax(dim=1).clamp(min=1e-12) / 127
         rounded, scale, bias = (weight / scale[:, None]).round().to(torch.int8), scale.bfloat16(), bias.bfloat16()
@@ -196,7 +200,7 @@ def _product(weight: Tensor, bias: Tensor, precision: WeightPrecision) -> Callab
 
 
 def _attend(query: Tensor, keys: Tensor, values: Tensor, future: Tensor | None) -> Tensor:
-    """Return the values (B, heads, 1, d), weighted by how well their keys fit the query, whose scale is in it."""
+    """Return the attention (B, heads, 1, d) of one query, which holds the scale already."""
     if query.dtype != torch.float32:
         return F.scaled_dot_product_attention(query, keys, values, None if future is None else ~future[None], scale=1.0)
     fit = query @ keys.transpose(2, 3)  # for a single query in 32 bits two products beat the fused kernel on CPUs

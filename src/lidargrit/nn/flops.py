@@ -1,4 +1,4 @@
-"""How much a network computes in one pass, without computing it: (module, shapes of its inputs) → operations."""
+"""The number of operations of one pass through a network, counted without computing it."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from torch.utils.flop_counter import FlopCounterMode
 
 
 def flops_of(module: nn.Module, *shapes: tuple[int, ...]) -> int:
-    """Count the floating-point operations of one forward pass over inputs of these shapes.
+    """Count the floating-point operations of one forward pass over inputs of the given shapes.
 
-    Only products and convolutions count, a multiplication with its addition as two. Nothing is computed: the module
-    runs on tensors that have a shape and no values.
+    Only products and convolutions count, a multiplication with its addition as two. The module runs on tensors that
+    have a shape and no values, so that nothing is computed.
     """
     tensors = {
         name: torch.empty_like(tensor, device="meta")

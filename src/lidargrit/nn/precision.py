@@ -1,4 +1,4 @@
-"""What a machine computes quickly: → whether in 16 bits."""
+"""The number type that a network computes in: 32 bits, or 16 where the machine has instructions for them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What each of several processes holds of a batch → what one process with the whole batch would hold."""
+"""Sums and samples over the processes of a training, equal to those of one process with the whole batch."""
 
 from __future__ import annotations
 
@@ -8,25 +8,31 @@ from torch import Tensor, distributed
 
 
 def sum_over_processes(counted: Shaped[Tensor, "*shape"]) -> Shaped[Tensor, "*shape"]:
-    """Add up, in place, what every process counted; in one process it is the sum already."""
+    """Add up a tensor over all processes, in place; with one process it is the sum already."""
     if _several():
         distributed.all_reduce(counted)
     return counted
 
 
 def sample_from_all(rows: Float[Tensor, "n D"], count: int, rng: torch.Generator | None) -> Float[Tensor, "count D"]:
-    """Draw rows, with repetition, from those of all processes; all get the rows that the first one's ``rng`` draws.
+    """Sample rows, with repetition, from those of all processes.
 
-    The rows of the processes count as following one another, as the shares of a batch do.
+    Every process gets the same rows, which the first process chooses. The rows of the processes follow one another, as
+    their shares of a batch do.
+
+    Args:
+        rows: rows of this process; every process has as many.
+        count: number of rows to sample.
+        rng: source of random numbers; that of the first process counts. None for torch's own.
     """
     if not _several():
         return rows[torch.randint(len(rows), (count,), generator=rng, device=rows.device)]
     everywhere = len(rows) * distributed.get_world_size()
-    drawn = torch.randint(everywhere, (count,), generator=rng, device=rows.device)
-    distributed.broadcast(drawn, src=0)
-    place: Int[Tensor, "count"] = drawn - distributed.get_rank() * len(rows)
-    is_mine = (place >= 0) & (place < len(rows))
-    mine = torch.where(is_mine[:, None], rows[place.clamp(0, len(rows) - 1)], 0.0)
+    chosen = torch.randint(everywhere, (count,), generator=rng, device=rows.device)
+    distributed.broadcast(chosen, src=0)
+    index: Int[Tensor, "count"] = chosen - distributed.get_rank() * len(rows)
+    is_mine = (index >= 0) & (index < len(rows))
+    mine = torch.where(is_mine[:, None], rows[index.clamp(0, len(rows) - 1)], 0.0)
     return sum_over_processes(mine)
 
 

@@ -1,4 +1,4 @@
-"""Vector quantisation: latents → the nearest codes of a learned codebook, with straight-through gradients."""
+"""Vector quantisation: each latent is replaced by the nearest code of a learned codebook."""
 
 from __future__ import annotations
 
@@ -22,7 +22,13 @@ _DEAD_BELOW = 0.1  # a code that is chosen less often than this share of an even
 
 
 class Quantised(NamedTuple):
-    """Latents snapped to codes, which codes, and the loss that pulls the two together."""
+    """The result of quantising a batch of latents.
+
+    Args:
+        latents: nearest codes; gradients pass straight through to the latents.
+        tokens: indices of these codes.
+        loss: loss that moves latents and codes towards each other.
+    """
 
     latents: Float[Tensor, "B D h w"]
     tokens: Int[Tensor, "B h w"]
@@ -30,14 +36,14 @@ class Quantised(NamedTuple):
 
 
 class VectorQuantiser(nn.Module):
-    """A codebook.
+    """A codebook, with counts of how its codes are used.
 
     Args:
-        num_codes: its size.
+        num_codes: number of codes.
         code_dim: length of a code.
-        loss: which terms move codes and latents towards each other; see ``_LOSS_WEIGHTS``.
-        restart_dead: while training, replace codes that are hardly ever chosen by latents of the batch: the remedy
-            against a collapsed codebook. The reference has none.
+        loss: name of the terms that move codes and latents towards each other; see ``_LOSS_WEIGHTS``.
+        restart_dead: whether training replaces codes that are hardly ever chosen by latents of the batch, so that the
+            codebook does not collapse. The reference has no such remedy.
     """
 
     usage: Tensor
@@ -53,7 +59,7 @@ class VectorQuantiser(nn.Module):
         self.register_buffer("code_sums", torch.zeros(num_codes, code_dim))
 
     def forward(self, z: Float[Tensor, "B D h w"], rng: torch.Generator | None = None) -> Quantised:
-        """Replace every latent by its nearest code; ``rng`` draws the latents that dead codes restart from."""
+        """Replace every latent by its nearest code; ``rng`` chooses the latents that dead codes restart from."""
         with torch.autocast(z.device.type, enabled=False):  # codes lie too close together for 16 bits
             return self._quantise(z.float(), rng)
 
@@ -61,7 +67,7 @@ class VectorQuantiser(nn.Module):
         flat = z.movedim(1, -1).flatten(0, -2)
         tokens = self.nearest(flat)
         if self.training:
-            self._follow(flat.detach(), tokens, rng)
+            self._update_codes(flat.detach(), tokens, rng)
         codes = self.lookup(tokens.unflatten(0, (z.shape[0], *z.shape[2:])))
         commitment_weight, codebook_weight = _LOSS_WEIGHTS[self.loss]
         loss = commitment_weight * F.mse_loss(z, codes.detach()) + codebook_weight * F.mse_loss(codes, z.detach())
@@ -77,17 +83,17 @@ class VectorQuantiser(nn.Module):
         return self.embedding(tokens).movedim(-1, 1)
 
     def perplexity(self) -> float:
-        """Return exp(entropy) of the running use of the codes: how many of them are in effect used."""
+        """Return exp(entropy) of how often codes are used: the number of codes in effective use."""
         share = self.usage / self.usage.sum().clamp(min=1e-9)
         return float(torch.special.entr(share).sum().exp())
 
     def used_share(self) -> float:
-        """Return the share of the codes that are alive."""
+        """Return the share of codes that are used often enough not to be dead."""
         return float((self.usage > self._dead_below()).float().mean())
 
     @torch.no_grad()
-    def _follow(self, flat: Tensor, tokens: Tensor, rng: torch.Generator | None) -> None:
-        """Update how often codes are used, move them if they follow means, restart the dead."""
+    def _update_codes(self, flat: Tensor, tokens: Tensor, rng: torch.Generator | None) -> None:
+        """Count how often codes are used, move codes that follow the mean of their latents, and restart dead ones."""
         num_codes = self.embedding.num_embeddings
         counts = sum_over_processes(torch.bincount(tokens, minlength=num_codes).to(flat.dtype))
         sums = sum_over_processes(torch.zeros_like(self.code_sums).index_add_(0, tokens, flat))

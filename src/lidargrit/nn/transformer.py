@@ -1,7 +1,7 @@
-"""Transformers over tokens: those so far → logits of the next; or some of them → logits of the rest.
+"""Transformers over tokens: causal ones predict the next token, masked ones the tokens that are hidden.
 
-They read whole sequences; ``nn.decoding`` writes them token by token. Parameter names follow the reference's state dict
-(a minGPT), so that published weights load.
+They read whole sequences; ``nn.decoding`` generates token by token with the same weights. Parameter names follow the
+reference's state dict (a minGPT), so that published weights load.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ class TransformerConfig:
 
     Args:
         layers: number of blocks.
-        heads: of attention in each.
-        width: length of a token's vector.
-        embedding_dropout: on the input.
-        residual_dropout: on what a block adds.
-        attention_dropout: on attention weights.
+        heads: number of attention heads in each block.
+        width: length of the vector that stands for a token.
+        embedding_dropout: probability of dropout on the embedded tokens.
+        residual_dropout: probability of dropout on what a block adds.
+        attention_dropout: probability of dropout on attention weights.
     """
 
     layers: int = 6
@@ -53,11 +53,11 @@ class Transformer(Network):
     """Pre-norm blocks, learned positions, exact GELU, an untied head without bias.
 
     Args:
-        config: sizes.
-        num_inputs: how many different tokens it reads.
-        num_tokens: how many different tokens it tells the logits of.
-        context_length: longest sequence.
-        causal: whether a token sees only itself and those before it.
+        config: sizes and dropout.
+        num_inputs: number of different tokens that it reads.
+        num_tokens: number of different tokens that it predicts.
+        context_length: number of tokens in the longest sequence.
+        causal: whether a token attends only to itself and to those before it.
 
     Source:
         Haghighi et al., LidarGRIT, 2024, section 3.3; layers as in hamedhaghighi/LidarGRIT@a3f86e7.
@@ -77,7 +77,7 @@ class Transformer(Network):
         self.apply(_initialise)
 
     def forward(self, tokens: Int[Tensor, "B T"]) -> Float[Tensor, "B T K"]:
-        """Return the logits at each place: of the token after it if causal, else of its own."""
+        """Return the logits at each position: of the next token if causal, else of the position's own."""
         x = self.drop(self.tok_emb(tokens) + self.pos_emb[:, : tokens.shape[1]])
         for block in self.blocks:
             x = block(x)
@@ -85,14 +85,14 @@ class Transformer(Network):
 
 
 class CausalTransformer(Transformer):
-    """Reads tokens so far and tells the next, at every place of a sequence at once."""
+    """Predicts, at every position of a sequence, the token that follows."""
 
     def __init__(self, config: TransformerConfig, num_tokens: int, context_length: int) -> None:
         super().__init__(config, num_tokens, num_tokens, context_length, causal=True)
 
 
 class MaskedTransformer(Transformer):
-    """Reads a sequence in which some tokens are hidden, shown as ``mask_token``, and tells what they are."""
+    """Predicts the tokens of a sequence that are hidden, which it reads as ``mask_token``."""
 
     def __init__(self, config: TransformerConfig, num_tokens: int, context_length: int) -> None:
         super().__init__(config, num_tokens + 1, num_tokens, context_length, causal=False)

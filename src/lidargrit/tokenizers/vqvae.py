@@ -1,4 +1,4 @@
-"""The paper's first stage, a VQ-VAE that decodes clean range and raydrop apart: range images ⇄ tokens."""
+"""The paper's first stage, a VQ-VAE whose decoder gives a clean range and, apart from it, the raydrop."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from lidargrit.sensors import SensorModel
 from lidargrit.structures import Decoded, RangeImage, TokenGrid
 from lidargrit.tokenizers import Tokenizer, TokenizerConfig
 
-_COLLAPSED_BELOW = 0.05  # of the codes in effect used; healthy codebooks of ours keep above half
+_COLLAPSED_BELOW = 0.05  # perplexity over number of codes; healthy codebooks of ours keep above a half
 _NO_RETURN_BELOW = -0.9  # without a raydrop head, an encoded range below this is read as no return (the program's rule)
 
 
@@ -42,25 +42,30 @@ class VqvaeConfig(TokenizerConfig):
     """Sizes and losses of the VQ-VAE; the defaults are the paper's for KITTI odometry.
 
     Args:
-        channels: of the finest level; a multiple of 32.
-        channel_multipliers: of every level from fine to coarse; each further level halves rows and columns.
-        residual_blocks: of every encoder level (a decoder level has one more).
+        channels: number of channels at the finest level, a multiple of 32.
+        channel_multipliers: channels of each level, from fine to coarse, over those of the finest; each further level
+            halves rows and columns.
+        residual_blocks: number of residual blocks of each encoder level; a decoder level has one more.
         code_dim: length of a code.
-        num_codes: size of the codebook.
-        dropout: within residual blocks.
-        padding: ``zero`` is the reference's; ``wrap`` closes the circle of azimuth.
+        num_codes: number of codes in the codebook.
+        dropout: probability of dropout within residual blocks.
+        padding: what lies beyond the first and the last column: ``zero`` as in the reference; ``wrap`` closes the
+            circle of azimuth.
         range_encoding: how metres become [-1, 1]; ``linear`` is the paper's.
-        raydrop_loss: decode a return mask beside the range and train it (RL in the paper's ablation). Without it one
-            channel learns the range image with its holes.
-        raydrop_weight: lambda; the paper's 0.1. The released configuration for KITTI odometry has 0.0001.
-        reconstruction: ``paper`` takes the clean range and divides by all pixels; ``reference`` draws the mask first,
-            which lets only kept pixels learn, and divides by the returns of each scan; ``returns`` takes the clean
-            range and divides by the returns of each scan.
-        error_unit: ``encoded`` takes the error between encodings, as the paper does; ``metres`` between ranges, scaled
-            so that for the linear encoding the two are the same. With the logarithmic encoding the first cares for near
-            surfaces, the second for far ones.
+        raydrop_loss: whether a return mask is decoded beside the range, with its own loss (RL in the paper's ablation).
+            Without it one channel learns the range image with its holes.
+        raydrop_weight: weight of that loss, lambda; 0.1 in the paper, 0.0001 in the released configuration for KITTI
+            odometry.
+        reconstruction: which pixels the error of the range is of, and what it is divided by. ``paper``: the clean range
+            at returns, divided by all pixels. ``reference``: a mask is sampled first, so that only kept pixels learn,
+            and the sum is divided by the returns of each scan. ``returns``: the clean range at returns, divided by
+            their number in each scan.
+        error_unit: ``encoded`` for the error between encodings, as in the paper; ``metres`` for the error between
+            ranges, scaled so that with the linear encoding the two are equal. With the logarithmic encoding the first
+            weighs near surfaces more, the second far ones.
         codebook_loss: ``paper``, ``reference``, ``vqvae`` or ``ema``; see lidargrit.nn.quantiser.
-        restart_dead_codes: the remedy against a collapsing codebook; the reference has none.
+        restart_dead_codes: whether codes that are hardly ever used restart from latents, so that the codebook does not
+            collapse; the reference has no such remedy.
     """
 
     channels: int = 64
@@ -133,7 +138,7 @@ class Level(nn.Module):
 
 
 class Encoder(Network):
-    """Encoded range (B, 1, H, W) → latents (B, code_dim, h, w)."""
+    """The network from encoded range (B, 1, H, W) to latents (B, code_dim, h, w)."""
 
     def __init__(self, config: VqvaeConfig) -> None:
         super().__init__()
@@ -156,7 +161,7 @@ class Encoder(Network):
 
 
 class Decoder(Network):
-    """Latents (B, code_dim, h, w) → encoded range before tanh, and return logits if there is a raydrop head."""
+    """The network from latents (B, code_dim, h, w) to encoded range, before tanh, and return logits if it has them."""
 
     def __init__(self, config: VqvaeConfig) -> None:
         super().__init__()
@@ -178,7 +183,7 @@ class Decoder(Network):
         return self.conv_out(self.features(z))
 
     def features(self, z: Float[Tensor, "B D h w"]) -> Float[Tensor, "B C H W"]:
-        """Return what the last convolution reads: in the type of its weights, at the image's full resolution."""
+        """Return the feature maps that the last convolution reads, at the image's full resolution, in 32 bits."""
         x = self.mid(self.conv_in(z.to(self.conv_in.weight)))
         for level in reversed(self.up):
             x = level(x)
@@ -207,10 +212,10 @@ class Vqvae(Tokenizer[VqvaeConfig]):
 
     Args:
         config: sizes and losses.
-        sensor: the rays and limits of the range images it learns.
+        sensor: rays and limits of its range images.
 
     Raises:
-        ConfigError: the image cannot be halved as often as the configuration wants.
+        ConfigError: the image's rows or columns cannot be halved at every level.
 
     Source:
         Haghighi et al., LidarGRIT, 2024, section 3.2; layer sizes and state-dict names as in
@@ -251,7 +256,7 @@ class Vqvae(Tokenizer[VqvaeConfig]):
         return TokenGrid(tokens, self.num_codes)
 
     def decode(self, tokens: TokenGrid) -> Decoded:
-        """Return clean range and return logits of a batch of tokens, with what the decoder's last layer reads."""
+        """Return clean range, return logits and the last feature maps of a batch of tokens."""
         features = self.decoder.features(self.post_quant_conv(self.quantize.lookup(tokens.tokens)))
         encoded, return_logits = self._heads(self.decoder.conv_out(features))
         return Decoded(self.range_encoding.decode(encoded), return_logits, self.sensor, features=features)
@@ -268,7 +273,7 @@ class Vqvae(Tokenizer[VqvaeConfig]):
         return flops_of(self.post_quant_conv, latents) + flops_of(self.decoder.prepared("fp32"), latents)
 
     def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
-        """Return the loss of eq. 5 of the paper and its terms, with the error in metres and the mask's accuracy."""
+        """Return the loss of eq. 5 of the paper and its terms, the range error in metres, and the mask's accuracy."""
         z = self.quantize(self.latents(images), rng)
         encoded, return_logits = self._heads(self.decoder(self.post_quant_conv(z.latents)))
         mask, encoding = images.return_mask, self.range_encoding
@@ -295,7 +300,7 @@ class Vqvae(Tokenizer[VqvaeConfig]):
         return {"loss": loss, **terms}
 
     def warnings(self) -> list[str]:
-        """Return what a person should know of the codebook: nothing, or that it has collapsed, and the remedy."""
+        """Return a line with the remedy if the codebook has collapsed."""
         perplexity, used = self.quantize.perplexity(), self.quantize.used_share()
         if perplexity >= _COLLAPSED_BELOW * self.num_codes:
             return []
@@ -322,17 +327,17 @@ def reconstruction_loss(
     encoded: Float[Tensor, "B H W"],
     target: Float[Tensor, "B H W"],
     return_mask: Bool[Tensor, "B H W"],
-    drawn_mask: Bool[Tensor, "B H W"],
+    sampled_mask: Bool[Tensor, "B H W"],
     kind: Literal["paper", "reference", "returns"],
 ) -> Float[Tensor, ""]:
     """Return the masked absolute error of the encoded range on the pixels that truly returned.
 
     Source:
         ``paper``: eq. 2, clean range over all pixels. ``reference``: hamedhaghighi/LidarGRIT@a3f86e7, range composed
-        with a drawn mask, over each scan's returns.
+        with a sampled mask, over each scan's returns.
     """
     if kind == "reference":
-        encoded = torch.where(drawn_mask, encoded, -1.0)
+        encoded = torch.where(sampled_mask, encoded, -1.0)
     error = (encoded - target).abs() * return_mask
     if kind == "paper":
         return error.mean()

@@ -1,0 +1,61 @@
+"""Threads that wait for one another: they sleep in the command, and where they do not, small steps are not shared."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from lidargrit.nn.decoding import CachedDecoder
+from lidargrit.nn.transformer import CausalTransformer, TransformerConfig
+
+ASK = """
+import os, sys
+from lidargrit.cli import main
+{before}
+loaded = "torch" in sys.modules
+main(["list", "sensors"])
+print(loaded, *(os.environ.get(name, "unset") for name in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")), file=sys.stderr)
+"""
+
+
+def waiting_in_the_command(before="", **variables):
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(("OMP_", "GOMP_"))}
+    program = [sys.executable, "-c", ASK.format(before=before)]
+    answer = subprocess.run(program, env=kept | variables, capture_output=True, text=True, check=True, timeout=60)
+    return answer.stderr.split()
+
+
+def test_the_command_lets_threads_sleep_before_torch_is_loaded():
+    assert waiting_in_the_command() == ["False", "PASSIVE", "0"]
+
+
+def test_what_the_user_has_set_stays():
+    assert waiting_in_the_command(OMP_WAIT_POLICY="ACTIVE") == ["False", "ACTIVE", "unset"]
+    assert waiting_in_the_command(GOMP_SPINCOUNT="1000") == ["False", "unset", "1000"]
+
+
+def test_a_program_that_has_loaded_torch_keeps_its_environment():
+    assert waiting_in_the_command("import torch") == ["True", "unset", "unset"]
+
+
+@pytest.mark.parametrize(("policy", "width", "expected"), [("", 16, 1), ("PASSIVE", 16, 3), ("ACTIVE", 1024, 3)])
+def test_small_steps_are_not_shared_by_threads_that_spin(policy, width, expected, monkeypatch):
+    monkeypatch.setenv("OMP_WAIT_POLICY", policy)
+    config = TransformerConfig(layers=1, heads=2, width=width)
+    transformer = CausalTransformer(config, num_tokens=8, context_length=2).eval()
+    seen = []
+
+    def sample_token(logits, uniform):
+        seen.append(torch.get_num_threads())
+        return logits.argmax(dim=1)
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        CachedDecoder(transformer, 8, sample_token).generate(torch.zeros(8, 2))
+        assert seen == [expected, expected]
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
