@@ -1,6 +1,5 @@
 """Prepared range images: pixels of projecting, found again, never stale, never half, whoever made which part."""
 
-import json
 import os
 import signal
 import subprocess
@@ -256,65 +255,6 @@ def test_a_shard_is_taken_up_where_a_process_was_stopped(tmp_path, monkeypatch):
     monkeypatch.setattr(workers, "project", project)
     assert same(folder, prepare("simulated:6", SIMULATED, tmp_path / "whole"))
     assert sorted(path.name for path in folder.iterdir()) == ["000000.shard", "plan.json", "scans.json"]
-
-
-@pytest.mark.parametrize("damage", [b"", b"noise" * 99])
-def test_a_damaged_unfinished_shard_is_made_anew(tmp_path, damage):
-    folder = prepare("simulated:2", SIMULATED, tmp_path / "out")
-    (folder / "000000.shard").unlink()
-    (folder / "000000.unfinished").write_bytes(damage)
-    assert same(prepare("simulated:2", SIMULATED, folder), prepare("simulated:2", SIMULATED, tmp_path / "whole"))
-    assert not (folder / "000000.unfinished").exists()
-
-
-def test_damage_is_found_and_made_good(tmp_path, small_shards):
-    folder = prepare("simulated:6", SIMULATED, tmp_path / "out")
-    good = pixels_of(folder)
-    second = folder / "000001.shard"
-    content = bytearray(second.read_bytes())
-    content[5000] ^= 255  # within the compressed pixels
-    second.write_bytes(content)
-    assert damaged_shards(folder) == [1]
-    for damage in (b"", content[:-1], content[: len(content) // 2], b"noise" * 99):
-        second.write_bytes(damage)
-        with pytest.raises(DataError, match=r"000001.shard"):
-            PreparedImages(str(folder))
-        prepare("simulated:6", SIMULATED, folder)
-        assert all(np.array_equal(one[0], other[0]) for one, other in zip(pixels_of(folder), good, strict=True))
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"offset": -1},
-        {"offset": 10**9},
-        {"range_bytes": 10**12},
-        {"range_bytes": "many"},
-        {"scan": 77},
-        {"reflectance_bytes": 3},
-    ],
-)
-def test_an_index_that_lies_is_refused(tmp_path, change):
-    folder = prepare("simulated:1", SIMULATED, tmp_path / "out")
-    path = folder / "000000.shard"
-    content = path.read_bytes()
-    length = int.from_bytes(content[-16:-8], "little")
-    index = json.loads(content[-16 - length : -16])
-    index["entries"][0] |= change
-    told = json.dumps(index).encode()
-    path.write_bytes(content[: -16 - length] + told + len(told).to_bytes(8, "little") + content[-8:])
-    with pytest.raises(DataError, match="shard"):
-        PreparedImages(str(folder)).read(0)
-
-
-def test_a_blob_that_claims_to_be_gigabytes_is_refused_before_they_are_allocated(tmp_path):
-    folder = prepare("simulated:1", SIMULATED, tmp_path / "out")
-    path = folder / "000000.shard"
-    content = bytearray(path.read_bytes())
-    content[8 + 4 : 8 + 8] = (1 << 31).to_bytes(4, "little")  # the size in the header of the first blob
-    path.write_bytes(content)
-    with pytest.raises(DataError, match=r"2147483648 bytes of pixels for an image of 262144"):
-        PreparedImages(str(folder)).read(0)
 
 
 def test_prepared_images_are_a_source_here_and_by_url(tmp_path):

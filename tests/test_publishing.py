@@ -11,7 +11,9 @@ import yaml
 
 import lidargrit
 from lidargrit.cli import main
-from lidargrit.datasets import load, without_place
+from lidargrit.datasets import _files, load, without_place
+from lidargrit.datasets import folder as folder_of_scans
+from lidargrit.datasets.kitti_odometry import KittiOdometry
 from lidargrit.errors import CheckpointError
 from lidargrit.generators import Generator
 from lidargrit.generators.lidargrit import LidarGrit
@@ -188,6 +190,17 @@ def test_a_card_of_imported_weights_names_their_files_and_their_authors_rights()
 )
 def test_a_source_without_its_place(source, name, split):
     assert without_place(source) == data_set_of(source) == (name, split)
+
+
+def test_the_name_of_a_source_is_not_worth_a_walk_through_a_disk(tmp_path, monkeypatch):
+    def walked(*arguments):
+        raise AssertionError("the folder was searched")
+
+    monkeypatch.setattr(_files, "scans_below", walked)
+    monkeypatch.setattr(folder_of_scans, "scans_below", walked)
+    assert data_set_of(str(tmp_path)) == ("folder", "all")
+    KittiOdometry.write_example(tmp_path, 1)
+    assert data_set_of(str(tmp_path)) == ("kitti_odometry", "all")
 
 
 def test_prepared_scans_are_named_by_what_they_were_prepared_from(tmp_path):

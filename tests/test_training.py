@@ -1,6 +1,7 @@
 """Training: batches as a function of scans seen, exact resuming, one real scan learned by heart."""
 
 import json
+import os
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -9,8 +10,8 @@ import pytest
 import torch
 
 from lidargrit.datasets.kitti_odometry import KittiOdometry
-from lidargrit.errors import TrainingError
-from lidargrit.files import read_tensors
+from lidargrit.errors import OutputError, TrainingError
+from lidargrit.files import claim_folder, read_tensors
 from lidargrit.loading import Batches, DataConfig, load_range_images
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
@@ -210,6 +211,16 @@ def test_stages_use_their_own_settings():
     assert recipe.training["transformer"].learning_rate == 0.5
     assert recipe.training["tokenizer"] == load_recipe("demo").training["tokenizer"]
     assert replace(recipe, seed=1) != recipe
+
+
+def test_a_folder_is_trained_in_by_one_process_at_a_time(tmp_path):
+    with (
+        claim_folder(tmp_path / "run"),
+        pytest.raises(OutputError, match=rf"run, which process {os.getpid()} on .* since 2\d\d\d-.* is writing"),
+    ):
+        train(load_recipe("demo", TINY), tmp_path / "run")
+    train(load_recipe("demo", TINY), tmp_path / "run")
+    assert not [path for path in (tmp_path / "run").rglob("*") if path.name.startswith(".")]
 
 
 def test_pictures_change_nothing(tmp_path):

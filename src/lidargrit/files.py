@@ -8,6 +8,7 @@ import os
 import socket
 import stat
 import tempfile
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -139,7 +140,8 @@ def _lock(folder: Path, kind: int) -> int:
                 return lock
             if os.fstat(lock).st_nlink:
                 alone = kind == fcntl.LOCK_EX
-                holder = f"process {os.getpid()} on {socket.gethostname()}" if alone else "another command"
+                began = f"since {time.strftime('%Y-%m-%d %H:%M')}"
+                holder = f"process {os.getpid()} on {socket.gethostname()} {began}" if alone else "another command"
                 os.ftruncate(lock, 0)
                 os.pwrite(lock, holder.encode(), 0)
                 return lock

@@ -172,7 +172,7 @@ def without_place(source: str) -> tuple[str, str]:
         name, (_, split) = head, _root_and_split(rest)
     else:
         root, split = _root_and_split(source)
-        name = (recognise(root) or "") if root.is_dir() else ""
+        name = (recognise(root, crawl=False) or "folder") if root.is_dir() else ""
     known = load(name).splits() if name else {}
     part = split.partition("[")[0]
     return name, split if part in known or "/" not in part else ""
@@ -183,9 +183,15 @@ def load(name: str) -> type[ScanDataset]:
     return _discovery.load_class("datasets", name, ScanDataset)
 
 
-def recognise(root: Path) -> str | None:
-    """Name the data set whose layout a folder has: the most specific that matches, None if none does."""
-    trees = {name: load(name).tree for name in _discovery.names("datasets")}
+def recognise(root: Path, crawl: bool = True) -> str | None:
+    """Name the data set whose layout a folder has: the most specific that matches, None if none does.
+
+    Args:
+        root: folder to look into.
+        crawl: also try layouts whose files may lie at any depth, for which the whole folder is searched.
+    """
+    every = {name: load(name).tree for name in _discovery.names("datasets")}
+    trees = {name: tree for name, tree in every.items() if crawl or "**" not in tree}
     most_specific_first = sorted(trees, key=lambda name: ("**" in trees[name], -trees[name].count("/"), name))
     return next((name for name in most_specific_first if load(name).matches(root)), None)
 

@@ -120,7 +120,7 @@ class PreparedFolder:
             if file.size > _PLAN_AT_MOST:
                 raise ValueError(f"{file.size} bytes")
             return json.loads(bytes(file.read(0, file.size)))
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise DataError(
                 f"{self.location}/{name}, which is damaged ({error})", "what lidargrit prepare wrote", "prepare again"
             ) from None
@@ -128,10 +128,13 @@ class PreparedFolder:
     def read_spec(self) -> PreparedSpec:
         """Read what the images were prepared from and how, or raise DataError."""
         try:
-            spec = PreparedSpec(**self.read_json(PLAN_FILE))
+            entries = self.read_json(PLAN_FILE)
+            if not isinstance(entries, dict):
+                raise TypeError(f"{entries!r:.40} in place of entries by name")
+            spec = PreparedSpec(**entries)
             for field in fields(PreparedSpec):  # the plain types; the sensor checks itself
                 kind = {"int": int, "float": (int, float), "str": str}.get(str(field.type), dict)
-                if not isinstance(getattr(spec, field.name), kind):
+                if not isinstance(getattr(spec, field.name), kind) or isinstance(getattr(spec, field.name), bool):
                     raise TypeError(f"{field.name} is {getattr(spec, field.name)!r:.40}")
             if spec.format != FORMAT or min(spec.shard_scans, spec.num_scans) < 1:
                 raise TypeError(f"format {spec.format}, {spec.num_scans} scans by {spec.shard_scans}")
@@ -140,6 +143,11 @@ class PreparedFolder:
             raise DataError(
                 f"{self.location}/{PLAN_FILE}, which is no plan ({error})", "one of this version", "prepare again"
             ) from None
+
+
+def _is_named(scan: Any) -> bool:
+    """Tell whether an entry of the list of scans begins with the scan's name and its recording."""
+    return isinstance(scan, list) and len(scan) >= 2 and isinstance(scan[0], str) and isinstance(scan[1], str)
 
 
 class _RemoteBytes:
@@ -172,7 +180,7 @@ class PreparedImages:
         self._open: dict[int, Bytes] = {}
         self._lock = threading.Lock()
         scans = self._folder.read_json(SCANS_FILE)
-        if len(scans) != self.spec.num_scans or not all(isinstance(scan, list) and len(scan) >= 2 for scan in scans):
+        if not isinstance(scans, list) or len(scans) != self.spec.num_scans or not all(map(_is_named, scans)):
             raise DataError(f"{location}/{SCANS_FILE}, which is damaged", "the scans of the plan", "prepare again")
         for shard in range(self.spec.num_shards):
             entries, left_out = read_index(self._bytes(shard), shard_name(shard))

@@ -158,7 +158,7 @@ def read_index(file: Bytes, name: str) -> tuple[list[Entry], dict[int, str]]:
             if entry.offset + entry.range_bytes + entry.reflectance_bytes > start:
                 raise ValueError("an image beyond its end")
         return entries, {int(scan): str(why) for scan, why in index["left_out"].items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise _damaged(name, error) from None
 
 

@@ -9,6 +9,8 @@ from lidargrit.augmentation import Augmentation
 from lidargrit.errors import ConfigError
 from lidargrit.loading import DataConfig
 
+_BATCH_AT_MOST = 65_536  # scans: 4 GB of the smallest images, and more than any step learns from
+
 
 @dataclass(frozen=True)
 class FitConfig:
@@ -68,6 +70,8 @@ class FitConfig:
         for name in ("warmup_scans", "weight_decay", "gradient_clip", "average_over_scans", "pictures_every"):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"{name}={getattr(self, name)}", "0 or more", "raise it")
+        if self.batch_size > _BATCH_AT_MOST:
+            raise ConfigError(f"batch_size={self.batch_size}", f"at most {_BATCH_AT_MOST}", "lower it")
         if not all(0 <= beta < 1 for beta in self.betas):
             raise ConfigError(f"betas={self.betas}", "two numbers in [0, 1)", "e.g. [0.9,0.95]")
         if not self.learning_rate > 0:

@@ -9,6 +9,7 @@ import platform
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ import torch
 from lidargrit import __version__, configuration
 from lidargrit.determinism import derive_seed
 from lidargrit.errors import CheckpointError, ConfigError, OutputError
-from lidargrit.files import is_taken, read_json, write_json, write_text
+from lidargrit.files import claim_folder, is_taken, read_json, write_json, write_text
 from lidargrit.generators import RUN_FILE, TRAINED_ON_FILE, Generator, load, load_class, locate, recipe_settings
 from lidargrit.loading import DataConfig, RangeImages, load_range_images
 from lidargrit.nn.objective import Objective
@@ -49,14 +50,20 @@ def train(
         plot: function that plots the progress, called every ``pictures_every`` scans of a stage.
 
     Raises:
-        OutputError: the folder holds something else, or cannot be written.
+        OutputError: the folder holds something else, another process trains in it, or it cannot be written.
         DataError, ScanError: the data cannot be used.
         TrainingError: the loss is not finite.
         ConfigError: the tokenizer to be taken from another run is not this recipe's.
     """
     engine = Engine("fp32")  # here only for who is the first of several processes, who alone writes
     reporter = reporter if reporter and engine.rank == 0 else Reporter()
-    engine.by_first(lambda: check_folder(folder, recipe))
+    with ExitStack() as held:
+        engine.by_first(lambda: check_folder(folder, recipe))
+        engine.by_first(lambda: held.enter_context(claim_folder(folder)))
+        return _train(recipe, folder, reporter, plot, engine)
+
+
+def _train(recipe: Recipe, folder: Path, reporter: Reporter, plot: PlotProgress | None, engine: Engine) -> Generator:
     train_images = load_range_images(recipe.data.train, recipe.data, reporter)
     val_images = load_range_images(recipe.data.val, recipe.data, reporter)
     _warn_of_overlap(train_images, val_images, reporter)
