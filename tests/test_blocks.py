@@ -16,7 +16,7 @@ from lidargrit.generators import load_class
 from lidargrit.nn.blocks import Block, Network, prepare_for_training
 from lidargrit.recipes import load_recipe
 from lidargrit.training import FitConfig, train
-from lidargrit.training.compute import same_everywhere
+from lidargrit.training.compute import uniform_images
 from tiny_runs import LONG, MODEL, SHORT, SIMULATED
 
 SETTINGS = (
@@ -40,7 +40,7 @@ def gradients(objective: nn.Module) -> tuple[list[torch.Tensor], int]:
         return tensor
 
     torch.manual_seed(1)
-    images = same_everywhere(objective.sensor, 2)
+    images = uniform_images(objective.sensor, 2)
     with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
         loss = objective.train()(images, torch.Generator().manual_seed(2))["loss"]
         bytes_kept = sum(kept.values())

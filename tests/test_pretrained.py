@@ -16,7 +16,7 @@ from lidargrit.recipes import load_recipe
 from lidargrit.serving import finished_runs
 from lidargrit.sources.samples import read_samples
 from lidargrit.structures import RangeImage
-from lidargrit.training.compute import same_everywhere
+from lidargrit.training.compute import uniform_images
 from tiny_runs import the_one_line
 
 FOLDER = Path(lidargrit.__file__).parent / "pretrained"
@@ -107,7 +107,7 @@ def test_it_is_served_after_the_users_own(model, tmp_path, monkeypatch):
 def test_half_as_many_bytes_keep_what_networks_compute(model, tmp_path):
     torch.manual_seed(0)
     whole = type(model)(model.config, model.sensor).eval()  # not the model's own: they are rounded already
-    images = same_everywhere(model.sensor, 2)
+    images = uniform_images(model.sensor, 2)
     wanted = whole.tokenizer.latents(images)
     whole.save_pretrained(tmp_path / "whole")
     whole.save_pretrained(tmp_path / "half", half=True)

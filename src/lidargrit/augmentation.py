@@ -1,9 +1,9 @@
-"""Range images that could have been: range and mask changed together, every random number from the given generator."""
+"""Range images → randomly changed ones for training; range, return mask and reflectance change together."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -26,12 +26,13 @@ def augment(images: RangeImage, kinds: Sequence[Augmentation], rng: torch.Genera
     """Change every image of a batch at random.
 
     Args:
-        images: (B, H, W).
-        kinds: ``flip`` mirrors left and right with probability 1/2. ``roll`` turns the car by a random whole number of
-            columns. ``geometric`` is the paper's geometric preservation: with probability 1/2, an affine map and flips
-            of both axes, of range and mask together; what comes in from outside is *no return*.
-            ``geometric_reference`` is the same with the program's larger rotation and its fill, a far wall.
-        rng: source of all randomness, on the CPU.
+        images: batch of range images (B, H, W).
+        kinds: kinds of change, made one after the other. ``flip`` mirrors left and right with probability 1/2. ``roll``
+            turns the scan about the vertical axis by a random number of columns. ``geometric`` is the paper's geometric
+            preservation: with probability 1/2, an affine map and flips along both axes; pixels from outside the image
+            are *no return*. ``geometric_reference`` is the same with the larger rotation of the authors' program, which
+            fills such pixels with returns at the longest range.
+        rng: source of all random numbers, on the CPU.
 
     Source:
         Haghighi et al., LidarGRIT, 2024, section 3.2.2 (the paper gives no numbers); numbers from the program,
@@ -78,7 +79,7 @@ def _distort(images: RangeImage, rng: torch.Generator, extra_rotation_rad: float
     scale = 1 + uniform(_MAX_SCALE_CHANGE)
     flip_columns, flip_rows = ((torch.rand(batch, generator=rng) < 0.5) * -2.0 + 1 for _ in range(2))
     cos, sin = angle.cos() / scale, angle.sin() / scale
-    # In pixels a rotation keeps shapes; affine_grid works in units of half an image, hence the ratio of the sizes.
+    # A rotation keeps shapes in pixels, but affine_grid counts in halves of the image: hence the ratio of its sides.
     matrix = torch.stack(
         (
             torch.stack((flip_columns * cos, flip_columns * -sin * height / width, uniform(2 * _MAX_SHIFT)), 1),
@@ -104,7 +105,7 @@ def _distort(images: RangeImage, rng: torch.Generator, extra_rotation_rad: float
     return _pick(_coin(images, rng), warped, images)
 
 
-def _map(images: RangeImage, change) -> RangeImage:
+def _map(images: RangeImage, change: Callable[[Tensor], Tensor]) -> RangeImage:
     return replace(
         images,
         range_m=change(images.range_m),

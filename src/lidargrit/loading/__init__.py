@@ -1,4 +1,4 @@
-"""Data sources → batches of range images: projected once, kept on disk, drawn and augmented by seed."""
+"""Data sources → batches of range images: projected once, kept on disk, ordered and augmented by seed."""
 
 from lidargrit.loading.batches import Batches
 from lidargrit.loading.config import DataConfig

@@ -1,4 +1,4 @@
-"""One of the processes that make shards; see workers.py."""
+"""Entry point of one of the processes that make shards; see workers.py."""
 
 import sys
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Training batches as a function of the scans seen before; read ahead by threads, in the same order however many."""
+"""Scans seen so far → the next training batch, read ahead by threads whose number changes nothing."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from lidargrit.structures import RangeImage
 
 
 class Batches:
-    """Training batches as a function of the scans seen before, so that a stopped run goes on as if never stopped.
+    """Training batches as a function of the scans seen so far: a resumed run sees the same as one that ran through.
 
     Args:
-        images: what to draw from; every scan once per epoch, in an order of the seed.
-        batch_size: over all processes.
-        augmentations: applied in turn.
-        any_columns: of the fine columns keep others every time a scan is seen; see :class:`FitConfig`.
-        seed: of order and augmentation.
-        rank: this process, of
-        world_size: this many; each takes its share of every batch.
-        workers: threads that read ahead.
+        images: range images to learn from; each comes once an epoch, in an order that the seed determines.
+        batch_size: number of scans in a batch, over all processes.
+        augmentations: kinds of augmentation, applied in this order.
+        any_columns: whether an image may begin at any fine column; see :class:`FitConfig`.
+        seed: seed of order and augmentation.
+        rank: number of this process, from 0; it takes its share of every batch.
+        world_size: number of processes that train together.
+        workers: number of threads that read ahead.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class Batches:
         self._epoch, self._order = -1, torch.empty(0)
 
     def stream(self, scans_seen: int, until: int) -> Iterator[RangeImage]:
-        """Yield the batches that follow ``scans_seen`` scans, to the last that begins before ``until``."""
+        """Yield the batches from ``scans_seen`` scans on, up to the last that begins before ``until`` scans."""
         waiting: deque[Future[RangeImage]] = deque()
         with ThreadPoolExecutor(self.workers, thread_name_prefix="reading scans") as pool:
             try:
@@ -70,13 +70,13 @@ class Batches:
         return self._read(*self._chosen(scans_seen))
 
     def _chosen(self, scans_seen: int) -> tuple[list[int], list[int]]:
-        """Choose the scans of a batch, and for each the seed of all else that is random about it."""
+        """Return the indices of a batch's scans, and a seed for each scan's column and augmentation."""
         share = self.batch_size // self.world_size
         positions = range(scans_seen + self.rank * share, scans_seen + (self.rank + 1) * share)
         return [self._scan_at(position) for position in positions], [derive_seed(self.seed, 1, p) for p in positions]
 
     def _read(self, indices: list[int], seeds: list[int]) -> RangeImage:
-        # Each scan has random numbers of its own: it looks the same however many processes share a batch.
+        # Each scan has its own random numbers, so that it looks the same however many processes share a batch.
         rngs = [torch.Generator().manual_seed(seed) for seed in seeds]
         columns = [int(torch.randint(self.images.sensor.column_stride, (1,), generator=rng)) for rng in rngs]
         images = self.images.batch(indices, columns if self.any_columns else None)

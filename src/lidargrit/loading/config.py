@@ -1,4 +1,4 @@
-"""Which scans, and how they become range images."""
+"""Settings of the data: which scans are read, and how they become range images."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from lidargrit.sensors import SensorModel, load_sensor
 
 @dataclass(frozen=True)
 class DataConfig:
-    """Which scans, and how they become range images.
+    """Which scans are read, and how they become range images.
 
     Args:
-        train: sources to learn from, each "NAME:ROOT:SPLIT", "FOLDER", "simulated:COUNT", or a prepared folder or URL.
-        val: sources to watch, never learned from.
-        sensor: name of a sensor, or a sensor's ``.json`` file.
-        columns: fine columns of the circle; 0 for the sensor's own.
-        column_stride: keep every n-th of them.
-        projection: ``sensor`` for the sensor's own, ``spherical`` or ``unfolding``.
-        projection_variant: ``exact``, or ``reference`` to repeat the released program's projection.
-        max_scans: of each source, evenly spaced over it; 0 for all.
-        bad_points: ``refuse`` scans with NaN, infinite or origin points, or ``drop`` these points.
-        bad_scans: ``refuse`` to go on after a scan that cannot be used, or ``skip`` it and say so.
-        workers: processes that prepare scans, and threads that read ahead while a model trains.
+        train: sources of training scans: "NAME:ROOT:SPLIT", a folder, "simulated:COUNT", or a prepared folder or URL.
+        val: sources of validation scans, which the model is tried on and does not learn from.
+        sensor: name of a sensor, or path of a sensor's ``.json`` file.
+        columns: number of fine columns over the whole circle; 0 for the sensor's own number.
+        column_stride: step between the fine columns that an image keeps, such as 8 for every eighth.
+        projection: ``spherical`` (rows by elevation), ``unfolding`` (rows by ring), or ``sensor`` for the sensor's own.
+        projection_variant: ``exact``, or ``reference`` to repeat the projection of LidarGRIT's released program.
+        max_scans: largest number of scans taken from each source, evenly spaced over it; 0 for all.
+        bad_points: ``refuse`` a scan with points that are NaN, infinite or at the origin, or ``drop`` these points.
+        bad_scans: ``refuse`` to go on when a scan cannot be used, or ``skip`` that scan with a message.
+        workers: number of processes that prepare scans, and of threads that read ahead during training.
     """
 
     train: tuple[str, ...] = ()
@@ -46,12 +46,12 @@ class DataConfig:
             raise ConfigError(f"max_scans={self.max_scans}", "at least 1, or 0 for all", "raise it")
         if self.column_stride != 1 and not self.columns:
             got = f"column_stride={self.column_stride} without columns"
-            raise ConfigError(got, "both, or neither", "say of how many columns it is, as columns=2048")
+            raise ConfigError(got, "both, or neither", "give the number of fine columns too, as columns=2048")
         if not 1 <= self.workers <= 1024:
             raise ConfigError(f"workers={self.workers}", "1 to 1024", "choose about as many as there are cores")
 
     def load_sensor(self) -> SensorModel:
-        """Return the sensor at the wanted number of columns and with the wanted projection."""
+        """Return the sensor with these columns and this projection."""
         sensor = load_sensor(self.sensor)
         if self.columns:
             sensor = sensor.with_columns(self.columns, self.column_stride)

@@ -1,4 +1,4 @@
-"""Many range images that read like a list; only those asked for are in memory."""
+"""Range images on disk → batches in memory, of only the images that are asked for."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
 Pixels = tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "H W"] | None]
-"""Range in metres, 0 where nothing returned; reflectance in [0, 1] if it is known."""
+"""Range (H, W) in metres, 0 where there is no return; reflectance (H, W) in [0, 1], or None if it is not known."""
 
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where images come from, so that it can be told what two sets share.
+    """Where images come from; two provenances tell which scans or drives two sets share.
 
     Args:
-        names: of each image: the file of its scan, or what else identifies it.
-        recordings: the drives that images were cut from; none for generated scans.
-        fingerprints: equal for equal pixels; none where that is not known.
+        names: one name for each image: the file of its scan, or another identifier.
+        recordings: names of the drives that the images were cut from; empty for generated scans.
+        fingerprints: one hash of the pixels for each image; empty where it is not known.
     """
 
     names: tuple[str, ...] = ()
@@ -35,10 +35,10 @@ class Provenance:
     fingerprints: tuple[str, ...] = ()
 
     def overlap(self, other: Provenance) -> str:
-        """Say in a few words what two sets have in common that they should not, "" if nothing is known to be.
+        """Return in a few words what two sets share; "" if they share nothing that is known.
 
-        The same scan is told by its file or by its pixels, and scans of one drive, which show the same streets, by the
-        recording, also where one recording is in several data sets.
+        Two scans are the same if their files or their pixels are. Scans of one drive show the same streets; they are
+        recognised by their recording, also where two data sets hold the same recording.
         """
         scans = max(len(set(self.names) & set(other.names)), len(set(self.fingerprints) & set(other.fingerprints)))
         if scans:
@@ -51,23 +51,23 @@ class Provenance:
 
 @runtime_checkable
 class ImageStore(Protocol):
-    """Where the pixels of many images lie."""
+    """A source of pixels of many images."""
 
     provenance: Provenance
 
     def __len__(self) -> int: ...
 
     def read(self, index: int) -> Pixels:
-        """Return the pixels of one image; may be called from several threads."""
+        """Return the pixels of one image; several threads may call it at once."""
         ...
 
 
 class RangeImages:
-    """Range images on disk that read like a list.
+    """Range images of one sensor, in one or more stores, numbered through.
 
     Args:
-        sensor: of the images that are read.
-        stores: of images as wide as the sensor's, or with all the fine columns of which the sensor keeps some.
+        sensor: sensor of the images that are returned.
+        stores: sources of images that are as wide as the sensor's, or that have all of its fine columns.
     """
 
     def __init__(self, sensor: SensorModel, stores: Sequence[ImageStore]) -> None:
@@ -80,7 +80,7 @@ class RangeImages:
 
     @property
     def provenance(self) -> Provenance:
-        """Where the images come from."""
+        """Provenance of all images, in their order."""
         parts = [store.provenance for store in self._stores]
         return Provenance(
             tuple(name for part in parts for name in part.names),
@@ -90,11 +90,16 @@ class RangeImages:
 
     @cached_property
     def _all_have_reflectance(self) -> bool:
-        """Tell it by the first image of every store: batches that have it now and then would be of no use."""
+        """Whether the first image of every store has reflectance; batches with it and without it would not mix."""
         return all(store.read(0)[1] is not None for store in self._stores)
 
     def batch(self, indices: Sequence[int], first_columns: Sequence[int] | None = None) -> RangeImage:
-        """Return the images of these indices as one batch, each from its own first fine column on."""
+        """Return some images as one batch (B, H, W).
+
+        Args:
+            indices: numbers of the images.
+            first_columns: fine column at which each image begins, below the sensor's column stride; 0 if not given.
+        """
         first_columns = first_columns or [0] * len(indices)
         pixels = [self._pixels(index, first) for index, first in zip(indices, first_columns, strict=True)]
         range_m = torch.from_numpy(np.stack([one for one, _ in pixels]))

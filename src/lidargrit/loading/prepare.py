@@ -1,4 +1,4 @@
-"""Scans → prepared range images: planned once, projected by many processes on many machines, taken up where stopped."""
+"""Sources of scans → prepared range images, projected once by many processes, and resumed where they were stopped."""
 
 from __future__ import annotations
 
@@ -35,22 +35,22 @@ from lidargrit.processes import rank_and_world_size
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel
 
-_SHARD_SCANS = 128  # 12 MB of a KITTI-360 size image: what a killed process loses, and 625 files for 80,000 scans
-_WAIT_S, _PATIENCE_S = 0.5, 1800.0  # for shards that other processes make; a shard takes seconds
+_SHARD_SCANS = 128  # 12 MB of KITTI-360 size images, and 625 files for 80,000 scans
+_WAIT_S, _PATIENCE_S = 0.5, 1800.0  # for shards that other machines make
 
 
 def load_range_images(
     sources: Sequence[str], config: DataConfig, reporter: Reporter | None = None, sensor: SensorModel | None = None
 ) -> RangeImages:
-    """Open range images of the sources: prepared ones as they are, scans projected once and then found in the cache.
+    """Open the range images of sources; scans are projected the first time, and then found in the cache.
 
     The cache is ``$LIDARGRIT_CACHE``, else ``lidargrit`` in the user's cache folder. It may be deleted at any time.
 
     Args:
-        sources: as in :class:`DataConfig`.
-        config: how scans become images; its own sources are not looked at.
-        reporter: hears of the progress.
-        sensor: stands in for the config's.
+        sources: sources of scans or of prepared images, as in :class:`DataConfig`.
+        config: settings by which scans become images; its own sources are ignored.
+        reporter: receiver of progress and messages.
+        sensor: sensor of the images, in place of the config's.
 
     Raises:
         DataError: no source, a source without a scan, or prepared scans of another sensor.
@@ -63,7 +63,7 @@ def load_range_images(
     for source in sources:
         if is_prepared(source):
             prepared = PreparedImages(source, config.max_scans)
-            _check_way(source, prepared, sensor, config)
+            _require_same_projection(source, prepared, sensor, config)
         else:
             prepared = PreparedImages(str(prepare(source, config, reporter=reporter, sensor=sensor)))
         for why in prepared.left_out.values():
@@ -84,23 +84,23 @@ def prepare(
     rank: int | None = None,
     world_size: int | None = None,
 ) -> Path:
-    """Project every scan of a source into a folder of shards; what is there already is kept, if it is still right.
+    """Project every scan of a source into a folder of shards; shards that are there already are kept.
 
     Args:
-        source: of scans, as data sets are opened by.
-        config: how scans become images, how many processes work, what is done with bad scans.
-        folder: where to; a place in the cache, named by everything the pixels depend on, if not given.
-        reporter: hears of the progress.
-        sensor: stands in for the config's.
-        rank: this machine, which makes its part and waits for the others to make theirs; ``RANK`` in the environment
-            if not given, and 0 without that.
-        world_size: of so many; ``WORLD_SIZE`` if not given, and 1 without that.
+        source: source of scans, as :func:`lidargrit.datasets.open_dataset` takes it.
+        config: settings by which scans become images, number of processes, and treatment of bad scans.
+        folder: prepared folder; if not given, one in the cache, named by everything that the pixels depend on.
+        reporter: receiver of progress and messages.
+        sensor: sensor of the images, in place of the config's.
+        rank: number of this machine, from 0; it makes its part of the shards and waits for those of the others. If not
+            given, the environment's ``RANK``, else 0.
+        world_size: number of machines that share the work; if not given, the environment's ``WORLD_SIZE``, else 1.
 
     Returns:
         the folder, complete.
 
     Raises:
-        OutputError: the folder holds something else, or what is no longer right.
+        OutputError: the folder holds something else, or images of scans or settings that have changed since.
         ScanError: a scan that cannot be used; names it.
     """
     reporter, sensor = reporter or Reporter(), sensor or config.load_sensor()
@@ -127,16 +127,16 @@ def prepare(
 
 @dataclass(frozen=True)
 class Prepared:
-    """What a folder of prepared scans holds.
+    """What a prepared folder holds.
 
     Args:
-        folder: where.
-        images: how many.
-        rows: of an image.
-        columns: of an image, those that the sensor's image leaves out among them.
-        size: of all shards, in bytes.
-        seconds: that the work took.
-        left_out: why scans that could not be used were left out, one line each.
+        folder: path of the folder.
+        images: number of images.
+        rows: number of rows of an image.
+        columns: number of fine columns of an image.
+        size: bytes of all shards.
+        seconds: time that the work took.
+        left_out: reasons why scans were left out, one line for each scan.
     """
 
     folder: Path
@@ -148,7 +148,7 @@ class Prepared:
     left_out: tuple[str, ...]
 
     def as_line(self) -> str:
-        """Return all of it for people."""
+        """Return all of it as a line for a person."""
         return (
             f"{self.images} range images of {self.rows}x{self.columns} in {self.folder}: "
             f"{self.size / 1e6:.1f} MB, {self.size / 1e3 / max(self.images, 1):.0f} KB each, in {self.seconds:.1f} s"
@@ -169,9 +169,14 @@ def prepare_and_describe(
     world_size: int | None = None,
     verify: bool = False,
 ) -> Prepared:
-    """Prepare, read everything back if asked to, and tell what lies where.
+    """Prepare a source and return what the folder holds.
 
-    Args, Raises: as for :func:`prepare`.
+    Args:
+        source, config, folder, reporter, rank, world_size: as for :func:`prepare`.
+        verify: whether to read every image back and make damaged shards again.
+
+    Raises:
+        OutputError, ScanError: as for :func:`prepare`.
     """
     begun = time.monotonic()
     folder = prepare(source, config, folder, reporter, rank=rank, world_size=world_size)
@@ -189,7 +194,7 @@ def prepare_and_describe(
 
 
 def damaged_shards(folder: Path, reporter: Reporter | None = None) -> list[int]:
-    """Read every image of a prepared folder and return the shards with one that is not what was written."""
+    """Read every image of a prepared folder and return the numbers of the shards with a damaged one."""
     images = PreparedImages(str(folder))
     damaged: set[int] = set()
     with (reporter or Reporter()).progress("verifying", len(images)) as progress:
@@ -205,7 +210,7 @@ def damaged_shards(folder: Path, reporter: Reporter | None = None) -> list[int]:
 def _spec(
     source: str, dataset: ScanDataset, sensor: SensorModel, config: DataConfig
 ) -> tuple[PreparedSpec, list[tuple[str, str, int, int]]]:
-    """Return what the images depend on, and of every scan its name, its drive, and its file's size and time."""
+    """Return what the images depend on, and for every scan its name, its drive, and its file's size and time."""
     fine, scans = sensor.fine(), []
     for index in evenly_spaced(config.max_scans or len(dataset), len(dataset)):
         path = dataset.path(index)
@@ -238,7 +243,7 @@ def _spec(
 
 
 def _claim(folder: Path, spec: PreparedSpec, scans: list[tuple[str, str, int, int]]) -> None:
-    """Write the specification into a free folder, or find that the folder's is the same."""
+    """Write the plan into a free folder, or check that the folder's plan is the same."""
     if (folder / PLAN_FILE).exists():
         if differing := spec.differences(PreparedFolder(str(folder)).read_spec()):
             raise OutputError(
@@ -283,8 +288,8 @@ def _wait_for(folder: Path, shards: list[int], reporter: Reporter) -> None:
             time.sleep(_WAIT_S if still else 0)
 
 
-def _check_way(source: str, images: PreparedImages, sensor: SensorModel, config: DataConfig) -> None:
-    """Refuse images that were prepared for other rays, or projected in another way than is wanted."""
+def _require_same_projection(source: str, images: PreparedImages, sensor: SensorModel, config: DataConfig) -> None:
+    """Refuse prepared images of other rays, or of another projection, than are wanted."""
     prepared, wanted = images.sensor, sensor.fine()
     if not prepared.same_rays(wanted):
         raise DataError(
@@ -297,5 +302,7 @@ def _check_way(source: str, images: PreparedImages, sensor: SensorModel, config:
     if theirs != ours:
         told = [f"{variant}, {projection}, {near:g} to {far:g} m" for variant, projection, near, far in (theirs, ours)]
         raise DataError(
-            f"{source}, prepared by the projection {told[0]}", told[1], "ask for what was prepared, or prepare it anew"
+            f"{source}, prepared by the projection {told[0]}",
+            told[1],
+            "choose that projection, or prepare the scans anew",
         )

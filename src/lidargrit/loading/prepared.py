@@ -1,4 +1,4 @@
-"""Prepared scans: a folder, here or far away, that holds a plan and shards → range images."""
+"""A prepared folder, on this machine or behind a URL, with a plan and shards → range images."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ _PLAN_AT_MOST = 1 << 30  # bytes; the list of a million scans has a quarter of t
 
 @dataclass(frozen=True)
 class PreparedSpec:
-    """Everything that the pixels depend on, so that one look tells whether they are still right.
+    """Everything that the pixels of a prepared folder depend on; ``plan.json`` holds it under these names.
 
     Args:
-        format: of the shards, raised whenever projection or simulation give other pixels for the same scan.
-        version: of lidargrit.
-        source: where the scans come from, as the user named it.
-        sensor: with all its fine columns.
-        variant: of the projection.
-        bad_points: refused or dropped.
-        bad_scans: refused or skipped.
-        max_scans: taken evenly from the source; 0 for all.
-        range_step_m: in which ranges are kept.
-        shard_scans: how many scans make a shard.
-        num_scans: how many there are.
-        digest: of the files: their places, sizes and times.
+        format: number of the format, raised whenever projection or simulation gives other pixels for the same scan.
+        version: version of lidargrit.
+        source: source of the scans, as the user typed it.
+        sensor: JSON of the sensor, with all its fine columns.
+        variant: projection variant, ``exact`` or ``reference``.
+        bad_points: ``refuse`` or ``drop``.
+        bad_scans: ``refuse`` or ``skip``.
+        max_scans: largest number of scans taken from the source, evenly spaced; 0 for all.
+        range_step_m: step in which ranges are kept, in metres.
+        shard_scans: number of scans in a shard; the last shard may have fewer.
+        num_scans: number of scans in the folder, those left out included.
+        digest: hash of the names, sizes and times of the scans' files.
     """
 
     format: int
@@ -53,7 +53,7 @@ class PreparedSpec:
 
     @property
     def num_shards(self) -> int:
-        """How many shards there will be."""
+        """Number of shards."""
         return -(-self.num_scans // self.shard_scans)
 
     def scans_of(self, shard: int) -> range:
@@ -85,7 +85,14 @@ def is_prepared(source: str) -> bool:
 
 
 class PreparedFolder:
-    """A folder of this machine, or any that fsspec reaches by a URL such as s3://bucket/scans."""
+    """The files of a prepared folder.
+
+    Args:
+        location: path on this machine, or a URL that fsspec opens, such as s3://bucket/scans.
+
+    Raises:
+        DataError: fsspec cannot open the URL.
+    """
 
     def __init__(self, location: str) -> None:
         self.location = location
@@ -99,10 +106,10 @@ class PreparedFolder:
                 raise DataError(f"{location} ({error})", "a URL that fsspec can open", "check it") from None
 
     def open(self, name: str) -> Bytes:
-        """Open a file to read pieces of it.
+        """Open a file, of which pieces can then be read.
 
         Raises:
-            DataError: it is not there.
+            DataError: the file cannot be read.
         """
         try:
             if self._is_local:
@@ -160,14 +167,14 @@ class _RemoteBytes:
 
 
 class PreparedImages:
-    """The range images of a prepared place.
+    """The range images of a prepared folder.
 
     Args:
-        location: a folder or a URL.
-        max_scans: taken evenly; 0 for all.
+        location: path of the folder, or its URL.
+        max_scans: largest number of images, evenly spaced over the folder; 0 for all.
 
     Raises:
-        DataError: nothing prepared is there, or it is not complete, or damaged.
+        DataError: the folder is not a prepared one, is not complete, or is damaged.
     """
 
     def __init__(self, location: str, max_scans: int = 0) -> None:
@@ -200,13 +207,21 @@ class PreparedImages:
         return len(self._entries)
 
     def read(self, index: int, verify: bool = False) -> Pixels:
-        """Return the pixels of one image; ``verify`` compares them with their fingerprint."""
+        """Return the pixels of one image.
+
+        Args:
+            index: number of the image.
+            verify: whether to compare the pixels with their fingerprint.
+
+        Raises:
+            DataError: the image is damaged.
+        """
         shard, entry = self._entries[index]
         name = f"{self._folder.location}/{shard_name(shard)}"
         return read_image(self._bytes(shard), entry, self._shape, self.spec.range_step_m, name, verify)
 
     def shard_of(self, index: int) -> int:
-        """Return which shard holds an image."""
+        """Return the number of the shard that holds an image."""
         return self._entries[index][0]
 
     def _bytes(self, shard: int) -> Bytes:

@@ -71,7 +71,7 @@ class LocalBytes:
         self.size = len(self._map)
 
     def read(self, start: int, end: int) -> memoryview:
-        """Return the bytes from ``start`` up to ``end``, without a copy."""
+        """Return the bytes from ``start`` up to ``end``, without copying them."""
         return memoryview(self._map)[start:end]
 
 
@@ -139,7 +139,7 @@ class ShardWriter:
 
 
 def read_index(file: Bytes, name: str) -> tuple[list[Entry], dict[int, str]]:
-    """Return where the images of a shard lie, and which scans were left out and why.
+    """Return the entries of a shard's images, and for each scan that was left out the reason.
 
     Raises:
         DataError: the file is no whole shard.
@@ -165,7 +165,7 @@ def read_index(file: Bytes, name: str) -> tuple[list[Entry], dict[int, str]]:
 def read_image(
     file: Bytes, entry: Entry, shape: tuple[int, int], step_m: float, name: str, verify: bool = False
 ) -> Pixels:
-    """Return one image of a shard; ``verify`` compares its pixels with their fingerprint.
+    """Return the pixels of one image of a shard; ``verify`` compares them with their fingerprint.
 
     Raises:
         DataError: the image is damaged.

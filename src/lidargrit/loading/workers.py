@@ -1,7 +1,7 @@
 """Shards of a prepared folder, made by several processes: ``python -m lidargrit.loading FOLDER PARENT SHARD...``.
 
-Processes of their own rather than a pool: they need nothing but the plan in the folder, a caller's script needs no
-guard against being imported again, and none is left at work when the caller dies.
+These are commands of their own and not a pool of multiprocessing: they need only the plan in the folder, the caller's
+script needs no guard against being imported again, and they end when the caller dies.
 """
 
 from __future__ import annotations

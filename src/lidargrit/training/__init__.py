@@ -1,4 +1,4 @@
-"""One loop, one optimiser, one checkpoint, whatever the model: recipe → run folder."""
+"""Recipe → run folder, by one training loop for every generator."""
 
 from lidargrit.training.compute import estimated_training_flops, gpu_time, training_flops, with_budget
 from lidargrit.training.config import FitConfig, Recipe

@@ -1,4 +1,4 @@
-"""A stage of a run, stopped at any scan: weights, their average, the optimiser → one file and back."""
+"""State of a stage in training (weights, their average, the optimiser) ⇄ one file."""
 
 from __future__ import annotations
 
@@ -21,7 +21,16 @@ def save_checkpoint(
     scans_seen: int,
     built_on: str,
 ) -> None:
-    """Write everything that the next step depends on, atomically: an interrupted save leaves the file before it."""
+    """Write everything that the next step depends on, atomically: an interrupted save leaves the older checkpoint.
+
+    Args:
+        path: file of the checkpoint.
+        objective: objective in training.
+        average: moving average of its weights.
+        optimiser: optimiser with its moments.
+        scans_seen: number of training scans seen so far, over all processes.
+        built_on: fingerprint of the earlier stage's weights; "" for the first stage.
+    """
     tensors: dict[str, Tensor] = {}
     tensors |= {f"objective.{name}": tensor for name, tensor in objective.state_dict().items()}
     tensors |= {f"average.{name}": tensor for name, tensor in average.objective.state_dict().items()}
@@ -36,7 +45,7 @@ def load_checkpoint(
     """Load what :func:`save_checkpoint` wrote and return the scans seen.
 
     Raises:
-        CheckpointError: a damaged file, one of another configuration, or of a stage that was built on other weights.
+        CheckpointError: the file is damaged, of another configuration, or of a stage that was built on other weights.
     """
     tensors, about = read_tensors(path)
     if about.get("built_on", "") != built_on:

@@ -1,4 +1,4 @@
-"""A recipe → the arithmetic that its training takes, and the recipe cut to a budget of it."""
+"""A recipe → the floating-point operations of its training, and the recipe scaled to a budget of them."""
 
 from __future__ import annotations
 
@@ -18,28 +18,31 @@ from lidargrit.structures import RangeImage
 from lidargrit.training.config import FitConfig, Recipe
 from lidargrit.training.engine import Engine
 
-_SCANS = 2  # of a counted batch: some objectives compare the scans of a batch, so one alone would not do
-_STEPS = 16  # counted of players who take turns: some of their terms come in every 16th step only
+_SCANS = 2  # in a counted batch: some objectives compare the scans of a batch
+_STEPS = 16  # counted of adversarial objectives, some of whose terms come only every 16th step
 _A100_FP32_FLOPS_PER_S, _A100_BF16_FLOPS_PER_S = 19.5e12, 312e12
-_SHARE = 0.25  # of a card's peak: a guess for networks as small as these; few scans at once reach less
-_STRIP = 16  # columns: as often as the deepest of our networks halves them
+_SHARE = 0.25  # of a card's peak: a guess for networks as small as these; small batches reach less
+_STRIP = 16  # columns: the deepest of our networks halves their number four times
 
 
 def training_flops(recipe: Recipe) -> dict[str, int]:
-    """Count the floating-point operations of a recipe's training, stage by stage, forward and backward.
+    """Count the floating-point operations of a recipe's training, forward and backward, for each stage.
 
-    Products and convolutions are counted as they are called, two operations for a multiplication with its addition, on
-    a few steps with scans that return everywhere at 10 m. Validation and optimiser are left out.
+    Matrix products and convolutions are counted while a few steps run, on scans whose every pixel returns at 10 m. A
+    multiplication with its addition counts as two operations. Validation and the optimiser are not counted.
+
+    Returns:
+        number of operations, by the name of the stage.
     """
     return _counted(recipe, recipe.data.load_sensor())
 
 
 def estimated_training_flops(recipe: Recipe) -> dict[str, int]:
-    """Return what :func:`training_flops` does, in seconds and little memory also where images are large.
+    """Estimate what :func:`training_flops` counts, in seconds and little memory also where images are large.
 
-    A layer's operations grow with the columns of the image, attention's with their square: so those of one, two and
-    three narrow strips of it tell those of the whole, but for layers of R2DM that are made by the number of columns
-    (3 % too much).
+    The operations of a convolution grow with the number of columns, those of attention with its square. So counts on
+    images of 16, 32 and 48 columns determine the count on the whole image. The estimate is 3 % too high for R2DM, some
+    of whose layers depend on the number of columns in another way.
     """
     sensor = recipe.data.load_sensor()
     strips = sensor.width / _STRIP
@@ -74,7 +77,11 @@ def _strip(sensor: SensorModel, columns: int) -> SensorModel:
 
 
 def gpu_time(flops: int, precision: Precision) -> str:
-    """Return the operations and an estimate of the time that a GPU of the paper's day takes for them, for a person.
+    """Return a line for a person: the operations, and the estimated time of an NVIDIA A100 for them.
+
+    Args:
+        flops: number of floating-point operations.
+        precision: precision of the operations.
 
     Source:
         Peaks of the card without sparsity: NVIDIA A100 datasheet, 2021.
@@ -87,7 +94,7 @@ def gpu_time(flops: int, precision: Precision) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Return a time in the unit that suits it, for a person."""
+    """Return a time as text, in days, hours, minutes or seconds."""
     for unit, length in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
         if seconds >= 2 * length:
             return f"{seconds / length:.1f} {unit}"
@@ -95,12 +102,16 @@ def duration(seconds: float) -> str:
 
 
 def with_budget(recipe: Recipe, flops: float) -> Recipe:
-    """Return the recipe with more or fewer scans, all stages by one factor, so that its training takes ``flops``.
+    """Return the recipe with more or fewer scans, by one factor for all stages, so that its training takes ``flops``.
 
-    What is counted in scans besides the budget (warm-up, validation) shrinks or grows alike; averages only shrink.
+    Warm-up and the distance between validations are scaled by the same factor; the half-life of averages only falls.
+
+    Args:
+        recipe: recipe to scale.
+        flops: number of floating-point operations that the training may take.
 
     Raises:
-        ConfigError: a budget that is not even a batch of every stage.
+        ConfigError: the budget is smaller than one batch of every stage.
     """
     if not recipe.training:
         return recipe
@@ -125,21 +136,21 @@ def _scaled(config: FitConfig, share: float) -> FitConfig:
     )
 
 
-def same_everywhere(sensor: SensorModel, count: int) -> RangeImage:
-    """Return scans that return everywhere, at 10 m: enough where only the arithmetic matters."""
+def uniform_images(sensor: SensorModel, count: int) -> RangeImage:
+    """Return range images whose every pixel returns at 10 m, for counting operations and measuring speed."""
     range_m = torch.full((count, sensor.height, sensor.width), 10.0).clamp(sensor.range_min_m, sensor.range_max_m)
     return RangeImage(range_m, torch.ones_like(range_m, dtype=torch.bool), sensor, torch.full_like(range_m, 0.3))
 
 
 def _flops_per_scan(objective: Objective, sensor: SensorModel) -> float:
-    images = same_everywhere(sensor, _SCANS)
+    images = uniform_images(sensor, _SCANS)
     engine = Engine("fp32", bool(objective.players))
-    engine.set_up(objective, torch.optim.SGD(objective.parameters(), lr=0.0))  # the quickest: it is not counted
+    engine.set_up(objective, torch.optim.SGD(objective.parameters(), lr=0.0))  # the cheapest; it is not counted
     steps = _STEPS if objective.players else 1
     counter = FlopCounterMode(display=False)
-    # Which module an operation is of is not asked, and the tracker stumbles over penalties.
+    # The counter's tracker of modules fails on gradient penalties, and counts by module are not needed.
     counter.mod_tracker = _NoModules()
-    # The fused attention of a CPU is no product to the counter.
+    # The counter does not see the matrix products within the fused attention of a CPU.
     with counter, sdpa_kernel(SDPBackend.MATH):
         for step in range(steps):
             engine.step(images.to(engine.device), step, 0.0)
@@ -147,7 +158,7 @@ def _flops_per_scan(objective: Objective, sensor: SensorModel) -> float:
 
 
 class _NoModules(ModuleTracker):
-    """Keeps no track of modules: what is counted counts once, in all."""
+    """Tracks no modules, so that every operation is counted once, in the total."""
 
     def __enter__(self) -> ModuleTracker:
         return self

@@ -1,4 +1,4 @@
-"""What an experiment is: data, model, and how long and how each of its stages learns."""
+"""An experiment as settings: its data, its model, and the training of each of its stages."""
 
 from __future__ import annotations
 
@@ -14,33 +14,36 @@ _BATCH_AT_MOST = 65_536  # scans: 4 GB of the smallest images, and more than any
 
 @dataclass(frozen=True)
 class FitConfig:
-    """How one stage of a model learns; every duration is counted in scans seen.
+    """How one stage of a generator is trained; every duration is a number of scans seen.
 
     Args:
-        scans: the budget.
-        batch_size: over all processes.
-        accumulate: each process takes its share of a batch in so many parts, one after the other: less memory, and the
-            same step up to rounding, but for a codebook, which follows or restarts its codes after each part.
-        learning_rate: at its highest.
-        schedule: ``constant``; ``cosine`` falls to 0 over the budget; ``linear_second_half`` is constant for the first
-            half and then falls to 0 (the reference's for its KITTI-360 transformer).
-        warmup_scans: the rate rises linearly over this many scans.
-        betas: of Adam.
-        weight_decay: on the weights of linear layers only, as in the reference.
-        gradient_clip: largest norm of the gradient; 0 for none.
-        average_over_scans: half-life of the moving average of the weights that is sampled and scored; 0 for none.
-        precision: ``bf16`` runs convolutions and products in 16 bits, sums and losses in 32; ``auto`` does so where the
-            machine has instructions for it, for elsewhere it is many times slower.
-        recompute: drop the activations within blocks, and compute them again for the gradients: less memory, the same
-            gradients, about a third more operations.
-        compile: by ``torch.compile``, which needs a C++ compiler, and minutes before the first step.
-        augmentations: see lidargrit.augmentation.
-        any_columns: where the sensor keeps every n-th column, begin at any of the first n each time a scan is seen: n
-            times as many images of the same scans. The reference always keeps the first.
-        validate_every: scans between two validations, which take at most ``validation_scans`` scans.
-        validation_scans: see above.
-        checkpoint_every: scans between two checkpoints.
-        pictures_every: scans between two pictures of what the model makes of validation scans; 0 for none.
+        scans: number of scans seen over the whole training of the stage.
+        batch_size: number of scans in a batch, over all processes.
+        accumulate: number of parts in which each process takes its share of a batch, one after the other. More parts
+            need less memory and give the same step up to rounding; only a codebook, which moves or restarts its codes
+            after each part, comes out differently.
+        learning_rate: highest learning rate.
+        schedule: course of the learning rate. ``constant``; ``cosine`` falls to 0 over all scans;
+            ``linear_second_half`` stays constant for the first half and falls to 0 over the second, as LidarGRIT's
+            program does for its KITTI-360 transformer.
+        warmup_scans: number of scans over which the learning rate rises linearly from 0.
+        betas: decay rates of Adam's two moments.
+        weight_decay: decay of the weights of linear layers; other weights do not decay, as in LidarGRIT's program.
+        gradient_clip: largest norm of the gradient; 0 for no limit.
+        average_over_scans: half-life, in scans, of the moving average of the weights; the averaged weights are
+            validated and become the model. 0 for no averaging.
+        precision: ``bf16`` computes convolutions and matrix products in 16 bits, sums and losses in 32. ``auto`` does
+            so where the machine has instructions for it; elsewhere 16 bits are many times slower.
+        recompute: whether to drop the activations within blocks and compute them again for the gradients: less memory,
+            the same gradients, about a third more operations.
+        compile: whether to use ``torch.compile``, which needs a C++ compiler, and minutes before the first step.
+        augmentations: kinds of augmentation, applied in this order; see lidargrit.augmentation.
+        any_columns: whether an image may begin at any of the first n fine columns where the sensor keeps every n-th,
+            so that each scan gives n different images. LidarGRIT's program always begins at the first.
+        validate_every: number of scans between two validations.
+        validation_scans: largest number of scans in a validation, evenly spaced over the validation set.
+        checkpoint_every: number of scans between two checkpoints.
+        pictures_every: number of scans between two pictures of reconstructed or sampled scans; 0 for none.
     """
 
     scans: int
@@ -83,14 +86,14 @@ class Recipe:
     """One experiment.
 
     Args:
-        title: one line.
+        title: description of the experiment in one line.
         generator: name of the generator in lidargrit.generators.
-        model: the generator's own configuration.
-        data: which scans.
-        training: how each stage of the generator learns.
-        seed: of everything random.
-        published: what the paper reports for it, for the reader; empty if this is not an experiment of the paper.
-        tokenizer_from: folder of a finished run whose tokenizer is taken as it is, in place of training one.
+        model: configuration of the generator, of its own ``Config`` class.
+        data: settings of the data.
+        training: settings of the training, by the name of the stage.
+        seed: seed of everything random: weights, order, augmentation, dropout.
+        published: scores that a paper reports for the experiment, for the reader; empty if no paper does.
+        tokenizer_from: folder of a finished run whose tokenizer is used as it is; without it, a tokenizer is trained.
     """
 
     title: str

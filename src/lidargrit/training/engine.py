@@ -1,4 +1,4 @@
-"""The one file that knows Lightning Fabric: devices, processes and precision."""
+"""Devices, processes and precision by Lightning Fabric; no other file imports it."""
 
 from __future__ import annotations
 
@@ -25,8 +25,9 @@ class Engine:
     """Runs an objective on this machine's device, in one process or in each of several under a launcher.
 
     Args:
-        precision: ``fp32``, ``bf16``, or ``auto`` for the second where the machine has instructions for it.
-        players_take_turns: some weights are out of a loss's reach, and no process may wait for their gradients.
+        precision: ``fp32``, ``bf16``, or ``auto`` for ``bf16`` where the machine has instructions for it.
+        players_take_turns: whether a loss leaves some weights without gradients, as in adversarial training; processes
+            then do not wait for these gradients.
     """
 
     def __init__(self, precision: Precision, players_take_turns: bool = False) -> None:
@@ -34,7 +35,7 @@ class Engine:
         from lightning_fabric.plugins.environments.torchelastic import TorchElasticEnvironment  # noqa: PLC0415
         from lightning_fabric.strategies.ddp import DDPStrategy  # noqa: PLC0415
 
-        logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # it tells the precision at every start
+        logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # it prints the precision at every start
         # One device, unless a launcher such as torchrun began this process as one of several.
         where: dict[str, Any] = {"devices": 1}
         _, processes = rank_and_world_size(None, None)
@@ -49,11 +50,11 @@ class Engine:
         self.device, self.rank, self.world_size = self._fabric.device, self._fabric.global_rank, self._fabric.world_size
 
     def set_up(self, objective: Objective, optimiser: torch.optim.Optimizer) -> None:
-        """Place an objective on the device and spread it over the processes."""
+        """Move an objective to the device, and synchronise its gradients over the processes."""
         self._objective, self._optimiser = self._fabric.setup(_UncastInputs(objective), optimiser)
 
     def by_first(self, action: Callable[[], None]) -> None:
-        """Let the first process alone do something, such as write a file; all raise the error that it met."""
+        """Let only the first process do something, such as write a file; every process raises the error that it met."""
         error: LidarGritError | None = None
         if self.rank == 0:
             try:
@@ -66,26 +67,26 @@ class Engine:
             raise error
 
     def peak_gib(self) -> float:
-        """Return the most memory that this process has held so far: of its GPU, or else of the machine."""
+        """Return the largest memory that this process has held so far, in GiB, on its GPU or else in the machine."""
         if self.device.type == "cuda":
             return torch.cuda.max_memory_allocated(self.device) / 2**30
         unit = 1 if sys.platform == "darwin" else 1024  # of ru_maxrss, bytes there and kibibytes elsewhere
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**30
 
     def any(self, asked: bool) -> bool:
-        """Tell whether it was asked of any process."""
+        """Return whether ``asked`` is true in any process."""
         return asked if self.world_size == 1 else bool(self._mean(torch.tensor(float(asked), device=self.device)) > 0)
 
     def step(self, images: RangeImage, seed: int, gradient_clip: float, parts: int = 1) -> dict[str, Tensor]:
-        """Take one step, or one of each player in turn, and return the terms, averaged over the processes.
+        """Take one step, or one for each player in turn, and return the loss terms, averaged over the processes.
 
-        No weight changes by a loss or a gradient that is not finite in any process.
+        If a loss or a gradient is not finite in any process, no process changes its weights.
 
         Args:
-            images: this process's share of a batch.
-            seed: of its draws.
-            gradient_clip: largest norm of the gradient; 0 for none.
-            parts: gradients of so many parts of the share, one after the other, are added up for one step.
+            images: this process's share of a batch (B, H, W).
+            seed: seed of the objective's random numbers.
+            gradient_clip: largest norm of the gradient; 0 for no limit.
+            parts: number of parts of the share whose gradients are computed one after the other and added up.
         """
         self._objective.train()
         terms: dict[str, Tensor] = {}
@@ -129,7 +130,7 @@ class Engine:
         return dict(zip(terms, self._mean(together).unbind(), strict=True))
 
     def evaluate(self, objective: Objective, images: RangeImage, seed: int) -> dict[str, float]:
-        """Return an objective's terms on a batch, in evaluation mode."""
+        """Return an objective's loss terms on a batch, in evaluation mode."""
         was_training = objective.training
         objective.eval()
         terms: dict[str, Tensor] = {}
@@ -166,7 +167,7 @@ def _turns(objective: Objective) -> tuple[str, ...]:
 
 
 def _joined(terms: dict[str, Tensor], found: dict[str, Tensor], player: str) -> dict[str, Tensor]:
-    """Add a player's terms under its name to those of the players before it, and its loss to theirs."""
+    """Add a player's terms, with its name before theirs, to those of earlier players, and its loss to their sum."""
     if not player:
         return found
     loss = found["loss"] + terms.get("loss", 0.0)

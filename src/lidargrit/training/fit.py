@@ -1,4 +1,4 @@
-"""One training loop whatever the model: (objective, batches, configuration) → trained weights in a folder."""
+"""The training loop of every model: (objective, range images, configuration) → trained weights in a folder."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ _LOG_EVERY_STEPS = 20
 
 @dataclass
 class Fit:
-    """The state of one stage of a run.
+    """One stage of a run in training.
 
     Args:
-        objective: what the stage minimises.
-        config: how it learns.
-        folder: where ``checkpoint.safetensors`` and ``log.jsonl`` lie.
-        seed: of order, augmentation, dropout and draws.
-        reporter: hears of the progress.
-        built_on: fingerprint of the earlier stages' weights, which a checkpoint must share.
-        workers: threads that read ahead.
-        plot: plots the averaged objective into the named file.
+        objective: objective that the stage minimises.
+        config: settings of the stage's training.
+        folder: folder of ``checkpoint.safetensors`` and ``log.jsonl``.
+        seed: seed of order, augmentation, dropout and the objective's random numbers.
+        reporter: receiver of progress and messages.
+        built_on: fingerprint of the earlier stage's weights; a checkpoint with another one is refused.
+        workers: number of threads that read ahead.
+        plot: function that plots the averaged objective into a file; None for no pictures.
     """
 
     objective: Objective
@@ -69,16 +69,21 @@ class Fit:
 
     @property
     def checkpoint(self) -> Path:
-        """The one file from which the stage goes on."""
+        """File from which the stage resumes."""
         return self.folder / "checkpoint.safetensors"
 
     def run(self, train: RangeImages, val: RangeImages, what: str) -> Objective:
-        """Learn until the budget is spent and return the objective with its averaged weights.
+        """Train until all scans of the budget are seen, and return the objective with its averaged weights.
+
+        Args:
+            train: range images to learn from.
+            val: range images for validation.
+            what: words beside the progress bar.
 
         Raises:
-            TrainingError: the loss is not finite; names the step and the last good checkpoint.
-            OutputError: a checkpoint could not be written; the last one still stands.
-            Terminated: SIGTERM was received; the step was finished and saved.
+            TrainingError: the loss is not finite; names the scans seen and the last good checkpoint.
+            OutputError: a checkpoint could not be written; the one before it is intact.
+            Terminated: SIGTERM was received; the step in progress was finished and saved.
         """
         config = self.config
         batches = Batches(
@@ -118,7 +123,7 @@ class Fit:
         return self.average.objective.eval()
 
     def validate(self, images: RangeImages) -> dict[str, float]:
-        """Return the mean terms of the averaged objective over validation scans, evenly spaced."""
+        """Return the averaged objective's mean loss terms over evenly spaced validation scans."""
         chosen = evenly_spaced(self.config.validation_scans, len(images))
         totals: dict[str, float] = {}
         for first in range(0, len(chosen), self.config.batch_size):
@@ -135,7 +140,7 @@ class Fit:
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate_at(config, self.scans_seen)
         seed = derive_seed(self.seed, 2, self.scans_seen, self.engine.rank)
-        torch.manual_seed(seed)  # dropout draws from the global generator
+        torch.manual_seed(seed)  # of dropout, which takes the global random numbers
         terms = self.engine.step(images.to(self.engine.device), seed, config.gradient_clip, config.accumulate)
         if not bool(terms["loss"].isfinite()):
             raise TrainingError(
@@ -149,7 +154,7 @@ class Fit:
 
     def _begin(self) -> None:
         remove_partials(self.checkpoint.parent)
-        self.log = Log(self.folder, self.scans_seen)  # the first process alone has one
+        self.log = Log(self.folder, self.scans_seen)  # only the first process has one
 
     def _close_log(self) -> None:
         self.log.close()
@@ -175,7 +180,7 @@ class Fit:
 
 
 def _check_parts(config: FitConfig, processes: int, players_take_turns: bool) -> None:
-    """Refuse parts that a share of a batch cannot be taken in."""
+    """Refuse a number of parts into which a process cannot divide its share of a batch."""
     if config.accumulate > 1 and players_take_turns:
         raise ConfigError(
             f"accumulate={config.accumulate} for players who take turns",

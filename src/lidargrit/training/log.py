@@ -1,4 +1,4 @@
-"""The terms of a stage while it trains → ``log.jsonl``, and TensorBoard's event files."""
+"""Loss terms of a stage in training → ``log.jsonl`` and TensorBoard's event files."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from lidargrit.files import write_text
 
 
 class Log:
-    """The log of one stage, which forgets what came after the checkpoint that the stage goes on from.
+    """The log of one stage. Entries later than the checkpoint from which the stage resumes are removed.
 
     Args:
-        folder: of the stage.
-        scans_seen: of the checkpoint.
+        folder: folder of the stage.
+        scans_seen: number of scans seen at that checkpoint.
     """
 
     def __init__(self, folder: Path, scans_seen: int) -> None:
@@ -27,8 +27,14 @@ class Log:
     def write(self, split: str, scans_seen: int, seconds: float, terms: dict[str, float]) -> None:
         """Add an entry.
 
+        Args:
+            split: ``train`` or ``val``.
+            scans_seen: number of training scans seen so far, over all processes.
+            seconds: time since the start or the resumption of the stage.
+            terms: values of the loss terms, by name.
+
         Raises:
-            OutputError: it cannot be written.
+            OutputError: the log cannot be written.
         """
         line = {"scans_seen": scans_seen, "split": split, "seconds": round(seconds, 1), **terms}
         try:
@@ -44,7 +50,7 @@ class Log:
     def _plot(self, split: str, scans_seen: int, terms: dict[str, float]) -> None:
         from torch.utils.tensorboard import SummaryWriter  # noqa: PLC0415  slow to import, and only training needs it
 
-        if self._board is None:  # TensorBoard forgets by itself what was logged from purge_step on
+        if self._board is None:  # TensorBoard itself removes what was logged from purge_step on
             self._board = SummaryWriter(str(self._path.parent), purge_step=self._resumed_at + 1)
         for name, value in terms.items():
             self._board.add_scalar(f"{name}/{split}", value, scans_seen)
@@ -62,5 +68,5 @@ class Log:
                 if json.loads(line)["scans_seen"] <= self._resumed_at:
                     kept.append(line)
             except ValueError:
-                continue  # the line that was being written when the process was killed
+                continue  # a line that was cut short when the process was killed
         write_text(self._path, "".join(f"{line}\n" for line in kept))

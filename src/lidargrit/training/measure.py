@@ -1,4 +1,4 @@
-"""A recipe → what its training takes on this machine: a few steps of each stage, timed, and the whole foretold."""
+"""A recipe → the time and memory of its training on this machine, predicted from a few timed steps of each stage."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 
 from lidargrit.generators import load_class
 from lidargrit.nn.blocks import prepare_for_training
-from lidargrit.training.compute import duration, same_everywhere, training_flops
+from lidargrit.training.compute import duration, training_flops, uniform_images
 from lidargrit.training.config import Recipe
 from lidargrit.training.engine import Engine
 from lidargrit.training.optimiser import make_optimiser
@@ -22,12 +22,12 @@ class Measured:
     """What the training of one stage takes on this machine.
 
     Args:
-        stage: its name.
-        flops: floating-point operations of all its steps.
-        scans_per_s: that this machine trains on.
-        seconds: that all of them will take.
-        device: that computes.
-        peak_gib: the most memory that this process has held so far.
+        stage: name of the stage.
+        flops: floating-point operations of all steps.
+        scans_per_s: number of training scans per second.
+        seconds: predicted time of all steps.
+        device: name of the device that computes.
+        peak_gib: largest memory that this process has held so far, in GiB.
     """
 
     stage: str
@@ -46,10 +46,7 @@ class Measured:
 
 
 def measure(recipe: Recipe) -> list[Measured]:
-    """Take a few steps of every stage and foretell its whole training.
-
-    Reading scans and validation are not in the time; the memory is the most that this process has held so far.
-    """
+    """Take a few steps of every stage and predict the time of its whole training, without reading and validation."""
     with torch.random.fork_rng(range(torch.cuda.device_count())):
         torch.manual_seed(0)
         flops = training_flops(recipe)
@@ -60,7 +57,7 @@ def measure(recipe: Recipe) -> list[Measured]:
             prepare_for_training(objective, config.recompute, config.compile)
             engine = Engine(config.precision, bool(objective.players))
             engine.set_up(objective, make_optimiser(objective, config))
-            images = same_everywhere(recipe.data.load_sensor(), config.batch_size // engine.world_size)
+            images = uniform_images(recipe.data.load_sensor(), config.batch_size // engine.world_size)
             images = images.to(engine.device)
             begun = 0.0
             for step in range(_WARM_UP_STEPS + _TIMED_STEPS):

@@ -1,4 +1,4 @@
-"""Optimiser, learning rate and the moving average of weights: (configuration, scans seen) → update."""
+"""Optimiser, learning rate and moving average of the weights: (configuration, scans seen) → update."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lidargrit.training.config import FitConfig
 
 
 def make_optimiser(objective: nn.Module, config: FitConfig) -> torch.optim.AdamW:
-    """Return AdamW that decays the weights of linear layers only: not biases, norms, convolutions or embeddings."""
+    """Return AdamW with weight decay for linear layers only: not for biases, norms, convolutions or embeddings."""
     decaying = {id(module.weight) for module in objective.modules() if isinstance(module, nn.Linear)}
     learned = [parameter for parameter in objective.parameters() if parameter.requires_grad]
     groups = [
@@ -26,7 +26,7 @@ def make_optimiser(objective: nn.Module, config: FitConfig) -> torch.optim.AdamW
 
 
 def memory_of_weights(objective: nn.Module) -> int:
-    """Return the bytes of weights and their average, and of the gradients and Adam's two moments of those learned."""
+    """Return the bytes of weights, of their average, and of gradients and Adam's two moments of the trained weights."""
     tensors = [*objective.parameters(), *objective.buffers()]
     learned = [parameter for parameter in objective.parameters() if parameter.requires_grad]
     return 2 * sum(t.nbytes for t in tensors) + 3 * sum(t.nbytes for t in learned)
@@ -46,9 +46,13 @@ def learning_rate_at(config: FitConfig, scans_seen: int) -> float:
 
 
 class WeightAverage:
-    """A copy of an objective whose weights follow it as a moving average; buffers and fixed weights are copied.
+    """A copy of an objective with the moving average of its weights; buffers and fixed weights are copied.
 
-    The half-life grows with the scans seen until it is the one asked for, so that early weights are forgotten.
+    The half-life grows with the scans seen up to ``half_life_scans``, so that early weights are soon forgotten.
+
+    Args:
+        objective: objective whose weights are averaged.
+        half_life_scans: number of scans after which a weight counts half; 0 for no averaging.
 
     Source:
         Karras et al., EDM2, 2023: half-lives in samples, with a ramp.
@@ -60,7 +64,13 @@ class WeightAverage:
 
     @torch.no_grad()
     def update(self, objective: nn.Module, scans_seen: int, batch_size: int) -> None:
-        """Follow the objective after a step."""
+        """Take in the weights after a step.
+
+        Args:
+            objective: objective after the step.
+            scans_seen: number of training scans seen so far, over all processes.
+            batch_size: number of scans in the step, over all processes.
+        """
         half_life = min(self.half_life_scans, 0.1 * scans_seen)
         keep = 0.5 ** (batch_size / half_life) if half_life > 0 else 0.0
         for average, current in zip(self.objective.parameters(), objective.parameters(), strict=True):

@@ -1,4 +1,4 @@
-"""A recipe → what it would do: every setting by its name, sizes, budgets and estimated cost."""
+"""A recipe → what its training would do: every setting by its name, sizes, budgets and estimated cost."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from lidargrit.training.optimiser import memory_of_weights
 
 @dataclass(frozen=True)
 class StagePlan:
-    """What one stage would do.
+    """What the training of one stage would do.
 
     Args:
-        name: of the stage.
-        parameters: that it trains or looks through.
-        scans: that it sees.
-        batch_size: scans in a step, over all processes.
-        memory: bytes of weights, their average and the optimiser, besides activations.
-        flops: floating-point operations of all its steps, by estimate.
-        precision: in which they are computed.
+        name: name of the stage.
+        parameters: number of weights that the stage trains or uses.
+        scans: number of scans seen.
+        batch_size: number of scans in a step, over all processes.
+        memory: bytes of weights, their average, gradients and the optimiser's moments, without activations.
+        flops: floating-point operations of all steps, estimated.
+        precision: precision of the operations.
     """
 
     name: str
@@ -38,16 +38,16 @@ class StagePlan:
 
 @dataclass(frozen=True)
 class TrainingPlan:
-    """What a recipe would do.
+    """What the training of a recipe would do.
 
     Args:
-        title: of the recipe.
-        published: the score that its source reports, or "".
-        settings: every one by its name.
-        rows: of an image.
-        columns: of an image.
-        range_m: nearest and farthest return.
-        stages: in their order.
+        title: title of the recipe.
+        published: scores that a paper reports for the recipe, or "".
+        settings: value of every setting, by its dotted name.
+        rows: number of rows of an image.
+        columns: number of columns of an image.
+        range_m: nearest and farthest range of a return, in metres.
+        stages: plans of the stages, in their order.
     """
 
     title: str
@@ -60,7 +60,7 @@ class TrainingPlan:
 
     def as_text(self) -> str:
         """Return all of it as lines for a person."""
-        lines = [self.title, f"published: {self.published or 'no figure'}", ""]
+        lines = [self.title, f"published: {self.published or 'no score'}", ""]
         lines += [f"  {name} = {value}" for name, value in self.settings.items()]
         near_m, far_m = self.range_m
         lines += ["", f"range images of {self.rows}x{self.columns}, {near_m:g} to {far_m:g} m"]
@@ -78,7 +78,7 @@ class TrainingPlan:
 
 
 def plan_training(recipe: Recipe) -> TrainingPlan:
-    """Return what a recipe would do; nothing is read or written."""
+    """Return what the training of a recipe would do; nothing is read or written."""
     sensor = recipe.data.load_sensor()
     generator = load_class(recipe.generator)(recipe.model, sensor)
     stages, flops = [], estimated_training_flops(recipe)

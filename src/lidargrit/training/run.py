@@ -1,4 +1,4 @@
-"""A run from its recipe to its finished model: every stage in turn, each going on where it stopped."""
+"""Recipe → finished model in a run folder: the stages are trained in turn, and each resumes where it stopped."""
 
 from __future__ import annotations
 
@@ -39,23 +39,24 @@ def train(
 ) -> Generator:
     """Train every stage of a recipe in a run folder and return the finished generator.
 
-    The same call goes on where a stopped one was. The folder holds ``run.json`` (recipe, command, versions) before the
-    first step, a folder for each stage (checkpoint, log), and at the end ``config.json`` and ``model.safetensors``.
-    Under a launcher such as torchrun, every process calls it, and the first one writes.
+    The same call resumes a stopped training. Before the first step, the folder holds ``run.json`` (recipe, command,
+    versions); each stage adds a folder with its checkpoint and log; at the end ``config.json`` and
+    ``model.safetensors`` are written. Under a launcher such as torchrun, every process makes this call, and only the
+    first one writes. No second training can run in the folder at the same time.
 
     Args:
-        recipe: what to train.
-        folder: the run's.
-        reporter: hears of the progress.
+        recipe: experiment to train.
+        folder: run folder.
+        reporter: receiver of progress and messages.
         plot: function that plots the progress, called every ``pictures_every`` scans of a stage.
 
     Raises:
         OutputError: the folder holds something else, another process trains in it, or it cannot be written.
         DataError, ScanError: the data cannot be used.
         TrainingError: the loss is not finite.
-        ConfigError: the tokenizer to be taken from another run is not this recipe's.
+        ConfigError: the tokenizer that ``tokenizer_from`` names has other settings or another sensor than the recipe.
     """
-    engine = Engine("fp32")  # here only for who is the first of several processes, who alone writes
+    engine = Engine("fp32")  # tells which of several processes is the first, the only one that writes
     reporter = reporter if reporter and engine.rank == 0 else Reporter()
     with ExitStack() as held:
         engine.by_first(lambda: check_folder(folder, recipe))
@@ -67,7 +68,7 @@ def _train(recipe: Recipe, folder: Path, reporter: Reporter, plot: PlotProgress 
     train_images = load_range_images(recipe.data.train, recipe.data, reporter)
     val_images = load_range_images(recipe.data.val, recipe.data, reporter)
     _warn_of_overlap(train_images, val_images, reporter)
-    with torch.random.fork_rng(range(torch.cuda.device_count())):  # the caller's random numbers are the caller's
+    with torch.random.fork_rng(range(torch.cuda.device_count())):  # the caller's own random numbers stay as they are
         torch.manual_seed(derive_seed(recipe.seed, 9))
         generator = load_class(recipe.generator)(recipe.model, recipe.data.load_sensor())
         borrowed = None if recipe.tokenizer_from is None else _tokenizer_of(Path(recipe.tokenizer_from), generator)
@@ -100,7 +101,7 @@ def _plot(
 
 
 def _tokenizer_of(donor: Path, generator: Generator) -> Tokenizer:
-    """Return the tokenizer of a finished run, once it is known to be of the generator's own sizes and sensor."""
+    """Return the tokenizer of a finished run; refuse one of other settings or another sensor than the generator's."""
     ours, theirs = generator.get_tokenizer(), load(donor).get_tokenizer()
     mine, other = ({"name": each.config.name(), **configuration.leaves(each.config)} for each in (ours, theirs))
     differing = [name for name in mine if mine[name] != other.get(name)]
@@ -115,7 +116,12 @@ def _tokenizer_of(donor: Path, generator: Generator) -> Tokenizer:
 
 
 def check_folder(folder: Path, recipe: Recipe) -> None:
-    """Refuse a folder that is neither free nor this recipe's already, with OutputError."""
+    """Refuse a folder that holds something else than a run of this recipe.
+
+    Raises:
+        OutputError: the folder holds another run or other files.
+        CheckpointError: its ``run.json`` cannot be used.
+    """
     if (folder / RUN_FILE).exists():
         about, ours = read_json(folder / RUN_FILE), configuration.to_json(recipe)
         if not (theirs := recipe_settings(about)):
@@ -144,14 +150,14 @@ def check_folder(folder: Path, recipe: Recipe) -> None:
 
 
 def _defaults(recipe: Recipe) -> dict[str, Any]:
-    """Return the settings of a recipe that changes none: a run that began before there was a setting had this one."""
+    """Return the default settings of a recipe: a run that began before a setting existed had its default."""
     fits = {name: FitConfig(fit.scans, fit.batch_size, fit.learning_rate) for name, fit in recipe.training.items()}
     plain = Recipe(recipe.title, recipe.generator, configuration.defaults(recipe.model), DataConfig(), fits)
     return configuration.leaves(configuration.to_json(plain))
 
 
 def _claim(folder: Path, recipe: Recipe, train_images: RangeImages, val_images: RangeImages) -> None:
-    """Write what the run is, once all of it is known to be usable; or find that its data are still the same."""
+    """Write ``run.json``, or check that a resumed run has the data with which it began."""
     data = {
         "sensor": train_images.sensor.to_json(),
         "train": hashlib.sha256("\n".join(train_images.provenance.names).encode()).hexdigest(),
@@ -182,11 +188,11 @@ def _claim(folder: Path, recipe: Recipe, train_images: RangeImages, val_images: 
 
 
 def _write_trained_on(folder: Path, train_images: RangeImages, tokenizer_from: str | None) -> None:
-    """Write what the model learns from, without the names of the user's files, so that samples can carry it."""
+    """Write which scans the model learns from, without names of the user's files, so that samples can carry it on."""
     if not (folder / TRAINED_ON_FILE).exists():
         came_from = train_images.provenance
         facts = {"recordings": {*came_from.recordings} - {""}, "fingerprints": {*came_from.fingerprints}}
-        if tokenizer_from is not None:  # what the tokenizer learned from, the model has learned from
+        if tokenizer_from is not None:  # the model has learned from the tokenizer's scans too
             theirs = read_json(locate(tokenizer_from) / TRAINED_ON_FILE)
             facts = {name: known | set(theirs[name]) for name, known in facts.items()}
         write_text(folder / TRAINED_ON_FILE, json.dumps({name: sorted(known) for name, known in facts.items()}) + "\n")
@@ -194,7 +200,7 @@ def _write_trained_on(folder: Path, train_images: RangeImages, tokenizer_from: s
 
 def _warn_of_overlap(train_images: RangeImages, val_images: RangeImages, reporter: Reporter) -> None:
     if shared := train_images.provenance.overlap(val_images.provenance):
-        reporter.message(f"WARNING: train and val overlap ({shared}): val figures flatter the model")
+        reporter.message(f"WARNING: train and val overlap ({shared}): scores on val flatter the model")
 
 
 def _commit() -> str:

@@ -1,4 +1,4 @@
-"""SIGTERM → a flag, so that a step in progress is finished and saved before the process ends."""
+"""SIGTERM → a flag, so that the step in progress is finished and saved before the process ends."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from types import FrameType
 
 
 class Termination:
-    """Notes a SIGTERM, which batch schedulers send some seconds before they kill, while it is entered.
+    """Within its ``with`` block, a SIGTERM sets ``asked`` and does not end the process.
 
-    Outside of the main thread nothing can be noted, and the signal does what it did.
+    Batch schedulers send this signal some seconds before they kill. Python lets only the main thread handle signals;
+    in other threads the block changes nothing.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""A run's TensorBoard files → a project on Weights & Biases, by its own synchronisation."""
+"""A run's TensorBoard files → a project on Weights & Biases."""
 
 from __future__ import annotations
 
@@ -16,10 +16,15 @@ from lidargrit.training.config import Recipe
 
 @contextmanager
 def tracked(project: str, recipe: Recipe, folder: Path) -> Iterator[None]:
-    """Send what is logged meanwhile to a project; a run that goes on is the same run there. Nothing if "".
+    """Send what is logged within the ``with`` block to a project on Weights & Biases; a resumed run is one run there.
+
+    Args:
+        project: name of the project; "" to send nothing.
+        recipe: recipe of the run, whose settings are sent.
+        folder: run folder.
 
     Raises:
-        ConfigError: the package is missing, or the service refuses.
+        ConfigError: the package wandb is missing, or the service refuses.
     """
     if not project or rank_and_world_size(None, None)[0] > 0:  # of several processes the first one logs
         yield
