@@ -1,6 +1,7 @@
 """Prepared folders that are damaged, or made to do harm: each is refused in one line, or made anew."""
 
 import json
+import shutil
 import sys
 
 import numpy as np
@@ -18,18 +19,27 @@ def small_shards(monkeypatch):
     monkeypatch.setattr(prepare_module, "_SHARD_SCANS", 2)
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    return prepare("simulated:1", CONFIG, tmp_path_factory.mktemp("whole") / "out")
+
+
+@pytest.fixture
+def folder(whole, tmp_path):
+    return shutil.copytree(whole, tmp_path / "out")
+
+
 def pixels_of(folder):
     store = PreparedImages(str(folder))
     return [store.read(index) for index in range(len(store))]
 
 
 @pytest.mark.parametrize("damage", [b"", b"noise" * 99])
-def test_a_damaged_unfinished_shard_is_made_anew(tmp_path, damage):
-    folder = prepare("simulated:2", CONFIG, tmp_path / "out")
+def test_a_damaged_unfinished_shard_is_made_anew(folder, damage):
     (folder / "000000.shard").unlink()
     (folder / "000000.unfinished").write_bytes(damage)
-    prepare("simulated:2", CONFIG, folder)
-    assert len(PreparedImages(str(folder))) == 2
+    prepare("simulated:1", CONFIG, folder)
+    assert len(PreparedImages(str(folder))) == 1
     assert damaged_shards(folder) == []
     assert not (folder / "000000.unfinished").exists()
 
@@ -61,21 +71,20 @@ def test_damage_is_found_and_made_good(tmp_path, small_shards):
         {"reflectance_bytes": 3},
     ],
 )
-def test_an_index_that_lies_is_refused(tmp_path, change):
-    folder = prepare("simulated:1", CONFIG, tmp_path / "out")
+def test_an_index_that_lies_is_refused(folder, change):
     path = folder / "000000.shard"
     content = path.read_bytes()
     length = int.from_bytes(content[-16:-8], "little")
     index = json.loads(content[-16 - length : -16])
     index["entries"][0] |= change
     told = json.dumps(index).encode()
-    path.write_bytes(content[: -16 - length] + told + len(told).to_bytes(8, "little") + content[-8:])
-    with pytest.raises(DataError, match="shard"):
-        PreparedImages(str(folder)).read(0)
+    for lie in (told, b"[" * 100_000, b"null"):
+        path.write_bytes(content[: -16 - length] + lie + len(lie).to_bytes(8, "little") + content[-8:])
+        with pytest.raises(DataError, match="shard"):
+            PreparedImages(str(folder)).read(0)
 
 
-def test_a_blob_that_claims_to_be_gigabytes_is_refused_before_they_are_allocated(tmp_path):
-    folder = prepare("simulated:1", CONFIG, tmp_path / "out")
+def test_a_blob_that_claims_to_be_gigabytes_is_refused_before_they_are_allocated(folder):
     path = folder / "000000.shard"
     content = bytearray(path.read_bytes())
     content[8 + 4 : 8 + 8] = (1 << 31).to_bytes(4, "little")  # the size in the header of the first blob
@@ -86,8 +95,7 @@ def test_a_blob_that_claims_to_be_gigabytes_is_refused_before_they_are_allocated
 
 @pytest.mark.parametrize("name", ["plan.json", "scans.json"])
 @pytest.mark.parametrize("content", ["null", "3", "[]", "[null]", '{"format": true}', "[[1, 2]]", "[" * 100_000, "{"])
-def test_a_plan_or_a_list_of_scans_that_is_none_is_refused(tmp_path, name, content):
-    folder = prepare("simulated:1", CONFIG, tmp_path / "out")
+def test_a_plan_or_a_list_of_scans_that_is_none_is_refused(folder, name, content):
     (folder / name).write_text(content)
     with pytest.raises(DataError, match=name):
         PreparedImages(str(folder))
