@@ -23,7 +23,7 @@ import torch
 from torch import nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
-from lidargrit.generators import Generator, load_class
+from lidargrit.generators import Generator
 from lidargrit.loading import RangeImages, load_range_images
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Progress, Reporter
@@ -120,7 +120,7 @@ def main() -> None:
         os.environ["LIDARGRIT_CACHE"] = folder
         images = load_range_images(recipe.data.train, recipe.data)
         torch.manual_seed(0)
-        generator = load_class(recipe.generator)(recipe.model, recipe.data.load_sensor())
+        generator = recipe.build_generator()
         flops = training_flops(recipe)
         for stage in generator.stages:
             best = {"plain": 0.0, "ours": 0.0}

@@ -15,7 +15,7 @@ from lidargrit.evaluation.benchmark import run as run_benchmark
 from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.evaluation.protocols import load_protocol
 from lidargrit.evaluation.tables import Format
-from lidargrit.generators import is_run, load_class
+from lidargrit.generators import is_run
 from lidargrit.loading import load_range_images
 from lidargrit.metrics import load_metric
 from lidargrit.recipes import load_recipe
@@ -191,7 +191,7 @@ def plan(wanted: Reproduction, folder: Path) -> dict[str, Any]:
     systems = {}
     for system, recipe in recipes.items():
         run = folder / "runs" / system
-        generator = load_class(recipe.generator)(recipe.model, recipe.data.load_sensor())
+        generator = recipe.build_generator()
         systems[system] = {
             "state": "finished" if is_run(run) else "begun" if run.exists() else "to do",
             "plan": plan_training(recipe).to_json(),

@@ -19,6 +19,7 @@ from lidargrit.errors import CheckpointError, ConfigError, LidarGritError
 from lidargrit.files import is_taken, load_exactly, read_json, read_tensors, write_json, write_tensors, write_text
 from lidargrit.loading import RangeImages
 from lidargrit.nn.objective import Objective
+from lidargrit.nn.size import numbers_at_most
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 from lidargrit.tokenizers import Tokenizer
@@ -306,7 +307,11 @@ def load(folder: str | Path) -> Generator:
             f"{folder / CONFIG_FILE}, which cannot be used ({error})", "what lidargrit wrote", "restore the file"
         ) from None
     config = configuration.from_json(cls.Config, config, str(folder / CONFIG_FILE))
-    return cls.from_weights(config, sensor, read_tensors(folder / WEIGHTS_FILE)[0], folder / WEIGHTS_FILE)
+    weights = read_tensors(folder / WEIGHTS_FILE)[0]
+    expected = sum(tensor.numel() for tensor in weights.values())
+    # Twice as many as the file holds, for what is built besides: a wrong file is refused before it fills the memory.
+    with numbers_at_most(2 * expected + 2**20, f"{folder / CONFIG_FILE} with a network", "restore both files"):
+        return cls.from_weights(config, sensor, weights, folder / WEIGHTS_FILE)
 
 
 def load_class(name: str) -> type[Generator]:

@@ -16,6 +16,8 @@ from torch import Tensor, nn
 from lidargrit.errors import ConfigError
 from lidargrit.nn.blocks import Block, Network
 
+_LAYERS_AT_MOST = 1000  # of the largest language models about a hundred
+
 
 @dataclass(frozen=True)
 class TransformerConfig:
@@ -38,6 +40,8 @@ class TransformerConfig:
     attention_dropout: float = 0.0
 
     def __post_init__(self) -> None:
+        if self.layers > _LAYERS_AT_MOST:
+            raise ConfigError(f"layers={self.layers}", f"at most {_LAYERS_AT_MOST}", "lower it")
         if self.layers < 1 or self.heads < 1 or self.width < 1 or self.width % self.heads:
             raise ConfigError(
                 f"layers={self.layers}, heads={self.heads}, width={self.width}",

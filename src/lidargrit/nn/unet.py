@@ -24,6 +24,8 @@ Layer = TypeVar("Layer", bound=nn.Module)
 _EPSILON = 1e-6  # of every norm, as in the reference
 _LONGEST_PERIOD = 10_000  # of the sinusoids that tell the log SNR, as in the reference
 
+_BLOCKS_AT_MOST = 1000  # over all levels; the published network has 12
+
 
 @dataclass(frozen=True)
 class UnetConfig:
@@ -44,6 +46,8 @@ class UnetConfig:
     attention_heads: int = 8
 
     def __post_init__(self) -> None:
+        if sum(self.residual_blocks) > _BLOCKS_AT_MOST:
+            raise ConfigError(f"residual_blocks={self.residual_blocks}", f"{_BLOCKS_AT_MOST} at most", "lower them")
         numbers = (self.channels, *self.channel_multipliers, *self.residual_blocks, self.norm_groups)
         if min(*numbers, self.attention_heads) < 1 or len(self.channel_multipliers) != len(self.residual_blocks):
             raise ConfigError(

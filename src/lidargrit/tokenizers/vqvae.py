@@ -88,9 +88,9 @@ class VqvaeConfig(TokenizerConfig):
             raise ConfigError(
                 f"channels={self.channels}", "a positive multiple of 32", "the norms share 32 groups: round it up"
             )
-        for name in ("residual_blocks", "code_dim", "num_codes"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"{name}={getattr(self, name)}", "at least 1", "raise it")
+        for name, most in (("residual_blocks", 100), ("code_dim", 16_384), ("num_codes", 65_536)):
+            if not 1 <= getattr(self, name) <= most:
+                raise ConfigError(f"{name}={getattr(self, name)}", f"1 to {most}", "correct it")
         if not self.channel_multipliers or min(self.channel_multipliers) < 1:
             raise ConfigError(
                 f"channel_multipliers={self.channel_multipliers}", "one positive number a level", "e.g. (1,1,2)"

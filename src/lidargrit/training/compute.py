@@ -10,7 +10,6 @@ from torch.utils.flop_counter import FlopCounterMode
 from torch.utils.module_tracker import ModuleTracker
 
 from lidargrit.errors import ConfigError
-from lidargrit.generators import load_class
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.precision import Precision
 from lidargrit.sensors import SensorModel
@@ -63,7 +62,7 @@ def estimated_training_flops(recipe: Recipe) -> dict[str, int]:
 def _counted(recipe: Recipe, sensor: SensorModel) -> dict[str, int]:
     with torch.random.fork_rng(range(torch.cuda.device_count())):
         torch.manual_seed(0)
-        generator = load_class(recipe.generator)(recipe.model, sensor)
+        generator = recipe.build_generator(sensor)
         found = {}
         for stage in generator.stages:
             found[stage] = round(_flops_per_scan(generator.objective(stage), sensor) * recipe.training[stage].scans)

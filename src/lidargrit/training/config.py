@@ -7,7 +7,10 @@ from typing import Any, Literal
 
 from lidargrit.augmentation import Augmentation
 from lidargrit.errors import ConfigError
+from lidargrit.generators import Generator, load_class
 from lidargrit.loading import DataConfig
+from lidargrit.nn.size import numbers_at_most
+from lidargrit.sensors import SensorModel
 
 _BATCH_AT_MOST = 65_536  # scans: 4 GB of the smallest images, and more than any step learns from
 
@@ -108,3 +111,15 @@ class Recipe:
     def __post_init__(self) -> None:
         if self.seed < 0:
             raise ConfigError(f"seed={self.seed}", "0 or more", "choose another seed")
+
+    def build_generator(self, sensor: SensorModel | None = None) -> Generator:
+        """Return the generator with new random weights.
+
+        Args:
+            sensor: sensor of its scans, in place of that of the data.
+
+        Raises:
+            ConfigError: the generator does not fit the sensor, or is too large.
+        """
+        with numbers_at_most():
+            return load_class(self.generator)(self.model, sensor or self.data.load_sensor())

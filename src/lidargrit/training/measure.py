@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import torch
 
-from lidargrit.generators import load_class
 from lidargrit.nn.blocks import prepare_for_training
 from lidargrit.training.compute import duration, training_flops, uniform_images
 from lidargrit.training.config import Recipe
@@ -50,7 +49,7 @@ def measure(recipe: Recipe) -> list[Measured]:
     with torch.random.fork_rng(range(torch.cuda.device_count())):
         torch.manual_seed(0)
         flops = training_flops(recipe)
-        generator = load_class(recipe.generator)(recipe.model, recipe.data.load_sensor())
+        generator = recipe.build_generator()
         found = []
         for stage in generator.stages:
             config, objective = recipe.training[stage], generator.objective(stage)

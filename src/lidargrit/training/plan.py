@@ -6,7 +6,6 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from lidargrit import configuration
-from lidargrit.generators import load_class
 from lidargrit.nn.precision import Precision
 from lidargrit.training.compute import estimated_training_flops, gpu_time
 from lidargrit.training.config import Recipe
@@ -80,7 +79,7 @@ class TrainingPlan:
 def plan_training(recipe: Recipe) -> TrainingPlan:
     """Return what the training of a recipe would do; nothing is read or written."""
     sensor = recipe.data.load_sensor()
-    generator = load_class(recipe.generator)(recipe.model, sensor)
+    generator = recipe.build_generator(sensor)
     stages, flops = [], estimated_training_flops(recipe)
     for name in generator.stages:
         objective, budget = generator.objective(name), recipe.training[name]

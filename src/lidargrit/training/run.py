@@ -20,7 +20,7 @@ from lidargrit import __version__, configuration
 from lidargrit.determinism import derive_seed
 from lidargrit.errors import CheckpointError, ConfigError, OutputError
 from lidargrit.files import claim_folder, is_taken, read_json, write_json, write_text
-from lidargrit.generators import RUN_FILE, TRAINED_ON_FILE, Generator, load, load_class, locate, recipe_settings
+from lidargrit.generators import RUN_FILE, TRAINED_ON_FILE, Generator, load, locate, recipe_settings
 from lidargrit.loading import DataConfig, RangeImages, load_range_images
 from lidargrit.nn.objective import Objective
 from lidargrit.reporting import Reporter
@@ -70,7 +70,7 @@ def _train(recipe: Recipe, folder: Path, reporter: Reporter, plot: PlotProgress 
     _warn_of_overlap(train_images, val_images, reporter)
     with torch.random.fork_rng(range(torch.cuda.device_count())):  # the caller's own random numbers stay as they are
         torch.manual_seed(derive_seed(recipe.seed, 9))
-        generator = load_class(recipe.generator)(recipe.model, recipe.data.load_sensor())
+        generator = recipe.build_generator()
         borrowed = None if recipe.tokenizer_from is None else _tokenizer_of(Path(recipe.tokenizer_from), generator)
         engine.by_first(lambda: _claim(folder, recipe, train_images, val_images))
         generator.fit_statistics(train_images)

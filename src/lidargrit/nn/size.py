@@ -1,0 +1,51 @@
+"""A bound on the size of a network, checked while the network is built: settings → a network, or an error."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from torch import Tensor, nn
+from torch.nn.modules.module import (
+    register_module_buffer_registration_hook,
+    register_module_parameter_registration_hook,
+)
+
+from lidargrit.errors import ConfigError
+
+NUMBERS_AT_MOST = 2**30  # 4.3 GB in 32 bits, thirty times the largest network of our recipes
+
+
+@contextmanager
+def numbers_at_most(
+    count: int = NUMBERS_AT_MOST, what: str = "a network", cure: str = "lower its widths, layers or codes"
+) -> Iterator[None]:
+    """Refuse to build networks of more than ``count`` numbers within the ``with`` block, before memory is filled.
+
+    Weights and buffers are counted as modules register them, which they do before they fill them.
+
+    Args:
+        count: largest number of weights and buffer elements of all modules that are built in the block.
+        what: words for the network in the message of an error.
+        cure: advice in that message.
+
+    Raises:
+        ConfigError: there are more, or the system has no memory for one of them.
+    """
+    found = 0
+
+    def add(module: nn.Module, name: str, tensor: Tensor | None) -> None:
+        nonlocal found
+        found += 0 if tensor is None else tensor.numel()
+        if found > count:
+            raise ConfigError(f"{what} of more than {count:,} numbers", "fewer", cure)
+
+    hooks = [register_module_parameter_registration_hook(add), register_module_buffer_registration_hook(add)]
+    try:
+        yield
+    except (RuntimeError, MemoryError, OverflowError) as error:  # a single tensor that no machine can hold
+        reason = str(error).partition("\n")[0][:100]
+        raise ConfigError(f"{what} that cannot be built ({reason})", f"at most {count:,} numbers", cure) from None
+    finally:
+        for hook in hooks:
+            hook.remove()
