@@ -26,7 +26,7 @@ from lidargrit.metrics._curves import divergence
 from lidargrit.sensors import SensorModel, load_sensor
 from lidargrit.simulator import observation
 from lidargrit.simulator.power import RaydropModel
-from lidargrit.simulator.scene import draw_scene
+from lidargrit.simulator.scene import sample_scene
 from lidargrit.simulator.tracing import Hits, Tracer, in_reach
 from lidargrit.structures import RangeImage
 
@@ -75,14 +75,14 @@ class Street:
 
     def __init__(self, seed: int, sensor: SensorModel) -> None:
         street_rng, beam_rng = np.random.default_rng(seed).spawn(2)
-        self.sensor, self.scene, self.rngs = sensor, draw_scene(street_rng), (street_rng, beam_rng)
+        self.sensor, self.scene, self.rngs = sensor, sample_scene(street_rng), (street_rng, beam_rng)
         self.mesh, self.tracer = None, None
 
-    def draw(self, model: RaydropModel) -> tuple[RangeImage, RangeImage]:
+    def sample(self, model: RaydropModel) -> tuple[RangeImage, RangeImage]:
         """Return what stands there, and what a model measures of it."""
-        settings = observation.Settings(kept_columns_only=True, model=model)
+        config = observation.ObservationConfig(kept_columns_only=True, model=model)
         with patch.object(observation, "Tracer", self._trace), patch.object(observation, "in_reach", self._reach):
-            seen = observation.observe_scene(self.scene, self.sensor, *copy.deepcopy(self.rngs), settings)
+            seen = observation.observe_scene(self.scene, self.sensor, *copy.deepcopy(self.rngs), config)
         return pair_of(seen, self.sensor)
 
     def _reach(self, *arguments):
@@ -96,7 +96,7 @@ class Street:
 
 
 def simulated(streets: list[Street], model: RaydropModel) -> SimulatedScans:
-    pairs = [street.draw(model) for street in streets]
+    pairs = [street.sample(model) for street in streets]
     return SimulatedScans(*(RangeImage.stack(list(side)) for side in zip(*pairs, strict=True)))
 
 
@@ -214,7 +214,7 @@ def main() -> None:
     real = load_range_images(tuple(options.train), config, None, sensor)
     begun = time.perf_counter()
     streets = [Street(seed, sensor) for seed in range(FIRST_SEED, FIRST_SEED + options.scans)]
-    assert streets[0].draw(model)[1].range_m.equal(simulate_pair(FIRST_SEED, sensor)[1].range_m)
+    assert streets[0].sample(model)[1].range_m.equal(simulate_pair(FIRST_SEED, sensor)[1].range_m)
     print(f"{len(real)} real scans, {len(streets)} scenes drawn in {time.perf_counter() - begun:.0f} s")
     fitted = search(streets, Target(real), Rows.of(real.batch(range(len(real)))), model, options.rounds)
     print(f"gains {fitted.laser_gains}\nreadings {fitted.laser_readings}\nspread {fitted.laser_spread}")

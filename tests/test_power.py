@@ -9,7 +9,7 @@ from lidargrit.sensors import load_sensor
 from lidargrit.simulator import labels, materials
 from lidargrit.simulator.kitti_car import hidden_by_car
 from lidargrit.simulator.mesh import Mesh
-from lidargrit.simulator.observation import Settings, observe_scene
+from lidargrit.simulator.observation import ObservationConfig, observe_scene
 from lidargrit.simulator.power import Lasers, RaydropModel, Surfaces, received_power, reflectance, return_probability
 from toy_scene import HEIGHT_M, ToyScene, box, quad, road, street, wall
 
@@ -18,9 +18,9 @@ NO_GAPS = replace(MODEL, gap_share=0.0)
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(1024)
 
 
-def look(scene, beam_seed=0, scene_seed=0, sensor=SENSOR, **settings):
+def look(scene, beam_seed=0, scene_seed=0, sensor=SENSOR, **config):
     streams = (np.random.default_rng(seed) for seed in (scene_seed, beam_seed))
-    return observe_scene(scene, sensor, *streams, Settings(**{"model": NO_GAPS, **settings}))
+    return observe_scene(scene, sensor, *streams, ObservationConfig(**{"model": NO_GAPS, **config}))
 
 
 @pytest.fixture(scope="module")
@@ -230,8 +230,8 @@ def test_nothing_is_met_beyond_the_reach():
 
 
 def test_reflectance_follows_albedo_until_the_echo_is_weak():
-    def reads(scattered, level, chance=0.0, shine=0.0):
-        return float(reflectance(*(np.float32([v]) for v in (scattered, shine, level, chance)), MODEL)[0])
+    def reads(scattered, level, chance=0.0, specular=0.0):
+        return float(reflectance(*(np.float32([v]) for v in (scattered, specular, level, chance)), MODEL)[0])
 
     assert reads(0.3, 5) == pytest.approx(0.3)
     assert reads(0.6, 5) == pytest.approx(0.6)
@@ -240,7 +240,7 @@ def test_reflectance_follows_albedo_until_the_echo_is_weak():
     assert reads(0.3, MODEL.dim_level) == 0
     assert reads(0.3, MODEL.dim_level + 1e-3) == pytest.approx(0.3 * MODEL.dim_share, abs=0.006)
     assert reads(0.3, 5, chance=0.1) == pytest.approx(0.33)
-    assert reads(0.5, 5, shine=3.0) == pytest.approx(0.99)
+    assert reads(0.5, 5, specular=3.0) == pytest.approx(0.99)
     scene = look(ToyScene(road(), wall(20.0, 0.6)))
     near = scene.return_mask & (scene.clean_range_m < 22) & (scene.cos_incidence > 0.1)
     asphalt, plaster = (materials.MATERIALS[m].diffuse for m in (materials.ASPHALT, materials.PLASTER))

@@ -7,12 +7,12 @@ import pytest
 
 from lidargrit.errors import ConfigError
 from lidargrit.simulator import labels, materials
-from lidargrit.simulator.scene import SENSOR_HEIGHT_M, draw_scene
+from lidargrit.simulator.scene import SENSOR_HEIGHT_M, sample_scene
 from lidargrit.simulator.scene.layout import driving, parked
-from lidargrit.simulator.scene.movers import Stands
-from lidargrit.simulator.scene.plan import draw_plan
-from lidargrit.simulator.scene.settlement import settle
-from lidargrit.simulator.scene.vehicles import draw_vehicles
+from lidargrit.simulator.scene.objects import Placements
+from lidargrit.simulator.scene.settlement import lay_out_houses
+from lidargrit.simulator.scene.street_plan import sample_street_plan
+from lidargrit.simulator.scene.vehicles import make_vehicles
 
 THEMES = ("city", "suburb", "country")
 SEEDS = range(12)
@@ -22,7 +22,7 @@ FIELDS = ("triangles_m", "material", "albedo", "label", "instance")
 
 @pytest.fixture(scope="module")
 def scenes():
-    return {(theme, seed): draw_scene(np.random.default_rng(seed), theme) for theme in THEMES for seed in SEEDS}
+    return {(theme, seed): sample_scene(np.random.default_rng(seed), theme) for theme in THEMES for seed in SEEDS}
 
 
 @pytest.fixture(scope="module")
@@ -33,18 +33,18 @@ def meshes(scenes):
 @pytest.mark.parametrize("theme", THEMES)
 def test_one_state_one_scene(theme):
     np.random.seed(1)  # noqa: NPY002
-    one = draw_scene(np.random.default_rng(7), theme)
+    one = sample_scene(np.random.default_rng(7), theme)
     np.random.seed(2)  # noqa: NPY002
-    two = draw_scene(np.random.default_rng(7), theme)
+    two = sample_scene(np.random.default_rng(7), theme)
     for time_s in (0.0, 0.7):
         for field in FIELDS:
             assert np.array_equal(getattr(one.mesh(time_s), field), getattr(two.mesh(time_s), field)), field
         assert np.array_equal(one.sensor_pose(time_s), two.sensor_pose(time_s))
-    assert len(draw_scene(np.random.default_rng(8), theme).mesh()) != len(one.mesh())
+    assert len(sample_scene(np.random.default_rng(8), theme).mesh()) != len(one.mesh())
 
 
 def test_mixed_draws_mostly_streets_with_houses():
-    drawn = [draw_plan(np.random.default_rng(seed), "mixed").theme for seed in range(200)]
+    drawn = [sample_street_plan(np.random.default_rng(seed), "mixed").theme for seed in range(200)]
     assert set(drawn) == set(THEMES)
     assert drawn.count("country") < 40
     assert drawn.count("suburb") > drawn.count("city") > drawn.count("country")
@@ -52,7 +52,7 @@ def test_mixed_draws_mostly_streets_with_houses():
 
 def test_unknown_theme_is_refused():
     with pytest.raises(ConfigError, match="the theme 'village'; wanted one of city"):
-        inspect.unwrap(draw_scene)(np.random.default_rng(0), "village")
+        inspect.unwrap(sample_scene)(np.random.default_rng(0), "village")
 
 
 def test_triangles_are_sound(meshes):
@@ -117,27 +117,27 @@ def test_parked_cars_stand_at_kerbs_and_not_in_houses(theme):
     at_kerb, all_along = 0, 0
     for seed in range(30):
         rng = np.random.default_rng(seed)
-        plan = draw_plan(rng, theme)
-        town = settle(rng, plan)
-        stands = parked(rng, plan, town)
-        assert not town.covers(stands.u_m, stands.v_m, 0.5).any()
-        along = ~stands.across
-        kerb = np.where(stands.v_m > 0, plan.edge_m[1], plan.edge_m[0])[along] - np.abs(stands.v_m[along])
+        plan = sample_street_plan(rng, theme)
+        town = lay_out_houses(rng, plan)
+        placements = parked(rng, plan, town)
+        assert not town.covers(placements.u_m, placements.v_m, 0.5).any()
+        along = ~placements.across
+        kerb = np.where(placements.v_m > 0, plan.edge_m[1], plan.edge_m[0])[along] - np.abs(placements.v_m[along])
         assert np.all((kerb > 0.9) & (kerb < 1.15))  # half a car and a hand
-        assert (plan.in_side_street(stands.u_m[along], stands.v_m[along], 2.0) < 0).all()
-        at_kerb, all_along = at_kerb + along.sum(), all_along + len(stands)
+        assert (plan.in_side_street(placements.u_m[along], placements.v_m[along], 2.0) < 0).all()
+        at_kerb, all_along = at_kerb + along.sum(), all_along + len(placements)
     assert at_kerb > 0.4 * all_along > 60
 
 
 def test_drivers_keep_their_distance():
     for seed in range(60):
         rng = np.random.default_rng(seed)
-        plan = draw_plan(rng, "mixed")
-        stands = driving(rng, plan, 8.0)
-        ours = np.abs(stands.v_m - plan.our_v_m) < 1.7
+        plan = sample_street_plan(rng, "mixed")
+        placements = driving(rng, plan, 8.0)
+        ours = np.abs(placements.v_m - plan.our_v_m) < 1.7
         for time_s in (0.0, 1.0, 2.0):
-            way = stands.speed_m_s * time_s * np.cos(stands.turn_rad) * ~stands.across
-            assert (np.abs(stands.u_m + way - 8.0 * time_s)[ours & ~stands.across] > 7).all()
+            way = placements.speed_m_s * time_s * np.cos(placements.turn_rad) * ~placements.across
+            assert (np.abs(placements.u_m + way - 8.0 * time_s)[ours & ~placements.across] > 7).all()
 
 
 def test_houses_have_windows(meshes):
@@ -182,31 +182,31 @@ def _slow_sight(town, place, eye):
 @pytest.mark.parametrize("seed", range(4))
 def test_things_count_as_far_only_behind_houses(seed):
     rng = np.random.default_rng(seed)
-    plan = draw_plan(rng, "suburb")
-    town = settle(rng, plan)
+    plan = sample_street_plan(rng, "suburb")
+    town = lay_out_houses(rng, plan)
     places = rng.uniform(-50, 50, (60, 2))
-    away, straight = town.houses.away_m(plan, places), plan.away_m(places)
-    nearest = [min(np.hypot(*(place - eye)) for eye in plan.eyes_m) for place in places]
+    away, straight = town.houses.nearest_approach_m(plan, places), plan.nearest_approach_m(places)
+    nearest = [min(np.hypot(*(place - eye)) for eye in plan.viewpoints_m) for place in places]
     assert np.allclose(straight, nearest)
     hidden = away > straight
     assert np.array_equal(away[~hidden], straight[~hidden])
     for place in places[hidden]:
-        assert not any(_slow_sight(town, place, eye) for eye in plan.eyes_m)
+        assert not any(_slow_sight(town, place, eye) for eye in plan.viewpoints_m)
     checked = (straight > 12) & (straight < 40) & ~hidden
-    assert np.mean([any(_slow_sight(town, place, eye) for eye in plan.eyes_m) for place in places[checked]]) > 0.8
+    assert np.mean([any(_slow_sight(town, place, eye) for eye in plan.viewpoints_m) for place in places[checked]]) > 0.8
 
 
 def test_our_car_passes_what_is_drawn_in_detail(scenes):
     for scene in scenes.values():
         way = np.array([scene.sensor_pose(time_s)[:2, 3] for time_s in np.linspace(0, 2, 9)])
-        assert scene.plan.away_m(way).max() < 3.1  # half of what lies between two of the places that count
+        assert scene.plan.nearest_approach_m(way).max() < 3.1  # half of what lies between two of the places that count
 
 
 def test_far_cars_are_as_large_as_near_ones():
     kinds, far = np.arange(6), {}
-    stands = Stands.of(np.arange(6.0) * 20, 0.0)
+    placements = Placements.of(np.arange(6.0) * 20, 0.0)
     for away in (0.0, 80.0):
-        herds = draw_vehicles(np.random.default_rng(3), kinds, stands, 1, np.full(6, away))
+        herds = make_vehicles(np.random.default_rng(3), kinds, placements, 1, np.full(6, away))
         far[away] = herds[0].local_m
     assert far[80.0].shape[1] < 0.45 * far[0.0].shape[1]
     for corner in (np.min, np.max):
@@ -229,7 +229,7 @@ def test_what_moves_moves_and_the_rest_stays(scenes):
 
 
 def test_backdrop_leaves_little_bare_sky(meshes):
-    """In most directions something stands higher than the sensor's top ring."""
+    """In most directions something placements higher than the sensor's top ring."""
     share = {theme: [] for theme in THEMES}
     for (theme, _), mesh in meshes.items():
         corner = mesh.triangles_m.reshape(-1, 3)

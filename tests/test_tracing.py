@@ -8,7 +8,7 @@ import pytest
 from lidargrit.sensors import load_sensor
 from lidargrit.simulator import labels, materials
 from lidargrit.simulator.beams import REVOLUTION_S, Beams, footprint
-from lidargrit.simulator.echoes import edges, listen
+from lidargrit.simulator.echoes import detect_echoes, edges
 from lidargrit.simulator.mesh import Mesh
 from lidargrit.simulator.power import RaydropModel, Surfaces, received_power
 from lidargrit.simulator.tracing import NOTHING, Tracer, in_reach
@@ -98,12 +98,12 @@ def test_glass_lets_a_part_through_twice():
     assert first.range_m == pytest.approx(8)
     assert behind.range_m == pytest.approx(20, abs=1e-3)
     assert light == pytest.approx(passes**2)
-    echo = listen(tracer, surfaces, rays, first, np.array([False]), MODEL)
+    echo = detect_echoes(tracer, surfaces, rays, first, np.array([False]), MODEL)
     assert echo.range_m == pytest.approx(20, abs=1e-3)
     assert echo.power == pytest.approx(passes**2 * 0.5 * DIFFUSE / (20**2 + MODEL.near_m**2), rel=1e-3)
     assert first.range_m == pytest.approx(8)  # what was handed in is as it was
     shut = replace(MODEL, materials=tuple(replace(m, passes=0.0) for m in MODEL.materials))
-    echo = listen(tracer, Surfaces.of(mesh, shut), rays, first, np.array([False]), shut)
+    echo = detect_echoes(tracer, Surfaces.of(mesh, shut), rays, first, np.array([False]), shut)
     assert echo.range_m == pytest.approx(8)
 
 
@@ -123,7 +123,7 @@ def test_light_ends_behind_two_panes_and_beyond_reach():
 
 def test_planes_have_no_edges_and_boxes_have():
     sensor = load_sensor("hdl64e_kitti_360")
-    beams = Beams.draw(sensor, np.random.default_rng(0), 0.0)
+    beams = Beams.sample(sensor, np.random.default_rng(0), 0.0)
 
     def edge(*parts):
         scene = ToyScene(*parts)
@@ -151,7 +151,7 @@ def test_beams_at_edges_mix_near_surfaces_and_choose_between_far_ones():
         front = np.array([[(10, 0.0003, -5), (10, 9, -5), (10, 9, 9)], [(10, 0.0003, -5), (10, 9, 9), (10, 0.0003, 9)]])
         mesh = Mesh.join([Mesh.of(front, materials.PLASTER, albedo, 50), wall(10 + gap_m, 0.5)])
         tracer, rays = Tracer(mesh), ahead(0)
-        return listen(tracer, Surfaces.of(mesh, MODEL), rays, tracer.cast(*rays), np.array([True]), MODEL)
+        return detect_echoes(tracer, Surfaces.of(mesh, MODEL), rays, tracer.cast(*rays), np.array([True]), MODEL)
 
     near = heard(0.4, 0.5)
     assert 10.05 < near.range_m < 10.35  # neither the one nor the other
@@ -173,15 +173,15 @@ def test_footprint_lies_within_the_beam():
 
 def test_rays_of_tables_and_of_lasers_that_look_aside():
     sensor = load_sensor("hdl64e_kitti_360").with_columns(128)
-    plain = Beams.draw(sensor, np.random.default_rng(0), 0.0)
+    plain = Beams.sample(sensor, np.random.default_rng(0), 0.0)
     assert np.allclose(plain.directions(), sensor.ray_directions().numpy(), atol=1e-6)
     elevation, azimuth = sensor.elevation_rad.expand(64, 128), sensor.azimuth_rad.expand(64, 128)
     table = replace(sensor, elevation_rad=elevation.clone(), azimuth_rad=azimuth.clone())
-    assert np.array_equal(Beams.draw(table, np.random.default_rng(0), 0.0).directions(), plain.directions())
+    assert np.array_equal(Beams.sample(table, np.random.default_rng(0), 0.0).directions(), plain.directions())
 
     step = 2 * np.pi / 128
     offset = sensor.elevation_rad[:, 0] * 0 + 3.25 * step  # a quarter of a column to the left, and three whole ones
-    aside = Beams.draw(replace(sensor, azimuth_offset_rad=offset), np.random.default_rng(0), 0.0)
+    aside = Beams.sample(replace(sensor, azimuth_offset_rad=offset), np.random.default_rng(0), 0.0)
     assert np.allclose(aside.azimuth_rad - sensor.azimuth_rad.numpy(), 0.25 * step, atol=1e-5)
     late = (plain.turn - aside.turn) % 1
     assert np.allclose(late, 3.25 / 128, atol=1e-5)  # fired before the head points there
@@ -189,7 +189,7 @@ def test_rays_of_tables_and_of_lasers_that_look_aside():
 
 def test_jitter_stays_in_the_column_and_leaves_gaps():
     sensor = load_sensor("hdl64e_kitti_odometry")
-    beams = Beams.draw(sensor, np.random.default_rng(3), 0.033)
+    beams = Beams.sample(sensor, np.random.default_rng(3), 0.033)
     column = (np.pi - beams.azimuth_rad.astype(np.float64)) / (2 * np.pi) * 2048
     assert np.array_equal(np.floor(column), np.broadcast_to(np.arange(2048), (64, 2048)))
     assert 0.2 < (column % 1).std() < 0.25
@@ -201,7 +201,7 @@ def test_jitter_stays_in_the_column_and_leaves_gaps():
 
 def test_motion_bends_the_rays_evenly():
     sensor = load_sensor("hdl64e_kitti_360")
-    beams = Beams.draw(sensor, np.random.default_rng(0), 0.0)
+    beams = Beams.sample(sensor, np.random.default_rng(0), 0.0)
     scene = ToyScene(road(), speed_m_s=10.0, turn_rad_s=0.5)
     before, after = scene.sensor_pose(), scene.sensor_pose(REVOLUTION_S)
     origins, directions = beams.rays(before, after)
@@ -221,6 +221,6 @@ def test_power_of_nothing_is_nothing():
     assert received_power(np.float32([0.3]), np.float32([np.inf]), MODEL)[0] == 0
     mesh, (origins, directions) = road(), ahead(5)
     hits = Tracer(mesh).cast(origins, directions)
-    echo = listen(Tracer(mesh), Surfaces.of(mesh, MODEL), (origins, directions), hits, np.array([True]), MODEL)
+    echo = detect_echoes(Tracer(mesh), Surfaces.of(mesh, MODEL), (origins, directions), hits, np.array([True]), MODEL)
     assert echo.power[0] == 0
     assert echo.triangle[0] == NOTHING

@@ -36,7 +36,7 @@ def wall(x_m, albedo=0.4, material=materials.PLASTER, half_width_m=40.0):
 
 
 class ToyScene:
-    """Stands where the sensor of KITTI stands; drives ahead and to the left if told to."""
+    """Placements where the sensor of KITTI placements; drives ahead and to the left if told to."""
 
     theme = "city"
 

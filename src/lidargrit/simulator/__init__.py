@@ -8,9 +8,9 @@ import numpy as np
 
 from lidargrit.errors import ConfigError
 from lidargrit.sensors import SensorModel, load_sensor
-from lidargrit.simulator.observation import Observation, Settings, observe_scene
+from lidargrit.simulator.observation import Observation, ObservationConfig, observe_scene
 from lidargrit.simulator.power import RaydropModel
-from lidargrit.simulator.scene import Scene, Theme, draw_scene
+from lidargrit.simulator.scene import Scene, Theme, sample_scene
 from lidargrit.structures import Scan
 
 __all__ = ["Observation", "RaydropModel", "Scene", "Theme", "observe", "scene_of", "simulate"]
@@ -38,16 +38,16 @@ def simulate(
     come in patches as they do on the road.
 
     Args:
-        seed: of the street and of the noise, not negative; the same seed gives the same scan, bit for bit.
-        sensor: whose rays are cast, every column that it fires; the HDL-64E of KITTI odometry if not given.
-        theme: what kind of street is drawn.
-        frame: how many tenths of a second later; the frames of one seed are a drive through one street.
+        seed: seed of the street and of the noise, 0 or more; the same seed gives the same scan, bit for bit.
+        sensor: sensor to simulate, with every column that it fires; the HDL-64E of KITTI odometry if not given.
+        theme: kind of street.
+        frame: index of the revolution, 0.1 s apart; the frames of one seed are a drive through one street.
         motion: leave the points as a moving car measures them, bent by its motion; otherwise all are as seen from where
             the revolution began, which is how KITTI odometry stores them.
-        wet: of asphalt and concrete, from 0 (dry) to 1 (soaked).
+        wet: wetness of asphalt and concrete, from 0 (dry) to 1 (soaked).
         kept_columns_only: cast only the columns that the sensor's image keeps, at a fraction of the work. The points
             are those of the whole scan that fall into these columns.
-        model: which beams come back.
+        model: model of which beams return.
 
     Returns:
         points in the firing order of KITTI's files: ring by ring from the top, each counter-clockwise from straight
@@ -102,9 +102,9 @@ def observe(
     street_rng, beam_rng = root.spawn(2)
     if frame:
         beam_rng = root.spawn(frame)[-1]
-    scene = draw_scene(street_rng, theme)
-    settings = Settings(FRAME_S * frame, motion, wet, kept_columns_only, model)
-    return observe_scene(scene, sensor, street_rng, beam_rng, settings)
+    scene = sample_scene(street_rng, theme)
+    config = ObservationConfig(FRAME_S * frame, motion, wet, kept_columns_only, model)
+    return observe_scene(scene, sensor, street_rng, beam_rng, config)
 
 
 def scene_of(seed: int, theme: Theme = "mixed") -> Scene:
@@ -114,7 +114,7 @@ def scene_of(seed: int, theme: Theme = "mixed") -> Scene:
         ConfigError: a negative seed, or an unknown theme.
     """
     _check(seed, theme)
-    return draw_scene(np.random.default_rng(seed).spawn(2)[0], theme)
+    return sample_scene(np.random.default_rng(seed).spawn(2)[0], theme)
 
 
 def _check(seed: int, theme: str) -> None:

@@ -24,10 +24,10 @@ class Beams:
     """One ray for each pixel: rows from the top, columns of falling azimuth.
 
     Args:
-        elevation_rad: up is positive.
-        azimuth_rad: counter-clockwise from +x; within the pixel's own column.
+        elevation_rad: elevation of each ray, up positive.
+        azimuth_rad: azimuth of each ray, counter-clockwise from +x, within the pixel's own column.
         turn: share of the revolution, 0 to 1, after which the ray is fired.
-        fired: False where no firing fell into the pixel.
+        fired: False where no firing falls into the pixel.
         clear: False where the ray ends on the car that carries the sensor.
     """
 
@@ -38,15 +38,15 @@ class Beams:
     clear: Bool[np.ndarray, "H W"]
 
     @classmethod
-    def draw(cls, sensor: SensorModel, rng: np.random.Generator, gap_share: float) -> Beams:
+    def sample(cls, sensor: SensorModel, rng: np.random.Generator, gap_share: float) -> Beams:
         """Aim at every fine column of a sensor, with the small jitter of a turning head.
 
         A pixel whose ray leaves its column by the jitter gets no firing.
 
         Args:
-            sensor: whose rays; those columns that its image leaves out are there too.
-            rng: of the jitter.
-            gap_share: share of pixels without a firing; it says how strong the jitter is.
+            sensor: sensor to simulate; columns that its image leaves out are included.
+            rng: source of the jitter.
+            gap_share: share of pixels without a firing, which determines the strength of the jitter.
         """
         elevation, azimuth, turn, phase, clear = _aims(sensor)
         sigma = 0.5 / float(ndtri(1 - gap_share / 2))  # of the jitter in columns: so many fall beyond half a column
@@ -80,8 +80,8 @@ class Beams:
         """Return where the rays begin and go in a scene, row by row.
 
         Args:
-            pose: of the sensor in the scene, when a revolution begins.
-            pose_after: when it ends, if the sensor moves meanwhile; between the two it goes and turns evenly.
+            pose: sensor pose in the scene at the beginning of a revolution.
+            pose_after: sensor pose at its end, if the sensor moves; poses between are interpolated linearly.
         """
         local = self.directions().reshape(-1, 3)
         directions = local @ pose[:3, :3].T.astype(np.float32)
@@ -101,7 +101,7 @@ def footprint(directions: Float32[np.ndarray, "n 3"], divergence_rad: float) -> 
     """Return four rays at the corners of a square inside each beam.
 
     Args:
-        directions: of the middle of the beams.
+        directions: unit direction vectors of the beams' central rays.
         divergence_rad: full angle of the beam; the corners lie at 7/10 of the radius, the mean of an even disc.
     """
     aside = np.zeros_like(directions)

@@ -32,12 +32,12 @@ class DriveConfig:
     """What is simulated.
 
     Args:
-        sensor: whose scans.
-        seed: of the first street; the next has the next.
-        frames: scans of each street, a tenth of a second apart; 1 gives as many streets as scans.
-        theme: of the streets.
+        sensor: sensor to simulate.
+        seed: seed of the first street; each further street has the next seed.
+        frames: scans of each street, 0.1 s apart; with 1, every scan shows another street.
+        theme: kind of street.
         motion: leave the distortion by the car's own motion in the scans; KITTI odometry has it removed.
-        wet: of the ground, from 0 (dry) to 1.
+        wet: wetness of the ground, from 0 (dry) to 1 (soaked).
         clean: also write what a raydrop model learns from and is judged by: the clean range of every pixel, the
             probability of a return, the drawn mask, reflectance and label, as ``observation/NNNNNN.npz``.
     """
@@ -76,11 +76,11 @@ def write_drives(
     The tree is ``sequences/SS/{velodyne/NNNNNN.bin, labels/NNNNNN.label, poses.txt, times.txt, calib.txt}``.
 
     Args:
-        out: an empty folder, or one that the same simulation began; more scans can be added to it.
-        num_scans: in all.
-        config: of what.
-        workers: processes at once.
-        reporter: hears of the progress.
+        out: an empty folder, or a folder that the same simulation began; scans can be added to it.
+        num_scans: total number of scans.
+        config: settings of the simulation.
+        workers: number of parallel processes.
+        reporter: receiver of progress messages.
 
     Raises:
         OutputError: the folder holds something else.

@@ -19,10 +19,10 @@ class Echoes:
     """The echo that each beam's receiver answers to.
 
     Args:
-        power: received.
-        range_m: to where it comes from, without noise; infinite for none.
-        triangle: whose light is the most of it, or NOTHING.
-        cos_incidence: there.
+        power: received power.
+        range_m: noise-free range of the echo; infinite for none.
+        triangle: index of the triangle that contributes most of the light, or NOTHING.
+        cos_incidence: cosine of incidence at that triangle.
     """
 
     power: Float32[np.ndarray, " n"]
@@ -40,10 +40,10 @@ def edges(
     """Find the pixels at which a surface ends or folds: there inverse range bends, which on a plane it does not.
 
     Args:
-        range_m: infinite for no hit.
-        left_m: of the pixels to the left.
-        right_m: of the pixels to the right.
-        edge_share: the bend, as a share of inverse range, that makes an edge.
+        range_m: range of each pixel; infinite for no hit.
+        left_m: range of the pixel to the left.
+        right_m: range of the pixel to the right.
+        edge_share: relative bend of inverse range that makes an edge.
     """
     inverse, left, right = (1 / a for a in (range_m, left_m, right_m))
     bend = np.abs(2 * inverse - left - right)
@@ -55,7 +55,7 @@ def edges(
     return edge
 
 
-def listen(
+def detect_echoes(
     tracer: Tracer,
     surfaces: Surfaces,
     rays: tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]],
@@ -70,12 +70,12 @@ def listen(
     another than the pulse is long are heard as one, at their mean range.
 
     Args:
-        tracer: of the scene.
-        surfaces: of the scene.
-        rays: where the beams begin and go.
-        first: what their middle rays meet.
-        edge: which beams are cast in their full width.
-        model: the numbers.
+        tracer: ray caster of the scene.
+        surfaces: reflection properties of the scene's triangles.
+        rays: origins and directions of the beams.
+        first: first hits of the central rays.
+        edge: True for beams that are cast in their full width.
+        model: parameters of the raydrop model.
     """
     power = _power(surfaces, first, model)
     echoes = Echoes(power, first.range_m.copy(), first.triangle.copy(), first.cos_incidence.copy())

@@ -63,8 +63,8 @@ def hidden_by_car(
     """Tell which rays end on the car that carries the sensor; each is as the laser of the nearest elevation.
 
     Args:
-        azimuth_rad: counter-clockwise from straight ahead.
-        elevation_rad: up is positive.
+        azimuth_rad: azimuth, counter-clockwise from straight ahead.
+        elevation_rad: elevation, up positive.
     """
     azimuth, elevation = np.broadcast_arrays(np.degrees(azimuth_rad), np.degrees(elevation_rad))
     lasers = np.array([laser for laser, _ in _HIDDEN_DEG])

@@ -10,14 +10,14 @@ class Material:
     """How one kind of surface answers a beam; how bright it scatters (albedo) belongs to each triangle.
 
     Args:
-        name: what it is.
+        name: name of the material.
         diffuse: factor on the triangle's albedo, the share scattered evenly; clear coats and panes scatter little.
         gloss: strength of the mirror-like lobe, seen only close to normal incidence.
         lobe_power: exponent of the cosine of incidence in that lobe; the higher, the narrower.
         retroreflection: strength of the lobe that goes straight back whatever the incidence (foils, number plates).
         passes: share of the light that goes through (glass).
-        mottle: how much its reflectance differs from spot to spot, as a share: leaves turn every way, plaster is rough.
-        source: where the numbers come from.
+        mottle: relative variation of its reflectance from spot to spot: leaves face all directions, plaster is rough.
+        source: origin of the numbers.
     """
 
     name: str

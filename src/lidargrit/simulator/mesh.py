@@ -14,11 +14,11 @@ class Mesh:
     """Triangles in metres; z is up.
 
     Args:
-        triangles_m: corners of every triangle; either side answers a beam.
+        triangles_m: corners of each triangle; both sides reflect a beam.
         material: index into ``MATERIALS``.
         albedo: share of light that is scattered evenly, 0 to 1, at the wavelength of the sensor.
-        label: class, by the numbers of SemanticKITTI.
-        instance: 0 for what is no single object; unique within a scene otherwise.
+        label: class number of SemanticKITTI.
+        instance: number of the object, unique within a scene; 0 for what is no single object.
     """
 
     triangles_m: Float32[np.ndarray, "t 3 3"]
@@ -55,7 +55,3 @@ class Mesh:
         turn = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
         shifted = self.triangles_m.astype(np.float64) @ turn + np.array([x_m, y_m, z_m])
         return replace(self, triangles_m=shifted.astype(np.float32))
-
-    def as_instance(self, instance: int) -> Mesh:
-        """Return the mesh as one object of a scene."""
-        return replace(self, instance=np.full(len(self), instance, np.int32))

@@ -11,10 +11,10 @@ from jaxtyping import Bool, Float32, Float64, Int32, UInt16
 
 from lidargrit.sensors import SensorModel
 from lidargrit.simulator.beams import REVOLUTION_S, Beams
-from lidargrit.simulator.echoes import Echoes, edges, listen
+from lidargrit.simulator.echoes import Echoes, detect_echoes, edges
 from lidargrit.simulator.mesh import Mesh
 from lidargrit.simulator.power import (
-    Chances,
+    BeamNoise,
     Lasers,
     RaydropModel,
     Surfaces,
@@ -27,7 +27,7 @@ from lidargrit.structures import Scan
 
 
 @runtime_checkable
-class Surroundings(Protocol):
+class ObservableScene(Protocol):
     """What a sensor needs of a scene."""
 
     def mesh(self, time_s: float = 0.0) -> Mesh:
@@ -49,17 +49,17 @@ class Observation:
         clean_range_m: range without noise, whether it came back or not; 0 where the ray meets nothing
             within the sensor's reach. The car that
             carries the sensor is not part of the scene.
-        return_probability: chance of a return, given all but what differs from pulse to pulse; ``return_mask`` is drawn
-            by it.
+        return_probability: probability of a return, given everything but the noise from pulse to pulse;
+            ``return_mask`` is sampled with it.
         return_mask: True = the beam came back.
         blocked: True = the ray ends on the car that carries the sensor, and never comes back.
-        range_m: measured, with noise; 0 where nothing returned.
-        reflectance: measured, in [0, 1]; 0 where nothing returned.
+        range_m: measured range with noise; 0 for no return.
+        reflectance: measured reflectance in [0, 1]; 0 for no return.
         label: class of what the ray meets, by SemanticKITTI's numbers; 0 for nothing.
         instance: number of the object that the ray meets; 0 for what is no single object.
         cos_incidence: cosine between ray and surface normal; 0 where the ray meets nothing.
         directions: unit vectors of the rays in the sensor's frame when each was fired.
-        sensor_pose: from the sensor's frame to the scene's when the revolution begins.
+        sensor_pose: transform from the sensor's frame to the scene's at the beginning of the revolution.
     """
 
     clean_range_m: Float32[np.ndarray, "H W"]
@@ -78,7 +78,7 @@ class Observation:
         """Return the points that came back in the firing order of KITTI's files.
 
         Args:
-            source: where the scan comes from, for messages.
+            source: origin of the scan, for messages.
 
         Raises:
             ScanError: not one point came back.
@@ -103,15 +103,15 @@ class Observation:
 
 
 @dataclass(frozen=True)
-class Settings:
+class ObservationConfig:
     """How a scene is looked at.
 
     Args:
-        time_s: when the revolution begins.
-        motion: whether the sensor moves during the revolution.
-        wet: of the ground, 0 (dry) to 1 (soaked).
-        kept_columns_only: leave out the columns that the sensor's image leaves out.
-        model: which beams come back.
+        time_s: time at which the revolution begins.
+        motion: True if the sensor moves during the revolution.
+        wet: wetness of the ground, 0 (dry) to 1 (soaked).
+        kept_columns_only: True to leave out the columns that the sensor's image leaves out.
+        model: model of which beams return.
     """
 
     time_s: float = 0.0
@@ -122,36 +122,36 @@ class Settings:
 
 
 def observe_scene(
-    scene: Surroundings,
+    scene: ObservableScene,
     sensor: SensorModel,
     scene_rng: np.random.Generator,
     beam_rng: np.random.Generator,
-    settings: Settings,
+    config: ObservationConfig,
 ) -> Observation:
     """Look at a scene for one revolution.
 
     Things other than the sensor stand still during a revolution.
 
     Args:
-        scene: what there is.
-        sensor: whose rays are cast.
-        scene_rng: of what stays with the scene from one revolution to the next: the gain of every object.
-        beam_rng: of what differs from one revolution to the next.
-        settings: when and how.
+        scene: triangles and sensor poses.
+        sensor: sensor to simulate.
+        scene_rng: source of what stays the same from one revolution to the next: the gain of every object.
+        beam_rng: source of what differs from one revolution to the next.
+        config: time, motion, wetness and raydrop model.
     """
-    model = settings.model
-    begun, ended = (scene.sensor_pose(settings.time_s + after_s) for after_s in (0.0, REVOLUTION_S))
-    poses = (begun, ended) if settings.motion else (begun,)
-    beams = Beams.draw(sensor, beam_rng, model.gap_share)
+    model = config.model
+    begun, ended = (scene.sensor_pose(config.time_s + after_s) for after_s in (0.0, REVOLUTION_S))
+    poses = (begun, ended) if config.motion else (begun,)
+    beams = Beams.sample(sensor, beam_rng, model.gap_share)
     height, fine_width = beams.azimuth_rad.shape
-    chances = Chances.draw(beam_rng, height, fine_width, model)
-    stride = fine_width // sensor.width if settings.kept_columns_only else 1
+    beam_noise = BeamNoise.sample(beam_rng, height, fine_width, model)
+    stride = fine_width // sensor.width if config.kept_columns_only else 1
     kept = slice(None, None, stride)
-    looked, chances = beams.columns(kept), chances.columns(kept)
+    looked, beam_noise = beams.columns(kept), beam_noise.columns(kept)
 
     elevations_rad = float(beams.elevation_rad.min()), float(beams.elevation_rad.max())
-    mesh = in_reach(scene.mesh(settings.time_s), poses, elevations_rad, sensor.range_max_m)
-    tracer, surfaces = Tracer(mesh, sensor.range_max_m), Surfaces.of(mesh, model, settings.wet)
+    mesh = in_reach(scene.mesh(config.time_s), poses, elevations_rad, sensor.range_max_m)
+    tracer, surfaces = Tracer(mesh, sensor.range_max_m), Surfaces.of(mesh, model, config.wet)
     rays = looked.rays(*poses)
     first = tracer.cast(*rays)
     range_m = first.range_m.reshape(looked.azimuth_rad.shape)
@@ -160,10 +160,10 @@ def observe_scene(
     else:
         beside = _beside(tracer, beams, poses, stride)
     edge = edges(range_m, *beside, model.edge_share).ravel()
-    echoes = listen(tracer, surfaces, rays, first, edge, model)
+    echoes = detect_echoes(tracer, surfaces, rays, first, edge, model)
     limits_m = sensor.range_min_m, sensor.range_max_m
     lasers = Lasers.of(sensor, model)
-    return _measure(mesh, surfaces, echoes, looked, lasers, chances, scene_rng, limits_m, begun, model)
+    return _measure(mesh, surfaces, echoes, looked, lasers, beam_noise, scene_rng, limits_m, begun, model)
 
 
 def _beside(
@@ -193,7 +193,7 @@ def _measure(
     echoes: Echoes,
     beams: Beams,
     lasers: Lasers,
-    chances: Chances,
+    beam_noise: BeamNoise,
     scene_rng: np.random.Generator,
     limits_m: tuple[float, float],
     pose: Float64[np.ndarray, "4 4"],
@@ -204,21 +204,21 @@ def _measure(
     label = np.append(mesh.label, np.uint16(0))[echoes.triangle]
     instance = np.append(mesh.instance, np.int32(0))[echoes.triangle]
     of_object = _object_gains(mesh, scene_rng, model)[instance]
-    log_gain = (lasers.log_gain + chances.patch).ravel() + of_object
+    log_gain = (lasers.log_gain + beam_noise.patch).ravel() + of_object
     level = levels(echoes.power, log_gain, model)
     clear = beams.clear.ravel() & (echoes.range_m >= limits_m[0]) & (echoes.range_m <= limits_m[1])
     probability = np.where(clear, return_probability(level, model), np.float32(0))
-    noise = np.float32(model.pulse_spread) * chances.pulse.ravel()
-    range_m = echoes.range_m + np.float32(model.range_sigma_m) * chances.range_noise.ravel()
-    came_back = clear & beams.fired.ravel() & (level + noise > 0)
+    pulse_noise = np.float32(model.pulse_spread) * beam_noise.pulse.ravel()
+    range_m = echoes.range_m + np.float32(model.range_sigma_m) * beam_noise.range_noise.ravel()
+    came_back = clear & beams.fired.ravel() & (level + pulse_noise > 0)
     came_back &= (range_m >= limits_m[0]) & (range_m <= limits_m[1])
-    shine = surfaces.shine(echoes.triangle, echoes.cos_incidence)
+    specular = surfaces.specular(echoes.triangle, echoes.cos_incidence)
     # An object that answers more strongly than others of its kind reads brighter too.
     scattered = surfaces.albedo[echoes.triangle] * np.exp(of_object)
     scattered = (scattered.reshape(shape) * lasers.reading).ravel()
     # The very pulse that comes back stronger reads brighter.
-    chance = chances.pulse.ravel() * surfaces.mottle[surfaces.material[echoes.triangle]]
-    bright = reflectance(scattered, shine, level + noise, chance, model)
+    chance = beam_noise.pulse.ravel() * surfaces.mottle[surfaces.material[echoes.triangle]]
+    bright = reflectance(scattered, specular, level + pulse_noise, chance, model)
     return Observation(
         clean_range_m=np.where(np.isinf(echoes.range_m), np.float32(0), echoes.range_m).reshape(shape),
         return_probability=probability.reshape(shape),

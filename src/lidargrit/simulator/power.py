@@ -23,36 +23,37 @@ class RaydropModel:
     ``docs/results/simulator-against-kitti.md`` says how near that is. Single ones of them are not measurements.
 
     Args:
-        least_power: weaker echoes are lost. Set by hand: asphalt is lost at about 55 m, as in KITTI. The fit does not
-            move it, since albedos and gains do the same.
-        near_m: nearer than this the receiver is out of focus, and power no longer grows as 1 / range^2. Fitted.
+        least_power: weakest power that is detected. Set by hand: asphalt is lost at about 55 m, as in KITTI. The fit
+            does not move it, since albedos and gains do the same.
+        near_m: range below which the receiver is out of focus, so that power stops growing as 1 / range^2. Fitted.
         extinction_per_m: share of light that air takes per metre, one way. 0 is clear air; fog of 500 m visibility has
             about 0.006, by Koschmieder's rule, 3 / visibility.
         gloss: factor on the gloss of all materials.
         retroreflection: factor on the retroreflection of all materials.
         laser_gains: natural logarithm of the gain of each laser of KITTI's HDL-64E, from the top. Fitted, to its share
             of returns and its reflectance.
-        laser_readings: factor of the reflectance that each of them reports. Fitted likewise.
-        laser_spread: of the gains of other sensors, drawn at random; a sensor keeps them. As KITTI's neighbours differ.
-        patch_spread: the same, along a ring. Fitted.
-        patch_deg: how far along a ring the gain stays alike. Fitted.
-        object_spread: the same, from object to object. Fitted.
-        pulse_spread: the same, from pulse to pulse. Fitted.
-        gap_share: pixels into which no firing falls. Measured: 2.9 to 3.5 % of four unfolded KITTI scans.
+        laser_readings: factor on the reflectance that each of these lasers reports. Fitted to the same.
+        laser_spread: spread of the log gains of other sensors' lasers, sampled once for a sensor. KITTI's lasers differ
+            as much.
+        patch_spread: spread of the log gain along a ring. Fitted.
+        patch_deg: angle along a ring over which that gain is correlated. Fitted.
+        object_spread: spread of the log gain from object to object. Fitted.
+        pulse_spread: spread of the log gain from pulse to pulse. Fitted.
+        gap_share: share of pixels without a firing. Measured: 2.9 to 3.5 % of four unfolded KITTI scans.
         divergence_mrad: full angle of a beam. Velodyne's HDL-64E S2 data sheet: 2 mrad.
-        pulse_length_m: echoes nearer to one another than this are one. The same data sheet: pulses of 5 ns, so c t / 2.
-        edge_share: an edge is where inverse range bends by more than this share of itself; a plane has no bend.
-        range_sigma_m: noise of the range. The HDL-64E S2 data sheet: accuracy below 2 cm, one sigma.
-        dim_level: log of power over the least one, below which reflectance reads 0. Fitted.
-        dim_share: of its reflectance that an echo just above that level reads: KITTI has few readings below 0.05 but 0.
-            Fitted.
-        bright_level: the same level, above which it reads in full. Fitted.
-        reflectance_spread: of reflectance, from pulse to pulse, as a share of it, on top of its material's. Set by
-            hand: with it neighbouring readings of near ground differ as in KITTI, by 0.12.
-        wet_darkening: share of its scattering that soaked asphalt or concrete loses. Assumed: about half, as films of
-            water on rough ground darken it.
+        pulse_length_m: distance below which two echoes merge. The same data sheet: pulses of 5 ns, so c t / 2.
+        edge_share: relative bend of inverse range above which a pixel counts as an edge; a plane has no bend.
+        range_sigma_m: standard deviation of the range noise. HDL-64E S2 data sheet: accuracy below 2 cm, one sigma.
+        dim_level: log of power over ``least_power`` below which reflectance reads 0. Fitted.
+        dim_share: share of its reflectance that an echo just above that level reads; KITTI has few readings in
+            (0, 0.05). Fitted.
+        bright_level: log of power over ``least_power`` above which reflectance reads in full. Fitted.
+        reflectance_spread: relative spread of reflectance from pulse to pulse, besides its material's. Set by hand:
+            with it neighbouring readings of near ground differ as in KITTI, by 0.12.
+        wet_darkening: share of scattered light that soaked asphalt or concrete loses. Assumed: about half, because
+            films of water darken rough ground.
         wet_gloss: strength of the mirror-like lobe of soaked ground. Assumed: 0.02, as Fresnel's law has it for water.
-        materials: how surfaces answer.
+        materials: reflection properties of all materials.
     """
 
     least_power: float = 2.5e-6
@@ -83,16 +84,16 @@ class RaydropModel:
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """How every triangle of a scene answers; the last entry stands for nothing, which does not.
+    """How every triangle of a scene answers; the last entry is for rays that hit nothing.
 
     Args:
         albedo: share of light scattered evenly.
         material: index into the tables below.
-        gloss: of every material, strength of the mirror-like lobe.
-        lobe_power: of every material, exponent of that lobe.
-        retroreflection: of every material, strength of the lobe that goes straight back.
-        passes: of every material, share of the light that goes through.
-        mottle: of every material, how much what is read of it differs from spot to spot, as a share.
+        gloss: strength of each material's mirror-like lobe.
+        lobe_power: exponent of each material's mirror-like lobe.
+        retroreflection: strength of the lobe that each material sends straight back.
+        passes: share of light that passes each material.
+        mottle: relative variation of each material's reflectance from spot to spot.
     """
 
     albedo: Float32[np.ndarray, " t"]
@@ -126,16 +127,16 @@ class Surfaces:
         """Return the share of light that goes through each triangle."""
         return self.passes[self.material]
 
-    def shine(
+    def specular(
         self, triangle: Int32[np.ndarray, " n"], cos_incidence: Float32[np.ndarray, " n"]
     ) -> Float32[np.ndarray, " n"]:
         """Return what surfaces send back besides the light they scatter evenly: gloss and retroreflection."""
         material = self.material[triangle]
-        shine = np.zeros(len(triangle), np.float32)
+        specular = np.zeros(len(triangle), np.float32)
         bright = np.flatnonzero(((self.gloss > 0) | (self.retroreflection > 0))[material])
         of, cos = material[bright], cos_incidence[bright]
-        shine[bright] = self.gloss[of] * cos ** self.lobe_power[of] + self.retroreflection[of] * cos
-        return shine
+        specular[bright] = self.gloss[of] * cos ** self.lobe_power[of] + self.retroreflection[of] * cos
+        return specular
 
     def brightness(
         self, triangle: Int32[np.ndarray, " n"], cos_incidence: Float32[np.ndarray, " n"]
@@ -144,7 +145,7 @@ class Surfaces:
 
         A foil sends light back whatever the incidence; only the area that it turns to the beam shrinks.
         """
-        return self.albedo[triangle] * cos_incidence + self.shine(triangle, cos_incidence)
+        return self.albedo[triangle] * cos_incidence + self.specular(triangle, cos_incidence)
 
 
 def received_power(
@@ -168,8 +169,8 @@ class Lasers:
     """How the lasers of one sensor differ, row by row; they are alike in all scans.
 
     Args:
-        log_gain: natural log of the power's factor.
-        reading: factor of the reflectance that is reported.
+        log_gain: natural log of each laser's gain.
+        reading: factor on the reflectance that each laser reports.
     """
 
     log_gain: Float32[np.ndarray, "H 1"]
@@ -188,13 +189,13 @@ class Lasers:
 
 
 @dataclass(frozen=True, eq=False)
-class Chances:
+class BeamNoise:
     """All that is random about the beams of one scan besides where they look.
 
     Args:
-        patch: natural log of the power's factor along a ring.
-        pulse: of the power's factor from pulse to pulse, in standard deviations.
-        range_noise: of the range, in standard deviations.
+        patch: natural log of the gain along a ring.
+        pulse: gain noise from pulse to pulse, in standard deviations.
+        range_noise: range noise, in standard deviations.
     """
 
     patch: Float32[np.ndarray, "H W"]
@@ -202,8 +203,8 @@ class Chances:
     range_noise: Float32[np.ndarray, "H W"]
 
     @classmethod
-    def draw(cls, rng: np.random.Generator, height: int, width: int, model: RaydropModel) -> Chances:
-        """Draw the chances of a scan of one size."""
+    def sample(cls, rng: np.random.Generator, height: int, width: int, model: RaydropModel) -> BeamNoise:
+        """Draw the noise of a scan of one size."""
         num_knots = max(round(360 / model.patch_deg), 1)
         knots = rng.standard_normal((height, num_knots), dtype=np.float32) * np.float32(model.patch_spread)
         place = np.arange(width, dtype=np.float32) * np.float32(num_knots / width)
@@ -217,9 +218,9 @@ class Chances:
             range_noise=rng.standard_normal((height, width), dtype=np.float32),
         )
 
-    def columns(self, which: slice) -> Chances:
-        """Return the chances of some columns."""
-        return Chances(self.patch[:, which], self.pulse[:, which], self.range_noise[:, which])
+    def columns(self, which: slice) -> BeamNoise:
+        """Return the noise of some columns."""
+        return BeamNoise(self.patch[:, which], self.pulse[:, which], self.range_noise[:, which])
 
 
 def levels(
@@ -242,7 +243,7 @@ def return_probability(level: Float32[np.ndarray, "*shape"], model: RaydropModel
 
 def reflectance(
     scattered: Float32[np.ndarray, "*shape"],
-    shine: Float32[np.ndarray, "*shape"],
+    specular: Float32[np.ndarray, "*shape"],
     level: Float32[np.ndarray, "*shape"],
     chance: Float32[np.ndarray, "*shape"],
     model: RaydropModel,
@@ -254,12 +255,12 @@ def reflectance(
 
     Args:
         scattered: share of light that the surface scatters evenly.
-        shine: what it sends back besides.
+        specular: light that the surface sends back besides, by gloss and retroreflection.
         level: natural log of power over the least power.
-        chance: how much too bright this one reads, as a share.
-        model: the numbers.
+        chance: relative error of this reading.
+        model: parameters of the raydrop model.
     """
-    full = scattered * (1 + chance) + np.float32(0.5) * shine
+    full = scattered * (1 + chance) + np.float32(0.5) * specular
     seen = (level - np.float32(model.dim_level)) * np.float32(1 / (model.bright_level - model.dim_level))
     dimmed = np.where(seen > 0, model.dim_share + (1 - model.dim_share) * np.minimum(seen, 1), 0).astype(np.float32)
     return np.round(np.clip(full * dimmed, 0, 0.99), 2)

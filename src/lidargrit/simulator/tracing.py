@@ -25,7 +25,7 @@ class Hits:
 
     Args:
         range_m: distance to it along the ray, infinite where nothing is met.
-        triangle: its index, or NOTHING.
+        triangle: index of the triangle that is hit, or NOTHING.
         cos_incidence: cosine between the ray and the triangle's normal, 0 to 1; 0 where nothing is met.
     """
 
@@ -45,10 +45,10 @@ def in_reach(
     Embree takes longer to be told of a triangle than to find out that a ray misses it.
 
     Args:
-        mesh: in the scene.
-        poses: of the sensor, first and last.
-        elevations_rad: of the lowest and the highest ray.
-        range_max_m: nothing beyond is of interest.
+        mesh: triangles in the scene's frame.
+        poses: sensor poses at the beginning and the end of the revolution.
+        elevations_rad: elevations of the lowest and the highest ray.
+        range_max_m: longest range of interest.
     """
     corners = mesh.triangles_m.reshape(-1, 3)
     longest_m = float(np.abs(np.diff(mesh.triangles_m, axis=1)).max()) * 4  # not below any side's length
@@ -71,8 +71,8 @@ class Tracer:
     """Casts rays at one mesh. Embree runs on the CPU only, in the thread that calls.
 
     Args:
-        mesh: what there is to meet.
-        reach_m: nothing farther is met.
+        mesh: triangles that rays can hit.
+        reach_m: longest range at which a hit counts.
 
     Source:
         Wald et al., Embree: A Kernel Framework for Efficient CPU Ray Tracing, SIGGRAPH 2014.
@@ -87,8 +87,8 @@ class Tracer:
         """Find the first hit of every ray.
 
         Args:
-            origins_m: where the rays begin.
-            directions: where they go, unit vectors.
+            origins_m: origins of the rays.
+            directions: unit direction vectors of the rays.
         """
         if len(directions) == 0:
             return Hits(np.empty(0, np.float32), np.empty(0, np.int32), np.empty(0, np.float32))
@@ -114,11 +114,11 @@ class Tracer:
         """Follow rays that met a pane to what stands behind it, through a few panes at most.
 
         Args:
-            origins_m: where the rays begin.
-            directions: where they go.
-            first: what they meet first; those that met no pane end there.
-            passes: of every triangle, and of NOTHING at the end, the share of light that goes through.
-            at_most: how many panes a ray may pass; the two windows of a car.
+            origins_m: origins of the rays.
+            directions: unit direction vectors of the rays.
+            first: first hit of each ray; a ray that hits no glass ends there.
+            passes: share of light that passes each triangle; the last entry is for NOTHING.
+            at_most: largest number of panes that a ray passes; 2 for the two windows of a car.
 
         Returns:
             what each meets last, with the range from its origin, and the share of its light that gets there and back.

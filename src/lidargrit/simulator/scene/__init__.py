@@ -12,13 +12,13 @@ from lidargrit.errors import ConfigError
 from lidargrit.simulator.mesh import Mesh
 from lidargrit.simulator.scene.buildings import add_houses
 from lidargrit.simulator.scene.layout import add_furniture, add_gardens, add_greenery, traffic
-from lidargrit.simulator.scene.movers import Herd
-from lidargrit.simulator.scene.plan import Plan, Theme, draw_plan
+from lidargrit.simulator.scene.objects import ObjectBatch
 from lidargrit.simulator.scene.roads import add_bridge, add_ground, add_markings
-from lidargrit.simulator.scene.settlement import settle
-from lidargrit.simulator.scene.shapes import Pile
+from lidargrit.simulator.scene.settlement import lay_out_houses
+from lidargrit.simulator.scene.shapes import MeshBuilder
+from lidargrit.simulator.scene.street_plan import StreetPlan, Theme, sample_street_plan
 
-__all__ = ["Scene", "Theme", "draw_scene"]
+__all__ = ["Scene", "Theme", "sample_scene"]
 
 SENSOR_HEIGHT_M = 1.73  # of the Velodyne above the road, Geiger et al., IJRR 2013, figure 3
 
@@ -30,17 +30,17 @@ class Scene:
     The world has z up, its origin on the road below the sensor at time 0, and x along the heading there.
 
     Args:
-        theme: city, suburb or country.
-        plan: of the roads and the ground.
-        standing: what never moves.
-        moving: what does.
-        attitude_rad: yaw, pitch and roll of our car against the road.
+        theme: kind of street: city, suburb or country.
+        plan: layout of the roads and the ground.
+        standing: triangles that never move.
+        moving: objects that move.
+        attitude_rad: yaw, pitch and roll of our car relative to the road.
     """
 
     theme: str
-    plan: Plan
+    plan: StreetPlan
     standing: Mesh
-    moving: tuple[Herd, ...]
+    moving: tuple[ObjectBatch, ...]
     attitude_rad: Float64[np.ndarray, "3"]
 
     @property
@@ -50,10 +50,10 @@ class Scene:
 
     def mesh(self, time_s: float = 0.0) -> Mesh:
         """Return all triangles at a time, in seconds."""
-        pile = Pile()
-        for herd in self.moving:
-            herd.add_to(pile, self.plan, time_s)
-        return Mesh.join([self.standing, pile.mesh()]) if len(pile) else self.standing
+        builder = MeshBuilder()
+        for objects in self.moving:
+            objects.add_to(builder, self.plan, time_s)
+        return Mesh.join([self.standing, builder.build()]) if len(builder) else self.standing
 
     def sensor_pose(self, time_s: float = 0.0) -> Float64[np.ndarray, "4 4"]:
         """Return the transform from the sensor's frame to the world at a time; our car keeps to its lane."""
@@ -74,32 +74,32 @@ class Scene:
         return pose
 
 
-def draw_scene(rng: np.random.Generator, theme: Theme = "mixed") -> Scene:
+def sample_scene(rng: np.random.Generator, theme: Theme = "mixed") -> Scene:
     """Draw a street scene; the same state of the generator gives the same scene, bit for bit.
 
     Args:
-        rng: all that is random comes from here.
-        theme: dense city, suburb with gardens, open country, or drawn: mostly suburb and city.
+        rng: source of all random numbers.
+        theme: dense city, suburb with gardens, open country, or mixed: chosen at random, mostly suburb and city.
 
     Raises:
         ConfigError: a theme of another name.
     """
     if theme not in get_args(Theme):
         raise ConfigError(f"the theme {theme!r}", f"one of {', '.join(get_args(Theme))}", "choose one of these")
-    plan = draw_plan(rng, theme)
-    pile = Pile()
-    add_ground(pile, rng, plan)
-    add_markings(pile, rng, plan)
-    add_bridge(pile, rng, plan)
-    town = settle(rng, plan)
-    add_houses(pile, rng, plan, town.houses)
-    add_gardens(pile, rng, plan, town)
-    add_greenery(pile, rng, plan, town)
-    add_furniture(pile, rng, plan)
+    plan = sample_street_plan(rng, theme)
+    builder = MeshBuilder()
+    add_ground(builder, rng, plan)
+    add_markings(builder, rng, plan)
+    add_bridge(builder, rng, plan)
+    town = lay_out_houses(rng, plan)
+    add_houses(builder, rng, plan, town.houses)
+    add_gardens(builder, rng, plan, town)
+    add_greenery(builder, rng, plan, town)
+    add_furniture(builder, rng, plan)
     moving = []
-    for herd in traffic(rng, plan, town):
-        still, goes = herd.split()
-        still.add_to(pile, plan)
-        if len(goes.stands):
+    for objects in traffic(rng, plan, town):
+        still, goes = objects.split()
+        still.add_to(builder, plan)
+        if len(goes.placements):
             moving.append(goes)
-    return Scene(plan.theme, plan, pile.mesh(), tuple(moving), rng.normal(0, (0.015, 0.004, 0.004)))
+    return Scene(plan.theme, plan, builder.build(), tuple(moving), rng.normal(0, (0.015, 0.004, 0.004)))

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float, Int, Num
 
 from lidargrit.simulator import labels, materials
-from lidargrit.simulator.scene.plan import Plan, Poses
-from lidargrit.simulator.scene.shapes import Pile, boxes, owners, quads, rows_of
+from lidargrit.simulator.scene.shapes import MeshBuilder, boxes, owners, quads, rows_of
+from lidargrit.simulator.scene.street_plan import Poses, StreetPlan
 
 _SINK_M = 1.5  # walls go on below the ground, which may fall away
 _RELIEF_TO_M = 40.0  # how deep windows lie farther away is less than a beam is wide
@@ -27,15 +27,15 @@ class Houses:
     """Houses with x along their fronts and the street on the side of -y; the origin is the middle of the floor.
 
     Args:
-        poses: of the middles.
-        length_m: along the street.
-        depth_m: away from it.
-        height_m: of the walls.
+        poses: poses of the centres of the houses.
+        length_m: size along the street.
+        depth_m: size away from the street.
+        height_m: height of the walls.
         storey_m: height of a storey; a garage has one storey.
-        roof_m: how much the ridge stands over the walls; 0 for flat roofs.
-        wall_material: brick, plaster or concrete.
-        wall_albedo: of the walls.
-        plain: no windows at all: garages and sheds.
+        roof_m: height of the ridge above the walls; 0 for flat roofs.
+        wall_material: index of brick, plaster or concrete.
+        wall_albedo: albedo of the walls.
+        plain: True for garages and sheds, which have no windows.
     """
 
     poses: Poses
@@ -48,12 +48,14 @@ class Houses:
     wall_albedo: Float[np.ndarray, " n"]
     plain: np.ndarray
 
-    def away_m(self, plan: Plan, places_m: Num[np.ndarray, "p _"]) -> Float[np.ndarray, " p"]:
+    def nearest_approach_m(self, plan: StreetPlan, places_m: Num[np.ndarray, "p _"]) -> Float[np.ndarray, " p"]:
         """Return how near our car comes to places; those that houses hide from it count as far."""
-        away = plan.away_m(places_m)
-        hides = np.flatnonzero((plan.away_m(self.poses.xyz_m) < _OCCLUDERS_TO_M) & ~self.plain)
+        away = plan.nearest_approach_m(places_m)
+        hides = np.flatnonzero((plan.nearest_approach_m(self.poses.xyz_m) < _OCCLUDERS_TO_M) & ~self.plain)
         beside = np.flatnonzero((away > 12.0) & (away < _HIDDEN_M))
-        from_x, from_y = self._into(hides, plan.eyes_m)  # (houses, eyes): lines of sight in the frame of each house
+        from_x, from_y = self._into(
+            hides, plan.viewpoints_m
+        )  # (houses, eyes): lines of sight in the frame of each house
         to_x, to_y = self._into(hides, places_m[beside, :2])
         spans = []
         with np.errstate(divide="ignore", invalid="ignore"):  # a line along a wall counts as free
@@ -85,17 +87,17 @@ class _Walls:
     glazed: np.ndarray
 
 
-def add_houses(pile: Pile, rng: np.random.Generator, plan: Plan, houses: Houses) -> None:
+def add_houses(builder: MeshBuilder, rng: np.random.Generator, plan: StreetPlan, houses: Houses) -> None:
     """Add houses; walls that the sensor never sees are plain."""
     walls = _walls(plan, houses)
-    _add_plain_walls(pile, houses, walls)
-    _add_windows(pile, rng, houses, walls)
-    _add_insides(pile, rng, houses, walls)
-    _add_roofs(pile, rng, houses)
-    _add_balconies(pile, rng, houses, walls)
+    _add_plain_walls(builder, houses, walls)
+    _add_windows(builder, rng, houses, walls)
+    _add_insides(builder, rng, houses, walls)
+    _add_roofs(builder, rng, houses)
+    _add_balconies(builder, rng, houses, walls)
 
 
-def _walls(plan: Plan, houses: Houses) -> _Walls:
+def _walls(plan: StreetPlan, houses: Houses) -> _Walls:
     count = len(houses.length_m)
     half = np.stack((houses.length_m, houses.depth_m), axis=1) / 2
     start = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)], float)[:, None] * half  # front, right, back, left
@@ -105,8 +107,8 @@ def _walls(plan: Plan, houses: Houses) -> _Walls:
     before = start + along * length[..., None] / 2 + outward  # a step before the middle of each wall
     cos, sin = np.cos(houses.poses.yaw_rad), np.sin(houses.poses.yaw_rad)
     turned = np.stack((cos * before[..., 0] - sin * before[..., 1], sin * before[..., 0] + cos * before[..., 1]), -1)
-    away = houses.away_m(plan, (turned + houses.poses.xyz_m[:, :2]).reshape(-1, 2))
-    eyes = np.stack(houses._into(np.arange(count), plan.eyes_m), axis=-1)  # (n, k, 2)
+    away = houses.nearest_approach_m(plan, (turned + houses.poses.xyz_m[:, :2]).reshape(-1, 2))
+    eyes = np.stack(houses._into(np.arange(count), plan.viewpoints_m), axis=-1)  # (n, k, 2)
     faces = (((eyes - start[:, :, None]) * outward[:, :, None]).sum(axis=3) > 0).any(axis=2)
     glazed = (faces & ~houses.plain).ravel() & (away < _WINDOWS_TO_M)
     return _Walls(
@@ -122,28 +124,30 @@ def _on_wall(
     inward = np.stack((-along[..., 1], along[..., 0]), axis=-1)
     flat = start + along * along_m[..., None] + inward * deep_m[..., None]
     local = np.concatenate((flat, np.broadcast_to(z_m, along_m.shape)[..., None]), axis=-1).astype(np.float32)
-    return houses.poses.of(walls.house[which]).put(local)
+    return houses.poses.of(walls.house[which]).to_world(local)
 
 
-def _add_wall_quads(pile: Pile, houses: Houses, walls: _Walls, which: np.ndarray, spans: np.ndarray) -> None:
+def _add_wall_quads(builder: MeshBuilder, houses: Houses, walls: _Walls, which: np.ndarray, spans: np.ndarray) -> None:
     """Add rectangles of wall; spans has the columns from, to, bottom, top."""
     along, z = spans[:, [0, 1, 1, 0]], spans[:, [2, 2, 3, 3]]
     points = _on_wall(houses, walls, which, along, np.zeros_like(along), z)
     house = walls.house[which]
-    pile.add(quads(points), houses.wall_material[house][:, None], houses.wall_albedo[house][:, None], labels.BUILDING)
+    builder.add(
+        quads(points), houses.wall_material[house][:, None], houses.wall_albedo[house][:, None], labels.BUILDING
+    )
 
 
-def _add_plain_walls(pile: Pile, houses: Houses, walls: _Walls) -> None:
+def _add_plain_walls(builder: MeshBuilder, houses: Houses, walls: _Walls) -> None:
     """Add whole walls where there is no relief, and the foot of the others."""
     relief = walls.glazed & (walls.away < _RELIEF_TO_M)
     plain = np.flatnonzero(~relief)
     top = houses.height_m[walls.house]
-    _add_wall_quads(pile, houses, walls, plain, rows_of(0.0, walls.length, -_SINK_M, top)[plain])
+    _add_wall_quads(builder, houses, walls, plain, rows_of(0.0, walls.length, -_SINK_M, top)[plain])
     foot = np.flatnonzero(relief)
-    _add_wall_quads(pile, houses, walls, foot, rows_of(0.0, walls.length, -_SINK_M, 0.0)[foot])
+    _add_wall_quads(builder, houses, walls, foot, rows_of(0.0, walls.length, -_SINK_M, 0.0)[foot])
 
 
-def _add_windows(pile: Pile, rng: np.random.Generator, houses: Houses, walls: _Walls) -> None:
+def _add_windows(builder: MeshBuilder, rng: np.random.Generator, houses: Houses, walls: _Walls) -> None:
     """Divide walls into bays and storeys; each cell is a frame of wall round an opening, its reveal and its pane.
 
     Far cells are dark patches on a whole wall.
@@ -172,16 +176,16 @@ def _add_windows(pile: Pile, rng: np.random.Generator, houses: Houses, walls: _W
     near = walls.away[wall] < _RELIEF_TO_M
     span = rows_of(left, left + width, low, low + height)
     shut = near & blind
-    _add_wall_quads(pile, houses, walls, wall[shut], span[shut])
+    _add_wall_quads(builder, houses, walls, wall[shut], span[shut])
     middle = left + width / 2
     hole = rows_of(middle - half_width, middle + half_width, low + sill, low + np.minimum(head, height - 0.1))
     open_, patch = np.flatnonzero(near & ~blind), np.flatnonzero(~near & ~blind)
-    _add_cells(pile, rng, houses, walls, wall[open_], span[open_], hole[open_], kind[open_])
-    _add_patches(pile, rng, houses, walls, wall[patch], hole[patch], kind[patch])
+    _add_cells(builder, rng, houses, walls, wall[open_], span[open_], hole[open_], kind[open_])
+    _add_patches(builder, rng, houses, walls, wall[patch], hole[patch], kind[patch])
 
 
 def _add_patches(
-    pile: Pile, rng: np.random.Generator, houses: Houses, walls: _Walls, wall: np.ndarray, hole: np.ndarray,
+    builder: MeshBuilder, rng: np.random.Generator, houses: Houses, walls: _Walls, wall: np.ndarray, hole: np.ndarray,
     kind: np.ndarray,
 ) -> None:  # fmt: skip
     """Add openings as flat patches before a whole wall, as bright as what is seen through a pane."""
@@ -190,11 +194,11 @@ def _add_patches(
     room = np.where(rng.random(len(kind)) < _CURTAINED, rng.uniform(0.25, 0.6, len(kind)), 0.09)
     bright = np.where(kind == _PANE, room * _THROUGH_PANE, rng.uniform(0.15, 0.55, len(kind)))
     material = np.where(kind == _DOOR, materials.PAINT, materials.PLASTER)
-    pile.add(quads(points), material[:, None], bright[:, None], labels.BUILDING)
+    builder.add(quads(points), material[:, None], bright[:, None], labels.BUILDING)
 
 
 def _add_cells(
-    pile: Pile,
+    builder: MeshBuilder,
     rng: np.random.Generator,
     houses: Houses,
     walls: _Walls,
@@ -209,24 +213,24 @@ def _add_cells(
         np.stack((span[:, 0], hole[:, 0], hole[:, 2], hole[:, 3]), axis=1),
         np.stack((hole[:, 1], span[:, 1], hole[:, 2], hole[:, 3]), axis=1),
     ]
-    _add_wall_quads(pile, houses, walls, np.tile(wall, 4), np.concatenate(frame))
+    _add_wall_quads(builder, houses, walls, np.tile(wall, 4), np.concatenate(frame))
     house = walls.house[wall]
     deep = np.where(kind == _SHUTTER, 0.05, 0.14)[:, None]
     along, z = hole[:, [0, 1, 1, 0]], hole[:, [2, 2, 3, 3]]
     outer, inner = (_on_wall(houses, walls, wall, along, np.broadcast_to(d, along.shape), z) for d in (deep * 0, deep))
     reveal = np.stack((outer, np.roll(outer, -1, 1), np.roll(inner, -1, 1), inner), axis=2)
     material, albedo = houses.wall_material[house][:, None, None], houses.wall_albedo[house][:, None, None]
-    pile.add(quads(reveal), material, albedo, labels.BUILDING)
+    builder.add(quads(reveal), material, albedo, labels.BUILDING)
     filling = np.array([materials.GLASS, materials.PLASTER, materials.PAINT])[kind]
     bright = np.where(kind == _PANE, 0.02, rng.uniform(0.15, 0.55, len(kind)))
-    pile.add(quads(inner), filling[:, None], bright[:, None], labels.BUILDING)
+    builder.add(quads(inner), filling[:, None], bright[:, None], labels.BUILDING)
     curtain = np.flatnonzero((kind == _PANE) & (rng.random(len(kind)) < _CURTAINED))  # cloth close behind the pane
     along, z = along[curtain], z[curtain]
     points = _on_wall(houses, walls, wall[curtain], along, np.full(along.shape, 0.25), z)
-    pile.add(quads(points), materials.CLOTH, rng.uniform(0.25, 0.6, (len(curtain), 1)), labels.BUILDING)
+    builder.add(quads(points), materials.CLOTH, rng.uniform(0.25, 0.6, (len(curtain), 1)), labels.BUILDING)
 
 
-def _add_insides(pile: Pile, rng: np.random.Generator, houses: Houses, walls: _Walls) -> None:
+def _add_insides(builder: MeshBuilder, rng: np.random.Generator, houses: Houses, walls: _Walls) -> None:
     """Stand dark inner walls behind the windows."""
     opened = (walls.glazed & (walls.away < _RELIEF_TO_M)).reshape(4, -1).any(axis=0)
     half = np.stack((houses.length_m, houses.depth_m), axis=1) / 2 - 0.9
@@ -234,10 +238,10 @@ def _add_insides(pile: Pile, rng: np.random.Generator, houses: Houses, walls: _W
     half, top = half[some], houses.height_m[some] - 0.1
     inner = boxes(rows_of(-half[:, 0], -half[:, 1], -0.2), rows_of(half[:, 0], half[:, 1], top))
     dark = rng.uniform(0.03, 0.15, (len(some), 1))
-    pile.add(houses.poses.of(some).put(inner[:, :8]), materials.PLASTER, dark, labels.BUILDING)
+    builder.add(houses.poses.of(some).to_world(inner[:, :8]), materials.PLASTER, dark, labels.BUILDING)
 
 
-def _add_roofs(pile: Pile, rng: np.random.Generator, houses: Houses) -> None:
+def _add_roofs(builder: MeshBuilder, rng: np.random.Generator, houses: Houses) -> None:
     """Add saddle roofs with eaves, their gables, and flat lids."""
     out = np.where(houses.roof_m > 0, 0.35, 0.02)
     half_length, half_depth = houses.length_m / 2 + out, houses.depth_m / 2 + out
@@ -252,17 +256,17 @@ def _add_roofs(pile: Pile, rng: np.random.Generator, houses: Houses) -> None:
         ],
         axis=1,
     )
-    tiles = houses.poses.put(quads(slopes))
+    tiles = houses.poses.to_world(quads(slopes))
     bright = rng.uniform(0.12, 0.35, (len(low), 1, 1))
-    pile.add(tiles, materials.BRICK, bright, labels.BUILDING)
+    builder.add(tiles, materials.BRICK, bright, labels.BUILDING)
     ends = np.stack(
         [np.stack((corner[1], corner[2], tops[1]), axis=1), np.stack((corner[3], corner[0], tops[0]), axis=1)], axis=1
     )
-    gable = houses.poses.put(ends.astype(np.float32))
-    pile.add(gable, houses.wall_material[:, None], houses.wall_albedo[:, None], labels.BUILDING)
+    gable = houses.poses.to_world(ends.astype(np.float32))
+    builder.add(gable, houses.wall_material[:, None], houses.wall_albedo[:, None], labels.BUILDING)
 
 
-def _add_balconies(pile: Pile, rng: np.random.Generator, houses: Houses, walls: _Walls) -> None:
+def _add_balconies(builder: MeshBuilder, rng: np.random.Generator, houses: Houses, walls: _Walls) -> None:
     """Hang balconies on some fronts, put steps before some doors, and add bays that break the plane."""
     count = len(houses.length_m)
     front = (walls.glazed & (walls.away < _BALCONIES_TO_M))[:count]
@@ -279,11 +283,15 @@ def _add_balconies(pile: Pile, rng: np.random.Generator, houses: Houses, walls: 
     slab = boxes(rows_of(x - half, face - out, floor - 0.15), rows_of(x + half, face, floor))
     rail = boxes(rows_of(x - half, face - out, floor), rows_of(x + half, face - out + 0.06, floor + 0.95))
     balcony = np.stack((slab, rail), axis=1)[hung]
-    pile.add(houses.poses.of(home[hung]).put(balcony), materials.CONCRETE, albedo[hung][:, None, None], labels.BUILDING)
+    builder.add(
+        houses.poses.of(home[hung]).to_world(balcony), materials.CONCRETE, albedo[hung][:, None, None], labels.BUILDING
+    )
     steps = np.flatnonzero(kind > 0.75)
     step = boxes(rows_of(x - half, face - out, -_SINK_M), rows_of(x + half, face, 0.15 + 0.5 * kind))[steps]
-    pile.add(houses.poses.of(home[steps]).put(step), materials.CONCRETE, 0.3, labels.BUILDING)
+    builder.add(houses.poses.of(home[steps]).to_world(step), materials.CONCRETE, 0.3, labels.BUILDING)
     bays = np.flatnonzero((kind > 0.5) & (kind < 0.75))
     tall = houses.height_m[home] * np.where(half > 1.2, 1.0, 0.45)
     bay = boxes(rows_of(x - half, face - out * 0.6, -_SINK_M), rows_of(x + half, face + 0.05, tall))[bays]
-    pile.add(houses.poses.of(home[bays]).put(bay), material[bays][:, None], albedo[bays][:, None], labels.BUILDING)
+    builder.add(
+        houses.poses.of(home[bays]).to_world(bay), material[bays][:, None], albedo[bays][:, None], labels.BUILDING
+    )

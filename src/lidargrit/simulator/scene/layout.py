@@ -1,16 +1,16 @@
-"""Where everything but houses stands: a plan and its houses → gardens, trees, street furniture, traffic, people."""
+"""Positions of everything but houses: a plan and its houses → gardens, trees, street furniture, traffic, people."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from lidargrit.simulator.scene import plants, street_furniture
-from lidargrit.simulator.scene.movers import Herd, Stands
-from lidargrit.simulator.scene.people import draw_cyclists, draw_walkers
-from lidargrit.simulator.scene.plan import Plan
+from lidargrit.simulator.scene.objects import ObjectBatch, Placements
+from lidargrit.simulator.scene.people import make_cyclists, make_walkers
 from lidargrit.simulator.scene.settlement import Settlement, free_spans
-from lidargrit.simulator.scene.shapes import Pile, rows_of
-from lidargrit.simulator.scene.vehicles import HATCHBACK, draw_kinds, draw_vehicles
+from lidargrit.simulator.scene.shapes import MeshBuilder, rows_of
+from lidargrit.simulator.scene.street_plan import StreetPlan
+from lidargrit.simulator.scene.vehicles import HATCHBACK, make_vehicles, sample_vehicle_kinds
 
 _OUR_LENGTH_M = 9.0  # from the middle of our car to that of the next in our lane, at least
 _PARKED_SHARE = {"city": (0.25, 0.85), "suburb": (0.1, 0.65), "country": (0.0, 0.1)}
@@ -20,7 +20,7 @@ _CYCLISTS = {"city": 0.8, "suburb": 0.35, "country": 0.15}
 _BOUNDARY_TO_M = 75.0  # hedges and fences farther away hide behind nearer ones
 
 
-def add_gardens(pile: Pile, rng: np.random.Generator, plan: Plan, town: Settlement) -> None:
+def add_gardens(builder: MeshBuilder, rng: np.random.Generator, plan: StreetPlan, town: Settlement) -> None:
     """Line front gardens with hedges, walls and fences, close some gaps, and plant bushes."""
     lines: dict[str, list[tuple[float, float, float, float]]] = {"hedge": [], "wall": [], "fence": []}
     taste = rng.dirichlet([3.0, 1.3, 0.9])  # each street has its own
@@ -38,12 +38,12 @@ def add_gardens(pile: Pile, rng: np.random.Generator, plan: Plan, town: Settleme
             shut = rng.uniform(0.4, 1.0) * (u_to - u_from)
             kind = str(rng.choice(list(lines), p=taste))
             lines[kind].append((u_from, u_from + min(shut, 18.0), plan.front(int(side)) + side * 0.4, side))
-    _add_lines(pile, rng, plan, lines)
+    _add_lines(builder, rng, plan, lines)
     if plan.theme == "country" and rng.random() < 0.4:
-        street_furniture.add_guard_rails(pile, rng, plan, int(rng.choice([-1, 1])))
+        street_furniture.add_guard_rails(builder, rng, plan, int(rng.choice([-1, 1])))
 
 
-def _add_lines(pile: Pile, rng: np.random.Generator, plan: Plan, lines: dict[str, list]) -> None:
+def _add_lines(builder: MeshBuilder, rng: np.random.Generator, plan: StreetPlan, lines: dict[str, list]) -> None:
     rise = plan.level_m[1]
     for kind, add, heights, thick in (
         ("hedge", plants.add_hedges, (0.8, 2.1), 0.9),
@@ -61,10 +61,10 @@ def _add_lines(pile: Pile, rng: np.random.Generator, plan: Plan, lines: dict[str
         v = line[home, 2]
         u = np.column_stack((start, start + step + (0.2 if kind == "hedge" else 0.0)))
         height = np.where(rng.random(len(line)) < 0.5, rng.uniform(*heights), rng.uniform(*heights, len(line)))
-        add(pile, rng, plan, u, np.column_stack((v, v + line[home, 3] * thick)), height[home], rise)
+        add(builder, rng, plan, u, np.column_stack((v, v + line[home, 3] * thick)), height[home], rise)
 
 
-def add_greenery(pile: Pile, rng: np.random.Generator, plan: Plan, town: Settlement) -> None:
+def add_greenery(builder: MeshBuilder, rng: np.random.Generator, plan: StreetPlan, town: Settlement) -> None:
     """Plant trees and bushes: along pavements, in gardens and parks, and in rows and woods in the country."""
     green = rng.uniform(0.3, 1.0)
     lots = [*_parks(rng, town), *(_woods(rng) if plan.theme == "country" else [])]
@@ -72,14 +72,14 @@ def add_greenery(pile: Pile, rng: np.random.Generator, plan: Plan, town: Settlem
     lots.append(np.column_stack((rng.normal(0, 50, count), rng.normal(0, 34, count))))
     trees = [_plantable(plan, town, np.concatenate(lots), 2.2), *_tree_rows(rng, plan)]
     u, v = _clear_of_bridge(plan, *np.concatenate(trees).T)
-    plants.add_trees(pile, rng, plan, town.houses, u, v, size=rng.uniform(0.7, 1.15), rise_m=plan.level_m[1])
+    plants.add_trees(builder, rng, plan, town.houses, u, v, size=rng.uniform(0.7, 1.15), rise_m=plan.level_m[1])
     count = rng.poisson({"city": 60, "suburb": 230, "country": 50}[plan.theme] * green)
     places = [np.column_stack((rng.normal(0, 30, count), rng.normal(0, 13, count))), *_parks(rng, town)]
     u, v = _clear_of_bridge(plan, *_plantable(plan, town, np.concatenate(places), 1.0).T)
-    plants.add_bushes(pile, rng, plan, town.houses, u, v, plan.level_m[1])
+    plants.add_bushes(builder, rng, plan, town.houses, u, v, plan.level_m[1])
 
 
-def _plantable(plan: Plan, town: Settlement, places: np.ndarray, spare_m: float) -> np.ndarray:
+def _plantable(plan: StreetPlan, town: Settlement, places: np.ndarray, spare_m: float) -> np.ndarray:
     """Return the places (n, 2) that lie off roads and houses, and not beyond what the sensor sees."""
     u, v = places.T
     keep = _off_road(plan, u, v, spare_m) & ~town.covers(u, v, 0.5 * spare_m) & (np.hypot(u, v) < 115)
@@ -112,7 +112,7 @@ def _woods(rng: np.random.Generator) -> list[np.ndarray]:
     return lots
 
 
-def _tree_rows(rng: np.random.Generator, plan: Plan) -> list[np.ndarray]:
+def _tree_rows(rng: np.random.Generator, plan: StreetPlan) -> list[np.ndarray]:
     """Draw rows of trees along our road."""
     rows = []
     for which, side in enumerate((-1, 1)):
@@ -126,19 +126,19 @@ def _tree_rows(rng: np.random.Generator, plan: Plan) -> list[np.ndarray]:
     return rows
 
 
-def _off_road(plan: Plan, u: np.ndarray, v: np.ndarray, spare_m: float) -> np.ndarray:
+def _off_road(plan: StreetPlan, u: np.ndarray, v: np.ndarray, spare_m: float) -> np.ndarray:
     """Tell which places are clear of roads and pavements."""
     edge = np.where(v > 0, plan.edge_m[1] + plan.pavement_m[1], plan.edge_m[0] + plan.pavement_m[0])
     pavement = max((s.pavement_m for s in plan.side_streets), default=0.0)
     return (np.abs(v) > edge + spare_m * 0.6) & (plan.in_side_street(u, v, pavement + spare_m * 0.6) < 0)
 
 
-def _clear_of_bridge(plan: Plan, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _clear_of_bridge(plan: StreetPlan, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     keep = np.abs(u - plan.bridge_u_m) > 14.0 if np.isfinite(plan.bridge_u_m) else np.ones(len(u), bool)
     return u[keep], v[keep]
 
 
-def add_furniture(pile: Pile, rng: np.random.Generator, plan: Plan) -> None:
+def add_furniture(builder: MeshBuilder, rng: np.random.Generator, plan: StreetPlan) -> None:
     """Set lamps, signs, bins and bollards on the pavements."""
     wild = plan.theme == "country"
     lamps, signs, bins = [], [_corner_signs(rng, plan)], []  # columns: u, v, turn
@@ -157,15 +157,15 @@ def add_furniture(pile: Pile, rng: np.random.Generator, plan: Plan) -> None:
         if rng.random() < 0.25:
             first = rng.uniform(-40, 30)
             posts = _beside(plan, np.arange(first, first + rng.uniform(6, 25), 2.0), side * (edge + 0.35), 0.0)
-            street_furniture.add_bollards(pile, rng, plan, posts[:, 0], posts[:, 1])
+            street_furniture.add_bollards(builder, rng, plan, posts[:, 0], posts[:, 1])
     adding = (street_furniture.add_lamps, street_furniture.add_signs, street_furniture.add_bins)
     for add, places in zip(adding, (lamps, signs, bins), strict=True):
         if places:
             u, v, turn = np.concatenate(places).T
-            add(pile, rng, plan.poses(u, v, turn, rise_m=plan.level_m[0]))
+            add(builder, rng, plan.poses(u, v, turn, rise_m=plan.level_m[0]))
 
 
-def _corner_signs(rng: np.random.Generator, plan: Plan) -> np.ndarray:
+def _corner_signs(rng: np.random.Generator, plan: StreetPlan) -> np.ndarray:
     rows = [(s.u_m + way * (s.half_m + s.pavement_m * 0.6), plan.edge(side) + side * 0.7, 0.0)
             for s in plan.side_streets for side in s.sides for way in (-1, 1)]  # fmt: skip
     signs = np.array(rows).reshape(-1, 3)
@@ -179,16 +179,16 @@ def _pole_offset(rng: np.random.Generator, pavement_m: float) -> float:
     return float(rng.choice([0.5, max(pavement_m - 0.25, 0.6)]) + rng.uniform(-0.1, 0.15))
 
 
-def _beside(plan: Plan, u: np.ndarray, v_m: float, turn_rad: float) -> np.ndarray:
+def _beside(plan: StreetPlan, u: np.ndarray, v_m: float, turn_rad: float) -> np.ndarray:
     """Return rows of u, v, turn without those in the mouths of side streets and below the bridge."""
     u, v = _clear_of_bridge(plan, u, np.full(len(u), v_m))
     clear = plan.in_side_street(u, v, 1.0) < 0
     return rows_of(u, v, turn_rad)[clear]
 
 
-def parked(rng: np.random.Generator, plan: Plan, town: Settlement) -> Stands:
+def parked(rng: np.random.Generator, plan: StreetPlan, town: Settlement) -> Placements:
     """Draw where vehicles park: along our kerbs, in side streets, and before houses."""
-    stands = []
+    placements = []
     for which, side in enumerate((-1, 1)):
         if plan.parked[which]:
             u = -92.0 + np.cumsum(rng.uniform(5.3, 7.2, 40))
@@ -196,7 +196,7 @@ def parked(rng: np.random.Generator, plan: Plan, town: Settlement) -> Stands:
             v = side * (plan.edge_m[which] - rng.uniform(0.98, 1.08, len(u)))
             clear = plan.in_side_street(u, v, 4.0) < 0
             turn = np.where(rng.random(len(u)) < 0.85, 0.0 if side < 0 else np.pi, np.pi if side < 0 else 0.0)
-            stands.append(Stands.of(u, v, turn + rng.normal(0, 0.025, len(u))).those(clear))
+            placements.append(Placements.of(u, v, turn + rng.normal(0, 0.025, len(u))).select(clear))
     for street in plan.side_streets:
         for side in street.sides if street.half_m > 2.7 and plan.theme != "country" else ():
             flank = rng.choice([-1, 1])
@@ -204,54 +204,58 @@ def parked(rng: np.random.Generator, plan: Plan, town: Settlement) -> Stands:
             v = side * v[rng.random(11) < rng.uniform(*_PARKED_SHARE[plan.theme])]
             u = np.full(len(v), street.u_m + flank * (street.half_m - 1.0))
             turn = rng.choice([0.0, np.pi], len(v)) + rng.normal(0, 0.025, len(v))
-            stands.append(Stands.of(u, v, turn, across=True))
+            placements.append(Placements.of(u, v, turn, across=True))
     wide = town.gaps_m[(town.gaps_m[:, 1] - town.gaps_m[:, 0] > 3.2) & (np.abs(town.gaps_m[:, 0]) < 70)]
     wide = wide[rng.random(len(wide)) < {"city": 0.2, "suburb": 0.45, "country": 0.2}[plan.theme]]
     u, side = wide[:, 0] + 1.7, wide[:, 2]
     v = side * (np.where(side > 0, plan.front(1), -plan.front(-1)) + rng.uniform(0.0, 5.0, len(wide)))
     turn = rng.choice([0.0, np.pi], len(wide)) + rng.normal(0, 0.04, len(wide))
     free = ~town.covers(u, v - 2.0, 0.9) & ~town.covers(u, v + 2.0, 0.9) & ~town.covers(u, v, 0.9)
-    stands.append(Stands.of(u, v, turn, across=True, rise_m=plan.level_m[1]).those(free))
-    return Stands.join(stands)
+    placements.append(Placements.of(u, v, turn, across=True, rise_m=plan.level_m[1]).select(free))
+    return Placements.join(placements)
 
 
-def driving(rng: np.random.Generator, plan: Plan, speed_m_s: float) -> Stands:
+def driving(rng: np.random.Generator, plan: StreetPlan, speed_m_s: float) -> Placements:
     """Draw who drives: ahead of us and behind at our speed, towards us, and away into side streets."""
-    stands = []
+    placements = []
     for ahead in (-1, 1):
         count = rng.poisson(_TRAFFIC[plan.theme] / 3)
         gap = _OUR_LENGTH_M + 0.6 * speed_m_s + rng.exponential(14.0, count)
         u = ahead * (np.cumsum(gap) + 3.0)
-        stands.append(Stands.of(u, plan.our_v_m + rng.normal(0, 0.1, count), 0.0, speed_m_s))
+        placements.append(Placements.of(u, plan.our_v_m + rng.normal(0, 0.1, count), 0.0, speed_m_s))
     count = rng.poisson(_TRAFFIC[plan.theme] / 2)
     u = np.cumsum(_OUR_LENGTH_M + 4 + rng.exponential(25.0, count)) + rng.uniform(-80, 10)
     if plan.lanes == 1:  # the way is too narrow to meet: far ones only
         u = u[u > 30 + 5 * speed_m_s]
     fast = max(speed_m_s, 3.0) * rng.uniform(0.8, 1.2)
     side = plan.lane_m / 2 if plan.lanes == 2 else 0.0
-    stands.append(Stands.of(u, side, np.pi, fast))
+    placements.append(Placements.of(u, side, np.pi, fast))
     for street in plan.side_streets:
         if rng.random() < 0.2:
             way = street.sides[0]
             turn = 0.0 if way > 0 else np.pi
             at = np.array([way * (abs(plan.edge(way)) + rng.uniform(6, 40))])
-            stands.append(Stands.of(at * 0 + street.u_m, at, turn, rng.uniform(3, 9), across=True))
-    every = Stands.join(stands)
-    return every.those(np.abs(every.u_m) < 105)
+            placements.append(Placements.of(at * 0 + street.u_m, at, turn, rng.uniform(3, 9), across=True))
+    every = Placements.join(placements)
+    return every.select(np.abs(every.u_m) < 105)
 
 
-def traffic(rng: np.random.Generator, plan: Plan, town: Settlement) -> list[Herd]:
+def traffic(rng: np.random.Generator, plan: StreetPlan, town: Settlement) -> list[ObjectBatch]:
     """Draw all vehicles, people and bicycles, each with an instance of its own."""
     resting, going = parked(rng, plan, town), driving(rng, plan, plan.speed_m_s)
-    stands = Stands.join([resting, going])
-    kinds = np.concatenate((draw_kinds(rng, len(resting), trucks=0.0), draw_kinds(rng, len(going), trucks=0.06)))
-    kinds[stands.across] = HATCHBACK  # short drives and narrow streets
-    away = np.append(town.houses.away_m(plan, plan.place(resting.u_m, resting.v_m)), _nearest_m(plan, going))
-    herds = draw_vehicles(rng, kinds, stands, 1, away)
-    following = len(stands) + 1
+    placements = Placements.join([resting, going])
+    kinds = np.concatenate(
+        (sample_vehicle_kinds(rng, len(resting), trucks=0.0), sample_vehicle_kinds(rng, len(going), trucks=0.06))
+    )
+    kinds[placements.across] = HATCHBACK  # short drives and narrow streets
+    away = np.append(
+        town.houses.nearest_approach_m(plan, plan.ground_points(resting.u_m, resting.v_m)), _nearest_m(plan, going)
+    )
+    herds = make_vehicles(rng, kinds, placements, 1, away)
+    following = len(placements) + 1
     walkers = _walkers(rng, plan)
     if len(walkers):
-        herds.append(draw_walkers(rng, walkers, following))
+        herds.append(make_walkers(rng, walkers, following))
     following += len(walkers)
     count = rng.poisson(_CYCLISTS[plan.theme])
     side = rng.choice([-1, 1], count)
@@ -259,30 +263,32 @@ def traffic(rng: np.random.Generator, plan: Plan, town: Settlement) -> list[Herd
     v = np.where(side < 0, plan.our_v_m - 0.1, plan.edge_m[1] - 0.5 - 2.1 * plan.parked[1])
     slow = np.minimum(plan.speed_m_s, 5.0)
     away = (side > 0) | (u > 12)
-    riders = Stands.of(u, v, np.where(side < 0, 0.0, np.pi), np.where(side < 0, plan.speed_m_s, slow + 1.0)).those(away)
+    riders = Placements.of(u, v, np.where(side < 0, 0.0, np.pi), np.where(side < 0, plan.speed_m_s, slow + 1.0)).select(
+        away
+    )
     if len(riders):
-        herds.append(draw_cyclists(rng, riders, following))
+        herds.append(make_cyclists(rng, riders, following))
     following += len(riders)
     count = rng.poisson(1.2) if plan.theme != "country" else 0
     place = rng.choice([-1, 1], count)
     v = np.where(place > 0, plan.front(1) - 0.5, plan.front(-1) + 0.5)
-    bicycles = Stands.of(rng.uniform(-40, 40, count), v, rng.normal(0, 0.3, count), rise_m=plan.level_m[1])
+    bicycles = Placements.of(rng.uniform(-40, 40, count), v, rng.normal(0, 0.3, count), rise_m=plan.level_m[1])
     clear = plan.in_side_street(bicycles.u_m, bicycles.v_m, 2.0) < 0
     if clear.any():
-        herds.append(draw_cyclists(rng, bicycles.those(clear), following, ridden=False))
+        herds.append(make_cyclists(rng, bicycles.select(clear), following, ridden=False))
     return herds
 
 
-def _nearest_m(plan: Plan, going: Stands) -> np.ndarray:
+def _nearest_m(plan: StreetPlan, going: Placements) -> np.ndarray:
     """Return how near those that drive come to our car, which drives too, in the first seconds."""
     apart = []
     for time_s in (0.0, 1.0, 2.0):
-        u, v = going.after(time_s)
+        u, v = going.positions_at(time_s)
         apart.append(np.hypot(u - plan.speed_m_s * time_s, v - plan.our_v_m))
     return np.min(apart, axis=0)
 
 
-def _walkers(rng: np.random.Generator, plan: Plan) -> Stands:
+def _walkers(rng: np.random.Generator, plan: StreetPlan) -> Placements:
     count = rng.poisson(_WALKERS[plan.theme])
     side = rng.choice([-1, 1], count)
     across = np.where(side > 0, *plan.edge_m[::-1]) + np.where(side > 0, *plan.pavement_m[::-1]) * rng.uniform(
@@ -291,4 +297,4 @@ def _walkers(rng: np.random.Generator, plan: Plan) -> Stands:
     speed = np.where(rng.random(count) < 0.75, rng.uniform(0.7, 1.8, count), 0.0)
     u = np.clip(rng.normal(0, 28, count), -80, 80)
     keep = plan.in_side_street(u, side * across, 1.0) < 0
-    return Stands.of(u, side * across, rng.choice([0.0, np.pi], count), speed, rise_m=plan.level_m[0]).those(keep)
+    return Placements.of(u, side * across, rng.choice([0.0, np.pi], count), speed, rise_m=plan.level_m[0]).select(keep)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lidargrit.simulator import labels, materials
-from lidargrit.simulator.scene.movers import Herd, Stands
+from lidargrit.simulator.scene.objects import ObjectBatch, Placements
 from lidargrit.simulator.scene.shapes import quads, tubes
 
 # Limbs of somebody 1 m tall: start, end (x ahead, y left, z up), radii there, 1 where skin shows.
@@ -45,35 +45,39 @@ _FRAME = np.array(  # metres: start, end, radii
 )
 
 
-def draw_walkers(rng: np.random.Generator, stands: Stands, first_instance: int) -> Herd:
+def make_walkers(rng: np.random.Generator, placements: Placements, first_instance: int) -> ObjectBatch:
     """Draw people on foot, 1 to 1.95 m tall, most of them grown up."""
-    tall = np.where(rng.random(len(stands)) < 0.12, rng.uniform(1.0, 1.5, len(stands)), 0.0)
-    tall = np.where(tall > 0, tall, rng.normal(1.72, 0.08, len(stands)).clip(1.5, 1.95))
-    label = np.where(stands.speed_m_s != 0, labels.MOVING_PERSON, labels.PERSON)
-    limbs, material, albedo = _limbs(rng, _WALKER, tall, rng.uniform(0.9, 1.25, len(stands)))
-    return _herd(limbs, material, albedo, label, stands, first_instance)
+    tall = np.where(rng.random(len(placements)) < 0.12, rng.uniform(1.0, 1.5, len(placements)), 0.0)
+    tall = np.where(tall > 0, tall, rng.normal(1.72, 0.08, len(placements)).clip(1.5, 1.95))
+    label = np.where(placements.speed_m_s != 0, labels.MOVING_PERSON, labels.PERSON)
+    limbs, material, albedo = _limbs(rng, _WALKER, tall, rng.uniform(0.9, 1.25, len(placements)))
+    return _object_batch(limbs, material, albedo, label, placements, first_instance)
 
 
-def draw_cyclists(rng: np.random.Generator, stands: Stands, first_instance: int, ridden: bool = True) -> Herd:
+def make_cyclists(
+    rng: np.random.Generator, placements: Placements, first_instance: int, ridden: bool = True
+) -> ObjectBatch:
     """Draw bicycles with somebody on them, or without."""
-    count = len(stands)
+    count = len(placements)
     bicycle, material, albedo = _bicycles(rng, count)
     if not ridden:
-        return _herd(bicycle, material, albedo, np.full(count, labels.BICYCLE), stands, first_instance)
+        return _object_batch(bicycle, material, albedo, np.full(count, labels.BICYCLE), placements, first_instance)
     rider, cloth, bright = _limbs(rng, _RIDER, rng.normal(1.75, 0.07, count), np.ones(count))
     rider[..., 2] += np.float32(0.06)
-    label = np.where(stands.speed_m_s != 0, labels.MOVING_BICYCLIST, labels.BICYCLIST)
+    label = np.where(placements.speed_m_s != 0, labels.MOVING_BICYCLIST, labels.BICYCLIST)
     pairs = ((bicycle, rider), (material, cloth), (albedo, bright))
     local, made_of, shade = (np.concatenate(pair, axis=1) for pair in pairs)
-    return _herd(local, made_of, shade, label, stands, first_instance)
+    return _object_batch(local, made_of, shade, label, placements, first_instance)
 
 
-def _herd(
-    local: np.ndarray, material: np.ndarray, albedo: np.ndarray, label: np.ndarray, stands: Stands, first: int
-) -> Herd:
+def _object_batch(
+    local: np.ndarray, material: np.ndarray, albedo: np.ndarray, label: np.ndarray, placements: Placements, first: int
+) -> ObjectBatch:
     every = np.broadcast_to(label[:, None], local.shape[:2]).astype(np.uint16)
     instance = np.arange(first, first + len(local), dtype=np.int32)
-    return Herd(local.astype(np.float32), material.astype(np.uint8), albedo.astype(np.float32), every, instance, stands)
+    return ObjectBatch(
+        local.astype(np.float32), material.astype(np.uint8), albedo.astype(np.float32), every, instance, placements
+    )
 
 
 def _limbs(

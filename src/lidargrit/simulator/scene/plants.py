@@ -7,8 +7,8 @@ from jaxtyping import Float, Num
 
 from lidargrit.simulator import labels, materials
 from lidargrit.simulator.scene.buildings import Houses
-from lidargrit.simulator.scene.plan import Plan
-from lidargrit.simulator.scene.shapes import Pile, leaves, owners, rows_of, tubes
+from lidargrit.simulator.scene.shapes import MeshBuilder, leaves, owners, rows_of, tubes
+from lidargrit.simulator.scene.street_plan import StreetPlan
 
 _LEAVES = 30_000  # in one go at most: denser woods have fewer and larger leaves
 _LIMBS_TO_M = 30.0  # limbs farther away are thinner than a beam, and lost in leaves
@@ -32,14 +32,14 @@ def _leaf_m(away_m: np.ndarray) -> np.ndarray:
 
 
 def add_trees(
-    pile: Pile, rng: np.random.Generator, plan: Plan, houses: Houses, u_m: Num[np.ndarray, " n"],
+    builder: MeshBuilder, rng: np.random.Generator, plan: StreetPlan, houses: Houses, u_m: Num[np.ndarray, " n"],
     v_m: Num[np.ndarray, " n"], size: float = 1.0, rise_m: float = 0.0,
 ) -> None:  # fmt: skip
     """Add trees with a clear trunk, forked below the crown; ``size`` 1 is a street tree of about 8 m."""
     count = len(u_m)
     if not count:
         return
-    foot = plan.place(u_m, v_m) + np.array([0, 0, rise_m])
+    foot = plan.ground_points(u_m, v_m) + np.array([0, 0, rise_m])
     tall = size * rng.uniform(5.0, 11.0, count)
     over_road = np.abs(v_m) < max(plan.edge_m) + 4.5  # no branches as low as our own car
     clear = np.clip(tall * rng.uniform(0.1, 0.36, count), np.where(over_road, 2.5, 0.5), 4.0)
@@ -49,38 +49,46 @@ def add_trees(
     lean = rng.normal(0, 0.02, (count, 2)) * fork[:, None]
     top = foot + np.column_stack((lean, fork))
     bark = rng.uniform(0.2, 0.4, (count, 1))
-    away = houses.away_m(plan, foot)
+    away = houses.nearest_approach_m(plan, foot)
     near = away < _LIMBS_TO_M
     for some, sides in ((near, 7), (~near, 4)):
         stems = tubes((foot - np.array([0, 0, 0.3]))[some], top[some], trunk[some] * 1.15, trunk[some] * 0.75, sides)
-        pile.add(stems[:, : 2 * sides], materials.BARK, bark[some], labels.TRUNK)  # nobody sees the cap in the crown
+        builder.add(stems[:, : 2 * sides], materials.BARK, bark[some], labels.TRUNK)  # nobody sees the cap in the crown
     limb = np.repeat(np.flatnonzero(near), 4)
     way = rng.uniform(0, 2 * np.pi, len(limb))
     reach = wide[limb] * rng.uniform(0.4, 0.8, len(limb))
     rise = (tall - fork)[limb] * rng.uniform(0.3, 0.7, len(limb))
     tip = top[limb] + rows_of(reach * np.cos(way), reach * np.sin(way), rise)
     start = foot[limb] + (top - foot)[limb] * rng.uniform(0.75, 1.0, (len(limb), 1))
-    pile.add(tubes(start, tip, trunk[limb] * 0.5, 0.02, sides=4), materials.BARK, bark[limb], labels.VEGETATION)
+    builder.add(tubes(start, tip, trunk[limb] * 0.5, 0.02, sides=4), materials.BARK, bark[limb], labels.VEGETATION)
     middle = foot + np.column_stack((lean, (clear + tall) / 2))
-    _add_crowns(pile, rng, middle, wide, (tall - clear) / 2, away, density=1.0)
+    _add_crowns(builder, rng, middle, wide, (tall - clear) / 2, away, density=1.0)
 
 
 def add_bushes(
-    pile: Pile, rng: np.random.Generator, plan: Plan, houses: Houses, u_m: Num[np.ndarray, " n"],
+    builder: MeshBuilder, rng: np.random.Generator, plan: StreetPlan, houses: Houses, u_m: Num[np.ndarray, " n"],
     v_m: Num[np.ndarray, " n"], rise_m: float = 0.0,
 ) -> None:  # fmt: skip
     """Add bushes and conifers whose leaves begin at the ground."""
     count = len(u_m)
     if not count:
         return
-    foot = plan.place(u_m, v_m) + np.array([0, 0, rise_m])
+    foot = plan.ground_points(u_m, v_m) + np.array([0, 0, rise_m])
     wide = rng.uniform(0.4, 1.8, count)
     half = np.where(rng.random(count) < 0.25, rng.uniform(1.2, 2.6, count), wide * rng.uniform(0.6, 1.1, count))
-    _add_crowns(pile, rng, foot + rows_of(0.0, 0.0, half * 0.9), wide, half, houses.away_m(plan, foot), density=1.6)
+    _add_crowns(
+        builder,
+        rng,
+        foot + rows_of(0.0, 0.0, half * 0.9),
+        wide,
+        half,
+        houses.nearest_approach_m(plan, foot),
+        density=1.6,
+    )
 
 
 def _add_crowns(
-    pile: Pile,
+    builder: MeshBuilder,
     rng: np.random.Generator,
     middle: np.ndarray,
     wide: np.ndarray,
@@ -105,13 +113,13 @@ def _add_crowns(
     within = _TUFT[rng.integers(0, len(_TUFT), len(home))]
     centre = tuft.reshape(-1, 3).astype(np.float32)[pick] + within * scale.astype(np.float32)[home]
     green = rng.uniform(0.3, 0.6, count)
-    pile.add(leaves(centre, leaf[home]), materials.LEAVES, green[home], labels.VEGETATION)
+    builder.add(leaves(centre, leaf[home]), materials.LEAVES, green[home], labels.VEGETATION)
 
 
 def add_hedges(
-    pile: Pile,
+    builder: MeshBuilder,
     rng: np.random.Generator,
-    plan: Plan,
+    plan: StreetPlan,
     u_m: Float[np.ndarray, "n 2"],
     v_m: Float[np.ndarray, "n 2"],
     height_m: Float[np.ndarray, " n"],
@@ -124,10 +132,10 @@ def add_hedges(
     high_u, high_v = u_m.max(axis=1) - 0.12, v_m.max(axis=1) - 0.12
     heart = plan.blocks(low_u, high_u, low_v, high_v, -0.3, rise_m + height_m - 0.12)
     green = rng.uniform(0.3, 0.6, len(u_m))
-    pile.add(heart, materials.LEAVES, green[:, None] * 0.8, labels.VEGETATION)
+    builder.add(heart, materials.LEAVES, green[:, None] * 0.8, labels.VEGETATION)
     size = rows_of(high_u - low_u, high_v - low_v, height_m) + np.array([0.24, 0.24, 0])
     middle = rows_of((low_u + high_u) / 2, (low_v + high_v) / 2, height_m / 2)
-    leaf = np.minimum(0.9 * _leaf_m(plan.away_m(plan.place(middle[:, 0], middle[:, 1]))), 0.35)
+    leaf = np.minimum(0.9 * _leaf_m(plan.nearest_approach_m(plan.ground_points(middle[:, 0], middle[:, 1]))), 0.35)
     skin = size[:, 2] * (size[:, 0] + size[:, 1]) * 2 + size[:, 0] * size[:, 1]
     number = np.clip(0.45 * skin / leaf**2, 20, 900).astype(int)
     home = owners(number)
@@ -141,11 +149,11 @@ def add_hedges(
     deep = 0.12 * rng.random(len(home)) / size[home, axis]
     inside[np.arange(len(home)), axis] = side - np.sign(side) * deep
     place = middle[home] + inside * size[home]
-    corners = plan.place(
+    corners = plan.ground_points(
         np.stack((low_u, high_u, low_u, high_u), axis=1), np.stack((low_v, low_v, high_v, high_v), axis=1)
     )
     du, dv = (place[:, 0] - low_u[home]) / (high_u - low_u)[home], (place[:, 1] - low_v[home]) / (high_v - low_v)[home]
     shares = np.stack(((1 - du) * (1 - dv), du * (1 - dv), (1 - du) * dv, du * dv), axis=1)
     centre = np.einsum("nk,nkc->nc", shares, corners[home])  # hedges are straight: no need to bend every leaf
     centre[:, 2] += place[:, 2] + rise_m
-    pile.add(leaves(centre, leaf[home]), materials.LEAVES, green[home], labels.VEGETATION)
+    builder.add(leaves(centre, leaf[home]), materials.LEAVES, green[home], labels.VEGETATION)

@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 
 from lidargrit.simulator import labels, materials
-from lidargrit.simulator.scene.plan import EXTENT_M, Plan
-from lidargrit.simulator.scene.shapes import Pile, quads
+from lidargrit.simulator.scene.shapes import MeshBuilder, quads
+from lidargrit.simulator.scene.street_plan import EXTENT_M, StreetPlan
 
 _ROAD, _PAVEMENT, _PARKING, _YARD, _GREEN = range(5)
 _LABEL = np.array([labels.ROAD, labels.SIDEWALK, labels.PARKING, labels.OTHER_GROUND, labels.TERRAIN])
@@ -19,12 +19,12 @@ _MARKED_M = 48.0  # markings farther away are seen by hardly a beam
 _PAINT_M = 0.012  # over the road: clear of the corners that the ground's own triangles cut
 
 
-def add_ground(pile: Pile, rng: np.random.Generator, plan: Plan) -> None:
+def add_ground(builder: MeshBuilder, rng: np.random.Generator, plan: StreetPlan) -> None:
     """Add a grid of ground whose lines run along kerbs, so that kerbs are true steps."""
     u, v = _lines(_u_edges(plan), 8.0), _lines(_v_edges(plan), 14.0)
     kind = _kinds(plan, rng, *np.meshgrid((u[1:] + u[:-1]) / 2, (v[1:] + v[:-1]) / 2, indexing="ij"))
     level = np.array([0.0, plan.level_m[0], 0.0, plan.level_m[1], plan.level_m[1]])[kind]
-    base = plan.place(*np.meshgrid(u, v, indexing="ij"))
+    base = plan.ground_points(*np.meshgrid(u, v, indexing="ij"))
     base[..., 2] += _rough(rng, kind)
     corners = np.stack((base[:-1, :-1], base[1:, :-1], base[1:, 1:], base[:-1, 1:]), axis=2)
     corners[..., 2] += level[..., None]
@@ -32,10 +32,10 @@ def add_ground(pile: Pile, rng: np.random.Generator, plan: Plan) -> None:
         [rng.uniform(*span) for span in ((0.1, 0.25), (0.2, 0.4), (0.12, 0.25), (0.15, 0.35), (0.3, 0.5))]
     )
     albedo = bright[kind] * rng.uniform(0.94, 1.06, kind.shape)
-    pile.add(quads(corners), _MATERIAL[kind][..., None], albedo[..., None], _LABEL[kind][..., None])
+    builder.add(quads(corners), _MATERIAL[kind][..., None], albedo[..., None], _LABEL[kind][..., None])
     kerb = rng.uniform(0.25, 0.4)
     for axis in (0, 1):
-        _add_kerbs(pile, base, level, axis, kerb)
+        _add_kerbs(builder, base, level, axis, kerb)
 
 
 def _lines(edges: np.ndarray, far_m: float) -> np.ndarray:
@@ -57,7 +57,7 @@ def _lines(edges: np.ndarray, far_m: float) -> np.ndarray:
     return np.concatenate((*pieces, [EXTENT_M]))
 
 
-def _u_edges(plan: Plan) -> np.ndarray:
+def _u_edges(plan: StreetPlan) -> np.ndarray:
     edges = [
         street.u_m + way * (street.half_m + wide)
         for street in plan.side_streets
@@ -67,7 +67,7 @@ def _u_edges(plan: Plan) -> np.ndarray:
     return np.array(edges)
 
 
-def _v_edges(plan: Plan) -> np.ndarray:
+def _v_edges(plan: StreetPlan) -> np.ndarray:
     edges = []
     for which, side in enumerate((-1, 1)):
         kerb = plan.edge_m[which]
@@ -77,7 +77,7 @@ def _v_edges(plan: Plan) -> np.ndarray:
     return np.array(edges)
 
 
-def _kinds(plan: Plan, rng: np.random.Generator, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+def _kinds(plan: StreetPlan, rng: np.random.Generator, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Return what each cell of the grid is."""
     bays = rng.random(2) < 0.35  # some parked rows stand on a strip of their own
     green = {"city": 0.35, "suburb": 0.8, "country": 1.0}[plan.theme]
@@ -106,7 +106,7 @@ def _rough(rng: np.random.Generator, kind: np.ndarray) -> np.ndarray:
     return np.where(grass, rng.normal(0, 0.04, grass.shape), 0.0)
 
 
-def _add_kerbs(pile: Pile, base: np.ndarray, level: np.ndarray, axis: int, albedo: float) -> None:
+def _add_kerbs(builder: MeshBuilder, base: np.ndarray, level: np.ndarray, axis: int, albedo: float) -> None:
     """Stand an upright strip wherever the levels of neighbouring cells differ."""
     if axis == 1:
         base, level = base.swapaxes(0, 1), level.swapaxes(0, 1)
@@ -115,10 +115,10 @@ def _add_kerbs(pile: Pile, base: np.ndarray, level: np.ndarray, axis: int, albed
     start, end = base[i + 1, j], base[i + 1, j + 1]
     rise = np.zeros((len(i), 4, 3))
     rise[:, :2, 2], rise[:, 2:, 2] = low[i, j][:, None], high[i, j][:, None]
-    pile.add(quads(np.stack((start, end, end, start), axis=1) + rise), materials.CONCRETE, albedo, labels.SIDEWALK)
+    builder.add(quads(np.stack((start, end, end, start), axis=1) + rise), materials.CONCRETE, albedo, labels.SIDEWALK)
 
 
-def add_markings(pile: Pile, rng: np.random.Generator, plan: Plan) -> None:
+def add_markings(builder: MeshBuilder, rng: np.random.Generator, plan: StreetPlan) -> None:
     """Paint the middle of the road, its edges out of town, and stop lines and zebra crossings at junctions."""
     bars: list[np.ndarray] = []  # columns: u from, u to, v from, v to
     along = np.arange(-_MARKED_M, _MARKED_M, 3.0)
@@ -143,18 +143,18 @@ def add_markings(pile: Pile, rng: np.random.Generator, plan: Plan) -> None:
     if not clear:
         return
     bar = np.concatenate(clear)
-    corners = plan.place(bar[:, [0, 1, 1, 0]], bar[:, [2, 2, 3, 3]])
+    corners = plan.ground_points(bar[:, [0, 1, 1, 0]], bar[:, [2, 2, 3, 3]])
     corners[..., 2] += _PAINT_M
     bright = rng.uniform(0.5, 0.7) * rng.uniform(0.85, 1.0, (len(bar), 1))
-    pile.add(quads(corners), materials.ASPHALT, bright, labels.LANE_MARKING)
+    builder.add(quads(corners), materials.ASPHALT, bright, labels.LANE_MARKING)
 
 
-def _zebra(plan: Plan, u_m: float) -> np.ndarray:
+def _zebra(plan: StreetPlan, u_m: float) -> np.ndarray:
     stripe = np.arange(-plan.edge_m[0] + 0.5, plan.edge_m[1] - 0.5, 1.0)
     return np.column_stack((stripe * 0 + u_m - 1.5, stripe * 0 + u_m + 1.5, stripe, stripe + 0.5))
 
 
-def add_bridge(pile: Pile, rng: np.random.Generator, plan: Plan) -> None:
+def add_bridge(builder: MeshBuilder, rng: np.random.Generator, plan: StreetPlan) -> None:
     """Let another road cross above ours: a deck with parapets between two banks that end in walls."""
     if not np.isfinite(plan.bridge_u_m):
         return
@@ -164,10 +164,10 @@ def add_bridge(pile: Pile, rng: np.random.Generator, plan: Plan) -> None:
     for side, wall in zip((-1, 1), walls, strict=True):
         v = side * np.linspace(abs(wall), 75.0, 8)
         bank = plan.blocks(u - half, u + half, v[:-1], v[1:], -0.5, top, flare_m=5.0)
-        pile.add(bank, materials.GRASS, rng.uniform(0.3, 0.5), labels.TERRAIN)
+        builder.add(bank, materials.GRASS, rng.uniform(0.3, 0.5), labels.TERRAIN)
         ends = plan.blocks(u - half - 0.2, u + half + 0.2, wall, wall + side * 0.8, -0.5, top)
-        pile.add(ends, materials.CONCRETE, concrete, labels.OTHER_STRUCTURE)
+        builder.add(ends, materials.CONCRETE, concrete, labels.OTHER_STRUCTURE)
     v = np.concatenate((np.linspace(-75, walls[0], 6), np.linspace(walls[1], 75, 6)))
     deck = plan.blocks(u - half, u + half, walls[0], walls[1], low, top)
     rails = [plan.blocks(u + way * half - 0.1, u + way * half + 0.1, v[:-1], v[1:], top, top + 0.9) for way in (-1, 1)]
-    pile.add(np.concatenate((deck, *rails)), materials.CONCRETE, concrete, labels.OTHER_STRUCTURE)
+    builder.add(np.concatenate((deck, *rails)), materials.CONCRETE, concrete, labels.OTHER_STRUCTURE)

@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float, Num
 
 from lidargrit.simulator import materials
 from lidargrit.simulator.scene.buildings import Houses
-from lidargrit.simulator.scene.movers import Stands
-from lidargrit.simulator.scene.plan import EXTENT_M, Plan
+from lidargrit.simulator.scene.objects import Placements
+from lidargrit.simulator.scene.street_plan import EXTENT_M, StreetPlan
 
 _LENGTH_M = {"city": (8.0, 20.0), "suburb": (7.5, 14.0), "country": (9.0, 18.0)}
 _DEPTH_M = {"city": (9.0, 13.0), "suburb": (7.5, 11.0), "country": (8.0, 14.0)}
@@ -27,10 +27,10 @@ class Settlement:
     """Houses and where they leave room.
 
     Args:
-        houses: all of them.
-        boxes_m: u from, u to, v from, v to of every house.
-        gaps_m: u from, u to and side of the gaps in the rows along our road.
-        parks_m: u from, u to and side of stretches without houses.
+        houses: all houses of the scene.
+        boxes_m: bounds of each house: lowest u, highest u, lowest v, highest v.
+        gaps_m: gaps in the rows of houses along our road: first u, last u and side.
+        parks_m: stretches without houses: first u, last u and side.
     """
 
     houses: Houses
@@ -50,7 +50,7 @@ def _covered(boxes: np.ndarray, u: np.ndarray, v: np.ndarray, spare: float | np.
     return np.any(inside_u & inside_v, axis=1)
 
 
-def free_spans(plan: Plan, side: int, spare_m: float = 0.5) -> list[tuple[float, float]]:
+def free_spans(plan: StreetPlan, side: int, spare_m: float = 0.5) -> list[tuple[float, float]]:
     """Return from where to where our road has land beside it on one side: no side street, no bridge."""
     taken = [
         (s.u_m, s.half_m + s.pavement_m + spare_m + 6.0 * abs(s.skew)) for s in plan.side_streets if side in s.sides
@@ -65,7 +65,7 @@ def free_spans(plan: Plan, side: int, spare_m: float = 0.5) -> list[tuple[float,
     return [*spans, (start, EXTENT_M - 5)]
 
 
-def settle(rng: np.random.Generator, plan: Plan) -> Settlement:
+def lay_out_houses(rng: np.random.Generator, plan: StreetPlan) -> Settlement:
     """Draw where houses stand."""
     rows, gaps, parks = [], [np.zeros((0, 3))], [np.zeros((0, 3))]
     for side in (-1, 1):
@@ -86,11 +86,11 @@ def settle(rng: np.random.Generator, plan: Plan) -> Settlement:
     blocks.append(garages)
     taken = np.concatenate([b[1] for b in blocks])
     blocks.append(_stand_behind(rng, plan, taken))
-    stands = Stands.join([b[0] for b in blocks])
+    placements = Placements.join([b[0] for b in blocks])
     extents = np.concatenate([b[1] for b in blocks])
     size = np.concatenate([b[2] for b in blocks])
     plain = np.concatenate([np.full(len(b[0]), b is garages) for b in blocks])
-    houses = _draw_houses(rng, plan, stands, size, plain)
+    houses = _sample_houses(rng, plan, placements, size, plain)
     return Settlement(houses, extents, np.concatenate(gaps), np.concatenate(parks))
 
 
@@ -117,18 +117,23 @@ def _steps(rng: np.random.Generator, count: int) -> np.ndarray:
 
 
 def _stand_along(
-    rng: np.random.Generator, plan: Plan, start: np.ndarray, length: np.ndarray, front: np.ndarray, side: np.ndarray
-) -> tuple[Stands, np.ndarray, np.ndarray]:
+    rng: np.random.Generator,
+    plan: StreetPlan,
+    start: np.ndarray,
+    length: np.ndarray,
+    front: np.ndarray,
+    side: np.ndarray,
+) -> tuple[Placements, np.ndarray, np.ndarray]:
     depth = rng.uniform(*_DEPTH_M[plan.theme], len(start))
-    stands = Stands.of(start + length / 2, side * (front + depth / 2), np.where(side > 0, 0.0, np.pi))
+    placements = Placements.of(start + length / 2, side * (front + depth / 2), np.where(side > 0, 0.0, np.pi))
     near, far = side * front, side * (front + depth)
     extent = np.column_stack((start, start + length, np.minimum(near, far), np.maximum(near, far)))
-    return stands, extent, np.column_stack((length, depth))
+    return placements, extent, np.column_stack((length, depth))
 
 
 def _stand_beside(
-    rng: np.random.Generator, plan: Plan, street, side: int, flank: int
-) -> tuple[Stands, np.ndarray, np.ndarray]:
+    rng: np.random.Generator, plan: StreetPlan, street, side: int, flank: int
+) -> tuple[Placements, np.ndarray, np.ndarray]:
     """Line one flank of a side street, from behind the corner house on."""
     first = abs(plan.front(side)) + 14.0 + rng.uniform(0, 6)
     start, length = _row(rng, plan.theme, (first, 112.0))
@@ -140,15 +145,15 @@ def _stand_beside(
     clear = (np.abs(middle_u[:, None] - others) > depth[:, None] / 2 + 6.0).all(axis=1) & (np.abs(middle_u) < 122)
     if np.isfinite(plan.bridge_u_m):
         clear &= (np.abs(middle_u - plan.bridge_u_m) > 18) | (start > 75)
-    stands = Stands.of(middle_u, side * (start + length / 2), np.pi if flank > 0 else 0.0, across=True)
+    placements = Placements.of(middle_u, side * (start + length / 2), np.pi if flank > 0 else 0.0, across=True)
     v_from, v_to = side * start, side * (start + length)
     extent = np.column_stack(
         (np.minimum(u_near, u_far), np.maximum(u_near, u_far), np.minimum(v_from, v_to), np.maximum(v_from, v_to))
     )
-    return stands.those(clear), extent[clear], np.column_stack((length, depth))[clear]
+    return placements.select(clear), extent[clear], np.column_stack((length, depth))[clear]
 
 
-def _garages(rng: np.random.Generator, plan: Plan, gaps: np.ndarray) -> tuple[Stands, np.ndarray, np.ndarray]:
+def _garages(rng: np.random.Generator, plan: StreetPlan, gaps: np.ndarray) -> tuple[Placements, np.ndarray, np.ndarray]:
     wide = gaps[:, 1] - gaps[:, 0]
     chosen = (wide > 3.2) & (rng.random(len(gaps)) < {"city": 0.25, "suburb": 0.45, "country": 0.1}[plan.theme])
     gap, length = gaps[chosen], np.minimum(wide[chosen] - 0.3, rng.uniform(2.9, 6.0, chosen.sum()))
@@ -156,13 +161,15 @@ def _garages(rng: np.random.Generator, plan: Plan, gaps: np.ndarray) -> tuple[St
     front = np.where(side > 0, plan.front(1), -plan.front(-1)) + rng.uniform(0.5, 7.0, len(gap))
     start = gap[:, 0] + 0.1
     depth = rng.uniform(5.0, 7.0, len(gap))
-    stands = Stands.of(start + length / 2, side * (front + depth / 2), np.where(side > 0, 0.0, np.pi))
+    placements = Placements.of(start + length / 2, side * (front + depth / 2), np.where(side > 0, 0.0, np.pi))
     near, far = side * front, side * (front + depth)
     extent = np.column_stack((start, start + length, np.minimum(near, far), np.maximum(near, far)))
-    return stands, extent, np.column_stack((length, depth))
+    return placements, extent, np.column_stack((length, depth))
 
 
-def _stand_behind(rng: np.random.Generator, plan: Plan, taken: np.ndarray) -> tuple[Stands, np.ndarray, np.ndarray]:
+def _stand_behind(
+    rng: np.random.Generator, plan: StreetPlan, taken: np.ndarray
+) -> tuple[Placements, np.ndarray, np.ndarray]:
     """Build here and there behind the rows, as a backdrop; blocks of a city are large."""
     line = np.arange(-EXTENT_M + 8, EXTENT_M, _LATTICE_M)
     u, v = (a.ravel() for a in np.meshgrid(line, line))
@@ -176,13 +183,15 @@ def _stand_behind(rng: np.random.Generator, plan: Plan, taken: np.ndarray) -> tu
     if np.isfinite(plan.bridge_u_m):
         free &= np.abs(u - plan.bridge_u_m) > 13 + reach
     u, v, size = u[free], v[free], size[free]
-    stands = Stands.of(u, v, np.where(v > 0, 0.0, np.pi) + rng.choice([0, np.pi / 2], len(u)))
+    placements = Placements.of(u, v, np.where(v > 0, 0.0, np.pi) + rng.choice([0, np.pi / 2], len(u)))
     half = size.max(axis=1) / 2
-    return stands, np.column_stack((u - half, u + half, v - half, v + half)), size
+    return placements, np.column_stack((u - half, u + half, v - half, v + half)), size
 
 
-def _draw_houses(rng: np.random.Generator, plan: Plan, stands: Stands, size: np.ndarray, plain: np.ndarray) -> Houses:
-    count = len(stands)
+def _sample_houses(
+    rng: np.random.Generator, plan: StreetPlan, placements: Placements, size: np.ndarray, plain: np.ndarray
+) -> Houses:
+    count = len(placements)
     storey = rng.uniform(2.6, 3.0, count) if plan.theme != "city" else rng.uniform(2.8, 3.8, count)
     storeys = rng.integers(*_STOREYS[plan.theme], count)
     storey = np.where(plain, rng.uniform(2.3, 2.9, count), storey)
@@ -192,7 +201,7 @@ def _draw_houses(rng: np.random.Generator, plan: Plan, stands: Stands, size: np.
     material = rng.choice([materials.PLASTER, materials.BRICK, materials.CONCRETE], count, p=[0.72, 0.18, 0.1])
     bright = np.where(material == materials.PLASTER, rng.uniform(0.2, 0.7, count), rng.uniform(0.2, 0.45, count))
     return Houses(
-        poses=plan.poses(stands.u_m, stands.v_m, stands.turn_rad, stands.across, plan.level_m[1]),
+        poses=plan.poses(placements.u_m, placements.v_m, placements.turn_rad, placements.across, plan.level_m[1]),
         length_m=size[:, 0],
         depth_m=size[:, 1],
         height_m=height,

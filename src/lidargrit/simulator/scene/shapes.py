@@ -1,4 +1,4 @@
-"""Simple solids, many at once: arrays of sizes → arrays of triangles; a pile of them → a mesh."""
+"""Simple solids, many at once: arrays of sizes → arrays of triangles; a builder of them → a mesh."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _BOX_FACES = np.array(
 _BOX_CORNERS = np.array([(i >> 2 & 1, i >> 1 & 1, i & 1) for i in range(8)], np.float32)
 
 
-class Pile:
+class MeshBuilder:
     """Collects triangles with what they are made of, and joins them once at the end."""
 
     def __init__(self) -> None:
@@ -46,7 +46,7 @@ class Pile:
     def __len__(self) -> int:
         return sum(len(part[0]) for part in self._parts)
 
-    def mesh(self) -> Mesh:
+    def build(self) -> Mesh:
         """Return all that was added, in order."""
         return Mesh(*(np.concatenate(column) for column in zip(*self._parts, strict=True)))
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lidargrit.simulator import labels, materials
-from lidargrit.simulator.scene.movers import Herd, Stands
+from lidargrit.simulator.scene.objects import ObjectBatch, Placements
 from lidargrit.simulator.scene.shapes import boxes, fans, loft, quads, rows_of, tubes
 
 HATCHBACK, SALOON, ESTATE, SUV, VAN, TRUCK = range(6)
@@ -46,21 +46,21 @@ _LABELS = np.array([labels.CAR] * 5 + [labels.TRUCK])
 _MOVING = np.array([labels.MOVING_CAR] * 5 + [labels.MOVING_TRUCK])
 
 
-def draw_kinds(rng: np.random.Generator, count: int, trucks: float = 0.03) -> Int[np.ndarray, " n"]:
+def sample_vehicle_kinds(rng: np.random.Generator, count: int, trucks: float = 0.03) -> Int[np.ndarray, " n"]:
     """Draw what kinds of vehicle stand or drive in a European street."""
     shares = np.array([0.36, 0.2, 0.22, 0.12, 0.10, 0.0]) * (1 - trucks)
     shares[TRUCK] = trucks
     return rng.choice(6, count, p=shares)
 
 
-def draw_vehicles(
+def make_vehicles(
     rng: np.random.Generator,
     kinds: Int[np.ndarray, " n"],
-    stands: Stands,
+    placements: Placements,
     first_instance: int,
     away_m: Float[np.ndarray, " n"],
-) -> list[Herd]:
-    """Draw vehicles of given kinds; far ones are cruder, and trucks come with a box in a herd of its own."""
+) -> list[ObjectBatch]:
+    """Draw vehicles of given kinds; far ones are cruder, and trucks come with a box in a objects of its own."""
     count = len(kinds)
     size = _SIZE_M[kinds] * (1 + _SPREAD[kinds] * np.clip(rng.normal(size=(count, 3)), -1.6, 1.6))
     length, width, height = size.T
@@ -68,7 +68,7 @@ def draw_vehicles(
     paint = np.where(dark, np.exp(rng.uniform(np.log(0.002), np.log(0.05), count)), rng.uniform(0.05, 0.4, count))
     seats, metal = rng.uniform(0.03, 0.12, (count, 1)), rng.uniform(0.1, 0.4, (count, 1))
     instance = np.arange(first_instance, first_instance + count, dtype=np.int32)
-    label = np.where(stands.speed_m_s != 0, _MOVING[kinds], _LABELS[kinds])
+    label = np.where(placements.speed_m_s != 0, _MOVING[kinds], _LABELS[kinds])
     herds = []
     for far in (False, True):
         some = np.flatnonzero((away_m > _DETAIL_TO_M) == far)
@@ -83,30 +83,30 @@ def draw_vehicles(
             (_inside(kind, long, wide, tall, far), materials.CLOTH, seats[some]),
             (_rims(kind, long, wide, tall, far), materials.METAL, metal[some]),
         ]
-        herds.append(_herd(parts, label[some], instance[some], stands.those(some)))
+        herds.append(_object_batch(parts, label[some], instance[some], placements.select(some)))
     trucks = np.flatnonzero(kinds == TRUCK)
     if len(trucks):
         high = np.maximum(height[trucks] * rng.uniform(1.05, 1.45, len(trucks)), 2.6)
         half, nose = width[trucks] / 2 + 0.06, length[trucks] / 2
         cargo = boxes(rows_of(-nose, -half, 0.9), rows_of(nose - 0.26 * length[trucks], half, high))
         part = (cargo, materials.PAINT, rng.uniform(0.1, 0.5, (len(trucks), 1)))
-        herds.append(_herd([part], label[trucks], instance[trucks], stands.those(trucks)))
+        herds.append(_object_batch([part], label[trucks], instance[trucks], placements.select(trucks)))
     return herds
 
 
-def _herd(parts: list[tuple], label: np.ndarray, instance: np.ndarray, stands: Stands) -> Herd:
+def _object_batch(parts: list[tuple], label: np.ndarray, instance: np.ndarray, placements: Placements) -> ObjectBatch:
     shapes = [part[0].shape[:2] for part in parts]
     local = np.concatenate([part[0] for part in parts], axis=1)
     material = np.concatenate([np.broadcast_to(p[1], s) for p, s in zip(parts, shapes, strict=True)], axis=1)
     albedo = np.concatenate([np.broadcast_to(p[2], s) for p, s in zip(parts, shapes, strict=True)], axis=1)
     labelled = np.broadcast_to(label[:, None], local.shape[:2])
-    return Herd(
+    return ObjectBatch(
         local.astype(np.float32),
         material.astype(np.uint8),
         albedo.astype(np.float32),
         labelled.astype(np.uint16),
         instance,
-        stands,
+        placements,
     )
 
 

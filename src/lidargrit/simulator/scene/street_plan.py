@@ -24,7 +24,7 @@ _SETBACK_M = {"city": (0.0, 2.5), "suburb": (2.0, 8.5), "country": (5.0, 18.0)}
 _SIDE_STREETS = {"city": 2.0, "suburb": 2.2, "country": 0.5}  # how many on average
 _SPEED_M_S = {"city": (2.0, 11.0), "suburb": (3.0, 11.0), "country": (9.0, 22.0)}
 _LOOKS_FOR_S = 2.0  # how long a street keeps its full detail around our car
-_EYES_APART_M = 6.0  # at most, along our car's way
+_VIEWPOINT_SPACING_M = 6.0  # at most, along our car's way
 _SKEW_REACH_M, _SKEW_WIDTH_M = 25.0, 25.0  # how far from our road, and from its mouth, a side street runs askew
 
 
@@ -47,7 +47,9 @@ class Poses:
     yaw_rad: Float[np.ndarray, " n"]
     slope: Float[np.ndarray, "n 2"]
 
-    def put(self, local_m: Float32[np.ndarray, "n *shape 3"], lean: bool = False) -> Float32[np.ndarray, "n *shape 3"]:
+    def to_world(
+        self, local_m: Float32[np.ndarray, "n *shape 3"], lean: bool = False
+    ) -> Float32[np.ndarray, "n *shape 3"]:
         """Move things from their own frames into the world; what leans follows the slope of the ground."""
         spread = (slice(None),) + (None,) * (local_m.ndim - 2)
         cos, sin = (f(self.yaw_rad).astype(np.float32)[spread] for f in (np.cos, np.sin))
@@ -68,28 +70,28 @@ class Poses:
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class StreetPlan:
     """Where everything may stand.
 
     Args:
-        theme: city, suburb or country.
+        theme: kind of street: city, suburb or country.
         lanes: 1 if cars of both ways share the carriageway, otherwise 2.
         lane_m: width of a lane.
-        edge_m: from the middle of the carriageway to the kerb, right and left, both positive.
+        edge_m: distances from the middle of the carriageway to the kerbs, right and left, both positive.
         parked: whether cars park along the kerb, right and left.
         pavement_m: widths of the pavements, right and left.
-        setback_m: from pavement to houses, right and left.
-        our_v_m: where our own car drives.
-        side_streets: that leave our road.
-        bridge_u_m: where another road crosses above ours, or infinite.
+        setback_m: distances from the pavement to the houses, right and left.
+        our_v_m: v of the lane in which our own car drives.
+        side_streets: streets that leave our road.
+        bridge_u_m: u at which another road crosses above ours; infinite for no bridge.
         line: knots of the middle of our road: u, x, y, cosine and sine of its heading, in a frame that begins at u = 0.
         waves: amplitude, wave vector (2) and phase of every wave of the ground.
-        tilt: of the whole ground along x and y.
+        tilt: slope of the whole ground along x and y.
         camber: fall of the road from its middle to its edges.
-        banks_m: how far the ground rises beside the road, right and left.
-        level_m: of pavements, and of gardens or fields, over the road.
-        speed_m_s: of our own car.
-        eyes_m: places on our car's way in the first seconds, in the world: detail is for them.
+        banks_m: rise of the ground beside the road, right and left.
+        level_m: heights of pavements and of gardens or fields above the road.
+        speed_m_s: speed of our own car.
+        viewpoints_m: positions of our car in the first seconds, in world coordinates; fine detail is made near them.
     """
 
     theme: str
@@ -109,7 +111,7 @@ class Plan:
     banks_m: tuple[float, float]
     level_m: tuple[float, float]
     speed_m_s: float
-    eyes_m: Float[np.ndarray, "k 2"] = field(init=False, repr=False)
+    viewpoints_m: Float[np.ndarray, "k 2"] = field(init=False, repr=False)
     _origin: tuple[np.ndarray, float, float] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -119,12 +121,12 @@ class Plan:
         foot_m = float(self.height_m(np.zeros(1), np.array([self.our_v_m]))[0])
         object.__setattr__(self, "_origin", (here, float(heading), foot_m))
         way = self.speed_m_s * _LOOKS_FOR_S
-        u = np.linspace(0.0, way, 1 + int(np.ceil(way / _EYES_APART_M)))
-        object.__setattr__(self, "eyes_m", self._flat(u, np.full(len(u), self.our_v_m)))
+        u = np.linspace(0.0, way, 1 + int(np.ceil(way / _VIEWPOINT_SPACING_M)))
+        object.__setattr__(self, "viewpoints_m", self._flat(u, np.full(len(u), self.our_v_m)))
 
-    def away_m(self, places_m: Num[np.ndarray, "n _"]) -> Float[np.ndarray, " n"]:
+    def nearest_approach_m(self, places_m: Num[np.ndarray, "n _"]) -> Float[np.ndarray, " n"]:
         """Return how near our car comes to places in the first seconds; one figure for all frames of a street."""
-        apart = places_m[:, :2] - self.eyes_m[:, None]
+        apart = places_m[:, :2] - self.viewpoints_m[:, None]
         return np.sqrt((apart[..., 0] ** 2 + apart[..., 1] ** 2).min(axis=0))
 
     def edge(self, side: int) -> float:
@@ -136,7 +138,7 @@ class Plan:
         which = (side + 1) // 2
         return side * (self.edge_m[which] + self.pavement_m[which] + self.setback_m[which])
 
-    def place(self, u_m: Num[np.ndarray, "*s"], v_m: Num[np.ndarray, "*s"]) -> Float[np.ndarray, "*s 3"]:
+    def ground_points(self, u_m: Num[np.ndarray, "*s"], v_m: Num[np.ndarray, "*s"]) -> Float[np.ndarray, "*s 3"]:
         """Return the points of the ground, at the level of the road, of places in the street."""
         flat = self._flat(u_m, v_m)
         return np.concatenate((flat, self._height(flat, u_m, v_m)[..., None]), axis=-1)
@@ -182,7 +184,7 @@ class Plan:
         u_0, u_1, v_0, v_1, z_0, z_1 = np.broadcast_arrays(*(np.atleast_1d(s) for s in spans))
         u = np.stack((u_0 - flare_m, u_0, u_0 - flare_m, u_0, u_1 + flare_m, u_1, u_1 + flare_m, u_1), axis=1)
         v = np.stack((v_0, v_0, v_1, v_1, v_0, v_0, v_1, v_1), axis=1)
-        corners = self.place(u, v)
+        corners = self.ground_points(u, v)
         corners[..., 2] += np.stack((z_0, z_1) * 4, axis=1)
         return blocks(corners)
 
@@ -237,7 +239,7 @@ class Plan:
         return height
 
 
-def draw_plan(rng: np.random.Generator, theme: Theme) -> Plan:
+def sample_street_plan(rng: np.random.Generator, theme: Theme) -> StreetPlan:
     """Draw roads and ground of one theme."""
     kind = str(rng.choice(["suburb", "city", "country"], p=[0.52, 0.38, 0.10])) if theme == "mixed" else theme
     lanes = 2 if kind == "country" or rng.random() < {"city": 0.8, "suburb": 0.5}[kind] else 1
@@ -247,12 +249,12 @@ def draw_plan(rng: np.random.Generator, theme: Theme) -> Plan:
     close = 0.15 if kind == "suburb" and rng.random() < 0.2 else 1.0  # streets without front gardens
     setback = close * rng.uniform(*_SETBACK_M[kind], 2)
     pavement = rng.uniform(*_PAVEMENT_M[kind], 2)
-    streets = _draw_side_streets(rng, kind)
+    streets = _sample_side_streets(rng, kind)
     bridge = rng.uniform(14, 70) * rng.choice([-1, 1]) if rng.random() < 0.06 else np.inf
     if any(abs(street.u_m - bridge) < 22 for street in streets):
         bridge = np.inf
     wild = kind == "country"
-    return Plan(
+    return StreetPlan(
         theme=kind,
         lanes=lanes,
         lane_m=lane,
@@ -263,8 +265,8 @@ def draw_plan(rng: np.random.Generator, theme: Theme) -> Plan:
         our_v_m=-lane / 2 + rng.normal(0, 0.12) if lanes == 2 else rng.uniform(-0.2, 0.2),
         side_streets=streets,
         bridge_u_m=float(bridge),
-        line=_draw_line(rng, kind),
-        waves=_draw_waves(rng),
+        line=_sample_line(rng, kind),
+        waves=_sample_waves(rng),
         tilt=rng.normal(0, 0.015, 2),
         camber=rng.uniform(0.005, 0.025),
         banks_m=(rng.normal(0.2, 1.0), rng.normal(0.2, 1.0)) if wild else (0.0, 0.0),
@@ -273,7 +275,7 @@ def draw_plan(rng: np.random.Generator, theme: Theme) -> Plan:
     )
 
 
-def _draw_side_streets(rng: np.random.Generator, kind: str) -> tuple[SideStreet, ...]:
+def _sample_side_streets(rng: np.random.Generator, kind: str) -> tuple[SideStreet, ...]:
     streets: list[SideStreet] = []
     for _ in range(min(rng.poisson(_SIDE_STREETS[kind]), 4)):
         u, skew = rng.normal(0, 42), float(np.clip(rng.normal(0, 0.25), -0.5, 0.5))
@@ -284,7 +286,7 @@ def _draw_side_streets(rng: np.random.Generator, kind: str) -> tuple[SideStreet,
     return tuple(streets)
 
 
-def _draw_line(rng: np.random.Generator, kind: str) -> np.ndarray:
+def _sample_line(rng: np.random.Generator, kind: str) -> np.ndarray:
     """Draw a gentle arc, in half of the streets with a bend or two."""
     u = np.arange(-260.0, 261.0, 2.0)
     yaw = rng.normal(0, 0.0012) * u
@@ -299,7 +301,7 @@ def _draw_line(rng: np.random.Generator, kind: str) -> np.ndarray:
     return np.column_stack((u, xy, np.cos(yaw), np.sin(yaw)))
 
 
-def _draw_waves(rng: np.random.Generator) -> np.ndarray:
+def _sample_waves(rng: np.random.Generator) -> np.ndarray:
     """Draw waves of the ground whose slopes have a spread of about one in sixty each."""
     length, turn = np.exp(rng.uniform(np.log(45), np.log(260), 4)), rng.uniform(0, 2 * np.pi, 4)
     number = 2 * np.pi / length
