@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import json
+import math
 import os
 import socket
 import stat
@@ -12,11 +13,13 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from torch import Tensor, nn
+from lidargrit.errors import CheckpointError, ConfigError, LidarGritError, OutputError
+from lidargrit.untrusted import JSON_BYTES_AT_MOST, TEXT_BYTES_AT_MOST, parse_json
 
-from lidargrit.errors import CheckpointError, ConfigError, OutputError
+if TYPE_CHECKING:  # quick start of commands that only read and write JSON
+    from torch import Tensor, nn
 
 _PARTIALS = f".lidargrit-partial-{os.getuid()}"  # one a user: a shared folder such as /tmp has files of many
 _LOCK = "lock"  # among the partial files, held by the commands that write into the folder
@@ -202,34 +205,64 @@ def write_text(path: Path, text: str) -> None:
 
 
 def read_text(path: Path) -> str:
-    """Read a text file that a user named.
+    """Read a text file that a user named, of at most :data:`lidargrit.untrusted.TEXT_BYTES_AT_MOST` bytes.
 
     Raises:
-        ConfigError: it is missing, or not text.
+        ConfigError: it is missing, too large or not text.
     """
+    wanted, cure = "a text file in UTF-8", "check the path"
     try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"{path}, which cannot be read ({error})", "a text file in UTF-8", "check the path") from None
+        return _read_bytes(path, ConfigError, wanted, cure, TEXT_BYTES_AT_MOST).decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}, which cannot be read ({error})", wanted, cure) from None
 
 
 def write_json(path: Path, data: Any) -> None:
-    """Write a JSON file atomically."""
-    write_text(path, json.dumps(data, indent=2) + "\n")
+    """Write a JSON file atomically; numbers that are NaN or infinite, for which JSON has no word, become null."""
+    write_text(path, json.dumps(plain(data), indent=2, allow_nan=False) + "\n")
 
 
-def read_json(path: Path) -> Any:
-    """Read a JSON file.
+def plain(value: Any) -> Any:
+    """Return a value of dicts and lists with null for every number that is NaN or infinite."""
+    if isinstance(value, dict):
+        return {name: plain(child) for name, child in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(child) for child in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def read_json(
+    path: Path,
+    kind: type = dict,
+    error: type[LidarGritError] = CheckpointError,
+    wanted: str = "a JSON file that lidargrit wrote",
+    cure: str = "check the path, or restore the file",
+    at_most: int = JSON_BYTES_AT_MOST,
+) -> Any:
+    """Read a JSON file of bounded size and depth; a pipe or a device is refused.
+
+    The arguments are those of :func:`lidargrit.untrusted.parse_json`.
 
     Raises:
-        CheckpointError: it is missing or not JSON.
+        LidarGritError: the file is missing or cannot be used; of the class ``error``.
     """
+    data = _read_bytes(path, error, wanted, cure, at_most)
+    return parse_json(data, str(path), kind, error, wanted, cure, at_most)
+
+
+def _read_bytes(path: Path, error: type[LidarGritError], wanted: str, cure: str, at_most: int) -> bytes:
+    """Read at most one byte more than is allowed: no device or growing file fills the memory."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise CheckpointError(
-            f"{path}, which cannot be read ({error})", "a JSON file that lidargrit wrote", "check the path"
-        ) from None
+        if not path.is_file():
+            raise OSError("no such file" if not path.exists() else "not a file")
+        with path.open("rb") as file:
+            data = file.read(at_most + 1)
+        if len(data) > at_most:
+            raise OSError(f"more than {at_most:,} bytes")
+    except (OSError, ValueError) as why:
+        reason = why.strerror if isinstance(why, OSError) and why.strerror else why
+        raise error(f"{path}, which cannot be read ({reason})", wanted, cure) from None
+    return data
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], about: Mapping[str, Any] | None = None) -> None:
@@ -258,7 +291,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
     try:
         with safe_open(path, framework="pt") as opened:
-            about = json.loads((opened.metadata() or {}).get("about", "{}"))
+            about = parse_json((opened.metadata() or {}).get("about", "{}"), str(path))
             return {name: opened.get_tensor(name) for name in opened.keys()}, about  # noqa: SIM118  not a dict
     except (OSError, SafetensorError, ValueError) as error:
         raise CheckpointError(

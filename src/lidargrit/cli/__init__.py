@@ -43,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.print_help()
         return 0
     try:
-        with _raising_on_termination():
+        with _raising_on_termination(), _refusing_unusable_paths():
             options.run(options)
         sys.stdout.flush()  # here, where a closed pipe is caught, and not when Python ends
     except LidarGritError as error:
@@ -116,3 +116,14 @@ def _raising_on_termination() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+@contextmanager
+def _refusing_unusable_paths() -> Iterator[None]:
+    """Tell in one line of a path that the system refuses, whoever was first to open it."""
+    try:
+        yield
+    except OSError as error:
+        if not error.filename:  # no matter of a path, such as a closed pipe
+            raise
+        raise UsageError(f"{error.strerror} for {error.filename}", "a file that can be used", "check it") from error

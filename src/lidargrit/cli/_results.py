@@ -8,10 +8,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 from pathlib import Path
 from typing import Any
+
+from lidargrit.errors import UsageError
+from lidargrit.files import plain, refuse_to_overwrite, write_json
+from lidargrit.untrusted import check_path
 
 STANDARD_OUTPUT = Path("-")
 
@@ -28,8 +31,6 @@ def refuse_taken(options: argparse.Namespace) -> None:
     """Refuse, before any work, to replace a file that ``--json`` names, with OutputError."""
     if options.json in (None, STANDARD_OUTPUT):
         return
-    from lidargrit.files import refuse_to_overwrite  # brings torch, without which a list is there at once
-
     refuse_to_overwrite(options.json, options.overwrite, ".json")
 
 
@@ -43,29 +44,18 @@ def tell(options: argparse.Namespace, text: str, result: Any, done: str = "") ->
         done: where further results lie; on standard error if JSON is printed.
     """
     if options.json == STANDARD_OUTPUT:
-        print(json.dumps(_plain(result), indent=2, allow_nan=False))
+        print(json.dumps(plain(result), indent=2, allow_nan=False))
     else:
         if options.json:
-            from lidargrit.files import write_json
-
-            write_json(options.json, _plain(result))
+            write_json(options.json, result)
         print(text)
     if done:
         print(done, file=sys.stderr if options.json == STANDARD_OUTPUT else sys.stdout)
-
-
-def _plain(value: Any) -> Any:
-    """Return a value with null for numbers that are infinite or none, for which strict JSON has no word."""
-    if isinstance(value, dict):
-        return {name: _plain(of) for name, of in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(of) for of in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _place(word: str) -> Path:
     if word == str(STANDARD_OUTPUT):
         return STANDARD_OUTPUT
     if Path(word).suffix.lower() != ".json":  # a word of the command that came to stand behind --json
-        raise argparse.ArgumentTypeError(f"{word}; a name in .json, or nothing; put --json last")
-    return Path(word)
+        raise UsageError(word[:200], "a name in .json, or nothing", "put --json last")
+    return check_path(word)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from lidargrit.errors import UsageError, nearest_names, one_of
+from lidargrit.untrusted import check_path, check_word, positive_number, whole_number
 
 EXIT_CODES = """\
 exit codes: 0 done, 1 a fault of lidargrit's own (with a traceback), 2 a mistake (told in one line),
@@ -16,12 +17,10 @@ exit codes: 0 done, 1 a fault of lidargrit's own (with a traceback), 2 a mistake
 """
 
 _ALL_SHOWN = 9  # choices; of more, those that look most like the word
-_KINDS = {"int": "a whole number", "float": "a number"}
 _ABOUT_ONE = re.compile(r"argument (\S*): (.*)", re.DOTALL)
 # What argparse says, and what to say in its place. Its words differ a little from one Python to the next.
 _SAID = (
     (re.compile(r"expected (?:one|at least one) argument"), "nothing after {name}", "a value", "write one behind it"),
-    (re.compile(r"invalid (int|float) value: (.*)"), "{name} {1}", "{0}", "correct it"),
     (re.compile(r"ignored explicit argument (.*)"), "{name} with {0}", "{name} alone", "leave the value out"),
 )
 
@@ -31,7 +30,8 @@ class Parser(argparse.ArgumentParser):
 
     def __init__(self, *words: Any, **options: Any) -> None:
         super().__init__(*words, **options)
-        self.register("type", Path, a_path)
+        for kind, check in ((None, check_word), (Path, check_path), (int, whole_number), (float, positive_number)):
+            self.register("type", kind, check)
 
     def error(self, message: str) -> NoReturn:
         """Raise what argparse complains of, in our manner."""
@@ -46,6 +46,17 @@ class Parser(argparse.ArgumentParser):
             if name.startswith("--") and not any(option.startswith(name) for option in self._option_string_actions):
                 self.refuse(name)
         return super().parse_known_args(args, namespace)
+
+    def _get_value(self, action: argparse.Action, arg_string: str) -> Any:
+        """Convert one word; what a type of ours says of a bad one is kept, with the option's name before it."""
+        if isinstance(action, argparse._SubParsersAction):  # all words of a verb, whose own parser converts them
+            return arg_string
+        convert = self._registry_get("type", action.type, action.type)
+        try:
+            return convert(arg_string)
+        except UsageError as error:
+            name = action.option_strings[0] if action.option_strings else str(action.metavar or action.dest)
+            raise UsageError(f"{name} {error.got}", error.wanted, error.cure) from None
 
     def verbs(self) -> list[Parser]:
         """Return the parsers of the verbs below this one."""
@@ -82,11 +93,10 @@ class Parser(argparse.ArgumentParser):
             return got, wanted, "choose one" if len(choices) <= _ALL_SHOWN else self._help()
         for pattern, *parts in _SAID:
             if said := pattern.match(complaint):
-                of = [_KINDS.get(group, group.strip("'")) for group in said.groups()]
+                of = [group.strip("'") for group in said.groups()]
                 got, wanted, cure = (part.format(*of, name=name) for part in parts)
                 return got, wanted, cure
-        parts = complaint.split("; ")  # what a type of ours says, such as a_path
-        return (f"{name} {parts[0]}", parts[1], parts[2]) if len(parts) == 3 else (message, "other words", self._help())
+        return message, "other words", self._help()
 
     def _choices(self, name: str) -> list[Any]:
         """Return what may stand in the place that argparse calls by this name; the verb's has none."""
@@ -104,14 +114,3 @@ class Parser(argparse.ArgumentParser):
 
     def _help(self) -> str:
         return f"see: {self.prog} --help"
-
-
-def a_path(word: str) -> Path:
-    """Return a path; "" is none, though Path takes it for the folder that one stands in.
-
-    Raises:
-        argparse.ArgumentTypeError: an empty word, as an unset variable of the shell leaves behind.
-    """
-    if not word.strip():
-        raise argparse.ArgumentTypeError(f"{word!r}; the name of a file or folder; write one")
-    return Path(word)

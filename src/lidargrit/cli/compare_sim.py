@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from lidargrit.cli._results import add_json, refuse_taken, tell
+from lidargrit.untrusted import seed_number
 
 EXAMPLES = """\
   lidargrit compare-sim /data/kitti_odometry
@@ -19,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-n", "--count", type=int, default=32, help="simulated, and at most so many real (default: 32)")
     parser.add_argument("--sensor", default="", help="a sensor's name or .json file (default: the data set's own)")
     parser.add_argument("--fine", action="store_true", help="every column that the sensor fires, not only those kept")
-    parser.add_argument("--seed", type=int, default=0, help="of the first simulated scan")
+    parser.add_argument("--seed", type=seed_number, default=0, help="of the first simulated scan")
     parser.add_argument("-o", "--out", type=Path, default=Path("compare_sim.png"), help="(default: compare_sim.png)")
     parser.add_argument("--bad-points", choices=["refuse", "drop"], default="refuse", help="NaN, infinite or at 0")
     parser.add_argument("--bad-scans", choices=["refuse", "skip"], default="refuse", help="that cannot be used")

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from lidargrit.cli._results import add_json, refuse_taken, tell
+from lidargrit.untrusted import seed_number
 
 EXAMPLES = """\
   lidargrit evaluate samples /data/held_out --report report.html
@@ -30,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("-n", "--max-scans", type=int, default=0, help="at most so many of each; 0 for the protocol's")
     add("--intervals", type=int, default=20, metavar="B", help="half-samples for intervals; 0 for none (default: 20)")
     add("--groups", type=int, default=16, metavar="G", help="of neighbouring scans that stay together (default: 16)")
-    add("--seed", type=int, default=0, help="of whatever is drawn")
+    add("--seed", type=seed_number, default=0, help="of whatever is drawn")
     add("--device", default="cpu", help="where trained networks compute: cpu or cuda")
     add("--bad-points", choices=["refuse", "drop"], default="refuse", help="NaN, infinite or at 0")
     add("--bad-scans", choices=["refuse", "skip"], default="refuse", help="that cannot be used")

@@ -6,6 +6,8 @@ import argparse
 import os
 from pathlib import Path
 
+from lidargrit.untrusted import seed_number
+
 EXAMPLES = """\
   lidargrit sample pretrained samples                     by the model that comes with the package
   lidargrit sample runs/demo samples -n 100
@@ -20,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run_folder", type=Path, metavar="RUN", help="folder of a finished run, or: pretrained")
     parser.add_argument("out", type=Path, help="folder for the samples")
     parser.add_argument("-n", "--count", type=int, default=16, help="number of scans (default: 16)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the first; the next have the next seeds")
+    parser.add_argument("--seed", type=seed_number, default=0, help="seed of the first; the next have the next seeds")
     parser.add_argument("--batch-size", type=int, default=8, help="scans drawn at once (default: 8)")
     choices = "change how the generator draws; see: lidargrit list generators"
     parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help=choices)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from lidargrit.untrusted import seed_number
+
 EXAMPLES = """\
   lidargrit simulate streets -n 1000
   lidargrit simulate drives -n 200 --frames 20                 ten drives of two seconds
@@ -18,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("out", type=Path, help="an empty folder, or one that the same command began")
     parser.add_argument("-n", "--num-scans", type=int, required=True, help="in all")
     parser.add_argument("--sensor", default="hdl64e_kitti_odometry", help="name or .json file")
-    parser.add_argument("--seed", type=int, default=0, help="of the first street")
+    parser.add_argument("--seed", type=seed_number, default=0, help="of the first street")
     parser.add_argument("--frames", type=int, default=1, help="scans of each street, a tenth of a second apart")
     parser.add_argument("--theme", choices=["mixed", "city", "suburb", "country"], default="mixed")
     parser.add_argument("--motion", action="store_true", help="leave in the distortion by our own motion")

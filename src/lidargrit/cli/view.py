@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from lidargrit.untrusted import seed_number
+
 EXAMPLES = """\
   lidargrit view /data/scans                           range image, return mask and bird's-eye view
   lidargrit view /data/held_out runs/demo -o all.png   real, reconstructed and generated
@@ -17,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("places", nargs="+", metavar="PATH", help="a run, a folder of samples, a scan, or other scans")
     parser.add_argument("-o", "--out", type=Path, default=Path("view.png"), help=".png or .html (default: view.png)")
     parser.add_argument("-n", "--count", type=int, default=3, help="scans of each (default: 3)")
-    parser.add_argument("--seed", type=int, default=0, help="of the first generated scan")
+    parser.add_argument("--seed", type=seed_number, default=0, help="of the first generated scan")
     parser.add_argument("--bad-points", choices=["refuse", "drop"], default="refuse", help="NaN, infinite or at 0")
     parser.add_argument("--bad-scans", choices=["refuse", "skip"], default="refuse", help="that cannot be used")
     parser.add_argument("--overwrite", action="store_true", help="replace what is there already")

@@ -13,6 +13,7 @@ from lidargrit import _discovery
 from lidargrit.errors import DataError
 from lidargrit.formats import BadPoints
 from lidargrit.structures import Scan
+from lidargrit.untrusted import user_path
 
 
 @dataclass(frozen=True)
@@ -198,17 +199,17 @@ def recognise(root: Path, crawl: bool = True) -> str | None:
 
 def _is_there(text: str) -> bool:
     try:
-        return Path(text).expanduser().exists()
-    except OSError:  # a name longer than names can be
+        return user_path(text).exists()
+    except DataError:  # no file can be called so
         return False
 
 
 def _root_and_split(text: str) -> tuple[Path, str]:
     if _is_there(text):  # colons and brackets of a folder that exists are its own
-        return Path(text).expanduser(), "all"
+        return user_path(text), "all"
     share = re.search(r"\[[^\]/]*\]$", text)
     before = text[: share.start()] if share else text
     root, colon, split = before.rpartition(":")
     if not colon:
         root, split = before, "all"
-    return Path(root).expanduser(), split + (share[0] if share else "")
+    return user_path(root), split + (share[0] if share else "")

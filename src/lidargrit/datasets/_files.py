@@ -6,7 +6,7 @@ import hashlib
 import os
 from abc import abstractmethod
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from fnmatch import fnmatchcase
 from itertools import islice
 from pathlib import Path
@@ -15,10 +15,11 @@ from typing import ClassVar
 from lidargrit import formats
 from lidargrit.datasets import ScanDataset, recognise
 from lidargrit.datasets._splits import Split
-from lidargrit.errors import DataError, OutputError, nearest_names
+from lidargrit.errors import DataError, OutputError, UsageError, nearest_names
 from lidargrit.formats import BadPoints
 from lidargrit.sensors import load_sensor
 from lidargrit.structures import Scan
+from lidargrit.untrusted import check_word
 
 _NAMED_AT_MOST = 5  # sequences in a message
 _SUBFOLDERS_AT_MOST = 100  # where a root is looked for that is one folder further down
@@ -39,6 +40,7 @@ class FileDataset(ScanDataset):
         found = {path: self.sequence_of(path.relative_to(root)) for path in self._find(root)}
         if not found:
             raise self._wrong_root()
+        _check_names(found)
         wanted = Split.parse(split)
         chosen = self._choose(wanted, set(found.values()))
         paths = [path for path, sequence in found.items() if sequence in chosen]
@@ -189,6 +191,15 @@ class FileDataset(ScanDataset):
         here, depth = self.root.resolve(), self.patterns[0].count("/")
         below = (one for one in sorted(islice(here.iterdir(), _SUBFOLDERS_AT_MOST)) if one.is_dir())
         return next((one for one in (*below, *here.parents[:depth]) if self._pattern_in(one)), None)
+
+
+def _check_names(paths: Iterable[Path]) -> None:
+    """Refuse file names that are not UTF-8: they cannot be printed, nor written to a file for other programs."""
+    try:
+        for path in paths:
+            check_word(str(path))
+    except UsageError as error:
+        raise DataError(error.got, error.wanted, error.cure) from None
 
 
 def scans_below(root: Path) -> Iterator[Path]:

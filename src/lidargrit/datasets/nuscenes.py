@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from bisect import bisect_right
 from collections.abc import Iterable
 from pathlib import Path
@@ -12,7 +11,8 @@ from lidargrit import formats
 from lidargrit.datasets import SplitScheme
 from lidargrit.datasets._files import FileDataset, unnamed_recording
 from lidargrit.datasets._splits import Split
-from lidargrit.errors import DataError, ScanError
+from lidargrit.errors import DataError
+from lidargrit.files import read_json
 from lidargrit.formats import BadPoints
 
 _TABLE_BYTES_AT_MOST = 50_000_000  # sample.json, the largest, has 9 MB
@@ -135,7 +135,7 @@ def _read_scenes(root: Path) -> dict[str, list[tuple[int, int, str]]]:
                 if known := times.get(scene["token"]):
                     span = (min(known), max(known), str(scene["name"]))
                     logs.setdefault(log_files[scene["log_token"]], []).append(span)
-        except (KeyError, TypeError, ValueError, OverflowError, RecursionError, ScanError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
             what = " ".join(str(error).split())[:200]
             raise DataError(
                 f"{table.parent}, whose tables cannot be used ({what})",
@@ -146,4 +146,4 @@ def _read_scenes(root: Path) -> dict[str, list[tuple[int, int, str]]]:
 
 
 def _read_table(path: Path) -> list[dict[str, Any]]:
-    return json.loads(formats.read_bytes(path, _TABLE_BYTES_AT_MOST, "a table of nuScenes"))
+    return read_json(path, list, DataError, "a table of nuScenes", "unpack it again", _TABLE_BYTES_AT_MOST)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -10,9 +9,8 @@ from typing import Any
 
 from lidargrit.errors import DataError
 from lidargrit.evaluation.intervals import Interval, RealAgainstReal
+from lidargrit.files import read_json
 from lidargrit.structures import MetricResult
-
-_FILE_BYTES_AT_MOST = 200_000_000  # curves of a dozen metrics take a few MB
 
 
 @dataclass(frozen=True)
@@ -135,11 +133,7 @@ class Scorecard:
         """
         wanted, cure = "the scores that lidargrit evaluate --json wrote", "check the path, or evaluate again"
         try:
-            if not path.is_file():
-                raise OSError("no such file")
-            if path.stat().st_size > _FILE_BYTES_AT_MOST:
-                raise OSError("too large")
-            data = json.loads(path.read_text(encoding="utf-8"))
+            data = read_json(path, error=DataError, wanted=wanted, cure=cure)
             protocol = dict(data["protocol"])
             return cls(
                 str(protocol.pop("name")),
@@ -153,7 +147,9 @@ class Scorecard:
                 dict(data["settings"]),
                 dict(data["versions"]),
             )
-        except (OSError, KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        except DataError:
+            raise
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise DataError(f"{path}, which cannot be used ({type(error).__name__}: {error})", wanted, cure) from None
 
     def as_table(self) -> str:

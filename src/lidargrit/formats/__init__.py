@@ -124,8 +124,10 @@ def read_scan(path: Path | str, index: int = 0, bad_points: BadPoints = "refuse"
         ScanError: the file cannot be used; says what is wrong and what to do.
     """
     form = recognise(Path(path))
-    if index and not 0 <= index < (count := form.count(Path(path))):
-        raise ScanError(f"scan number {index} of {path}", f"one of its {count}, counted from 0", "take a lower number")
+    if index:  # counting reads a whole recording
+        count = form.count(Path(path))
+        if not 0 <= index < count:
+            raise ScanError(f"scan number {index} of {path}", f"one of its {count}, counted from 0", "take another")
     return form.read(Path(path), index, bad_points)
 
 

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import math
-import struct
-import warnings
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from io import BufferedReader, BytesIO
 from pathlib import Path
 
 import numpy as np
 
+from lidargrit.arrays import HEADER_BYTES_AT_MOST, open_archive, parse_array, read_member
 from lidargrit.errors import ScanError
 from lidargrit.files import atomic_path
 from lidargrit.formats import POINTS_AT_MOST, BadPoints, ScanFormat, damaged, first_bytes, open_file, read_bytes
@@ -18,12 +18,9 @@ from lidargrit.formats._columns import BYTES_AT_MOST, REFLECTANCE_RULE, columns_
 from lidargrit.structures import Scan
 
 _FORMAT = "an .npy of n rows of 3 to 5 numbers, or an .npz with an array points of n rows"
-_HEADER_BYTES_AT_MOST = 1024  # of an array; numpy writes 118, and reads it as a Python expression
 _VALUE_BYTES_AT_MOST = 16  # numpy's widest number
-_DIRECTORY_BYTES_AT_MOST = 65_536  # of an archive: a thousand arrays
 _ROWS = ("x", "y", "z", "intensity", "ring")
 _POINTS = ("points", "xyz", "points_xyz_m")
-_END_BYTES, _END_BYTES_64 = 22, 20  # of the records that end an archive; the second only in archives over 4 GB
 
 
 class NumpyArray(ScanFormat):
@@ -56,7 +53,11 @@ class NumpyArray(ScanFormat):
         """Read the scan in a file."""
         data = read_bytes(path, BYTES_AT_MOST, _FORMAT)
         if data.startswith(b"\x93NUMPY"):
-            columns = _row_columns(_array(data, path), path)
+            try:
+                rows = parse_array(data)
+            except ValueError as error:
+                raise damaged(path, _FORMAT, error) from None
+            columns = _row_columns(rows, path)
         else:
             with _archive(BytesIO(data), path) as archive:
                 columns = _archive_columns(archive, path)
@@ -77,8 +78,8 @@ class NumpyArray(ScanFormat):
 
 
 def _row_columns(rows: np.ndarray, path: Path) -> dict[str, np.ndarray]:
-    if rows.ndim != 2 or not 3 <= rows.shape[1] <= len(_ROWS):
-        raise _refused(f"an array of shape {rows.shape}", path)
+    if rows.dtype.kind == "b" or rows.ndim != 2 or not 3 <= rows.shape[1] <= len(_ROWS) or len(rows) > POINTS_AT_MOST:
+        raise _refused(f"an array of {rows.dtype} and shape {rows.shape}", path)
     return dict(zip(_ROWS, rows.T, strict=False))
 
 
@@ -87,69 +88,31 @@ def _archive_columns(archive: zipfile.ZipFile, path: Path) -> dict[str, np.ndarr
     points_name = next((name for name in _POINTS if name in members), None)
     if points_name is None:
         raise _refused(f"the arrays {', '.join(map(ascii, list(members)[:8]))[:120]}", path)
-    columns = _row_columns(_member(archive, members.pop(points_name), BYTES_AT_MOST, path), path)
-    at_most = _VALUE_BYTES_AT_MOST * len(columns["x"]) + _HEADER_BYTES_AT_MOST
+    columns = _row_columns(read_member(archive, members.pop(points_name), BYTES_AT_MOST), path)
+    at_most = _VALUE_BYTES_AT_MOST * len(columns["x"]) + HEADER_BYTES_AT_MOST
     for member, info in members.items():
         name = known_name(member)
         # What else is in the archive is not unpacked, nor the same name again: with other capitals there are hundreds.
         if not name or name in columns:
             continue
-        columns[name] = _member(archive, info, at_most, path)
-        if columns[name].shape != columns["x"].shape:
-            raise _refused(f"{columns['x'].shape[0]} points, but {name} of shape {columns[name].shape}", path)
+        columns[name] = read_member(archive, info, at_most)
+        if columns[name].dtype.kind == "b" or columns[name].shape != columns["x"].shape:
+            raise _refused(
+                f"{columns['x'].shape[0]} points, but {name} of {columns[name].dtype} and shape {columns[name].shape}",
+                path,
+            )
     return columns
 
 
-def _member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, at_most: int, path: Path) -> np.ndarray:
-    """Unpack one array of an archive, after a look at how many bytes it says that it is."""
-    if info.file_size > at_most or info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise _refused(f"{info.file_size:,} bytes in one array, packed by method {info.compress_type}", path)
+@contextmanager
+def _archive(file: BytesIO | BufferedReader, path: Path) -> Iterator[zipfile.ZipFile]:
+    """Open an archive, or say in one line what is wrong with it or with an array that is read from it."""
     try:
-        with archive.open(info) as file:
-            data = file.read(info.file_size)  # never more, whatever the packed bytes would unpack to
-    except Exception as error:  # a damaged archive is met with errors of many kinds
-        raise damaged(path, _FORMAT, error) from None
-    return _array(data, path)
-
-
-def _array(data: bytes, path: Path) -> np.ndarray:
-    """Return the array in the bytes of an .npy file, after a look at its header."""
-    file = BytesIO(data)
-    try:
-        version = np.lib.format.read_magic(file)
-        length = struct.unpack("<H" if version == (1, 0) else "<I", file.read(2 if version == (1, 0) else 4))[0]
-        if version not in ((1, 0), (2, 0)) or length > _HEADER_BYTES_AT_MOST:
-            raise ValueError(f"version {version}, a header of {length} bytes")
-        file.seek(-2 if version == (1, 0) else -4, 1)
-        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        with warnings.catch_warnings(action="ignore"):  # of headers that Python 2 wrote
-            shape, by_column, dtype = read(file, max_header_size=_HEADER_BYTES_AT_MOST)
-    except Exception as error:  # a damaged header is met with errors of many kinds
-        raise damaged(path, _FORMAT, error) from None
-    if dtype.kind not in "fiu" or not 0 < len(shape) <= 2 or min(shape) < 0 or shape[0] > POINTS_AT_MOST:
-        raise _refused(f"an array of {ascii(dtype)[:40]} and shape {str(shape)[:60]}", path)
-    there, wanted = len(data) - file.tell(), math.prod(shape) * dtype.itemsize
-    if there < wanted:
-        raise _refused(f"{there} bytes of an array that needs {wanted}", path)
-    values = np.frombuffer(data, dtype, math.prod(shape), file.tell())
-    return values.reshape(shape, order="F" if by_column else "C")
-
-
-def _archive(file: BytesIO | BufferedReader, path: Path) -> zipfile.ZipFile:
-    """Open an archive, after a look at how large it says that its directory is."""
-    try:
-        size = file.seek(0, 2)
-        file.seek(max(0, size - _END_BYTES - _END_BYTES_64))
-        end = file.read()
-        directory_bytes = struct.unpack("<4s8xI6x", end[-_END_BYTES:])[1]
-        if (
-            end[-_END_BYTES:][:4] != b"PK\5\6"
-            or end.startswith(b"PK\6\7")
-            or directory_bytes > _DIRECTORY_BYTES_AT_MOST
-        ):
-            raise zipfile.BadZipFile(f"no directory of at most {_DIRECTORY_BYTES_AT_MOST} bytes at its end")
-        return zipfile.ZipFile(file)
-    except Exception as error:  # a damaged directory is met with errors of many kinds
+        with open_archive(file) as archive:
+            yield archive
+    except ScanError:
+        raise
+    except ValueError as error:
         raise damaged(path, _FORMAT, error) from None
 
 

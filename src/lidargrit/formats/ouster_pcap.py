@@ -12,7 +12,8 @@ import numpy as np
 import torch
 
 from lidargrit.errors import ScanError
-from lidargrit.formats import BadPoints, ScanFormat, first_bytes, open_file, read_bytes, scan_of
+from lidargrit.files import read_json
+from lidargrit.formats import BadPoints, ScanFormat, first_bytes, open_file, scan_of
 from lidargrit.formats._packets import PCAP, PCAPNG, check_packets
 from lidargrit.sensors import SensorModel, column_azimuths_rad, load_sensor
 from lidargrit.structures import Scan
@@ -166,14 +167,7 @@ def _metadata_of(path: Path) -> Path:
 
 
 def _read_json(path: Path) -> dict[str, Any]:
-    data = read_bytes(path, _METADATA_BYTES_AT_MOST, "the metadata of an Ouster sensor")
-    try:
-        content = json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise _unusable(path, error) from None
-    if not isinstance(content, dict):
-        raise _unusable(path, TypeError("no named entries"))
-    return content
+    return read_json(path, dict, ScanError, _FORMAT, _CURE, _METADATA_BYTES_AT_MOST)
 
 
 def _section(data: dict[str, Any], name: str) -> dict[str, Any]:

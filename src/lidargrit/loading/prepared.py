@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import threading
 from dataclasses import asdict, dataclass, fields
-from pathlib import Path
 from typing import Any
 
 from lidargrit.determinism import evenly_spaced
@@ -13,6 +12,7 @@ from lidargrit.errors import DataError
 from lidargrit.loading.images import Pixels, Provenance
 from lidargrit.loading.shards import Bytes, Entry, LocalBytes, read_image, read_index
 from lidargrit.sensors import SensorModel
+from lidargrit.untrusted import user_path
 
 PLAN_FILE, SCANS_FILE = "plan.json", "scans.json"
 FORMAT = 2  # to be raised whenever projection or simulation give other pixels for the same scan
@@ -79,8 +79,8 @@ def unfinished_name(shard: int) -> str:
 def is_prepared(source: str) -> bool:
     """Tell whether a source is where prepared scans lie: a URL, or a folder with a plan."""
     try:
-        return "://" in source or (Path(source).expanduser() / PLAN_FILE).is_file()
-    except OSError:  # a name longer than names can be
+        return "://" in source or (user_path(source) / PLAN_FILE).is_file()
+    except (OSError, DataError):  # no file can be called so, or no home folder is there
         return False
 
 
@@ -113,7 +113,7 @@ class PreparedFolder:
         """
         try:
             if self._is_local:
-                return LocalBytes(Path(self.location).expanduser() / name)
+                return LocalBytes(user_path(self.location) / name)
             return _RemoteBytes(self._files, f"{self._root}/{name}")
         except (OSError, ValueError) as error:  # an empty file cannot be mapped
             raise DataError(

@@ -15,7 +15,7 @@ def usable_device(name: str) -> torch.device:
     """
     try:
         device = torch.device(name)
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError):  # an assertion: PyTorch was built without it
+        torch.zeros(1, device=device).item()  # "meta" has shapes and no numbers
+    except (RuntimeError, AssertionError, NotImplementedError):  # an assertion: PyTorch was built without it
         raise ConfigError(f"device {name!r}", "one that PyTorch finds on this computer", "try cpu or cuda") from None
     return device

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Literal, get_args
 
 import torch
@@ -14,11 +12,11 @@ from torch import Tensor
 
 from lidargrit import _discovery
 from lidargrit.errors import ConfigError
-from lidargrit.sensors._checks import check_projection, check_tables, checked_entries
+from lidargrit.files import read_json
+from lidargrit.sensors._checks import FINE_COLUMNS_AT_MOST, check_projection, check_tables, checked_entries
+from lidargrit.untrusted import user_path
 
 ProjectionName = Literal["spherical", "unfolding"]
-
-_FILE_BYTES_AT_MOST = 100_000_000  # 128x2048 angles of each pixel, twice, take 12 MB of text
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,10 +82,10 @@ class SensorModel:
 
         The azimuth of a kept column is that of its own centre, pi - 2 pi (stride j + 1/2) / columns.
         """
-        if columns < 1 or stride < 1 or columns % stride:
+        if not 1 <= columns <= FINE_COLUMNS_AT_MOST or stride < 1 or columns % stride:
             raise ConfigError(
                 f"{columns} columns, every {stride}th kept",
-                "a positive multiple of the stride",
+                f"a multiple of the stride from 1 to {FINE_COLUMNS_AT_MOST}",
                 "change one of the two",
             )
         if self.elevation_rad.shape[1] > 1 or self.azimuth_rad.shape[0] > 1:
@@ -152,21 +150,8 @@ def load_sensor(name: str) -> SensorModel:
     """
     if not name.endswith(".json"):
         return _discovery.load_instance("sensors", name, SensorModel)
-    path, wanted, cure = (
-        Path(name),
-        "the JSON of a sensor",
-        "write one with: lidargrit fit-sensor, or SensorModel.to_json",
-    )
-    if path.exists() and not path.is_file():  # opening a pipe or a device would hang
-        raise ConfigError(f"the sensor file {name}, which is not a file", wanted, cure)
-    try:
-        if path.stat().st_size > _FILE_BYTES_AT_MOST:
-            raise ConfigError(f"the sensor file {name}, which is larger than any sensor's", wanted, cure)
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except ConfigError:
-        raise
-    except (OSError, ValueError, RecursionError) as error:
-        raise ConfigError(f"the sensor file {name}, which cannot be read ({error})", wanted, cure) from None
+    wanted, cure = "the JSON of a sensor", "write one with: lidargrit fit-sensor, or SensorModel.to_json"
+    data = read_json(user_path(name, ConfigError), error=ConfigError, wanted=wanted, cure=cure)
     try:
         return SensorModel.from_json(data)
     except ConfigError as error:

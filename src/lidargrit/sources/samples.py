@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
-import zipfile
-import zlib
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import asdict
@@ -16,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from lidargrit import configuration
+from lidargrit.arrays import HEADER_BYTES_AT_MOST, read_arrays
 from lidargrit.errors import CheckpointError, ConfigError, DataError, OutputError, ScanError
 from lidargrit.files import atomic_path, claim_folder, is_taken, read_json, remove_partials, write_json, write_text
 from lidargrit.generators import RUN_FILE, TRAINED_ON_FILE, WEIGHTS_FILE, Generator, recipe_settings
@@ -26,11 +26,6 @@ from lidargrit.structures import RangeImage
 
 MANIFEST = "samples.json"
 _LATER_ENTRIES = ("projection_variant", "generator")  # not in folders of before they existed
-
-_UNREADABLE = (  # what numpy and zipfile raise on damaged bytes, RuntimeError also where a bit says "encrypted"
-    *(OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, RuntimeError),
-    *(zipfile.BadZipFile, zlib.error),
-)
 
 
 def write_samples(
@@ -173,10 +168,12 @@ class _Files:
         path = self._paths[index]
         cure = "remove the file and sample again"
         try:
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as opened:
-                range_m = opened["range_m"]
-                reflectance = opened.get("reflectance")
-        except _UNREADABLE as error:
+            with path.open("rb") as file:
+                arrays = read_arrays(
+                    file, ("range_m", "reflectance"), 8 * math.prod(self._shape) + HEADER_BYTES_AT_MOST
+                )
+            range_m, reflectance = arrays["range_m"], arrays.get("reflectance")
+        except (OSError, ValueError, KeyError) as error:
             raise ScanError(f"{path}, which cannot be read ({error})", "an .npz with range_m", cure) from None
         if range_m.shape != self._shape or range_m.dtype != np.float32:
             raise ScanError(

@@ -1,0 +1,191 @@
+"""Words, JSON and arrays that others wrote: each has a bound, and each refusal is one line."""
+
+import io
+import json
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lidargrit.api import load_scan
+from lidargrit.arrays import open_archive, parse_array, read_arrays
+from lidargrit.cli import main
+from lidargrit.errors import CheckpointError, ConfigError, DataError, LidarGritError, ScanError, UsageError
+from lidargrit.files import read_json, read_text, write_json
+from lidargrit.nn.devices import usable_device
+from lidargrit.untrusted import check_path, parse_json, positive_number, seed_number, user_path, whole_number
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("[" * 100_000, "nested more than 32 deep"),
+        ('{"a":' * 40 + "1" + "}" * 40, "nested more than 32 deep"),
+        ('{"a": NaN}', "NaN, which is not JSON"),
+        ('{"a": -Infinity}', "-Infinity, which is not JSON"),
+        ('{"a": 1e400}', "1e400, which no float can hold"),
+        ('{"a": ' + "9" * 5000 + "}", "cannot be used"),
+        ("null", "null in place of an object"),
+        ("[]", "a list in place of an object"),
+        ('"a', "cannot be used"),
+        ("", "cannot be used"),
+        (b"\xff\xfe\xfd", "cannot be used"),
+    ],
+)
+def test_json_that_is_refused_in_one_line(text, why):
+    with pytest.raises(CheckpointError, match=f"got here, which .*{why}") as refused:
+        parse_json(text, "here")
+    assert len(str(refused.value)) < 300
+    assert "\n" not in str(refused.value)
+
+
+def test_json_as_deep_as_is_allowed_is_read():
+    text = '{"a":' * 32 + "1" + "}" * 32
+    assert json.dumps(parse_json(text, "here"), separators=(",", ":")) == text
+
+
+def test_json_files_that_are_too_large_or_no_files(tmp_path):
+    (tmp_path / "large.json").write_text("[" + "1," * 1000 + "1]")
+    with pytest.raises(DataError, match=r"large.json, which cannot be read \(more than 1,000 bytes\)"):
+        read_json(tmp_path / "large.json", list, DataError, at_most=1000)
+    with pytest.raises(DataError, match=r"/dev/zero, which cannot be read \(not a file\)"):
+        read_json(Path("/dev/zero"), dict, DataError)
+    with pytest.raises(ConfigError, match=r"/dev/zero, which cannot be read \(not a file\)"):
+        read_text(Path("/dev/zero"))
+    with pytest.raises(CheckpointError, match=r"none\.json, which cannot be read \(no such file\)"):
+        read_json(tmp_path / "none.json")
+
+
+def test_what_is_written_as_json_is_strict_json(tmp_path):
+    write_json(tmp_path / "a.json", {"a": float("nan"), "b": [1.5, float("inf")], "c": (1, None)})
+    assert read_json(tmp_path / "a.json") == {"a": None, "b": [1.5, None], "c": [1, None]}
+
+
+@pytest.mark.parametrize(
+    ("check", "word"),
+    [
+        *((whole_number, word) for word in ("-1", "1e9", "99999999999999999999", "9" * 100_000, "", "x", "1.0")),
+        *((seed_number, word) for word in (str(2**63), str(2**64), "-1", "x")),
+        *((positive_number, word) for word in ("nan", "inf", "1e400", "-1", "x", "1" * 400)),
+        *((check_path, word) for word in ("", " ", "a\0b", "\udcff", "x" * 256, "a/" * 3000)),
+    ],
+)
+def test_words_that_are_refused_in_one_line(check, word):
+    with pytest.raises(UsageError) as refused:
+        check(word)
+    assert len(str(refused.value)) < 200
+    assert str(refused.value).isprintable()
+
+
+def test_words_that_are_accepted():
+    assert (whole_number("0"), whole_number("10000000"), seed_number(str(2**63 - 1))) == (0, 10_000_000, 2**63 - 1)
+    assert (positive_number("2e14"), positive_number("0")) == (2e14, 0.0)
+    assert check_path("/daten/Straße") == Path("/daten/Straße")
+    assert user_path("~/x").is_absolute()
+    with pytest.raises(DataError, match="a home folder that is not there"):
+        user_path("~nobody_of_that_name/x")
+
+
+@pytest.mark.parametrize(
+    ("words", "got"),
+    [
+        (["sample", "pretrained", "out", "-n", "99999999999999999999"], "-n 99999999999999999999"),
+        (["sample", "pretrained", "out", "--seed", str(2**64)], f"--seed {2**64}"),
+        (["sample", "pretrained", "out", "--device", "meta"], "device 'meta'"),
+        (["evaluate", "~nobody_of_that_name/x", "y"], "home folder"),
+        (["evaluate", "x" * 300, "y"], "too long"),
+        (["inspect", "\udcff.bin"], "not UTF-8"),
+        (["inspect", "a\0b"], "NUL"),
+        (["publish", "pretrained", "out", "--notes", "/dev/zero"], "/dev/zero"),
+        (["compare", "out", "small", "--flops", "nan"], "--flops nan"),
+        (["train", "small", "out", "--set", "data.columns=1000000000", "--dry-run"], "1000000000 columns"),
+        (["train", "small", "out", "--set", f"data.columns={-(2**63)}", "--dry-run"], "columns"),
+    ],
+)
+def test_commands_refuse_in_one_line(words, got, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(words) == 2
+    said = capsys.readouterr().err
+    assert got in said
+    assert said.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_files_whose_names_are_not_utf8_are_refused_in_one_line(tmp_path, capsys):
+    (tmp_path / "\udcff.bin").write_bytes(bytes(64))
+    assert main(["inspect", str(tmp_path)]) == 2
+    assert "which is not UTF-8" in capsys.readouterr().err
+
+
+def npy(array: np.ndarray, header: dict | None = None) -> bytes:
+    file = io.BytesIO()
+    np.save(file, array)
+    if header is None:
+        return file.getvalue()
+    forged = io.BytesIO()
+    np.lib.format.write_array_header_1_0(forged, header)
+    return forged.getvalue() + array.tobytes()
+
+
+def npz(**members: bytes) -> io.BytesIO:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in members.items():
+            archive.writestr(f"{name}.npy", data)
+    return file
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        {"descr": "<f4", "fortran_order": False, "shape": (True, 4)},
+        {"descr": "<f4", "fortran_order": False, "shape": (-1, 4)},
+        {"descr": "<f4", "fortran_order": False, "shape": (10**12, 4)},
+        {"descr": "|O", "fortran_order": False, "shape": (4,)},
+        {"descr": "<f4", "fortran_order": False, "shape": (1,) * 9},
+    ],
+)
+def test_headers_of_arrays_that_are_refused(header, tmp_path):
+    data = npy(np.ones(4, np.float32), header)
+    with pytest.raises(ValueError, match=r"array"):
+        parse_array(data)
+    (tmp_path / "scan.npy").write_bytes(data)
+    with pytest.raises(ScanError, match=r"scan\.npy"):
+        load_scan(tmp_path / "scan.npy")
+
+
+def test_arrays_are_read_as_numpy_reads_them():
+    for array in (np.arange(12, dtype="<f4").reshape(3, 4), np.asfortranarray(np.ones((2, 3))), np.zeros(0, bool)):
+        assert np.array_equal(parse_array(npy(array)), array)
+        assert np.array_equal(read_arrays(npz(a=npy(array)), ("a", "b"))["a"], array)
+
+
+def test_an_archive_is_not_unpacked_beyond_what_is_allowed():
+    bomb = npz(a=npy(np.zeros(50_000_000, np.uint8)))
+    assert len(bomb.getvalue()) < 100_000
+    with pytest.raises(ValueError, match="bytes in one array"):
+        read_arrays(bomb, ("a",), 1_000_000)
+    assert read_arrays(bomb, ("b",), 1_000_000) == {}
+
+
+def test_a_member_that_is_no_array():
+    with pytest.raises(ValueError, match="damaged array"):
+        read_arrays(npz(a=b"not an array"), ("a",))
+    with pytest.raises(ValueError, match="directory"):
+        open_archive(io.BytesIO(b"not an archive, but longer than the end of one"))
+
+
+def test_scans_are_counted_from_0(tmp_path):
+    np.save(tmp_path / "scan.npy", np.ones((10, 3), np.float32))
+    assert len(load_scan(tmp_path / "scan.npy", 0)) == 10
+    for index in (-1, 1):
+        with pytest.raises(ScanError, match=f"scan number {index} of .*one of its 1, counted from 0"):
+            load_scan(tmp_path / "scan.npy", index)
+
+
+def test_a_device_without_numbers_is_refused():
+    assert usable_device("cpu").type == "cpu"
+    for name in ("meta", "nonsense", "cuda:99"):
+        with pytest.raises(LidarGritError, match="one that PyTorch finds"):
+            usable_device(name)
