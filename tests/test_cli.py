@@ -15,7 +15,7 @@ from PIL import Image
 
 import lidargrit
 from lidargrit import _discovery
-from lidargrit.cli import main
+from lidargrit.cli import build_parser, main
 from lidargrit.datasets import load
 from lidargrit.evaluation.scorecard import format_value
 from lidargrit.formats import read_scan as read_bin
@@ -319,7 +319,7 @@ def python(program: str, *words: object, **options) -> subprocess.CompletedProce
 def test_help_of_every_verb_loads_no_torch_and_opens_with_examples():
     program = """
 import contextlib, sys
-from lidargrit.cli import main
+from lidargrit.cli import build_parser, main
 for words in ([], *([word] for word in sys.argv[1:])):
     with contextlib.suppress(SystemExit):
         main([*words, "--help"])
@@ -345,3 +345,13 @@ def test_a_reader_that_has_seen_enough_is_no_error():
         command = [sys.executable, "-m", "lidargrit", "list"]
         done = subprocess.run(command, stdout=pipe, stderr=subprocess.PIPE, text=True, timeout=60, check=False)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_every_option_says_what_it_is():
+    for verb in build_parser().verbs():
+        for action in verb._actions:
+            about = (verb.prog, action.dest, action.help)
+            assert action.help, about
+            assert len(action.help.split()) >= 3, about
+            assert not re.match(r"(of|for|that|as|in all|likewise|evenly|see)\b", action.help), about
+            assert len(verb.format_help()) > 200, about

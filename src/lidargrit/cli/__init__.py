@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from lidargrit import __version__, _discovery
-from lidargrit.cli._words import EXIT_CODES, Parser
+from lidargrit.cli._words import EXIT_CODES, HelpFormatter, Parser
 from lidargrit.errors import LidarGritError, Terminated, UsageError
 
 _EXAMPLES = """\
@@ -74,7 +74,7 @@ def _let_threads_sleep() -> None:
 
 def build_parser() -> Parser:
     """Return the parser of all verbs; the verbs themselves are not imported beyond their words."""
-    raw: dict[str, Any] = {"formatter_class": argparse.RawDescriptionHelpFormatter, "epilog": EXIT_CODES}
+    raw: dict[str, Any] = {"formatter_class": HelpFormatter, "epilog": EXIT_CODES}
     parser = Parser(prog="lidargrit", usage="lidargrit VERB ...", description=_EXAMPLES, **raw)
     parser.add_argument("--version", action="version", version=f"lidargrit {__version__}")
     verbs = parser.add_subparsers(title="verbs", metavar="", dest="verb", prog="lidargrit")

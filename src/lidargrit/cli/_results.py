@@ -19,12 +19,12 @@ from lidargrit.untrusted import check_path
 STANDARD_OUTPUT = Path("-")
 
 
-def add_json(parser: argparse.ArgumentParser, files: str = "the file of --json") -> None:
+def add_json(parser: argparse.ArgumentParser, files: str = "files") -> None:
     """Add ``--json [FILE.json]``, and ``--overwrite`` for the ``files`` that it may replace."""
-    told = "print the result as JSON, or with a name also write it to that file"
-    place = {"nargs": "?", "const": STANDARD_OUTPUT, "type": _place, "metavar": "FILE.json"}
-    parser.add_argument("--json", help=told, **place)
-    parser.add_argument("--overwrite", action="store_true", help=f"replace {files}, if there already")
+    what = "print the result as JSON; with a file name, print the table and write the JSON to the file"
+    file = {"nargs": "?", "const": STANDARD_OUTPUT, "type": _json_file, "metavar": "FILE.json"}
+    parser.add_argument("--json", help=what, **file)
+    parser.add_argument("--overwrite", action="store_true", help=f"replace {files} if they exist")
 
 
 def refuse_taken(options: argparse.Namespace) -> None:
@@ -53,7 +53,7 @@ def tell(options: argparse.Namespace, text: str, result: Any, done: str = "") ->
         print(done, file=sys.stderr if options.json == STANDARD_OUTPUT else sys.stdout)
 
 
-def _place(word: str) -> Path:
+def _json_file(word: str) -> Path:
     if word == str(STANDARD_OUTPUT):
         return STANDARD_OUTPUT
     if Path(word).suffix.lower() != ".json":  # a word of the command that came to stand behind --json

@@ -25,6 +25,17 @@ _SAID = (
 )
 
 
+class HelpFormatter(argparse.RawDescriptionHelpFormatter):
+    """Adds its default to the help of every option that has one and does not describe it itself."""
+
+    def _get_help_string(self, action: argparse.Action) -> str:
+        text = action.help or ""
+        has_default = isinstance(action.default, (int, float, str, Path)) and not isinstance(action.default, bool)
+        is_told = "default" in text or action.default in ("", argparse.SUPPRESS)
+        shown = has_default and action.option_strings and not is_told
+        return f"{text} (default: %(default)s)" if shown else text
+
+
 class Parser(argparse.ArgumentParser):
     """argparse's parser, which raises our error in place of printing its usage and leaving."""
 

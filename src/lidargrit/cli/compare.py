@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from lidargrit.cli._options import add_settings
 from lidargrit.cli._results import add_json, refuse_taken, tell
 
 EXAMPLES = """\
@@ -16,19 +17,21 @@ EXAMPLES = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
-    parser.add_argument("out", type=Path, help="folder of runs, samples and scores; the same command goes on there")
-    drawn = "recipes or finished runs; RECIPE:NAME=VALUE,... tells how it is drawn from"
-    parser.add_argument("systems", nargs="+", metavar="SYSTEM", help=drawn)
-    parser.add_argument("--against", default="simulated:256:test", help="real scans (default: simulated:256:test)")
-    parser.add_argument("-n", "--count", type=int, default=256, help="samples of each (default: 256)")
-    parser.add_argument("--protocol", default="exact", help="see: lidargrit list protocols (default: exact)")
-    parser.add_argument("--metrics", nargs="+", default=[], help="in place of the protocol's: lidargrit list metrics")
-    settings = "settings of every recipe, such as data.train=..."
-    parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help=settings)
-    budget = "operations that the training of each takes (default: each recipe's own budget)"
+    parser.add_argument("out", type=Path, help="folder for runs, samples and scores; the same command continues there")
+    what = "name of a recipe or folder of a finished run; SYSTEM:NAME=VALUE,... also sets how it is sampled"
+    parser.add_argument("systems", nargs="+", metavar="SYSTEM", help=what)
+    parser.add_argument("--against", default="simulated:256:test", metavar="SOURCE", help="real scans to compare with")
+    parser.add_argument("-n", "--count", type=int, default=256, help="number of samples of each system")
+    parser.add_argument("--protocol", default="exact", help="name of a protocol, see: lidargrit list protocols")
+    parser.add_argument(
+        "--metrics", nargs="+", default=[], help="metrics instead of the protocol's, see: lidargrit list metrics"
+    )
+    settings = "settings to change in every recipe, such as data.train=/data/scans"
+    add_settings(parser, settings)
+    budget = "training budget of each system in floating-point operations (default: each recipe's own)"
     parser.add_argument("--flops", type=float, default=0.0, help=budget)
-    parser.add_argument("--batch-size", type=int, default=8, help="scans drawn at once (default: 8)")
-    parser.add_argument("--format", choices=["text", "markdown", "latex"], default="text", help="of the table")
+    parser.add_argument("--batch-size", type=int, default=8, help="number of scans sampled at once")
+    parser.add_argument("--format", choices=["text", "markdown", "latex"], default="text", help="format of the table")
     add_json(parser)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from lidargrit.cli._options import add_bad_scans
 from lidargrit.cli._results import add_json, refuse_taken, tell
 from lidargrit.untrusted import seed_number
 
@@ -16,14 +17,19 @@ EXAMPLES = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
-    parser.add_argument("real", metavar="REAL", help="a source of real scans")
-    parser.add_argument("-n", "--count", type=int, default=32, help="simulated, and at most so many real (default: 32)")
-    parser.add_argument("--sensor", default="", help="a sensor's name or .json file (default: the data set's own)")
-    parser.add_argument("--fine", action="store_true", help="every column that the sensor fires, not only those kept")
-    parser.add_argument("--seed", type=seed_number, default=0, help="of the first simulated scan")
-    parser.add_argument("-o", "--out", type=Path, default=Path("compare_sim.png"), help="(default: compare_sim.png)")
-    parser.add_argument("--bad-points", choices=["refuse", "drop"], default="refuse", help="NaN, infinite or at 0")
-    parser.add_argument("--bad-scans", choices=["refuse", "skip"], default="refuse", help="that cannot be used")
+    parser.add_argument("real", metavar="REAL", help="source of real scans")
+    parser.add_argument("-n", "--count", type=int, default=32, help="number of simulated scans, and the most real ones")
+    parser.add_argument("--sensor", default="", help="name or .json file of a sensor (default: the data set's)")
+    parser.add_argument(
+        "--fine",
+        action="store_true",
+        help="compare every column that the sensor fires, not only those that the data set keeps",
+    )
+    parser.add_argument("--seed", type=seed_number, default=0, help="seed of the first simulated scan")
+    parser.add_argument(
+        "-o", "--out", type=Path, default=Path("compare_sim.png"), metavar="PNG", help="picture of the curves"
+    )
+    add_bad_scans(parser)
     add_json(parser, "the files of --out and --json")
 
 

@@ -15,7 +15,9 @@ _KINDS = {"recipe": "recipes", "sensor": "sensors", "protocol": "protocols", "me
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
-    parser.add_argument("shell", choices=["bash", "zsh", "fish"], help="whose words to print; start a new one then")
+    parser.add_argument(
+        "shell", choices=["bash", "zsh", "fish"], help="shell to print the script for; start a new shell afterwards"
+    )
 
 
 def run(options: argparse.Namespace) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from lidargrit.cli._options import add_settings
+
 EXAMPLES = """\
   lidargrit demo                                simulated streets, about 11 minutes on two cores
   lidargrit demo --data /data/kitti_odometry    your own scans: a KITTI tree, or any folder of .bin
@@ -13,10 +15,10 @@ EXAMPLES = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
-    parser.add_argument("--data", help="a folder of scans; simulated ones if not given")
+    parser.add_argument("--data", metavar="SOURCE", help="folder of scans (default: simulated scans)")
     parser.add_argument("--out", type=Path, help="run folder (default: runs/demo, or runs/demo-FOLDER)")
-    settings = "change settings of the recipe"
-    parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help=settings)
+    settings = "settings of the recipe to change"
+    add_settings(parser, settings)
 
 
 def run(options: argparse.Namespace) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from lidargrit.cli._options import add_bad_scans, add_projection_variant
 from lidargrit.cli._results import add_json, refuse_taken, tell
 from lidargrit.untrusted import seed_number
 
@@ -20,25 +21,27 @@ EXAMPLES = """\
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
     add = parser.add_argument
-    add("samples", nargs="?", default="", help="samples of ours or of others (.pth), a source of scans, or a run")
-    add("reference", nargs="?", default="", help="likewise; projected with the sensor of the samples")
-    add("--protocol", default="exact", help="exact (default), lidargrit-kitti-360, lidargrit-kitti-odometry, r2dm, ...")
-    add("--metrics", nargs="+", default=[], help="in place of the protocol's; see: lidargrit list metrics")
-    add("--variant", default="", help="one definition of every metric, in place of the protocol's")
-    add("--projection-variant", choices=["exact", "reference"], help="of scans (default: the protocol's)")
-    add("--samples-format", default="", help="r2dm, lidargen or lidargrit, where .pth files do not tell")
-    add("--weights", nargs="+", default=[], metavar="NAME=FILE", help="of pointnet and rangenet53")
-    add("-n", "--max-scans", type=int, default=0, help="at most so many of each; 0 for the protocol's")
-    add("--intervals", type=int, default=20, metavar="B", help="half-samples for intervals; 0 for none (default: 20)")
-    add("--groups", type=int, default=16, metavar="G", help="of neighbouring scans that stay together (default: 16)")
-    add("--seed", type=seed_number, default=0, help="of whatever is drawn")
-    add("--device", default="cpu", help="where trained networks compute: cpu or cuda")
-    add("--bad-points", choices=["refuse", "drop"], default="refuse", help="NaN, infinite or at 0")
-    add("--bad-scans", choices=["refuse", "skip"], default="refuse", help="that cannot be used")
-    add("--report", type=Path, metavar="FILE.html", help="also write one page with scores and pictures")
+    samples = "samples of lidargrit or of another program (.pth), a source of scans, or a run"
+    add("samples", nargs="?", default="", help=samples)
+    reference = "scans to compare with, also any of these; projected with the sensor of the samples"
+    add("reference", nargs="?", default="", help=reference)
+    add("--protocol", default="exact", help="metrics and their definitions, see: lidargrit list protocols")
+    add("--metrics", nargs="+", default=[], help="metrics instead of the protocol's, see: lidargrit list metrics")
+    variant = "published definition of every metric, instead of the protocol's; see: lidargrit list metrics"
+    add("--variant", default="", help=variant)
+    add_projection_variant(parser, default=None)
+    add("--samples-format", default="", help="program that wrote .pth files: r2dm, lidargen or lidargrit")
+    add("--weights", nargs="+", default=[], metavar="NAME=FILE", help="weights of pointnet and rangenet53")
+    add("-n", "--max-scans", type=int, default=0, help="largest number of scans of each; 0 for the protocol's")
+    add("--intervals", type=int, default=20, metavar="B", help="number of half-samples for 95 %% intervals; 0 for none")
+    add("--groups", type=int, default=16, metavar="G", help="number of groups of neighbours kept together in them")
+    add("--seed", type=seed_number, default=0, help="seed of all random choices")
+    add("--device", default="cpu", help="device for feature networks: cpu or cuda")
+    add_bad_scans(parser)
+    add("--report", type=Path, metavar="FILE.html", help="also write a page with scores and pictures")
     add_json(parser, "the files of --json and --report")
-    add("--tables", nargs="+", type=Path, metavar="JSON", help="set files of --json side by side, and do nothing else")
-    add("--format", choices=["text", "markdown", "latex"], default="text", help="of the table (default: text)")
+    add("--tables", nargs="+", type=Path, metavar="JSON", help="only print these files of --json side by side")
+    add("--format", choices=["text", "markdown", "latex"], default="text", help="format of the table")
 
 
 def run(options: argparse.Namespace) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from lidargrit.cli._options import add_bad_scans
+
 EXAMPLES = """\
   lidargrit export samples clouds --format pcd                what a model drew, a file a scan
   lidargrit export samples tree --format kitti_odometry       sequences/00/velodyne/000000.bin, ...
@@ -15,17 +17,20 @@ EXAMPLES = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
-    parser.add_argument("source", help="samples, prepared scans, or scans: NAME:ROOT:SPLIT, a folder, simulated:COUNT")
-    parser.add_argument("out", type=Path, help="an empty folder, or one that the same command began")
+    parser.add_argument(
+        "source", help="samples, prepared scans, or scans: a folder, NAME:ROOT:SPLIT or simulated:COUNT"
+    )
+    parser.add_argument("out", type=Path, help="folder for the files: empty, or begun by the same command")
     parser.add_argument(
         "--format",
         default="kitti_bin",
-        help="bin, pcd, ply, las, npz, a name of: lidargrit list formats, or kitti_odometry for a tree with "
-        "SemanticKITTI's labels (default: kitti_bin)",
+        help="format of the files: bin, pcd, ply, las, npz, a name from: lidargrit list formats, or kitti_odometry for "
+        "a tree with SemanticKITTI's labels",
     )
-    parser.add_argument("-n", "--max-scans", type=int, default=0, help="0 for all")
-    parser.add_argument("--bad-points", choices=["refuse", "drop"], default="refuse", help="NaN, infinite or at 0")
-    parser.add_argument("--bad-scans", choices=["refuse", "skip"], default="refuse", help="that cannot be used")
+    parser.add_argument(
+        "-n", "--max-scans", type=int, default=0, help="number of scans to export, evenly spaced; 0 for all"
+    )
+    add_bad_scans(parser)
 
 
 def run(options: argparse.Namespace) -> None:

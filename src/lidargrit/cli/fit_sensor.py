@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from lidargrit.cli._options import add_bad_points
 from lidargrit.cli._results import add_json, refuse_taken, tell
 
 EXAMPLES = """\
@@ -15,12 +16,12 @@ EXAMPLES = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
-    parser.add_argument("source", help="a folder, a data set or a file of scans that one sensor made")
-    parser.add_argument("-o", "--out", type=Path, default=Path("my_sensor.json"), help="(default: my_sensor.json)")
-    parser.add_argument("--picture", type=Path, help="also draw what speaks for and against the fit, as a PNG")
-    parser.add_argument("-n", "--max-scans", type=int, default=20, help="look at so many, evenly spaced (default: 20)")
-    parser.add_argument("--name", help="of the sensor (default: the file's)")
-    parser.add_argument("--bad-points", choices=["refuse", "drop"], default="refuse", help="NaN, infinite or at 0")
+    parser.add_argument("source", help="folder, data set or file of scans that one sensor made")
+    parser.add_argument("-o", "--out", type=Path, default=Path("my_sensor.json"), help="sensor file to write")
+    parser.add_argument("--picture", type=Path, metavar="PNG", help="also plot the evidence for and against the fit")
+    parser.add_argument("-n", "--max-scans", type=int, default=20, help="number of scans to fit, evenly spaced")
+    parser.add_argument("--name", help="name of the sensor (default: the name of the sensor file)")
+    add_bad_points(parser)
     add_json(parser, "the files of --out, --picture and --json")
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from lidargrit.cli._options import add_settings
+
 EXAMPLES = """\
   lidargrit import-weights lidargrit_kitti_360 runs/published vqvae.pth transformer.pth \\
       --set data.projection_variant=reference data.columns=2048 data.column_stride=2
@@ -16,12 +18,18 @@ EXAMPLES = """\
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
     parser.add_argument(
-        "recipe", help="whose generator, sizes and sensor the weights have; see: lidargrit list recipes"
+        "recipe", help="recipe with the generator, sizes and sensor of the weights; see: lidargrit list recipes"
     )
-    parser.add_argument("out", type=Path, help="run folder, which sample, evaluate and view take")
-    parser.add_argument("files", type=Path, nargs="+", metavar="FILE", help="for lidargrit the VQ-VAE's first")
-    settings = "change settings of the recipe"
-    parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help=settings)
+    parser.add_argument("out", type=Path, help="run folder to write, for: lidargrit sample, evaluate and view")
+    parser.add_argument(
+        "files",
+        type=Path,
+        nargs="+",
+        metavar="FILE",
+        help="published weight files; for lidargrit the VQ-VAE's first, then the transformer's",
+    )
+    settings = "settings of the recipe to change"
+    add_settings(parser, settings)
 
 
 def run(options: argparse.Namespace) -> None:

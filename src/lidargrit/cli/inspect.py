@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from lidargrit.cli._options import add_bad_points, add_projection_variant
 from lidargrit.cli._results import add_json, refuse_taken, tell
 
 EXAMPLES = """\
@@ -16,13 +17,15 @@ EXAMPLES = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
-    parser.add_argument("scan", help="a file, or a source of scans, of which the first is taken")
-    parser.add_argument("--sensor", help="its name or .json file (default: the data set's, or the closest of ours)")
-    parser.add_argument("--columns", type=int, help="of the full circle (default: the sensor's own)")
-    parser.add_argument("--projection", choices=["spherical", "unfolding"], help="(default: the sensor's own)")
-    parser.add_argument("--variant", choices=["exact", "reference"], default="exact", help="of the projection")
-    parser.add_argument("--bad-points", choices=["refuse", "drop"], default="refuse", help="NaN, infinite or at 0")
-    parser.add_argument("-o", "--out", type=Path, help="also draw a picture, a PNG")
+    parser.add_argument("scan", help="file of a scan, or a source of scans whose first scan is inspected")
+    sensor = "name or .json file of the sensor (default: the data set's, or the known sensor that fits best)"
+    parser.add_argument("--sensor", help=sensor)
+    parser.add_argument("--columns", type=int, help="number of columns of the full circle (default: the sensor's)")
+    rows = "rows by elevation (spherical) or by ring (unfolding) (default: the sensor's own)"
+    parser.add_argument("--projection", choices=["spherical", "unfolding"], help=rows)
+    add_projection_variant(parser, "--variant")
+    add_bad_points(parser)
+    parser.add_argument("-o", "--out", type=Path, metavar="PNG", help="also plot the range image and what is lost")
     add_json(parser, "the files of --out and --json")
 
 
@@ -48,7 +51,7 @@ def run(options: argparse.Namespace) -> None:
     sensor = load_sensor(name or closest_sensor(scan))
     if options.columns is not None:
         sensor = sensor.with_columns(options.columns)
-    found = inspect(scan, sensor, options.projection, options.variant)
+    found = inspect(scan, sensor, options.projection, options.projection_variant)
     if options.out:
         plot_inspection(found, options.out)
     tell(options, as_table(found), as_json(found), f"\ndone: look at {options.out}" if options.out else "")

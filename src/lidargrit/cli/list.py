@@ -18,7 +18,7 @@ EXAMPLES = """\
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
     parser.add_argument(
-        "kind", nargs="?", choices=[*KINDS, *FORMER_KINDS], help="one kind only, with all that is known of it"
+        "kind", nargs="?", choices=[*KINDS, *FORMER_KINDS], help="list one kind only, with all that is known of it"
     )
     add_json(parser)
 

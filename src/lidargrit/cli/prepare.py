@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from lidargrit.cli._options import add_bad_scans, add_projection_variant, add_rank
 from lidargrit.cli._results import add_json, refuse_taken, tell
 
 EXAMPLES = """\
@@ -17,20 +18,22 @@ EXAMPLES = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
-    parser.add_argument("source", help="of scans: NAME:ROOT:SPLIT, a folder, simulated:COUNT")
-    parser.add_argument("-o", "--out", type=Path, help="a folder that train and evaluate take as a source")
-    parser.add_argument("--sensor", help="name or .json file (default: the data set's)")
-    parser.add_argument("--columns", type=int, default=0, help="fine columns of the circle (default: the sensor's)")
-    parser.add_argument("--column-stride", type=int, default=1, help="of which every n-th is the image's")
-    parser.add_argument("--projection", choices=["sensor", "spherical", "unfolding"], default="sensor")
-    parser.add_argument("--projection-variant", choices=["exact", "reference"], default="exact")
-    parser.add_argument("-n", "--max-scans", type=int, default=0, help="evenly spaced; 0 for all")
-    parser.add_argument("--bad-points", choices=["refuse", "drop"], default="refuse", help="NaN, infinite or at 0")
-    parser.add_argument("--bad-scans", choices=["refuse", "skip"], default="refuse", help="that cannot be used")
-    parser.add_argument("--workers", type=int, default=2, help="processes on this machine")
-    parser.add_argument("--rank", type=int, help="which machine this is, from 0")
-    parser.add_argument("--world-size", type=int, help="of how many")
-    parser.add_argument("--verify", action="store_true", help="also read everything back, and remake what is damaged")
+    parser.add_argument("source", help="scans: a folder, NAME:ROOT:SPLIT or simulated:COUNT")
+    out = "folder for the range images, a source for train and evaluate (default: in the cache)"
+    parser.add_argument("-o", "--out", type=Path, help=out)
+    parser.add_argument("--sensor", help="name or .json file of the sensor (default: the data set's)")
+    columns = "number of columns of the full circle (default: the sensor's)"
+    parser.add_argument("--columns", type=int, default=0, help=columns)
+    parser.add_argument("--column-stride", type=int, default=1, help="keep every n-th of the columns")
+    rows = "rows by elevation (spherical) or by ring (unfolding) (default: the sensor's own)"
+    parser.add_argument("--projection", choices=["sensor", "spherical", "unfolding"], default="sensor", help=rows)
+    add_projection_variant(parser)
+    count = "number of scans to prepare, evenly spaced; 0 for all"
+    parser.add_argument("-n", "--max-scans", type=int, default=0, help=count)
+    add_bad_scans(parser)
+    parser.add_argument("--workers", type=int, default=2, help="number of processes on this machine")
+    add_rank(parser, "machine")
+    parser.add_argument("--verify", action="store_true", help="also read all back, and prepare damaged parts anew")
     add_json(parser)
 
 

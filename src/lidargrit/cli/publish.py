@@ -15,10 +15,17 @@ EXAMPLES = """\
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
     parser.add_argument("run_folder", type=Path, metavar="RUN", help="folder of a finished run")
-    parser.add_argument("out", type=Path, help="folder for the weights, their configuration and the card")
-    parser.add_argument("--scores", type=Path, metavar="JSON", help="of the run's samples, for the card")
-    parser.add_argument("--notes", type=Path, metavar="MD", help="Markdown for the end of the card, such as failures")
-    parser.add_argument("--half", action="store_true", help="round weights to 16 bits")
+    parser.add_argument("out", type=Path, help="folder for the weights, their configuration and the model card")
+    parser.add_argument(
+        "--scores",
+        type=Path,
+        metavar="JSON",
+        help="scores of the run's samples for the card, written by: lidargrit evaluate --json",
+    )
+    parser.add_argument(
+        "--notes", type=Path, metavar="MD", help="Markdown file for the end of the card, such as known failures"
+    )
+    parser.add_argument("--half", action="store_true", help="store weights in 16 bits: half the size")
 
 
 def run(options: argparse.Namespace) -> None:

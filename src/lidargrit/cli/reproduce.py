@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from lidargrit.cli._options import add_settings
 from lidargrit.cli._results import add_json, refuse_taken, tell
 
 EXAMPLES = """\
@@ -16,20 +17,22 @@ EXAMPLES = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
-    parser.add_argument("table", type=int, help="1, 2 or 3, as the paper numbers them")
-    parser.add_argument("root", help="of KITTI-360 (1) or KITTI odometry (2, 3), or the word simulated")
-    parser.add_argument("out", type=Path, help="folder of runs, samples and scores; the same command goes on there")
-    small = "the small recipes, at equal compute, without metrics that need published weights"
+    parser.add_argument("table", type=int, help="number of the table in the paper: 1, 2 or 3")
+    parser.add_argument(
+        "root", help="root folder of KITTI-360 (table 1) or KITTI odometry (tables 2, 3), or the word simulated"
+    )
+    parser.add_argument("out", type=Path, help="folder for runs, samples and scores; the same command continues there")
+    small = "use the small recipes at equal compute, and no metric that needs published weights"
     parser.add_argument("--small", action="store_true", help=small)
-    count = "samples of each system (default: the paper's 5,000; 64 with --small)"
+    count = "number of samples of each system (default: the paper's 5,000; 64 with --small)"
     parser.add_argument("-n", "--count", type=int, default=0, help=count)
-    budget = "operations that the training of each takes (default: each recipe's own budget; 5e13 with --small)"
+    budget = "training budget of each system in floating-point operations (default: each recipe's; 5e13 with --small)"
     parser.add_argument("--flops", type=float, help=budget)
-    settings = "settings of every recipe, such as data.workers=16"
-    parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help=settings)
-    parser.add_argument("--batch-size", type=int, default=8, help="scans drawn at once (default: 8)")
-    parser.add_argument("--format", choices=["text", "markdown", "latex"], default="text", help="of the table")
-    parser.add_argument("--dry-run", action="store_true", help="say what would be done and what it costs, and stop")
+    settings = "settings to change in every recipe, such as data.workers=16"
+    add_settings(parser, settings)
+    parser.add_argument("--batch-size", type=int, default=8, help="number of scans sampled at once")
+    parser.add_argument("--format", choices=["text", "markdown", "latex"], default="text", help="format of the table")
+    parser.add_argument("--dry-run", action="store_true", help="print what would be done and what it costs, and stop")
     add_json(parser)
 
 

@@ -6,6 +6,7 @@ import argparse
 import os
 from pathlib import Path
 
+from lidargrit.cli._options import add_device, add_rank, add_settings
 from lidargrit.untrusted import seed_number
 
 EXAMPLES = """\
@@ -20,15 +21,13 @@ EXAMPLES = """\
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
     parser.add_argument("run_folder", type=Path, metavar="RUN", help="folder of a finished run, or: pretrained")
-    parser.add_argument("out", type=Path, help="folder for the samples")
-    parser.add_argument("-n", "--count", type=int, default=16, help="number of scans (default: 16)")
-    parser.add_argument("--seed", type=seed_number, default=0, help="seed of the first; the next have the next seeds")
-    parser.add_argument("--batch-size", type=int, default=8, help="scans drawn at once (default: 8)")
-    choices = "change how the generator draws; see: lidargrit list generators"
-    parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help=choices)
-    parser.add_argument("--rank", type=int, help="which process this is of several that share the work, from 0")
-    parser.add_argument("--world-size", type=int, help="of how many; under torchrun both are known")
-    parser.add_argument("--device", help="cpu, cuda or cuda:1 (default: cuda if there is one)")
+    parser.add_argument("out", type=Path, help="folder for the samples; the same command continues there")
+    parser.add_argument("-n", "--count", type=int, default=16, help="number of scans")
+    parser.add_argument("--seed", type=seed_number, default=0, help="seed of the first scan; the next has the next")
+    parser.add_argument("--batch-size", type=int, default=8, help="number of scans sampled at once")
+    add_settings(parser, "sampling settings to change, such as temperature=1.1; see: lidargrit list generators")
+    add_rank(parser, "process")
+    add_device(parser)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -53,10 +52,9 @@ def run(options: argparse.Namespace) -> None:
     own = f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu"
     device = usable_device(options.device or own)
     run_folder = locate(options.run_folder)
-    generator = load(run_folder)
+    generator = load(run_folder).to(device)
     owner = f"sampling from {generator.public_name()!r}"
     sampling = override(generator.Sampling(), options.set, owner, "see all with: lidargrit list generators")
-    generator.to(device)
     seeds = range(options.seed, options.seed + options.count)[rank::world_size]
     write_samples(generator, run_folder, options.out, seeds, sampling, options.batch_size, TerminalReporter())
     print(f"done: {len(seeds)} scans lie in {options.out}; look at them with: lidargrit view {options.out}")

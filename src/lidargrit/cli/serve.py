@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from lidargrit.cli._options import add_device
+
 EXAMPLES = """\
   lidargrit serve                          all runs in runs/ and the model in the package
   lidargrit serve runs/demo runs/mine --port 8080
@@ -14,12 +16,18 @@ EXAMPLES = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
-    parser.add_argument("runs", nargs="*", type=Path, metavar="RUN", help="finished runs (default: runs/*, pretrained)")
-    others = "let others in: the address to listen at, such as 0.0.0.0 (default: this machine only)"
+    parser.add_argument(
+        "runs",
+        nargs="*",
+        type=Path,
+        metavar="RUN",
+        help="folders of finished runs (default: all in runs/, and the model in the package)",
+    )
+    others = "address to listen at; 0.0.0.0 lets other machines in (default: 127.0.0.1, this machine only)"
     parser.add_argument("--host", default="127.0.0.1", help=others)
-    parser.add_argument("--port", type=int, default=8000, help="0 for any that is free (default: 8000)")
-    parser.add_argument("--seconds", type=float, default=120.0, help="that one drawing may take (default: 120)")
-    parser.add_argument("--device", default="", help="cpu, cuda or cuda:1 (default: cuda if there is one)")
+    parser.add_argument("--port", type=int, default=8000, help="port to listen at; 0 for any free one")
+    parser.add_argument("--seconds", type=float, default=120.0, help="time limit of one request, in seconds")
+    add_device(parser)
 
 
 def run(options: argparse.Namespace) -> None:

@@ -17,16 +17,24 @@ EXAMPLES = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
-    parser.add_argument("out", type=Path, help="an empty folder, or one that the same command began")
-    parser.add_argument("-n", "--num-scans", type=int, required=True, help="in all")
-    parser.add_argument("--sensor", default="hdl64e_kitti_odometry", help="name or .json file")
-    parser.add_argument("--seed", type=seed_number, default=0, help="of the first street")
-    parser.add_argument("--frames", type=int, default=1, help="scans of each street, a tenth of a second apart")
-    parser.add_argument("--theme", choices=["mixed", "city", "suburb", "country"], default="mixed")
-    parser.add_argument("--motion", action="store_true", help="leave in the distortion by our own motion")
-    parser.add_argument("--wet", type=float, default=0.0, help="ground, from 0 (dry) to 1")
-    parser.add_argument("--clean", action="store_true", help="also clean ranges and return probabilities (.npz)")
-    parser.add_argument("--workers", type=int, default=2, help="processes at once")
+    parser.add_argument("out", type=Path, help="folder for the scans: empty, or begun by the same command")
+    parser.add_argument("-n", "--num-scans", type=int, required=True, help="number of scans in all")
+    parser.add_argument("--sensor", default="hdl64e_kitti_odometry", help="name or .json file of the sensor")
+    parser.add_argument(
+        "--seed", type=seed_number, default=0, help="seed of the first street; each next street has the next seed"
+    )
+    parser.add_argument(
+        "--frames", type=int, default=1, help="number of scans of each street, a tenth of a second apart"
+    )
+    parser.add_argument(
+        "--theme", choices=["mixed", "city", "suburb", "country"], default="mixed", help="kind of streets"
+    )
+    parser.add_argument("--motion", action="store_true", help="keep the distortion that the car's own motion causes")
+    parser.add_argument("--wet", type=float, default=0.0, help="wetness of the ground, from 0 (dry) to 1")
+    parser.add_argument(
+        "--clean", action="store_true", help="also write clean ranges and return probabilities, as .npz"
+    )
+    parser.add_argument("--workers", type=int, default=2, help="number of processes")
 
 
 def run(options: argparse.Namespace) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from lidargrit.cli._options import add_settings
 from lidargrit.cli._results import add_json, refuse_taken, tell
 
 EXAMPLES = """\
@@ -18,11 +19,11 @@ EXAMPLES = """\
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
     parser.add_argument("recipe", help="name of a recipe; see: lidargrit list recipes")
-    parser.add_argument("out", type=Path, help="run folder")
-    settings = "change settings of the recipe"
-    parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help=settings)
-    parser.add_argument("--dry-run", action="store_true", help="say what would be done, with every setting, and stop")
-    measuring = "as --dry-run, and also take a few steps, and foretell operations, time and memory"
+    parser.add_argument("out", type=Path, help="run folder to write; the same command continues there")
+    settings = "settings of the recipe to change, such as data.train=/data/scans; see all with --dry-run"
+    add_settings(parser, settings)
+    parser.add_argument("--dry-run", action="store_true", help="print what would be done, with every setting, and stop")
+    measuring = "like --dry-run, and take a few steps to estimate operations, time and memory"
     tracking = "also log to this project of Weights & Biases (pip install 'lidargrit[wandb]')"
     parser.add_argument("--wandb", default="", metavar="PROJECT", help=tracking)
     parser.add_argument("--measure", action="store_true", help=measuring)

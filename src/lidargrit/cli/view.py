@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from lidargrit.cli._options import add_bad_scans
 from lidargrit.untrusted import seed_number
 
 EXAMPLES = """\
@@ -16,13 +17,16 @@ EXAMPLES = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
-    parser.add_argument("places", nargs="+", metavar="PATH", help="a run, a folder of samples, a scan, or other scans")
-    parser.add_argument("-o", "--out", type=Path, default=Path("view.png"), help=".png or .html (default: view.png)")
-    parser.add_argument("-n", "--count", type=int, default=3, help="scans of each (default: 3)")
-    parser.add_argument("--seed", type=seed_number, default=0, help="of the first generated scan")
-    parser.add_argument("--bad-points", choices=["refuse", "drop"], default="refuse", help="NaN, infinite or at 0")
-    parser.add_argument("--bad-scans", choices=["refuse", "skip"], default="refuse", help="that cannot be used")
-    parser.add_argument("--overwrite", action="store_true", help="replace what is there already")
+    parser.add_argument(
+        "places", nargs="+", metavar="PATH", help="run, folder of samples, file of a scan, or source of scans"
+    )
+    parser.add_argument(
+        "-o", "--out", type=Path, default=Path("view.png"), help="picture (.png) or interactive page (.html) to write"
+    )
+    parser.add_argument("-n", "--count", type=int, default=3, help="number of scans of each")
+    parser.add_argument("--seed", type=seed_number, default=0, help="seed of the first generated scan")
+    add_bad_scans(parser)
+    parser.add_argument("--overwrite", action="store_true", help="replace the file if it exists")
 
 
 def run(options: argparse.Namespace) -> None:
