@@ -67,7 +67,7 @@ def open_archive(file: BytesIO | BufferedReader) -> zipfile.ZipFile:
         directory_bytes = struct.unpack("<4s8xI6x", end[-_END_BYTES:])[1]
         is_large = end.startswith(b"PK\6\7") or directory_bytes > DIRECTORY_BYTES_AT_MOST
         if end[-_END_BYTES:][:4] != b"PK\5\6" or is_large:
-            raise ValueError(f"no directory of at most {DIRECTORY_BYTES_AT_MOST:,} bytes at its end")
+            raise ValueError(f"no directory of at most {DIRECTORY_BYTES_AT_MOST} bytes at its end")
         return zipfile.ZipFile(file)
     except Exception as error:  # a damaged directory is met with errors of many kinds
         raise ValueError(_first_words(error)) from None

@@ -145,8 +145,9 @@ def _lock(folder: Path, kind: int) -> int:
                 alone = kind == fcntl.LOCK_EX
                 began = f"since {time.strftime('%Y-%m-%d %H:%M')}"
                 holder = f"process {os.getpid()} on {socket.gethostname()} {began}" if alone else "another command"
-                os.ftruncate(lock, 0)
-                os.pwrite(lock, holder.encode(), 0)
+                with suppress(OSError):  # a full disk; the lock holds all the same
+                    os.ftruncate(lock, 0)
+                    os.pwrite(lock, holder.encode(), 0)
                 return lock
             os.close(lock)  # it was removed between the two calls
 
@@ -259,6 +260,8 @@ def _read_bytes(path: Path, error: type[LidarGritError], wanted: str, cure: str,
             data = file.read(at_most + 1)
         if len(data) > at_most:
             raise OSError(f"more than {at_most:,} bytes")
+        if not data and path.suffix == ".json":
+            raise OSError("an empty file")
     except (OSError, ValueError) as why:
         reason = why.strerror if isinstance(why, OSError) and why.strerror else why
         raise error(f"{path}, which cannot be read ({reason})", wanted, cure) from None

@@ -78,8 +78,10 @@ class NumpyArray(ScanFormat):
 
 
 def _row_columns(rows: np.ndarray, path: Path) -> dict[str, np.ndarray]:
-    if rows.dtype.kind == "b" or rows.ndim != 2 or not 3 <= rows.shape[1] <= len(_ROWS) or len(rows) > POINTS_AT_MOST:
-        raise _refused(f"an array of {rows.dtype} and shape {rows.shape}", path)
+    if rows.dtype.kind == "b":
+        raise _refused("truth values as points", path)
+    if rows.ndim != 2 or not 3 <= rows.shape[1] <= len(_ROWS) or len(rows) > POINTS_AT_MOST:
+        raise _refused(f"an array of shape {rows.shape}", path)
     return dict(zip(_ROWS, rows.T, strict=False))
 
 
@@ -96,11 +98,10 @@ def _archive_columns(archive: zipfile.ZipFile, path: Path) -> dict[str, np.ndarr
         if not name or name in columns:
             continue
         columns[name] = read_member(archive, info, at_most)
-        if columns[name].dtype.kind == "b" or columns[name].shape != columns["x"].shape:
-            raise _refused(
-                f"{columns['x'].shape[0]} points, but {name} of {columns[name].dtype} and shape {columns[name].shape}",
-                path,
-            )
+        if columns[name].dtype.kind == "b":
+            raise _refused(f"truth values as {name}", path)
+        if columns[name].shape != columns["x"].shape:
+            raise _refused(f"{len(columns['x'])} points, but {name} of shape {columns[name].shape}", path)
     return columns
 
 
