@@ -187,7 +187,7 @@ def of_clouds(n: int, repeats: int) -> None:
     names = ("minimum_matching_distance", "coverage", "one_nearest_neighbour")
     checked = [load_metric(name)().compare(small[1], small[0])[0] for name in names]
     assert np.allclose(plain, checked, atol=1e-6), (plain, checked)
-    ours_s, _ = timed(lambda: [load_metric(name)().compare(generated, real) for name in names])  # once: then remembered
+    ours_s, _ = timed(lambda: [load_metric(name)().compare(generated, real) for name in names])
     line(f"matching, coverage and 1-NNA, {n} v {n}", plain_s, (n // few) ** 2, ours_s)
     plain_s, plain = timed(lambda: plain_grid_counts(real[:few]))
     assert np.array_equal(grid_counts(real[:few].reshape(-1, 3)), plain)

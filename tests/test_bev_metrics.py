@@ -38,29 +38,29 @@ def score(name, generated, real, **options):
 
 
 @pytest.mark.shared
-@pytest.mark.parametrize("dialect", above.DIALECTS)
+@pytest.mark.parametrize("variant", above.VARIANTS)
 @pytest.mark.parametrize("which", [1, 2])
-def test_histograms_are_the_programs(golden, dialect, which):
+def test_histograms_are_the_programs(golden, variant, which):
     data = golden("bev")
-    ours = above.histograms(torch.from_numpy(data[f"clouds_{which}"]), dialect)
-    assert np.array_equal(ours.reshape(-1, 100, 100), data[f"{GOLDEN_OF[dialect]}_hist_{which}"])
+    ours = above.histograms(torch.from_numpy(data[f"clouds_{which}"]), variant)
+    assert np.array_equal(ours.reshape(-1, 100, 100), data[f"{GOLDEN_OF[variant]}_hist_{which}"])
 
 
 @pytest.mark.shared
-@pytest.mark.parametrize(("dialect", "rtol"), [("lidargrit", 1e-9), ("lidargen", 1e-9), ("r2dm", 1e-6)])
-def test_jsd_and_mmd_are_the_programs(golden, dialect, rtol):
+@pytest.mark.parametrize(("variant", "rtol"), [("lidargrit", 1e-9), ("lidargen", 1e-9), ("r2dm", 1e-6)])
+def test_jsd_and_mmd_are_the_programs(golden, variant, rtol):
     data = golden("bev")
-    first, second = (above.histograms(torch.from_numpy(data[f"clouds_{which}"]), dialect) for which in (1, 2))
-    single = "_float32" if dialect == "r2dm" else ""  # R2DM computes in single precision
+    first, second = (above.histograms(torch.from_numpy(data[f"clouds_{which}"]), variant) for which in (1, 2))
+    single = "_float32" if variant == "r2dm" else ""  # R2DM computes in single precision
     jsd = above.jensen_shannon_distance(first.sum(axis=0), second.sum(axis=0))
-    assert jsd == pytest.approx(float(data[f"{dialect}_jsd{single}"]), rel=rtol)
+    assert jsd == pytest.approx(float(data[f"{variant}_jsd{single}"]), rel=rtol)
     norm, key = (
         (bev_mmd.spectral, "lidargen_mmd_spectral_norm")
-        if dialect == "lidargen"
-        else (bev_mmd.frobenius, f"{dialect}_mmd{single}")
+        if variant == "lidargen"
+        else (bev_mmd.frobenius, f"{variant}_mmd{single}")
     )
     mmd = bev_mmd.discrepancy(first, second, norm, unbiased=False)
-    assert mmd == pytest.approx(float(data[key]), abs=2e-8 if single else 1e-12)
+    assert mmd == pytest.approx(float(data[key]), abs=2e-7 if single else 1e-12)
 
 
 @pytest.mark.shared
@@ -85,15 +85,15 @@ def test_r2dm_leaves_out_returns_beyond_63_m():
 # Against slow loops and scipy
 
 
-@pytest.mark.parametrize("dialect", above.DIALECTS)
-def test_histograms_are_those_of_a_slow_loop(dialect):
+@pytest.mark.parametrize("variant", above.VARIANTS)
+def test_histograms_are_those_of_a_slow_loop(variant):
     points = points_of_pixels(random_images(1, 2)).flatten(1, 2)
     slow = np.zeros((2, 100, 100), dtype=int)
     for scan, cloud in enumerate(points.tolist()):
         for x, y, z in cloud:
             if 3 < math.sqrt(x * x + y * y + z * z) < 70:
                 slow[scan, math.floor((x + 80) / 1.6), math.floor((y + 80) / 1.6)] += 1
-    assert np.array_equal(above.histograms(points, dialect).reshape(2, 100, 100), slow)
+    assert np.array_equal(above.histograms(points, variant).reshape(2, 100, 100), slow)
 
 
 @given(st.integers(-40, 39), st.integers(0, 7))
@@ -186,7 +186,7 @@ def test_lidm_matching_is_that_of_a_slow_loop():
 
 
 def test_lidm_matching_in_blocks(monkeypatch):
-    bits = matching.LidmBevMatching().keep(random_images(3, 7))
+    bits = matching.LidmBevMatching().summarise(random_images(3, 7), real=True)
     whole = matching.pair_distances(bits, bits)
     assert np.allclose(whole, whole.T)
     assert (np.diag(whole) == 0).all()
@@ -196,7 +196,7 @@ def test_lidm_matching_in_blocks(monkeypatch):
 
 # The definitions
 
-NAMES = [("bev_jsd", v) for v in above.DIALECTS] + [("bev_mmd", v) for v in above.DIALECTS]
+NAMES = [("bev_jsd", v) for v in above.VARIANTS] + [("bev_mmd", v) for v in above.VARIANTS]
 ROOMS = [*NAMES, ("lidm_bev_jsd", "exact"), ("lidm_bev_matching", "exact")]
 
 
@@ -238,10 +238,10 @@ def test_jsd_keeps_its_size_and_mmd_what_holds_a_count():
     for seed in range(4):
         jsd.update(random_images(seed, 10), real=True)
         mmd.update(random_images(seed, 10), real=True)
-    assert sum(part.nbytes for part in jsd._kept[True]) == 10_000 * 8
-    assert sum(part.nbytes for part in mmd._kept[True]) == 40 * 10_000  # a byte a cell while no count is above 255
+    assert jsd._kept[True].value().nbytes == 10_000 * 8
+    assert mmd._kept[True].value().nbytes == 40 * 10_000  # a byte a cell while no count is above 255
     wall = RangeImage.masked(torch.full((1, 16, 64), 5.0), torch.ones(1, 16, 64, dtype=torch.bool), SENSOR)
-    assert mmd.keep(wall).sum() == 16 * 64
+    assert mmd.summarise(mmd.extractor(SENSOR)(wall), real=True).sum() == 16 * 64
 
 
 def test_sensors_are_not_mixed():

@@ -89,6 +89,11 @@ def test_the_papers_protocol_is_the_papers():
         load_protocol("lidargrit-360")
 
 
+@pytest.mark.parametrize("name", ["lidargen", "r2dm"])
+def test_protocols_name_the_half_pixel_by_which_a_program_moves_points(name):
+    assert any("half a row and half a column" in line for line in load_protocol(name).departures)
+
+
 def test_a_scorecard_tells_all_that_is_needed_to_repeat_it(card):
     data = json.loads(json.dumps(card.to_json()))
     assert data["protocol"]["name"] == "exact"

@@ -9,39 +9,32 @@ import torch
 from lidargrit import _discovery
 from lidargrit.errors import ConfigError
 from lidargrit.evaluation.intervals import Part, Resampling, around, blocks, interval_of, merged, real_against_real
-from lidargrit.metrics import Metric, load_metric
-from lidargrit.sensors import load_sensor
-from lidargrit.structures import MetricResult, RangeImage
+from lidargrit.metrics import ImageMetric, load_metric
+from lidargrit.metrics._accumulators import Rows
+from lidargrit.sensors import SensorModel, load_sensor
+from lidargrit.structures import RangeImage
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(64)
+PIXEL = SensorModel("pixel", torch.zeros(1, 1), torch.zeros(1, 1), 1e-6, 1e6, "spherical")
 PLAIN = [name for name in _discovery.names("metrics") if not load_metric(name).needs_weights]
 
 
-class Ratio(Metric):
-    """Ratio of the means of two samples of numbers, fed as lists: cheap, not linear, and of a known law."""
+class Ratio(ImageMetric):
+    """Ratio of the means of two samples of numbers, fed as images of one pixel: cheap, not linear, of a known law."""
 
-    title, higher_is_better, variants = "a ratio", False, ("plain",)
+    title, accumulator = "a ratio", Rows
 
-    def __init__(self, *, variant=None, seed=0):
-        super().__init__(variant=variant, seed=seed)
-        self.seen = {False: [], True: []}
+    def summarise(self, features, *, real):
+        return features.range_m.flatten().numpy()
 
-    def update(self, images, *, real):
-        self.seen[real] += list(images)
-
-    def compute(self):
-        generated, real = self.seen[False], self.seen[True]
-        self.require_images(len(generated), len(real), 2)
-        value = float(np.mean(generated) / np.mean(real))
-        return MetricResult("ratio", value, False, len(generated), len(real), "plain")
-
-    def merge(self, other):
-        for real, numbers in other.seen.items():
-            self.seen[real] += numbers
+    def compare(self, generated, real):
+        return float(np.mean(generated) / np.mean(real)), {}
 
 
 def parts(numbers, groups, real):
     made = []
+    pixels = torch.from_numpy(numbers).float()[:, None, None]
+    numbers = RangeImage(pixels, pixels > 0, PIXEL)
     for group in groups:
         metric = Ratio()
         metric.update(numbers[group.start : group.stop], real=real)
@@ -52,7 +45,7 @@ def parts(numbers, groups, real):
 def interval(generated, real, resampling):
     groups = blocks(len(generated), resampling.groups)
     sides = parts(generated, groups, False), parts(real, groups, True)
-    return interval_of(merged(*sides).compute(), *sides, resampling)
+    return interval_of(merged(*sides).compute(), *sides, resampling, Ratio.bounds)
 
 
 def test_the_interval_covers_the_true_value_about_as_often_as_it_says():
@@ -107,12 +100,13 @@ def test_groups_are_neighbours_and_their_number_is_even():
 
 
 def test_an_interval_ends_where_the_metric_does():
-    result = MetricResult("coverage", 0.9, True, 8, 8, "exact")
-    assert around(result, [0.7, 0.9, 1.0, 1.0], 16).high == 1.0
-    low = MetricResult("bev_jsd", 0.01, False, 8, 8, "exact")
-    assert around(low, [0.0, 0.1, 0.2], 16).low == 0.0
-    unbiased = MetricResult("kernel_pointcloud_distance", 0.0, False, 8, 8, "exact")
-    assert around(unbiased, [-0.1, 0.1, 0.0], 16).low < 0
+    assert around(0.9, [0.7, 0.9, 1.0, 1.0], 16, load_metric("coverage").bounds).high == 1.0
+    assert around(0.9, [0.7, 0.9, 1.0, 1.0], 16, load_metric("drop_correlation").bounds).high == 1.0
+    assert around(0.9, [0.7, 0.9, 1.0, 1.0], 16, load_metric("sliced_wasserstein").bounds).high > 1.0
+    assert around(0.01, [0.0, 0.1, 0.2], 16, load_metric("bev_jsd").bounds).low == 0.0
+    unbiased = load_metric("kernel_pointcloud_distance").bounds
+    assert around(0.0, [-0.1, 0.1, 0.0], 16, unbiased).low < 0
+    assert around(0.01, [0.0, 0.1, 0.2], 16, unbiased).low == 0.0  # nothing says that it is below
 
 
 def test_the_floor_is_the_mean_of_halves_against_halves():
@@ -130,7 +124,7 @@ def test_too_few_scans_have_neither():
     numbers = np.ones(3)
     sides = parts(numbers, groups, False), parts(numbers, groups, True)
     result = merged(*sides).compute()
-    assert interval_of(result, *sides, Resampling()) is None
+    assert interval_of(result, *sides, Resampling(), Ratio.bounds) is None
     assert real_against_real(sides[1], sides[0], [1, 1], Resampling()) is None
 
 

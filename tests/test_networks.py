@@ -11,8 +11,8 @@ import torch
 
 from lidargrit.errors import ConfigError, DataError, WeightsError
 from lidargrit.metrics import load_metric
-from lidargrit.metrics._networks.features import normalised_images, unit_clouds
-from lidargrit.metrics._networks.network import NETWORKS, Network, filled, load_network
+from lidargrit.metrics._networks.features import NormalisedImages, UnitClouds
+from lidargrit.metrics._networks.network import NETWORKS, filled, load_network
 from lidargrit.metrics._networks.pointnet import PointNet
 from lidargrit.metrics._networks.rangenet import chosen_values
 from lidargrit.projection import points_of_pixels
@@ -174,7 +174,7 @@ def test_the_draw_of_features_is_that_of_lidargen(golden):
 )
 def test_clouds_of_the_programs(sensor, variant, unit_m, cut):
     batch = images(sensor)
-    clouds = unit_clouds(batch, variant).numpy()
+    clouds = UnitClouds.of(variant, sensor)(batch).numpy()
     assert clouds.shape == (3, 3, sensor.height * sensor.width)
     points = points_of_pixels(batch).numpy().reshape(3, -1, 3)
     kept = 0
@@ -190,7 +190,7 @@ def test_clouds_of_the_programs(sensor, variant, unit_m, cut):
 def test_exact_clouds_are_the_returns_alone():
     batch = images()
     network = load_network("pointnet")
-    features = network.features(unit_clouds(batch, "exact"))
+    features = network.features(UnitClouds.of("exact", SMALL)(batch))
     for index in range(3):
         returns = points_of_pixels(batch[index])[batch.return_mask[index]] / 80
         np.testing.assert_allclose(features[index], network.features(returns.T[None])[0], atol=1e-5)
@@ -199,13 +199,13 @@ def test_exact_clouds_are_the_returns_alone():
 def test_an_image_without_a_return_is_a_point_at_the_origin():
     empty = torch.zeros(1, SMALL.height, SMALL.width)
     for variant in ("lidargrit", "r2dm", "exact"):
-        assert not unit_clouds(RangeImage(empty, empty > 0, SMALL), variant).any()
+        assert not UnitClouds.of(variant, SMALL)(RangeImage(empty, empty > 0, SMALL)).any()
 
 
 @pytest.mark.parametrize(("variant", "cut"), [("r2dm", True), ("exact", False)])
 def test_normalised_images(variant, cut):
     batch = images()
-    channels = normalised_images(batch, variant).numpy()
+    channels = NormalisedImages.of(variant)(batch).numpy()
     points = points_of_pixels(batch).numpy()
     for place in np.ndindex(*batch.range_m.shape):
         r = float(batch.range_m[place])
@@ -227,20 +227,19 @@ def test_rangenet_needs_reflectance_and_widths_that_can_be_halved(name):
 # --- what metrics keep of it
 
 
-def test_an_image_is_looked_at_once(monkeypatch):
-    network = Network("pointnet", weights_folder() / "cls_model_39.pth", "cpu")
-    looks = []
-    look = network._look
-    monkeypatch.setattr(network, "_look", lambda some: looks.append(len(some)) or look(some))
-    clouds = torch.rand(3, 3, 50)
-    first = network.features(clouds)
-    assert np.array_equal(network.features(clouds[[2, 0, 0]]), first[[2, 0, 0]])
-    assert sum(looks) == 3
-    for seed in range(6):  # memory of it has an end
-        network.features(torch.rand(100, 3, 5, generator=torch.Generator().manual_seed(seed)))
-    assert len(network._known) == 512
-    network.features(clouds)
-    assert sum(looks) == 606
+def test_published_definitions_that_want_equal_inputs_share_them():
+    definitions = [
+        ("frechet_pointcloud_distance", "lidargrit"),
+        ("frechet_pointcloud_distance", "r2dm"),
+        ("kernel_pointcloud_distance", "r2dm"),
+        ("frechet_pointcloud_distance", "exact"),
+        ("kernel_pointcloud_distance", "exact"),
+    ]
+    metrics = [load_metric(name)(variant=variant) for name, variant in definitions]
+    assert (
+        len({metric.extractor(SMALL) for metric in metrics}) == 2
+    )  # of the programs, which agree on KITTI-360, and ours
+    assert len({metric.extractor(ODOMETRY) for metric in metrics}) == 3
 
 
 def test_few_scans_are_warned_of_and_weights_are_named():
@@ -253,7 +252,8 @@ def test_few_scans_are_warned_of_and_weights_are_named():
     data = (weights_folder() / "cls_model_39.pth").read_bytes()
     assert details["weights"] == {"file": "cls_model_39.pth", "sha256": hashlib.sha256(data).hexdigest()}
     for count, warnings in ((1807, 1), (1808, 0)):
-        metric._images = {False: count, True: 1808}
+        for moments in metric._kept.values():
+            moments.num = count
         assert len(metric.compute().details["warnings"]) == warnings
 
 

@@ -7,11 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.distance import cdist, jensenshannon
 
-from lidargrit.metrics import _clouds, _farthest_points, _matching, load_metric
+from lidargrit.metrics import _clouds, _farthest_points, _matching, load_metric, update_together
 from lidargrit.metrics import point_cloud_jsd as jsd
 from lidargrit.metrics._clouds import bits_reversed, sampled_clouds
 from lidargrit.metrics._farthest_points import farthest_points
-from lidargrit.metrics._memory import remembered
 from lidargrit.sensors import SensorModel, column_azimuths_rad
 from lidargrit.structures import RangeImage
 
@@ -140,7 +139,7 @@ def test_bits_are_reversed():
 def test_exact_clouds_are_of_returns_only_and_reference_keeps_the_first_pixel():
     images = random_images(0, 2)
     images = RangeImage.masked(images.range_m, images.return_mask & (torch.arange(1024).view(16, 64) > 0), SENSOR)
-    exact, reference = (load_metric("coverage")(variant=variant).keep(images) for variant in VARIANTS)
+    exact, reference = (_clouds.FarthestPointClouds(variant)(images) for variant in VARIANTS)
     assert (np.linalg.norm(exact, axis=2) > 1 / 80 - 1e-6).all()
     assert np.allclose(np.linalg.norm(exact[:, 0], axis=1), images.range_m.flatten(1).amax(1) / 80)  # the farthest
     assert (reference[:, 0] == 0).all()
@@ -151,7 +150,7 @@ def test_scans_of_few_returns_take_all_in_turn():
     mask = torch.zeros(2, 16, 64, dtype=torch.bool)
     mask[1, 3, 10:15] = True
     images = RangeImage.masked(torch.full((2, 16, 64), 8.0), mask, SENSOR)
-    empty, few = load_metric("coverage")().keep(images)
+    empty, few = _clouds.FarthestPointClouds("exact")(images)
     assert (empty == 0).all()
     places, times = np.unique(few, axis=0, return_counts=True)
     assert len(places) == 5
@@ -226,39 +225,21 @@ def test_ties_count_half():
     assert load_metric("one_nearest_neighbour")().compare(clouds, clouds.copy())[0] == 0.5
 
 
-def test_work_is_shared_between_metrics(monkeypatch):
-    calls = {"sample": 0, "matrix": 0}
+def test_metrics_that_are_fed_together_sample_points_once(monkeypatch):
+    sampled = []
 
-    def counted(key, function):
-        def call(*arguments):
-            calls[key] += 1
-            return function(*arguments)
+    def counted(points, *options):
+        sampled.append(len(points))
+        return farthest_points(points, *options)
 
-        return call
-
-    monkeypatch.setattr(_clouds, "farthest_points", counted("sample", _clouds.farthest_points))
-    monkeypatch.setattr(_matching, "chamfer_matrix", counted("matrix", _matching.chamfer_matrix))
-    images = random_images(777, 3), random_images(778, 3)
-    for name in [*MATCHING, "point_cloud_jsd"]:
-        score(name, *images)
-    assert calls == {"sample": 2, "matrix": 3}
-
-
-def test_what_is_remembered_is_known_by_its_content():
-    seen = []
-
-    @remembered(at_most=2)
-    def total(values, name):
-        seen.append(name)
-        return values.sum()
-
-    values = np.arange(4.0)
-    assert total(values, "a") == total(values.copy(), "a") == 6
-    values[0] = 10
-    assert total(values, "a") == 16
-    assert total(values.reshape(2, 2), "a") == 16
-    assert total(np.arange(4.0), "a") == 6  # dropped, and made again
-    assert seen == ["a"] * 4
+    monkeypatch.setattr(_clouds, "farthest_points", counted)
+    generated, real = random_images(777, 3), random_images(778, 3)
+    names = [*MATCHING, "point_cloud_jsd"]
+    metrics = [load_metric(name)() for name in names]
+    update_together([(metric, False) for metric in metrics], generated)
+    update_together([(metric, True) for metric in metrics], real)
+    assert sampled == [3, 3]
+    assert [metric.compute() for metric in metrics] == [score(name, generated, real) for name in names]
 
 
 # The grid of the 3-D divergence
@@ -300,5 +281,5 @@ def test_only_counts_are_kept():
     metric = load_metric("point_cloud_jsd")()
     for seed in range(3):
         metric.update(random_images(seed, 4), real=True)
-    assert [part.shape for part in metric._kept[True]] == [(10_144,)]
-    assert metric._kept[True][0].sum() == 12 * 512
+    assert metric._kept[True].value().shape == (10_144,)
+    assert metric._kept[True].value().sum() == 12 * 512

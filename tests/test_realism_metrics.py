@@ -9,7 +9,7 @@ from scipy.spatial.distance import jensenshannon
 
 from lidargrit.errors import ConfigError, DataError
 from lidargrit.metrics import load_metric
-from lidargrit.metrics._curves import Surroundings, compare_shares, divergence
+from lidargrit.metrics._curves import LocalSurface, compare_shares, divergence
 from lidargrit.sensors import SensorModel, load_sensor
 from lidargrit.structures import RangeImage
 
@@ -266,7 +266,7 @@ def test_surroundings_of_planes_are_exact(columns):
     on_ground = to_ground < to_wall
     range_m = torch.minimum(to_ground, to_wall)
     mask = (torch.rand(range_m.shape, generator=torch.Generator().manual_seed(0)) > 0.3) & (range_m < 80)
-    around = Surroundings.of(RangeImage.stack([RangeImage.masked(range_m, mask, sensor)]))
+    around = LocalSurface.of(RangeImage.stack([RangeImage.masked(range_m, mask, sensor)]))
     cosine = torch.where(on_ground, -directions[..., 2], directions[..., 1])
     known = ~around.incidence_rad[0].isnan()
     assert known.float().mean() > 0.5

@@ -3,28 +3,25 @@
 from __future__ import annotations
 
 import platform
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from lidargrit import __version__, _discovery
-from lidargrit.errors import ConfigError, LidarGritError, ScanError, nearest_names
-from lidargrit.evaluation.intervals import Part, Resampling, blocks, interval_of, merged, real_against_real
-from lidargrit.evaluation.pairs import EvalPair, EvalSet, pair_for_protocol
+from lidargrit.errors import ConfigError, LidarGritError, nearest_names
+from lidargrit.evaluation.intervals import Resampling
+from lidargrit.evaluation.pairs import EvalPair, pair_for_protocol
 from lidargrit.evaluation.protocols import DEFAULT, MetricChoice, Protocol, load_protocol, public_name
 from lidargrit.evaluation.scorecard import LeftOut, Score, Scorecard
+from lidargrit.evaluation.scoring import MetricFactory, score_metrics
 from lidargrit.loading import DataConfig
-from lidargrit.metrics import Metric, load_metric
+from lidargrit.metrics import load_metric
 from lidargrit.projection import Variant
 from lidargrit.reporting import Reporter
 
-_BATCH = 16
 _FEW = 100  # scans: below that the interval itself rests on too little, and values hardly differ from real against real
-_ORDER_MATTERS = frozenset({"sliced_wasserstein"})  # its program draws patches batch by batch: parts draw others
 
 
 @dataclass(frozen=True)
@@ -40,7 +37,7 @@ class EvalConfig:
         seed: of whatever a metric draws.
         resampling: how intervals and real against real are computed.
         weights: files by the name of their network.
-        samples_format: the sample_format of a folder of tensors.
+        samples_format: sample format of a folder of tensors.
         device: where networks compute.
         data: how scans are read.
     """
@@ -111,22 +108,22 @@ def open_pair(samples: str, reference: str, settings: EvalConfig, reporter: Repo
 
 
 def compare_pair(pair: EvalPair, settings: EvalConfig, reporter: Reporter | None = None) -> Scorecard:
-    """Score two opened sets, one metric after the other, so that only one's memory is held."""
+    """Score two opened sets.
+
+    Raises:
+        LidarGritError: not one metric could be computed; the reason of the first.
+    """
     reporter, protocol = reporter or Reporter(), load_protocol(settings.protocol)
-    scores: list[Score] = []
-    left_out: list[LeftOut] = []
-    errors: list[LidarGritError] = []
     wanted = chosen_metrics(protocol, settings)
-    with reporter.progress("scoring", 2 * len(pair.samples) * len(wanted)) as progress:
-        for choice in wanted:
-            heard = partial(progress.advance, note=choice.metric)
-            try:
-                scores.append(_score(choice, pair, settings, reporter, heard))
-            except ScanError:  # a damaged file, which spoils all metrics alike
-                raise
-            except LidarGritError as error:  # no weights, no reflectance, too few scans: the others may do without
-                errors.append(error)
-                left_out.append(LeftOut(choice.metric, choice.variant, str(error)))
+    factories = [_factory(choice, settings, reporter) for choice in wanted]
+    found = score_metrics(factories, pair, settings.resampling, reporter)
+    scores = [score for score in found if isinstance(score, Score)]
+    errors = [error for error in found if isinstance(error, LidarGritError)]
+    left_out = [
+        LeftOut(choice.metric, choice.variant, str(error))
+        for choice, error in zip(wanted, found, strict=True)
+        if isinstance(error, LidarGritError)
+    ]
     if errors and not scores:
         raise errors[0]
     warnings = [*pair.warnings, *_doubts(pair, scores, settings.resampling)]
@@ -156,11 +153,11 @@ def compare_pair(pair: EvalPair, settings: EvalConfig, reporter: Reporter | None
 
 
 def chosen_metrics(protocol: Protocol, settings: EvalConfig) -> list[MetricChoice]:
-    """Return what is to be computed: the protocol's numbers, or those of the metrics that the user named.
+    """Return the metrics to compute: the protocol's, or those that the user named.
 
     Raises:
-        UnknownNameError: a metric that the user named and nobody has.
-        ConfigError: a variant that none of the metrics has.
+        UnknownNameError: the user named a metric that does not exist.
+        ConfigError: none of the metrics has the variant that the user named.
     """
     wanted = list(protocol.metrics)
     if settings.metrics:
@@ -188,68 +185,10 @@ def _require_known(variant: str, wanted: Sequence[MetricChoice]) -> None:
         raise ConfigError(f"variant {variant!r}", f"one such as {nearest_names(variant, known)}", "choose one of these")
 
 
-def _score(
-    choice: MetricChoice, pair: EvalPair, settings: EvalConfig, reporter: Reporter, heard: Callable[[int], None]
-) -> Score:
-    """Compute one number with its interval and its reference row."""
-    begun, resampling = time.perf_counter(), settings.resampling
-    make, options = _maker(choice, settings, reporter)
-    make()  # a variant that it does not have, or weights that are not there, are told before scans are read
-    groups = blocks(len(pair.samples), resampling.groups if resampling.halves else 1)
-    generated = [Part(_fed(make(), pair.samples, group, heard)) for group in groups]
-    real, real_as_generated = [], []
-    for group in groups:
-        metric, again = make(), make() if resampling.halves else None
-        _fed(metric, pair.reference, group, heard, real=True, also_as_generated=again)
-        real.append(Part(metric))
-        real_as_generated += [] if again is None else [Part(again)]
-    if choice.metric in _ORDER_MATTERS and len(groups) > 1:
-        whole = make()
-        _fed(whole, pair.samples, range(len(pair.samples)))
-        _fed(whole, pair.reference, range(len(pair.reference)), real=True)
-        result = whole.compute()
-        del whole
-    else:
-        result = merged(generated, real).compute()
-    interval = reference_row = None
-    if resampling.halves:
-        interval = interval_of(result, generated, real, resampling)
-        reference_row = real_against_real(real, real_as_generated, [len(group) for group in groups], resampling)
-    return Score(result, interval, reference_row, options, time.perf_counter() - begun)
-
-
-def _maker(
-    choice: MetricChoice, settings: EvalConfig, reporter: Reporter
-) -> tuple[Callable[[], Metric], dict[str, Any]]:
-    """Return what makes an empty metric, and its options as they are told."""
-    if choice.metric not in _discovery.names("metrics"):
-        raise ConfigError(f"the metric {choice.metric!r}", "one that this version has", "see: lidargrit list metrics")
-    cls = load_metric(choice.metric)
-    options: dict[str, Any] = dict(choice.options)
-    needs: dict[str, Any] = {}
-    if cls.needs_weights:
-        needs = {"weights": settings.weights.get(cls.needs_weights), "device": settings.device, "reporter": reporter}
-    return partial(cls, variant=choice.variant or None, seed=settings.seed, **options, **needs), options
-
-
-def _fed(
-    metric: Metric,
-    side: EvalSet,
-    places: Sequence[int],
-    heard: Callable[[int], None] | None = None,
-    *,
-    real: bool = False,
-    also_as_generated: Metric | None = None,
-) -> Metric:
-    """Feed images to a metric, perhaps at once to another as if they were generated, and return the first."""
-    for first in range(0, len(places), _BATCH):
-        images = side.batch(places[first : first + _BATCH])
-        metric.update(images, real=real)
-        if also_as_generated is not None:
-            also_as_generated.update(images, real=False)
-        if heard is not None:
-            heard(len(images))
-    return metric
+def _factory(choice: MetricChoice, settings: EvalConfig, reporter: Reporter) -> MetricFactory:
+    known = choice.metric in _discovery.names("metrics")
+    weights = settings.weights.get(load_metric(choice.metric).needs_weights) if known else None
+    return MetricFactory(choice, settings.seed, weights, settings.device, reporter)
 
 
 def _doubts(pair: EvalPair, scores: Sequence[Score], resampling: Resampling) -> list[str]:

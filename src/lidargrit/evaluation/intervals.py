@@ -14,7 +14,6 @@ Source:
 
 from __future__ import annotations
 
-import math
 import pickle
 import zlib
 from collections.abc import Sequence
@@ -31,11 +30,6 @@ from lidargrit.structures import MetricResult
 _HALVINGS = 5  # of the reference against itself: their mean is what is told, not their spread
 _AT_LEAST = 4  # groups: fewer have too few halves
 _LARGE_BYTES = 8 << 20
-_HIGHEST = {  # of metrics that end somewhere, so that no interval goes beyond
-    "coverage": 1.0,
-    "one_nearest_neighbour": 1.0,
-    "point_cloud_jsd": 1.0,  # a divergence in bits
-}
 
 
 @dataclass(frozen=True)
@@ -138,7 +132,11 @@ def merged(generated: Sequence[Part], real: Sequence[Part]) -> Metric:
 
 
 def interval_of(
-    result: MetricResult, generated: Sequence[Part], real: Sequence[Part], resampling: Resampling
+    result: MetricResult,
+    generated: Sequence[Part],
+    real: Sequence[Part],
+    resampling: Resampling,
+    bounds: tuple[float, float],
 ) -> Interval | None:
     """Return how far the score of the whole sets is to be trusted; None if there are too few scans to tell.
 
@@ -161,20 +159,25 @@ def interval_of(
             values.append(merged(*halves).compute().value)
         except DataError:  # half of the scans are too few for this metric
             return None
-    return around(result, values, min(len(generated), len(real)))
+    return around(result.value, values, min(len(generated), len(real)), bounds)
 
 
-def around(result: MetricResult, half_values: Sequence[float], groups: int) -> Interval:
-    """Return the interval around a score, from the scores of half-samples of so many groups.
+def around(value: float, half_values: Sequence[float], groups: int, bounds: tuple[float, float]) -> Interval:
+    """Return the interval around a score.
 
-    The halves' own mean is what they spread about: a score of half as many scans is biased against that of all.
+    The spread of the half-samples is taken about their own mean: a score of half as many scans is biased against that
+    of all.
+
+    Args:
+        value: score of the whole sets.
+        half_values: scores of half-samples.
+        groups: number of groups from which the half-samples were taken.
+        bounds: least and greatest value that the metric can have.
     """
     error = float(np.std(half_values, ddof=1))
     reach = error * float(student.ppf(0.975, min(groups, len(half_values)) - 1))
-    low, high = result.value - reach, result.value + reach
-    if min(result.value, *half_values) >= 0:
-        low = max(low, 0.0)
-    return Interval(low, min(high, _HIGHEST.get(result.metric, math.inf)), error, len(half_values))
+    least = max(bounds[0], 0.0) if min(value, *half_values) >= 0 else bounds[0]
+    return Interval(max(value - reach, least), min(value + reach, bounds[1]), error, len(half_values))
 
 
 def real_against_real(

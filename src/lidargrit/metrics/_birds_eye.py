@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, Int64
 from torch import Tensor
 
+from lidargrit.metrics import FeatureExtractor
 from lidargrit.metrics._curves import divergence
 from lidargrit.projection import points_of_pixels
 from lidargrit.structures import RangeImage
@@ -20,6 +22,8 @@ CELLS = 100  # along each axis: 1.6 m wide
 _NEAR_M, _FAR_M = 3.0, 70.0  # closer points are the car itself; no point within 70 m leaves the grid
 _SHORT_M, _LONG_M = 0.5, 63.0  # LiDARGen's encoding ends at 2^6 - 1 m; R2DM leaves out what it cannot show
 LIDM_HALF_M = 50  # of the grid of LiDM's toolbox for 64 rows: lidm/eval of hancyran/LiDAR-Diffusion@4c94f10
+
+JSD_BOUNDS = 0.0, math.sqrt(math.log(2))  # of the root of the divergence in nats
 
 Axis = Float32[np.ndarray, "n"]
 Cell = Int64[np.ndarray, "n"]
@@ -49,26 +53,41 @@ _CELL_OF: dict[str, Callable[[Axis], Cell]] = {
     "r2dm": _r2dm,
     "lidargen": _exact,  # NumPy's histogram has its edges in double precision
 }
-DIALECTS = tuple(_CELL_OF)
+VARIANTS = tuple(_CELL_OF)
 
 
-def points_from_above(images: RangeImage, dialect: str) -> Float[Tensor, "B n 3"]:
+@dataclass(frozen=True)
+class BirdsEyeHistograms(FeatureExtractor[Int64[np.ndarray, "B cells"]]):
+    """The number of points of every scan in each cell of a grid of 100x100 cells, seen from above.
+
+    Args:
+        variant: published definition of the grid, one of ``VARIANTS``.
+    """
+
+    variant: str
+
+    def __call__(self, images: RangeImage) -> Int64[np.ndarray, "B cells"]:
+        """Return one row of 10,000 cells per scan."""
+        return histograms(points_from_above(images, self.variant), self.variant)
+
+
+def points_from_above(images: RangeImage, variant: str) -> Float[Tensor, "B n 3"]:
     """Return the points of a batch that a program would look at; those it leaves out lie at the origin."""
     points_xyz_m = points_of_pixels(images)
     range_m = images.range_m[..., None]
-    if dialect == "r2dm":
+    if variant == "r2dm":
         points_xyz_m = torch.where((range_m > _SHORT_M) & (range_m < _LONG_M), points_xyz_m, 0.0)
-    elif dialect == "lidargen":
+    elif variant == "lidargen":
         points_xyz_m = torch.where(range_m > _LONG_M, points_xyz_m * (_LONG_M / range_m), points_xyz_m)
     return points_xyz_m.flatten(1, 2)
 
 
-def histograms(points_xyz_m: Float[Tensor, "B n 3"], dialect: str) -> Int64[np.ndarray, "B cells"]:
+def histograms(points_xyz_m: Float[Tensor, "B n 3"], variant: str) -> Int64[np.ndarray, "B cells"]:
     """Count the points of every scan in the cells of the grid, those nearer than 3 m and beyond 70 m left out.
 
     Args:
         points_xyz_m: metres.
-        dialect: one of ``DIALECTS``; they differ for points on the border of two cells only.
+        variant: one of ``VARIANTS``; they differ for points on the border of two cells only.
 
     Returns:
         the 100x100 cells in one row: cell 100 i + j is the i-th along x and the j-th along y.
@@ -77,7 +96,7 @@ def histograms(points_xyz_m: Float[Tensor, "B n 3"], dialect: str) -> Int64[np.n
     squared = np.square(points[..., 0]) + np.square(points[..., 1]) + np.square(points[..., 2])
     range_m = np.sqrt(squared)
     scan, place = np.nonzero((range_m > _NEAR_M) & (range_m < _FAR_M))
-    x, y = (_CELL_OF[dialect](points[scan, place, axis]) for axis in (0, 1))
+    x, y = (_CELL_OF[variant](points[scan, place, axis]) for axis in (0, 1))
     cells = CELLS * CELLS
     return np.bincount(scan * cells + x * CELLS + y, minlength=len(points) * cells).reshape(-1, cells)
 

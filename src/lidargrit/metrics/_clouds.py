@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import final
+
 import numpy as np
 from jaxtyping import Float32, Int64
 
+from lidargrit.metrics import FeatureExtractor, Metric
+from lidargrit.metrics._accumulators import Accumulator, Rows
 from lidargrit.metrics._farthest_points import farthest_points
-from lidargrit.metrics._memory import remembered
-from lidargrit.metrics._sets import SetMetric
 from lidargrit.projection import points_of_pixels
+from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
 POINTS = 512  # per cloud, as in LidarGRIT's program; DUSty's paper has 2048, its training 512
@@ -17,32 +21,51 @@ _NEAREST_SQUARED = np.float32(1e-3)  # LidarGRIT's kernel never chooses a point 
 Clouds = Float32[np.ndarray, "n points 3"]
 
 
-class CloudMetric(SetMetric):
-    """Compares sets of clouds: of every scan, 512 points that lie far from one another, divided by the longest range.
+@dataclass(frozen=True)
+class FarthestPointClouds(FeatureExtractor[Clouds]):
+    """512 points of every scan that lie far from one another, divided by the sensor's longest range.
 
-    What a cloud is depends on the variant. ``exact``: sampling begins with the return farthest from the sensor, and
-    only returns are chosen; of a scan with fewer than 512 all are taken, in turn until there are 512; a scan without
-    any is 512 times the origin. ``reference`` is LidarGRIT's program: sampling begins with the first pixel, which is
-    mostly empty and then adds the origin to the cloud; points within a root of 0.001 of the longest range are never
-    chosen; equally far points are taken by the bits of their index in reverse; indices repeat if there are too few.
-    A cloud takes 6 kB. Clouds of a batch are sampled once for all metrics that are fed with it one after the other.
+    Args:
+        variant: published definition of the sampling, see :class:`CloudMetric`.
     """
 
-    variants = ("exact", "reference")
+    variant: str
 
-    def keep(self, images: RangeImage) -> Clouds:
+    def __call__(self, images: RangeImage) -> Clouds:
         """Return the cloud of every scan."""
         points = points_of_pixels(images).float().flatten(1, 2) / images.sensor.range_max_m
         return sampled_clouds(points.numpy(), self.variant)
 
 
-# Two sets in two variants, in chunks, for metrics that take turns batch by batch: 64 chunks of 8 clouds take 3 MB.
-@remembered(at_most=64)
+class CloudMetric(Metric[Clouds, np.ndarray]):
+    """Compares sets of clouds: of every scan, 512 points that lie far from one another, divided by the longest range.
+
+    The variant says which points those are. ``exact``: sampling begins with the return farthest from the sensor, and
+    only returns are chosen; of a scan with fewer than 512 returns all are taken, in turn until there are 512; a scan
+    without any return is 512 times the origin. ``reference`` is LidarGRIT's program: sampling begins with the first
+    pixel, which is mostly empty and then adds the origin to the cloud; points closer to the sensor than
+    sqrt(0.001) = 0.032 of the longest range are never chosen; of equally far points the one with the smallest
+    bit-reversed index comes first; indices repeat if there are too few. A cloud takes 6 kB.
+    """
+
+    variants = ("exact", "reference")
+    accumulator: type[Accumulator[np.ndarray]] = Rows
+
+    @final
+    def extractor(self, sensor: SensorModel) -> FarthestPointClouds:
+        """Return what samples points."""
+        return FarthestPointClouds(self.variant)
+
+    def summarise(self, features: Clouds, *, real: bool) -> np.ndarray:
+        """Return the clouds themselves."""
+        return features
+
+
 def sampled_clouds(points: Float32[np.ndarray, "n pixels 3"], variant: str) -> Clouds:
     """Choose 512 points of every scan; points at the origin are no returns.
 
     Args:
-        points: of all pixels, in units of the longest range.
+        points: points of all pixels, in units of the longest range.
         variant: ``exact`` or ``reference``.
     """
     squared = np.square(points[..., 0]) + np.square(points[..., 1]) + np.square(points[..., 2])

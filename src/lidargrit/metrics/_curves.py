@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, final
 
 import numpy as np
 import torch
@@ -13,16 +13,15 @@ from jaxtyping import Float, Float64, Int64
 from scipy.special import rel_entr
 from torch import Tensor
 
-from lidargrit.errors import ConfigError
-from lidargrit.metrics import Metric
-from lidargrit.sensors import SensorModel
-from lidargrit.structures import MetricResult, RangeImage
+from lidargrit.metrics import ImageKind, ImageMetric
+from lidargrit.metrics._accumulators import Total
+from lidargrit.structures import RangeImage
 
 _LEAST = 500  # pixels in a bin: the standard error of a share stays below 0.5 / sqrt(500) = 0.022
 _COLUMNS = 256  # neighbours are at least as far away as in an image of so many columns: 25 cm at 10 m,
 _ROWS = 32  # and of so many rows: 15 cm at 10 m, against the noise of 2 cm that a range has
 _REACH = 8  # times that far they may be: 11 degrees, across the window of a car 5 m away
-_AGREE = 0.1  # two surfaces nearer to one another than that share of their range are taken for one
+ONE_SURFACE = 0.1  # two surfaces nearer to one another than that share of their range are taken for one
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +41,7 @@ class Curves:
     real: Float64[np.ndarray, "*rows n"]
 
 
-class CurveMetric(Metric):
+class CurveMetric(ImageMetric):
     """Counts something in the pixels of every image and compares what the counts of two sets say.
 
     The value is the Jensen-Shannon distance: the square root of the divergence in base 2, from 0 (alike) to 1 (nothing
@@ -58,76 +57,42 @@ class CurveMetric(Metric):
         its square root is a metric: Endres and Schindelin, IEEE Trans. Information Theory 49(7), 2003.
     """
 
-    higher_is_better = False
-    variants = ("exact",)
+    bounds = (0.0, 1.0)
+    fewest_images = 1
+    accumulator = Total
     axis_label: ClassVar[str]
     """What the axis of the curves is, with its unit."""
     curve_label: ClassVar[str]
     """What the curves are."""
-
-    def __init__(self, *, variant: str | None = None, seed: int = 0) -> None:
-        super().__init__(variant=variant, seed=seed)
-        self._sensor: SensorModel | None = None
-        self._counts: dict[bool, Int64[np.ndarray, "..."]] = {}
-        self._images = {False: 0, True: 0}
 
     @abstractmethod
     def count(self, images: RangeImage) -> Int64[np.ndarray, "..."]:
         """Count in a batch; counts of batches add up."""
 
     @abstractmethod
-    def curves(
-        self, generated: Int64[np.ndarray, "..."], real: Int64[np.ndarray, "..."], sensor: SensorModel
-    ) -> Curves:
+    def curves(self, generated: Int64[np.ndarray, "..."], real: Int64[np.ndarray, "..."], kind: ImageKind) -> Curves:
         """Turn the counts of both sets into curves and compare these."""
 
-    @torch.no_grad()
-    def update(self, images: RangeImage, *, real: bool) -> None:
-        """Count in a batch of images, on the CPU."""
-        sensor = self._require_kind(images.sensor)
-        images = images.to("cpu") if images.range_m.ndim == 3 else RangeImage.stack([images.to("cpu")])
-        self._add(real, self.count(images), len(images))
-        self._sensor = sensor
+    @final
+    def summarise(self, features: RangeImage, *, real: bool) -> Int64[np.ndarray, "..."]:
+        """Count in a batch of either set."""
+        return self.count(features)
 
-    def compute(self) -> MetricResult:
+    @final
+    def compare(
+        self, generated: Int64[np.ndarray, "..."], real: Int64[np.ndarray, "..."]
+    ) -> tuple[float, dict[str, Any]]:
         """Return the distance, and the curves in the details."""
-        self.require_images(self._images[False], self._images[True], at_least=1)
-        assert self._sensor is not None
-        curves = self.curves(self._counts[False], self._counts[True], self._sensor)
-        details: dict[str, Any] = {
+        assert self.kind is not None
+        curves = self.curves(generated, real, self.kind)
+        details = {
             "axis_label": self.axis_label,
             "curve_label": self.curve_label,
             "axis": curves.axis.tolist(),
             "generated": _listed(curves.generated),
             "real": _listed(curves.real),
         }
-        value = math.sqrt(max(curves.divergence, 0.0))
-        return MetricResult(self.name, value, False, self._images[False], self._images[True], self.variant, details)
-
-    def merge(self, other: Metric) -> None:
-        """Add what another process has counted."""
-        self.require_same_options(other)
-        assert isinstance(other, CurveMetric)
-        if other._sensor is None:
-            return
-        self._sensor = self._require_kind(other._sensor)
-        for real, counts in other._counts.items():
-            self._add(real, counts, other._images[real])
-
-    def _add(self, real: bool, counts: Int64[np.ndarray, "..."], num_images: int) -> None:
-        self._counts[real] = self._counts.get(real, 0) + counts
-        self._images[real] += num_images
-
-    def _require_kind(self, sensor: SensorModel) -> SensorModel:
-        known = self._sensor or sensor
-        kinds = [(s.height, s.width, s.range_min_m, s.range_max_m) for s in (sensor, known)]
-        if kinds[0] != kinds[1]:
-            raise ConfigError(
-                "range images of {}x{} between {:g} and {:g} m".format(*kinds[0]),
-                "{}x{} between {:g} and {:g} m, as the images before".format(*kinds[1]),
-                "project both sets with one sensor",
-            )
-        return known
+        return math.sqrt(max(curves.divergence, 0.0)), details
 
 
 def _listed(curve: Float64[np.ndarray, "..."]) -> list[Any]:
@@ -202,7 +167,7 @@ def histogram(values: Float[Tensor, " n"], edges: Float64[np.ndarray, " edges"])
 
 
 @dataclass(frozen=True, eq=False)
-class Surroundings:
+class LocalSurface:
     """What the neighbours of every pixel tell of the surface that its ray should meet; the pixel itself is not asked.
 
     A plane has an inverse range that is linear in the direction, so ranges are interpolated as 1 / range. Since a
@@ -219,7 +184,7 @@ class Surroundings:
     incidence_rad: Float[Tensor, "B H W"]
 
     @classmethod
-    def of(cls, images: RangeImage) -> Surroundings:
+    def of(cls, images: RangeImage) -> LocalSurface:
         """Look around every pixel of a batch."""
         sensor = images.sensor
         size = (sensor.height, sensor.width)
@@ -235,9 +200,9 @@ class Surroundings:
         slope_across = (up - down) / (up_at - down_at)
         by_row = right + slope_along_row * to_right
         by_column = down + slope_across * (elevation - down_at)
-        one_surface = (left - right).abs() <= _AGREE * torch.maximum(left, right)
+        one_surface = (left - right).abs() <= ONE_SURFACE * torch.maximum(left, right)
         by_row = torch.where(one_surface, by_row, torch.nan)
-        plane = (by_row - by_column).abs() <= _AGREE * by_row
+        plane = (by_row - by_column).abs() <= ONE_SURFACE * by_row
         # With m the normal over the plane's distance, 1 / range = m . direction; its slopes are m along the tangents.
         across = torch.hypot(slope_along_row / elevation.cos(), slope_across)
         incidence = torch.where(plane, torch.atan2(across, by_row), torch.nan)

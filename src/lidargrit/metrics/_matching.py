@@ -10,8 +10,6 @@ from jaxtyping import Float32, Float64, Int64
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from lidargrit.metrics._memory import remembered
-
 Cloud = Float32[np.ndarray, "_ 3"]
 Clouds = Float32[np.ndarray, "_ points 3"]
 
@@ -70,14 +68,12 @@ def _factor(cloud: Cloud, *, left: bool) -> Float32[Tensor, "_ _"]:
     )
 
 
-@remembered(at_most=4)
 def nearest_between(first: Clouds, second: Clouds) -> tuple[Nearest, Nearest]:
     """Return the nearest of the second set for each of the first, and the other way round."""
     matrix = chamfer_matrix(first, second)
     return _exactly(matrix.argmin(axis=1), first, second), _exactly(matrix.argmin(axis=0), second, first)
 
 
-@remembered(at_most=4)
 def nearest_within(clouds: Clouds) -> Nearest:
     """Return the nearest other cloud of the same set for each."""
     return _exactly(chamfer_matrix(clouds).argmin(axis=1), clouds, clouds)

@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int64
 
-from lidargrit.metrics._birds_eye import DIALECTS, histograms, jensen_shannon_distance, points_from_above
-from lidargrit.metrics._sets import SetMetric
-from lidargrit.structures import RangeImage
+from lidargrit.metrics import Metric
+from lidargrit.metrics._accumulators import Total
+from lidargrit.metrics._birds_eye import JSD_BOUNDS, VARIANTS, BirdsEyeHistograms, jensen_shannon_distance
+from lidargrit.sensors import SensorModel
 
 
-class BevJsd(SetMetric):
+class BevJsd(Metric[Int64[np.ndarray, "B cells"], np.ndarray]):
     """Compare the points of all scans of a set together, in 100x100 cells of 1.6 m, as the paper's BEV JSD does.
 
     Points between 3 and 70 m are counted. The value is the square root of the Jensen-Shannon divergence in nats, from
@@ -33,12 +34,17 @@ class BevJsd(SetMetric):
     """
 
     title = "Jensen-Shannon distance of points seen from above"
-    variants = DIALECTS
-    adds_up = True
+    variants = VARIANTS
+    bounds = JSD_BOUNDS
+    accumulator = Total
 
-    def keep(self, images: RangeImage) -> Int64[np.ndarray, "cells"]:
-        """Count the points of a batch in every cell."""
-        return histograms(points_from_above(images, self.variant), self.variant).sum(axis=0)
+    def extractor(self, sensor: SensorModel) -> BirdsEyeHistograms:
+        """Return what counts points in cells."""
+        return BirdsEyeHistograms(self.variant)
+
+    def summarise(self, features: Int64[np.ndarray, "B cells"], *, real: bool) -> Int64[np.ndarray, "cells"]:
+        """Add the counts of a batch, cell by cell."""
+        return features.sum(axis=0)
 
     def compare(
         self, generated: Int64[np.ndarray, "cells"], real: Int64[np.ndarray, "cells"]

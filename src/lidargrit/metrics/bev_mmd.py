@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, Int64, UInt
 
-from lidargrit.metrics._birds_eye import CELLS, DIALECTS, histograms, points_from_above
-from lidargrit.metrics._sets import SetMetric
-from lidargrit.structures import RangeImage
+from lidargrit.metrics import Metric
+from lidargrit.metrics._accumulators import Rows
+from lidargrit.metrics._birds_eye import CELLS, VARIANTS, BirdsEyeHistograms
+from lidargrit.sensors import SensorModel
 
 _SIGMA = 0.5  # of the Gaussian kernel, in every program; shares of points have no unit
 _BLOCK = 250  # scans: 20 MB of shares
 _PAIRS = 250  # of scans whose 100x100 differences are decomposed at once: 20 MB
 
-Rows = Float64[np.ndarray, "rows cells"]
-Columns = Float64[np.ndarray, "columns cells"]
+RowShares = Float64[np.ndarray, "rows cells"]
+ColumnShares = Float64[np.ndarray, "columns cells"]
 
 
-class BevMmd(SetMetric):
+class BevMmd(Metric[Int64[np.ndarray, "B cells"], np.ndarray]):
     """Compare the scans of two sets by the kernel distance of their bird's-eye histograms, as the paper's BEV MMD does.
 
     Each scan is its share of points (between 3 and 70 m) in 100x100 cells of 1.6 m; the kernel is
@@ -45,12 +47,17 @@ class BevMmd(SetMetric):
     """
 
     title = "Maximum mean discrepancy of scans seen from above"
-    variants = DIALECTS
+    variants = VARIANTS
+    bounds = (-math.inf, math.inf)  # the unbiased estimate may lie below 0
+    accumulator = Rows
 
-    def keep(self, images: RangeImage) -> UInt[np.ndarray, "B cells"]:
+    def extractor(self, sensor: SensorModel) -> BirdsEyeHistograms:
+        """Return what counts points in cells."""
+        return BirdsEyeHistograms(self.variant)
+
+    def summarise(self, features: Int64[np.ndarray, "B cells"], *, real: bool) -> UInt[np.ndarray, "B cells"]:
         """Return the histogram of every scan in the smallest whole numbers that hold it."""
-        counts = histograms(points_from_above(images, self.variant), self.variant)
-        return counts.astype(np.min_scalar_type(int(counts.max())))
+        return features.astype(np.min_scalar_type(int(features.max())))
 
     def compare(
         self, generated: UInt[np.ndarray, "n cells"], real: UInt[np.ndarray, "m cells"]
@@ -63,7 +70,7 @@ class BevMmd(SetMetric):
 def discrepancy(
     first: UInt[np.ndarray, "n cells"] | Int64[np.ndarray, "n cells"],
     second: UInt[np.ndarray, "m cells"] | Int64[np.ndarray, "m cells"],
-    squared_norm: Callable[[Rows, Columns], Float64[np.ndarray, "rows columns"]],
+    squared_norm: Callable[[RowShares, ColumnShares], Float64[np.ndarray, "rows columns"]],
     *,
     unbiased: bool,
 ) -> float:
@@ -98,13 +105,13 @@ def shares(counts: np.ndarray) -> Float64[np.ndarray, "n cells"]:
     return counts / np.maximum(counts.sum(axis=1, keepdims=True, dtype=np.int64), 1)
 
 
-def frobenius(rows: Rows, columns: Columns) -> Float64[np.ndarray, "rows columns"]:
+def frobenius(rows: RowShares, columns: ColumnShares) -> Float64[np.ndarray, "rows columns"]:
     """Return the sums of squares of the differences of all pairs."""
     squares = [np.einsum("ij,ij->i", side, side) for side in (rows, columns)]
     return np.maximum(squares[0][:, None] + squares[1] - 2 * rows @ columns.T, 0)
 
 
-def spectral(rows: Rows, columns: Columns) -> Float64[np.ndarray, "rows columns"]:
+def spectral(rows: RowShares, columns: ColumnShares) -> Float64[np.ndarray, "rows columns"]:
     """Return the squares of the largest singular values of the differences of all pairs, as 100x100 matrices."""
     squares = np.empty((len(rows), len(columns)))
     for index, row in enumerate(rows):

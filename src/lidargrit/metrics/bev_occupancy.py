@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from jaxtyping import Int64
 
+from lidargrit.metrics import ImageKind
 from lidargrit.metrics._curves import CurveMetric, Curves, divergence
 from lidargrit.projection import points_of_pixels
-from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
 _HALF_M = 50  # of the grid; its cells are 1 m wide
@@ -38,7 +38,7 @@ class BevOccupancy(CurveMetric):
         return np.stack((np.full_like(times, len(images)), times))
 
     def curves(
-        self, generated: Int64[np.ndarray, "2 x y"], real: Int64[np.ndarray, "2 x y"], sensor: SensorModel
+        self, generated: Int64[np.ndarray, "2 x y"], real: Int64[np.ndarray, "2 x y"], kind: ImageKind
     ) -> Curves:
         """Return the occupancy of every cell."""
         shares = [side[1] / side[0] for side in (generated, real)]

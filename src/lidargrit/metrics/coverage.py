@@ -29,6 +29,7 @@ class Coverage(CloudMetric):
     """
 
     title = "Coverage of the real set by point clouds (Chamfer)"
+    bounds = (0.0, 1.0)
     higher_is_better = True
 
     def compare(self, generated: Clouds, real: Clouds) -> tuple[float, dict[str, Any]]:

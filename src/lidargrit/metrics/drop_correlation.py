@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Int64
 
+from lidargrit.metrics import ImageKind
 from lidargrit.metrics._curves import CurveMetric, Curves, compare_shares
-from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
 _COLUMN_LAGS = (1, 2, 4, 8, 16)
@@ -32,7 +32,7 @@ class DropCorrelation(CurveMetric):
         return np.array([[int(one.sum()) for one, _ in pairs], [int((one & other).sum()) for one, other in pairs]])
 
     def curves(
-        self, generated: Int64[np.ndarray, "2 lags"], real: Int64[np.ndarray, "2 lags"], sensor: SensorModel
+        self, generated: Int64[np.ndarray, "2 lags"], real: Int64[np.ndarray, "2 lags"], kind: ImageKind
     ) -> Curves:
         """Return the probability over the lag."""
         axis = np.array([-lag for lag in _ROW_LAGS[::-1]] + list(_COLUMN_LAGS), dtype=float)

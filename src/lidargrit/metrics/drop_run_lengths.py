@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
+from lidargrit.metrics import ImageKind
 from lidargrit.metrics._curves import CurveMetric, Curves, compare_histograms, histogram, middles
-from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
 
@@ -25,19 +25,19 @@ class DropRunLengths(CurveMetric):
 
     def count(self, images: RangeImage) -> Int64[np.ndarray, " bins"]:
         """Count the runs in bins of length."""
-        return histogram(run_lengths(images.return_mask).float(), _edges(images.sensor))
+        return histogram(run_lengths(images.return_mask).float(), _edges(ImageKind.of(images.sensor)))
 
     def curves(
-        self, generated: Int64[np.ndarray, " bins"], real: Int64[np.ndarray, " bins"], sensor: SensorModel
+        self, generated: Int64[np.ndarray, " bins"], real: Int64[np.ndarray, " bins"], kind: ImageKind
     ) -> Curves:
         """Return the share of runs over their length."""
-        edges = _edges(sensor)
+        edges = _edges(kind)
         return compare_histograms(generated, real, middles(edges))
 
 
-def _edges(sensor: SensorModel) -> Float64[np.ndarray, " edges"]:
-    steps = np.round(2 ** np.arange(0, np.log2(sensor.width), 0.5))
-    return np.append(np.unique(steps), sensor.width + 1) - 0.5  # lengths are whole numbers
+def _edges(kind: ImageKind) -> Float64[np.ndarray, " edges"]:
+    steps = np.round(2 ** np.arange(0, np.log2(kind.width), 0.5))
+    return np.append(np.unique(steps), kind.width + 1) - 0.5  # lengths are whole numbers
 
 
 def run_lengths(return_mask: Bool[Tensor, "B H W"]) -> Int64[Tensor, " runs"]:

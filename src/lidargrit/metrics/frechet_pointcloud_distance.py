@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-from jaxtyping import Float
-from torch import Tensor
-
-from lidargrit.metrics._networks.features import unit_clouds
 from lidargrit.metrics._networks.frechet import FrechetMetric
-from lidargrit.structures import RangeImage
 
 
 class FrechetPointcloudDistance(FrechetMetric):
@@ -26,7 +21,3 @@ class FrechetPointcloudDistance(FrechetMetric):
     title = "Fréchet distance between PointNet features of clouds (FPD)"
     variants = ("lidargrit", "r2dm", "exact")
     needs_weights = "pointnet"
-
-    def inputs(self, images: RangeImage) -> Float[Tensor, "B 3 n"]:
-        """Return clouds in unit space."""
-        return unit_clouds(images, self.variant)

@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-from jaxtyping import Float
-from torch import Tensor
-
-from lidargrit.metrics._networks.features import unit_clouds
 from lidargrit.metrics._networks.kernel import KernelMetric
-from lidargrit.structures import RangeImage
 
 
 class KernelPointcloudDistance(KernelMetric):
@@ -23,7 +18,3 @@ class KernelPointcloudDistance(KernelMetric):
     title = "Squared kernel distance between PointNet features of clouds (KPD)"
     variants = ("r2dm", "exact")
     needs_weights = "pointnet"
-
-    def inputs(self, images: RangeImage) -> Float[Tensor, "B 3 n"]:
-        """Return clouds in unit space."""
-        return unit_clouds(images, self.variant)

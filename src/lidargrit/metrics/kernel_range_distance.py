@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-from jaxtyping import Float
-from torch import Tensor
-
-from lidargrit.metrics._networks.features import normalised_images
 from lidargrit.metrics._networks.kernel import KernelMetric
-from lidargrit.structures import RangeImage
 
 
 class KernelRangeDistance(KernelMetric):
@@ -23,7 +18,3 @@ class KernelRangeDistance(KernelMetric):
     title = "Squared kernel distance between RangeNet++ features of range images"
     variants = ("r2dm", "exact")
     needs_weights = "rangenet53"
-
-    def inputs(self, images: RangeImage) -> Float[Tensor, "B 5 H W"]:
-        """Return the five channels that RangeNet++ was trained on."""
-        return normalised_images(images, self.variant)

@@ -7,14 +7,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int64
 
-from lidargrit.metrics._birds_eye import LIDM_HALF_M, jensen_shannon_distance, occupied_cells
-from lidargrit.metrics._sets import SetMetric
+from lidargrit.metrics import ImageMetric
+from lidargrit.metrics._accumulators import Total
+from lidargrit.metrics._birds_eye import JSD_BOUNDS, LIDM_HALF_M, jensen_shannon_distance, occupied_cells
 from lidargrit.structures import RangeImage
 
 _CELLS_PER_M = 20
 
 
-class LidmBevJsd(SetMetric):
+class LidmBevJsd(ImageMetric):
     """Compare in how many scans of a set each cell of 5 cm within +-50 m holds a point, as "JSD" of LiDM's tables.
 
     The value is the square root of the Jensen-Shannon divergence in nats, from 0 to 0.8326, of the counts of both sets
@@ -34,13 +35,13 @@ class LidmBevJsd(SetMetric):
     """
 
     title = "Jensen-Shannon distance of occupied 5 cm cells (LiDM)"
-    variants = ("exact",)
-    adds_up = True
+    bounds = JSD_BOUNDS
+    accumulator = Total
 
-    def keep(self, images: RangeImage) -> Int64[np.ndarray, "cells"]:
+    def summarise(self, features: RangeImage, *, real: bool) -> Int64[np.ndarray, "cells"]:
         """Count, for every cell, the scans of a batch that have a point in it."""
         cells = (2 * LIDM_HALF_M * _CELLS_PER_M) ** 2
-        return np.bincount(occupied_cells(images, _CELLS_PER_M) % cells, minlength=cells)
+        return np.bincount(occupied_cells(features, _CELLS_PER_M) % cells, minlength=cells)
 
     def compare(
         self, generated: Int64[np.ndarray, "cells"], real: Int64[np.ndarray, "cells"]

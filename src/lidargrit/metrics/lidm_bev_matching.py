@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 from scipy.ndimage import distance_transform_edt
 
+from lidargrit.metrics import ImageMetric
+from lidargrit.metrics._accumulators import Rows
 from lidargrit.metrics._birds_eye import LIDM_HALF_M, occupied_cells
-from lidargrit.metrics._sets import SetMetric
 from lidargrit.structures import RangeImage
 
 _CELLS_PER_M = 2
@@ -17,7 +18,7 @@ _SIDE = 2 * LIDM_HALF_M * _CELLS_PER_M  # 200 cells
 _BLOCK = 64  # scans: occupancy and distances take 41 MB
 
 
-class LidmBevMatching(SetMetric):
+class LidmBevMatching(ImageMetric):
     """Find for every real scan the generated one whose occupied cells are nearest; the value is the mean of these.
 
     LiDM's tables call it "MMD"; it is a minimum matching distance, not a maximum mean discrepancy. A scan is the set
@@ -40,14 +41,14 @@ class LidmBevMatching(SetMetric):
     """
 
     title = "Minimum matching distance of occupied 0.5 m cells (LiDM)"
-    variants = ("exact",)
+    accumulator = Rows
 
-    def keep(self, images: RangeImage) -> UInt8[np.ndarray, "B bytes"]:
+    def summarise(self, features: RangeImage, *, real: bool) -> UInt8[np.ndarray, "B bytes"]:
         """Return one bit for every cell of every scan."""
-        occupied = np.zeros((len(images), _SIDE, _SIDE), dtype=bool)
-        occupied.ravel()[occupied_cells(images, _CELLS_PER_M)] = True
+        occupied = np.zeros((len(features), _SIDE, _SIDE), dtype=bool)
+        occupied.ravel()[occupied_cells(features, _CELLS_PER_M)] = True
         occupied[~occupied.any(axis=(1, 2)), _SIDE // 2, _SIDE // 2] = True
-        return np.packbits(occupied.reshape(len(images), -1), axis=1)
+        return np.packbits(occupied.reshape(len(features), -1), axis=1)
 
     def compare(
         self, generated: UInt8[np.ndarray, "n bytes"], real: UInt8[np.ndarray, "m bytes"]

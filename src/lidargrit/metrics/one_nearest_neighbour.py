@@ -32,6 +32,7 @@ class OneNearestNeighbour(CloudMetric):
     """
 
     title = "Accuracy of telling the sets of point clouds by nearest neighbour (0.5 is best)"
+    bounds = (0.0, 1.0)
 
     def compare(self, generated: Clouds, real: Clouds) -> tuple[float, dict[str, Any]]:
         """Return the accuracy over both sets, and that of each in the details."""

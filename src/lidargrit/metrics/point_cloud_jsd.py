@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 from scipy.spatial import KDTree
 
-from lidargrit.metrics._clouds import CloudMetric
+from lidargrit.metrics._accumulators import Total
+from lidargrit.metrics._clouds import CloudMetric, Clouds
 from lidargrit.metrics._curves import divergence
-from lidargrit.structures import RangeImage
 
 _SIDE = 28  # grid points along each axis, from -1 to 1 times the longest range
 _EPSILON = 1e-8  # of the program, against the logarithm of 0
@@ -36,11 +36,12 @@ class PointCloudJsd(CloudMetric):
     """
 
     title = "Jensen-Shannon divergence of point clouds in space"
-    adds_up = True
+    bounds = (0.0, 1.0)
+    accumulator = Total
 
-    def keep(self, images: RangeImage) -> Int64[np.ndarray, "grid"]:
+    def summarise(self, features: Clouds, *, real: bool) -> Int64[np.ndarray, "grid"]:
         """Count the points of a batch at every grid point."""
-        return grid_counts(super().keep(images).reshape(-1, 3))
+        return grid_counts(features.reshape(-1, 3))
 
     def compare(
         self, generated: Int64[np.ndarray, "grid"], real: Int64[np.ndarray, "grid"]

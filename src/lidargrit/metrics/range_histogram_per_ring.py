@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from lidargrit.metrics import ImageKind
 from lidargrit.metrics._curves import CurveMetric, Curves, compare_histograms, histogram, log_edges, middles
-from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
 _BINS = 32  # of 120 m / 0.9 m: each reaches a sixth farther than the one before
@@ -24,18 +24,18 @@ class RangeHistogramPerRing(CurveMetric):
 
     def count(self, images: RangeImage) -> Int64[np.ndarray, "H bins"]:
         """Count the returns of every row in bins of range."""
-        edges = _edges(images.sensor)
+        edges = _edges(ImageKind.of(images.sensor))
         rows = zip(images.range_m.transpose(0, 1), images.return_mask.transpose(0, 1), strict=True)
         return np.stack([histogram(range_m[returned], edges) for range_m, returned in rows])
 
     def curves(
-        self, generated: Int64[np.ndarray, "H bins"], real: Int64[np.ndarray, "H bins"], sensor: SensorModel
+        self, generated: Int64[np.ndarray, "H bins"], real: Int64[np.ndarray, "H bins"], kind: ImageKind
     ) -> Curves:
         """Return one histogram a row."""
-        return compare_histograms(generated, real, middles(_edges(sensor)))
+        return compare_histograms(generated, real, middles(_edges(kind)))
 
 
-def _edges(sensor: SensorModel) -> Float64[np.ndarray, " edges"]:
-    edges = log_edges(sensor.range_min_m, sensor.range_max_m, _BINS)
+def _edges(kind: ImageKind) -> Float64[np.ndarray, " edges"]:
+    edges = log_edges(kind.range_min_m, kind.range_max_m, _BINS)
     edges[0], edges[-1] = edges[0] * 0.999, edges[-1] * 1.001  # float32 ranges at the limits lie inside
     return edges

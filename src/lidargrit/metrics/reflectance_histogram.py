@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Int64
 
 from lidargrit.errors import DataError
+from lidargrit.metrics import ImageKind
 from lidargrit.metrics._curves import CurveMetric, Curves, compare_histograms
-from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
 _STEPS = 50  # bins of 0.02, two of the hundredths that KITTI's files hold
@@ -38,7 +38,7 @@ class ReflectanceHistogram(CurveMetric):
         return torch.bincount(index, minlength=_STEPS + 1).numpy()
 
     def curves(
-        self, generated: Int64[np.ndarray, " bins"], real: Int64[np.ndarray, " bins"], sensor: SensorModel
+        self, generated: Int64[np.ndarray, " bins"], real: Int64[np.ndarray, " bins"], kind: ImageKind
     ) -> Curves:
         """Return the share of returns over the reflectance."""
         return compare_histograms(generated, real, (np.arange(_STEPS + 1) + 0.25) / _STEPS)

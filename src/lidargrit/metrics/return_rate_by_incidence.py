@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Int64
 
-from lidargrit.metrics._curves import CurveMetric, Curves, Surroundings, compare_shares, count_shares
-from lidargrit.sensors import SensorModel
+from lidargrit.metrics import ImageKind
+from lidargrit.metrics._curves import CurveMetric, Curves, LocalSurface, compare_shares, count_shares
 from lidargrit.structures import RangeImage
 
 _EDGES_DEG = np.linspace(0, 90, 19)  # 5 degrees each: what noise of 2 cm does to a plane through points 25 cm apart
@@ -26,10 +26,10 @@ class ReturnRateByIncidence(CurveMetric):
 
     def count(self, images: RangeImage) -> Int64[np.ndarray, "2 bins"]:
         """Count the pixels whose plane is known and, among them, the returns."""
-        return count_shares(Surroundings.of(images).incidence_rad.rad2deg(), images.return_mask, _EDGES_DEG)
+        return count_shares(LocalSurface.of(images).incidence_rad.rad2deg(), images.return_mask, _EDGES_DEG)
 
     def curves(
-        self, generated: Int64[np.ndarray, "2 bins"], real: Int64[np.ndarray, "2 bins"], sensor: SensorModel
+        self, generated: Int64[np.ndarray, "2 bins"], real: Int64[np.ndarray, "2 bins"], kind: ImageKind
     ) -> Curves:
         """Return the share of returns over the incidence."""
         return compare_shares(generated, real, (_EDGES_DEG[1:] + _EDGES_DEG[:-1]) / 2)

@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from lidargrit.metrics import ImageKind
 from lidargrit.metrics._curves import (
     CurveMetric,
     Curves,
-    Surroundings,
+    LocalSurface,
     compare_shares,
     count_shares,
     log_edges,
     middles,
 )
-from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
 _BINS = 24  # of 120 m / 0.9 m: each reaches a fifth farther than the one before
@@ -35,14 +35,14 @@ class ReturnRatePerRange(CurveMetric):
 
     def count(self, images: RangeImage) -> Int64[np.ndarray, "2 bins"]:
         """Count the pixels whose range is known and, among them, the returns."""
-        return count_shares(Surroundings.of(images).range_m, images.return_mask, _edges(images.sensor))
+        return count_shares(LocalSurface.of(images).range_m, images.return_mask, _edges(ImageKind.of(images.sensor)))
 
     def curves(
-        self, generated: Int64[np.ndarray, "2 bins"], real: Int64[np.ndarray, "2 bins"], sensor: SensorModel
+        self, generated: Int64[np.ndarray, "2 bins"], real: Int64[np.ndarray, "2 bins"], kind: ImageKind
     ) -> Curves:
         """Return the share of returns over the range."""
-        return compare_shares(generated, real, middles(_edges(sensor)))
+        return compare_shares(generated, real, middles(_edges(kind)))
 
 
-def _edges(sensor: SensorModel) -> Float64[np.ndarray, " edges"]:
-    return log_edges(sensor.range_min_m, sensor.range_max_m, _BINS)
+def _edges(kind: ImageKind) -> Float64[np.ndarray, " edges"]:
+    return log_edges(kind.range_min_m, kind.range_max_m, _BINS)

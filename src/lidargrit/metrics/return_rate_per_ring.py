@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Int64
 
+from lidargrit.metrics import ImageKind
 from lidargrit.metrics._curves import CurveMetric, Curves, compare_shares
-from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
 
@@ -22,8 +22,6 @@ class ReturnRatePerRing(CurveMetric):
         returned = images.return_mask.sum(dim=(0, 2)).numpy()
         return np.stack((np.full_like(returned, len(images) * images.sensor.width), returned))
 
-    def curves(
-        self, generated: Int64[np.ndarray, "2 H"], real: Int64[np.ndarray, "2 H"], sensor: SensorModel
-    ) -> Curves:
+    def curves(self, generated: Int64[np.ndarray, "2 H"], real: Int64[np.ndarray, "2 H"], kind: ImageKind) -> Curves:
         """Return the share of returns over the rows."""
-        return compare_shares(generated, real, np.arange(sensor.height, dtype=float))
+        return compare_shares(generated, real, np.arange(kind.height, dtype=float))

@@ -13,9 +13,10 @@ from jaxtyping import Float, Float32, Int
 from torch import Tensor
 
 from lidargrit.errors import ConfigError
-from lidargrit.metrics import Metric
+from lidargrit.metrics import ImageMetric
+from lidargrit.metrics._accumulators import Rows
 from lidargrit.projection import RangeEncoding
-from lidargrit.structures import MetricResult, RangeImage
+from lidargrit.structures import RangeImage
 
 # All from Karras et al. 2018, whose values LidarGRIT's program keeps.
 _COARSEST = 16  # rows or columns, whichever are fewer, of the last level of the pyramid
@@ -26,10 +27,8 @@ _REPEATS, _DIRECTIONS = 4, 128
 
 _MAX_PROJECTED = 2**23  # projections held at once: 32 MB per set, and as much again while they are sorted
 
-ShapeKey = tuple[int, int, float, float]  # rows, columns, shortest and longest range
 
-
-class SlicedWasserstein(Metric):
+class SlicedWasserstein(ImageMetric):
     """Compare the distributions of 7x7 patches of the encoded range at 3 scales (2 for 32 rows) by random projections.
 
     The range is encoded linearly onto [-1, 1] between the sensor's limits, -1 for no return, and split into a
@@ -61,88 +60,67 @@ class SlicedWasserstein(Metric):
     """
 
     title = "Sliced Wasserstein distance between patches of range images"
-    higher_is_better = False
     variants = ("reference", "textbook")
+    accumulator = Rows
 
     def __init__(self, *, variant: Literal["reference", "textbook"] = "reference", seed: int = 0) -> None:
         super().__init__(variant=variant, seed=seed)
-        self._kind: ShapeKey | None = None
         self._shared: SharedPositions | None = None
-        # Per set, a list of blocks of images; of every block its levels, each (images, patches, 49).
-        self._blocks: dict[bool, list[list[Tensor]]] = {False: [], True: []}
 
-    def update(self, images: RangeImage, *, real: bool) -> None:
-        """Cut the patches of a batch of images; only they are kept, 75 kB per image."""
-        sensor = images.sensor
-        self._require_kind((sensor.height, sensor.width, sensor.range_min_m, sensor.range_max_m))
-        range_m = images.range_m.detach().reshape(-1, sensor.height, sensor.width)
-        return_mask = images.return_mask.reshape(range_m.shape)
+    @property
+    def order_matters(self) -> bool:
+        """Whether patch positions depend on the batch into which an image falls, as in ``reference``."""
+        return self.variant == "reference"
+
+    def summarise(self, features: RangeImage, *, real: bool) -> Float32[np.ndarray, "B patches 49"]:
+        """Cut the patches of a batch of images, those of the finest level first: 75 kB per image."""
+        sensor = features.sensor
         encoding = RangeEncoding("linear", sensor.range_min_m, sensor.range_max_m)
-        start = 0
-        while start < len(range_m):
-            batch, place = divmod(self._count(real), _BATCH)
-            stop = min(len(range_m), start + _BATCH - place)  # a block never crosses the border of two batches
-            encoded = encoding.encode(range_m[start:stop].float(), return_mask[start:stop])
-            pyramid = laplacian_pyramid(encoded, shifted=self.variant == "reference")
-            if self._shared is not None:
-                positions = self._shared.of_batch(batch, real)
-            else:
-                positions = own_positions(range_m[start:stop], pyramid, self.seed, real)
-            self._blocks[real].append([descriptors(*pair).cpu() for pair in zip(pyramid, positions, strict=True)])
-            start = stop
+        encoded = encoding.encode(features.range_m.float(), features.return_mask)
+        pyramid = laplacian_pyramid(encoded, shifted=self.variant == "reference")
+        if self.variant == "reference":
+            images = range(self.num_images[real], self.num_images[real] + len(features))
+            positions = self._shared_positions().of_images(images, real)
+        else:
+            positions = own_positions(features.range_m, pyramid, self.seed, real)
+        return torch.cat([descriptors(*pair) for pair in zip(pyramid, positions, strict=True)], dim=1).numpy()
 
-    def compute(self) -> MetricResult:
+    def compare(
+        self, generated: Float32[np.ndarray, "n patches 49"], real: Float32[np.ndarray, "m patches 49"]
+    ) -> tuple[float, dict[str, Any]]:
         """Return the mean over levels, and every level in the details."""
-        num_generated, num_reference = self._count(False), self._count(True)
-        self.require_images(num_generated, num_reference, at_least=2)
-        n = min(num_generated, num_reference)
-        assert self._kind is not None
-        reference = self._shared is not None
-        rng = torch.Generator().manual_seed(self.seed)
-        if self._shared is not None:  # the program draws its directions after the patches of all batches
-            rng = self._shared.after_batches(math.ceil(n / _BATCH))
+        assert self.kind is not None
+        n = min(len(generated), len(real))
+        reference = self.variant == "reference"
+        # LidarGRIT's program takes its directions from the same random source, after the positions of all batches.
+        rng = self._shared_positions().after_images(n) if reference else torch.Generator().manual_seed(self.seed)
         details: dict[str, Any] = {}
-        for level in range(num_levels(*self._kind[:2])):
-            generated, real = (standardised(self._level(which, level, n), int(reference)) for which in (False, True))
+        first = 0
+        for level, num_patches in enumerate(self._patches_per_level()):
+            part = slice(first, first := first + num_patches)
+            sides = (torch.from_numpy(each[:n, part].reshape(-1, _PATCH**2)) for each in (generated, real))
+            patches = [standardised(side, int(reference)) for side in sides]
             repeats = [
-                sliced_distance(generated, real, random_directions(rng, unit_length=not reference))
+                sliced_distance(patches[0], patches[1], random_directions(rng, unit_length=not reference))
                 for _ in range(_REPEATS)
             ]
-            details[f"rows_{self._kind[0] >> level}"] = sum(repeats) / len(repeats)
+            details[f"rows_{self.kind.height >> level}"] = sum(repeats) / len(repeats)
         value = sum(details.values()) / len(details)
-        details["num_compared"] = n
-        return MetricResult(
-            self.name, value, self.higher_is_better, num_generated, num_reference, self.variant, details
-        )
+        return value, {**details, "num_compared": n}
 
-    def merge(self, other: Metric) -> None:
-        """Append the patches that another process has cut."""
-        self.require_same_options(other)
-        assert isinstance(other, SlicedWasserstein)
-        if other._kind is None:
-            return
-        self._require_kind(other._kind)
-        for real, blocks in other._blocks.items():
-            self._blocks[real] += blocks
+    def _level_sizes(self) -> list[int]:
+        """Return the number of patch positions in an image of each level."""
+        assert self.kind is not None
+        rows, columns = self.kind.height, self.kind.width
+        return [num_positions(rows >> level, columns >> level) for level in range(num_levels(rows, columns))]
 
-    def _count(self, real: bool) -> int:
-        return sum(len(block[0]) for block in self._blocks[real])
+    def _patches_per_level(self) -> list[int]:
+        return [_PATCHES if self.variant == "textbook" else min(_PATCHES, size) for size in self._level_sizes()]
 
-    def _level(self, real: bool, level: int, n: int) -> Float32[Tensor, "descriptors 49"]:
-        return torch.cat([block[level] for block in self._blocks[real]])[:n].flatten(0, 1)
-
-    def _require_kind(self, kind: ShapeKey) -> None:
-        if self._kind is None:
-            level_sizes = [num_positions(kind[0] >> k, kind[1] >> k) for k in range(num_levels(*kind[:2]))]
-            if self.variant == "reference":
-                self._shared = SharedPositions(self.seed, level_sizes)
-            self._kind = kind
-        if self._kind != kind:
-            raise ConfigError(
-                "range images of {}x{} between {:g} and {:g} m".format(*kind),
-                "{}x{} between {:g} and {:g} m, as the images before".format(*self._kind),
-                "project both sets with one sensor",
-            )
+    def _shared_positions(self) -> SharedPositions:
+        if self._shared is None:
+            self._shared = SharedPositions(self.seed, self._level_sizes())
+        return self._shared
 
 
 class SharedPositions:
@@ -154,23 +132,28 @@ class SharedPositions:
 
     def __init__(self, seed: int, level_sizes: list[int]) -> None:
         self._level_sizes = level_sizes
-        self._drawn: list[dict[bool, list[Tensor]]] = []
+        self._sampled: list[dict[bool, list[Tensor]]] = []
         self._states = [torch.Generator().manual_seed(seed).get_state()]  # before the first batch, after it, ...
 
-    def of_batch(self, batch: int, real: bool) -> list[Int[Tensor, "1 patches"]]:
-        """Return the positions for every level of a batch, shared by its images."""
-        while len(self._drawn) <= batch:
-            rng = self._source(len(self._drawn))
-            self._drawn.append(
-                {which: [shared_positions(size, rng) for size in self._level_sizes] for which in (False, True)}
+    def of_images(self, images: range, real: bool) -> list[Int[Tensor, "B patches"]]:
+        """Return the positions for every level of images of a set, by their numbers in it."""
+        batches = [self._of_batch(image // _BATCH)[real] for image in images]
+        return [torch.stack(level) for level in zip(*batches, strict=True)]
+
+    def after_images(self, num_images: int) -> torch.Generator:
+        """Return a random source in the state of the program's after the batches of so many images."""
+        batches = math.ceil(num_images / _BATCH)
+        self._of_batch(batches - 1)
+        return self._source(batches)
+
+    def _of_batch(self, batch: int) -> dict[bool, list[Int[Tensor, "patches"]]]:
+        while len(self._sampled) <= batch:
+            rng = self._source(len(self._sampled))
+            self._sampled.append(
+                {real: [shared_positions(size, rng) for size in self._level_sizes] for real in (False, True)}
             )
             self._states.append(rng.get_state())
-        return self._drawn[batch][real]
-
-    def after_batches(self, batches: int) -> torch.Generator:
-        """Return a random source in the state of the program's after so many batches."""
-        self.of_batch(batches - 1, False)
-        return self._source(batches)
+        return self._sampled[batch]
 
     def _source(self, batches: int) -> torch.Generator:
         rng = torch.Generator()
@@ -252,9 +235,9 @@ def num_positions(rows: int, columns: int) -> int:
     return (rows - _PATCH + 1) * (columns - _PATCH + 1)
 
 
-def shared_positions(num: int, rng: torch.Generator) -> Int[Tensor, "1 patches"]:
-    """Draw 128 of ``num`` places without replacement, or all in random order if there are fewer."""
-    return torch.randperm(num, generator=rng)[None, :_PATCHES]
+def shared_positions(num: int, rng: torch.Generator) -> Int[Tensor, "patches"]:
+    """Sample 128 of ``num`` positions without replacement, or return all in random order if there are fewer."""
+    return torch.randperm(num, generator=rng)[:_PATCHES]
 
 
 def own_positions(

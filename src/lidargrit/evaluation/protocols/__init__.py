@@ -1,4 +1,4 @@
-"""Who is compared with whom, how, on how many scans: name → :class:`Protocol`."""
+"""The name of a protocol → the metrics that it asks for, and the images on which it computes them."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class MetricChoice:
     """One number that a protocol asks for.
 
     Args:
-        metric: its name.
-        variant: its definition; each that the metric has if empty.
+        metric: name of the metric.
+        variant: published definition of the metric; its first one if empty.
         options: keyword options of the metric besides variant and seed.
     """
 
@@ -31,21 +31,22 @@ class MetricChoice:
 
 @dataclass(frozen=True)
 class Protocol:
-    """Everything that has to be equal before two figures of one name may be compared.
+    """All that two scores of one name must have in common before they may be compared.
 
     Args:
-        title: one line.
-        source: whose it is: a paper, or a program and its commit.
-        metrics: numbers that it asks for, in the order of its table.
-        sensor: whose rays the images have; that of the samples or the scans if empty.
-        columns: fine columns of the circle; 0 for the sensor's own.
-        column_stride: every n-th of them is kept.
-        variant: of the projection of real scans.
-        range_m: a return that is not strictly between these is none, in both sets; None for the sensor's own limits.
-        num_scans: of each set; 0 for as many as there are.
-        data_set: which data set the reference is of; any if empty.
-        splits: by which names of a split the reference may be called; any if empty.
-        departures: what we do otherwise than the source, and what it changes.
+        title: description of one line.
+        source: paper or program (with its commit) that the protocol follows.
+        metrics: metrics that are computed, in the order of the table.
+        sensor: name of the sensor whose rays the images have; that of the samples or of the scans if empty.
+        columns: number of columns into which the circle is divided; the sensor's own if 0.
+        column_stride: step between the columns that are kept.
+        variant: definition of the projection of real scans.
+        range_m: open interval of range in metres, outside which a return of either set counts as none; the sensor's
+            own limits if None.
+        num_scans: number of scans of each set; as many as there are if 0.
+        data_set: name of the data set of the reference; any if empty.
+        splits: names that the split of the reference may have; any if empty.
+        departures: differences from the source, each with what it changes.
     """
 
     title: str
@@ -86,5 +87,5 @@ def load_protocol(name: str) -> Protocol:
 
 
 def public_name(name: str) -> str:
-    """Return the name of a file for what a user types."""
+    """Return the file name of what a user types, such as lidargrit_kitti_360 of "LidarGRIT-KITTI-360"."""
     return name.strip().lower().replace("-", "_")

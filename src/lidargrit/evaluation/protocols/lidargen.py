@@ -16,7 +16,8 @@ lidargen = Protocol(
     splits=("test", "paper/test", "lidargen-code/test"),
     departures=(
         "the program shuffles the scans by a seed; here they are evenly spaced",
-        "its Fréchet range distance takes the first 1,100 scans of each set",
-        "the program puts points on the edge of a cell, half a row and half a column away, in both sets alike",
+        "the program's Fréchet range distance takes the first 1,100 scans of each set",
+        "the program puts the points of both sets on the edges of pixels, half a row and half a column away from their "
+        "centres; here both sets lie on the rays through the centres",
     ),
 )

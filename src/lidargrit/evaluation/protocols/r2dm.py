@@ -19,6 +19,7 @@ r2dm = Protocol(
     splits=("all",),
     departures=(
         "the program compares features of all real scans with those of the samples; here of equally many",
-        "the program takes the true points of real scans; here both sets are unprojected along the sensor's rays",
+        "the program puts the points of samples on the edges of pixels, half a row and half a column away from their "
+        "centres, and takes the measured points of real scans; here both sets lie on the rays through the centres",
     ),
 )

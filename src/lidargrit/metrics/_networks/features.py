@@ -1,10 +1,10 @@
-"""Range images → what a network sees of them, for metrics that compare two sets of features."""
+"""Range images → the features that a pretrained network finds in them, for metrics that compare two sets of these."""
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 import torch
@@ -12,35 +12,136 @@ from jaxtyping import Float, Float32
 from torch import Tensor
 
 from lidargrit.errors import ConfigError, DataError
-from lidargrit.metrics import Metric
-from lidargrit.metrics._networks.network import load_network
+from lidargrit.metrics import FeatureExtractor, Metric
+from lidargrit.metrics._accumulators import Kept
+from lidargrit.metrics._networks.network import PretrainedNetwork, load_network
+from lidargrit.metrics._networks.pointnet import POINTNET_WEIGHTS
 from lidargrit.metrics._networks.rangenet import WIDTH_STEP
 from lidargrit.projection import points_of_pixels
 from lidargrit.reporting import Reporter
+from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
-_NEAREST_M, _FARTHEST_M = 0.5, 63.0  # of LiDARGen, whose encoding of range ends at 63 m
+_LIDARGEN_WINDOW_M = 0.5, 63.0  # its encoding of range ends at 63 m
 _R2DM_UNIT_M = 80.0  # whatever the sensor: its limit on KITTI-360
 # Range, x, y, z and reflectance of SemanticKITTI, from darknet53-1024px.yaml of PRBonn/lidar-bonnetal.
 _MEANS, _DEVIATIONS = (12.12, 10.88, 0.23, -1.04, 0.21), (12.32, 11.47, 6.91, 0.86, 0.16)
 
 
-class FeatureMetric(Metric):
-    """Looks at both sets through a network that others have trained, and compares the two clouds of features.
+@dataclass(frozen=True)
+class UnitClouds:
+    """Inputs of PointNet: the cloud of every image, with all coordinates divided by one unit.
 
     Args:
-        variant: which definition is used.
-        seed: of all that the metric draws.
-        weights: the file with the network's weights; found or fetched if not given.
-        device: where the network computes, such as "cuda".
-        reporter: hears of a download.
+        unit_m: length that becomes 1, in metres.
+        window_m: returns outside this open interval of range count as dropped; None keeps all.
+        returns_only: a dropped pixel repeats a return of its image, which changes nothing since the network takes the
+            largest value over all points; else it is a point at the origin. An image without any return is one point at
+            the origin.
+    """
+
+    unit_m: float
+    window_m: tuple[float, float] | None
+    returns_only: bool
+
+    @classmethod
+    def of(cls, variant: str, sensor: SensorModel) -> UnitClouds:
+        """Return the inputs of a published definition for images of a sensor.
+
+        Args:
+            variant: ``lidargrit`` divides by the sensor's longest range, and on KITTI-360 sensors takes what is not
+                between 0.5 and 63 m for dropped; ``r2dm`` does so on all sensors and divides by 80 m; both keep dropped
+                pixels as points at the origin. ``exact`` takes all returns and nothing else.
+            sensor: the sensor of the images.
+        """
+        if variant == "r2dm":
+            return cls(_R2DM_UNIT_M, _LIDARGEN_WINDOW_M, False)
+        windowed = variant == "lidargrit" and "kitti_360" in sensor.name
+        return cls(sensor.range_max_m, _LIDARGEN_WINDOW_M if windowed else None, variant == "exact")
+
+    def __call__(self, images: RangeImage) -> Float[Tensor, "B 3 n"]:
+        """Return the clouds of a batch."""
+        images = within(images, self.window_m)
+        clouds = (points_of_pixels(images) / self.unit_m).flatten(1, 2)  # (B, n, 3)
+        if self.returns_only:
+            returned = images.return_mask.flatten(1)
+            first = returned.int().argmax(dim=1)
+            clouds = torch.where(returned[..., None], clouds, clouds[torch.arange(len(clouds)), first][:, None])
+        return clouds.mT
+
+
+@dataclass(frozen=True)
+class NormalisedImages:
+    """Inputs of RangeNet++: range, x, y, z and reflectance by the mean and deviation of its training, 0 where dropped.
+
+    Args:
+        window_m: returns outside this open interval of range count as dropped; None keeps all.
+    """
+
+    window_m: tuple[float, float] | None
+
+    @classmethod
+    def of(cls, variant: str) -> NormalisedImages:
+        """Return the inputs of a published definition: ``r2dm`` keeps 0.5 to 63 m, ``exact`` takes all returns."""
+        return cls(_LIDARGEN_WINDOW_M if variant == "r2dm" else None)
+
+    def __call__(self, images: RangeImage) -> Float[Tensor, "B 5 H W"]:
+        """Return the channels of a batch.
+
+        Raises:
+            DataError: images without reflectance.
+            ConfigError: a number of columns that cannot be halved five times.
+        """
+        if images.reflectance is None:
+            raise DataError(
+                "range images without reflectance",
+                "reflectance at every return: RangeNet++ has learnt from it",
+                "leave out frechet_range_distance and kernel_range_distance, or generate reflectance too",
+            )
+        if images.sensor.width % WIDTH_STEP:
+            raise ConfigError(
+                f"range images of {images.sensor.width} columns for RangeNet++",
+                f"a multiple of {WIDTH_STEP}",
+                "project with another number of columns: sensor.with_columns(...)",
+            )
+        reflectance = images.reflectance
+        images = within(images, self.window_m)
+        channels = torch.cat((images.range_m[..., None], points_of_pixels(images), reflectance[..., None]), dim=-1)
+        normalised = (channels - channels.new_tensor(_MEANS)) / channels.new_tensor(_DEVIATIONS)
+        return (normalised * images.return_mask[..., None]).permute(0, 3, 1, 2)
+
+
+@dataclass(frozen=True)
+class NetworkFeatures(FeatureExtractor[Float32[np.ndarray, "B d"]]):
+    """The features that a pretrained network finds in images.
+
+    Args:
+        network: the network with its weights.
+        inputs: what turns images into the network's inputs.
+    """
+
+    network: PretrainedNetwork
+    inputs: UnitClouds | NormalisedImages
+
+    def __call__(self, images: RangeImage) -> Float32[np.ndarray, "B d"]:
+        """Return the features of a batch."""
+        return self.network.features(self.inputs(images))
+
+
+class FeatureMetric(Metric[Float32[np.ndarray, "B d"], Kept]):
+    """Compares the features that a pretrained network finds in two sets of images.
+
+    Args:
+        variant: the published definition to compute; the first of ``variants`` if not given.
+        seed: seed of all random numbers of the metric.
+        weights: file with the network's weights; found or fetched if not given.
+        device: device on which the network computes, such as "cuda".
+        reporter: receives messages and the progress of a download.
 
     Raises:
         WeightsError: no weights, or not those of the network.
         ConfigError: images of two sizes or two pairs of range limits, or merged parts that used other weights.
     """
-
-    higher_is_better = False
 
     def __init__(
         self,
@@ -53,34 +154,23 @@ class FeatureMetric(Metric):
     ) -> None:
         super().__init__(variant=variant, seed=seed)
         self.network = load_network(self.needs_weights, weights, device, reporter)
-        self._images = {False: 0, True: 0}
-        self._kind: tuple[int, int, float, float] | None = None  # rows, columns, shortest and longest range
 
-    @abstractmethod
-    def inputs(self, images: RangeImage) -> Float[Tensor, "B ..."]:
-        """Turn a batch of images into what the network takes."""
+    @final
+    def extractor(self, sensor: SensorModel) -> NetworkFeatures:
+        """Return the network with the inputs of the variant."""
+        pointnet = self.needs_weights == POINTNET_WEIGHTS.name
+        inputs = UnitClouds.of(self.variant, sensor) if pointnet else NormalisedImages.of(self.variant)
+        return NetworkFeatures(self.network, inputs)
 
-    @abstractmethod
-    def take(self, features: Float32[np.ndarray, "B d"], real: bool) -> None:
-        """Take in the features of a batch."""
+    @final
+    def summarise(self, features: Float32[np.ndarray, "B d"], *, real: bool) -> np.ndarray:
+        """Return the features themselves."""
+        return features
 
-    @abstractmethod
-    def take_from(self, other: FeatureMetric) -> None:
-        """Take in the features that another process has gathered."""
-
-    @torch.no_grad()
-    def update(self, images: RangeImage, *, real: bool) -> None:
-        """Show a batch of images to the network."""
-        sensor = images.sensor
-        images = images if images.range_m.ndim == 3 else RangeImage.stack([images])
-        self._require_kind((sensor.height, sensor.width, sensor.range_min_m, sensor.range_max_m))
-        if len(images):
-            self.take(self.network.features(self.inputs(images)), real)
-            self._images[real] += len(images)
-
-    def merge(self, other: Metric) -> None:
-        """Take in what another process has gathered."""
-        self.require_same_options(other)
+    @final
+    def require_same_options(self, other: Metric[Float32[np.ndarray, "B d"], Kept]) -> None:
+        """Refuse to merge with a metric of another kind, variant, seed or weights."""
+        super().require_same_options(other)
         assert isinstance(other, FeatureMetric)
         if other.network.sha256 != self.network.sha256:
             raise ConfigError(
@@ -88,84 +178,19 @@ class FeatureMetric(Metric):
                 f"those through {self.network.path}",
                 "give every process the same file",
             )
-        if other._kind is not None:
-            self._require_kind(other._kind)
-            self.take_from(other)
-            for real, count in other._images.items():
-                self._images[real] += count
 
-    def common_details(self) -> dict[str, Any]:
-        """Return what identifies the weights, for a result's details."""
+    def weights_details(self) -> dict[str, Any]:
+        """Return what identifies the weights, for the details of a result."""
         return {"weights": {"file": self.network.path.name, "sha256": self.network.sha256}}
 
-    def _require_kind(self, kind: tuple[int, int, float, float]) -> None:
-        self._kind = self._kind or kind
-        if self._kind != kind:
-            raise ConfigError(
-                "range images of {}x{} between {:g} and {:g} m".format(*kind),
-                "{}x{} between {:g} and {:g} m, as the images before".format(*self._kind),
-                "project both sets with one sensor",
-            )
 
-
-def unit_clouds(images: RangeImage, variant: str) -> Float[Tensor, "B 3 n"]:
-    """Return the cloud of every image in units of the longest range: what PointNet sees.
-
-    Args:
-        images: a batch.
-        variant: ``lidargrit`` places dropped pixels at the origin, divides by the sensor's longest range, and on
-            KITTI-360 sensors takes what is not between 0.5 and 63 m for dropped; ``r2dm`` does so on all sensors and
-            divides by 80 m; ``exact`` takes all returns and nothing else. The network takes the largest value over
-            all points, so there a dropped pixel repeats a return; an image without any is one point at the origin.
-    """
-    sensor = images.sensor
-    if variant == "r2dm" or (variant == "lidargrit" and "kitti_360" in sensor.name):
-        images = between_limits(images)
-    unit_m = _R2DM_UNIT_M if variant == "r2dm" else sensor.range_max_m
-    clouds = (points_of_pixels(images) / unit_m).flatten(1, 2)  # (B, n, 3)
-    if variant == "exact":
-        returned = images.return_mask.flatten(1)
-        first = returned.int().argmax(dim=1)
-        clouds = torch.where(returned[..., None], clouds, clouds[torch.arange(len(clouds)), first][:, None])
-    return clouds.mT
-
-
-def normalised_images(images: RangeImage, variant: str) -> Float[Tensor, "B 5 H W"]:
-    """Return range, x, y, z and reflectance as RangeNet++ has learnt them: by mean and deviation, 0 where dropped.
-
-    Args:
-        images: a batch, with reflectance.
-        variant: ``r2dm`` takes what is not between 0.5 and 63 m for dropped; ``exact`` takes all returns.
-
-    Raises:
-        DataError: images without reflectance.
-        ConfigError: a number of columns that cannot be halved five times.
-    """
-    if images.reflectance is None:
-        raise DataError(
-            "range images without reflectance",
-            "reflectance at every return: RangeNet++ has learnt from it",
-            "leave out frechet_range_distance and kernel_range_distance, or generate reflectance too",
-        )
-    if images.sensor.width % WIDTH_STEP:
-        raise ConfigError(
-            f"range images of {images.sensor.width} columns for RangeNet++",
-            f"a multiple of {WIDTH_STEP}",
-            "project with another number of columns: sensor.with_columns(...)",
-        )
-    reflectance = images.reflectance
-    if variant == "r2dm":
-        images = between_limits(images)
-    channels = torch.cat((images.range_m[..., None], points_of_pixels(images), reflectance[..., None]), dim=-1)
-    normalised = (channels - channels.new_tensor(_MEANS)) / channels.new_tensor(_DEVIATIONS)
-    return (normalised * images.return_mask[..., None]).permute(0, 3, 1, 2)
-
-
-def between_limits(images: RangeImage) -> RangeImage:
-    """Drop what is not strictly between 0.5 and 63 m; reflectance is left out.
+def within(images: RangeImage, window_m: tuple[float, float] | None) -> RangeImage:
+    """Drop returns that are not strictly inside a window of range; reflectance is left out.
 
     Source:
         kazuto1011/r2dm@ad66e71, evaluate.py, after LiDARGen.
     """
-    inside = (images.range_m > _NEAREST_M) & (images.range_m < _FARTHEST_M)
+    if window_m is None:
+        return images
+    inside = (images.range_m > window_m[0]) & (images.range_m < window_m[1])
     return RangeImage.masked(images.range_m, images.return_mask & inside, images.sensor)

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64
+from jaxtyping import Float, Float64
 
+from lidargrit.metrics._accumulators import Accumulator
 from lidargrit.metrics._networks.features import FeatureMetric
-from lidargrit.structures import MetricResult
 
 
-class Moments:
+class Moments(Accumulator["Moments"]):
     """Mean and covariance of vectors seen in any number of batches, in memory that does not grow with their number.
 
     Kept are the number n, the mean, and a matrix R with R^T R = sum of (x - mean)(x - mean)^T, with at most 2 d rows
@@ -28,16 +29,21 @@ class Moments:
         self.mean: Float64[np.ndarray, " d"] = np.zeros(0)
         self._rows: list[Float64[np.ndarray, "_ d"]] = []
 
-    def add(self, vectors: Float[np.ndarray, "n d"]) -> None:
+    def add(self, summary: Float[np.ndarray, "n d"]) -> None:
         """Take in a batch of at least one vector."""
-        vectors = vectors.astype(np.float64)
+        vectors = summary.astype(np.float64)
         mean = vectors.mean(axis=0)
         self._join(len(vectors), mean, [vectors - mean] if len(vectors) > 1 else [])
 
-    def merge(self, other: Moments) -> None:
-        """Take in what another has gathered."""
-        if other.num:
-            self._join(other.num, other.mean, other._rows)
+    def merge(self, other: Accumulator[Moments]) -> None:
+        """Take in the vectors that another has seen."""
+        moments = other.value()
+        if moments.num:
+            self._join(moments.num, moments.mean, moments._rows)
+
+    def value(self) -> Moments:
+        """Return the moments themselves."""
+        return self
 
     def root(self) -> Float64[np.ndarray, "r d"]:
         """Return a matrix whose product with itself, transposed first, is the unbiased covariance; at most d rows."""
@@ -77,37 +83,23 @@ def frechet_distance(first: Moments, second: Moments) -> float:
     return max(apart + spread - 2 * common, 0.0)  # rounding alone takes it below
 
 
-class FrechetMetric(FeatureMetric):
+class FrechetMetric(FeatureMetric[Moments]):
     """Fréchet distance between the features of two sets.
 
     It is biased upwards for small sets, and says little where there are fewer scans than features: the details have a
     line about it in ``warnings``. Only values of equally large sets can be compared.
     """
 
-    def __init__(self, **options) -> None:
-        super().__init__(**options)
-        self._moments = {False: Moments(), True: Moments()}
+    accumulator = Moments
 
-    def take(self, features: Float32[np.ndarray, "B d"], real: bool) -> None:
-        """Add to the moments of a set."""
-        self._moments[real].add(features)
-
-    def take_from(self, other: FeatureMetric) -> None:
-        """Join the moments of both sets."""
-        assert isinstance(other, FrechetMetric)
-        for real, moments in other._moments.items():
-            self._moments[real].merge(moments)
-
-    def compute(self) -> MetricResult:
+    def compare(self, generated: Moments, real: Moments) -> tuple[float, dict[str, Any]]:
         """Return the distance; the details name the weights, and warn of small sets."""
-        counts = self._images[False], self._images[True]
-        self.require_images(*counts, at_least=2)
-        values = len(self._moments[True].mean)
+        values = len(real.mean)
         warnings = [
-            "{} generated and {} real scans for {} features: ".format(*counts, values)
+            f"{generated.num} generated and {real.num} real scans for {values} features: "
             + "too few for a covariance, so the distance is far too large; "
             + f"use more than {values} of each, or the kernel distance on the same features"
         ]
-        value = frechet_distance(self._moments[False], self._moments[True])
-        details = {"warnings": warnings if min(counts) < values else [], **self.common_details()}
-        return MetricResult(self.name, value, self.higher_is_better, *counts, self.variant, details)
+        too_few = min(generated.num, real.num) < values
+        details = {"warnings": warnings if too_few else [], **self.weights_details()}
+        return frechet_distance(generated, real), details

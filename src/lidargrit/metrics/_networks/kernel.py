@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float, Float32
 
+from lidargrit.metrics._accumulators import Rows
 from lidargrit.metrics._networks.features import FeatureMetric
-from lidargrit.structures import MetricResult
 
 _SUBSETS, _SUBSET_SIZE = 100, 1000  # of R2DM, after Bińkowski et al. 2018
 _ROWS = 1024  # of a kernel matrix held at once: 40 MB against 5000 scans
 
 
-class KernelMetric(FeatureMetric):
+class KernelMetric(FeatureMetric[np.ndarray]):
     """Squared kernel distance between the features of two sets.
 
     It is unbiased, so it may fall a little below 0 for sets of one kind, and sets of any size can be compared.
@@ -20,30 +23,17 @@ class KernelMetric(FeatureMetric):
     pairs of scans at once, and draws nothing. Features of all scans are kept: 7 or 16 kB for each.
     """
 
-    def __init__(self, **options) -> None:
-        super().__init__(**options)
-        self._features: dict[bool, list[Float32[np.ndarray, "n d"]]] = {False: [], True: []}
+    bounds = (-math.inf, math.inf)
+    accumulator = Rows
 
-    def take(self, features: Float32[np.ndarray, "B d"], real: bool) -> None:
-        """Keep the features of a set."""
-        self._features[real].append(features)
-
-    def take_from(self, other: FeatureMetric) -> None:
-        """Keep the features of both sets."""
-        assert isinstance(other, KernelMetric)
-        for real, features in other._features.items():
-            self._features[real] += features
-
-    def compute(self) -> MetricResult:
+    def compare(
+        self, generated: Float32[np.ndarray, "n d"], real: Float32[np.ndarray, "m d"]
+    ) -> tuple[float, dict[str, Any]]:
         """Return the distance; the details name the weights."""
-        counts = self._images[False], self._images[True]
-        self.require_images(*counts, at_least=2)
-        generated, real = (_in_order(np.concatenate(self._features[which])) for which in (False, True))
-        if self.variant == "exact":
-            value = kernel_distance(generated, real)
-        else:
-            value = subset_kernel_distance(generated, real, self.seed)
-        return MetricResult(self.name, value, self.higher_is_better, *counts, self.variant, self.common_details())
+        sides = _in_order(generated), _in_order(real)
+        exact = self.variant == "exact"
+        value = kernel_distance(*sides) if exact else subset_kernel_distance(*sides, self.seed)
+        return value, self.weights_details()
 
 
 def kernel_distance(first: Float[np.ndarray, "n d"], second: Float[np.ndarray, "m d"]) -> float:

@@ -1,9 +1,7 @@
-"""A network's name and the file with its weights → features of images, each image looked at once."""
+"""A network's name and the file with its weights → features of images."""
 
 from __future__ import annotations
 
-import hashlib
-from collections import OrderedDict
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
@@ -28,14 +26,12 @@ NETWORKS: dict[str, tuple[PublishedWeights, Callable[[], nn.Module]]] = {
 """Where the weights of each network come from, and what they fill."""
 
 _BATCH = 8  # images at a time elsewhere than on a CPU, which is no faster with several; RangeNet-53 takes 0.1 GB each
-_REMEMBERED = 512  # images: several metrics, and several variants of one, ask for the same batches; 8 MB at most
 
 
-class Network:
-    """A network that only looks: images in, features out.
+class PretrainedNetwork:
+    """A network with published weights that is only evaluated: images in, features out.
 
-    It remembers what it said of the last 512 images, so that metrics which share it, or variants that see the same in
-    an image, cost it only once. Pickled, it is the name of its file; whoever unpickles it reads that file.
+    Pickled, it is the name of its file; whoever unpickles it reads that file.
 
     Args:
         name: one of ``NETWORKS``.
@@ -52,7 +48,6 @@ class Network:
         weights, self.sha256 = read_weights(published, path)
         self.name, self.path, self._device = name, path, usable_device(device)
         self._module = filled(build, weights, path).to(self._device)
-        self._known: OrderedDict[bytes, Float32[np.ndarray, " d"]] = OrderedDict()
 
     def __reduce__(self) -> tuple[Any, ...]:
         return load_network, (self.name, self.path, str(self._device))
@@ -63,23 +58,12 @@ class Network:
         Raises:
             WeightsError: features that are no finite numbers: the weights are none that came from training.
         """
-        images = images.float()
-        keys = [_key(image) for image in images.cpu()]
-        new = list({key: index for index, key in enumerate(keys) if key not in self._known}.values())
         step = 1 if self._device.type == "cpu" else _BATCH
-        for first in range(0, len(new), step):
-            some = new[first : first + step]
-            for index, features in zip(some, self._look(images[some]), strict=True):
-                self._known[keys[index]] = features
-        for key in keys:
-            self._known.move_to_end(key)
-        found = np.stack([self._known[key] for key in keys])
-        while len(self._known) > _REMEMBERED:
-            self._known.popitem(last=False)
-        return found
+        parts = [self._forward(part) for part in images.float().split(step)]
+        return np.concatenate(parts)
 
     @torch.no_grad()
-    def _look(self, images: Float32[Tensor, "b ..."]) -> Float32[np.ndarray, "b d"]:
+    def _forward(self, images: Float32[Tensor, "b ..."]) -> Float32[np.ndarray, "b d"]:
         # TensorFloat-32 would change the fourth digit of the features from one graphics card to the next.
         with torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True, allow_tf32=False):
             features = self._module(images.to(self._device)).cpu().numpy()
@@ -92,14 +76,9 @@ class Network:
         return features
 
 
-def _key(image: Tensor) -> bytes:
-    content = hashlib.blake2b(image.contiguous().numpy().data, digest_size=16, key=str(tuple(image.shape)).encode())
-    return content.digest()
-
-
 def load_network(
     name: str, weights: Path | None = None, device: str = "cpu", reporter: Reporter | None = None
-) -> Network:
+) -> PretrainedNetwork:
     """Return a network with its published weights; the same object while its file stays the same.
 
     Args:
@@ -117,8 +96,8 @@ def load_network(
 
 
 @lru_cache(maxsize=2)  # the two that there are
-def _loaded(name: str, path: Path, device: str, _file: tuple[int, int] | None) -> Network:
-    return Network(name, path, device)
+def _loaded(name: str, path: Path, device: str, _file: tuple[int, int] | None) -> PretrainedNetwork:
+    return PretrainedNetwork(name, path, device)
 
 
 def filled(build: Callable[[], nn.Module], weights: dict[str, Tensor], source: Path) -> nn.Module:

@@ -1,0 +1,170 @@
+"""Two sets and the metrics that are wanted → scores with intervals and rows of real against real; shared features are computed once."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from lidargrit import _discovery
+from lidargrit.errors import ConfigError, LidarGritError, ScanError
+from lidargrit.evaluation.intervals import Part, Resampling, blocks, interval_of, merged, real_against_real
+from lidargrit.evaluation.pairs import EvalPair, EvalSet
+from lidargrit.evaluation.protocols import MetricChoice
+from lidargrit.evaluation.scorecard import Score
+from lidargrit.metrics import Metric, WholeImages, load_metric, update_together
+from lidargrit.reporting import Reporter
+
+_BATCH = 16
+
+
+@dataclass(frozen=True)
+class MetricFactory:
+    """Makes empty metrics of one definition.
+
+    Args:
+        choice: the metric with its variant and options.
+        seed: seed of all random numbers of the metric.
+        weights: file with the weights of its network; found or fetched if not given.
+        device: device on which its network computes.
+        reporter: receives messages and the progress of a download.
+    """
+
+    choice: MetricChoice
+    seed: int = 0
+    weights: Path | None = None
+    device: str = "cpu"
+    reporter: Reporter | None = None
+
+    def __call__(self) -> Metric[Any, Any]:
+        """Return an empty metric.
+
+        Raises:
+            ConfigError: no such metric, variant or device.
+            WeightsError: weights that cannot be found or read.
+        """
+        name = self.choice.metric
+        if name not in _discovery.names("metrics"):
+            raise ConfigError(f"the metric {name!r}", "one that this version has", "see: lidargrit list metrics")
+        cls = load_metric(name)
+        options: dict[str, Any] = {"variant": self.choice.variant or None, "seed": self.seed, **self.choice.options}
+        if cls.needs_weights:
+            options |= {"weights": self.weights, "device": self.device, "reporter": self.reporter}
+        return cls(**options)
+
+
+@dataclass(eq=False)
+class _FedMetric:
+    """One metric, fed group by group.
+
+    Args:
+        factory: what makes it.
+        generated: metrics that were fed one group of generated scans each.
+        real: metrics that were fed one group of real scans each.
+        real_as_generated: metrics that were fed the same real scans as generated ones, for real against real.
+        whole: a metric that was fed all scans of both sets, if merged parts would give another value.
+    """
+
+    factory: MetricFactory
+    generated: list[Part] = field(default_factory=list)
+    real: list[Part] = field(default_factory=list)
+    real_as_generated: list[Part] = field(default_factory=list)
+    whole: Metric[Any, Any] | None = None
+
+    def score(self, group_sizes: Sequence[int], resampling: Resampling, begun_s: float) -> Score:
+        """Compute the value with its interval and real against real."""
+        metric = self.whole or merged(self.generated, self.real)
+        result = metric.compute()
+        interval = reference_row = None
+        if resampling.halves:
+            interval = interval_of(result, self.generated, self.real, resampling, metric.bounds)
+            reference_row = real_against_real(self.real, self.real_as_generated, group_sizes, resampling)
+        seconds = time.perf_counter() - begun_s
+        return Score(result, interval, reference_row, dict(self.factory.choice.options), seconds)
+
+
+def score_metrics(
+    factories: Sequence[MetricFactory], pair: EvalPair, resampling: Resampling, reporter: Reporter | None = None
+) -> list[Score | LidarGritError]:
+    """Score two sets by several metrics.
+
+    Metrics that look at the same features of a scan, such as those of one network, are fed together, so that these are
+    computed once. All others are fed one after the other, so that only one's memory is held.
+
+    Args:
+        factories: what makes the metrics.
+        pair: the two sets.
+        resampling: how intervals and rows of real against real are computed.
+        reporter: receives the progress.
+
+    Returns:
+        the score of each metric, or why it could not be computed: no weights, no reflectance, too few scans.
+
+    Raises:
+        ScanError: a damaged file, which spoils all metrics alike.
+    """
+    found: dict[int, Score | LidarGritError] = {}
+    together: dict[Hashable, list[int]] = {}
+    for index, factory in enumerate(factories):
+        try:
+            extractor = factory().extractor(pair.samples.images.sensor)
+        except LidarGritError as error:
+            found[index] = error
+        else:
+            together.setdefault(index if isinstance(extractor, WholeImages) else extractor, []).append(index)
+    with (reporter or Reporter()).progress("scoring", 2 * len(pair.samples) * len(factories)) as progress:
+        for indices in together.values():
+            fed = {index: _FedMetric(factories[index]) for index in indices}
+            note = ", ".join(factories[index].choice.metric for index in indices)
+            begun_s = time.perf_counter()
+            try:
+                sizes = _feed(list(fed.values()), pair, resampling, lambda n: progress.advance(n, note=note))  # noqa: B023
+            except ScanError:
+                raise
+            except LidarGritError as error:
+                found |= dict.fromkeys(indices, error)
+                continue
+            feeding_s = (time.perf_counter() - begun_s) / len(indices)
+            for index, metric in fed.items():
+                try:
+                    found[index] = metric.score(sizes, resampling, time.perf_counter() - feeding_s)
+                except LidarGritError as error:
+                    found[index] = error
+    return [found[index] for index in range(len(factories))]
+
+
+def _feed(
+    fed: Sequence[_FedMetric], pair: EvalPair, resampling: Resampling, advance: Callable[[int], None]
+) -> list[int]:
+    """Feed both sets to metrics that share features, and return the number of scans in each group."""
+    groups = blocks(len(pair.samples), resampling.groups if resampling.halves else 1)
+    for each in fed:
+        empty = each.factory()
+        each.whole = empty if empty.order_matters and len(groups) > 1 else None
+    wholes = [each.whole for each in fed if each.whole is not None]
+    for real, images in ((False, pair.samples), (True, pair.reference)):
+        for group in groups:
+            parts = [each.factory() for each in fed]
+            as_generated = [each.factory() for each in fed] if real and resampling.halves else []
+            metrics = [(metric, real) for metric in (*parts, *wholes)] + [(metric, False) for metric in as_generated]
+            _feed_group(metrics, images, group, advance, len(fed))
+            for each, metric in zip(fed, parts, strict=True):
+                (each.real if real else each.generated).append(Part(metric))
+            for each, metric in zip(fed, as_generated, strict=False):
+                each.real_as_generated.append(Part(metric))
+    return [len(group) for group in groups]
+
+
+def _feed_group(
+    metrics: Sequence[tuple[Metric[Any, Any], bool]],
+    images: EvalSet,
+    group: Sequence[int],
+    advance: Callable[[int], None],
+    times: int,
+) -> None:
+    for first in range(0, len(group), _BATCH):
+        batch = images.batch(group[first : first + _BATCH])
+        update_together(metrics, batch)
+        advance(times * len(batch))

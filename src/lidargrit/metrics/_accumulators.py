@@ -1,0 +1,70 @@
+"""What a metric keeps of one set: summaries of batches → all of them together, joined in any number of parts."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Generic, TypeVar
+
+import numpy as np
+
+Kept = TypeVar("Kept")
+
+
+class Accumulator(ABC, Generic[Kept]):
+    """Collects the summaries of one set of images; what is added is never changed."""
+
+    @abstractmethod
+    def add(self, summary: np.ndarray) -> None:
+        """Take in the summary of a batch of at least one image."""
+
+    @abstractmethod
+    def merge(self, other: Accumulator[Kept]) -> None:
+        """Take in what another accumulator of the same class has collected; the other stays as it is."""
+
+    @abstractmethod
+    def value(self) -> Kept:
+        """Return everything collected so far, from at least one batch."""
+
+
+class Rows(Accumulator[np.ndarray]):
+    """Keeps every row of every summary, one row per image, in the order in which they came."""
+
+    def __init__(self) -> None:
+        self._parts: list[np.ndarray] = []
+
+    def add(self, summary: np.ndarray) -> None:
+        """Append rows."""
+        self._parts.append(summary)
+
+    def merge(self, other: Accumulator[np.ndarray]) -> None:
+        """Append the rows of another."""
+        assert isinstance(other, Rows)
+        self._parts += other._parts
+
+    def value(self) -> np.ndarray:
+        """Return all rows as one array, and keep them as that."""
+        if len(self._parts) > 1:
+            self._parts = [np.concatenate(self._parts)]
+        return self._parts[0]
+
+
+class Total(Accumulator[np.ndarray]):
+    """Keeps the sum of all summaries, so that memory does not grow with the number of images."""
+
+    def __init__(self) -> None:
+        self._total: np.ndarray | None = None
+
+    def add(self, summary: np.ndarray) -> None:
+        """Add element by element."""
+        self._total = summary if self._total is None else self._total + summary
+
+    def merge(self, other: Accumulator[np.ndarray]) -> None:
+        """Add the sum of another."""
+        assert isinstance(other, Total)
+        if other._total is not None:
+            self.add(other._total)
+
+    def value(self) -> np.ndarray:
+        """Return the sum."""
+        assert self._total is not None
+        return self._total
