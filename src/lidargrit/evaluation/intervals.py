@@ -37,9 +37,10 @@ class Resampling:
     """How often and how coarsely sets are divided.
 
     Args:
-        groups: into which each set is cut, 4 or more; fewer where there are fewer scans.
-        halves: random halves from which the standard error is taken; 0 for neither interval nor real against real.
-        seed: of the choice of halves, the same for every metric.
+        groups: number of groups into which each set is cut, 4 or more; fewer if there are fewer scans.
+        halves: number of random halves from which the standard error is taken; 0 for neither interval nor real
+            against real.
+        seed: seed of the choice of halves, the same for every metric.
     """
 
     groups: int = 16
@@ -60,11 +61,12 @@ class Interval:
     """A 95 % confidence interval of a score, from what scans happened to be in the two sets.
 
     Args:
-        low: value less t standard errors, not below 0 where no half is; t is Student's 97.5 % quantile, 2.13 for 16
-            groups and 20 halves (1.96 for many), since so few tell the standard error itself only roughly.
-        high: value and t standard errors, not beyond where the metric ends.
-        standard_error: spread of the half-sample values.
-        halves: how many there were.
+        low: value minus t standard errors, within the metric's bounds, and not below 0 if no half is; t is Student's
+            97.5 % quantile, 2.13 for 16 groups and 20 halves (1.96 for many), since few halves give only a rough
+            standard error.
+        high: value plus t standard errors, within the metric's bounds.
+        standard_error: standard deviation of the scores of half-samples.
+        halves: number of half-samples.
     """
 
     low: float
@@ -79,8 +81,9 @@ class RealAgainstReal:
 
     Args:
         value: mean over halvings.
-        num_scans: in each half. Most metrics fall as sets grow, so that of the whole sets is a little lower.
-        halvings: how many there were.
+        num_scans: number of scans in each half. Most metrics fall as sets grow, so the whole sets would score a little
+            lower.
+        halvings: number of halvings.
     """
 
     value: float
@@ -124,7 +127,7 @@ class Part:
 
 
 def merged(generated: Sequence[Part], real: Sequence[Part]) -> Metric:
-    """Return a new metric that has seen what the parts of both pair have seen, in their order."""
+    """Return a new metric that has seen what the parts of both sets were fed, in their order."""
     whole = real[0].copy()
     for part in (*generated, *real[1:]):
         whole.merge(part.metric())
@@ -141,10 +144,11 @@ def interval_of(
     """Return how far the score of the whole sets is to be trusted; None if there are too few scans to tell.
 
     Args:
-        result: of the whole sets.
-        generated: metrics that were fed one group each of generated scans.
-        real: likewise of real ones.
-        resampling: how many halves.
+        result: score of the whole sets.
+        generated: metrics that were fed one group of generated scans each.
+        real: metrics that were fed one group of real scans each.
+        resampling: number of halves and seed.
+        bounds: least and greatest value that the metric can have.
     """
     if min(len(generated), len(real)) < _AT_LEAST:
         return None
@@ -189,10 +193,10 @@ def real_against_real(
     """Return the mean score of one half of the reference against the other; None if there are too few scans.
 
     Args:
-        real: metrics that were fed one group each of real scans.
-        real_as_generated: the same scans, fed as if they were generated.
-        sizes: how many scans each group has.
-        resampling: whose seed is taken.
+        real: metrics that were fed one group of real scans each.
+        real_as_generated: metrics that were fed the same scans as generated ones.
+        sizes: number of scans in each group.
+        resampling: seed.
     """
     if len(real) < _AT_LEAST:
         return None

@@ -1,4 +1,4 @@
-"""Two sets and the metrics that are wanted → scores with intervals and rows of real against real; shared features are computed once."""
+"""Two sets and the metrics that are wanted → scores with intervals and real against real; shared features once."""
 
 from __future__ import annotations
 

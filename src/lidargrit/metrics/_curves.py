@@ -1,4 +1,4 @@
-"""What is counted in two sets of range images → curves → the Jensen-Shannon distance between them."""
+"""Counts in the pixels of two sets of range images → curves → the Jensen-Shannon distance between them."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ class Curves:
     """The curves of two sets and how far they are apart.
 
     Args:
-        divergence: Jensen-Shannon, base 2, in [0, 1]; a mean where there are several distributions.
-        axis: where along the axis the values stand.
-        generated: NaN where too little was seen.
-        real: likewise.
+        divergence: Jensen-Shannon divergence, base 2, in [0, 1]; the mean if there are several distributions.
+        axis: position of each value along the axis, in the unit of ``axis_label``.
+        generated: curve of the generated set; NaN where too little was counted.
+        real: curve of the real set; NaN where too little was counted.
     """
 
     divergence: float
@@ -125,14 +125,14 @@ def compare_shares(
 ) -> Curves:
     """Compare how often something happens, bin by bin: the mean divergence of the bins' yes and no.
 
-    Every bin weighs the same, as in a drawn curve, but those with fewer than 500 trials in either set are left out;
-    should that leave none, all with a trial count. If none has a trial in both sets there is nothing to compare: 0 for
-    two that are both empty, 1 otherwise.
+    Every bin has the same weight, but bins with fewer than 500 trials in either set are left out. If that leaves none,
+    all bins with a trial in both sets count. If there are none of these either, the result is 0 for two sets without
+    any trial, else 1.
 
     Args:
-        generated: how often it was tried, and how often it happened.
-        real: likewise.
-        axis: where the bins stand.
+        generated: numbers of trials and of successes in the generated set.
+        real: numbers of trials and of successes in the real set.
+        axis: position of each bin along the axis.
     """
     trials = np.minimum(generated[0], real[0])
     kept = trials >= _LEAST if (trials >= _LEAST).any() else trials > 0
@@ -140,8 +140,8 @@ def compare_shares(
     each = divergence(*yes_and_no)[kept]
     alike = not (generated[0].any() or real[0].any())
     mean = float(each.mean()) if len(each) else float(not alike)
-    drawn = [np.where(kept, normalised(side)[:, 0], np.nan) for side in yes_and_no]
-    return Curves(mean, axis, *drawn)
+    plotted = [np.where(kept, normalised(side)[:, 0], np.nan) for side in yes_and_no]
+    return Curves(mean, axis, *plotted)
 
 
 def compare_histograms(
@@ -168,10 +168,10 @@ def histogram(values: Float[Tensor, " n"], edges: Float64[np.ndarray, " edges"])
 
 @dataclass(frozen=True, eq=False)
 class LocalSurface:
-    """What the neighbours of every pixel tell of the surface that its ray should meet; the pixel itself is not asked.
+    """The surface that each ray should meet, estimated from the neighbours of its pixel alone.
 
-    A plane has an inverse range that is linear in the direction, so ranges are interpolated as 1 / range. Since a
-    pixel's own return plays no part, returns and drops are placed alike, and the share of returns is not biased by it.
+    The inverse range of a plane is linear in the direction, so ranges are interpolated as 1 / range. The pixel's own
+    return is not used: returns and drops are treated alike, and the share of returns is not biased.
 
     Args:
         range_m: interpolated along the row between the nearest return on either side, NaN where there is none within
@@ -185,10 +185,10 @@ class LocalSurface:
 
     @classmethod
     def of(cls, images: RangeImage) -> LocalSurface:
-        """Look around every pixel of a batch."""
+        """Estimate the surface at every pixel of a batch."""
         sensor = images.sensor
         size = (sensor.height, sensor.width)
-        inverse = torch.where(images.return_mask, 1 / images.range_m, torch.nan)  # NaN spreads to all that needs it
+        inverse = torch.where(images.return_mask, 1 / images.range_m, torch.nan)  # NaN spreads to whatever uses it
         azimuth, elevation = (angle.expand(size) for angle in (sensor.azimuth_rad, sensor.elevation_rad))
         columns, rows = max(1, sensor.width // _COLUMNS), max(1, sensor.height // _ROWS)
         left, left_at = _nearest(inverse, azimuth, -columns, dim=-1)

@@ -8,8 +8,10 @@ from jaxtyping import Bool, Float32, Int32, Int64
 _BUCKET = 128  # points; the fastest of 64, 128, 256 for 65,536 points
 _UNREACHED = np.float32(1e10)  # squared distance of a candidate before anything is chosen
 _NEVER = np.float32(-1)  # of what is no candidate
-# The bits of a number below 32, two places apart: three of them interleave to one number below 32768 (Morton's order).
-_SPREAD = np.array([sum((value >> bit & 1) << 3 * bit for bit in range(5)) for value in range(32)], dtype=np.uint16)
+# The bits of a number below 32, three bits apart: three such numbers interleave to one below 32768 (Morton's order).
+_SPACED_BITS = np.array(
+    [sum((value >> bit & 1) << 3 * bit for bit in range(5)) for value in range(32)], dtype=np.uint16
+)
 
 
 def farthest_points(
@@ -27,12 +29,12 @@ def farthest_points(
     so the distance to a box never exceeds that to a point in it.
 
     Args:
-        points: of several clouds.
-        candidates: which may be chosen. Of none, the first in precedence is taken; if all are used up, likewise.
-        num: how many are chosen.
-        start: index of the first point, which need not be a candidate. Without it the origin counts as chosen, but is
+        points: coordinates of the points of B clouds.
+        candidates: whether each point may be chosen. If none is left, the first point in precedence is taken.
+        num: number of points to choose from each cloud.
+        start: index of the first point, which need not be a candidate. Without it the origin counts as chosen but is
             not part of the result, which then begins with the candidate farthest from it.
-        precedence: all indices, in the order in which points that are equally far are taken; by default as they are.
+        precedence: all indices, in the order in which equally far points are taken; ascending by default.
 
     Source:
         Eldar et al., The farthest point strategy for progressive image sampling, IEEE Trans. Image Processing 6(9),
@@ -42,9 +44,9 @@ def farthest_points(
     precedence = np.arange(n) if precedence is None else precedence
     rank = _buckets(points[:, precedence], candidates[:, precedence])  # (B, buckets, points)
     members = rank.shape[1:]
-    place = precedence[rank] + n * np.arange(clouds)[:, None, None]
-    axes = [points[..., axis].ravel()[place].reshape(-1, members[1]) for axis in range(3)]
-    free = candidates.ravel()[place].reshape(-1, members[1])
+    position = precedence[rank] + n * np.arange(clouds)[:, None, None]
+    axes = [points[..., axis].ravel()[position].reshape(-1, members[1]) for axis in range(3)]
+    free = candidates.ravel()[position].reshape(-1, members[1])
     rank = rank.reshape(-1, members[1])
     squared = np.where(free, _UNREACHED, _NEVER)  # of every point to its nearest chosen one
     low, high = _boxes(axes, free, clouds)
@@ -106,7 +108,7 @@ def _buckets(
     for axis in range(3):
         ratio = points[..., axis] / scale
         root = np.copysign(np.sqrt(np.abs(ratio)), ratio)
-        key |= _SPREAD[(root * np.float32(15.99) + 16).astype(np.uint8)] << np.uint16(axis)
+        key |= _SPACED_BITS[(root * np.float32(15.99) + 16).astype(np.uint8)] << np.uint16(axis)
     key[~candidates] = 2**15  # after all others
     order = np.argsort(key, axis=1, kind="stable").astype(np.int32)
     filled = np.pad(order, ((0, 0), (0, -order.shape[1] % _BUCKET)))

@@ -19,8 +19,8 @@ class Nearest:
     """For every cloud of a set, the nearest of another set, or of its own set without itself.
 
     Args:
-        index: of the nearest in the other set.
-        distance: Chamfer distance to it.
+        index: index of the nearest cloud in the other set.
+        distance: Chamfer distance to that cloud.
     """
 
     index: Int64[np.ndarray, " n"]
@@ -44,7 +44,7 @@ def chamfer_matrix(first: Clouds, second: Clouds | None = None) -> Float32[np.nd
     """Return the Chamfer distances of all pairs of clouds, or of all pairs of one set, infinite from each to itself.
 
     In single precision from |a|^2 + |b|^2 - 2ab, a product of matrices: fast, but of points within the unit sphere
-    wrong by up to 1e-6, so only for telling which cloud is nearer.
+    wrong by up to 1e-6, so only to decide which cloud is nearer.
     """
     left = [_factor(cloud, left=True) for cloud in first]
     right = [_factor(cloud, left=False) for cloud in (first if second is None else second)]

@@ -28,7 +28,7 @@ class BevMmd(Metric[Int64[np.ndarray, "B cells"], np.ndarray]):
     Each scan is its share of points (between 3 and 70 m) in 100x100 cells of 1.6 m; the kernel is
     exp(-|p - q|^2 / (2 * 0.5^2)). A scan without such points is zero in every cell. The value is the squared
     discrepancy, never rooted; the paper prints it times 10,000. Differences of scans are small against the kernel's
-    width, so it sees little more than the mean and variance of the cells.
+    width, so little more than the mean and variance of the cells matters.
     A scan takes 10 to 20 kB, and time grows with the square of the number of scans.
 
     Args:
@@ -39,7 +39,7 @@ class BevMmd(Metric[Int64[np.ndarray, "B cells"], np.ndarray]):
             any other variant, and slow (a third of a millisecond for a pair of scans: hours for 5,000 of each).
             The histograms of each are those of ``bev_jsd``. All are in double precision (R2DM's is in single, where a
             number of 1e-4 has three digits).
-        seed: nothing is drawn.
+        seed: not used.
 
     Source:
         Gretton et al., A kernel two-sample test, JMLR 13, 2012, lemma 6 (unbiased: eq. 3, biased: eq. 5); programs as
@@ -79,9 +79,9 @@ def discrepancy(
     The kernel minus 1 is summed: the ones cancel, and the digits that matter are kept.
 
     Args:
-        first: counts.
-        second: likewise.
-        squared_norm: of the differences of all pairs of two blocks of shares.
+        first: counts of the first set, one row per scan.
+        second: counts of the second set, one row per scan.
+        squared_norm: function that returns the squared norm of the differences of all pairs of two blocks of shares.
         unbiased: whether pairs of a scan with itself are left out.
     """
 

@@ -18,9 +18,9 @@ _CELLS = 2 * _HALF_M
 class BevOccupancy(CurveMetric):
     """Compare the share of scans in which a cell of a bird's-eye grid of 100 m holds a return, cell by cell.
 
-    Each cell gives the divergence of two coins; the mean is over those that are ever occupied in either set. The
-    curves are images: row 0 is behind the sensor (x = -50 m), column 0 to its right (y = -50 m). Few scans make any
-    two sets look far apart, so only values of equally large sets can be compared.
+    Each cell gives the divergence of two Bernoulli distributions; the mean is over the cells that are occupied in any
+    scan of either set. The curves are images: row 0 is behind the sensor (x = -50 m), column 0 to its right
+    (y = -50 m). Small sets are always far apart, so only values of equally large sets can be compared.
     """
 
     title = "Occupancy of square metres seen from above"

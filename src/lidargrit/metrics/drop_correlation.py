@@ -14,7 +14,7 @@ _ROW_LAGS = (1, 2)
 
 
 class DropCorrelation(CurveMetric):
-    """Compare the probability that the pixel at a lag has no return either; at each lag, the divergence of two coins.
+    """Compare the probability that the pixel at a lag has no return either, by the divergence at each lag.
 
     The lags are 1, 2, 4, 8 and 16 columns, rows being circular, and 1 and 2 rows, where there is such a row. Along the
     axis of the curves rows are negative. A drop is a pixel without a return, for whatever cause, the sky included.

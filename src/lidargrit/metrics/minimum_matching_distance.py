@@ -20,8 +20,8 @@ class MinimumMatchingDistance(CloudMetric):
     change places), and its distance taken in double. Time grows with the product of the numbers of scans.
 
     Args:
-        variant: which points of a scan are taken, see :class:`CloudMetric`.
-        seed: nothing is drawn.
+        variant: how points are sampled from a scan, see :class:`CloudMetric`.
+        seed: not used.
 
     Source:
         Achlioptas et al., Learning representations and generative models for 3D point clouds, ICML 2018;

@@ -23,8 +23,8 @@ class OneNearestNeighbour(CloudMetric):
     number of scans.
 
     Args:
-        variant: which points of a scan are taken, see :class:`CloudMetric`.
-        seed: nothing is drawn.
+        variant: how points are sampled from a scan, see :class:`CloudMetric`.
+        seed: not used.
 
     Source:
         Lopez-Paz and Oquab, Revisiting classifier two-sample tests, ICLR 2017; Yang et al., PointFlow, ICCV 2019;

@@ -25,10 +25,10 @@ class PointCloudJsd(CloudMetric):
     Scenes are not seen, only their sum; only the sum is kept.
 
     Args:
-        variant: which points of a scan are taken, see :class:`CloudMetric`. Besides, ``reference`` adds 1e-8 to every
+        variant: how points are sampled from a scan, see :class:`CloudMetric`. Besides, ``reference`` adds 1e-8 to every
             share of either set, and once more to their mean, as LidarGRIT's program does: a set against itself then
             gives about 0.0024 instead of 0.
-        seed: nothing is drawn.
+        seed: not used.
 
     Source:
         Achlioptas et al., Learning representations and generative models for 3D point clouds, ICML 2018;

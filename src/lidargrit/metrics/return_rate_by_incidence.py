@@ -13,7 +13,7 @@ _EDGES_DEG = np.linspace(0, 90, 19)  # 5 degrees each: what noise of 2 cm does t
 
 
 class ReturnRateByIncidence(CurveMetric):
-    """Compare the share of returns in bins of incidence; in each, the divergence of two coins, and the mean over bins.
+    """Compare the share of returns in bins of incidence, by the divergence in each bin, and the mean over bins.
 
     Every pixel, returned or not, gets the plane of its neighbours: the nearest return on either side along the row and
     along the column. 0 degrees strikes the plane squarely. Pixels with too few neighbours, or whose neighbours lie on

@@ -21,7 +21,7 @@ _BINS = 24  # of 120 m / 0.9 m: each reaches a fifth farther than the one before
 
 
 class ReturnRatePerRange(CurveMetric):
-    """Compare the share of returns in bins of range; in each, the divergence of two coins, and the mean over bins.
+    """Compare the share of returns in bins of range, by the divergence in each bin, and the mean over bins.
 
     A drop has no range of its own. Every pixel, returned or not, gets the range of its neighbours along the row, if
     there is one within 11 degrees on either side and the two agree within a tenth. All others, in the sky, in wide

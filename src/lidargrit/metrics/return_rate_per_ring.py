@@ -11,7 +11,7 @@ from lidargrit.structures import RangeImage
 
 
 class ReturnRatePerRing(CurveMetric):
-    """Compare the share of pixels that return in every row; in each, the divergence of two coins."""
+    """Compare the share of pixels that return in every row, by the divergence in each row."""
 
     title = "Share of returns in every row"
     axis_label = "row, from the top"

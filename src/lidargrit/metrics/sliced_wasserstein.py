@@ -37,20 +37,21 @@ class SlicedWasserstein(ImageMetric):
     themselves are in the details by their number of rows, ``rows_64`` the finest. LidarGRIT's program names them the
     other way round: its "swd-16" is the finest, our ``rows_64``, and its "swd-64" our ``rows_16``.
 
-    Neither variant is 0 for a set against itself: the two sides draw their own patches. The floor falls as sets grow,
-    so only values of equally large sets can be compared. Of sets of unequal size the first n of the larger one are
-    used, n being the size of the smaller; ``num_compared`` in the details tells n.
+    Neither variant is 0 for a set against itself, since the patch positions of the two sets are sampled separately.
+    The value of real scans against real scans falls as sets grow, so only values of equally large sets can be compared.
+    Of sets of unequal size the first n of the larger one are used, where n is the size of the smaller;
+    ``num_compared`` in the details is n.
 
     Args:
-        variant: ``reference`` repeats LidarGRIT's program, draw for draw with generated images as its first set:
+        variant: ``reference`` repeats LidarGRIT's program with the same random numbers, generated images first:
             directions divided by their standard deviation instead of their length (values about 7 times larger), the
-            upsampled level shifted by one pixel, patch positions shared by the 128 images of a batch. It depends on the
-            order of images only through the batch into which each falls. Parts that are merged each count batches from
-            their own start: for more than 128 images the value is then that of another equally good draw.
-            ``textbook`` is Karras et al.: directions of unit length, an aligned pyramid, positions drawn for every
-            image. They are drawn from the image itself, its set and the seed, so that neither the order of images nor
-            the number of processes matters; equal images of one set give equal patches.
-        seed: of patch positions and directions.
+            upsampled level shifted by one pixel, patch positions shared by the 128 images of a batch. The order of
+            images matters only for the batch into which each falls. Parts that are merged each count batches from their
+            own start: for more than 128 images the value is then that of other, equally good patch positions.
+            ``textbook`` is Karras et al.: directions of unit length, an aligned pyramid, and positions of its own for
+            every image. These are sampled by a seed made of the image itself, its set and ``seed``, so that neither the
+            order of images nor the number of processes matters; equal images of one set give equal patches.
+        seed: seed of patch positions and directions.
 
     Raises:
         ConfigError: images of fewer than 16 rows or columns, of a size that cannot be halved, or of two kinds.
@@ -124,10 +125,10 @@ class SlicedWasserstein(ImageMetric):
 
 
 class SharedPositions:
-    """The patch positions of ``reference``: those of any batch, drawn in the order in which the program draws.
+    """The patch positions of ``reference`` for any batch, in the order in which the program samples them.
 
-    That order is, batch by batch, the levels of the generated set and then those of the real set, whatever the order in
-    which the sets arrive here.
+    That order is, batch by batch, the levels of the generated set and then those of the real set. It does not depend on
+    the order in which the sets arrive here.
     """
 
     def __init__(self, seed: int, level_sizes: list[int]) -> None:
@@ -216,7 +217,7 @@ def _halved(images: Float[Tensor, "B _ _"], dim: int) -> Float[Tensor, "B _ _"]:
 
 
 def _doubled(coarse: Float[Tensor, "B _ _"], dim: int, shifted: bool) -> Float[Tensor, "B _ _"]:
-    """Spread pixels along one axis, onto the even places or (shifted) the odd ones, and blur what lies between.
+    """Double one axis: pixels go to the even (shifted: odd) positions, and those between are interpolated.
 
     Mirroring the fine line at its borders repeats the coarse pixel at one end and mirrors at the other.
     """
@@ -231,7 +232,7 @@ def _doubled(coarse: Float[Tensor, "B _ _"], dim: int, shifted: bool) -> Float[T
 
 
 def num_positions(rows: int, columns: int) -> int:
-    """Return how many places a patch has in an image; place p is that of the corner (p // k, p % k), k per row."""
+    """Return the number of patch positions in an image; position p has its corner at (p // k, p % k), k per row."""
     return (rows - _PATCH + 1) * (columns - _PATCH + 1)
 
 
@@ -243,18 +244,18 @@ def shared_positions(num: int, rng: torch.Generator) -> Int[Tensor, "patches"]:
 def own_positions(
     range_m: Float[Tensor, "B H W"], pyramid: list[Float[Tensor, "B _ _"]], seed: int, real: bool
 ) -> list[Int[Tensor, "B patches"]]:
-    """Draw 128 places per image and level, with replacement, by a seed made of the image, its set and ``seed``."""
+    """Sample 128 positions per image and level, with replacement, by a seed made of the image, its set and ``seed``."""
     positions = [torch.empty(len(level), _PATCHES, dtype=torch.int64) for level in pyramid]
     for index, image in enumerate(range_m.float().cpu().contiguous().numpy()):
         content = hashlib.blake2b(image.tobytes(), digest_size=8, key=f"{seed} {int(real)}".encode())
         rng = torch.Generator().manual_seed(int.from_bytes(content.digest(), "big", signed=True))
-        for level, place in zip(pyramid, positions, strict=True):
-            place[index] = torch.randint(num_positions(*level.shape[1:]), (_PATCHES,), generator=rng)
+        for level, chosen in zip(pyramid, positions, strict=True):
+            chosen[index] = torch.randint(num_positions(*level.shape[1:]), (_PATCHES,), generator=rng)
     return positions
 
 
 def descriptors(images: Float[Tensor, "B h w"], positions: Int[Tensor, "#B patches"]) -> Float[Tensor, "B patches 49"]:
-    """Cut the 7x7 patches whose corners lie at the given places, the same in every image or others in each."""
+    """Cut the 7x7 patches whose corners lie at given positions, either shared by all images or one set per image."""
     columns = images.shape[2]
     per_row = columns - _PATCH + 1
     positions = positions.to(images.device)
@@ -266,10 +267,10 @@ def descriptors(images: Float[Tensor, "B h w"], positions: Int[Tensor, "#B patch
 
 
 def standardised(patches: Float[Tensor, "n 49"], correction: int) -> Float[Tensor, "n 49"]:
-    """Bring all numbers of a set together to mean 0 and deviation 1.
+    """Scale all numbers of a set together to mean 0 and deviation 1.
 
     Args:
-        patches: of one set at one level.
+        patches: patches of one set at one level.
         correction: 1 for the unbiased deviation, 0 for that of the set itself.
     """
     deviation, mean = torch.std_mean(patches, correction=correction)
@@ -277,7 +278,7 @@ def standardised(patches: Float[Tensor, "n 49"], correction: int) -> Float[Tenso
 
 
 def random_directions(rng: torch.Generator, *, unit_length: bool) -> Float[Tensor, "49 directions"]:
-    """Draw 128 normally distributed directions, divided by their length or, as LidarGRIT does, their deviation."""
+    """Sample 128 normally distributed directions, divided by their length or, as LidarGRIT does, their deviation."""
     directions = torch.randn(_PATCH**2, _DIRECTIONS, generator=rng)
     return directions / (directions.norm(dim=0) if unit_length else directions.std(dim=0))
 

@@ -20,7 +20,7 @@ class KernelMetric(FeatureMetric[np.ndarray]):
 
     It is unbiased, so it may fall a little below 0 for sets of one kind, and sets of any size can be compared.
     ``r2dm`` is the mean over 100 pairs of random subsets of at most 1000 scans each; ``exact`` is the value of all
-    pairs of scans at once, and draws nothing. Features of all scans are kept: 7 or 16 kB for each.
+    pairs of scans at once, without random numbers. Features of all scans are kept: 7 or 16 kB for each.
     """
 
     bounds = (-math.inf, math.inf)
@@ -69,11 +69,11 @@ def subset_kernel_distance(
     if size == len(first) == len(second):
         return kernel_distance(first, second)  # every subset is the whole set
     rng = np.random.default_rng(seed)
-    draws = (
+    distances = (
         kernel_distance(*(side[rng.choice(len(side), size, replace=False)] for side in (first, second)))
         for _ in range(subsets)
     )
-    return sum(draws) / subsets
+    return sum(distances) / subsets
 
 
 def _kernel_sum(first: np.ndarray, second: np.ndarray) -> float:
@@ -87,5 +87,5 @@ def _cubic(products: np.ndarray, features: np.ndarray) -> np.ndarray:
 
 
 def _in_order(features: Float32[np.ndarray, "n d"]) -> Float32[np.ndarray, "n d"]:
-    """Sort scans by their features, so that what is drawn depends neither on their order nor on who saw them."""
+    """Sort scans by their features, so that random subsets do not depend on their order."""
     return features[np.lexsort(features[:, ::-1].T)]

@@ -23,7 +23,7 @@ NETWORKS: dict[str, tuple[PublishedWeights, Callable[[], nn.Module]]] = {
     published.name: (published, build)
     for published, build in ((POINTNET_WEIGHTS, PointNet), (RANGENET_WEIGHTS, RangeNet53))
 }
-"""Where the weights of each network come from, and what they fill."""
+"""The published weights of each network and the class that they fill, by its name."""
 
 _BATCH = 8  # images at a time elsewhere than on a CPU, which is no faster with several; RangeNet-53 takes 0.1 GB each
 
@@ -34,9 +34,9 @@ class PretrainedNetwork:
     Pickled, it is the name of its file; whoever unpickles it reads that file.
 
     Args:
-        name: one of ``NETWORKS``.
-        path: the file with its weights.
-        device: where it computes.
+        name: name of the network, one of ``NETWORKS``.
+        path: file with its weights.
+        device: device on which it computes, such as "cuda".
 
     Raises:
         WeightsError: the file is not to be had, or not of this network.
@@ -82,10 +82,10 @@ def load_network(
     """Return a network with its published weights; the same object while its file stays the same.
 
     Args:
-        name: one of ``NETWORKS``.
-        weights: the file, where it is not to be looked for or fetched.
-        device: where it is to compute, such as "cuda".
-        reporter: hears of a download.
+        name: name of the network, one of ``NETWORKS``.
+        weights: file with its weights; found or fetched if not given.
+        device: device on which it computes, such as "cuda".
+        reporter: receives messages and the progress of a download.
 
     Raises:
         WeightsError: the file is not to be had, or not of this network.
@@ -106,7 +106,7 @@ def filled(build: Callable[[], nn.Module], weights: dict[str, Tensor], source: P
     Raises:
         WeightsError: a name or a size differs; names the first.
     """
-    with torch.device("meta"):  # no memory, and no draw from the global random source, for what is replaced anyway
+    with torch.device("meta"):  # takes no memory and no random numbers for what is replaced anyway
         module = build()
     wanted = {name: tensor.shape for name, tensor in module.state_dict().items()}
     given = {name: tensor.shape for name, tensor in weights.items()}

@@ -45,14 +45,14 @@ class RangeNet53(nn.Module):
         self.backbone, self.decoder = _Backbone(), _Decoder()
 
     def forward(self, images: Float[Tensor, "B 5 H W"]) -> Float[Tensor, "B d"]:
-        """Return 4096 values of the decoder's 32 x H x W, always those of the same places."""
+        """Return 4096 values of the decoder's 32 x H x W, always those at the same positions."""
         features = self.decoder(self.backbone(images)).flatten(1)
         return features[:, chosen_values(features.shape[1]).to(features.device)]
 
 
 @lru_cache
 def chosen_values(num: int) -> Int64[Tensor, "n"]:
-    """Return which of ``num`` values are the features: the draw of LiDARGen and R2DM, or all if there are fewer.
+    """Return which of ``num`` values are the features: the random choice of LiDARGen and R2DM, or all if fewer.
 
     Source:
         ``random.seed(0); random.sample(range(2097152), 4096)`` in vzyrianov/lidargen@4c3226c, for 32 x 64 x 1024.

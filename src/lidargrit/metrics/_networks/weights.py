@@ -40,13 +40,13 @@ class PublishedWeights:
     """Where the weights of a network can be had, and on which terms.
 
     Args:
-        name: of the network, as ``--weights NAME=FILE`` knows it.
-        url: of the file; https only.
-        licence: what its publishers say of its use.
-        bytes_at_most: of the file, and of what it unpacks to; more is refused unread.
-        sha256: of the file, if it is known; if not, only the layout of what the file holds can be checked.
-        members: of a ``.tar.gz``: the files to read, each with the name that goes before those of its tensors. Empty
-            for a file of ``torch.save``.
+        name: name of the network in ``--weights NAME=FILE``.
+        url: address of the file; https only.
+        licence: terms of use that its publishers state.
+        bytes_at_most: greatest size of the file, and of what it unpacks to; more is refused unread.
+        sha256: checksum of the file if it is known; if not, only the layout of the file's content can be checked.
+        members: files to read from a ``.tar.gz``, each with the prefix of the names of its tensors. Empty for a file of
+            ``torch.save``.
     """
 
     name: str
