@@ -22,8 +22,8 @@ class FlyingPoints(CurveMetric):
     on its right lie on one surface, and these surfaces, extended to the ray of the pixel, are at least 1 m apart. Its
     return is a flying point if it is farther than 0.3 m from both surfaces and lies between them. Surfaces are
     extended linearly in inverse range, which is exact for planes up to the curvature of one pixel, so a wall that is
-    struck at a grazing angle is no edge. Rows are circular. The value is the mean divergence over bins of gap width. Real
-    scans have flying points too: thin objects in a gap, and beams that are split by an edge.
+    struck at a grazing angle is no edge. Rows are circular. The value is the mean divergence over bins of gap width.
+    Real scans have flying points too: thin objects in a gap, and beams that are split by an edge.
 
     Source:
         the phenomenon: Tang et al., A comparative analysis of depth-discontinuity and mixed-pixel detection algorithms,
