@@ -3,9 +3,9 @@
     python benchmarks/kill_training.py
     python benchmarks/kill_training.py --random 40 --in-save 10
 
-A tiny run of two stages is killed (SIGKILL) at random moments, and while a checkpoint is half written: the first time
-that a hidden file beside a checkpoint is seen. Each time the same command goes on. At the end, its weights and the
-entries of its logs are compared with those of a run that nothing happened to.
+A tiny run of two stages is killed (SIGKILL) at random moments, and while a checkpoint is half written, that is when a
+partial file is seen in the hidden folder beside a checkpoint. Each time the same command resumes the run. At the end,
+its weights and the entries of its logs are compared with those of a run that was never killed.
 """
 
 import argparse
@@ -92,7 +92,7 @@ class Runs:
         return sum(read_tensors(path)[1]["scans_seen"] for path in found if path.exists())
 
     def half_written(self) -> set[Path]:
-        return set(self.folder.glob("*/.checkpoint.safetensors.*"))
+        return set(self.folder.glob("*/.lidargrit-partial-*/*.partial"))
 
 
 def main() -> None:
@@ -112,7 +112,7 @@ def main() -> None:
         whole_s = time.monotonic() - begun
         stage_s = {stage: logs(whole.folder / stage)[-1]["seconds"] for stage in STAGES}
         start_s = whole_s - sum(stage_s.values())
-        print(f"a run that nothing happens to: {whole_s:.1f} s, {start_s:.1f} s of it to start")
+        print(f"a run that is not killed: {whole_s:.1f} s, {start_s:.1f} s of it to start")
         runs = Runs(Path(folder) / "killed")
         met: Counter[str] = Counter()
         for stage in STAGES:

@@ -43,6 +43,7 @@ def estimated_training_flops(recipe: Recipe) -> dict[str, int]:
     images of 16, 32 and 48 columns determine the count on the whole image. The estimate is 3 % too high for R2DM, some
     of whose layers depend on the number of columns in another way.
     """
+    # Torch's fake tensors, which take no memory, stop at the codebook, whose counts depend on values.
     sensor = recipe.data.load_sensor()
     strips = sensor.width / _STRIP
     if strips <= 6 or sensor.width % _STRIP:
