@@ -3,9 +3,9 @@
     python benchmarks/precision.py RUN [--scans simulated:32:val]
 
 RUN is a trained LidarGRIT. Bits per token are the mean over the scans' own tokens, which each precision reads one by
-one as it would write them; beside them how far its odds lie from those in 32 bits (KL divergence, bits per token).
-Decoding is of the same tokens; a return is flipped where P(return) crosses a half, and drawn flips where one uniform
-number for each pixel falls between the two probabilities. Ranges are compared where both have a return.
+one as it would generate them; beside them how far its odds lie from those in 32 bits (KL divergence, bits per token).
+Decoding is of the same tokens; a return is flipped where P(return) crosses a half, and a sampled one where the uniform
+number of its pixel falls between the two probabilities. Ranges are compared where both have a return.
 """
 
 import argparse
@@ -24,8 +24,8 @@ from lidargrit.structures import TokenGrid
 
 def stepwise_logits(generator: LidarGrit, tokens: torch.Tensor, precision: str) -> torch.Tensor:
     """Return the logits (B, T, K) that the decoder computes when it is given the tokens one by one."""
-    chooser = partial(sample_token, sampling=TokenSampling())
-    decoder = CachedDecoder(generator.transformer, len(tokens), chooser, precision=precision)
+    by_choices = partial(sample_token, sampling=TokenSampling())
+    decoder = CachedDecoder(generator.transformer, len(tokens), by_choices, precision=precision)
     inputs = after_start(tokens[:, :-1])
     return torch.stack([decoder.next_logits(inputs[:, at], at) for at in range(inputs.shape[1])], dim=1)
 
@@ -53,11 +53,13 @@ def compare_decoding(generator: LidarGrit, grid: TokenGrid) -> None:
         both = (plain.return_logits >= 0) & (quick.return_logits >= 0)
         error_m = (plain.range_m - quick.range_m).abs()[both]
         flipped = ((plain.return_logits >= 0) != (quick.return_logits >= 0)).float().mean()
-        drawn = ((uniform < plain.return_logits.sigmoid()) != (uniform < quick.return_logits.sigmoid())).float().mean()
+        sampled = (
+            ((uniform < plain.return_logits.sigmoid()) != (uniform < quick.return_logits.sigmoid())).float().mean()
+        )
         print(
             f"decoder {precision:<6}mean {error_m.mean():.5f} m, median {error_m.median():.5f} m, "
             f"99 % below {error_m[:: max(1, len(error_m) // 10**6)].quantile(0.99):.4f} m, most {error_m.max():.3f} m; "
-            f"returns flipped by threshold {100 * flipped:.4f} %, as drawn {100 * drawn:.4f} %"
+            f"returns flipped by threshold {100 * flipped:.4f} %, as sampled {100 * sampled:.4f} %"
         )
 
 

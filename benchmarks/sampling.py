@@ -1,4 +1,4 @@
-"""Seconds to write tokens, to decode them, and for whole scans: ours and recomputation, side by side in one run.
+"""Seconds to generate tokens, to decode them, and for whole scans: ours and recomputation, side by side in one run.
 
     python benchmarks/sampling.py [--recipe lidargrit_kitti_360] [--batch 1 16] [--roofline]
 

@@ -63,13 +63,13 @@ def test_every_pass_shows_some_and_the_last_all(num_tokens, steps):
 def test_every_token_is_decided_once_and_stays(transformer):
     seen = []
     transformer.register_forward_hook(lambda module, given, found: seen.append(given[0].clone()))
-    written = generate_tokens(transformer, rngs(0, 1), MaskedSampling(steps=5))
+    generated = generate_tokens(transformer, rngs(0, 1), MaskedSampling(steps=5))
     assert len(seen) == 5
     assert bool((seen[0] == transformer.mask_token).all())
-    for before, after in zip(seen, [*seen[1:], written], strict=True):
+    for before, after in zip(seen, [*seen[1:], generated], strict=True):
         shown = before != transformer.mask_token
         assert torch.equal(before[shown], after[shown])
-    counts = [int((tokens[0] == transformer.mask_token).sum()) for tokens in [*seen, written]]
+    counts = [int((tokens[0] == transformer.mask_token).sum()) for tokens in [*seen, generated]]
     assert counts == [24, *numbers_hidden(24, 5)]
 
 
@@ -78,26 +78,26 @@ def test_greedy_with_a_pass_for_each_token_is_a_slow_loop(transformer):
     with torch.no_grad():
         for _ in range(24):
             odds = transformer(tokens)[0].softmax(-1)
-            surest, place, token = max(
-                (float(odds[place, token]), place, token)
-                for place in range(24)
-                if tokens[0, place] == transformer.mask_token
+            surest, position, token = max(
+                (float(odds[position, token]), position, token)
+                for position in range(24)
+                if tokens[0, position] == transformer.mask_token
                 for token in range(20)
             )
             assert surest > 0
-            tokens[0, place] = token
+            tokens[0, position] = token
         assert torch.equal(generate_tokens(transformer, rngs(0), GREEDY), tokens)
 
 
 def test_one_pass_draws_every_token_with_its_own_probability(transformer):
     with torch.no_grad():
         odds = transformer(torch.full((1, 24), transformer.mask_token))[0].softmax(-1)
-        written = torch.cat(
+        generated = torch.cat(
             [generate_tokens(transformer, rngs(*range(i, i + 500)), MaskedSampling(1)) for i in (0, 500, 1000)]
         )
-    for place in (0, 11, 23):
-        share = torch.bincount(written[:, place], minlength=20) / len(written)
-        assert float((share - odds[place]).abs().max()) < 0.06  # 5 standard deviations of a share of a half
+    for position in (0, 11, 23):
+        share = torch.bincount(generated[:, position], minlength=20) / len(generated)
+        assert float((share - odds[position]).abs().max()) < 0.06  # 5 standard deviations of a share of a half
 
 
 def test_a_high_order_temperature_shows_tokens_in_any_order(transformer):

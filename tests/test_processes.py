@@ -28,7 +28,7 @@ from tiny_runs import train_words
 
 SENSOR = load_sensor("hdl64e_kitti_odometry")
 
-STEADY = [  # nothing that is drawn for a process and not for a scan; codes that restart and follow means
+STEADY = [  # no random numbers of a process, only of a scan; codes that restart and follow means
     "model.tokenizer.dropout=0",
     *[f"model.transformer.{part}_dropout=0" for part in ("embedding", "attention", "residual")],
     "training.tokenizer.augmentations=[flip,roll]",

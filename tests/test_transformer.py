@@ -1,4 +1,4 @@
-"""The transformer against the reference program; how it writes token by token."""
+"""The transformer against the reference program; how it generates token by token."""
 
 from functools import partial
 
@@ -77,12 +77,12 @@ def test_top_k_keeps_what_the_program_keeps(golden_transformer):
     for uniform in torch.linspace(0, 0.9999, 4000):
         kept.scatter_(1, sample_token(logits, uniform.expand(len(logits)), TokenSampling(top_k=5))[:, None], True)
     theirs = torch.from_numpy(data["topk5_of_logits0"])
-    # Every token that can be drawn is among the program's; one too unlikely for 4,000 steps may be missing.
+    # Every token that can be sampled is among the program's; one too unlikely for 4,000 steps may be missing.
     assert bool((~kept | theirs.isfinite()).all())
     assert int(kept.sum()) > 0.9 * int(theirs.isfinite().sum())
 
 
-def write(transformer, uniform, sampling, **options):
+def generate(transformer, uniform, sampling, **options):
     return CachedDecoder(transformer, len(uniform), partial(sample_token, sampling=sampling), **options).generate(
         uniform
     )
@@ -110,17 +110,17 @@ def test_a_token_never_sees_what_follows(transformer):
 
 
 @pytest.mark.parametrize("sampling", [TokenSampling(), TokenSampling(0.7, 5), TokenSampling(1.2, 0, 0.8), GREEDY])
-def test_written_tokens_are_those_of_recomputing_in_any_batch_and_by_static_shapes(transformer, sampling):
+def test_generated_tokens_are_those_of_recomputing_in_any_batch_and_by_static_shapes(transformer, sampling):
     uniform = torch.rand((4, 24), generator=torch.Generator().manual_seed(1))
     with torch.no_grad():
         recomputed = sample_by_recomputing(transformer, uniform, sampling)
-    assert torch.equal(write(transformer, uniform, sampling), recomputed)
-    assert torch.equal(torch.cat([write(transformer, uniform[i : i + 1], sampling) for i in range(4)]), recomputed)
-    assert torch.equal(write(transformer, uniform, sampling, static=True), recomputed)
+    assert torch.equal(generate(transformer, uniform, sampling), recomputed)
+    assert torch.equal(torch.cat([generate(transformer, uniform[i : i + 1], sampling) for i in range(4)]), recomputed)
+    assert torch.equal(generate(transformer, uniform, sampling, static=True), recomputed)
 
 
 @pytest.mark.parametrize("static", [False, True])
-def test_a_writer_may_write_again_and_further_than_one_recording(static):
+def test_a_decoder_may_generate_again_and_further_than_one_recording(static):
     torch.manual_seed(0)
     longer = CausalTransformer(TransformerConfig(layers=1, heads=2, width=16), num_tokens=8, context_length=140).eval()
     torch.nn.init.normal_(longer.pos_emb)
@@ -134,20 +134,20 @@ def test_a_writer_may_write_again_and_further_than_one_recording(static):
     )
 
 
-def test_tokens_are_drawn_with_their_probability():
+def test_tokens_are_sampled_with_their_probability():
     logits = torch.tensor([[0.0, 1.0, 2.0, -1.0, 0.5]])
     uniform = torch.rand(20_000, generator=torch.Generator().manual_seed(0))
-    drawn = sample_token(logits.expand(20_000, -1), uniform, TokenSampling(top_k=0))
+    sampled = sample_token(logits.expand(20_000, -1), uniform, TokenSampling(top_k=0))
     expected = logits[0].double().softmax(0).numpy() * 20_000
-    assert stats.chisquare(torch.bincount(drawn, minlength=5).numpy(), expected).pvalue > 1e-3
+    assert stats.chisquare(torch.bincount(sampled, minlength=5).numpy(), expected).pvalue > 1e-3
 
 
 def test_top_p_keeps_the_smallest_set_that_holds_the_share():
     logits = torch.tensor([[0.5, 0.3, 0.15, 0.05]]).log()
     uniform = torch.linspace(0, 0.9999, 1000)
     for top_p, kept in ((0.4, {0}), (0.5, {0}), (0.6, {0, 1}), (0.81, {0, 1, 2}), (1.0, {0, 1, 2, 3})):
-        drawn = sample_token(logits.expand(1000, -1), uniform, TokenSampling(top_k=0, top_p=top_p))
-        assert set(drawn.tolist()) == kept
+        sampled = sample_token(logits.expand(1000, -1), uniform, TokenSampling(top_k=0, top_p=top_p))
+        assert set(sampled.tolist()) == kept
 
 
 def test_the_start_token_is_an_ordinary_one():
@@ -181,9 +181,9 @@ def test_a_changed_weight_is_noticed_and_token_bits_sum_to_the_likelihood():
         token_nll_bits = generator.token_nll_bits(first)
         tokens = generator.tokenizer.encode(first)
         odds = generator.transformer(after_start(tokens.tokens.flatten(1)[:, :-1])).softmax(-1)
-        for place in (0, 7, 255):
-            share = odds[0, place, tokens.tokens.flatten()[place]]
-            assert float(token_nll_bits.flatten()[place]) == pytest.approx(-np.log2(float(share)), abs=1e-4)
+        for position in (0, 7, 255):
+            share = odds[0, position, tokens.tokens.flatten()[position]]
+            assert float(token_nll_bits.flatten()[position]) == pytest.approx(-np.log2(float(share)), abs=1e-4)
         assert float(generator.log_likelihood(first)) == pytest.approx(
             -float(token_nll_bits.sum()) * np.log(2), rel=1e-5
         )

@@ -9,6 +9,7 @@ import torch
 
 from lidargrit.errors import ConfigError
 from lidargrit.nn.convolution import FoldedUpsample, Upsample
+from lidargrit.projection import RangeEncoding
 from lidargrit.sensors import load_sensor
 from lidargrit.structures import RangeImage, TokenGrid
 from lidargrit.tokenizers.vqvae import Vqvae, VqvaeConfig, reconstruction_loss
@@ -88,15 +89,15 @@ def test_heads_and_bernoulli_composition_are_the_programs(golden):
     encoded = raw[:, :1].tanh()
     assert torch.allclose(encoded, data["depth_orig"], atol=1e-6)
     torch.manual_seed(3)
-    drawn = torch.bernoulli(raw[:, 1:].sigmoid())
-    assert torch.equal(drawn, data["bernoulli_mask"])
-    assert torch.allclose(torch.where(drawn > 0, encoded, -1.0), data["depth_composed"], atol=1e-6)
+    sampled = torch.bernoulli(raw[:, 1:].sigmoid())
+    assert torch.equal(sampled, data["bernoulli_mask"])
+    assert torch.allclose(torch.where(sampled > 0, encoded, -1.0), data["depth_composed"], atol=1e-6)
 
 
 def test_losses_of_the_paper_by_a_slow_loop():
     rng = torch.Generator().manual_seed(0)
     encoded, target = (torch.rand((2, 3, 4), generator=rng) * 2 - 1 for _ in range(2))
-    mask, drawn = (torch.rand((2, 3, 4), generator=rng) < 0.6 for _ in range(2))
+    mask, sampled = (torch.rand((2, 3, 4), generator=rng) < 0.6 for _ in range(2))
     paper = returns = reference = 0.0
     for b in range(2):
         returned = int(mask[b].sum())
@@ -106,10 +107,10 @@ def test_losses_of_the_paper_by_a_slow_loop():
                     error = abs(float(encoded[b, i, j] - target[b, i, j]))
                     paper += error / 12 / 2
                     returns += error / returned / 2
-                    composed = float(encoded[b, i, j]) if drawn[b, i, j] else -1.0
+                    composed = float(encoded[b, i, j]) if sampled[b, i, j] else -1.0
                     reference += abs(composed - float(target[b, i, j])) / returned / 2
     for kind, slow in (("paper", paper), ("returns", returns), ("reference", reference)):
-        assert float(reconstruction_loss(encoded, target, mask, drawn, kind)) == pytest.approx(slow, rel=1e-5)
+        assert float(reconstruction_loss(encoded, target, mask, sampled, kind)) == pytest.approx(slow, rel=1e-5)
 
 
 @pytest.mark.parametrize("reconstruction", ["paper", "reference", "returns"])
@@ -123,6 +124,53 @@ def test_every_objective_is_finite_and_reaches_every_weight(reconstruction, rayd
     assert bool(terms["loss"].isfinite())
     assert ("raydrop" in terms) == raydrop_loss
     assert all(p.grad is not None and bool(p.grad.isfinite().all()) for p in vqvae.parameters())
+
+
+@pytest.mark.parametrize("range_encoding", ["linear", "log", "inverse"])
+@pytest.mark.parametrize("raydrop_loss", [True, False])
+def test_errors_in_metres_are_those_of_the_linear_encoding(range_encoding, raydrop_loss):
+    sensor = sensor_of(16, 32)
+    config = replace(SMALL, range_encoding=range_encoding, error_unit="metres", raydrop_loss=raydrop_loss)
+    torch.manual_seed(0)
+    vqvae, images = Vqvae(config, sensor).eval(), images_of(sensor)
+    linear = RangeEncoding("linear", sensor.range_min_m, sensor.range_max_m)
+    with torch.no_grad():
+        terms = vqvae(images, torch.Generator())
+        decoded_m = vqvae.decode(vqvae.encode(images)).range_m
+        encoded = linear.encode(decoded_m, torch.ones_like(images.return_mask))
+        error = (encoded - linear.encode(images.range_m, images.return_mask)).abs()
+    expected = (error * images.return_mask).mean() if raydrop_loss else error.mean()
+    assert float(terms["reconstruction"]) == pytest.approx(float(expected), rel=1e-4)
+
+
+@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+def test_features_are_what_the_last_layer_reads(precision):
+    torch.manual_seed(0)
+    sensor = sensor_of(16, 32)
+    vqvae = Vqvae(replace(SMALL, channel_multipliers=(1, 2)), sensor).eval().for_decoding(precision)
+    with torch.no_grad():
+        decoded = vqvae.decode(TokenGrid(torch.randint(16, (2, 8, 16)), 16))
+        assert decoded.features is not None
+        heads = vqvae.decoder.conv_out(decoded.features)
+    assert decoded.features.shape == (2, vqvae.num_features, 16, 32)
+    assert decoded.features.dtype == torch.float32
+    assert torch.equal(decoded.return_logits, heads[:, 1])
+    assert torch.equal(decoded.range_m, vqvae.range_encoding.decode(heads[:, 0].tanh()))
+
+
+def test_batches_are_joined_with_reflectance_only_if_all_have_it():
+    sensor = sensor_of(16, 32)
+    plain = images_of(sensor, 2)
+    shiny = replace(images_of(sensor, 3, seed=1), reflectance=torch.rand(3, 16, 32))
+    both = RangeImage.cat([plain, shiny])
+    assert torch.equal(both.range_m, torch.cat((plain.range_m, shiny.range_m)))
+    assert both.reflectance is None
+    twice = RangeImage.cat([shiny, shiny[:1]])
+    assert twice.reflectance is not None
+    assert torch.equal(twice[3].range_m, shiny[0].range_m)
+    masked = RangeImage.masked(shiny.range_m + 1, shiny.return_mask, sensor, shiny.reflectance)
+    assert masked.reflectance is not None
+    assert float(masked.reflectance[~masked.return_mask].abs().max()) == 0
 
 
 def test_padding_around_the_circle_commutes_with_turning_the_car():

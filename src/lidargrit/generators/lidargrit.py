@@ -29,7 +29,7 @@ from lidargrit.tokenizers import Tokenizer
 
 START_TOKEN = 0  # the reference prepends an ordinary token, shared with the first code, not one of its own
 _PUBLISHED_BYTES_AT_MOST = 2 << 30  # the first release's transformer of 126 M weights, with its optimiser, takes 1.6 GB
-_PUBLISHED_NETWORKS = {  # ours → its name in a checkpoint of the program, and what in it is no weight of the network
+_PUBLISHED_NETWORKS = {  # by our name: the program's name, and entries of its checkpoint that are no weights
     "tokenizer": ("VQ", ("loss.*",)),  # a discriminator and an image network, whose terms have the weight 0
     "transformer": ("Transformer", ("*.attn.mask",)),  # a triangle of ones
 }

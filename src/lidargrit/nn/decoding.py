@@ -1,4 +1,4 @@
-"""Sequences generated token by token, with a cache of keys and values: (transformer, uniform numbers) → tokens.
+"""Sequences generated token by token by a transformer, with a cache of keys and values.
 
 The transformer itself reads whole sequences, for training and for likelihoods. Here its weights are laid out for one
 token at a time, and a step takes few operations: query, key and value come from one product, the cache is allocated
@@ -66,7 +66,7 @@ class CachedDecoder:
         self._blocks = [_Block(block, heads, precision) for block in transformer.blocks]
         self._last_norm = _norm(transformer.ln_f, dtype)
         self._head = transformer.head.weight.detach().to(dtype)
-        # Layer, key or value, sequence and head, position, number: one step writes all layers' slices of a position.
+        # Layer, key or value, sequence and head, position, number: a step writes one position of all layers.
         size = (len(self._blocks), 2, batch_size * heads, self._length, width // heads)
         self._cache = torch.zeros(size, dtype=dtype, device=self._device)
         self._slots = self._cache.unflatten(2, (batch_size, heads))
@@ -121,7 +121,7 @@ class CachedDecoder:
             x.add_(block.contract(F.gelu(block.expand(block.norm2(x), None)), None))
         return F.linear(self._last_norm(x), self._head).float()
 
-    def _static_step(self, span: int) -> None:
+    def _static_step(self, num_positions: int) -> None:
         """Generate the token at the position that a tensor holds, and advance it; no shape depends on the position."""
         slots = self._slots.unbind()
 
@@ -129,8 +129,8 @@ class CachedDecoder:
             slots[layer].index_copy_(3, self._position, self._newest.unsqueeze(3))
 
         x = F.embedding(self._tokens, self._embedding) + self._positions.index_select(0, self._position)
-        future = torch.arange(span, device=self._device) > self._position
-        logits = self._logits(x, self._cache[:, :, :, :span], write_cache, future)
+        future = torch.arange(num_positions, device=self._device) > self._position
+        logits = self._logits(x, self._cache[:, :, :, :num_positions], write_cache, future)
         chosen = self._sample_token(logits, self._uniform.index_select(1, self._position)[:, 0])
         self._tokens.copy_(chosen)
         self._generated.index_copy_(1, self._position, chosen[:, None])
@@ -142,19 +142,19 @@ class CachedDecoder:
 
     def _record_graphs(self, length: int) -> None:
         for index in range(len(self._graphs), math.ceil(length / _POSITIONS_PER_GRAPH)):
-            span = min((index + 1) * _POSITIONS_PER_GRAPH, self._length)
+            num_positions = min((index + 1) * _POSITIONS_PER_GRAPH, self._length)
             if self._device.type != "cuda":
-                self._graphs[index] = lambda span=span: self._static_step(span)
+                self._graphs[index] = lambda num_positions=num_positions: self._static_step(num_positions)
                 continue
             stream, graph = torch.cuda.Stream(), torch.cuda.CUDAGraph()
             stream.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(stream):  # once outside of the graph, so that libraries take their workspaces
                 self._rewind()
-                self._static_step(span)
+                self._static_step(num_positions)
             torch.cuda.current_stream().wait_stream(stream)
             self._rewind()
             with torch.cuda.graph(graph):
-                self._static_step(span)
+                self._static_step(num_positions)
             self._graphs[index] = graph.replay
 
 

@@ -1,4 +1,4 @@
-"""Range images ⇄ tokens: the contract of a tokenizer, and how a configuration names its kind."""
+"""The contract of a tokenizer, which turns range images into tokens and back, and how a configuration names it."""
 
 from __future__ import annotations
 
