@@ -14,6 +14,7 @@ from format_examples import example, numpy_files, pcd_files, ply_files
 from lidargrit.errors import OutputError, ScanError
 from lidargrit.formats import candidates, load, read_scan, recognise, stem
 from lidargrit.formats.kitti_bin import KittiBin
+from lidargrit.formats.xyz_bin import XyzBin
 from lidargrit.projection import project
 from lidargrit.sensors import load_sensor
 from lidargrit.structures import Scan
@@ -367,3 +368,10 @@ def test_real_damaged_scans_are_refused(real, file, text):
     with pytest.raises(ScanError, match=text) as refused:
         project(read_scan(path), load_sensor("hdl64e_kitti_odometry"))
     assert str(path) in refused.value.got
+
+
+def test_bare_coordinates_that_could_not_be_read_back_are_not_written(tmp_path):
+    far = Scan(torch.tensor([[1001.0, 0.0, 0.0]]), source="a far point")
+    with pytest.raises(OutputError, match=r"a coordinate of 1001 m in a far point.*at most 1000 m"):
+        XyzBin.write(tmp_path / "far.bin", far)
+    assert not list(tmp_path.iterdir())

@@ -78,10 +78,10 @@ def override(config: T, settings: Iterable[str], owner: str = "this recipe", cur
     A value is read as YAML. A list needs no brackets: ``data.train=/data/one,/data/two``.
 
     Args:
-        config: what is changed; not itself, a copy.
-        settings: each NAME=VALUE.
-        owner: whose settings they are, for a message.
-        cure: how the user finds their names.
+        config: configuration to change; it stays as it is, and a changed copy is returned.
+        settings: words of the form NAME=VALUE.
+        owner: name of what has these settings, for a message.
+        cure: hint on how to find the names of the settings, for a message.
 
     Raises:
         ConfigError: an unknown name (names its nearest neighbours) or a value of another type.

@@ -36,11 +36,11 @@ def parse_json(
 
     Args:
         data: JSON in UTF-8.
-        source: what holds it, for the message.
-        kind: type that the whole must have, dict or list.
+        source: name of the file or message, for the error.
+        kind: required type of the whole, dict or list.
         error: class of the error that is raised.
-        wanted: what it should be, for the message.
-        cure: what the user can do, for the message.
+        wanted: description of valid content, for the error.
+        cure: advice to the user, for the error.
         at_most: largest size, in bytes.
 
     Raises:

@@ -38,10 +38,10 @@ def tell(options: argparse.Namespace, text: str, result: Any, done: str = "") ->
     """Print what was found as the user wants it, and write it where the user wants it.
 
     Args:
-        options: with ``json``, as :func:`add_json` has it.
-        text: for people.
-        result: the same for programs; numbers that JSON has no word for become null.
-        done: where further results lie; on standard error if JSON is printed.
+        options: parsed options with ``json``, see :func:`add_json`.
+        text: result as people read it.
+        result: result as programs read it; numbers that are NaN or infinite become null.
+        done: last line, on standard error if JSON is printed.
     """
     if options.json == STANDARD_OUTPUT:
         print(json.dumps(plain(result), indent=2, allow_nan=False))

@@ -21,7 +21,7 @@ class SplitScheme:
     """One way to divide a data set, as some paper or program does it.
 
     Args:
-        source: whose it is.
+        source: publication or program that defines it.
         leak: what the parts share that they should not, in one sentence; everybody who compares figures needs it.
         parts: the sequences of every part: train, val, test.
     """
@@ -44,7 +44,7 @@ class ScanDataset(ABC):
 
     Args:
         root: the folder that ``tree`` starts from.
-        split: which scans.
+        split: name or range of the wanted scans, such as ``val`` or ``all[:10%]``.
         bad_points: ``refuse`` a scan with NaN, infinite or all-zero coordinates, or ``drop`` such points.
 
     Raises:
@@ -125,7 +125,7 @@ def open_dataset(source: str, bad_points: BadPoints = "refuse") -> ScanDataset:
     Args:
         source: "NAME:ROOT" or "NAME:ROOT:SPLIT"; "ROOT" or "ROOT:SPLIT" to have the layout recognised;
             "simulated:COUNT" or "simulated:COUNT:SPLIT" for scans of procedural streets.
-        bad_points: as for :class:`ScanDataset`.
+        bad_points: see :class:`ScanDataset`.
 
     Raises:
         UnknownNameError: no data set of that name; names its nearest neighbours.

@@ -15,10 +15,10 @@ class Split:
     """What is between the brackets of ``all[:90%]``, and what is before them.
 
     Args:
-        text: as the user typed it.
+        text: split as the user typed it.
         parts: "all", named splits and sequences, joined by "+" in the text.
-        start_percent: where the block of scans begins.
-        end_percent: where it ends.
+        start_percent: begin of the block of scans, in percent.
+        end_percent: end of the block of scans, in percent.
     """
 
     text: str

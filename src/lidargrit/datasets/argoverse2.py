@@ -13,7 +13,7 @@ class Argoverse2(FileDataset):
     """The sensor and the lidar data set of Argoverse 2; a sequence is ``train/LOG``.
 
     A file holds the points of two sensors. A scan is those of the upright one, so that all scans have one sensor's
-    rays; for the one below it, upside down, use ``lidargrit.read_scan(FILE, 1)``. The folder of a split, of a log, or
+    rays; for the one below it, upside down, use ``lidargrit.load_scan(FILE, 1)``. The folder of a split, of a log, or
     of .feather files alone is read, too; then there are no named splits.
     """
 

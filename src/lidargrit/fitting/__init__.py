@@ -34,21 +34,21 @@ class SensorFit:
 
     Args:
         sensor: ready to be written with ``to_json``; its rows are where returns are seen from the origin.
-        method: how the laser of every point was found.
-        num_scans: that were looked at and used.
-        laser_elevation_deg: of the lasers themselves, which far points approach; a maker's table holds these.
-        laser_height_m: of every laser above the origin, as its near points betray it; all 0 where none shows.
+        method: way in which the laser of every point was found.
+        num_scans: number of scans that were used.
+        laser_elevation_deg: elevations (H,) of the lasers, which far points approach; a maker's table holds these.
+        laser_height_m: height of every laser above the origin (H,), found from near points; all 0 if none is found.
         residual_deg: spread of the points of every row around it (standard deviation, outliers left out).
-        points_per_ring: over all scans.
-        agree_share: of the points, how many lie nearer to their row than a quarter of the way to the next one.
-        counter_clockwise: how it turns, seen from above; None where the order of points does not tell.
-        start_deg: azimuth where a revolution begins in the file; None likewise.
-        range_step_m: in which ranges are counted, or None.
-        coordinate_step_m: in which coordinates are counted, or None.
-        elevations_deg: of the points that were looked at, a row's number for each beside it; for a picture.
-        row_of_point: -1 for points of no row.
-        steps_deg: in azimuth between neighbouring points of a ring; for a picture.
-        warnings: what a user should know, one sentence each.
+        points_per_ring: number of points of each ring (H,), over all scans.
+        agree_share: share of the points nearer to their row than a quarter of the way to the next one.
+        counter_clockwise: whether the sensor turns so, seen from above; None if the order of points does not show it.
+        start_deg: azimuth where a revolution begins in the file; None if unknown.
+        range_step_m: step of which all ranges are multiples, or None.
+        coordinate_step_m: step of which all coordinates are multiples, or None.
+        elevations_deg: elevations (n,) of the points that were used, for a plot.
+        row_of_point: row (n,) of each of these points, -1 for none.
+        steps_deg: steps in azimuth (m,) between neighbouring points of a ring, for a plot.
+        warnings: sentences that the user should read.
     """
 
     sensor: SensorModel
@@ -73,8 +73,8 @@ def fit_sensor(scans: Sequence[Scan], name: str = "fitted") -> SensorFit:
     """Find the sensor that made scans: its rows, columns, limits, and how it turns.
 
     Args:
-        scans: of one sensor, in its own frame; five or more from different places.
-        name: of the new sensor.
+        scans: scans of one sensor in its own frame, best five or more from different places.
+        name: name of the new sensor.
 
     Raises:
         ConfigError: no scan.
@@ -130,9 +130,9 @@ def fit_sensor_to_source(
     """Find the sensor that made the scans of a data source, from some of them, evenly spaced.
 
     Args:
-        source: as for :func:`lidargrit.datasets.open_dataset`.
-        name: of the new sensor.
-        num_scans: to look at, at most.
+        source: source of scans, see :func:`lidargrit.datasets.open_dataset`.
+        name: name of the new sensor.
+        num_scans: largest number of scans to use.
         bad_points: ``refuse`` scans with NaN, infinite or origin points, or ``drop`` these points.
 
     Raises:

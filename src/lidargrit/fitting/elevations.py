@@ -26,12 +26,12 @@ class Rows:
 
     Args:
         elevation_deg: under which the points of a row are seen from the origin, at the range where most of them are.
-        laser_elevation_deg: that of the laser itself, which points at far range approach.
-        laser_height_m: of the laser above the origin; all 0 where it does not show.
+        laser_elevation_deg: elevation of the laser itself, which points at far range approach.
+        laser_height_m: height of the laser above the origin; all 0 if it is not found.
         residual_deg: spread of the points around these, as a standard deviation that outliers do not move.
-        num_points: of every row.
-        agree_share: of all points, how many lie nearer to their row than a quarter of the way to the next.
-        number: of every row among the rings that went in.
+        num_points: number of points of every row (H,).
+        agree_share: share of all points nearer to their row than a quarter of the way to the next.
+        number: index of every row among the given rings.
     """
 
     elevation_deg: Float64[np.ndarray, "H"]

@@ -21,10 +21,10 @@ class Points:
 
     Args:
         range_m: distance from the origin.
-        elevation_deg: up-positive.
+        elevation_deg: elevation, up is positive.
         azimuth_deg: counter-clockwise from +x, in [-180, 180].
-        ring: as the file has it, or None.
-        place: of every point in the file, counted with those that were left out here.
+        ring: ring number from the file, or None.
+        place: index in the file of every point, counting those that are left out here.
         num_in_file: points with those that were left out.
     """
 

@@ -29,11 +29,11 @@ class Rings:
     """The laser of every point of every scan.
 
     Args:
-        method: how it was found.
+        method: way in which it was found.
         of_point: one array a scan; -1 where it is not known. Numbers are the file's own, or count in its order.
         used: the scans that it could be found for.
-        counter_clockwise: how the sensor turns, seen from above; None where the order of points does not tell.
-        start_deg: azimuth where a file begins its rings or its first column; None likewise.
+        counter_clockwise: whether the sensor turns so, seen from above; None if the order of points does not show it.
+        start_deg: azimuth where a file begins its rings or its first column; None if unknown.
         by_column: whether files keep a place for every laser of every firing, one firing after another.
     """
 

@@ -9,7 +9,6 @@ from io import BufferedReader
 from pathlib import Path
 from typing import ClassVar, Literal
 
-import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -117,7 +116,7 @@ def read_scan(path: Path | str, index: int = 0, bad_points: BadPoints = "refuse"
 
     Args:
         path: the file.
-        index: which of the scans in it.
+        index: number of the scan in the file, from 0.
         bad_points: ``drop`` removes points with NaN or infinite coordinates and points at the origin.
 
     Raises:
@@ -218,8 +217,3 @@ def damaged(path: Path, wanted: str, error: Exception) -> ScanError:
     """Return, in one line, what a library says of a file that it stumbled over."""
     said = "".join(filter(str.isprintable, " ".join(str(error).split())))[:120] or type(error).__name__
     return ScanError(f"{path}, a damaged file ({said})", wanted, "download it again, or remove it")
-
-
-def float_tensor(values: object) -> Tensor:
-    """Return an array of any number type as float32 of its own memory."""
-    return torch.as_tensor(values).to(torch.float32, copy=True)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from lidargrit.errors import ScanError
+from lidargrit.errors import OutputError, ScanError
 from lidargrit.files import atomic_path
 from lidargrit.formats import POINTS_AT_MOST, BadPoints, ScanFormat, first_bytes, read_bytes, scan_of
 from lidargrit.structures import Scan
@@ -58,7 +58,15 @@ class XyzBin(ScanFormat):
 
     @classmethod
     def write(cls, path: Path, scan: Scan) -> None:
-        """Write the points of a scan to a new file."""
+        """Write the points of a scan to a new file.
+
+        Raises:
+            OutputError: a coordinate beyond 1,000 m, which would not be read back.
+        """
+        farthest_m = float(scan.points_xyz_m.abs().max())
+        if farthest_m > _FARTHEST_M:
+            what = f"a coordinate of {farthest_m:g} m in {scan.source}, to write as {cls.title}"
+            raise OutputError(what, f"at most {_FARTHEST_M:g} m", "choose another format, such as ply")
         with atomic_path(path) as temporary:
             temporary.write_bytes(scan.points_xyz_m.numpy().astype("<f4").tobytes())
 

@@ -44,15 +44,15 @@ class Inspection:
     Args:
         scan: the points.
         sensor: the rays of the image.
-        method: how points find their row.
-        variant: of the projection.
-        fate: of every point, an index into FATES.
+        method: projection method, ``spherical`` or ``unfolding``.
+        variant: variant of the projection, ``exact`` or ``reference``.
+        fate: index into FATES (n,) of every point.
         range_m: the range image, 0 where there is no return.
-        points_per_pixel: how many points wanted each pixel.
-        errors: of the kept points against the points that their pixels unproject to: ``range_m``; ``position_m``, the
+        points_per_pixel: number of points (H, W) that fall into each pixel.
+        errors: differences between the kept points and their pixels unprojected: ``range_m``; ``position_m``, the
             distance; and its parts ``across`` (azimuth) and ``up`` (elevation), as arcs in metres and in degrees.
             Empty if no point is kept.
-        rings: how many rings the scan has, if unfolding.
+        rings: number of rings of the scan, for ``unfolding`` only.
         problems: why :func:`project` would refuse the scan; empty if it would not.
     """
 
@@ -84,7 +84,7 @@ def inspect(
     A scan that does not fit is projected as far as it goes, and what is wrong stands in ``problems``.
 
     Args:
-        scan, sensor, method, variant: as for :func:`project`.
+        scan, sensor, method, variant: the arguments of :func:`project`.
     """
     method = method or sensor.projection
     placed = place(scan, sensor, method, variant)

@@ -21,10 +21,10 @@ class Placement:
 
     Args:
         row: -1 above all rows, and ``height`` or more below them.
-        column: of the fine columns.
+        column: index (n,) among the fine columns.
         range_m: Euclidean distance from the sensor.
         height: rows of the image.
-        width: its fine columns.
+        width: number of fine columns of the image.
     """
 
     row: Int[np.ndarray, "n"]

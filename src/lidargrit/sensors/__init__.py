@@ -24,16 +24,16 @@ class SensorModel:
     """The ray directions of a range image and the limits of the sensor that fills it.
 
     Args:
-        name: what the sensor is called.
-        elevation_rad: of every row (H, 1), or of every pixel (H, W); falls from row 0 down; up is positive.
-        azimuth_rad: of every column (1, W), or of every pixel (H, W); falls from near +pi at column 0 to near -pi;
-            counter-clockwise from +x is positive.
+        name: public name of the sensor.
+        elevation_rad: elevation of every row (H, 1), or of every pixel (H, W); falls from row 0 down; up is positive.
+        azimuth_rad: azimuth of every column (1, W), or of every pixel (H, W); falls from near +pi at column 0 to near
+            -pi; counter-clockwise from +x is positive.
         range_min_m: a shorter range is no return.
         range_max_m: a longer range is no return.
-        projection: how this sensor's scans become range images unless told otherwise.
+        projection: default projection of the sensor's scans, ``spherical`` or ``unfolding``.
         column_stride: the image keeps every n-th of ``W * n`` fine columns (the paper's 64x256: every 8th of 2048).
-        source: where the numbers come from.
-        azimuth_offset_rad: how far counter-clockwise of its column's azimuth each row's laser looks when it fires. A
+        source: origin of the numbers, such as a data sheet.
+        azimuth_offset_rad: angle (H,) from a column's azimuth, counter-clockwise, at which each row's laser fires. A
             point is placed by its own azimuth, so images do not depend on it; the simulator aims by it.
 
     Raises:
