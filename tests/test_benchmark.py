@@ -19,7 +19,7 @@ from tiny_runs import MODEL
 
 FEW = ("data.train=simulated:6:train", "data.val=simulated:2:val", "data.columns=512", "data.column_stride=8")
 QUICK = EvalConfig(metrics=("bev_jsd",), resampling=Resampling(groups=4, halves=2))
-BENCHMARK = Benchmark("simulated:8:test", 8, QUICK, (*FEW, "seed=3"), batch_size=4)
+BENCHMARK = Benchmark("simulated:8:test", 8, QUICK, (*FEW, "seed=3"))
 
 
 def test_systems_are_made_once_and_set_side_by_side(tmp_path):

@@ -7,7 +7,7 @@ import re
 import pytest
 import torch
 
-from lidargrit import _discovery, configuration
+from lidargrit import _discovery
 from lidargrit.errors import ConfigError
 from lidargrit.generators import CAPABILITIES, Generator, load, load_class
 from lidargrit.loading import Provenance, RangeImages
@@ -15,32 +15,12 @@ from lidargrit.sensors import load_sensor
 from lidargrit.structures import RangeImage
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
-SIZES = {  # the smallest of each, and the quickest way to draw from it: a new generator names its own here
-    "dusty": ("latent_dim=8 channels=4 max_channels=8", "search_steps=4"),
-    "lidargrit": (
-        "tokenizer.channels=32 tokenizer.channel_multipliers=[1,1,1,1] tokenizer.code_dim=8 tokenizer.num_codes=32 "
-        "transformer.layers=1 transformer.heads=2 transformer.width=16",
-        "",
-    ),
-    "marginal": ("bins=16", ""),
-    "maskgit": (
-        "tokenizer.channels=32 tokenizer.channel_multipliers=[1,1,1,1] tokenizer.code_dim=8 tokenizer.num_codes=32 "
-        "transformer.layers=1 transformer.heads=2 transformer.width=16",
-        "steps=4",
-    ),
-    "memorised": ("scans=8", ""),
-    "r2dm": (
-        "unet.channels=8 unet.channel_multipliers=[1,1] unet.residual_blocks=[1,1] unet.norm_groups=2 "
-        "unet.attention_heads=2",
-        "steps=3 resamples=2",
-    ),
-}
-METHODS = {  # what a capability is called by
+HOOKS = {  # what a generator with a capability overrides
     "tokens": "get_tokenizer",
-    "encode": "reconstruct",
-    "complete": "complete",
-    "invert": "invert",
-    "likelihood": "log_likelihood",
+    "encode": "_reconstruct",
+    "complete": "_complete",
+    "invert": "_invert",
+    "likelihood": "_log_likelihood",
 }
 
 
@@ -67,36 +47,94 @@ IMAGES = RangeImages(SENSOR, [Store()])
 
 @functools.cache
 def made(name):
-    """Return a small generator that has seen the images but was not trained, and how to draw from it quickly."""
+    """Return a small generator that has seen the images but was not trained, and settings to sample quickly."""
     cls = load_class(name)
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        generator = cls(configuration.override(cls.Config(), SIZES[name][0].split()), SENSOR)
+        generator = cls(cls.smallest_config(SENSOR), SENSOR)
         generator.fit_statistics(IMAGES)
-    return generator.eval(), configuration.override(cls.Sampling(), SIZES[name][1].split())
+    return generator.eval(), cls.quickest_sampling()
 
 
 def same(one: RangeImage, other: RangeImage) -> bool:
-    """Tell whether two batches are equal; products over another batch may differ in their last bits."""
-    close = torch.isclose(one.range_m, other.range_m, rtol=1e-4, atol=1e-4)
-    return float(close.float().mean()) > 0.999
+    """Tell whether two batches are equal, bit for bit."""
+    pairs = [(one.range_m, other.range_m), (one.return_mask, other.return_mask)]
+    if one.reflectance is not None:
+        pairs.append((one.reflectance, other.reflectance))
+    return all(torch.equal(*pair) for pair in pairs)
 
 
-pytestmark = pytest.mark.parametrize("name", _discovery.names("generators"))
+def calls(images, observed, seeds, sampling):
+    """Return the arguments of every public method besides ``sample``, by capability."""
+    return {
+        "tokens": ("get_tokenizer",),
+        "encode": ("reconstruct", images),
+        "complete": ("complete", images, observed, seeds, sampling),
+        "invert": ("invert", images, seeds, sampling),
+        "likelihood": ("log_likelihood", images),
+    }
 
 
-def test_a_seed_gives_the_same_scan_whatever_the_batch(name):
+def call(generator, name_and_arguments):
+    name, *arguments = name_and_arguments
+    return getattr(generator, name)(*arguments)
+
+
+NAMES = _discovery.names("generators")
+pytestmark = pytest.mark.parametrize("name", NAMES)
+
+
+def test_a_seed_gives_the_same_scan_bit_for_bit_whatever_the_batch(name):
     generator, sampling = made(name)
-    together = generator.sample([3, 4, 5], sampling)
-    assert same(generator.sample([4], sampling), together[1:2])
-    assert same(generator.sample([5, 3], sampling), RangeImage.stack([together[2], together[0]]))
+    seeds = list(range(3, 14))  # more than a batch is computed at once
+    together = generator.sample(seeds, sampling)
+    for index, seed in enumerate(seeds):
+        assert same(generator.sample([seed], sampling), together[index : index + 1]), seed
+    assert same(generator.sample(seeds[::-1], sampling), RangeImage.stack([together[i] for i in range(10, -1, -1)]))
     assert not torch.equal(together.range_m[0], together.range_m[1])
 
 
 def test_streams_the_same_scans_without_end(name):
     generator, sampling = made(name)
-    streamed = list(itertools.islice(generator.stream(itertools.count(3), sampling, batch_size=2), 3))
-    assert same(RangeImage.stack(streamed), generator.sample([3, 4, 5], sampling))
+    streamed = list(itertools.islice(generator.stream(itertools.count(3), sampling), 11))
+    assert same(RangeImage.stack(streamed), generator.sample(range(3, 14), sampling))
+
+
+def test_seeds_and_settings_that_cannot_be_are_refused(name):
+    generator, sampling = made(name)
+    for seeds, told in (
+        ([], "no seeds"),
+        ([0, -1], "the seed -1"),
+        ([1 << 63], "the seed 9223372036854775808"),
+        ([10**99], "the seed 1000"),
+    ):
+        with pytest.raises(ConfigError, match=f"^got {told}.*"):
+            generator.sample(seeds, sampling)
+    assert generator.sample([(1 << 63) - 1], sampling).range_m.shape == (1, 64, 32)
+    with pytest.raises(ConfigError, match=r"^got settings of type SensorModel; wanted \w+; "):
+        generator.sample([0], SENSOR)
+
+
+def test_images_and_masks_of_others_are_refused(name):
+    """By whatever the generator can do with them; DUSty once took another sensor's scans for its own."""
+    generator, sampling = made(name)
+    images, seeds = IMAGES.batch([0, 1]), [3, 4]
+    observed = torch.ones(2, 64, 32, dtype=torch.bool)
+    other = RangeImage(images.range_m, images.return_mask, load_sensor("hdl64e_kitti_360").with_columns(32))
+    for capability in sorted(generator.capabilities - {"tokens"}):
+        with pytest.raises(ConfigError, match=r"^got range images of the sensor 'hdl64e_kitti_360', 64x32; wanted "):
+            call(generator, calls(other, observed, seeds, sampling)[capability])
+        with pytest.raises(ConfigError, match=r"^got range images of shape \(64, 32\); wanted a batch"):
+            call(generator, calls(images[0], observed, seeds, sampling)[capability])
+        if capability in ("complete", "invert"):
+            with pytest.raises(ConfigError, match=r"^got 3 seeds for 2 images; wanted one seed for each image"):
+                call(generator, calls(images, observed, [0, 1, 2], sampling)[capability])
+            with pytest.raises(ConfigError, match=r"^got the seed -2; "):
+                call(generator, calls(images, observed, [0, -2], sampling)[capability])
+        if capability == "complete":
+            for mask in (observed[:1], observed[:, :32]):
+                with pytest.raises(ConfigError, match=r"^got observed pixels of shape "):
+                    call(generator, calls(images, mask, seeds, sampling)[capability])
 
 
 def test_scans_are_those_of_its_sensor(name):
@@ -114,7 +152,7 @@ def test_scans_are_those_of_its_sensor(name):
         assert bool((images.reflectance[~images.return_mask] == 0).all())
 
 
-def test_saved_and_loaded_it_draws_the_same(name, tmp_path):
+def test_saved_and_loaded_it_samples_the_same(name, tmp_path):
     generator, sampling = made(name)
     generator.save(tmp_path)
     again = load(tmp_path)
@@ -132,27 +170,22 @@ def test_leaves_the_global_random_state_alone(name):
 
 def test_has_exactly_the_capabilities_that_it_declares(name):
     generator, _ = made(name)
-    assert METHODS.keys() == CAPABILITIES.keys()
-    for capability, method in METHODS.items():
-        assert (getattr(type(generator), method) is not getattr(Generator, method)) == (
+    assert HOOKS.keys() == CAPABILITIES.keys()
+    for capability, hook in HOOKS.items():
+        assert (getattr(type(generator), hook) is not getattr(Generator, hook)) == (
             capability in generator.capabilities
         ), capability
 
 
 def test_what_it_cannot_do_is_told_with_who_can(name):
-    generator, _ = made(name)
+    generator, sampling = made(name)
     images = IMAGES.batch([0, 1])
-    arguments = {
-        "tokens": (),
-        "encode": (images,),
-        "complete": (images, images.return_mask, [0, 1]),
-        "invert": (images, [0, 1]),
-        "likelihood": (images,),
-    }
-    for capability in CAPABILITIES.keys() - generator.capabilities:
-        able = [other for other in SIZES if capability in load_class(other).capabilities]
+    for capability, arguments in calls(images, images.return_mask, [0, 1], sampling).items():
+        if capability in generator.capabilities:
+            continue
+        able = [other for other in NAMES if capability in load_class(other).capabilities]
         with pytest.raises(ConfigError) as told:
-            getattr(generator, METHODS[capability])(*arguments[capability])
+            call(generator, arguments)
         assert re.match(rf"got a generator '{name}', which cannot .*; wanted one that can: ", str(told.value))
         assert all(other in told.value.wanted for other in able)
         assert "lidargrit list generators" in told.value.cure
@@ -169,9 +202,9 @@ def test_what_it_can_do_besides_keeps_to_the_seeds_and_the_sensor(name):
         assert bool((generator.log_likelihood(images) < 0).all())
     for capability, arguments in (("complete", (observed,)), ("invert", ())):
         if capability in generator.capabilities:
-            call = getattr(generator, capability)
-            found = call(images, *arguments, [3, 4], sampling)
-            alone = call(images[1:], *(each[1:] for each in arguments), [4], sampling)
+            method = getattr(generator, capability)
+            found = method(images, *arguments, [3, 4], sampling)
+            alone = method(images[1:], *(each[1:] for each in arguments), [4], sampling)
             assert same(found[1:2], alone)
 
 

@@ -198,7 +198,7 @@ def test_a_completed_scan_keeps_what_was_observed():
         generator.complete(images, observed, [0])
     with pytest.raises(ConfigError, match="sampler=ddim for completion"):
         generator.complete(images, observed, [0, 1], DiffusionSampling(sampler="ddim"))
-    with pytest.raises(ConfigError, match="observed at"):
+    with pytest.raises(ConfigError, match="observed pixels of shape"):
         generator.complete(images, observed[:1], [0, 1])
 
 

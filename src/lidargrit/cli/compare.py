@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_settings(parser, settings)
     budget = "training budget of each system in floating-point operations (default: each recipe's own)"
     parser.add_argument("--flops", type=float, default=0.0, help=budget)
-    parser.add_argument("--batch-size", type=int, default=8, help="number of scans sampled at once")
+    parser.add_argument("--batch-size", type=int, help="no effect any more: each generator has a batch size of its own")
     parser.add_argument("--format", choices=["text", "markdown", "latex"], default="text", help="format of the table")
     add_json(parser)
 
@@ -49,7 +49,6 @@ def run(options: argparse.Namespace) -> None:
         settings=EvalConfig(protocol=options.protocol, metrics=tuple(options.metrics)),
         recipe_settings=tuple(options.set),
         flops=options.flops,
-        batch_size=options.batch_size,
     )
     scores = run_benchmark(options.systems, options.out, benchmark, TerminalReporter())
     tell(options, as_table(scores, options.format), as_json(scores))

@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("out", type=Path, help="folder for the samples; the same command continues there")
     parser.add_argument("-n", "--count", type=int, default=16, help="number of scans")
     parser.add_argument("--seed", type=seed_number, default=0, help="seed of the first scan; the next has the next")
-    parser.add_argument("--batch-size", type=int, default=8, help="number of scans sampled at once")
+    parser.add_argument("--batch-size", type=int, help="no effect any more: each generator has a batch size of its own")
     add_settings(parser, "sampling settings to change, such as temperature=1.1; see: lidargrit list generators")
     add_rank(parser, "process")
     add_device(parser)
@@ -42,10 +42,10 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.reporting import TerminalReporter
     from lidargrit.sources.samples import write_samples
 
-    if options.count < 1 or options.batch_size < 1 or options.seed < 0:
+    if options.count < 1 or options.seed < 0:
         raise ConfigError(
-            f"-n {options.count}, --batch-size {options.batch_size}, --seed {options.seed}",
-            "at least one scan, at least one at once, and no negative seed",
+            f"-n {options.count}, --seed {options.seed}",
+            "at least one scan, and no negative seed",
             "correct the number",
         )
     rank, world_size = rank_and_world_size(options.rank, options.world_size)
@@ -56,5 +56,5 @@ def run(options: argparse.Namespace) -> None:
     owner = f"sampling from {generator.public_name()!r}"
     sampling = override(generator.Sampling(), options.set, owner, "see all with: lidargrit list generators")
     seeds = range(options.seed, options.seed + options.count)[rank::world_size]
-    write_samples(generator, run_folder, options.out, seeds, sampling, options.batch_size, TerminalReporter())
+    write_samples(generator, run_folder, options.out, seeds, sampling, TerminalReporter())
     print(f"done: {len(seeds)} scans lie in {options.out}; look at them with: lidargrit view {options.out}")

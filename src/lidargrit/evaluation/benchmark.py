@@ -40,7 +40,6 @@ class Benchmark:
         settings: of the evaluation; its protocol above all.
         recipe_settings: of every recipe, as ``train --set`` takes them: the same data for all.
         flops: what the training of each takes; 0 leaves every recipe's own budget.
-        batch_size: scans drawn at once.
     """
 
     reference: str
@@ -48,13 +47,12 @@ class Benchmark:
     settings: EvalConfig = field(default_factory=EvalConfig)
     recipe_settings: tuple[str, ...] = ()
     flops: float = 0.0
-    batch_size: int = 8
 
     def __post_init__(self) -> None:
-        if self.num_samples < 2 or self.batch_size < 1 or not 0 <= self.flops < math.inf:
+        if self.num_samples < 2 or not 0 <= self.flops < math.inf:
             raise ConfigError(
-                f"{self.num_samples} samples, {self.batch_size} at once, {self.flops:g} operations",
-                "at least 2 samples, at least 1 at once, and a budget from 0 on",
+                f"{self.num_samples} samples, {self.flops:g} operations",
+                "at least 2 samples, and a budget from 0 on",
                 "correct the number",
             )
 
@@ -160,7 +158,7 @@ def _sample(
     """Draw what is not there yet, and return the seconds for a scan; None if all was there."""
     before = len(list(folder.glob("[!.]*.npz"))) if folder.is_dir() else 0
     begun = time.perf_counter()
-    write_samples(generator, run, folder, range(benchmark.num_samples), sampling, benchmark.batch_size, reporter)
+    write_samples(generator, run, folder, range(benchmark.num_samples), sampling, reporter)
     drawn = benchmark.num_samples - before
     return (time.perf_counter() - begun) / drawn if drawn > 0 else None
 

@@ -108,7 +108,6 @@ class Reproduction:
         count: samples of each system, compared with as many scans; 0 for 5,000, or 64 if small.
         flops: what the training of each takes; None for the recipes' own budgets, or, if small, 5e13 for each.
         settings: of every recipe, besides the table's own.
-        batch_size: scans drawn at once.
     """
 
     number: int
@@ -117,7 +116,6 @@ class Reproduction:
     count: int = 0
     flops: float | None = None
     settings: tuple[str, ...] = ()
-    batch_size: int = 8
 
     def __post_init__(self) -> None:
         if self.number not in TABLES:
@@ -148,7 +146,6 @@ class Reproduction:
             settings=EvalConfig(protocol=self.table.protocol, metrics=metrics if self.small else ()),
             recipe_settings=(train, val, *images, f"data.projection_variant={protocol.variant}", *self.settings),
             flops=flops,
-            batch_size=self.batch_size,
         )
 
     def source(self, split: str) -> str:

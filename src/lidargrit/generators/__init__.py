@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-import importlib
-import re
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Generic, Self, TypeVar, final
 
+import torch
 from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from lidargrit import _discovery, configuration
 from lidargrit.errors import CheckpointError, ConfigError, LidarGritError
-from lidargrit.files import is_taken, load_exactly, read_json, read_tensors, write_json, write_tensors, write_text
+from lidargrit.files import is_taken, read_json, read_tensors
+from lidargrit.generators._checks import check_images, check_observed, check_seeds
+from lidargrit.generators._hub import download
+from lidargrit.generators._saved import CONFIG_FILE, WEIGHTS_FILE, ConfigT, SavedModel
 from lidargrit.loading import RangeImages
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.size import numbers_at_most
@@ -24,133 +26,274 @@ from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 from lidargrit.tokenizers import Tokenizer
 
-CONFIG_FILE, WEIGHTS_FILE, CARD_FILE = "config.json", "model.safetensors", "README.md"  # the names that the hub knows
 RUN_FILE = "run.json"  # ``origin`` in it says that the weights beside it were not trained in this folder
 TRAINED_ON_FILE = "trained_on.json"  # in a run's folder and beside its samples: which drives, which pixels
-PRETRAINED = Path(__file__).parents[1] / "pretrained"
-"""The run that comes with the package; by the folder's name it goes wherever a run is wanted."""
+PRETRAINED = Path(__file__).parents[1] / "pretrained"  # the run in the package; its name goes wherever a run is wanted
 
 
 @dataclass(frozen=True)
 class NoSampling:
-    """Of a generator that leaves nothing to choose when scans are drawn."""
+    """Settings of a generator that leaves nothing to choose."""
 
 
 @dataclass(frozen=True)
 class Cost:
-    """What drawing one scan takes, counted and not timed, so the same on every machine.
+    """What sampling one scan takes, counted and not timed, so the same on every machine.
 
     Args:
-        network_evaluations: passes through a network, one after the other.
-        flops: floating-point operations of products and convolutions, two for each multiplication with its addition.
+        network_evaluations: number of passes through a network, one after the other.
+        flops: number of floating-point operations in products and convolutions; a multiplication with its addition
+            counts as two.
     """
 
     network_evaluations: int
     flops: int
 
 
-CAPABILITIES = {  # name → what a generator that declares it can do besides sampling, for people
+CAPABILITIES = {  # name → what a generator with it can do besides sampling, for messages
     "tokens": "turn scans into tokens and back",
     "encode": "give scans back from a code of its own",
     "complete": "fill in the pixels of a scan that were not observed",
-    "invert": "search the scan nearest to a given one among those it can write",
+    "invert": "search the scan nearest to a given one among those it can generate",
     "likelihood": "tell how likely a scan is",
 }
 
 
-class Generator(nn.Module, ABC):
-    """A system that writes new scans of one sensor.
+SamplingT = TypeVar("SamplingT")
 
-    It is made of ``Config`` and a sensor, and trained in ``stages``, one after the other, each by its own objective.
-    Every one can ``sample``, by the choices of its ``Sampling``. What else it can do, it declares in ``capabilities``;
-    asked for anything beyond them, it says which generators can.
+
+class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
+    """A system that generates new scans of one sensor.
+
+    It is made from a ``Config`` and a sensor, and trained in ``stages``, one after the other, each by its own
+    objective. Every generator can ``sample``, by the settings of its ``Sampling``. What else it can do is named in
+    ``capabilities``; asked for anything beyond them, it answers which generators can.
+
+    The public methods check what they are given and take care of seeds and batches, so they are the same for all
+    generators. A subclass writes ``_sample``, and for its capabilities ``_complete``, ``_invert``, ``_reconstruct``,
+    ``_log_likelihood`` and ``get_tokenizer``; these see valid arguments on the generator's device only, in evaluation
+    mode and without gradients.
     """
 
-    Config: ClassVar[type]
     Sampling: ClassVar[type] = NoSampling
-    stages: ClassVar[tuple[str, ...]]
     capabilities: ClassVar[frozenset[str]] = frozenset()
     published_files: ClassVar[tuple[str, ...]] = ()
-    """What the files hold that the system's authors published its weights in, in order; none if we read none."""
-    sensor: SensorModel
-    config: Any
+    """Contents of the files in which the system's authors published weights, in order; empty if we read none."""
 
+    @classmethod
     @abstractmethod
-    def __init__(self, config: Any, sensor: SensorModel) -> None:
-        super().__init__()
+    def smallest_config(cls, sensor: SensorModel) -> ConfigT:
+        """Return settings of networks as small as can be, for tests and first trials.
+
+        Args:
+            sensor: the sensor of the images; its rows and columns are multiples of 32.
+        """
+
+    @classmethod
+    def quickest_sampling(cls) -> SamplingT:
+        """Return the settings that take the least time to sample, complete or invert, for tests and first trials."""
+        return cls.Sampling()
+
+    @classmethod
+    def completion_sampling(cls) -> SamplingT:
+        """Return the settings by which scans are completed if the caller names none."""
+        return cls.Sampling()
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """Names of the stages of training, in their order; they may depend on ``config``."""
+        return ()
+
+    @property
+    def compute_batch(self) -> int:
+        """Number of scans that are computed at once, always.
+
+        Kernels differ by the size of a batch, and with them the last bits of a result. So every batch has this size,
+        the last one filled up with copies, and a seed gives the same scan whatever else is asked for.
+        """
+        return 1
+
+    @property
+    def device(self) -> torch.device:
+        """Device on which the weights lie and scans are computed."""
+        return next(chain(self.parameters(), self.buffers())).device
 
     def fit_statistics(self, images: RangeImages) -> None:
         """Take from the training scans what needs no objective, such as counts; called once, before the stages."""
 
-    @abstractmethod
     def objective(self, stage: str) -> Objective:
-        """Return what a stage trains: a module (images, rng) → terms with ``loss``; its weights are ours."""
+        """Return what a stage minimises; its trained weights are given back by :meth:`load_stage`."""
+        raise NotImplementedError(f"{self.public_name()} has no stage {stage!r}")
 
-    @abstractmethod
     def load_stage(self, stage: str, objective: Objective) -> None:
         """Take over the weights of a stage's trained objective."""
+        raise NotImplementedError(f"{self.public_name()} has no stage {stage!r}")
 
-    @abstractmethod
-    def sample(self, seeds: Sequence[int], sampling: Any = None) -> RangeImage:
-        """Write one scan for each seed; a seed gives the same scan whatever the others are.
+    @final
+    @torch.no_grad()
+    def sample(self, seeds: Sequence[int], sampling: SamplingT | None = None) -> RangeImage:
+        """Generate one scan for each seed; a seed gives the same scan whatever the others are, bit for bit.
 
         Args:
-            seeds: one a scan.
-            sampling: choices, of the generator's own ``Sampling``; its defaults if not given.
+            seeds: one for each scan, from 0 to 2^63 - 1.
+            sampling: settings of the generator's own ``Sampling``; its defaults if not given.
+
+        Raises:
+            ConfigError: no seed or one out of bounds, or settings of another generator.
 
         Example::
 
             lidargrit.load("runs/demo").sample(seeds=[0, 1, 2, 3])
         """
+        check_seeds(seeds)
+        settings = self._settings(sampling, self.Sampling)
+        return self._in_batches(len(seeds), lambda some: self._sample([seeds[i] for i in some], settings))
 
-    def stream(self, seeds: Iterable[int], sampling: Any = None, batch_size: int = 8) -> Iterator[RangeImage]:
-        """Yield one scan for each seed, drawn so many at once; nothing is kept, so seeds may be without end.
-
-        Args:
-            seeds: one a scan, such as ``itertools.count(0)``.
-            sampling: as for :meth:`sample`.
-            batch_size: the scans do not depend on it.
-        """
+    @final
+    def stream(self, seeds: Iterable[int], sampling: SamplingT | None = None) -> Iterator[RangeImage]:
+        """Yield the scans of :meth:`sample` one by one; seeds may be without end, such as ``itertools.count(0)``."""
         remaining = iter(seeds)
-        while some := list(islice(remaining, batch_size)):
+        while some := list(islice(remaining, self.compute_batch)):
             images = self.sample(some, sampling)
             yield from (images[index] for index in range(len(images)))
 
     @abstractmethod
-    def cost(self, sampling: Any = None) -> Cost:
-        """Return what drawing one scan takes."""
+    def cost(self, sampling: SamplingT | None = None) -> Cost:
+        """Return what sampling one scan takes."""
 
-    def get_tokenizer(self) -> Tokenizer:
-        """Return the tokenizer whose tokens the generator writes (``tokens``)."""
+    def get_tokenizer(self) -> Tokenizer[Any]:
+        """Return the tokenizer whose tokens the generator samples (capability ``tokens``)."""
         raise self._cannot("tokens")
 
+    @final
+    @torch.no_grad()
     def reconstruct(self, images: RangeImage) -> RangeImage:
-        """Return what the generator's code keeps of a batch of scans (``encode``)."""
-        raise self._cannot("encode")
-
-    def complete(
-        self, images: RangeImage, observed: Bool[Tensor, "B H W"], seeds: Sequence[int], sampling: Any = None
-    ) -> RangeImage:
-        """Return scans that agree with what was observed and make up the rest (``complete``).
+        """Return what the generator's own code keeps of each scan (capability ``encode``).
 
         Args:
-            images: (B, H, W); what they hold where nothing was observed is not looked at.
-            observed: where they are known, be it a return or that there was none.
-            seeds: one for each image.
-            sampling: choices; the defaults if not given.
+            images: batch of range images (B, H, W).
+
+        Raises:
+            ConfigError: images of other rays, or a generator without the capability.
         """
-        raise self._cannot("complete")
+        self._require("encode")
+        check_images(images, self.sensor)
+        return self.eval()._reconstruct(images.to(self.device))
 
-    def invert(self, images: RangeImage, seeds: Sequence[int], sampling: Any = None) -> RangeImage:
-        """Return for each scan the nearest that the generator can write, as far as a search from a seed finds it."""
-        raise self._cannot("invert")
+    @final
+    @torch.no_grad()
+    def complete(
+        self,
+        images: RangeImage,
+        observed: Bool[Tensor, "B H W"],
+        seeds: Sequence[int],
+        sampling: SamplingT | None = None,
+    ) -> RangeImage:
+        """Return scans that keep the observed pixels and generate the others (capability ``complete``).
 
+        Args:
+            images: batch of range images (B, H, W); pixels that were not observed have no influence.
+            observed: True for pixels that are known, be it as a return or as none.
+            seeds: one for each image, from 0 to 2^63 - 1.
+            sampling: settings of the generator's own ``Sampling``; :meth:`completion_sampling` if not given.
+
+        Raises:
+            ConfigError: images of other rays, a mask of another shape, seeds that are too many, too few or out of
+                bounds, settings of another generator, or a generator without the capability.
+        """
+        self._require("complete")
+        check_images(images, self.sensor)
+        check_observed(observed, images)
+        check_seeds(seeds, len(images))
+        settings = self._settings(sampling, self.completion_sampling)
+        images, observed = images.to(self.device), observed.to(self.device)
+        generated = self._in_batches(
+            len(seeds),
+            lambda some: self._complete(_those(images, some), observed[some], [seeds[i] for i in some], settings),
+        )
+        reflectance, range_m = None, torch.where(observed, images.range_m, generated.range_m)
+        if generated.reflectance is not None and images.reflectance is not None:
+            reflectance = torch.where(observed, images.reflectance, generated.reflectance)
+        return RangeImage(range_m, range_m > 0, self.sensor, reflectance)
+
+    @final
+    @torch.no_grad()
+    def invert(self, images: RangeImage, seeds: Sequence[int], sampling: SamplingT | None = None) -> RangeImage:
+        """Return for each scan the nearest that the generator can generate (capability ``invert``).
+
+        Args:
+            images: batch of range images (B, H, W).
+            seeds: one for each image, from 0 to 2^63 - 1; the search starts at random.
+            sampling: settings of the generator's own ``Sampling``; its defaults if not given.
+
+        Raises:
+            ConfigError: see :meth:`complete`.
+        """
+        self._require("invert")
+        check_images(images, self.sensor)
+        check_seeds(seeds, len(images))
+        settings, images = self._settings(sampling, self.Sampling), images.to(self.device)
+        return self._in_batches(
+            len(seeds), lambda some: self._invert(_those(images, some), [seeds[i] for i in some], settings)
+        )
+
+    @final
+    @torch.no_grad()
     def log_likelihood(self, images: RangeImage) -> Float[Tensor, "B"]:
-        """Return the log-likelihood of each scan in nats (``likelihood``).
+        """Return the log-likelihood of each scan in nats (capability ``likelihood``).
 
         It is that of the generator's own representation of a scan, such as its tokens: systems do not compare by it.
+
+        Args:
+            images: batch of range images (B, H, W).
+
+        Raises:
+            ConfigError: images of other rays, or a generator without the capability.
         """
-        raise self._cannot("likelihood")
+        self._require("likelihood")
+        check_images(images, self.sensor)
+        return self.eval()._log_likelihood(images.to(self.device))
+
+    @abstractmethod
+    def _sample(self, seeds: Sequence[int], sampling: SamplingT) -> RangeImage:
+        """Generate one scan for each of ``compute_batch`` seeds."""
+
+    def _complete(
+        self, images: RangeImage, observed: Bool[Tensor, "B H W"], seeds: Sequence[int], sampling: SamplingT
+    ) -> RangeImage:
+        """Generate scans that agree with the observed pixels; the caller then puts these in."""
+        raise NotImplementedError
+
+    def _invert(self, images: RangeImage, seeds: Sequence[int], sampling: SamplingT) -> RangeImage:
+        raise NotImplementedError
+
+    def _reconstruct(self, images: RangeImage) -> RangeImage:
+        raise NotImplementedError
+
+    def _log_likelihood(self, images: RangeImage) -> Float[Tensor, "B"]:
+        raise NotImplementedError
+
+    def _in_batches(self, count: int, compute: Callable[[list[int]], RangeImage]) -> RangeImage:
+        """Compute scans by their indices in batches of one size, and return those that were asked for."""
+        self.eval()
+        size, parts = self.compute_batch, []
+        for first in range(0, count, size):
+            wanted = list(range(first, min(first + size, count)))
+            filled = wanted + wanted[-1:] * (size - len(wanted))
+            parts.append(compute(filled)[: len(wanted)])
+        return RangeImage.cat(parts)
+
+    def _settings(self, given: SamplingT | None, default: Callable[[], SamplingT]) -> SamplingT:
+        if given is None:
+            return default()
+        if not isinstance(given, self.Sampling):
+            got, wanted = type(given).__name__, self.Sampling.__name__
+            raise ConfigError(f"settings of type {got}", wanted, "make them with generator.Sampling(...)")
+        return given
+
+    def _require(self, capability: str) -> None:
+        if capability not in self.capabilities:
+            raise self._cannot(capability)
 
     def _cannot(self, capability: str) -> ConfigError:
         able = [name for name in _discovery.names("generators") if capability in load_class(name).capabilities]
@@ -162,61 +305,19 @@ class Generator(nn.Module, ABC):
 
     @classmethod
     def about(cls) -> list[str]:
-        """Return what the generator can do, and the choices of its sampling with their defaults, for people."""
+        """Return lines for a person: what the generator can do, and its sampling settings with their defaults."""
         facts = [f"can {told} ({name})" for name, told in CAPABILITIES.items() if name in cls.capabilities]
         settings = [f"{name}={value}" for name, value in configuration.leaves(cls.Sampling()).items()]
         return [*facts, f"sample --set: {', '.join(settings)}"] if settings else facts
 
     @classmethod
-    def public_name(cls) -> str:
-        """Return the name of the file that defines the class."""
-        return cls.__module__.rpartition(".")[2]
-
-    def weights(self, half: bool = False) -> dict[str, Tensor]:
-        """Return what is saved of the networks.
-
-        Args:
-            half: round parameters, but no buffers, to 16 bits; networks that are read again compute in 32 as before.
-
-        Raises:
-            ConfigError: a parameter is beyond what 16 bits hold.
-        """
-        halved = {name: weight.detach().half() for name, weight in self.named_parameters()} if half else {}
-        for name, weight in halved.items():
-            if not weight.isfinite().all():
-                largest = self.get_parameter(name).abs().max()
-                raise ConfigError(f"weights {name!r} of up to {largest:g}", "at most 65,504", "leave half out")
-        return {**self.state_dict(), **halved}
-
-    def save(self, folder: Path, half: bool = False) -> None:
-        """Write :meth:`weights` and, last, the configuration that says they are there."""
-        write_tensors(folder / WEIGHTS_FILE, self.weights(half))
-        config = {
-            "generator": self.public_name(),
-            "config": configuration.to_json(self.config),
-            "sensor": self.sensor.to_json(),
-        }
-        write_json(folder / CONFIG_FILE, config)
-
-    @classmethod
-    def from_weights(cls, config: Any, sensor: SensorModel, weights: dict[str, Tensor], source: Path) -> Generator:
-        """Make a generator with given weights.
-
-        Raises:
-            CheckpointError: weights of another configuration.
-        """
-        generator = cls(config, sensor)
-        load_exactly(generator, weights, source)
-        return generator.eval()
-
-    @classmethod
-    def from_published(cls, files: Sequence[Path], config: Any, sensor: SensorModel) -> Generator:
+    def from_published(cls, files: Sequence[Path], config: ConfigT, sensor: SensorModel) -> Self:
         """Make a generator with the weights that the system's authors published, or that their program saved.
 
         Args:
-            files: as many as ``published_files``, in that order; code in them is not run.
-            config: sizes, where the files do not tell them.
-            sensor: whose rays their images have.
+            files: one file for each of ``published_files``, in that order; code in them is not run.
+            config: sizes of the networks, used where the files do not tell them.
+            sensor: sensor whose rays are the pixels of the authors' images.
 
         Raises:
             CheckpointError: other files, or weights of other sizes.
@@ -228,33 +329,19 @@ class Generator(nn.Module, ABC):
             "see which generator a recipe has with: lidargrit train RECIPE OUT --dry-run",
         )
 
-    def save_pretrained(self, folder: str | Path, card: str = "", half: bool = False) -> None:
-        """Write what a repository of the Hugging Face hub holds: weights, configuration, and a model card if given.
-
-        These are the files of :meth:`save`. ``lidargrit publish`` writes the card from a run.
-
-        Args:
-            folder: for the files.
-            card: Markdown, for ``README.md``.
-            half: as for :meth:`weights`.
-        """
-        self.save(Path(folder), half)
-        if card:
-            write_text(Path(folder) / CARD_FILE, card)
-
     @classmethod
-    def from_pretrained(cls, name: str | Path, revision: str | None = None) -> Generator:
+    def from_pretrained(cls, name: str | Path, revision: str | None = None) -> Self:
         """Read a generator from a folder, or from a repository of the Hugging Face hub.
 
         Args:
-            name: of a run's or a published folder, or "USER/REPOSITORY" if no such folder is there.
-            revision: of the repository: a branch, a tag or a commit.
+            name: folder of a run or of a published generator, or else "USER/REPOSITORY" on the hub.
+            revision: branch, tag or commit of the repository; its main branch if not given.
 
         Raises:
             CheckpointError: no such folder or repository, a damaged one, or another kind of generator in it.
         """
         here = locate(name)
-        generator = load(here if here.is_dir() else _downloaded(str(name), revision))
+        generator = load(here if here.is_dir() else download(str(name), revision, ["*.json", WEIGHTS_FILE]))
         if not isinstance(generator, cls):
             raise CheckpointError(
                 f"{name}, which holds a generator {generator.public_name()!r}",
@@ -319,16 +406,5 @@ def load_class(name: str) -> type[Generator]:
     return _discovery.load_class("generators", name, Generator)
 
 
-def _downloaded(name: str, revision: str | None) -> Path:
-    """Fetch the files of a repository by the hub's own client, which keeps them in its cache."""
-    wanted, cure = "a run's folder, or USER/REPOSITORY on the Hugging Face hub", "check the name"
-    if not re.fullmatch(r"[\w.-]+/[\w.-]+", name):
-        raise CheckpointError(f"{name}, which is no folder", wanted, cure)
-    try:
-        hub = importlib.import_module("huggingface_hub")  # an extra: nothing else needs it
-        return Path(hub.snapshot_download(name, revision=revision, allow_patterns=["*.json", WEIGHTS_FILE]))
-    except ImportError:
-        got, cure = f"{name}, which is no folder here", "to fetch it from the hub: pip install 'lidargrit[hub]'"
-    except Exception as error:  # its client has a dozen kinds, from a wrong name to a broken line, and changes them
-        got = f"{name}, which cannot be fetched ({type(error).__name__}: {str(error).partition(chr(10))[0][:100]})"
-    raise CheckpointError(got, wanted, cure)
+def _those(images: RangeImage, indices: list[int]) -> RangeImage:
+    return RangeImage.stack([images[index] for index in indices])

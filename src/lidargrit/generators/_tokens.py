@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float, Int
@@ -34,17 +34,30 @@ class TokenGeneratorConfig:
     transformer: TransformerConfig = field(default_factory=TransformerConfig)
 
 
-class TokenGenerator(Generator):
+TokenConfigT = TypeVar("TokenConfigT", bound=TokenGeneratorConfig)
+SamplingT = TypeVar("SamplingT")
+
+
+class TokenGenerator(Generator[TokenConfigT, SamplingT]):
     """A tokenizer, trained first, and a ``transformer`` over its tokens, trained over the frozen tokenizer."""
 
     Config = TokenGeneratorConfig
-    stages = ("tokenizer", "transformer")
     capabilities = frozenset({"tokens", "encode"})
 
-    def __init__(self, config: Any, sensor: SensorModel) -> None:
+    def __init__(self, config: TokenConfigT, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
-        self.config, self.sensor = config, sensor
         self.tokenizer = make_tokenizer(config.tokenizer, sensor)
+
+    @classmethod
+    def smallest_config(cls, sensor: SensorModel) -> TokenConfigT:
+        """Return a VQ-VAE of one block a level, and a transformer of one layer."""
+        tokenizer = VqvaeConfig(channels=32, channel_multipliers=(1, 1, 1, 1), code_dim=8, num_codes=32)
+        return cls.Config(tokenizer, TransformerConfig(layers=1, heads=2, width=16))
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """The tokenizer, then the transformer over its tokens."""
+        return ("tokenizer", "transformer")
 
     def load_stage(self, stage: str, objective: Objective) -> None:
         """Take over a stage's trained weights."""
@@ -58,8 +71,7 @@ class TokenGenerator(Generator):
         """Return the tokenizer."""
         return self.tokenizer
 
-    @torch.no_grad()
-    def reconstruct(self, images: RangeImage) -> RangeImage:
+    def _reconstruct(self, images: RangeImage) -> RangeImage:
         """Return what the tokens keep of a batch of scans, the mask by threshold."""
         return self.tokenizer.reconstruct(images)
 

@@ -110,7 +110,7 @@ class DustySampling:
                 raise ConfigError(f"{name}={value}", f"at least {least}", "raise it")
 
 
-class Dusty(Generator):
+class Dusty(Generator[DustyConfig, DustySampling]):
     """A generative adversarial network over inverse range, whose raydrop is a stage of its own.
 
     Source:
@@ -120,19 +120,32 @@ class Dusty(Generator):
 
     Config = DustyConfig
     Sampling = DustySampling
-    stages = ("adversarial",)
     capabilities = frozenset({"complete", "invert"})
     published_files = ("generator",)
 
     def __init__(self, config: DustyConfig, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
         _check_size(sensor)
-        self.config, self.sensor = config, sensor
         self.encoding = InverseRange(sensor)
         self.synthesis = Synthesis(config.latent_dim, _widths(config), _size(sensor), _LOGITS[config.variant])
 
+    @classmethod
+    def smallest_config(cls, sensor: SensorModel) -> DustyConfig:
+        """Return networks of 4 to 8 channels."""
+        return DustyConfig(latent_dim=8, channels=4, max_channels=8)
+
+    @classmethod
+    def quickest_sampling(cls) -> DustySampling:
+        """Return a search of 4 steps."""
+        return DustySampling(search_steps=4)
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """One stage, of two players."""
+        return ("adversarial",)
+
     def objective(self, stage: str) -> Objective:
-        """Return the game of the network against a discriminator."""
+        """Return the losses of the network and of a discriminator."""
         return AdversarialObjective(self.synthesis, self.config, self.sensor)
 
     def load_stage(self, stage: str, objective: Objective) -> None:
@@ -140,11 +153,8 @@ class Dusty(Generator):
         assert isinstance(objective, AdversarialObjective)
         self.synthesis.load_state_dict(objective.synthesis.state_dict())
 
-    @torch.no_grad()
-    def sample(self, seeds: Sequence[int], sampling: DustySampling | None = None) -> RangeImage:
-        """Write one scan for each seed; a seed gives the same scan whatever the others are."""
-        self.eval()
-        return self._draw(self._normal(seeds, 1)[:, 0], seeds, sampling or DustySampling())
+    def _sample(self, seeds: Sequence[int], sampling: DustySampling) -> RangeImage:
+        return self._generate(self._normal(seeds, 1)[:, 0], seeds, sampling)
 
     def cost(self, sampling: DustySampling | None = None) -> Cost:
         """Return one pass of the network."""
@@ -155,29 +165,16 @@ class Dusty(Generator):
         """Make a generator of one checkpoint, which tells its own sizes; see :func:`load_published`."""
         return load_published(files[0], sensor)
 
-    def invert(self, images: RangeImage, seeds: Sequence[int], sampling: DustySampling | None = None) -> RangeImage:
-        """Return for each scan the nearest that the network draws, as far as a search from a seed finds it."""
-        sampling = sampling or DustySampling()
-        latents = self._search(images, images.return_mask, seeds, sampling)
-        with torch.no_grad():
-            return self._draw(latents, seeds, sampling)
+    def _invert(self, images: RangeImage, seeds: Sequence[int], sampling: DustySampling) -> RangeImage:
+        return self._generate(self._search(images, images.return_mask, seeds, sampling), seeds, sampling)
 
-    def complete(
-        self,
-        images: RangeImage,
-        observed: Bool[Tensor, "B H W"],
-        seeds: Sequence[int],
-        sampling: DustySampling | None = None,
+    def _complete(
+        self, images: RangeImage, observed: Bool[Tensor, "B H W"], seeds: Sequence[int], sampling: DustySampling
     ) -> RangeImage:
-        """Return what was observed, and elsewhere the nearest scan that the network draws."""
-        sampling = sampling or DustySampling()
-        latents = self._search(images, images.return_mask & observed, seeds, sampling)
-        with torch.no_grad():
-            drawn = self._draw(latents, seeds, sampling).to(images.range_m.device)
-        range_m = torch.where(observed, images.range_m, drawn.range_m)
-        return RangeImage(range_m, range_m > 0, self.sensor)
+        """Return the nearest scans that the network generates, by the observed returns alone."""
+        return self._generate(self._search(images, images.return_mask & observed, seeds, sampling), seeds, sampling)
 
-    def _draw(self, latents: Tensor, seeds: Sequence[int], sampling: DustySampling) -> RangeImage:
+    def _generate(self, latents: Tensor, seeds: Sequence[int], sampling: DustySampling) -> RangeImage:
         encoded, logits = self.synthesis(latents)
         range_m = self.encoding.decode(encoded[:, 0])
         tolerance = _TOLERANCE[self.config.variant] if sampling.tolerance is None else sampling.tolerance
@@ -208,9 +205,7 @@ class Dusty(Generator):
         self, images: RangeImage, known: Bool[Tensor, "B H W"], seeds: Sequence[int], sampling: DustySampling
     ) -> Float[Tensor, "B D"]:
         """Return the latents whose clean ranges are nearest to the known returns: mean distance of inverse ranges."""
-        self.eval()
-        device = self.synthesis.project.weight.device
-        target, known = self.encoding.encode(images.to(device))[:, 0], known.to(device)
+        target = self.encoding.encode(images)[:, 0]
 
         def error_of(latents: Tensor) -> Tensor:
             distance = (self.synthesis(latents)[0][:, 0] - target).abs() / 2

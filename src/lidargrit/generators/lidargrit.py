@@ -75,7 +75,7 @@ class LidarGritConfig(TokenGeneratorConfig):
     """The two networks of the paper; with other tokenizers than its VQ-VAE, of systems like it."""
 
 
-class LidarGrit(TokenGenerator):
+class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
     """The paper's system.
 
     Source:
@@ -97,16 +97,16 @@ class LidarGrit(TokenGenerator):
         """Return the VQ-VAE itself, or the transformer's objective over the frozen VQ-VAE."""
         return self.tokenizer if stage == "tokenizer" else NextToken(self.tokenizer, self.transformer)
 
-    @torch.no_grad()
-    def sample(self, seeds: Sequence[int], sampling: TokenSampling | None = None) -> RangeImage:
-        """Write one scan for each seed; a seed gives the same scan whatever the others are."""
-        sampling = sampling or TokenSampling()
-        self.eval()
-        device = self.transformer.head.weight.device
+    @property
+    def compute_batch(self) -> int:
+        """Number of scans whose tokens are sampled at once: a step takes little longer for several than for one."""
+        return 8 if self.device.type == "cpu" else 32
+
+    def _sample(self, seeds: Sequence[int], sampling: TokenSampling) -> RangeImage:
         rngs = [torch.Generator().manual_seed(seed) for seed in seeds]  # on the CPU: the same numbers on every device
         uniform = torch.stack([torch.rand(self.transformer.context_length, generator=rng) for rng in rngs])
         decoder, tokenizer = self._prepare(len(seeds), sampling)
-        tokens = decoder.generate(uniform.to(device))
+        tokens = decoder.generate(uniform.to(self.device))
         return self.decode(tokens, rngs, sampling.mask, tokenizer)
 
     @torch.no_grad()
@@ -118,7 +118,7 @@ class LidarGrit(TokenGenerator):
         nats = F.cross_entropy(logits.double().movedim(-1, 1), tokens.flatten(1), reduction="none")
         return (nats / math.log(2)).float().view(tokens.shape)
 
-    def log_likelihood(self, images: RangeImage) -> Float[Tensor, "B"]:
+    def _log_likelihood(self, images: RangeImage) -> Float[Tensor, "B"]:
         """Return the log-likelihood of each scan's tokens in nats; what is lost in encoding is not counted."""
         return -self.token_nll_bits(images).double().sum(dim=(1, 2)).mul(math.log(2)).float()
 

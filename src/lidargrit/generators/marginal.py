@@ -12,7 +12,6 @@ from torch import Tensor
 from lidargrit.errors import CheckpointError, ConfigError
 from lidargrit.generators import Cost, Generator, NoSampling
 from lidargrit.loading import RangeImages
-from lidargrit.nn.objective import Objective
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
@@ -34,7 +33,7 @@ class MarginalConfig:
             raise ConfigError(f"{self.bins} bins", "1 to 4096", "choose about a hundred")
 
 
-class Marginal(Generator):
+class Marginal(Generator[MarginalConfig, NoSampling]):
     """Knows of each pixel how often it returns and how far, and nothing of how pixels hang together.
 
     A metric that gives it a good score does not look at shapes. It has no stage to train by an objective: it counts,
@@ -42,23 +41,18 @@ class Marginal(Generator):
     """
 
     Config = MarginalConfig
-    stages = ()
     scans: Tensor
     counts: Tensor
 
     def __init__(self, config: MarginalConfig, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
-        self.config, self.sensor = config, sensor
         self.register_buffer("scans", torch.zeros((), dtype=torch.int64))
         self.register_buffer("counts", torch.zeros(config.bins, sensor.height, sensor.width, dtype=torch.int32))
 
-    def objective(self, stage: str) -> Objective:
-        """Refuse: there is no stage."""
-        raise NotImplementedError(stage)
-
-    def load_stage(self, stage: str, objective: Objective) -> None:
-        """Refuse: there is no stage."""
-        raise NotImplementedError(stage)
+    @classmethod
+    def smallest_config(cls, sensor: SensorModel) -> MarginalConfig:
+        """Return a histogram of 16 bins."""
+        return MarginalConfig(bins=16)
 
     def fit_statistics(self, images: RangeImages) -> None:
         """Count the returns of all images."""
@@ -72,9 +66,8 @@ class Marginal(Generator):
                 self.counts.scatter_add_(0, one[None], mask[None].int())
             self.scans += len(batch)
 
-    @torch.no_grad()
-    def sample(self, seeds: Sequence[int], sampling: NoSampling | None = None) -> RangeImage:
-        """Write one scan for each seed; there is nothing to choose.
+    def _sample(self, seeds: Sequence[int], sampling: NoSampling) -> RangeImage:
+        """Sample every pixel by itself.
 
         Raises:
             CheckpointError: nothing was counted yet.

@@ -60,7 +60,7 @@ class MaskGitConfig(TokenGeneratorConfig):
     """The tokenizer of LidarGRIT, and a transformer of the same blocks that sees all tokens."""
 
 
-class MaskGit(TokenGenerator):
+class MaskGit(TokenGenerator[MaskGitConfig, MaskedSampling]):
     """Parallel generation of tokens: fewer passes than tokens, at some cost in quality.
 
     A pass samples every hidden token given those that are shown, and shows some of them. Tokens of one pass are sampled
@@ -83,11 +83,12 @@ class MaskGit(TokenGenerator):
         """Return the VQ-VAE itself, or the transformer's objective over the frozen VQ-VAE."""
         return self.tokenizer if stage == "tokenizer" else HiddenTokens(self.tokenizer, self.transformer)
 
-    @torch.no_grad()
-    def sample(self, seeds: Sequence[int], sampling: MaskedSampling | None = None) -> RangeImage:
-        """Write one scan for each seed; a seed gives the same scan whatever the others are."""
-        sampling = sampling or MaskedSampling()
-        self.eval()
+    @classmethod
+    def quickest_sampling(cls) -> MaskedSampling:
+        """Return 4 passes."""
+        return MaskedSampling(steps=4)
+
+    def _sample(self, seeds: Sequence[int], sampling: MaskedSampling) -> RangeImage:
         rngs = [torch.Generator().manual_seed(seed) for seed in seeds]  # on the CPU: the same numbers on every device
         tokens = generate_tokens(self.transformer, rngs, sampling)
         return self.decode(tokens, rngs, sampling.mask, self.tokenizer.for_decoding(sampling.decoder))

@@ -14,7 +14,6 @@ from lidargrit.errors import CheckpointError, ConfigError
 from lidargrit.files import load_exactly
 from lidargrit.generators import Cost, Generator, NoSampling
 from lidargrit.loading import RangeImages
-from lidargrit.nn.objective import Objective
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
@@ -34,7 +33,7 @@ class MemorisedConfig:
             raise ConfigError(f"{self.scans} scans", "1 to 100,000", "choose about a thousand")
 
 
-class Memorised(Generator):
+class Memorised(Generator[MemorisedConfig, NoSampling]):
     """Gives back what it was shown: the best that a generator without a thought of its own can score.
 
     A generator that scores better on held-out scans has learned something; one that scores the same may have learned
@@ -42,23 +41,18 @@ class Memorised(Generator):
     """
 
     Config = MemorisedConfig
-    stages = ()
     scans: Tensor
     range_m: Tensor
 
     def __init__(self, config: MemorisedConfig, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
-        self.config, self.sensor = config, sensor
         self.register_buffer("scans", torch.zeros((), dtype=torch.int64))
         self.register_buffer("range_m", torch.zeros(0, sensor.height, sensor.width))
 
-    def objective(self, stage: str) -> Objective:
-        """Refuse: there is no stage."""
-        raise NotImplementedError(stage)
-
-    def load_stage(self, stage: str, objective: Objective) -> None:
-        """Refuse: there is no stage."""
-        raise NotImplementedError(stage)
+    @classmethod
+    def smallest_config(cls, sensor: SensorModel) -> MemorisedConfig:
+        """Return room for 8 scans."""
+        return MemorisedConfig(scans=8)
 
     def fit_statistics(self, images: RangeImages) -> None:
         """Keep the images, in an order that does not follow the drive, so that the first seeds are not neighbours."""
@@ -71,7 +65,7 @@ class Memorised(Generator):
     @classmethod
     def from_weights(
         cls, config: MemorisedConfig, sensor: SensorModel, weights: dict[str, Tensor], source: Path
-    ) -> Memorised:
+    ) -> Self:
         """Make a generator that keeps as many scans as the weights hold."""
         generator, kept = cls(config, sensor), weights.get("range_m", torch.zeros(0))
         if kept.ndim == 3:
@@ -79,9 +73,8 @@ class Memorised(Generator):
         load_exactly(generator, weights, source)
         return generator.eval()
 
-    @torch.no_grad()
-    def sample(self, seeds: Sequence[int], sampling: NoSampling | None = None) -> RangeImage:
-        """Give the scan of each seed: as many seeds in a row as there are scans give each of them once.
+    def _sample(self, seeds: Sequence[int], sampling: NoSampling) -> RangeImage:
+        """Return the scan of each seed: as many seeds in a row as there are scans give each of them once.
 
         Raises:
             CheckpointError: nothing was kept yet.

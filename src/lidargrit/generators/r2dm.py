@@ -76,11 +76,10 @@ class DiffusionSampling:
             raise ConfigError(f"steps={self.steps}, resamples={self.resamples}", "at least 1 of both", "raise it")
 
 
-_COMPLETION = DiffusionSampling(steps=32)  # with 16 resamples: the reference's own demonstration
 _CALIBRATION = DiffusionSampling(steps=32)
 
 
-class R2dm(Generator):
+class R2dm(Generator[R2dmConfig, DiffusionSampling]):
     """Draws the image of log ranges, in which a missing return is a range that no return has.
 
     Source:
@@ -90,7 +89,6 @@ class R2dm(Generator):
 
     Config = R2dmConfig
     Sampling = DiffusionSampling
-    stages = ("diffusion",)
     capabilities = frozenset({"complete"})
     published_files = ("settings and network",)
     return_share: Tensor
@@ -98,12 +96,31 @@ class R2dm(Generator):
 
     def __init__(self, config: R2dmConfig, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
-        self.config, self.sensor = config, sensor
         self.shape = (1 + config.reflectance, sensor.height, sensor.width)
         angles = torch.broadcast_tensors(sensor.elevation_rad, sensor.azimuth_rad)
         self.network = EfficientUnet(config.unet, self.shape[0], *(angle.contiguous() for angle in angles))
         self.register_buffer("return_share", torch.tensor(math.nan))
         self.register_buffer("return_threshold", torch.tensor(math.nan))
+
+    @classmethod
+    def smallest_config(cls, sensor: SensorModel) -> R2dmConfig:
+        """Return a U-Net of two levels and 8 channels."""
+        return R2dmConfig(UnetConfig(8, (1, 1), (1, 1), norm_groups=2, attention_heads=2))
+
+    @classmethod
+    def quickest_sampling(cls) -> DiffusionSampling:
+        """Return 3 steps, each taken twice when a scan is completed."""
+        return DiffusionSampling(steps=3, resamples=2)
+
+    @classmethod
+    def completion_sampling(cls) -> DiffusionSampling:
+        """Return 32 steps with 16 resamples each, as in the authors' demonstration."""
+        return DiffusionSampling(steps=32)
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """One stage."""
+        return ("diffusion",)
 
     def fit_statistics(self, images: RangeImages) -> None:
         """Count how many of the training scans' rays return."""
@@ -134,55 +151,20 @@ class R2dm(Generator):
         dropped = min(round((1 - float(self.return_share)) * len(levels)), len(levels) - 1)
         self.return_threshold.fill_(float(levels[dropped]))
 
-    def sample(self, seeds: Sequence[int], sampling: DiffusionSampling | None = None) -> RangeImage:
-        """Write one scan for each seed; a seed gives the same scan whatever the others are."""
-        sampling = sampling or DiffusionSampling()
+    def _sample(self, seeds: Sequence[int], sampling: DiffusionSampling) -> RangeImage:
         self._check(sampling)
         return self._decoded(self._draw(seeds, sampling), sampling)
 
-    @torch.no_grad()
-    def complete(
-        self,
-        images: RangeImage,
-        observed: Bool[Tensor, "B H W"],
-        seeds: Sequence[int],
-        sampling: DiffusionSampling | None = None,
+    def _complete(
+        self, images: RangeImage, observed: Bool[Tensor, "B H W"], seeds: Sequence[int], sampling: DiffusionSampling
     ) -> RangeImage:
-        """Return scans that agree with what was observed and make up the rest, by RePaint over DDPM.
-
-        Args:
-            images: (B, H, W); what they hold where nothing was observed is not looked at.
-            observed: where they are known, be it a return or that there was none.
-            seeds: one for each image.
-            sampling: 32 steps with 16 resamples each if not given.
-
-        Raises:
-            ConfigError: images of other rays, as many seeds or masks as there are not images, or another sampler.
-        """
-        sampling = sampling or _COMPLETION
+        """Generate scans that agree with the observed pixels, by RePaint over DDPM."""
         self._check(sampling)
         if sampling.sampler != "ddpm":
             raise ConfigError(f"sampler={sampling.sampler} for completion", "sampler=ddpm", "RePaint adds fresh noise")
-        if not images.sensor.same_rays(self.sensor) or observed.shape != images.range_m.shape:
-            raise ConfigError(
-                f"{tuple(images.range_m.shape)} of {images.sensor.name!r}, observed at {tuple(observed.shape)}",
-                f"(B, {self.sensor.height}, {self.sensor.width}) of {self.sensor.name!r}, and masks of that shape",
-                "project the scans with the generator's sensor",
-            )
-        if len(seeds) != len(images):
-            raise ConfigError(f"{len(seeds)} seeds for {len(images)} images", "one for each", "correct the seeds")
-        self.eval()
-        device = self.network.coords.device
-        images, observed = images.to(device), observed.to(device)
-        noise = SeededNoise(seeds, self.shape, device)
-        clean = encode(images, self.config.reflectance)
-        drawn = diffusion.repaint(self.network, noise, clean, observed[:, None], sampling.steps, sampling.resamples)
-        made_up = self._decoded(drawn, sampling)
-        reflectance = None
-        if made_up.reflectance is not None and images.reflectance is not None:
-            reflectance = torch.where(observed, images.reflectance, made_up.reflectance)
-        range_m = torch.where(observed, images.range_m, made_up.range_m)
-        return RangeImage(range_m, range_m > 0, self.sensor, reflectance)
+        noise, clean = SeededNoise(seeds, self.shape, self.device), encode(images, self.config.reflectance)
+        generated = diffusion.repaint(self.network, noise, clean, observed[:, None], sampling.steps, sampling.resamples)
+        return self._decoded(generated, sampling)
 
     def cost(self, sampling: DiffusionSampling | None = None) -> Cost:
         """Return the network's passes, one a step."""
@@ -197,7 +179,7 @@ class R2dm(Generator):
     @torch.no_grad()
     def _draw(self, seeds: Sequence[int], sampling: DiffusionSampling) -> Float[Tensor, "B C H W"]:
         self.eval()
-        noise = SeededNoise(seeds, self.shape, self.network.coords.device)
+        noise = SeededNoise(seeds, self.shape, self.device)
         return diffusion.sample(self.network, noise, sampling.steps, sampling.sampler)
 
     def _decoded(self, drawn: Float[Tensor, "B C H W"], sampling: DiffusionSampling) -> RangeImage:

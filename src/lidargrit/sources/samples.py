@@ -34,7 +34,6 @@ def write_samples(
     folder: Path,
     seeds: Sequence[int],
     sampling: Any = None,
-    batch_size: int = 8,
     reporter: Reporter | None = None,
 ) -> None:
     """Write one file for each seed, at bounded memory; seeds that are there already are not drawn again.
@@ -46,7 +45,6 @@ def write_samples(
             and ``reflectance`` in [0, 1] if the generator writes it.
         seeds: one a scan; other processes may write others into the same folder meanwhile.
         sampling: choices, of the generator's own ``Sampling``; its defaults if not given.
-        batch_size: scans drawn at once; the scans do not depend on it.
         reporter: hears of the progress.
 
     Raises:
@@ -82,7 +80,7 @@ def write_samples(
         claim_folder(folder, shared=True) if missing else nullcontext(),
         (reporter or Reporter()).progress("sampling", len(seeds), len(seeds) - len(missing)) as progress,
     ):
-        for seed, image in zip(missing, generator.stream(missing, sampling, batch_size), strict=True):
+        for seed, image in zip(missing, generator.stream(missing, sampling), strict=True):
             _write_image(_file(folder, seed), image)
             progress.advance(1)
     remove_partials(folder)

@@ -1,0 +1,57 @@
+"""What a caller hands to a generator → the same, or one line that says what is wrong with it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from lidargrit.errors import ConfigError
+from lidargrit.sensors import SensorModel
+from lidargrit.structures import RangeImage
+
+SEEDS_BELOW = 1 << 63  # what torch.Generator.manual_seed takes without folding two seeds into one
+
+
+def check_seeds(seeds: Sequence[int], count: int | None = None) -> None:
+    """Refuse seeds that are out of bounds, none at all, or another number of them than there are images.
+
+    Args:
+        seeds: one for each scan.
+        count: number of images; None where the seeds alone say how many scans are wanted.
+    """
+    if count is not None and len(seeds) != count:
+        raise ConfigError(f"{len(seeds)} seeds for {count} images", "one seed for each image", "correct the seeds")
+    if not len(seeds):
+        raise ConfigError("no seeds", "at least one, such as seeds=[0]", "name a seed for each scan")
+    for seed in seeds:
+        if not 0 <= seed < SEEDS_BELOW:
+            raise ConfigError(f"the seed {str(seed)[:30]}", "a whole number from 0 to 2^63 - 1", "choose another seed")
+
+
+def check_images(images: RangeImage, sensor: SensorModel) -> None:
+    """Refuse a single image, an empty batch, and images whose pixels are other rays than the sensor's."""
+    if images.range_m.ndim != 3 or not len(images):
+        raise ConfigError(
+            f"range images of shape {tuple(images.range_m.shape)}",
+            f"a batch (B, {sensor.height}, {sensor.width}) of at least one",
+            "make a batch of single images with RangeImage.stack([image])",
+        )
+    if not images.sensor.same_rays(sensor):
+        raise ConfigError(
+            f"range images of the sensor {images.sensor.name!r}, {images.sensor.height}x{images.sensor.width}",
+            f"images of the generator's own, {sensor.name!r}, {sensor.height}x{sensor.width}, with the same rays",
+            "project the scans with generator.sensor",
+        )
+
+
+def check_observed(observed: Bool[Tensor, "..."], images: RangeImage) -> None:
+    """Refuse a mask of observed pixels whose shape is not that of the images."""
+    if observed.shape != images.range_m.shape or observed.dtype != torch.bool:
+        raise ConfigError(
+            f"observed pixels of shape {tuple(observed.shape)} and type {observed.dtype}",
+            f"{tuple(images.range_m.shape)} and torch.bool, one for each pixel of the images",
+            "give a mask for each image",
+        )
