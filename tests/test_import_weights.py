@@ -179,7 +179,7 @@ def test_code_in_a_file_is_never_run(files, tmp_path, capsys):
 
 
 def test_r2dm_and_dusty_import_with_sizes_of_their_own(tmp_path):
-    torch.save(r2dm_checkpoint(), tmp_path / "r2dm.pth")
+    torch.save(r2dm_checkpoint(layout_of_2024=True), tmp_path / "r2dm.pth")
     torch.save({"G_ema": dusty_weights(1, (64, 256))}, tmp_path / "dusty.pth")
     assert main(["import-weights", "r2dm_kitti_360", str(tmp_path / "a"), str(tmp_path / "r2dm.pth")]) == 0
     assert main(["import-weights", "dusty_kitti_odometry", str(tmp_path / "b"), str(tmp_path / "dusty.pth")]) == 0

@@ -1,5 +1,6 @@
 """R2DM: its network against a slow one, its published layout, raydrop, completion, learning."""
 
+import copy
 import math
 
 import pytest
@@ -16,20 +17,67 @@ from reference_unet import SlowUnet
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
 TINY = UnetConfig(8, (1, 2), (1, 1), norm_groups=2, attention_heads=2)
-PUBLISHED = {
+FIRST = {  # ``cfg`` as the program of 1c5963d writes it, small sizes but for the image's
+    "dataset": "kitti_360",
     "image_format": "log_depth",
+    "lidar_projection": "spherical-1024",
+    "train_depth": True,
     "train_reflectance": True,
     "resolution": (64, 1024),
+    "num_steps": 300_000,
+    "criterion": "l2",
+    "ema_decay": 0.995,
+    "mixed_precision": "fp16",
+    "model_name": "efficient_unet",
     "model_base_channels": 4,
     "model_temb_channels": None,
     "model_channel_multiplier": (1, 2, 1, 2),
     "model_num_residual_blocks": 1,
     "model_gn_num_groups": 2,
+    "model_gn_eps": 1e-6,
     "model_attn_num_heads": 2,
     "model_coords_embedding": "fourier_features",
+    "model_dropout": 0.0,
+    "diffusion_num_training_steps": 1024,
     "diffusion_objective": "eps",
     "diffusion_beta_schedule": "cosine",
     "diffusion_timesteps_type": "continuous",
+}
+SECOND = {  # the same as the program of 6ce7cc2 writes it
+    "data": {
+        "dataset": "kitti_360",
+        "depth_format": "log_depth",
+        "projection": "spherical-1024",
+        "train_depth": True,
+        "train_reflectance": True,
+        "resolution": (64, 1024),
+    },
+    "model": {
+        "architecture": "efficient_unet",
+        "base_channels": 4,
+        "temb_channels": None,
+        "channel_multiplier": (1, 2, 1, 2),
+        "num_residual_blocks": (1, 1, 1, 1),
+        "gn_num_groups": 2,
+        "gn_eps": 1e-6,
+        "attn_num_heads": 2,
+        "coords_encoding": "fourier_features",
+        "dropout": 0.0,
+    },
+    "diffusion": {
+        "num_training_steps": None,
+        "num_sampling_steps": 1024,
+        "prediction_type": "eps",
+        "loss_type": "l2",
+        "noise_schedule": "cosine",
+        "timestep_type": "continuous",
+    },
+    "training": {
+        "batch_size_train": 8,
+        "num_steps": 300_000,
+        "mixed_precision": "fp16",
+        "output_dir": "logs/diffusion",
+    },
 }
 
 
@@ -46,8 +94,11 @@ def made(**settings):
         return R2dm(R2dmConfig(TINY, **settings), SENSOR).eval()
 
 
-def seeded_checkpoint(prefix="denoiser"):
-    """Draw weights by name in the reference's layout, constants included, of a network that is small and whole."""
+def seeded_checkpoint(layout_of_2024=False):
+    """Sample the weights of a small whole network, and return them as the program saves them, in either layout."""
+    prefix, angles_of, cfg = "denoiser", "coords_embedding", FIRST
+    if layout_of_2024:
+        prefix, angles_of, cfg = "model", "coords_encoding", SECOND
     with torch.device("meta"):
         angles = torch.zeros(64, 1024)
         layout = EfficientUnet(UnetConfig(4, (1, 2, 1, 2), (1,) * 4, 2, 2), 2, angles, angles).state_dict()
@@ -57,13 +108,18 @@ def seeded_checkpoint(prefix="denoiser"):
         for name, of in layout.items()
     }
     weights |= {
-        f"{prefix}.coords_embedding.freqs": torch.ones(16, 2, 1, 1),
-        f"{prefix}.coords_embedding.phase": torch.zeros(16),
+        f"{prefix}.{angles_of}.freqs": torch.ones(16, 2, 1, 1),
+        f"{prefix}.{angles_of}.phase": torch.zeros(16),
         f"{prefix}.d_block1.residual_blocks.0.scale": torch.tensor(math.sqrt(0.5)),
         f"{prefix}.d_block2.downsample.1.kernel": torch.tensor([1, 3, 3, 1]) / 8,
         "_dummy": torch.tensor([]),
     }
-    return {"cfg": dict(PUBLISHED), "weights": {}, "ema_weights": weights, "global_step": 300_000}
+    state = {
+        "state": {0: {"step": torch.tensor(5.0), "exp_avg": torch.ones(2)}},
+        "param_groups": [{"betas": (0.9, 0.99)}],
+    }
+    others = {"optimizer": state, "lr_scheduler": {"last_epoch": 3, "lr_lambdas": [None]}, "global_step": 300_000}
+    return {"cfg": copy.deepcopy(cfg), "weights": dict(weights), "ema_weights": weights, **others}
 
 
 def test_the_published_size_has_the_published_parameters_and_operations():
@@ -107,11 +163,56 @@ def test_a_turned_image_gives_a_turned_answer_but_for_the_rays():
     assert torch.allclose(turned, straight.roll(6, 3), atol=1e-4)
 
 
-def test_later_versions_of_the_layout_are_read_too(tmp_path):
-    for prefix in ("denoiser", "model"):
-        torch.save(seeded_checkpoint(prefix), tmp_path / f"{prefix}.pth")
-    first, second = (load_published(tmp_path / f"{name}.pth").state_dict() for name in ("denoiser", "model"))
+def test_both_layouts_that_the_program_has_written_are_read(tmp_path):
+    generators = []
+    for layout_of_2024 in (False, True):
+        torch.save(seeded_checkpoint(layout_of_2024), tmp_path / "weights.pth")
+        generators.append(load_published(tmp_path / "weights.pth"))
+    first, second = (generator.state_dict() for generator in generators)
+    assert generators[0].config == generators[1].config
     assert all(torch.equal(first[name], second[name]) for name in first if name.startswith("network."))
+
+
+@pytest.mark.parametrize(
+    ("part", "name", "value"),
+    [
+        ("data", "depth_format", "inverse_depth"),
+        ("data", "train_depth", False),
+        ("model", "architecture", "refinenet"),
+        ("model", "coords_encoding", "spherical_harmonics"),
+        ("model", "gn_eps", 1e-5),
+        ("model", "temb_channels", 32),
+        ("diffusion", "prediction_type", "v"),
+        ("diffusion", "noise_schedule", "linear"),
+        ("diffusion", "timestep_type", "discrete"),
+    ],
+)
+def test_settings_of_the_later_layout_are_checked_under_their_names(tmp_path, part, name, value):
+    checkpoint = seeded_checkpoint(layout_of_2024=True)
+    checkpoint["cfg"][part][name] = value
+    torch.save(checkpoint, tmp_path / "weights.pth")
+    with pytest.raises(CheckpointError, match=rf"with {part}\.{name}={value!r}; wanted {part}\.{name}="):
+        load_published(tmp_path / "weights.pth")
+
+
+def test_sizes_that_the_weights_do_not_have_are_refused_before_a_network_is_built(tmp_path):
+    for name, value in (("base_channels", 1 << 30), ("num_residual_blocks", 10**9), ("channel_multiplier", 10**6)):
+        checkpoint = seeded_checkpoint(layout_of_2024=True)
+        checkpoint["cfg"]["model"][name] = value
+        torch.save(checkpoint, tmp_path / "weights.pth")
+        with pytest.raises(CheckpointError, match="whose level 1 is not of "):
+            load_published(tmp_path / "weights.pth")
+
+
+def test_a_value_beyond_the_far_limit_is_cut_to_it_and_keeps_its_return():
+    """The program cuts values to [-1, 1]; in 32 bits the limit of 80 m decodes to just below 80 m, so it is kept."""
+    generator = R2dm(R2dmConfig(TINY, reflectance=False), load_sensor("hdl64e_kitti_360").with_columns(32))
+    values = torch.full((1, 1, 64, 32), 1.0)
+    values[0, 0, 0], values[0, 0, 1] = 1.01, -1.01
+    images = generator._decoded(values, DiffusionSampling())
+    assert bool(images.return_mask[0, 0].all()) and bool(images.return_mask[0, 2:].all())
+    assert not bool(images.return_mask[0, 1].any())
+    assert float(images.range_m[0, 0].min()) == pytest.approx(80, abs=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -123,6 +224,7 @@ def test_later_versions_of_the_layout_are_read_too(tmp_path):
         ),
         (lambda c: c["cfg"].update(model_coords_embedding=None), "model_coords_embedding=None"),
         (lambda c: c["cfg"].update(model_channel_multiplier=(1, 2)), "channel_multipliers"),
+        (lambda c: c["cfg"].update(model_gn_eps=1e-5), "model_gn_eps=1e-05; wanted model_gn_eps=1e-06"),
         (lambda c: c["ema_weights"].pop("denoiser.in_conv.bias"), "lacks 'network.in_conv.bias'"),
         (lambda c: c["ema_weights"].update({"denoiser.new": torch.ones(1)}), "has besides 'network.new'"),
         (lambda c: c.pop("ema_weights"), r"cannot be read \(KeyError: 'ema_weights'\)"),

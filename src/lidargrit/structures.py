@@ -168,8 +168,8 @@ class RangeImage:
     def __len__(self) -> int:
         return self.range_m.shape[0] if self.range_m.ndim > 2 else 1
 
-    def __getitem__(self, index: int | slice) -> RangeImage:
-        """Return one image, or a slice of images, of a batch."""
+    def __getitem__(self, index: int | slice | list[int]) -> RangeImage:
+        """Return one image of a batch, or a batch of some of its images."""
         return replace(
             self,
             range_m=self.range_m[index],

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Self, TypeVar, final
+from typing import Any, ClassVar, Generic, TypeVar, final
 
 import torch
 from jaxtyping import Bool, Float
@@ -209,7 +209,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         images, observed = images.to(self.device), observed.to(self.device)
         generated = self._in_batches(
             len(seeds),
-            lambda some: self._complete(_those(images, some), observed[some], [seeds[i] for i in some], settings),
+            lambda some: self._complete(images[some], observed[some], [seeds[i] for i in some], settings),
         )
         reflectance, range_m = None, torch.where(observed, images.range_m, generated.range_m)
         if generated.reflectance is not None and images.reflectance is not None:
@@ -233,9 +233,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         check_images(images, self.sensor)
         check_seeds(seeds, len(images))
         settings, images = self._settings(sampling, self.Sampling), images.to(self.device)
-        return self._in_batches(
-            len(seeds), lambda some: self._invert(_those(images, some), [seeds[i] for i in some], settings)
-        )
+        return self._in_batches(len(seeds), lambda some: self._invert(images[some], [seeds[i] for i in some], settings))
 
     @final
     @torch.no_grad()
@@ -311,7 +309,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         return [*facts, f"sample --set: {', '.join(settings)}"] if settings else facts
 
     @classmethod
-    def from_published(cls, files: Sequence[Path], config: ConfigT, sensor: SensorModel) -> Self:
+    def from_published(cls, files: Sequence[Path], config: ConfigT, sensor: SensorModel) -> Generator[Any, Any]:
         """Make a generator with the weights that the system's authors published, or that their program saved.
 
         Args:
@@ -330,7 +328,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         )
 
     @classmethod
-    def from_pretrained(cls, name: str | Path, revision: str | None = None) -> Self:
+    def from_pretrained(cls, name: str | Path, revision: str | None = None) -> Generator[Any, Any]:
         """Read a generator from a folder, or from a repository of the Hugging Face hub.
 
         Args:
@@ -404,7 +402,3 @@ def load(folder: str | Path) -> Generator:
 def load_class(name: str) -> type[Generator]:
     """Return the generator class of a name, or raise UnknownNameError."""
     return _discovery.load_class("generators", name, Generator)
-
-
-def _those(images: RangeImage, indices: list[int]) -> RangeImage:
-    return RangeImage.stack([images[index] for index in indices])

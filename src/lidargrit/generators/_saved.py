@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import ClassVar, Generic, Self, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 from torch import Tensor, nn
 
@@ -15,6 +15,7 @@ from lidargrit.sensors import SensorModel
 CONFIG_FILE, WEIGHTS_FILE, CARD_FILE = "config.json", "model.safetensors", "README.md"  # the names that the hub knows
 
 ConfigT = TypeVar("ConfigT")
+ModelT = TypeVar("ModelT", bound=nn.Module)
 
 
 class SavedModel(nn.Module, Generic[ConfigT]):
@@ -64,7 +65,9 @@ class SavedModel(nn.Module, Generic[ConfigT]):
         write_json(folder / CONFIG_FILE, config)
 
     @classmethod
-    def from_weights(cls, config: ConfigT, sensor: SensorModel, weights: dict[str, Tensor], source: Path) -> Self:
+    def from_weights(
+        cls: type[ModelT], config: Any, sensor: SensorModel, weights: dict[str, Tensor], source: Path
+    ) -> ModelT:
         """Make a generator with given weights.
 
         Raises:

@@ -65,7 +65,7 @@ class Memorised(Generator[MemorisedConfig, NoSampling]):
     @classmethod
     def from_weights(
         cls, config: MemorisedConfig, sensor: SensorModel, weights: dict[str, Tensor], source: Path
-    ) -> Self:
+    ) -> Memorised:
         """Make a generator that keeps as many scans as the weights hold."""
         generator, kept = cls(config, sensor), weights.get("range_m", torch.zeros(0))
         if kept.ndim == 3:

@@ -6,14 +6,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lidargrit.determinism import evenly_spaced
-from lidargrit.errors import CheckpointError, ConfigError
+from lidargrit.errors import ConfigError
 from lidargrit.files import load_exactly
 from lidargrit.generators import Cost, Generator
 from lidargrit.loading import RangeImages
@@ -21,14 +21,13 @@ from lidargrit.nn import diffusion
 from lidargrit.nn.diffusion import Sampler, SeededNoise
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.objective import Objective
-from lidargrit.nn.published import RefusedFileError, float_tensors, read_everything
+from lidargrit.nn.r2dm_checkpoint import read_r2dm_checkpoint
 from lidargrit.nn.unet import EfficientUnet, UnetConfig
 from lidargrit.sensors import SensorModel, load_sensor
 from lidargrit.structures import RangeImage
 
 _BATCH = 8
 _PUBLISHED_SENSOR = "hdl64e_kitti_360"
-_FILE_BYTES_AT_MOST = 1 << 30  # the published ones, with optimiser and average, take half a gigabyte
 _SHARE_SCANS = 1000  # whose returns are counted: more would not change their share
 _CALIBRATION_SEED = 1 << 40  # of the first scan that is drawn for it: no one draws their samples there
 
@@ -184,11 +183,16 @@ class R2dm(Generator[R2dmConfig, DiffusionSampling]):
 
     def _decoded(self, drawn: Float[Tensor, "B C H W"], sampling: DiffusionSampling) -> RangeImage:
         level, sensor = drawn[:, 0], self.sensor
-        range_m = torch.exp2((level + 1) * (math.log2(1 + sensor.range_max_m) / 2)) - 1
+        exponent = (level.clamp(-1, 1) + 1) * (math.log2(1 + sensor.range_max_m) / 2)
+        range_m = torch.exp2(exponent) - 1
         if sampling.raydrop == "calibrated":
             returned = level >= self.return_threshold
-        else:  # without the limits themselves, as in the reference: a value cut at the far end is no return
-            returned = (range_m > sensor.range_min_m) & (range_m < sensor.range_max_m)
+        else:
+            # The program cuts values to [-1, 1], decodes them and keeps what lies between the limits. The exponent of
+            # the far limit is rounded to 32 bits: that of 80 m decodes to just below it, which is a return. The power
+            # is taken in 64 bits, because in 32 its last bit differs with the size of a batch.
+            exact_m = torch.exp2(exponent.double()) - 1
+            returned = (exact_m > sensor.range_min_m) & (exact_m < sensor.range_max_m)
         image = RangeImage.masked(range_m.clamp(sensor.range_min_m, sensor.range_max_m), returned, sensor)
         if not self.config.reflectance:
             return image
@@ -246,68 +250,18 @@ class Denoising(Objective):
 
 
 def load_published(path: Path, sensor: SensorModel | None = None) -> R2dm:
-    """Make a generator of a checkpoint that the authors published (r2dm-h-kitti360-300k.pth and the like).
-
-    Such a file is torch's, a dictionary of which this reads ``cfg`` (the settings by name, in one level) and
-    ``ema_weights``. Its names of weights are ours below ``network.``, where it has ``denoiser.`` or, in later versions,
-    ``model.``; its constants (``scale``, ``kernel``, ``freqs``, ``phase``) are built in here. ``coords`` are the ray
-    angles that it was trained with, at the edges of cells, and are kept; where a pixel's point lies is the sensor's.
-    Only the published form is known: log range, predicted noise, cosine schedule, continuous time, Fourier features.
+    """Make a generator from a checkpoint that the authors published, or that their program saved.
 
     Args:
-        path: of the file; code in it is not run.
-        sensor: whose rays the images have; if not given, by elevation, for the KITTI-360 weights.
+        path: checkpoint in either layout of lidargrit.nn.r2dm_checkpoint; code in it is not run.
+        sensor: sensor of the images; if not given, that of the KITTI-360 weights, with rows by elevation. The network
+            keeps the ray angles of its training, at the edges of cells; where a pixel's point lies is the sensor's.
 
     Raises:
         CheckpointError: another file, or a model of another form.
-
-    Source:
-        kazuto1011/r2dm@1c5963d (MIT), utils/inference.py and utils/training.py.
     """
-    wanted, cure = "a checkpoint of R2DM's authors", "download it again from kazuto1011/r2dm, release 'weights'"
-    try:
-        file = read_everything(path, _FILE_BYTES_AT_MOST)
-        settings = dict(file["cfg"])
-        weights = {
-            f"network.{name.partition('.')[2]}": tensor
-            for name, tensor in file["ema_weights"].items()
-            if name.partition(".")[0] in ("denoiser", "model") and name.rpartition(".")[2] not in _CONSTANTS
-        }
-        published = float_tensors(weights, _FILE_BYTES_AT_MOST)
-        unet = UnetConfig(
-            channels=int(settings["model_base_channels"]),
-            channel_multipliers=_four(settings["model_channel_multiplier"]),
-            residual_blocks=_four(settings["model_num_residual_blocks"]),
-            norm_groups=int(settings["model_gn_num_groups"]),
-            attention_heads=int(settings["model_attn_num_heads"]),
-        )
-    except ConfigError:
-        raise
-    except (OSError, KeyError, TypeError, ValueError, AttributeError, RefusedFileError) as error:
-        told = str(error).partition("\n")[0][:100]
-        raise CheckpointError(f"{path}, which cannot be read ({type(error).__name__}: {told})", wanted, cure) from None
-    for name, known in _KNOWN_FORM.items():
-        if settings.get(name, known) != known:
-            raise CheckpointError(f"{path} with {name}={settings[name]!r}", f"{name}={known!r}", "use other weights")
-    config = R2dmConfig(unet, bool(settings.get("train_reflectance", True)))
-    generator = R2dm(config, sensor or load_sensor(_PUBLISHED_SENSOR))
+    unet, reflectance, weights = read_r2dm_checkpoint(path)
+    generator = R2dm(R2dmConfig(unet, reflectance), sensor or load_sensor(_PUBLISHED_SENSOR))
     own = {name: tensor for name, tensor in generator.state_dict().items() if not name.startswith("network.")}
-    load_exactly(generator, published | own, path)
+    load_exactly(generator, own | {f"network.{name}": tensor for name, tensor in weights.items()}, path)
     return generator.eval()
-
-
-_CONSTANTS = ("scale", "kernel", "freqs", "phase")
-_KNOWN_FORM: dict[str, Any] = {
-    "model_name": "efficient_unet",
-    "image_format": "log_depth",
-    "train_depth": True,
-    "model_coords_embedding": "fourier_features",
-    "diffusion_objective": "eps",
-    "diffusion_beta_schedule": "cosine",
-    "diffusion_timesteps_type": "continuous",
-}
-
-
-def _four(setting: Any) -> tuple[int, ...]:
-    """Return a setting of the reference that is one number for all four levels, or one for each."""
-    return (int(setting),) * 4 if isinstance(setting, int) else tuple(int(each) for each in setting)

@@ -188,10 +188,15 @@ def from_published(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
     Args:
         weights: ``G`` or ``G_ema`` of a checkpoint of DUSty v1. Its names are numbers of layers; ``module`` is the
             convolution within its scaling, ``heads.depth`` the range and ``heads.confidence`` the returns. Biases of
-            hidden layers are those of the rectifiers behind them. ``drop_const`` is the value of no return, -1.
+            hidden layers are those of the rectifiers behind them. ``drop_const`` is the value of no return, -1, and a
+            learned temperature of the raydrop (``gumbel*.weight``) has no part in sampling: both are left out.
 
     Source:
         kazuto1011/dusty-gan@0374a5e, models/gans/dcgan_eqlr.py and models/dusty.py, MIT.
     """
-    plain = {name.removeprefix(_PUBLISHED_PREFIX): weight for name, weight in weights.items() if name != "drop_const"}
+    plain = {
+        name.removeprefix(_PUBLISHED_PREFIX): weight
+        for name, weight in weights.items()
+        if name != "drop_const" and not name.startswith("gumbel")
+    }
     return {_PUBLISHED_NAMES.get(name, name): weight for name, weight in plain.items()}
