@@ -210,7 +210,8 @@ def test_a_value_beyond_the_far_limit_is_cut_to_it_and_keeps_its_return():
     values = torch.full((1, 1, 64, 32), 1.0)
     values[0, 0, 0], values[0, 0, 1] = 1.01, -1.01
     images = generator._decoded(values, DiffusionSampling())
-    assert bool(images.return_mask[0, 0].all()) and bool(images.return_mask[0, 2:].all())
+    assert bool(images.return_mask[0, 0].all())
+    assert bool(images.return_mask[0, 2:].all())
     assert not bool(images.return_mask[0, 1].any())
     assert float(images.range_m[0, 0].min()) == pytest.approx(80, abs=1e-4)
 
