@@ -163,8 +163,8 @@ def test_the_cost_is_what_torch_counts():
     recipe = load_recipe("small", ["model.transformer.width=32", "data.columns=512", "data.column_stride=8"])
     generator = LidarGrit(recipe.model, recipe.data.load_sensor())
     with FlopCounterMode(display=False) as counter:
-        generator.sample([0])
-    assert generator.cost().flops == counter.get_total_flops()
+        generator.sample(range(generator.compute_batch))
+    assert generator.cost().flops * generator.compute_batch == counter.get_total_flops()
     assert generator.cost().network_evaluations == 256 + 1
 
 

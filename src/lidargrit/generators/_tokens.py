@@ -80,18 +80,24 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
     ) -> RangeImage:
         """Return the scans of sampled tokens.
 
+        They are decoded in batches of one size, as tokens are sampled, because kernels differ by the size. Copies that
+        fill up the end of a batch are not decoded again, beyond what that size needs.
+
         Args:
-            tokens: in raster order.
+            tokens: tokens of ``compute_batch`` scans in raster order.
             rngs: random generators on the CPU, one for each scan.
             mask: how returns are decided.
             tokenizer: the generator's own, or what that gives for decoding only.
         """
+        wanted, seeds = len(rngs), [rng.initial_seed() for rng in rngs]
+        while wanted > 1 and seeds[wanted - 1] == seeds[wanted - 2]:
+            wanted -= 1
         images = []
-        for first in range(0, len(tokens), _DECODED_AT_ONCE):
+        for first in range(0, wanted, _DECODED_AT_ONCE):
             some = slice(first, first + _DECODED_AT_ONCE)
             grid = TokenGrid(tokens[some].unflatten(1, tokenizer.grid_size), tokenizer.num_codes)
             images.append(tokenizer.sample(grid, rngs[some], mask))
-        return RangeImage.cat(images)
+        return RangeImage.cat(images)[[*range(wanted), *[wanted - 1] * (len(rngs) - wanted)]]
 
 
 class TokenObjective(Objective):
