@@ -42,8 +42,7 @@ class Cost:
 
     Args:
         network_evaluations: number of passes through a network, one after the other.
-        flops: number of floating-point operations in products and convolutions; a multiplication with its addition
-            counts as two.
+        flops: number of floating-point operations in products and convolutions, two for a multiply-add.
     """
 
     network_evaluations: int
@@ -58,7 +57,6 @@ CAPABILITIES = {  # name → what a generator with it can do besides sampling, f
     "likelihood": "tell how likely a scan is",
 }
 
-
 SamplingT = TypeVar("SamplingT")
 
 
@@ -67,12 +65,11 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
 
     It is made from a ``Config`` and a sensor, and trained in ``stages``, one after the other, each by its own
     objective. Every generator can ``sample``, by the settings of its ``Sampling``. What else it can do is named in
-    ``capabilities``; asked for anything beyond them, it answers which generators can.
+    ``capabilities``; asked for more, it answers which generators can.
 
-    The public methods check what they are given and take care of seeds and batches, so they are the same for all
-    generators. A subclass writes ``_sample``, and for its capabilities ``_complete``, ``_invert``, ``_reconstruct``,
-    ``_log_likelihood`` and ``get_tokenizer``; these see valid arguments on the generator's device only, in evaluation
-    mode and without gradients.
+    The public methods check their arguments and form batches, the same for all. A subclass writes ``_sample``, and for
+    its capabilities ``_complete``, ``_invert``, ``_reconstruct``, ``_log_likelihood`` and ``get_tokenizer``; these get
+    valid arguments on the generator's device, in evaluation mode and without gradients.
     """
 
     Sampling: ClassVar[type] = NoSampling
@@ -86,7 +83,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         """Return settings of networks as small as can be, for tests and first trials.
 
         Args:
-            sensor: the sensor of the images; its rows and columns are multiples of 32.
+            sensor: sensor of the images, whose rows and columns are multiples of 32.
         """
 
     @classmethod
@@ -238,9 +235,9 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     @final
     @torch.no_grad()
     def log_likelihood(self, images: RangeImage) -> Float[Tensor, "B"]:
-        """Return the log-likelihood of each scan in nats (capability ``likelihood``).
+        """Return the log-likelihood of each scan in nats, of its tokens for instance (capability ``likelihood``).
 
-        It is that of the generator's own representation of a scan, such as its tokens: systems do not compare by it.
+        It is that of the generator's own representation of a scan: systems do not compare by it.
 
         Args:
             images: batch of range images (B, H, W).
