@@ -235,12 +235,9 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     @final
     @torch.no_grad()
     def log_likelihood(self, images: RangeImage) -> Float[Tensor, "B"]:
-        """Return the log-likelihood of each scan in nats, of its tokens for instance (capability ``likelihood``).
+        """Return the log-likelihood of each scan in nats (capability ``likelihood``).
 
-        It is that of the generator's own representation of a scan: systems do not compare by it.
-
-        Args:
-            images: batch of range images (B, H, W).
+        It is that of the generator's own representation of a scan, such as its tokens: systems do not compare by it.
 
         Raises:
             ConfigError: images of other rays, or a generator without the capability.
