@@ -106,7 +106,7 @@ def test_requests_out_of_bounds_are_refused(changed, why):
 
 @pytest.mark.parametrize("data", [b"", b"[]", b"7", b"{", b'{"seed": NaN}', b"\xff", b"[" * 4000, b'{"a":' * 800])
 def test_words_that_are_none_are_refused(data):
-    with pytest.raises(ConfigError, match="no JSON object"):
+    with pytest.raises(ConfigError, match="not a JSON object"):
         parse_json_object(data)
 
 
@@ -170,7 +170,7 @@ def names(browser: Browser) -> list[str]:
     return browser.run("[...document.querySelectorAll('[data-part=name]')].map((one) => one.textContent)")
 
 
-def drawn(picture: np.ndarray) -> float:
+def plotted_share(picture: np.ndarray) -> float:
     return float((picture != picture[2, 2]).any(axis=2).mean())
 
 
@@ -179,7 +179,7 @@ def test_generate_compare_and_save(opened, served, tmp_path):
     assert options == [f"tiny-{name}" for name in MODELS]
     opened.click("#generate")
     finish(opened)
-    assert opened.run("document.querySelector('#status').textContent").startswith("Drawn in ")
+    assert opened.run("document.querySelector('#status').textContent").startswith("Done in ")
     fill(opened, "[name=temperature]", "0.5")
     fill(opened, "#seed", "4")
     opened.click("#generate")
@@ -187,8 +187,8 @@ def test_generate_compare_and_save(opened, served, tmp_path):
     assert names(opened) == ["tiny-lidargrit", "tiny-lidargrit, temperature=0.5"]
     assert said(opened) == ""
     for which in range(2):
-        assert drawn(opened.screenshot(".cloud", which)) > 0.005
-        assert drawn(opened.screenshot(".image", which)) > 0.2
+        assert plotted_share(opened.screenshot(".cloud", which)) > 0.005
+        assert plotted_share(opened.screenshot(".image", which)) > 0.2
     assert opened.run("document.documentElement.scrollHeight <= innerHeight"), "all is seen at once"
     opened.send("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
     opened.click("#next")
@@ -241,7 +241,7 @@ def test_a_scan_that_is_uploaded_is_completed(opened, scan_file):
 def test_a_bad_file_is_told_in_one_line(opened, tmp_path):
     for name, data, why in (
         ("cut.bin", bytes(17), "17 bytes in cut.bin"),
-        ("text.docx", b"hello", "whose ending we do not know"),
+        ("text.docx", b"hello", "cannot be read here by itself"),
         ("large.bin", bytes(4_000_016), "at most 4,000,000"),
     ):
         (tmp_path / name).write_bytes(data)
@@ -290,7 +290,7 @@ def test_everything_is_reached_by_keys_and_has_a_name(opened):
 
 
 class Idle(JobQueue):
-    """Draws nothing."""
+    """Runs no jobs."""
 
     def __init__(self, *_: object) -> None:
         self.models, self.limits = [], LIMITS
@@ -303,7 +303,7 @@ def test_the_command_says_where_and_to_whom(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     made("marginal")[0].save(tmp_path / "runs" / "tiny")
     (tmp_path / "runs" / "tiny" / "model.safetensors").write_bytes(b"no weights")
-    assert main(["serve", "--port", "0"]) == 2, "told by the process that draws"
+    assert main(["serve", "--port", "0"]) == 2, "told by the worker process"
     assert re.fullmatch(r"lidargrit serve: got \S*model.safetensors.*; wanted .*; .*\n", capsys.readouterr().err)
     monkeypatch.setattr(server, "JobQueue", Idle)
     monkeypatch.setattr(TcpWSGIServer, "run", lambda self: None)

@@ -1,11 +1,13 @@
 """Clients of the page that is served who mean no good, or are many: each is answered in one line, and it goes on."""
 
+import errno
 import io
 import json
 import os
 import pickle
 import re
 import signal
+import tempfile
 import threading
 import time
 import urllib.parse
@@ -16,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lidargrit.serving import application
 from lidargrit.serving.application import is_own
 from served import LIMITS, running
 
@@ -97,7 +100,7 @@ def test_results_are_had_by_their_names_only(served):
     job = served.take("/generate", {"model": 1, "count": 2})
     assert served.ended(job)["state"] == "done"
     assert served.ask(f"{job}/0-1.ply")[0] == 200
-    for name in ("0-2.ply", "1-0.ply", "0-0.pkl", "0-0.npz/..", "999-999.bin", "told.json", "../0-0.ply", "0--1.ply"):
+    for name in ("0-2.ply", "1-0.ply", "0-0.pkl", "0-0.npz/..", "999-999.bin", "page.json", "../0-0.ply", "0--1.ply"):
         assert served.ask(f"{job}/{name}")[0] == 404
     for method in ("PUT", "DELETE", "OPTIONS", "HEAD", "TRACE"):
         assert served.ask("/models", method=method)[0] == 405
@@ -134,7 +137,7 @@ def bombs() -> dict[str, bytes]:
 
 
 def test_hostile_files_are_refused_and_removed(served, tmp_path):
-    status = Path(f"/proc/{served.queue._process._process.pid}/status")
+    status = Path(f"/proc/{served.queue._worker.pid}/status")
     jobs = {}
     for name, data in bombs().items():
         (tmp_path / name).write_bytes(data)
@@ -150,6 +153,44 @@ def test_hostile_files_are_refused_and_removed(served, tmp_path):
         assert most_kb < 1_500_000, "no more than the program takes anyway, and one array"
     assert not list(served.queue._folder.rglob("upload*"))
     assert served.ended(served.take("/generate", {"model": 1}))["state"] == "done", "the same process goes on"
+
+
+@pytest.mark.parametrize("line", ['{"done": tr', '{"done": tr\n', "[]\n", "7\n", '{"done": true}'])
+def test_a_worker_that_ends_within_a_line_ends_one_job_only(served, line):
+    served.queue._worker._lines.put(line)
+    ended = served.ended(served.take("/generate", {"model": 1}))
+    assert ended["state"] == "failed"
+    assert "during which the program ended" in ended["error"]
+    assert served.ended(served.take("/generate", {"model": 1}))["state"] == "done", "later jobs run"
+
+
+def test_an_upload_onto_a_full_disk_is_refused_in_one_line_and_removed(served, monkeypatch, capfd):
+    def full(source=None, file=None) -> None:
+        if file is not None:
+            file.write(source.read(1000))
+            file.flush()
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    before = sorted(served.queue._folder.iterdir())
+    monkeypatch.setattr(application.shutil, "copyfileobj", full)
+    monkeypatch.setattr(tempfile, "TemporaryFile", full)  # where large bodies would wait
+    words = urllib.parse.quote(json.dumps({"name": "a.bin", "model": 2}))
+    status, why = served.refused(f"/complete?request={words}", bytes(3_000_000))
+    assert status == 507
+    assert "no room on the server's disk" in why
+    assert str(served.queue._folder) not in why
+    assert sorted(served.queue._folder.iterdir()) == before
+    assert capfd.readouterr().err == ""
+
+
+def test_a_file_that_needs_another_beside_it_is_not_offered(served):
+    assert b".pcap" not in served.ask("/")[2]
+    words = urllib.parse.quote(json.dumps({"name": "drive.pcap", "model": 2}))
+    status, why = served.refused(f"/complete?request={words}", b"x" * 100)
+    assert status == 400
+    assert "cannot be read here by itself" in why
+    assert ".ply" in why
+    assert why.count(".pcap") == 1
 
 
 def test_too_much_is_cut_off_without_being_read(served):
@@ -205,14 +246,14 @@ def test_fifty_clients_at_once(served):
         thread.join()
     assert sorted(answers) == [202] * LIMITS.waiting + [503] * (50 - LIMITS.waiting)
     served.queue.limits = replace(LIMITS, unpolled_seconds=0.0)  # nobody asks for theirs
-    os.kill(served.queue._process._process.pid, signal.SIGKILL)  # as when memory runs out
-    assert "ended the program" in served.ended(holding)["error"]
+    os.kill(served.queue._worker.pid, signal.SIGKILL)  # as when memory runs out
+    assert "during which the program ended" in served.ended(holding)["error"]
     end = time.monotonic() + 20
     while served.queue._waiting:
         assert time.monotonic() < end
         time.sleep(0.02)
     served.queue.limits = LIMITS
-    assert served.ended(served.take("/generate", {"model": 1}))["state"] == "done", "a new process draws"
+    assert served.ended(served.take("/generate", {"model": 1}))["state"] == "done", "a new process runs it"
 
 
 def test_what_takes_too_long_is_ended(served):
@@ -226,9 +267,7 @@ def test_what_takes_too_long_is_ended(served):
 
 def test_old_results_are_forgotten(served):
     served.queue.limits = replace(LIMITS, kept=2)
-    jobs = [
-        served.take("/generate", {"model": 9}) if False else served.take("/generate", {"model": 1}) for _ in range(4)
-    ]
+    jobs = [served.take("/generate", {"model": 1}) for _ in range(4)]
     for job in jobs:
         served.ended(job)
     last = served.take("/generate", {"model": 1})

@@ -214,8 +214,8 @@ def test_keys_and_buttons_step_through_the_scans(opened):
     opened.press("ArrowRight")
     assert opened.run("document.querySelector('#counter').textContent") == "Scan 1 of 3"
     opened.click("#previous")
-    assert opened.run("document.querySelector('#place').value") == "3"
-    opened.click("#place")  # its middle
+    assert opened.run("document.querySelector('#position').value") == "3"
+    opened.click("#position")  # its middle
     opened.press("ArrowLeft")
     assert opened.run("document.querySelector('#counter').textContent") == "Scan 1 of 3", (
         "the slider has its own arrows"
@@ -279,7 +279,7 @@ def test_pointing_in_one_picture_finds_the_place_in_the_other(opened, shown):
     left, top, width, height = opened.box(".image")
     before = opened.box(".cloud")
     opened.move(left + (column + 0.5) / 256 * width, top + (row + 0.5) / 64 * height)
-    said = words(opened, "told")
+    said = words(opened, "readout")
     assert re.fullmatch(
         rf"road, {range_m:.2f} m away, height -1\.73 m, reflectance 0\.\d\d \(row 40, column 133\)", said[0]
     )
@@ -288,14 +288,14 @@ def test_pointing_in_one_picture_finds_the_place_in_the_other(opened, shown):
     mark = opened.box("[data-part=cloudMark]")
     assert opened.run("!document.querySelector('[data-part=cloudMark]').hidden")
     opened.move(5, 5)
-    assert words(opened, "told") == ["", ""]
+    assert words(opened, "readout") == ["", ""]
     opened.move(mark[0] + mark[2] / 2, mark[1] + mark[3] / 2)
-    assert words(opened, "told")[0] == said[0], "and back again"
+    assert words(opened, "readout")[0] == said[0], "and back again"
     near = opened.box("[data-part=imageMark]")
     assert near[0] + near[2] / 2 == pytest.approx(left + (column + 0.5) / 256 * width, abs=1)
     opened.run("document.querySelector('.image').focus()")
     opened.press("ArrowDown", modifiers=8)
-    assert words(opened, "told")[0].endswith("(row 41, column 133)")
+    assert words(opened, "readout")[0].endswith("(row 41, column 133)")
 
 
 def test_scans_are_saved_as_files_that_others_read(opened, shown, tmp_path):
@@ -330,7 +330,7 @@ def test_everything_is_reached_by_keys_and_has_a_name(opened):
         )
         assert what == "BODY" or outline == "solid", f"{what} does not show that it has the focus"
         reached.append(what)
-    for control in ("previous", "place", "next", "mode", "dropped", "size", "reset", "cloud", "image", "bin", "ply"):
+    for control in ("previous", "position", "next", "mode", "dropped", "size", "reset", "cloud", "image", "bin", "ply"):
         assert control in reached
     nodes = opened.send("Accessibility.getFullAXTree")["nodes"]
     kinds = ("button", "slider", "combobox", "checkbox", "image", "img")

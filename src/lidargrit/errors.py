@@ -17,15 +17,19 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Sequence
 
+_LETTERS_AT_MOST = 600  # of each part of a message: a long path in full, or a few
 _SURELY_MEANT = 0.85  # of difflib's likeness: one letter wrong, missing or doubled in a name of seven
 
 
 class LidarGritError(ValueError):
-    """A user's mistake, told in one line: what was got, what was wanted, the cure."""
+    """A user's mistake, told in one line: what was got, what was wanted, the cure.
+
+    Parts may quote names of files and other foreign text, which :func:`one_line` makes safe to print.
+    """
 
     def __init__(self, got: str, wanted: str, cure: str) -> None:
-        super().__init__(f"got {got}; wanted {wanted}; {cure}")
-        self.got, self.wanted, self.cure = got, wanted, cure
+        self.got, self.wanted, self.cure = one_line(got), one_line(wanted), one_line(cure)
+        super().__init__(f"got {self.got}; wanted {self.wanted}; {self.cure}")
 
     def __reduce__(self) -> tuple[type[LidarGritError], tuple[str, str, str]]:
         return type(self), (self.got, self.wanted, self.cure)
@@ -69,6 +73,21 @@ class TrainingError(LidarGritError):
 
 class Terminated(KeyboardInterrupt):  # its kin, so that what cleans up after Ctrl-C does so here
     """SIGTERM ended the work; nobody's mistake."""
+
+
+def one_line(text: str) -> str:
+    r"""Return a text as one short line that a terminal shows as it is.
+
+    Line breaks, control characters, marks that turn the direction of writing, and bytes of a file name that are no text
+    are written as escapes such as ``\n``; the middle of a long text is left out.
+
+    Example:
+        >>> one_line("scan\x1b[2J.bin")
+        'scan\\x1b[2J.bin'
+    """
+    if len(text) > _LETTERS_AT_MOST:
+        text = f"{text[: _LETTERS_AT_MOST * 2 // 3]} [...] {text[-_LETTERS_AT_MOST // 3 :]}"
+    return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in text)
 
 
 def nearest_names(name: str, known: Iterable[str], at_most: int = 3) -> str:

@@ -37,6 +37,8 @@ class ScanFormat(ABC):
     """Whether one file may hold more than one scan."""
     keeps: ClassVar[tuple[str, ...]] = ()
     """What :meth:`write` keeps of a scan besides its points, in files of the first suffix: reflectance, ring, label."""
+    companion: ClassVar[str] = ""
+    """The file that must lie beside such a file for it to be read, if it needs one."""
     extra: ClassVar[str] = ""
     """Which optional part of this program reads them: pip install 'lidargrit[EXTRA]'."""
 

@@ -40,6 +40,7 @@ class OusterPcap(ScanFormat):
     reflectance = "calibrated reflectivity of 8 bits, divided by 255; of 16 bits in old recordings, by 65535"
     frame = "x forward (away from the plug), y left, z up, origin at the sensor's base"
     several = True
+    companion = "the sensor's metadata, a .json of the same name"
     extra = "ouster"
 
     @staticmethod

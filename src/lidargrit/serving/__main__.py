@@ -1,4 +1,4 @@
-"""The process that draws; see drawing.py."""
+"""The worker process of the server; see worker.py."""
 
 import json
 import sys
@@ -6,8 +6,8 @@ from pathlib import Path
 
 from lidargrit.serving.worker import run_worker
 
-asked = json.loads(sys.argv[1])
+options = json.loads(sys.argv[1])
 try:
-    run_worker([Path(run) for run in asked["runs"]], asked["device"])
+    run_worker([Path(run) for run in options["runs"]], options["device"])
 except (KeyboardInterrupt, BrokenPipeError):
     sys.exit(130)

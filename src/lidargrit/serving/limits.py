@@ -1,4 +1,4 @@
-"""What a stranger can ask for at most: numbers with their reasons, in one place."""
+"""Bounds on what a client of the server may ask for: numbers with their reasons, in one place."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ class Limits:
     """Bounds on size, time and number.
 
     Args:
-        upload_bytes: of a file; a revolution of 128 rows by 2048 columns takes 12.6 MB as Ouster's PCD.
-        request_bytes: of a question in words.
-        scans: drawn at once.
-        seconds: that drawing may take; then it is ended, whatever it was doing.
-        start_seconds: that reading the runs may take.
-        waiting: who may wait for others; whoever comes after is told to come again.
-        unpolled_seconds: whoever waits and does not ask for so long is gone, and is not drawn for.
-        kept: results; the oldest are forgotten first.
-        connections: at once, open and quiet ones included.
-        idle_seconds: after which a connection is closed on which nothing comes.
+        upload_bytes: largest uploaded file; a revolution of 128 rows by 2048 columns takes 12.6 MB as Ouster's PCD.
+        request_bytes: longest JSON of a request.
+        scans: largest number of scans in one request.
+        seconds: longest time that one job may compute; the worker process is ended when it is over.
+        start_seconds: longest time that the worker process may take to read the runs.
+        waiting: largest number of jobs in the queue; the next client is told to try again.
+        unpolled_seconds: time after which a waiting job is dropped if its client no longer asks for it.
+        kept: number of finished results that are kept; the oldest is removed first.
+        connections: largest number of open connections, each of which holds at most one upload in memory.
+        idle_seconds: time after which a connection is closed if no byte arrives on it.
     """
 
     upload_bytes: int = 16 << 20
@@ -32,9 +32,9 @@ class Limits:
     waiting: int = 8
     unpolled_seconds: float = 20.0
     kept: int = 24
-    connections: int = 100
+    connections: int = 64
     idle_seconds: int = 15
 
     def __post_init__(self) -> None:
         if not self.seconds > 0:
-            raise ConfigError(f"{self.seconds:g} seconds for drawing", "more than 0", "raise it")
+            raise ConfigError(f"{self.seconds:g} seconds for one job", "more than 0", "raise it")

@@ -1,11 +1,11 @@
-"""The page that is served: a form and the viewer's parts, files in ``browser/`` → HTML, script and style."""
+"""The page of the server: a form and the viewer's parts, files in ``browser/`` → HTML, script and style."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from lidargrit import __version__
-from lidargrit.serving.requests import HIDDEN, SEED_AT_MOST
+from lidargrit.serving.requests import HIDDEN, SEED_AT_MOST, upload_endings
 from lidargrit.viewer import interactive
 from lidargrit.viewer.interactive import button, filled
 
@@ -14,12 +14,14 @@ _SAVED = ("npz", "ply", "bin")
 
 
 def page() -> str:
-    """Return the page without anything in it: what there is to choose, its script asks for."""
+    """Return the page without models and scans; its script asks the server for them."""
     buttons = "".join(button(kind, f".{kind}") for kind in _SAVED) + button("remove", "Remove")
     parts = {
-        "looking": interactive.looking("", f'<span class="soft">Save</span>{buttons}', f"lidargrit {__version__}."),
-        "hidden": "".join(f'<option value="{name}">{told}</option>' for name, told in HIDDEN.items()),
+        "viewer": interactive.viewer_html("", f'<span class="soft">Save</span>{buttons}', f"lidargrit {__version__}."),
+        "hidden": "".join(f'<option value="{name}">{text}</option>' for name, text in HIDDEN.items()),
         "seed_at_most": str(SEED_AT_MOST),
+        "endings": ",".join(upload_endings()),
+        "listed_endings": ", ".join(upload_endings()),
     }
     return filled(_read("serve.html"), parts)
 
@@ -30,7 +32,7 @@ def script() -> str:
 
 
 def style() -> str:
-    """Return how the page looks."""
+    """Return the style sheet of the page."""
     return interactive.style() + _read("serve.css")
 
 

@@ -1,4 +1,4 @@
-"""A stranger's words → what is to be drawn, every value checked; and what there is to choose of a generator."""
+"""A client's JSON → a request whose every value is checked; and the numbers of a generator that a client may set."""
 
 from __future__ import annotations
 
@@ -8,14 +8,17 @@ import json
 import math
 import re
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, get_type_hints
 
+from lidargrit import formats
+from lidargrit._discovery import names
 from lidargrit.errors import ConfigError, nearest_names
 from lidargrit.serving.limits import Limits
 
 SEED_AT_MOST = 2**32 - 1  # what fits a field on a page; more seeds than anyone will try
-HIDDEN = {  # what of an uploaded scan the model does not get to see → how the page says it
-    "nothing": "nothing: fill in the rays that have no point",
+HIDDEN = {  # part of an uploaded scan that is hidden from the model → its description on the page
+    "nothing": "nothing: fill in the rays without a point",
     "ahead": "the quarter straight ahead",
     "rows": "three of every four rows",
 }
@@ -25,14 +28,14 @@ _FRACTION_AT_MOST = 100.0  # temperatures and the like: far beyond, everything i
 
 @dataclass(frozen=True)
 class SamplingSetting:
-    """A number that a generator lets one choose when it draws.
+    """A number that a client may set when a generator samples.
 
     Args:
-        name: of the field of its ``Sampling``.
+        name: name of the field in the generator's ``Sampling``.
         whole: whether it is a whole number.
-        default: None where the generator chooses by itself.
-        at_most: here.
-        about: what the field's docstring says.
+        default: its default value; None where the generator computes one itself.
+        at_most: largest value that is accepted.
+        about: description, from the docstring of ``Sampling``.
     """
 
     name: str
@@ -44,16 +47,16 @@ class SamplingSetting:
 
 @dataclass(frozen=True)
 class SampleRequest:
-    """What somebody wants drawn.
+    """What a client asks for: new scans, or a completed or reconstructed uploaded scan.
 
     Args:
-        model: its place among those that are served.
-        seed: of the first scan.
-        count: of scans.
-        sampling: numbers by name that are not left as they are.
-        hidden: of an uploaded scan; see :data:`HIDDEN`.
-        file: where an uploaded scan lies; "" if there is none.
-        name: that it was given, for people.
+        model: index of the model among those that are served.
+        seed: seed of the first scan; the next scan has the next seed.
+        count: number of scans.
+        sampling: values of the sampling settings that the client changed, by name.
+        hidden: part of the uploaded scan that is hidden from the model; a key of :data:`HIDDEN`.
+        file: path of the uploaded scan; "" if there is none.
+        name: name of the uploaded file on the client's side, for display.
     """
 
     model: int
@@ -79,66 +82,79 @@ def sampling_settings(sampling: Any) -> list[SamplingSetting]:
     return found
 
 
-def _about(sampling: type, name: str) -> str:
-    """Return what a class's docstring says of a field, in one line."""
-    text = inspect.cleandoc(sampling.__doc__ or "")
-    said = re.search(rf"^    {name}: (.*?)(?=^    \w+: |^\S|\Z)", text, re.MULTILINE | re.DOTALL)
-    return " ".join(said[1].split()).replace("``", "") if said else ""
-
-
 def parse_json_object(data: bytes) -> dict[str, Any]:
-    """Read JSON of an object.
+    """Parse the JSON object of a request.
 
     Raises:
-        ConfigError: it is something else.
+        ConfigError: the bytes are not a JSON object.
     """
     try:
-        words = json.loads(data.decode("utf-8"), parse_constant=_refuse)
+        values = json.loads(data.decode("utf-8"), parse_constant=_refuse_constant)
     except (ValueError, RecursionError):
-        words = None
-    if not isinstance(words, dict):
-        raise ConfigError("words that are no JSON object", '{"model": 0, "seed": 0, ...}', "use the page")
-    return words
+        values = None
+    if not isinstance(values, dict):
+        raise ConfigError("a request that is not a JSON object", '{"model": 0, "seed": 0, ...}', "use the page")
+    return values
 
 
-def parse_request(words: dict[str, Any], settings: list[list[SamplingSetting]], limits: Limits) -> SampleRequest:
-    """Check every word of a request.
+def parse_request(values: dict[str, Any], settings: list[list[SamplingSetting]], limits: Limits) -> SampleRequest:
+    """Check every value of a request.
 
     Args:
-        words: by name; what is not said has its default.
-        settings: of each model that is served.
-        limits: what may be asked for.
+        values: values by name; a missing one has its default.
+        settings: sampling settings of each model that is served.
+        limits: bounds on what may be asked for.
 
     Raises:
         ConfigError: an unknown name, a value of another type, or one out of its bounds.
     """
     known = ("model", "seed", "count", "sampling", "hidden", "name")
-    for name in words:
+    for name in values:
         if name not in known:
             raise ConfigError(f"the word {name[:40]!r}", f"one of {', '.join(known)}", "use the page")
-    model = _whole("model", words.get("model", 0), 0, len(settings) - 1)
-    hidden = words.get("hidden", "nothing")
+    model = _whole("model", values.get("model", 0), 0, len(settings) - 1)
+    hidden = values.get("hidden", "nothing")
     if not isinstance(hidden, str) or hidden not in HIDDEN:
         raise ConfigError(f"hidden={str(hidden)[:40]!r}", f"one of {', '.join(HIDDEN)}", "choose one")
-    asked = words.get("sampling", {})
-    if not isinstance(asked, dict):
-        raise ConfigError("sampling that is no JSON object", "numbers by name", "use the page")
-    of_name = {setting.name: setting for setting in settings[model]}
-    for name in asked:
-        if name not in of_name:
-            wanted = f"one such as {nearest_names(name[:40], of_name)}" if of_name else "none: it has no such settings"
+    changed = values.get("sampling", {})
+    if not isinstance(changed, dict):
+        raise ConfigError("sampling that is not a JSON object", "numbers by name", "use the page")
+    by_name = {setting.name: setting for setting in settings[model]}
+    for name in changed:
+        if name not in by_name:
+            wanted = f"one such as {nearest_names(name[:40], by_name)}" if by_name else "none: it has no such settings"
             raise ConfigError(f"the setting {name[:40]!r}, which this model does not have", wanted, "use the page")
     return SampleRequest(
         model,
-        _whole("seed", words.get("seed", 0), 0, SEED_AT_MOST),
-        _whole("count", words.get("count", 1), 1, limits.scans),
-        {name: _number(of_name[name], value) for name, value in asked.items()},
+        _whole("seed", values.get("seed", 0), 0, SEED_AT_MOST),
+        _whole("count", values.get("count", 1), 1, limits.scans),
+        {name: _number(by_name[name], value) for name, value in changed.items()},
         hidden,
-        name=_plain(words.get("name", "")),
+        name=_harmless_name(values.get("name", "")),
     )
 
 
-def _refuse(word: str) -> None:
+def upload_ending(name: str) -> str:
+    """Return the ending of a file's name if a format reads such a file by itself, else ""."""
+    fitting = [ending for ending in upload_endings() if name.lower().endswith(ending)]
+    of_format = {ending for form in formats.candidates(Path(name)) for ending in form.suffixes}
+    return max((ending for ending in fitting if ending in of_format), key=len, default="")
+
+
+def upload_endings() -> list[str]:
+    """Return the endings of files that can be uploaded: all but those that need a second file beside them."""
+    forms = [formats.load(name) for name in names("formats")]
+    return sorted({ending for form in forms if not form.companion for ending in form.suffixes})
+
+
+def _about(sampling: type, name: str) -> str:
+    """Return what a class's docstring says of a field, in one line."""
+    text = inspect.cleandoc(sampling.__doc__ or "")
+    found = re.search(rf"^    {name}: (.*?)(?=^    \w+: |^\S|\Z)", text, re.MULTILINE | re.DOTALL)
+    return " ".join(found[1].split()).replace("``", "") if found else ""
+
+
+def _refuse_constant(word: str) -> None:
     raise ValueError(word)  # NaN and Infinity, which JSON does not have
 
 
@@ -156,7 +172,7 @@ def _number(setting: SamplingSetting, value: Any) -> int | float:
     return float(value)
 
 
-def _plain(name: Any) -> str:
-    """Return the letters of a file's name that can do no harm anywhere, without any folder."""
+def _harmless_name(name: Any) -> str:
+    """Return the characters of a file's name that can do no harm anywhere, without any folder."""
     last = re.split(r"[/\\]", name if isinstance(name, str) else "")[-1]
     return re.sub(r"[^\w.()+-]", "_", last)[-60:]

@@ -18,17 +18,18 @@ from lidargrit.serving.application import LOOPBACK_NAMES, Application
 from lidargrit.serving.jobs import JobQueue
 from lidargrit.serving.limits import Limits
 
-_THREADS = 4  # that answer requests: each takes milliseconds, for drawing is done elsewhere
+_THREADS = 4  # threads that answer requests: each takes milliseconds, because the worker process computes
 _PORT_AT_MOST = 65_535
+_RESPONSE_BYTES = 1 << 30  # more than any response has; all of them are in memory already
 
 
 class RunningServer(NamedTuple):
-    """A server that listens, and answers while it runs.
+    """A server that listens.
 
     Args:
-        port: that it listens at.
-        queue: what draws for it.
-        run: answers until Ctrl-C.
+        port: port at which it listens.
+        queue: the jobs of all clients.
+        run: function that answers requests until Ctrl-C.
     """
 
     port: int
@@ -44,15 +45,15 @@ def serve(
     device: str = "",
     limits: Limits | None = None,
 ) -> None:
-    """Serve a page on which everybody who reaches it generates, completes, compares and saves, until Ctrl-C.
+    """Serve a page to generate, complete, compare and save scans, until Ctrl-C.
 
     Args:
         runs: folders of finished runs.
-        say: hears the address, and a warning where others reach it.
-        host: the address to listen at; a loopback one keeps it to this machine.
-        port: to listen at; 0 for any that is free.
-        device: where networks compute; "" for a GPU if there is one.
-        limits: what may be asked for.
+        say: function that prints the address, and a warning where others reach it.
+        host: address to listen at; a loopback one keeps the page to this machine.
+        port: port to listen at; 0 for any that is free.
+        device: device of the networks; "" for a GPU if there is one.
+        limits: bounds on what clients may ask for.
 
     Raises:
         OutputError: the address is taken, or not this machine's.
@@ -72,15 +73,15 @@ def serve(
 def open_server(
     runs: Sequence[Path], host: str = "127.0.0.1", port: int = 0, device: str = "", limits: Limits | None = None
 ) -> Iterator[RunningServer]:
-    """Yield a server that is about to run; after the block it, its process and its files are gone.
+    """Yield a server that listens; at the end of the block it, its worker process and its files are gone.
 
     Args, Raises: as for :func:`serve`.
     """
     limits = limits or Limits()
-    logging.getLogger("waitress.queue").setLevel(logging.ERROR)  # it tells of every request that waits
+    logging.getLogger("waitress.queue").setLevel(logging.ERROR)  # it logs every request that waits
     with (
         contextlib.closing(_listening(host, port)) as bound,
-        tempfile.TemporaryDirectory(prefix="lidargrit-serve-", ignore_cleanup_errors=True) as folder,
+        _temporary_folder() as folder,
         JobQueue(runs, Path(folder), device, limits) as queue,
     ):
         server = create_server(
@@ -91,6 +92,8 @@ def open_server(
             connection_limit=limits.connections,
             max_request_header_size=16_384,
             max_request_body_size=limits.upload_bytes + 1,
+            inbuf_overflow=limits.upload_bytes + 1,  # in memory: on a full disk waitress would hang up without a word
+            outbuf_overflow=_RESPONSE_BYTES,  # the same
             channel_timeout=limits.idle_seconds,
             cleanup_interval=max(1, limits.idle_seconds // 3),
         )
@@ -102,8 +105,19 @@ def open_server(
 
 
 def finished_runs(folder: Path) -> list[Path]:
-    """Return the finished runs of a folder, in the order of their names, and last the model in the package."""
+    """Return the finished runs in a folder, sorted by name, and then the model in the package."""
     return [*sorted(path for path in folder.glob("*") if is_run(path)), PRETRAINED]
+
+
+def _temporary_folder() -> tempfile.TemporaryDirectory[str]:
+    try:
+        return tempfile.TemporaryDirectory(prefix="lidargrit-serve-", ignore_cleanup_errors=True)
+    except OSError as error:
+        raise OutputError(
+            f"no folder for temporary files ({error.strerror or error})",
+            "a disk with room",
+            "free some space, or name another folder in the environment variable TMPDIR",
+        ) from None
 
 
 def _listening(host: str, port: int) -> socket.socket:

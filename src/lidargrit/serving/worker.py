@@ -1,7 +1,7 @@
-"""Wishes → range images on disk, in a process of its own that can be ended at any moment.
+"""Requests → range images on disk, in a process of its own that can be killed at any moment.
 
-It reads a request a line and answers a line, both JSON: no pickle passes, and the process that serves strangers never
-computes. A scan that takes too long, or takes the memory, is ended with its process, and the next one begins anew.
+The process reads and answers lines of JSON: no pickle passes, and the process that talks to clients never computes.
+A job that takes too long, or all memory, ends with this process; the next job starts a new one.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import sys
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 import torch
@@ -22,39 +22,41 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from lidargrit import formats
-from lidargrit.errors import ConfigError, LidarGritError, ScanError
-from lidargrit.files import write_text
+from lidargrit.errors import ConfigError, LidarGritError, OutputError, ScanError
+from lidargrit.files import atomic_path, write_text
 from lidargrit.generators import Generator, load
 from lidargrit.projection import project
 from lidargrit.sensors import SensorModel
 from lidargrit.serving.requests import SampleRequest, sampling_settings
 from lidargrit.structures import RangeImage
-from lidargrit.viewer.interactive import told
+from lidargrit.viewer.interactive import page_data
 from lidargrit.viewer.scan_sets import ScanSet
 
-PAGE_FILE, PIXELS_FILE = "told.json", "pixels.npz"  # of a result: for the page, and for files to save
+PAGE_FILE, PIXELS_FILE = "page.json", "pixels.npz"  # of a result: for the page, and for files to save
+NO_ROOM = OutputError(
+    "no room on the server's disk for this scan", "some free space in its temporary folder", "try again later"
+)
 
 
 def run_worker(runs: Sequence[Path], device: str) -> None:
-    """Say what the runs can do, then fulfil requests from standard input until it ends."""
+    """Describe the models of the runs, then answer requests from standard input until it ends."""
     answers = sys.stdout
     sys.stdout = sys.stderr  # whatever a library prints is no answer
     try:
         generators = [load(run).to(device or ("cuda" if torch.cuda.is_available() else "cpu")) for run in runs]
     except LidarGritError as error:
-        _say(answers, {"error": [type(error).__name__, error.got, error.wanted, error.cure]})
+        _send(answers, {"refused": [type(error).__name__, error.got, error.wanted, error.cure]})
         return
     except (RuntimeError, AssertionError) as error:  # torch's ways to say: no such device, or not in this build
-        _say(answers, {"error": ["ConfigError", f"--device {device} ({_first(error)})", "cpu or cuda", "leave it out"]})
+        got = f"--device {device} ({_first_line(error)})"
+        _send(answers, {"refused": ["ConfigError", got, "cpu or cuda", "leave it out"]})
         return
-    _say(
-        answers,
-        {"models": [describe_model(run.resolve().name, one) for run, one in zip(runs, generators, strict=True)]},
-    )
+    models = [describe_model(run.resolve().name, model) for run, model in zip(runs, generators, strict=True)]
+    _send(answers, {"models": models})
     for line in sys.stdin:
-        asked = json.loads(line)
-        request = SampleRequest(**asked["request"])
-        _say(answers, _answer_request(generators[request.model], request, Path(asked["folder"])))
+        message = json.loads(line)
+        request = SampleRequest(**message["request"])
+        _send(answers, _answer_request(generators[request.model], request, Path(message["folder"])))
 
 
 def describe_model(name: str, generator: Generator) -> dict[str, Any]:
@@ -71,34 +73,36 @@ def describe_model(name: str, generator: Generator) -> dict[str, Any]:
 
 
 def compute_result(generator: Generator, request: SampleRequest) -> list[ScanSet]:
-    """Draw what is wanted: new scans, or what the model makes of an uploaded one.
+    """Sample new scans, or complete or reconstruct an uploaded scan.
 
     Raises:
         LidarGritError: a file that cannot be used, or a setting out of its bounds.
     """
-    # What nobody touched is left to the generator, which may complete by other numbers than it samples by.
+    # Settings that the client left alone stay with the generator: it may complete by other values than it samples by.
     sampling = dataclasses.replace(generator.Sampling(), **request.sampling) if request.sampling else None
     device = next(iter(generator.state_dict().values())).device
+    seeds = range(request.seed, request.seed + request.count)
     if not request.file:
-        seeds = range(request.seed, request.seed + request.count)
         names = tuple(f"seed {seed}" for seed in seeds)
         return [ScanSet("generated", generator.sample(seeds, sampling).to("cpu"), names)]
     image = _uploaded(request, generator.sensor, partial="complete" in generator.capabilities)
-    shown = [ScanSet("as uploaded", image, (request.name,))]
+    sets = [ScanSet("as uploaded", image, (request.name,))]
     image = image.to(device)
     if "complete" not in generator.capabilities:
-        return [*shown, ScanSet("reconstructed", generator.reconstruct(image).to("cpu"), (request.name,))]
+        return [*sets, ScanSet("reconstructed", generator.reconstruct(image).to("cpu"), (request.name,))]
     hidden = _hidden(request.hidden, image)
     if request.hidden != "nothing":
-        shown.append(ScanSet("what the model saw", _without(image, hidden).to("cpu"), (request.name,)))
-    seeds = range(request.seed, request.seed + request.count)
+        sets.append(ScanSet("what the model saw", _without(image, hidden).to("cpu"), (request.name,)))
     images = RangeImage.stack([image[0]] * request.count)
-    drawn = generator.complete(images, ~hidden.expand_as(images.return_mask), seeds, sampling)
-    return [*shown, ScanSet("completed", drawn.to("cpu"), tuple(f"{request.name}, seed {seed}" for seed in seeds))]
+    completed = generator.complete(images, ~hidden.expand_as(images.return_mask), seeds, sampling)
+    return [*sets, ScanSet("completed", completed.to("cpu"), tuple(f"{request.name}, seed {seed}" for seed in seeds))]
 
 
 def _uploaded(request: SampleRequest, sensor: SensorModel, partial: bool) -> RangeImage:
-    """Read and project a file, whose place no message names; of a scan without rings, rows are told by elevation."""
+    """Read and project an uploaded file; messages give its name on the client's side, not its path on the server.
+
+    A scan without rings, for a sensor that needs them, is projected by elevation.
+    """
     path = Path(request.file)
     try:
         scan = dataclasses.replace(formats.read_scan(path, bad_points="drop"), source=request.name)
@@ -111,13 +115,13 @@ def _uploaded(request: SampleRequest, sensor: SensorModel, partial: bool) -> Ran
                 return RangeImage.stack([project(scan, sensor, "spherical", partial=partial)])
             raise
     except LidarGritError as error:
-        told = [part.replace(str(path), request.name) for part in (error.got, error.wanted, error.cure)]
-        raise type(error)(*told) from None
+        parts = [part.replace(str(path), request.name) for part in (error.got, error.wanted, error.cure)]
+        raise type(error)(*parts) from None
     return RangeImage.stack([image])
 
 
 def _hidden(what: str, image: RangeImage) -> Bool[Tensor, "1 H W"]:
-    """Return the pixels that the model is to make up."""
+    """Return the pixels that are hidden from the model."""
     if what == "nothing":
         return ~image.return_mask
     hidden = torch.zeros_like(image.return_mask)
@@ -135,31 +139,33 @@ def _without(image: RangeImage, hidden: Bool[Tensor, "1 H W"]) -> RangeImage:
 
 
 def _answer_request(generator: Generator, request: SampleRequest, folder: Path) -> dict[str, Any]:
-    """Write a result into a folder, and return what is to be answered."""
+    """Write a result into a folder, and return the answer."""
     try:
-        shown = compute_result(generator, request)
-        write_text(folder / PAGE_FILE, json.dumps(told(shown)))
+        sets = compute_result(generator, request)
         pixels: dict[str, Any] = {}
-        for place, one in enumerate(shown):
-            pixels[f"range_m_{place}"] = one.images.range_m.numpy()
-            if one.images.reflectance is not None:
-                pixels[f"reflectance_{place}"] = one.images.reflectance.numpy()
-        np.savez(folder / PIXELS_FILE, **pixels)
+        for index, scans in enumerate(sets):
+            pixels[f"range_m_{index}"] = scans.images.range_m.numpy()
+            if scans.images.reflectance is not None:
+                pixels[f"reflectance_{index}"] = scans.images.reflectance.numpy()
+        try:
+            write_text(folder / PAGE_FILE, json.dumps(page_data(sets)))
+            with atomic_path(folder / PIXELS_FILE) as temporary, temporary.open("wb") as file:
+                np.savez(file, **pixels)
+        except OutputError:  # its message names a folder of the server
+            raise NO_ROOM from None
     except LidarGritError as error:
-        return {"refused": str(error)}
-    except Exception as error:  # the process is to live on, whatever a network or a library stumbles over
+        return {"error": str(error)}
+    except Exception as error:  # the process is to go on, whatever error a network or a library raises
         traceback.print_exc()
-        unfit = ConfigError(
-            f"an error of the program ({_first(error)})", "a result", "try other settings, and report it"
-        )
-        return {"refused": str(unfit)}
+        got = f"an error of the program ({_first_line(error)})"
+        return {"error": str(ConfigError(got, "a result", "try other settings, and report it"))}
     return {"done": True}
 
 
-def _first(error: Exception) -> str:
+def _first_line(error: Exception) -> str:
     return f"{type(error).__name__}: {str(error).partition(os.linesep)[0][:100]}"
 
 
-def _say(answers: Any, what: dict[str, Any]) -> None:
-    answers.write(json.dumps(what) + "\n")
+def _send(answers: TextIO, message: dict[str, Any]) -> None:
+    answers.write(json.dumps(message) + "\n")
     answers.flush()

@@ -263,7 +263,7 @@ def _new_scans(story: DemoPage) -> str:
     )
     buttons = button("bin", ".bin") + button("ply", ".ply")
     return _step(
-        "5. New scans", text, interactive.looking("", f"Save {buttons}", f"Written by lidargrit {__version__}.")
+        "5. New scans", text, interactive.viewer_html("", f"Save {buttons}", f"Written by lidargrit {__version__}.")
     )
 
 

@@ -1,7 +1,7 @@
 """Scans to turn, zoom and step through: range images → one HTML page that needs no network and no other file.
 
-The page holds ranges in 16 bits and the rays of each sensor once; the browser makes the points. Its scripts and its
-style are the files in ``browser/``.
+The page holds ranges in 16 bits and the rays of each sensor once; the browser computes the points from them. Scripts
+and style sheet are the files in ``browser/``.
 """
 
 from __future__ import annotations
@@ -52,80 +52,80 @@ _NO_RETURN = {"dark": (72, 81, 90), "light": (214, 220, 225)}
 _UNKNOWN = {"dark": (140, 150, 160), "light": (110, 120, 130)}
 
 
-def write_page(shown: Sequence[ScanSet], path: Path) -> None:
-    """Write a page with groups of scans side by side, on one scale of each colour.
+def write_page(sets: Sequence[ScanSet], path: Path) -> None:
+    """Write a page that shows sets of scans side by side, with one scale for each colour.
 
     Args:
-        shown: 1 to 8 groups; the i-th scans of all are shown together.
-        path: of the page; an older one there is replaced, in one step.
+        sets: 1 to 8 sets of scans; the i-th scans of all sets are shown together.
+        path: path of the page; an older page there is replaced in one step.
 
     Raises:
-        ConfigError: no group, or too many.
+        ConfigError: no set, or too many.
         OutputError: the page cannot be written.
     """
-    write_text(path, page(shown))
+    write_text(path, page(sets))
 
 
-def page(shown: Sequence[ScanSet]) -> str:
-    """Return the page as text. Whatever comes from outside, such as names of files, is escaped."""
-    if not 1 <= len(shown) <= SOURCES_AT_MOST:
+def page(sets: Sequence[ScanSet]) -> str:
+    """Return the page as text; names of files and other foreign text are escaped."""
+    if not 1 <= len(sets) <= SOURCES_AT_MOST:
         raise ConfigError(
-            f"{len(shown)} groups of scans side by side", f"1 to {SOURCES_AT_MOST}", "name fewer, or make two pages"
+            f"{len(sets)} sets of scans side by side", f"1 to {SOURCES_AT_MOST}", "name fewer, or make two pages"
         )
     script = opening_script()
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    coarsest_m = max(_far_m(one) for one in shown) / _RANGE_STEPS
+    coarsest_m = max(_far_m(scans) for scans in sets) / _RANGE_STEPS
     precision = f"Ranges are kept here in steps of {1000 * coarsest_m:.1f} mm. Written by lidargrit {__version__}."
     parts = {
-        "title": escape(f"Scans: {', '.join(one.name for one in shown)}"),
+        "title": escape(f"Scans: {', '.join(scans.name for scans in sets)}"),
         "style": style(),
-        "looking": looking("<h1>Scans</h1>", button("bin", "Save .bin") + button("ply", "Save .ply"), precision),
+        "viewer": viewer_html("<h1>Scans</h1>", button("bin", "Save .bin") + button("ply", "Save .ply"), precision),
         "script": script,
         # No other script runs, and nothing is fetched, whatever a file name may hold.
         "script_hash": f"sha256-{digest}",
-        "scans": as_json(shown),
+        "scans": as_json(sets),
     }
     return filled(_read("page.html"), parts)
 
 
 def scripts() -> str:
-    """Return what every page runs that shows scans; it begins to show them when told to by ``new Page``."""
+    """Return the scripts of every page that shows scans; ``new Page`` starts them."""
     return '"use strict";\n' + "\n".join(_read(name) for name in _SCRIPTS) + "\n"
 
 
 def opening_script() -> str:
-    """Return the script of a page that holds its own scans, as the JSON of an element called ``scans``."""
+    """Return the script of a page that holds its scans itself, as JSON in the element ``scans``."""
     return scripts() + _read("open.js")
 
 
-def as_json(shown: Sequence[ScanSet]) -> str:
-    """Return groups of scans as they stand inside a page: no name in them can end their element."""
-    return json.dumps(told(shown)).replace("<", "\\u003c")
+def as_json(sets: Sequence[ScanSet]) -> str:
+    """Return sets of scans as JSON for an element of a page; no name in them can end that element."""
+    return json.dumps(page_data(sets)).replace("<", "\\u003c")
 
 
 def style() -> str:
-    """Return how such a page looks."""
+    """Return the style sheet of such a page."""
     return _read("page.css")
 
 
-def looking(heading: str, buttons: str, note: str) -> str:
-    """Return the elements that the scripts work on: controls, a legend, room for scans, and how to use them.
+def viewer_html(heading: str, buttons: str, note: str) -> str:
+    """Return the elements that the scripts use: controls, a legend, room for scans, and instructions.
 
     Args:
-        heading: before the controls.
-        buttons: of every source.
-        note: at the end of the explanation.
+        heading: HTML before the controls.
+        buttons: HTML of the buttons of each set.
+        note: last sentence of the instructions.
     """
-    return filled(_read("looking.html"), {"heading": heading, "buttons": buttons, "precision": note})
+    return filled(_read("viewer.html"), {"heading": heading, "buttons": buttons, "precision": note})
 
 
 def button(part: str, words: str) -> str:
-    """Return a button of every source, by the name that scripts know it by."""
+    """Return a button of a set of scans; ``part`` is its name in the scripts."""
     return f'<button type="button" data-part="{part}">{escape(words)}</button>'
 
 
 def filled(text: str, parts: dict[str, str]) -> str:
-    """Return a text with parts in the place of their names in double braces."""
+    """Return a template in which each name in double braces is replaced by its part."""
     return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], text)
 
 
@@ -133,17 +133,17 @@ def _read(name: str) -> str:
     return (_FOLDER / name).read_text(encoding="utf-8")
 
 
-def told(shown: Sequence[ScanSet]) -> dict[str, Any]:
-    """Return all that a page needs to know of groups of scans, as plain numbers and words."""
-    labels = [one.label[one.images.return_mask] for one in shown if one.label is not None]
+def page_data(sets: Sequence[ScanSet]) -> dict[str, Any]:
+    """Return all that a page needs to show sets of scans, as JSON values."""
+    labels = [one.label[one.images.return_mask] for one in sets if one.label is not None]
     numbers = sorted({int(number) for label in labels for number in label.unique()})
     if len(numbers) > _CLASSES_AT_MOST:
         raise ConfigError(f"{len(numbers)} classes of labels", f"at most {_CLASSES_AT_MOST}", "show fewer scans")
     named = [(number, *name_and_colour(number)) for number in numbers]
     return {
-        "sources": [_source(one, numbers) for one in shown],
+        "sources": [_source(one, numbers) for one in sets],
         "classes": [{"number": number, "name": name, "colour": colour} for number, name, colour in named],
-        "scales": _scales(shown),
+        "scales": _scales(sets),
         "looks": {
             theme: {
                 "ramps": {mode: _ramp(*of) for mode, of in ramps.items()},
@@ -155,14 +155,14 @@ def told(shown: Sequence[ScanSet]) -> dict[str, Any]:
     }
 
 
-def _source(shown: ScanSet, numbers: list[int]) -> dict[str, Any]:
-    """Return one group: its rays once, and the pixels of every scan."""
-    images = shown.images.to("cpu")
-    step_m = _far_m(shown) / _RANGE_STEPS
+def _source(scan_set: ScanSet, numbers: list[int]) -> dict[str, Any]:
+    """Return one set: its rays once, and the pixels of every scan."""
+    images = scan_set.images.to("cpu")
+    step_m = _far_m(scan_set) / _RANGE_STEPS
     steps = (images.range_m.detach() / step_m).round().clamp(1, _RANGE_STEPS) * images.return_mask
-    reflectance, label = images.reflectance, shown.label
+    reflectance, label = images.reflectance, scan_set.label
     scans: list[dict[str, Any]] = []
-    for index, name in enumerate(shown.scan_names):
+    for index, name in enumerate(scan_set.scan_names):
         scan = {"name": name, "range": _packed(steps[index].numpy().astype("<u2"))}
         if reflectance is not None:
             scan["reflectance"] = _packed((255 * reflectance[index].detach()).round().numpy().astype(np.uint8))
@@ -170,30 +170,30 @@ def _source(shown: ScanSet, numbers: list[int]) -> dict[str, Any]:
             scan["label"] = _packed(np.searchsorted(numbers, label[index].numpy()).astype(np.uint8))
         scans.append(scan)
     return {
-        "name": shown.name,
+        "name": scan_set.name,
         "height": images.sensor.height,
         "width": images.sensor.width,
         "elevation": _packed(images.sensor.elevation_rad.numpy().astype("<f4")),
         "azimuth": _packed(images.sensor.azimuth_rad.numpy().astype("<f4")),
         "rangeStepM": step_m,
-        "endM": min(images.sensor.range_max_m, _far_m(shown)),  # a ray ends where returns do: the rest is empty
+        "endM": min(images.sensor.range_max_m, _far_m(scan_set)),  # a ray ends where returns do: the rest is empty
         "scans": scans,
     }
 
 
-def _far_m(shown: ScanSet) -> float:
-    return max(float(shown.images.range_m.max()), 1.0)
+def _far_m(scan_set: ScanSet) -> float:
+    return max(float(scan_set.images.range_m.max()), 1.0)
 
 
 def _packed(values: np.ndarray) -> str:
     return base64.b64encode(gzip.compress(values.tobytes(), mtime=0)).decode()
 
 
-def _scales(shown: Sequence[ScanSet]) -> dict[str, tuple[float, float]]:
-    """Find ends of the colours that hold all but the outermost returns of all groups."""
-    ranges = np.concatenate([one.images.range_m[one.images.return_mask].detach().cpu().numpy() for one in shown])
+def _scales(sets: Sequence[ScanSet]) -> dict[str, tuple[float, float]]:
+    """Return the two ends of each colour scale, which hold all but the outermost returns of all sets."""
+    ranges = np.concatenate([one.images.range_m[one.images.return_mask].detach().cpu().numpy() for one in sets])
     heights = np.concatenate(
-        [points_of_pixels(one.images)[one.images.return_mask][:, 2].detach().cpu().numpy() for one in shown]
+        [points_of_pixels(one.images)[one.images.return_mask][:, 2].detach().cpu().numpy() for one in sets]
     )
     if not len(ranges):
         ranges, heights = np.array([1.0, 10.0]), np.array([-2.0, 2.0])

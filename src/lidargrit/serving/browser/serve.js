@@ -1,10 +1,10 @@
-// The page that is served: a form whose results appear beside one another.
+// The page of the server: a form whose results appear beside one another.
 
 const PANES_AT_MOST = 4; // more are too small to see anything in
 const ASK_AGAIN_MS = 300;
 const el = (id) => document.getElementById(id);
 
-// A pane whose files are written by the server, as the export writes them.
+// A pane whose files the server writes, by the same code as `lidargrit export`.
 class ServedPane extends Pane {
   constructor(source, page, job, group, scales) {
     super(source, page);
@@ -15,19 +15,19 @@ class ServedPane extends Pane {
     this.part.npz.addEventListener("click", () => this.save("npz"));
     this.part.remove.setAttribute("aria-label", `Remove ${source.name}`);
     this.part.remove.addEventListener("click", () => desk.remove(this));
-    this.place = `/jobs/${job}/${group}`;
+    this.path = `/jobs/${job}/${group}`;
   }
 
   async save(ending) {
     await desk.trying(async () => {
-      const index = this.source.place(this.page.index);
-      const file = await asked(`${this.place}-${index}.${ending}`);
+      const index = this.source.scanIndex(this.page.index);
+      const file = await asked(`${this.path}-${index}.${ending}`);
       save([await file.arrayBuffer()], `${this.source.name}-${this.scan.name}.${ending}`);
     });
   }
 }
 
-// The answer to a request; what is refused is thrown as the words that say why.
+// The answer to a request; a refusal is thrown as an error with the server's words.
 async function asked(path, options) {
   let answer;
   try {
@@ -36,8 +36,8 @@ async function asked(path, options) {
     throw new Error("The server does not answer. Is it still running?");
   }
   if (!answer.ok) {
-    const told = await answer.json().catch(() => ({}));
-    throw new Error(told.error ?? (answer.status === 413 ? "The file is too large." : `The server answered ${answer.status}.`));
+    const data = await answer.json().catch(() => ({}));
+    throw new Error(data.error ?? (answer.status === 413 ? "The file is too large." : `The server answered ${answer.status}.`));
   }
   return answer;
 }
@@ -46,7 +46,7 @@ class Desk {
   constructor({ models, limits }) {
     this.models = models;
     this.limits = limits;
-    el("model").replaceChildren(...models.map((model, place) => new Option(model.name, String(place))));
+    el("model").replaceChildren(...models.map((model, index) => new Option(model.name, String(index))));
     el("count").max = String(limits.scans);
     el("model").addEventListener("change", () => this.offer());
     el("request").addEventListener("submit", (event) => this.submit(event, () => this.generate()));
@@ -58,7 +58,7 @@ class Desk {
     return this.models[Number(el("model").value)];
   }
 
-  // What the chosen model can do, and the numbers that it lets one choose.
+  // Show what the chosen model can do, and the numbers that it lets the user set.
   offer() {
     const { generator, sensor, settings, upload } = this.model;
     el("sensor").textContent = `${generator}; ${sensor}`;
@@ -79,11 +79,11 @@ class Desk {
     el("complete").disabled = Boolean(this.busy) || this.model.upload === "";
   }
 
-  // Only what was changed: the rest is left to the generator.
+  // The settings that the user changed; the generator chooses the others.
   request() {
     const fields = [...el("request").querySelectorAll("[name]")].filter((field) => field.value !== field.defaultValue);
-    const told = fields.filter((field) => field.value !== "").map((field) => [field.name, Number(field.value)]);
-    return { model: Number(el("model").value), seed: Number(el("seed").value), sampling: Object.fromEntries(told) };
+    const data = fields.filter((field) => field.value !== "").map((field) => [field.name, Number(field.value)]);
+    return { model: Number(el("model").value), seed: Number(el("seed").value), sampling: Object.fromEntries(data) };
   }
 
   generate() {
@@ -109,19 +109,19 @@ class Desk {
     await this.trying(async () => {
       const { job } = await (await begin()).json();
       const seconds = await this.waited(job);
-      const told = await (await asked(`/jobs/${job}/scans`)).json();
-      await this.show(told, job, by);
-      el("status").textContent = `Drawn in ${seconds} s.`;
+      const data = await (await asked(`/jobs/${job}/scans`)).json();
+      await this.show(data, job, by);
+      el("status").textContent = `Done in ${seconds} s.`;
     });
     this.busy = false;
     this.enable();
   }
 
-  // Whatever goes wrong is said in one place.
-  async trying(work) {
+  // Every error is shown in one place.
+  async trying(action) {
     el("error").hidden = true;
     try {
-      await work();
+      await action();
     } catch (error) {
       el("status").textContent = "";
       el("error").textContent = error.message;
@@ -138,18 +138,18 @@ class Desk {
       if (state === "failed") {
         throw new Error(error);
       }
-      el("status").textContent = state === "waiting" ? `Waiting; before you: ${before}` : `Drawing, ${Math.round(seconds)} s`;
+      el("status").textContent = state === "waiting" ? `Waiting; requests before yours: ${before}` : `Computing, ${Math.round(seconds)} s`;
       await new Promise((done) => setTimeout(done, seconds < 5 ? ASK_AGAIN_MS : 4 * ASK_AGAIN_MS));
     }
   }
 
-  async show(told, job, by) {
+  async show(data, job, by) {
     el("empty").hidden = true;
-    el("looking").hidden = false;
-    this.page ??= new Page({ ...told, sources: [] });
-    const fresh = told.sources.map((source, group) => {
+    el("viewer").hidden = false;
+    this.page ??= new Page({ ...data, sources: [] });
+    const fresh = data.sources.map((source, group) => {
       const name = { generated: by, completed: `completed by ${by}`, reconstructed: `reconstructed by ${by}` }[source.name];
-      return new ServedPane(new Source({ ...source, name: name ?? source.name }), this.page, job, group, told.scales);
+      return new ServedPane(new Source({ ...source, name: name ?? source.name }), this.page, job, group, data.scales);
     });
     await this.arrange([...this.page.panes, ...fresh].slice(-Math.max(PANES_AT_MOST, fresh.length)));
   }
@@ -158,16 +158,16 @@ class Desk {
     await this.arrange(this.page.panes.filter((one) => one !== pane));
   }
 
-  // One scale of each colour for all that is shown, wide enough for everything.
+  // One scale of each colour for all panes, wide enough for every scan.
   async arrange(panes) {
     this.page.arrange(panes);
     if (panes.length === 0) {
-      [el("empty").hidden, el("looking").hidden] = [false, true];
+      [el("empty").hidden, el("viewer").hidden] = [false, true];
       return;
     }
     for (const mode of Object.keys(panes[0].scales)) {
       const ends = panes.map((pane) => pane.scales[mode]);
-      this.page.told.scales[mode] = [Math.min(...ends.map((end) => end[0])), Math.max(...ends.map((end) => end[1]))];
+      this.page.data.scales[mode] = [Math.min(...ends.map((end) => end[0])), Math.max(...ends.map((end) => end[1]))];
     }
     await this.page.go(this.page.index);
   }
@@ -190,8 +190,8 @@ function fieldOf(setting) {
 let desk = null;
 asked("/models")
   .then((answer) => answer.json())
-  .then((told) => {
-    desk = new Desk(told);
+  .then((data) => {
+    desk = new Desk(data);
   })
   .catch((error) => {
     el("error").textContent = error.message;

@@ -66,7 +66,7 @@ function onScreen(matrix, points, pixel, width, height) {
   return [((across + 1) / 2) * width, ((1 - up) / 2) * height, far];
 }
 
-// The point nearest to a place on the screen, of two that are as near the one in front; -1 if none is near.
+// The point nearest to a point on the screen, of two that are as near the one in front; -1 if none is near.
 function pick(matrix, points, withDropped, width, height, left, top) {
   const reachPx = 12; // about half a fingertip
   let [best, chosen] = [reachPx * reachPx, -1];

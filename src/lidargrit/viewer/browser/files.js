@@ -14,11 +14,11 @@ function returnsOf(source, scan) {
 function binFile(source, scan, points) {
   const pixels = returnsOf(source, scan);
   const rows = new DataView(new ArrayBuffer(16 * pixels.length));
-  pixels.forEach((pixel, place) => {
+  pixels.forEach((pixel, row) => {
     for (let axis = 0; axis < 3; axis++) {
-      rows.setFloat32(16 * place + 4 * axis, points[4 * pixel + axis], true);
+      rows.setFloat32(16 * row + 4 * axis, points[4 * pixel + axis], true);
     }
-    rows.setFloat32(16 * place + 12, scan.reflectance ? scan.reflectance[pixel] / 255 : 0, true);
+    rows.setFloat32(16 * row + 12, scan.reflectance ? scan.reflectance[pixel] / 255 : 0, true);
   });
   return [rows];
 }
@@ -40,17 +40,17 @@ function plyFile(source, scan, points, classes) {
   ];
   const rows = new DataView(new ArrayBuffer(rowBytes * pixels.length));
   pixels.forEach((pixel, row) => {
-    let place = rowBytes * row;
-    for (let axis = 0; axis < 3; axis++, place += 4) {
-      rows.setFloat32(place, points[4 * pixel + axis], true);
+    let offset = rowBytes * row;
+    for (let axis = 0; axis < 3; axis++, offset += 4) {
+      rows.setFloat32(offset, points[4 * pixel + axis], true);
     }
     if (scan.reflectance) {
-      rows.setFloat32(place, scan.reflectance[pixel] / 255, true);
-      place += 4;
+      rows.setFloat32(offset, scan.reflectance[pixel] / 255, true);
+      offset += 4;
     }
-    rows.setUint16(place, Math.floor(pixel / source.width), true);
+    rows.setUint16(offset, Math.floor(pixel / source.width), true);
     if (scan.label) {
-      rows.setUint32(place + 2, classes[scan.label[pixel]].number, true);
+      rows.setUint32(offset + 2, classes[scan.label[pixel]].number, true);
     }
   });
   return [lines.join("\n"), rows];

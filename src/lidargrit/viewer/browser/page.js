@@ -1,12 +1,12 @@
 // The whole page: controls, keys, and the panes that follow them.
 
 class Page {
-  constructor(told) {
-    this.told = told;
-    this.classes = told.classes;
+  constructor(data) {
+    this.data = data;
+    this.classes = data.classes;
     this.camera = new Camera();
     this.control = Object.fromEntries(
-      ["previous", "next", "place", "counter", "mode", "dropped", "size", "reset", "legend"].map((id) => [
+      ["previous", "next", "position", "counter", "mode", "dropped", "size", "reset", "legend"].map((id) => [
         id,
         document.getElementById(id),
       ]),
@@ -16,7 +16,7 @@ class Page {
     this.dark = window.matchMedia("(prefers-color-scheme: dark)");
     this.area = document.getElementById("panes");
     document.getElementById("slow").hidden = hasGraphicsCard();
-    this.arrange(told.sources.map((source) => new Pane(new Source(source), this)));
+    this.arrange(data.sources.map((source) => new Pane(new Source(source), this)));
     this.listen();
   }
 
@@ -40,21 +40,21 @@ class Page {
 
   // Only what some scan has.
   offerModes() {
-    const has = (name) => this.panes.some((pane) => pane.source.told.scans.some((scan) => scan[name]));
+    const has = (name) => this.panes.some((pane) => pane.source.data.scans.some((scan) => scan[name]));
     for (const name of ["reflectance", "label"]) {
       this.control.mode.querySelector(`[value=${name}]`).disabled = !has(name);
     }
-    this.control.place.max = String(this.count);
-    for (const name of ["previous", "next", "place"]) {
+    this.control.position.max = String(this.count);
+    for (const name of ["previous", "next", "position"]) {
       this.control[name].disabled = this.count < 2;
     }
   }
 
   listen() {
-    const { previous, next, place, mode, dropped, size, reset } = this.control;
+    const { previous, next, position, mode, dropped, size, reset } = this.control;
     previous.addEventListener("click", () => this.step(-1));
     next.addEventListener("click", () => this.step(1));
-    place.addEventListener("input", () => this.go(Number(place.value) - 1));
+    position.addEventListener("input", () => this.go(Number(position.value) - 1));
     mode.addEventListener("change", () => this.paint());
     dropped.addEventListener("change", () => this.redraw());
     size.addEventListener("input", () => this.redraw());
@@ -98,7 +98,7 @@ class Page {
 
   async go(index) {
     this.index = index;
-    this.control.place.value = String(index + 1);
+    this.control.position.value = String(index + 1);
     this.control.counter.textContent = `Scan ${index + 1} of ${this.count}`;
     this.area.setAttribute("aria-busy", "true"); // until all pictures are of this scan
     try {
@@ -117,9 +117,9 @@ class Page {
   look() {
     const theme = this.dark.matches ? "dark" : "light";
     return {
-      ...this.told.looks[theme],
+      ...this.data.looks[theme],
       classes: this.classes,
-      scales: this.told.scales,
+      scales: this.data.scales,
       mode: this.control.mode.value,
     };
   }

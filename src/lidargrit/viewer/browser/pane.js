@@ -92,11 +92,11 @@ class Pane {
     this.scan = scan;
     this.points = pointsOf(this.source, this.scan);
     this.fresh = true; // points and colours are drawn together, once all panes have theirs
-    const place = this.source.place(index) + 1;
+    const number = this.source.scanIndex(index) + 1;
     const share = Math.round((100 * this.scan.returns) / this.source.size);
     const returns = this.scan.returns.toLocaleString("en");
     this.part.about.textContent =
-      `${this.scan.name} (${place} of ${this.source.count}): ${returns} points, from ${share} % of rays`;
+      `${this.scan.name} (${number} of ${this.source.count}): ${returns} points, from ${share} % of rays`;
   }
 
   paint(look) {
@@ -121,7 +121,7 @@ class Pane {
       [cloud.width, cloud.height] = [width, height];
     }
     this.drawer.draw(this.page.camera.matrix(width / height), this.page.pointSize * dense, this.page.withDropped);
-    this.placeMarks();
+    this.moveMarks();
   }
 
   close() {
@@ -135,11 +135,11 @@ class Pane {
       return; // nothing is shown yet
     }
     this.marked = pixel;
-    this.placeMarks();
-    this.part.told.textContent = pixel < 0 ? "" : this.tell(pixel);
+    this.moveMarks();
+    this.part.readout.textContent = pixel < 0 ? "" : this.describe(pixel);
   }
 
-  placeMarks() {
+  moveMarks() {
     const { cloud, image, cloudMark, imageMark } = this.part;
     const pixel = this.marked ?? -1;
     const matrix = this.page.camera.matrix(cloud.clientWidth / cloud.clientHeight);
@@ -157,8 +157,8 @@ class Pane {
     }
   }
 
-  // The place comes last: it is what may be cut off where panes are narrow.
-  tell(pixel) {
+  // The position comes last: it is what may be cut off where panes are narrow.
+  describe(pixel) {
     const { source, scan } = this;
     const facts = scan.label && scan.steps[pixel] ? [this.page.classes[scan.label[pixel]].name] : [];
     if (scan.steps[pixel] === 0) {

@@ -50,7 +50,7 @@ class WebglPoints {
     gl.useProgram(this.program);
     gl.enable(gl.DEPTH_TEST);
     this.buffers = { point: gl.createBuffer(), colour: gl.createBuffer() };
-    this.places = Object.fromEntries(
+    this.locations = Object.fromEntries(
       ["camera", "size", "dropped"].map((name) => [name, gl.getUniformLocation(this.program, name)]),
     );
   }
@@ -67,11 +67,11 @@ class WebglPoints {
 
   fill(name, values, type, scaled) {
     const gl = this.gl;
-    const place = gl.getAttribLocation(this.program, name);
+    const location = gl.getAttribLocation(this.program, name);
     gl.bindBuffer(gl.ARRAY_BUFFER, this.buffers[name]);
     gl.bufferData(gl.ARRAY_BUFFER, values, gl.STATIC_DRAW);
-    gl.enableVertexAttribArray(place);
-    gl.vertexAttribPointer(place, 4, type, scaled, 0, 0);
+    gl.enableVertexAttribArray(location);
+    gl.vertexAttribPointer(location, 4, type, scaled, 0, 0);
   }
 
   draw(matrix, sizePx, withDropped) {
@@ -79,9 +79,9 @@ class WebglPoints {
     gl.viewport(0, 0, this.canvas.width, this.canvas.height);
     gl.clearColor(0, 0, 0, 0); // the page's own background shows through
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    gl.uniformMatrix4fv(this.places.camera, false, matrix);
-    gl.uniform1f(this.places.size, sizePx);
-    gl.uniform1f(this.places.dropped, withDropped ? 1 : 0);
+    gl.uniformMatrix4fv(this.locations.camera, false, matrix);
+    gl.uniform1f(this.locations.size, sizePx);
+    gl.uniform1f(this.locations.dropped, withDropped ? 1 : 0);
     gl.drawArrays(gl.POINTS, 0, this.points.length / 4);
   }
 

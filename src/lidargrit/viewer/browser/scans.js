@@ -2,50 +2,50 @@
 
 // One set of scans that share their rays.
 class Source {
-  constructor(told) {
-    this.name = told.name;
-    this.height = told.height;
-    this.width = told.width;
-    this.size = told.height * told.width;
-    this.rangeStepM = told.rangeStepM;
-    this.endM = told.endM;
-    this.told = told;
+  constructor(data) {
+    this.name = data.name;
+    this.height = data.height;
+    this.width = data.width;
+    this.size = data.height * data.width;
+    this.rangeStepM = data.rangeStepM;
+    this.endM = data.endM;
+    this.data = data;
     this.unpacked = new Map();
   }
 
   get count() {
-    return this.told.scans.length;
+    return this.data.scans.length;
   }
 
   // A set with fewer scans than the longest stays at its last one.
-  place(index) {
+  scanIndex(index) {
     return Math.min(index, this.count - 1);
   }
 
   async scan(index) {
-    const place = this.place(index);
+    const own = this.scanIndex(index);
     if (!this.rays) {
       this.rays = await unpackRays(this);
     }
-    if (!this.unpacked.has(place)) {
-      this.unpacked.set(place, await unpackScan(this, this.told.scans[place]));
+    if (!this.unpacked.has(own)) {
+      this.unpacked.set(own, await unpackScan(this, this.data.scans[own]));
     }
-    return this.unpacked.get(place);
+    return this.unpacked.get(own);
   }
 }
 
-async function unpackScan(source, told) {
-  const steps = new Uint16Array(await unpack(told.range));
+async function unpackScan(source, data) {
+  const steps = new Uint16Array(await unpack(data.range));
   let returns = 0;
   for (const step of steps) {
     returns += step > 0;
   }
   return {
-    name: told.name,
+    name: data.name,
     steps,
     returns,
-    reflectance: told.reflectance && new Uint8Array(await unpack(told.reflectance)),
-    label: told.label && new Uint8Array(await unpack(told.label)),
+    reflectance: data.reflectance && new Uint8Array(await unpack(data.reflectance)),
+    label: data.label && new Uint8Array(await unpack(data.label)),
   };
 }
 
@@ -58,8 +58,8 @@ async function unpack(text) {
 
 // The unit vector of every pixel's ray: x forward, y left, z up.
 async function unpackRays(source) {
-  const elevation = new Float32Array(await unpack(source.told.elevation));
-  const azimuth = new Float32Array(await unpack(source.told.azimuth));
+  const elevation = new Float32Array(await unpack(source.data.elevation));
+  const azimuth = new Float32Array(await unpack(source.data.azimuth));
   const rays = new Float32Array(3 * source.size);
   for (let pixel = 0; pixel < source.size; pixel++) {
     const row = Math.floor(pixel / source.width);
@@ -90,8 +90,8 @@ function pointsOf(source, scan) {
   return points;
 }
 
-// What can be shown by colour: the place of a pixel on the ramp, 0 to 1.
-const PLACES = {
+// What can be shown by colour: the position of a pixel on the ramp, 0 to 1.
+const POSITIONS = {
   range: (source, scan, points, [near, far]) => (pixel) =>
     Math.log(rangeM(source, scan, pixel) / near) / Math.log(far / near),
   height: (source, scan, points, [low, high]) => (pixel) => (points[4 * pixel + 2] - low) / (high - low),
@@ -103,14 +103,14 @@ const PLACES = {
 function coloursOf(source, scan, points, look) {
   const colours = new Uint8ClampedArray(4 * source.size).fill(255);
   const ramp = look.ramps[look.mode];
-  const place = look.mode === "label" ? null : PLACES[look.mode](source, scan, points, look.scales[look.mode]);
+  const position = look.mode === "label" ? null : POSITIONS[look.mode](source, scan, points, look.scales[look.mode]);
   const classOf = look.mode === "label" && scan.label && ((pixel) => look.classes[scan.label[pixel]].colour);
   for (let pixel = 0; pixel < source.size; pixel++) {
     let colour = look.unknown;
     if (scan.steps[pixel] === 0) {
       colour = look.noReturn;
-    } else if (place) {
-      const step = Math.round(Math.min(1, Math.max(0, place(pixel))) * (ramp.length - 1));
+    } else if (position) {
+      const step = Math.round(Math.min(1, Math.max(0, position(pixel))) * (ramp.length - 1));
       colour = ramp[step];
     } else if (classOf) {
       colour = classOf(pixel);
