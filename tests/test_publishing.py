@@ -1,8 +1,13 @@
 """A run → a folder that can be shared: the hub's file names, a card that keeps to the facts, no path of the user's."""
 
+import errno
 import json
+import os
+import re
 import shutil
 import sys
+from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -94,7 +99,7 @@ def test_the_card_tells_the_facts(run, tmp_path):
         "| tokenizer | 4 | 4 | 0.0015 |",
         "| transformer | 8 | 8 | 0.001 |",
         f"lidargrit {lidargrit.__version__}, commit ",
-        "By the protocol `exact`, against 2 of kitti_odometry 00.",
+        "By the protocol `exact`, against 2 scans of kitti_odometry 00.",
         "Generator.from_pretrained(",
     ):
         assert fact in body, fact
@@ -115,7 +120,7 @@ def test_scores_of_other_weights_and_taken_folders_are_refused(run, tmp_path, ca
         told = error(run, tmp_path / "new", "--scores", run.parent / "scores.json")
     finally:
         samples.write_text(before)
-    assert "which were not drawn from" in told
+    assert "which were not sampled from" in told
     assert "then rounded" in error(run, tmp_path / "new", "--half", "--scores", run.parent / "scores.json")
     assert not (tmp_path / "new").exists()
     (tmp_path / "taken").mkdir()
@@ -130,9 +135,74 @@ def test_scores_of_other_weights_and_taken_folders_are_refused(run, tmp_path, ca
     assert not (tmp_path / "new").exists()
 
 
-def marginal():
-    recipe = lidargrit.load_sensor("hdl64e_kitti_odometry").with_columns(32)
-    return Marginal(Marginal.Config(bins=8), recipe)
+@pytest.mark.parametrize("written", [1, 2, 3, 4])
+def test_a_command_that_was_killed_goes_on(run, tmp_path, written, monkeypatch, capsys):
+    """Stop before the second, third, ... file, as a kill or a full disk does."""
+    rename, whole, folder = os.replace, tmp_path / "whole", tmp_path / "killed"
+    assert main(["publish", str(run), str(whole)]) == 0
+    count = iter(range(9))
+
+    def until_full(self, target):
+        if next(count) >= written:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        rename(self, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", until_full)
+        assert main(["publish", str(run), str(folder)]) == 2
+    assert "No space left on device" in capsys.readouterr().err
+    assert len(contents(folder)) == written
+    assert main(["publish", str(run), str(folder)]) == 0
+    assert contents(folder) == contents(whole)
+    capsys.readouterr()
+    (folder / "README.md").write_text("my own words")
+    assert main(["publish", str(run), str(folder)]) == 2, "a finished folder, whose card may have been edited"
+    assert "which is not empty" in the_one_line(capsys.readouterr().err, "publish")
+    assert (folder / "README.md").read_text() == "my own words"
+
+
+def test_a_folder_begun_for_another_run_is_refused(run, tmp_path, capsys):
+    assert main(["publish", str(run), str(tmp_path / "public")]) == 0
+    (tmp_path / "public" / "README.md").unlink()
+    about = json.loads((tmp_path / "public" / "run.json").read_text())
+    (tmp_path / "public" / "run.json").write_text(json.dumps({**about, "commit": "another"}))
+    assert main(["publish", str(run), str(tmp_path / "public")]) == 2
+    assert "which is not empty" in capsys.readouterr().err
+
+
+def test_notes_without_end_are_refused(run, tmp_path, capsys):
+    assert main(["publish", str(run), str(tmp_path / "public"), "--notes", "/dev/zero"]) == 2
+    assert "/dev/zero" in the_one_line(capsys.readouterr().err, "publish")
+    assert not (tmp_path / "public").exists()
+
+
+def test_no_source_of_a_run_is_searched(monkeypatch):
+    """A run's own words about its data may name anything, such as the root of the disk."""
+    monkeypatch.setattr("lidargrit.datasets._files.scans_below", lambda root: pytest.fail(f"searches {root}"))
+    monkeypatch.setattr("lidargrit.datasets.folder.scans_below", lambda root: pytest.fail(f"searches {root}"))
+    for source in ("/", "/::all", str(Path.home()), "."):
+        assert data_set_of(source)[0] == ""
+
+
+def marginal(sensor="hdl64e_kitti_odometry"):
+    rays = replace(lidargrit.load_sensor("hdl64e_kitti_odometry").with_columns(32), name=sensor)
+    return Marginal(Marginal.Config(bins=8), rays)
+
+
+def test_foreign_words_are_neither_html_nor_links_nor_tables():
+    name = "a<img src=x onerror=alert(1)>\n# b `c` [d](http://e) | f"
+    about = {
+        "files": [{"name": name, "sha256": name}],
+        "recipe": {"title": name, "seed": name, "data": {"train": [f"simulated:5:{name}"]}},
+        "torch": name,
+    }
+    for facts in (about, {**about, "files": []}):
+        body = head_of(model_card(marginal(name), facts, Provenance()))[1]
+        outside_code = re.sub(r"`[^`\n]*`", "", body.replace("\\`", ""))
+        assert "<img" not in outside_code
+        assert "\n# b" not in body
+        assert "[d](" not in outside_code
+        assert "| f" not in outside_code
 
 
 @pytest.mark.parametrize(
@@ -159,7 +229,7 @@ def test_the_licence_is_what_the_data_demand(sources, licence):
 def test_a_card_of_which_nothing_is_known_claims_nothing():
     head, body = head_of(model_card(marginal(), {}, Provenance()))
     assert "license" not in head
-    for line in ("Not told by the run.", "What the data demand is not known", "None were given with this model."):
+    for line in ("does not say which scans", "does not say which terms", "No scores were published with this model."):
         assert line in body
 
 
@@ -171,8 +241,8 @@ def test_a_card_of_imported_weights_names_their_files_and_their_authors_rights()
     }
     body = head_of(model_card(marginal(), about, Provenance()))[1]
     assert f"- `vq.pth`, SHA-256 `{'ab' * 32}`" in body
-    assert "Not by lidargrit" in body
-    assert "The weights are their authors'" in body
+    assert "were not trained by lidargrit" in body
+    assert "The weights belong to their authors" in body
     assert "scans seen" not in body
 
 

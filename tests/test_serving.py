@@ -234,7 +234,7 @@ def test_a_scan_that_is_uploaded_is_completed(opened, scan_file):
     assert len(names(opened)) == 4
     fill(opened, "#model", "1")
     assert opened.run("document.querySelector('#complete').disabled")
-    assert "can neither complete" in opened.run("document.querySelector('#unable').textContent")
+    assert "can neither complete" in opened.run("document.querySelector('#ability').textContent")
     assert opened.troubles() == []
 
 
@@ -248,7 +248,7 @@ def test_a_bad_file_is_told_in_one_line(opened, tmp_path):
         choose_file(opened, tmp_path / name)
         opened.click("#complete")
         finish(opened)
-        assert why in said(opened)
+        assert why in said(opened), name
         assert "/" not in said(opened).replace("/complete", ""), "no place on the server's disk"
     assert opened.run("document.querySelector('#error').getAttribute('role')") == "alert"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,8 +13,17 @@ import torch
 from lidargrit import __version__, configuration
 from lidargrit.errors import CheckpointError, ConfigError, OutputError
 from lidargrit.evaluation.scorecard import Scorecard
-from lidargrit.files import is_taken, read_json, write_json
-from lidargrit.generators import RUN_FILE, TRAINED_ON_FILE, WEIGHTS_FILE, Generator, load, load_class, locate
+from lidargrit.files import claim_folder, is_taken, read_json, write_json
+from lidargrit.generators import (
+    CARD_FILE,
+    RUN_FILE,
+    TRAINED_ON_FILE,
+    WEIGHTS_FILE,
+    Generator,
+    load,
+    load_class,
+    locate,
+)
 from lidargrit.publishing.card import data_set_of, model_card
 from lidargrit.recipes import load_recipe
 from lidargrit.sources.samples import MANIFEST, is_sample_folder, trained_on
@@ -23,13 +33,13 @@ def import_weights(recipe: str, folder: Path, files: Sequence[Path], settings: S
     """Make a run folder of the weights that a system's authors published, or that their program saved.
 
     Args:
-        recipe: says which generator, of which sizes, and the sensor; nothing is trained.
-        folder: gets ``run.json``, ``model.safetensors`` and ``config.json``, as after training.
-        files: of ``torch.save``, in the order of the generator's ``published_files``; code in them is not run.
-        settings: of the recipe, changed as in ``data.projection_variant=reference``.
+        recipe: name of the recipe, which names the generator, its sizes and the sensor; nothing is trained.
+        folder: folder that gets ``run.json``, ``model.safetensors`` and ``config.json``, as after training.
+        files: files of ``torch.save``, in the order of the generator's ``published_files``; code in them is not run.
+        settings: changed settings of the recipe, such as ``data.projection_variant=reference``.
 
     Raises:
-        ConfigError: as many files as the generator's weights do not come in.
+        ConfigError: another number of files than the generator's published weights consist of.
         CheckpointError: a file that holds something else, or weights of other sizes; names the first.
         OutputError: the folder holds something else.
     """
@@ -56,33 +66,36 @@ def import_weights(recipe: str, folder: Path, files: Sequence[Path], settings: S
 
 
 def publish(run: Path, folder: Path, scores: Path | None = None, notes: str = "", half: bool = False) -> str:
-    """Write what of a run others need, and nothing of where its user keeps things; nothing is uploaded.
+    """Write the files of a run that others need into a folder, without the user's own paths; nothing is uploaded.
+
+    A command that was killed, or that met a full disk, goes on where the same run is published again.
 
     Args:
         run: folder of a finished run.
-        folder: gets ``model.safetensors``, ``config.json``, a model card (``README.md``), and the run's recipe and what
-            it learned from, without folders and file names. It is a run folder again: all that reads runs reads it.
-        scores: of the run's samples, as ``lidargrit evaluate --json`` wrote them.
+        folder: folder that gets ``model.safetensors``, ``config.json``, the run's recipe and training recordings
+            without paths and file names, and last a model card (``README.md``). Like the run itself, it is read
+            wherever a run is wanted.
+        scores: scores of the run's samples, as ``lidargrit evaluate --json`` wrote them.
         notes: Markdown for the end of the card: what the model is good for, and where it fails.
-        half: round parameters to 16 bits.
+        half: whether parameters are rounded to 16 bits.
 
     Returns:
-        the card.
+        Text of the card.
 
     Raises:
         CheckpointError: no finished run.
-        ConfigError: scores of samples of other weights, or weights beyond 16 bits.
-        OutputError: the folder is not empty.
+        ConfigError: scores of samples of other weights, or weights that do not fit into 16 bits.
+        OutputError: the folder holds something else, or a finished card.
     """
     run = locate(run)
     generator = load(run)
-    if is_taken(folder):
-        raise OutputError(f"{folder}, which is not empty", "an empty folder", "choose another one")
+    if (folder / CARD_FILE).exists() or not folder.is_dir():
+        _refuse_taken(folder, None)  # soon, before much is read
     about: Any = read_json(run / RUN_FILE) if (run / RUN_FILE).is_file() else {}
-    scored = Scorecard.read(scores) if scores else None
+    card_scores = Scorecard.read(scores) if scores else None
     whole, written = generator.state_dict(), generator.weights(half)
-    if scored:
-        _check_scores(scored, run)
+    if card_scores:
+        _check_scores(card_scores, run)
         if any(not torch.equal(weight, written[name].to(weight.dtype)) for name, weight in whole.items()):
             raise ConfigError(
                 "scores of weights that are then rounded",
@@ -91,23 +104,34 @@ def publish(run: Path, folder: Path, scores: Path | None = None, notes: str = ""
             )
     learned = trained_on(run)
     try:
-        card, public = model_card(generator, about, learned, scored, half), _without_places(about, generator)
+        card, public = model_card(generator, about, learned, card_scores, half), _public_facts(about, generator)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise CheckpointError(
             f"{run / RUN_FILE}, which cannot be used ({error!r})", "what lidargrit wrote", "restore the file"
         ) from None
     card = "\n".join(filter(None, [card, notes.strip() and notes.strip() + "\n"]))
-    write_json(folder / RUN_FILE, public)
-    if learned.recordings or learned.fingerprints:
-        # A recording that has no name of its own goes by its folder, which is the user's.
-        drives = [recording for recording in learned.recordings if not recording.startswith("#")]
-        write_json(folder / TRAINED_ON_FILE, {"recordings": drives, "fingerprints": list(learned.fingerprints)})
-    generator.save_pretrained(folder, card, half)
+    with claim_folder(folder):
+        _refuse_taken(folder, public)
+        write_json(folder / RUN_FILE, public)
+        if learned.recordings or learned.fingerprints:
+            # A recording that has no name of its own is named by its folder, which is the user's.
+            drives = [recording for recording in learned.recordings if not recording.startswith("#")]
+            write_json(folder / TRAINED_ON_FILE, {"recordings": drives, "fingerprints": list(learned.fingerprints)})
+        generator.save_pretrained(folder, card, half)  # the card last: it says that the folder is finished
     return card
 
 
-def _without_places(about: dict[str, Any], generator: Generator) -> dict[str, Any]:
-    """Return what a run says of itself without the command, and with data sets and splits in place of sources."""
+def _refuse_taken(folder: Path, begun: dict[str, Any] | None) -> None:
+    """Raise OutputError unless a folder is empty, or holds these facts of a run and no card yet."""
+    if not is_taken(folder):
+        return
+    unfinished = folder.is_dir() and not (folder / CARD_FILE).exists() and (folder / RUN_FILE).is_file()
+    if begun is None or not unfinished or read_json(folder / RUN_FILE) != json.loads(json.dumps(begun)):
+        raise OutputError(f"{folder}, which is not empty", "an empty folder", "choose another one")
+
+
+def _public_facts(about: dict[str, Any], generator: Generator) -> dict[str, Any]:
+    """Return the facts of ``run.json`` without the command, and with data sets and splits in place of sources."""
     recipe = about.get("recipe", {})
     data = recipe.get("data", {})
     sources = {part: ["::".join(data_set_of(source)) for source in data.get(part, ())] for part in ("train", "val")}
@@ -117,14 +141,14 @@ def _without_places(about: dict[str, Any], generator: Generator) -> dict[str, An
 
 
 def _check_scores(scores: Scorecard, run: Path) -> None:
-    """Refuse scores of other weights, where their samples are still there to tell."""
+    """Raise ConfigError if the scores are of other weights, as far as their samples are still there to tell."""
     samples = Path(scores.samples.source)
     if not is_sample_folder(samples):
         return
     theirs = read_json(samples / MANIFEST)
     if not isinstance(theirs, dict) or theirs.get("weights_sha256") != _sha256(run / WEIGHTS_FILE):
         raise ConfigError(
-            f"scores of {samples}, which were not drawn from {run}", "scores of this run's samples", "evaluate those"
+            f"scores of {samples}, which were not sampled from {run}", "scores of this run's samples", "evaluate those"
         )
 
 

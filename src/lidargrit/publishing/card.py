@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import re
 from collections.abc import Iterable
@@ -10,7 +11,7 @@ from typing import Any
 from lidargrit import _discovery
 from lidargrit.datasets import load as load_dataset
 from lidargrit.datasets import without_place
-from lidargrit.errors import LidarGritError
+from lidargrit.errors import LidarGritError, one_line
 from lidargrit.evaluation.scorecard import Scorecard, format_value
 from lidargrit.generators import Generator, recipe_settings
 from lidargrit.loading import Provenance
@@ -19,7 +20,7 @@ from lidargrit.loading.prepared import PreparedFolder, is_prepared
 _PIPELINE = "unconditional-image-generation"  # of the hub's tasks the nearest; it has none for scans
 _CREATIVE_COMMONS = re.compile(r"CC ([A-Z-]+) (\d\.\d) \([a-z-]+\)")  # without terms beside it
 _FREE = load_dataset("simulated").licence
-_PLACE = re.compile(r"(?<![\w.])(?:~|[A-Za-z]:)?[/\\][^\s,;:)']*")
+_PATH = re.compile(r"(?<![\w.])(?:~|[A-Za-z]:)?[/\\][^\s,;:)']*")
 
 
 def model_card(
@@ -29,13 +30,13 @@ def model_card(
     scores: Scorecard | None = None,
     half: bool = False,
 ) -> str:
-    """Write the card of a model, from what its run folder tells and nothing else.
+    """Return the card of a model, made from the facts in its run folder alone.
 
     Args:
         generator: the model.
-        about: its ``run.json``; empty if that is not there.
-        learned: from which recordings and pixels.
-        scores: of its samples.
+        about: content of its ``run.json``; empty if there is no such file.
+        learned: recordings and images that it was trained on.
+        scores: scores of its samples, if there are any.
         half: whether its parameters are rounded to 16 bits.
 
     Source:
@@ -56,14 +57,14 @@ def model_card(
         _data(about, learned),
         _licence(about, licences),
         _training(about),
-        *([_scores(scores)] if scores else ["## Scores\n\nNone were given with this model."]),
+        *([_scores(scores)] if scores else ["## Scores\n\nNo scores were published with this model."]),
     ]
     return "\n\n".join(parts) + "\n"
 
 
 def data_set_of(source: str) -> tuple[str, str]:
     """Return the data set and the split of a source; of prepared scans, those that they were prepared from."""
-    if "://" in source:  # where it lies is nobody's business, and asking there may take long
+    if "://" in source:  # an address stays out of the card, and a request to it may take long
         return "", ""
     try:
         return without_place(PreparedFolder(source).read_spec().source if is_prepared(source) else source)
@@ -75,12 +76,12 @@ def _what(generator: Generator, half: bool) -> str:
     sensor, name = generator.sensor, generator.public_name()
     weights = sum(weight.numel() for weight in generator.parameters())
     return (
-        f"# {name} for {sensor.name}\n\n"
+        f"# {name} for {_text(sensor.name)}\n\n"
         f"{_discovery.summary('generators', name)}\n\n"
-        f"It writes range images of {sensor.height}x{sensor.width} pixels, {sensor.range_min_m:g} to "
-        f"{sensor.range_max_m:g} m, in the rays of the sensor `{sensor.name}`, and has {weights:,} parameters"
-        f"{', rounded to 16 bits' if half else ''}.\n"
-        "It is read by the Python package `lidargrit`; `config.json` holds its sizes and rays."
+        f"This model generates LiDAR scans as range images of {sensor.height}x{sensor.width} pixels, "
+        f"{sensor.range_min_m:g} to {sensor.range_max_m:g} m, along the rays of the sensor {_code(sensor.name)}.\n"
+        f"It has {weights:,} parameters{', rounded to 16 bits' if half else ''}.\n"
+        "The Python package `lidargrit` reads it; `config.json` holds its sizes and the rays of the sensor."
     )
 
 
@@ -105,72 +106,82 @@ points_xyz_m = unproject(scans[0]).points_xyz_m
 def _data(about: dict[str, Any], learned: Provenance) -> str:
     data = about.get("recipe", {}).get("data", {})
     if not data:
-        return "## Data\n\nNot told by the run."
+        return "## Data\n\nThe run does not say which scans the model was trained on."
     lines = ["## Data", ""]
     if _imported(about):
-        lines += ["The model's authors trained it; what they learned from is theirs to tell. The recipe names:", ""]
+        lines += ["The model's authors trained it and know its training scans. The recipe names these data sets:", ""]
     lines += ["| part | data set | split | licence |", "|---|---|---|---|"]
     leaks: list[str] = []
     for part in ("train", "val"):
         for name, split in map(data_set_of, data.get(part, ())):
             licence = load_dataset(name).licence if name else "not known"
-            lines.append(f"| {part} | {name or 'unnamed scans'} | {split or '-'} | {licence} |")
+            lines.append(f"| {part} | {name or 'unnamed scans'} | {_text(split) or '-'} | {licence} |")
             leaks += _leaks(name, split)
     lines += ["", *dict.fromkeys(leaks)]
     if variant := recipe_settings(about).get("data.projection_variant"):
-        lines.append(f"Scans are to become images by the `{variant}` projection, as those it learned from.")
+        lines.append(f"The training scans were projected by the {_code(variant)} variant; project others by the same.")
     if learned.fingerprints:
-        lines.append(f"It learned from {len(learned.fingerprints):,} different images.")
+        lines.append(f"The model was trained on {len(learned.fingerprints):,} different images.")
     return "\n".join(lines)
 
 
 def _leaks(name: str, split: str) -> list[str]:
-    """Tell what a published split's parts share."""
+    """Return a sentence for each published split in which the parts share scans or streets."""
     part = split.partition("[")[0]
     found = []
     for number, (scheme, of) in enumerate(load_dataset(name).schemes.items() if name else ()):
         if part in {f"{scheme}/{each}" for each in of.parts} | (set(of.parts) if number == 0 else set()):
-            found.append(f"Splits of {name} are those of {of.source}. What they share: {of.leak}")
+            found.append(f"Splits of {name} are those of {of.source}. What their parts share: {of.leak}")
     return found
 
 
 def _licence(about: dict[str, Any], licences: list[str]) -> str:
     lines = ["## Licence", ""]
     if _imported(about):
-        lines.append("The weights are their authors': whether they may be passed on, and used, is for these to say.")
+        lines.append("The weights belong to their authors; ask them whether the weights may be used and passed on.")
     if any("non-commercial" in licence for licence in licences):
-        lines.append("It learned from data for non-commercial use only: treat the weights as non-commercial too.")
-    lines += [f"The data are under: {licence}." for licence in licences]
+        lines.append("The training data are for non-commercial use only: treat the weights as non-commercial too.")
+    lines += [f"Terms of the training data: {licence}." for licence in licences]
     if not licences:
-        lines.append("What the data demand is not known from the run.")
+        lines.append("The run does not say which terms its training data have.")
     return "\n".join(lines)
 
 
 def _training(about: dict[str, Any]) -> str:
     recipe = about.get("recipe", {})
-    files = [f"- `{file['name']}`, SHA-256 `{file['sha256']}`" for file in about.get("files", ())]
+    files = [f"- {_code(file['name'])}, SHA-256 {_code(file['sha256'])}" for file in about.get("files", ())]
     if _imported(about):
-        return "\n".join(["## Training", "", "Not by lidargrit: the weights were imported from", "", *files])
-    lines = ["## Training", "", f"Recipe: {recipe.get('title', 'unknown')}.", ""]
+        return "\n".join(
+            [
+                "## Training",
+                "",
+                "The weights were not trained by lidargrit. They were imported from these files:",
+                "",
+                *files,
+            ]
+        )
+    lines = ["## Training", "", f"Recipe: {_text(recipe.get('title', 'unknown'))}.", ""]
     lines += ["| stage | scans seen | batch | learning rate |", "|---|---|---|---|"]
     for stage, fit in recipe.get("training", {}).items():
-        lines.append(f"| {stage} | {fit['scans']:,} | {fit['batch_size']} | {fit['learning_rate']:g} |")
+        lines.append(f"| {_text(stage)} | {fit['scans']:,} | {fit['batch_size']:,} | {fit['learning_rate']:g} |")
     if not recipe.get("training"):
-        lines = ["## Training", "", "None is told by the run."]
-    software = [f"{name} {about[name]}" for name in ("lidargrit", "commit", "torch", "python") if name in about]
-    lines += ["", f"Seed {recipe.get('seed', 'unknown')}; {', '.join(software) or 'software unknown'}."]
+        lines = ["## Training", "", "The run does not say how the model was trained."]
+    software = [f"{name} {_text(about[name])}" for name in ("lidargrit", "commit", "torch", "python") if name in about]
+    lines += ["", f"Seed {_text(recipe.get('seed', 'unknown'))}; {', '.join(software) or 'software unknown'}."]
     return "\n".join([*lines, "Every setting is in `run.json`."])
 
 
 def _scores(card: Scorecard) -> str:
-    reference = " ".join(filter(None, (card.reference.data_set, card.reference.split))) or "scans"
+    reference = " ".join(filter(None, (card.reference.data_set, card.reference.split))) or "an unnamed data set"
     lines = [
         "## Scores",
         "",
-        f"By the protocol `{card.protocol}`, against {card.reference.scans_used:,} of {reference}.",
-        "The interval is 95 %; the floor is what such scans score against one another.",
+        f"By the protocol {_code(card.protocol)}, against {card.reference.scans_used:,} scans of {_text(reference)}.",
+        "The interval says how far a score may move with other scans of the same kind.",
+        "Real against real is the score of one half of the real scans against the other half: no model can be expected "
+        "to be better.",
         "",
-        "| metric | variant | score | interval | floor | better |",
+        "| metric | variant | score | 95 % interval | real against real | better |",
         "|---|---|---|---|---|---|",
     ]
     for score in card.scores:
@@ -178,13 +189,21 @@ def _scores(card: Scorecard) -> str:
         between = f"{format_value(interval.low)} to {format_value(interval.high)}" if interval else "-"
         floor = format_value(score.real_against_real.value) if score.real_against_real else "-"
         better = "higher" if result.higher_is_better else "lower"
-        lines.append(
-            f"| {result.metric} | {result.variant} | {format_value(result.value)} | {between} | {floor} | {better} |"
-        )
-    notes = [f"- not the protocol: {each}" for each in card.deviations] + [
-        f"- warning: {each}" for each in card.warnings
-    ]
-    return "\n".join([*lines, "", *(_PLACE.sub("…", note) for note in notes)]).rstrip()
+        cells = (_text(result.metric), _text(result.variant), format_value(result.value), between, floor, better)
+        lines.append(f"| {' | '.join(cells)} |")
+    notes = [f"- not as in the protocol: {_text(_PATH.sub('…', each))}" for each in card.deviations]
+    notes += [f"- warning: {_text(_PATH.sub('…', each))}" for each in card.warnings]
+    return "\n".join([*lines, "", *notes]).rstrip()
+
+
+def _text(words: Any) -> str:
+    """Return foreign words for Markdown: one line without HTML, links and table borders."""
+    return re.sub(r"([\\`|\[\]])", r"\\\1", html.escape(one_line(str(words)), quote=False))
+
+
+def _code(words: Any) -> str:
+    """Return foreign words as code, in which Markdown reads nothing but its end."""
+    return "`" + one_line(str(words)).replace("`", "'") + "`"
 
 
 def _imported(about: dict[str, Any]) -> bool:

@@ -69,8 +69,10 @@ class Desk {
     el("hiding").hidden = upload !== "complete";
     el("complete").textContent = upload === "encode" ? "Reconstruct it" : "Complete it";
     el("file").disabled = upload === "";
-    el("unable").hidden = upload !== "";
-    el("unable").textContent = `A ${generator} model can neither complete nor reconstruct scans.`;
+    el("ability").textContent = {
+      complete: "The model fills in the rays that have no point, or that you hide from it.",
+      encode: "The model encodes the scan as tokens and decodes a scan from them: you see what the tokens keep.",
+    }[upload] ?? `A ${generator} model can neither complete nor reconstruct scans.`;
     this.enable();
   }
 
