@@ -29,8 +29,8 @@ class Named(Store):
 def cards():
     images = RangeImages(SENSOR, [Store()])
     generator = made("lidargrit")[0]
-    drawn = RangeImages(SENSOR, [demo._Drawn(generator.sample(range(12)))])
-    return drawn, demo._cards(drawn, images, images, Reporter())
+    sampled = RangeImages(SENSOR, [demo._ImagesInMemory(generator.sample(range(12)))])
+    return sampled, demo._cards(sampled, images, images, Reporter())
 
 
 @pytest.fixture(scope="module")
@@ -38,28 +38,28 @@ def written(tmp_path_factory, cards) -> Path:
     folder = tmp_path_factory.mktemp("run")
     generator, val = made("lidargrit")[0], RangeImages(SENSOR, [Named()])
     errors = score_reconstruction(generator.get_tokenizer(), val)
-    demo.tell(generator, "simulated", val, *cards[:1], errors, cards[1], SECONDS, ("a <fact>",), folder)
+    demo.write_results_page(generator, "simulated", val, *cards[:1], errors, cards[1], SECONDS, ("a <fact>",), folder)
     return folder / "demo.html"
 
 
-def test_scores_have_a_floor_and_a_ceiling(cards):
-    drawn, (card, floor, ceiling) = cards
-    assert [one.samples.source for one in (card, floor, ceiling)] == ["samples", "val", "marginal"]
-    assert {one.reference.sha256 for one in (card, floor, ceiling)} == {card.reference.sha256}, "one reference for all"
-    for score, low in zip(card.scores, floor.scores, strict=True):
+def test_scores_stand_between_real_against_real_and_pixel_statistics(cards):
+    sampled, (card, real, pixels) = cards
+    assert [one.samples.source for one in (card, real, pixels)] == ["samples", "val", "marginal"]
+    assert {one.reference.sha256 for one in (card, real, pixels)} == {card.reference.sha256}, "one reference for all"
+    for score, low in zip(card.scores, real.scores, strict=True):
         assert low.result.value <= max(score.result.value, 1e-9), "the reference itself, which nothing can beat"
     drawing = score_chart(card.scores[0], 0.25, 9.0)
-    assert "floor 0.2500, ceiling 9.0000" in drawing
-    assert 'class="ceiling"' not in score_chart(card.scores[0])
-    assert 'class="floor"' in score_chart(card.scores[0])
-    assert 'class="floor"' not in score_chart(replace(card.scores[0], floor=None))
-    assert len(drawn) == 12
+    assert "real against real 0.2500, pixel statistics 9.0000" in drawing
+    assert 'class="pixels"' not in score_chart(card.scores[0])
+    assert 'class="real"' in score_chart(card.scores[0])
+    assert 'class="real"' not in score_chart(replace(card.scores[0], real_against_real=None))
+    assert len(sampled) == 12
 
 
 def test_the_page_tells_all_of_it_and_fetches_nothing(written, cards):
     text = written.read_text(encoding="utf-8")
     titles = re.findall(r"<h2>(.*?)</h2>", text)
-    assert [title[:2] for title in titles] == ["1.", "2.", "3.", "4.", "5.", "6.", "7.", "An"]
+    assert [title[:2] for title in titles] == ["1.", "2.", "3.", "4.", "5.", "6.", "7.", "Wh"]
     assert not re.search(r"https?://|src=\"(?!data:)|@import|url\(", text)
     assert text.count("</script>") == 2, "names cannot end a script"
     assert "<b>0</b>" not in text

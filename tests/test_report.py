@@ -90,7 +90,7 @@ def test_the_page_can_be_heard_and_walked(evaluated):
     assert all(images)
     drawings = [value for tag, name, value in reader.attributes if (tag, name) == ("svg", "aria-label")]
     assert len(drawings) == reader.tags.count("svg")
-    assert any("95 % interval" in value and "floor" in value for value in drawings)
+    assert any("95 % interval" in value and "real against real" in value for value in drawings)
     heads = [value for tag, name, value in reader.attributes if (tag, name) == ("th", "scope")]
     assert len(heads) == reader.tags.count("th")
 
@@ -118,10 +118,10 @@ def test_whatever_comes_from_outside_is_escaped(evaluated):
 def test_a_chart_puts_marks_where_the_numbers_are():
     result = MetricResult("bev_jsd", 0.2, False, 9, 9, "exact")
     drawn = score_chart(Score(result, Interval(0.1, 0.3, 0.05, 20), RealAgainstReal(0.4, 4, 5)))
-    assert 'aria-label="score 0.2000, 95 % interval 0.1000 to 0.3000, floor 0.4000"' in drawn
-    assert 'cx="160.0"' in drawn  # half-way between 0, at 10, and the largest mark, the floor, at 310
+    assert 'aria-label="score 0.2000, 95 % interval 0.1000 to 0.3000, real against real 0.4000"' in drawn
+    assert 'cx="160.0"' in drawn  # half-way between 0, at 10, and the largest mark, real against real, at 310
     assert 'class="interval" x1="85.0"' in drawn
-    assert 'class="floor" x1="310.0"' in drawn
+    assert 'class="real" x1="310.0"' in drawn
     assert score_chart(Score(replace(result, value=float("nan")))) == ""
     assert "<circle" in score_chart(Score(replace(result, value=0.0)))
     lines = line_chart({"a<b": np.array([0.0, 1.0]), "c": np.array([0.5, 0.5])}, "x", "y", [0])

@@ -35,17 +35,17 @@ from lidargrit.viewer.scan_sets import ScanSet
 PAGE, PICTURE, TIMINGS = "demo.html", "scans_reconstructed_generated.png", "timings.json"
 _NUM_SAMPLES = 16
 _MAX_SCANS = 400  # of the user's: more would not be seen in the demo's few minutes
-_SHOWN = 6  # of each set on the page: enough to step through, and half a megabyte each
+_SCANS_OF_A_SET = 6  # of each set on the page: enough to step through, and half a megabyte each
 
 
 def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter) -> Path:
     """Run everything on simulated or on the user's scans, and return the folder of the results.
 
     Args:
-        data: a folder of scans or another source; simulated scans if not given.
-        folder: becomes a run folder with ``demo.html``, ``samples``, ``evaluation.json`` and two pictures besides.
-        settings: of the recipe, as ``--set`` takes them.
-        reporter: hears of the progress.
+        data: a folder of scans or another source; None for simulated scans.
+        folder: run folder, which also gets ``demo.html``, ``samples``, ``evaluation.json`` and two pictures.
+        settings: changed settings of the recipe, as ``--set`` takes them.
+        reporter: receiver of progress and messages.
     """
     recipe = load_recipe("demo")
     if data is not None:
@@ -61,7 +61,7 @@ def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter
     for stage in generator.stages:
         clock.add(f"train the {stage}", _trained_s(folder / stage / "log.jsonl"))
     clock.keep()
-    with clock.stage(f"draw {_NUM_SAMPLES} new scans"):
+    with clock.stage(f"sample {_NUM_SAMPLES} new scans"):
         write_samples(generator, folder, folder / "samples", range(_NUM_SAMPLES), reporter=reporter)
     samples = read_samples(folder / "samples", _NUM_SAMPLES)
     with clock.stage("score reconstruction and new scans"):
@@ -78,19 +78,21 @@ def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter
         f"{reconstruction.drop_recall:.2f} with precision {reconstruction.drop_precision:.2f}"
     )
     reporter.message(cards[0].as_table())
-    reporter.message("(figures of a few minutes on little data; they do not compare with published tables)")
+    reporter.message(
+        "(scores after a few minutes of training on little data; they cannot be compared with published tables)"
+    )
     kind = "real" if data else "simulated"
-    _draw(generator, kind, val, samples, folder)
+    _plot_pictures(generator, kind, val, samples, folder)
     weights = sum(weight.numel() for weight in generator.parameters()) / 1e6
     facts = (
         f"LidarGRIT at a small size: {weights:.1f} million weights",
         f"{len(real):,} {kind} scans to learn from and {len(val):,} held out, of the sensor {generator.sensor.name}",
     )
-    tell(generator, kind, val, samples, reconstruction, cards, clock.seconds, facts, folder)
+    write_results_page(generator, kind, val, samples, reconstruction, cards, clock.seconds, facts, folder)
     return folder
 
 
-def tell(
+def write_results_page(
     generator: Generator,
     kind: str,
     val: RangeImages,
@@ -104,38 +106,38 @@ def tell(
     """Write the page ``demo.html`` into a run's folder.
 
     Args:
-        generator: with tokens.
-        kind: of the scans: "real" or "simulated".
-        val: held-out scans, of which the first is followed.
-        samples: what the generator wrote.
-        errors: of reconstruction.
-        cards: scores of the samples, of held-out scans and of single pixels, all against training scans.
-        seconds: that stages took.
-        facts: about model and training.
-        folder: of the run.
+        generator: a generator over tokens.
+        kind: kind of the scans: "real" or "simulated".
+        val: held-out scans; the page follows the first of them.
+        samples: scans that the generator sampled.
+        errors: errors of reconstruction.
+        cards: scores of the samples, of held-out scans, and of pixel statistics, all against training scans.
+        seconds: time that each stage took, in seconds, by its name.
+        facts: short sentences about the model and its training.
+        folder: folder of the run.
     """
-    tokenizer, shown = generator.get_tokenizer(), val.batch(evenly_spaced(_SHOWN, len(val)))
-    names = tuple(val.provenance.names[index].rpartition("/")[2] for index in evenly_spaced(_SHOWN, len(val)))
+    tokenizer, held_out = generator.get_tokenizer(), val.batch(evenly_spaced(_SCANS_OF_A_SET, len(val)))
+    names = tuple(val.provenance.names[index].rpartition("/")[2] for index in evenly_spaced(_SCANS_OF_A_SET, len(val)))
     with torch.no_grad():
-        tokens = tokenizer.encode(shown[:1])
+        tokens = tokenizer.encode(held_out[:1])
         decoded = tokenizer.decode(tokens)
-        drawn = tokenizer.sample(tokens, [torch.Generator().manual_seed(0)])
-        again = generator.reconstruct(shown)
-    new = samples.batch(range(min(_SHOWN, len(samples))))
+        sampled = tokenizer.sample(tokens, [torch.Generator().manual_seed(0)])
+        reconstructed = generator.reconstruct(held_out)
+    new = samples.batch(range(min(_SCANS_OF_A_SET, len(samples))))
     seeds = tuple(f"seed {seed}" for seed in range(len(new)))
     sets = (
-        ScanSet(f"{kind}, held out", shown, names),
-        ScanSet("reconstructed", again, names),
+        ScanSet(f"{kind}, held out", held_out, names),
+        ScanSet("reconstructed", reconstructed, names),
         ScanSet("new", new, seeds),
     )
-    told = errors, *cards, seconds, facts, folder
-    write_demo_page(DemoPage(kind, names[0], shown[:1], tokens, decoded, drawn, sets, *told), folder / PAGE)
+    results = errors, *cards, seconds, facts, folder
+    write_demo_page(DemoPage(kind, names[0], held_out[:1], tokens, decoded, sampled, sets, *results), folder / PAGE)
 
 
 def divided(data: str, reporter: Reporter) -> DataConfig:
-    """Divide a user's scans into train and val: by whole drives where there are several.
+    """Divide a user's scans into train and val, by whole drives where there are several.
 
-    One drive in both would leak; where there is only one, its last scans are held out, and that is said.
+    The same drive in both would leak. Where there is only one, its last scans are held out, and a warning says so.
 
     Raises:
         DataError: too few scans to hold any out.
@@ -143,11 +145,11 @@ def divided(data: str, reporter: Reporter) -> DataConfig:
     dataset = open_dataset(data)
     if len(dataset) < 4:
         raise DataError(f"{len(dataset)} scans in {data}", "at least 4, to hold one out", "add scans")
-    place, split = f"{dataset.public_name()}:{dataset.root}", dataset.split
+    source, split = f"{dataset.public_name()}:{dataset.root}", dataset.split
     drives = sorted({dataset.name(index).rpartition("/")[0] for index in range(len(dataset))})
     has_drives = dataset.public_name() != "folder" and all(drive and "/" not in drive for drive in drives)
     if has_drives and len(drives) > 1 and "[" not in split:
-        train, val = f"{place}:{'+'.join(drives[:-1])}", f"{place}:{drives[-1]}"
+        train, val = f"{source}:{'+'.join(drives[:-1])}", f"{source}:{drives[-1]}"
     elif "[" in split:
         raise DataError(
             f"{data} with a share", "whole drives, or a folder", "leave the brackets out: demo divides the scans"
@@ -156,19 +158,19 @@ def divided(data: str, reporter: Reporter) -> DataConfig:
         reporter.message(
             "WARNING: the last scans are held out; if they are of the same drive, they show the same streets"
         )
-        train, val = f"{place}:{split}[:85%]", f"{place}:{split}[85%:]"
+        train, val = f"{source}:{split}[:85%]", f"{source}:{split}[85%:]"
     return DataConfig(train=(train,), val=(val,), sensor=dataset.sensor, max_scans=_MAX_SCANS)
 
 
 def _cards(
     samples: RangeImages, val: RangeImages, real: RangeImages, reporter: Reporter
 ) -> tuple[Scorecard, Scorecard, Scorecard]:
-    """Score new scans, held-out ones and those of single pixels, equally many of each, against training scans."""
+    """Score new scans, held-out scans and pixel statistics, equally many of each, against training scans."""
     marginal = load_class("marginal")
     single = marginal(marginal.Config(), real.sensor)
     single.fit_statistics(real)
     count = min(len(samples), len(real))
-    pixels = RangeImages(real.sensor, [_Drawn(single.sample(range(count)))])
+    pixels = RangeImages(real.sensor, [_ImagesInMemory(single.sample(range(count)))])
     plain = EvalConfig(resampling=Resampling(halves=0))
     cards = []
     for name, images, config in (("samples", samples, EvalConfig()), ("val", val, plain), ("marginal", pixels, plain)):
@@ -179,8 +181,8 @@ def _cards(
     return cards[0], cards[1], cards[2]
 
 
-class _Drawn:
-    """Images in memory as a store."""
+class _ImagesInMemory:
+    """A store of range images that lie in memory."""
 
     provenance = Provenance()
 
@@ -195,9 +197,9 @@ class _Drawn:
 
 
 class _Clock:
-    """How long each stage took when it was first done, kept in a file: the same command again does none anew.
+    """The time of each stage when it was first done, kept in a file: the same command does no stage again.
 
-    The file is written once there is a run beside it: a folder that holds anything else is refused.
+    The file is written once a run lies beside it, because a folder that holds anything else is refused.
     """
 
     def __init__(self, path: Path) -> None:
@@ -218,7 +220,7 @@ class _Clock:
 
 
 def _trained_s(log: Path) -> float:
-    """Return how long a stage was trained, by its log, whose clock begins anew each time it goes on."""
+    """Return the training time of a stage by its log, whose clock starts at 0 whenever training goes on."""
     before, total = 0.0, 0.0
     for line in log.read_text(encoding="utf-8").splitlines():
         seconds = float(json.loads(line)["seconds"])
@@ -227,7 +229,7 @@ def _trained_s(log: Path) -> float:
     return total
 
 
-def _draw(generator: Generator, kind: str, val: RangeImages, samples: RangeImages, folder: Path) -> None:
+def _plot_pictures(generator: Generator, kind: str, val: RangeImages, samples: RangeImages, folder: Path) -> None:
     real = val.batch(evenly_spaced(3, len(val)))
     title = f"{kind} scans never trained on, what the tokens keep of them, and new scans"
     plot_comparison(

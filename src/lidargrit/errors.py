@@ -15,9 +15,11 @@ LidarGritError (ValueError)
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable, Sequence
 
 _LETTERS_AT_MOST = 600  # of each part of a message: a long path in full, or a few
+_ABSOLUTE_PATH = re.compile(r"(?<![\w.…])(?:~|[A-Za-z]:)?[/\\][^\s,;:)'\"<>]*")
 _SURELY_MEANT = 0.85  # of difflib's likeness: one letter wrong, missing or doubled in a name of seven
 
 
@@ -88,6 +90,16 @@ def one_line(text: str) -> str:
     if len(text) > _LETTERS_AT_MOST:
         text = f"{text[: _LETTERS_AT_MOST * 2 // 3]} [...] {text[-_LETTERS_AT_MOST // 3 :]}"
     return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in text)
+
+
+def without_folders(text: str) -> str:
+    """Return a text in which absolute paths have lost their folders, for pages and files that others will read.
+
+    Example:
+        >>> without_folders("kitti_360:/home/me/data/kitti_360:train against ~/runs/mine/samples")
+        'kitti_360:…/kitti_360:train against …/samples'
+    """
+    return _ABSOLUTE_PATH.sub(lambda found: "…/" + re.split(r"[/\\]", found[0].rstrip("/\\"))[-1], text)
 
 
 def nearest_names(name: str, known: Iterable[str], at_most: int = 3) -> str:

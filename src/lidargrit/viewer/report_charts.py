@@ -1,4 +1,4 @@
-"""Scores and curves → drawings that lie inside a page: SVG in the page's own colours."""
+"""Scores and curves → charts inside a page: SVG in the page's own colours."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from jaxtyping import Float
 
 from lidargrit.evaluation.scorecard import Score, format_value
 
-_WIDE, _TALL = 320, 34  # a score's drawing
+_WIDE, _TALL = 320, 34  # a score's chart
 _CHART_WIDE, _CHART_TALL = 720, 260
 _LEFT, _RIGHT, _TOP, _BOTTOM = 48, 12, 12, 40
 
 
-def score_chart(score: Score, floor: float | None = None, ceiling: float | None = None) -> str:
-    """Draw a score as a dot on its interval, from 0, with the floor as an upright line; a screen reader hears it.
+def score_chart(score: Score, real: float | None = None, pixels: float | None = None) -> str:
+    """Plot a score as a dot on its interval, from 0, with an upright line for real against real.
 
     Args:
-        score: with the floor that its evaluation found, if it has one.
-        floor: in place of that.
-        ceiling: drawn as a square.
+        score: score with its interval, and real against real, if the evaluation found them.
+        real: value of real against real to plot in place of the score's own.
+        pixels: value of the pixel statistics, plotted as a square.
     """
     value, interval = score.result.value, score.interval
-    if floor is None and score.real_against_real is not None:
-        floor = score.real_against_real.value
+    if real is None and score.real_against_real is not None:
+        real = score.real_against_real.value
     low, high = (interval.low, interval.high) if interval else (value, value)
-    marks = [low, high, value, *(mark for mark in (floor, ceiling) if mark is not None)]
+    marks = [low, high, value, *(mark for mark in (real, pixels) if mark is not None)]
     if not np.isfinite(marks).all():
         return ""
     first, last = min(0.0, *marks), max(0.0, *marks)
@@ -37,28 +37,28 @@ def score_chart(score: Score, floor: float | None = None, ceiling: float | None 
         return 10 + (at - first) / spread * (_WIDE - 20)
 
     middle = _TALL / 2
-    told = f"score {format_value(value)}"
+    spoken = f"score {format_value(value)}"
     parts = [f'<line class="axis" x1="10" y1="{middle}" x2="{_WIDE - 10}" y2="{middle}"/>']
     parts.append(f'<line class="axis" x1="{x(0.0):.1f}" y1="{middle - 5}" x2="{x(0.0):.1f}" y2="{middle + 5}"/>')
     if interval:
-        told += f", 95 % interval {format_value(low)} to {format_value(high)}"
+        spoken += f", 95 % interval {format_value(low)} to {format_value(high)}"
         parts.append(f'<line class="interval" x1="{x(low):.1f}" y1="{middle}" x2="{x(high):.1f}" y2="{middle}"/>')
-    if floor is not None:
-        told += f", floor {format_value(floor)}"
-        parts.append(f'<line class="floor" x1="{x(floor):.1f}" y1="4" x2="{x(floor):.1f}" y2="{_TALL - 4}"/>')
-    if ceiling is not None:
-        told += f", ceiling {format_value(ceiling)}"
-        parts.append(f'<rect class="ceiling" x="{x(ceiling) - 5:.1f}" y="{middle - 5}" width="10" height="10"/>')
+    if real is not None:
+        spoken += f", real against real {format_value(real)}"
+        parts.append(f'<line class="real" x1="{x(real):.1f}" y1="4" x2="{x(real):.1f}" y2="{_TALL - 4}"/>')
+    if pixels is not None:
+        spoken += f", pixel statistics {format_value(pixels)}"
+        parts.append(f'<rect class="pixels" x="{x(pixels) - 5:.1f}" y="{middle - 5}" width="10" height="10"/>')
     parts.append(f'<circle class="dot" cx="{x(value):.1f}" cy="{middle}" r="5"/>')
     return (
-        f'<svg viewBox="0 0 {_WIDE} {_TALL}" width="{_WIDE}" height="{_TALL}" role="img" aria-label="{escape(told)}">'
+        f'<svg viewBox="0 0 {_WIDE} {_TALL}" width="{_WIDE}" height="{_TALL}" role="img" aria-label="{escape(spoken)}">'
         + "".join(parts)
         + "</svg>"
     )
 
 
 def bar_chart(bars: Mapping[str, float], unit: str) -> str:
-    """Draw amounts as bars below one another, each with its name before and its figure behind it."""
+    """Plot amounts as bars below one another, each with its name on the left and its value on the right."""
     highest = max([*bars.values(), 1e-9])
     rows = "".join(
         f'<tr><th scope="row">{escape(name)}</th><td><svg viewBox="0 0 {_WIDE} 14" width="{_WIDE}" height="14" '
@@ -70,28 +70,28 @@ def bar_chart(bars: Mapping[str, float], unit: str) -> str:
 
 
 def line_chart(lines: Mapping[str, Float[np.ndarray, " n"]], x_label: str, y_label: str, x_ticks: Sequence[int]) -> str:
-    """Draw shares from 0 to 1, one line a name: the first solid, the second dashed, so that colour is not needed."""
+    """Plot shares from 0 to 1, one line for each name: the first solid, the second dashed."""
     count = max(len(values) for values in lines.values())
     wide, tall = _CHART_WIDE - _LEFT - _RIGHT, _CHART_TALL - _TOP - _BOTTOM
 
-    def place(index: int, share: float) -> tuple[float, float]:
+    def point(index: int, share: float) -> tuple[float, float]:
         return _LEFT + index / max(count - 1, 1) * wide, _TOP + (1 - share) * tall
 
     parts = []
     for share in (0.0, 0.25, 0.5, 0.75, 1.0):
-        (left, y), (right, _) = place(0, share), place(count - 1, share)
+        (left, y), (right, _) = point(0, share), point(count - 1, share)
         parts.append(f'<line class="grid" x1="{left:.1f}" y1="{y:.1f}" x2="{right:.1f}" y2="{y:.1f}"/>')
         parts.append(f'<text x="{left - 6:.1f}" y="{y + 4:.1f}" text-anchor="end">{share:.0%}</text>')
     for tick in x_ticks:
-        x, y = place(tick, 0.0)
+        x, y = point(tick, 0.0)
         parts.append(f'<text x="{x:.1f}" y="{y + 16:.1f}" text-anchor="middle">{tick}</text>')
     for number, (name, values) in enumerate(lines.items()):
-        points = " ".join("{:.1f},{:.1f}".format(*place(i, float(v))) for i, v in enumerate(values))
+        points = " ".join("{:.1f},{:.1f}".format(*point(i, float(v))) for i, v in enumerate(values))
         parts.append(f'<polyline class="line line{number}" points="{points}"><title>{escape(name)}</title></polyline>')
     parts.append(
         f'<text x="{_LEFT + wide / 2:.1f}" y="{_CHART_TALL - 6}" text-anchor="middle">{escape(x_label)}</text>'
     )
-    told = escape(f"{y_label} by {x_label}: " + " and ".join(lines))
-    return f'<svg class="chart" viewBox="0 0 {_CHART_WIDE} {_CHART_TALL}" role="img" aria-label="{told}">' + (
+    spoken = escape(f"{y_label} by {x_label}: " + " and ".join(lines))
+    return f'<svg class="chart" viewBox="0 0 {_CHART_WIDE} {_CHART_TALL}" role="img" aria-label="{spoken}">' + (
         "".join(parts) + "</svg>"
     )

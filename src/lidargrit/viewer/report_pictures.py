@@ -1,4 +1,4 @@
-"""Arrays → pictures that lie inside a page: PNG as data URIs."""
+"""Arrays → pictures inside a page: PNG as data URIs."""
 
 from __future__ import annotations
 
@@ -22,30 +22,30 @@ Picture = str
 def range_picture(
     range_m: Float[np.ndarray, "H W"], known: Bool[np.ndarray, "H W"], limits_m: tuple[float, float]
 ) -> Picture:
-    """Draw ranges from near (yellow) to far (violet) on a logarithmic scale, light grey where nothing is known."""
+    """Render ranges from near (yellow) to far (violet) on a logarithmic scale, light grey where ``known`` is False."""
     colours = colormaps["viridis_r"](LogNorm(*limits_m, clip=True)(np.where(known, range_m, limits_m[0])))[..., :3]
     colours[~known] = to_rgb(NO_RETURN)
     return _picture(_bytes(colours), (_WIDE, _TALL))
 
 
 def rate_picture(rate: Float[np.ndarray, "H W"]) -> Picture:
-    """Draw shares from 0 (dark) to 1 (light)."""
+    """Render shares from 0 (dark blue) to 1 (yellow)."""
     return _picture(_bytes(colormaps["cividis"](Normalize(0, 1)(rate))[..., :3]), (_WIDE, _TALL))
 
 
 def colour_picture(colours: Float[np.ndarray, "H W 3"]) -> Picture:
-    """Draw red, green and blue from 0 to 1."""
+    """Render red, green and blue, each from 0 to 1."""
     return _picture(_bytes(colours), (_WIDE, _TALL))
 
 
 def density_picture(density: Float[np.ndarray, "x y"], highest: float) -> Picture:
-    """Draw a density seen from above, forward up and left to the left; roots of densities, so that far cells show."""
+    """Render a density seen from above, forward up and left to the left; colours follow its root."""
     colours = colormaps["magma"](PowerNorm(0.4, 0, max(highest, 1e-9), clip=True)(_upright(density)))[..., :3]
     return _picture(_bytes(colours), (_VIEW, _VIEW))
 
 
 def difference_picture(difference: Float[np.ndarray, "x y"], largest: float) -> Picture:
-    """Draw a difference of densities: red where the first is denser, blue where the second is, roots as above."""
+    """Render a difference of densities: red where the first is denser, blue where the second is."""
     scaled = np.sign(difference) * (np.abs(difference) / max(largest, 1e-9)).clip(0, 1) ** 0.4
     return _picture(_bytes(colormaps["RdBu_r"](Normalize(-1, 1)(_upright(scaled)))[..., :3]), (_VIEW, _VIEW))
 
@@ -59,7 +59,7 @@ def _bytes(colours: Float[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def _picture(pixels: UInt8[np.ndarray, "H W 3"], at_least: tuple[int, int]) -> Picture:
-    """Encode pixels, each repeated so often that the picture is at least so large: no browser need smooth it."""
+    """Encode pixels as PNG, each repeated until the picture has the given size, so that no browser blurs it."""
     wide, tall = (-(-wanted // size) for wanted, size in zip(at_least, pixels.shape[1::-1], strict=True))
     image = Image.fromarray(pixels.repeat(tall, axis=0).repeat(wide, axis=1))
     image = image.quantize(128, dither=Image.Dither.NONE)  # a third of the bytes, no difference to be seen

@@ -32,7 +32,7 @@ svg{max-width:100%;height:auto;color:var(--ink)}
 svg text{fill:var(--soft);font-size:12px}
 .axis,.grid{stroke:var(--line);stroke-width:1.5}
 .interval{stroke:var(--a);stroke-width:6;stroke-opacity:.45;stroke-linecap:round}
-.floor{stroke:var(--b);stroke-width:2.5;stroke-dasharray:4 3}
+.real{stroke:var(--b);stroke-width:2.5;stroke-dasharray:4 3}
 .dot{fill:var(--a);stroke:var(--paper);stroke-width:1.5}
 .chart{width:100%;max-width:820px}
 .line{fill:none;stroke-width:2.2}
