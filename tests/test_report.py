@@ -75,7 +75,7 @@ def test_the_page_is_whole_and_needs_nothing_else(evaluated, tmp_path):
     assert "url(" not in text
     assert "@import" not in text
     assert "http://" not in text
-    for heading in ("Scores", "The best matches", "Mean images", "Return rate by ring", "Seen from above", "Recipe"):
+    for heading in ("Scores", "The best matches", "Mean images", "Return rate by ring", "Seen from above", "Settings"):
         assert f">{heading}</h" in text
 
 
@@ -93,6 +93,17 @@ def test_the_page_can_be_heard_and_walked(evaluated):
     assert any("95 % interval" in value and "real against real" in value for value in drawings)
     heads = [value for tag, name, value in reader.attributes if (tag, name) == ("th", "scope")]
     assert len(heads) == reader.tags.count("th")
+
+
+def test_the_page_names_no_folder_of_the_machine(evaluated):
+    card, pair = evaluated
+    samples = replace(card.samples, source="/srv/secret/runs/mine/samples")
+    warnings = ("see kitti_360:/home/somebody/secret/kitti_360:train",)
+    text = page(replace(card, samples=samples, warnings=warnings), pair)
+    assert "secret" not in text
+    assert "/home" not in text
+    assert "…/samples" in text
+    assert "kitti_360:…/kitti_360:train" in text
 
 
 def test_whatever_comes_from_outside_is_escaped(evaluated):

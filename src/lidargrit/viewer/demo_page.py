@@ -299,8 +299,8 @@ def _scores(demo: DemoPage) -> str:
     text = (
         f"Each metric measures how far {demo.card.samples.scans_used} new scans are from as many training scans; lower "
         f"is better. <i>Real against real</i> (dashed line) is the score of held-out {demo.kind} scans: no model can "
-        "be expected to do better. <i>Pixel statistics</i> (square) is the score of the generator <code>marginal</code>, "
-        "which samples each pixel by itself and knows nothing of shapes. Where it does as well as real against real, "
+        "be expected to do better. <i>Pixel statistics</i> (square) is the score of the generator "
+        "<code>marginal</code>, which samples each pixel by itself and knows nothing of shapes. Where it does as well as real against real, "
         "the metric looks at single pixels only, and a good score says little. With so few scans all scores are rough; "
         "the line through the dot is the 95 % interval."
     )
