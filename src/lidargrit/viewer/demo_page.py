@@ -300,9 +300,9 @@ def _scores(demo: DemoPage) -> str:
         f"Each metric measures how far {demo.card.samples.scans_used} new scans are from as many training scans; lower "
         f"is better. <i>Real against real</i> (dashed line) is the score of held-out {demo.kind} scans: no model can "
         "be expected to do better. <i>Pixel statistics</i> (square) is the score of the generator "
-        "<code>marginal</code>, which samples each pixel by itself and knows nothing of shapes. Where it does as well as real against real, "
-        "the metric looks at single pixels only, and a good score says little. With so few scans all scores are rough; "
-        "the line through the dot is the 95 % interval."
+        "<code>marginal</code>, which samples each pixel by itself and knows nothing of shapes. Where it does as well "
+        "as real against real, the metric looks at single pixels only, and a good score says little. With so few scans "
+        "all scores are rough; the line through the dot is the 95 % interval."
     )
     heads = ("metric", "real against real", "this model", "pixel statistics", "chart, from 0")
     head = "".join(f'<th scope="col">{name}</th>' for name in heads)
