@@ -1,4 +1,4 @@
-"""Pictures of scans: range images → PNG."""
+"""Pictures and pages of scans: range images → PNG or HTML."""
 
 from lidargrit.viewer.pictures import plot_comparison
 from lidargrit.viewer.progress import plot_progress

@@ -1,4 +1,4 @@
-"""What labels are called and how they are coloured: SemanticKITTI's number → name and colour.
+"""Names and colours of labels: SemanticKITTI's number → name and colour.
 
 Source: the numbers and names are those of Behley et al., SemanticKITTI, ICCV 2019, and the configuration published with
 it. The colours are ours: what moves is warm, what stands is grey or brown, and all can be seen on black and on white.
@@ -52,5 +52,5 @@ CLASSES: dict[int, tuple[str, Colour]] = {
 
 
 def name_and_colour(number: int) -> tuple[str, Colour]:
-    """Return what a class is called and its colour in red, green and blue."""
+    """Return the name of a class, and its colour in red, green and blue."""
     return CLASSES.get(number, (f"class {number}", _OBJECT))

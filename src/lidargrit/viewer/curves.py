@@ -1,4 +1,4 @@
-"""What real, simulated and coin-dropped scans have in common: scores of curves → PNG."""
+"""Curves of real scans, of simulated ones, and of scans whose rays are dropped by a coin: scores → PNG."""
 
 from __future__ import annotations
 
@@ -29,22 +29,22 @@ _TICKS_M = (1, 2, 5, 10, 20, 50, 100)
 
 
 def plot_curves(scores: Sequence[CurveScore], path: Path, title: str = "") -> None:
-    """Draw the curves of real scans, of simulated ones and of a coin: a panel for each score.
+    """Plot the curves of real scans, of simulated ones, and of scans whose rays a coin drops: a panel for each score.
 
-    Curves with two axes, such as a histogram for every row, get one image for each side, and the mean over rows where
-    rows are of one kind.
+    Curves with two axes, such as a histogram for every row, get one image for each of the three, and the mean over
+    rows where rows are of one kind.
 
     Args:
-        scores: of any curves.
-        path: of the PNG; an older picture there is replaced, in one step.
-        title: above everything.
+        scores: scores of curves.
+        path: path of the PNG; an older picture there is replaced in one step.
+        title: title of the whole picture.
 
     Raises:
         ConfigError: no score.
         OutputError: the picture cannot be written.
     """
     if not scores:
-        raise ConfigError("no curve to draw", "at least one", "compare some scans first")
+        raise ConfigError("no curve", "at least one", "compare some scans first")
     flat = [score for score in scores if _curve(score, "real").ndim == 1]
     deep = [score for score in scores if _curve(score, "real").ndim == 2]
     rows = -(-len(flat) // 2) + len(deep)
@@ -80,8 +80,8 @@ def _plot_lines(axes: Axes, score: CurveScore) -> None:
     axis, label = np.array(details["axis"], dtype=float), details["axis_label"]
     lags = axis[0] < 0  # rows and columns share the axis: no line of numbers
     for side, colour in _SIDES.items():
-        place = np.arange(len(axis)) if lags else axis
-        axes.plot(place, _curve(score, side), color=colour, label=side, marker=".", markersize=4, linewidth=1.2)
+        position = np.arange(len(axis)) if lags else axis
+        axes.plot(position, _curve(score, side), color=colour, label=side, marker=".", markersize=4, linewidth=1.2)
     axes.set_title(_title(score), loc="left", fontsize=10)
     axes.set(xlabel=label, ylabel=details["curve_label"])
     if lags:
@@ -101,13 +101,13 @@ def _log_axis(axes: Axes) -> None:
     axes.xaxis.set_minor_formatter(NullFormatter())
 
 
-def _plot_images(figure: Figure, place: SubplotSpec, score: CurveScore) -> None:
-    """Draw one image for each side on one scale, with the mean over rows beside them where rows share an axis."""
+def _plot_images(figure: Figure, cell: SubplotSpec, score: CurveScore) -> None:
+    """Plot the three images on one scale, with the mean over rows beside them where rows share an axis."""
     details = score.simulated.details
     axis = np.array(details["axis"], dtype=float)
     images = {side: _curve(score, side) for side in _SIDES}
     is_map = images["real"].shape == (len(axis), len(axis))  # a view from above: both axes are metres
-    grid = place.subgridspec(1, 4, wspace=0.25)
+    grid = cell.subgridspec(1, 4, wspace=0.25)
     norm = PowerNorm(0.5, 0, np.nanmax([np.nanmax(image, initial=0) for image in images.values()]) or 1)
     for index, (side, image) in enumerate(images.items()):
         axes = figure.add_subplot(grid[0, index])
@@ -120,12 +120,12 @@ def _plot_images(figure: Figure, place: SubplotSpec, score: CurveScore) -> None:
             axes.set(xlabel=details["axis_label"], ylim=(len(image) - 0.5, -0.5), ylabel="row" if index == 0 else "")
             _log_axis(axes)
         axes.set_title(side, loc="left", fontsize=10)
-    box = place.get_position(figure)
+    box = cell.get_position(figure)
     figure.text(box.x0, box.y1 + 0.35 / figure.get_figheight(), _title(score), fontsize=10)
     axes = figure.add_subplot(grid[0, 3])
     for side, colour in _SIDES.items():
-        drawn = np.sort(images[side].ravel())[::-1] if is_map else np.nanmean(images[side], axis=0)
-        axes.plot(np.arange(1, len(drawn) + 1) if is_map else axis, drawn, color=colour, label=side, linewidth=1.2)
+        values = np.sort(images[side].ravel())[::-1] if is_map else np.nanmean(images[side], axis=0)
+        axes.plot(np.arange(1, len(values) + 1) if is_map else axis, values, color=colour, label=side, linewidth=1.2)
     if is_map:
         axes.set(xscale="log", xlabel="rank of the cell")
         axes.set_title("cells, the fullest first", loc="left", fontsize=10)

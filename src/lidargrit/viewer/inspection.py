@@ -27,15 +27,15 @@ _COLOURS = {
     "hidden": "#d7191c",
     "kept": "#1a9641",
 }
-_DOTS_AT_MOST = 20_000  # of one fate in a view; more hide one another and take seconds to draw
+_DOTS_AT_MOST = 20_000  # of one fate in a view; more hide one another and take seconds to plot
 
 
 def plot_inspection(inspection: Inspection, path: Path) -> None:
-    """Draw where points collide, which are lost, and how their elevations lie to the sensor's rows.
+    """Plot which points collide, which are lost, and their elevations beside the sensor's rows.
 
     Args:
-        inspection: of one scan.
-        path: of the PNG; an older picture there is replaced, in one step.
+        inspection: result of inspecting one scan.
+        path: path of the PNG; an older picture there is replaced in one step.
 
     Raises:
         OutputError: the picture cannot be written.
@@ -62,8 +62,8 @@ def _plot_range(figure: Figure, axes: Axes, inspection: Inspection) -> None:
     shown = np.ma.masked_where(~inspection.filled(), inspection.range_m)
     colours = colormaps["viridis_r"].with_extremes(bad=_NO_RETURN)
     norm = LogNorm(inspection.sensor.range_min_m, inspection.sensor.range_max_m)
-    drawn = axes.imshow(shown, cmap=colours, norm=norm, aspect="auto", interpolation="nearest")
-    figure.colorbar(drawn, ax=axes, label="range [m]", pad=0.01)
+    plotted = axes.imshow(shown, cmap=colours, norm=norm, aspect="auto", interpolation="nearest")
+    figure.colorbar(plotted, ax=axes, label="range [m]", pad=0.01)
     axes.set_title(f"range image, {inspection.filled().mean():.1%} of the pixels filled", loc="left")
     axes.set_ylabel("row")
 
@@ -72,8 +72,8 @@ def _plot_collisions(figure: Figure, axes: Axes, inspection: Inspection) -> None
     # 0 grey, 1 white, and from 2 on ever darker red.
     colours = ListedColormap([_NO_RETURN, "white", "#fcae91", "#fb6a4a", "#cb181d", "#67000d"])
     norm = BoundaryNorm([0, 1, 2, 3, 4, 6, 1000], colours.N)
-    drawn = axes.imshow(inspection.points_per_pixel, cmap=colours, norm=norm, aspect="auto", interpolation="nearest")
-    bar = figure.colorbar(drawn, ax=axes, label="points", pad=0.01)
+    plotted = axes.imshow(inspection.points_per_pixel, cmap=colours, norm=norm, aspect="auto", interpolation="nearest")
+    bar = figure.colorbar(plotted, ax=axes, label="points", pad=0.01)
     bar.set_ticks([0.5, 1.5, 2.5, 3.5, 5, 500], labels=["0", "1", "2", "3", "4, 5", "6 ..."])
     hidden = inspection.counts()["hidden"]
     axes.set_title(f"points per pixel; {hidden} are behind a nearer one of their pixel", loc="left")
@@ -81,7 +81,7 @@ def _plot_collisions(figure: Figure, axes: Axes, inspection: Inspection) -> None
 
 
 def _plot_lost(above: Axes, side: Axes, inspection: Inspection) -> None:
-    """Draw every point from above and from the side, the lost ones in the colour of their fate."""
+    """Plot every point from above and from the side, the lost ones in the colour of their fate."""
     x, y, z = inspection.scan.points_xyz_m.numpy().T
     away = np.hypot(x, y)
     for number, name in reversed(list(enumerate(FATES))):  # the kept ones first, so that they hide no lost one
@@ -103,7 +103,7 @@ def _plot_lost(above: Axes, side: Axes, inspection: Inspection) -> None:
 
 
 def _plot_rows(axes: Axes, inspection: Inspection) -> None:
-    """Draw how many points lie at each elevation, over lines where the sensor has its rows."""
+    """Plot how many points lie at each elevation, over lines where the sensor has its rows."""
     rows_deg = np.degrees(row_elevation_rad(inspection.sensor))
     points_deg = elevations_deg(inspection.scan.points_xyz_m)
     low, high = np.quantile(points_deg, (0.001, 0.999))

@@ -32,16 +32,16 @@ def plot_comparison(
     title: str = "",
     labels: list[str] | None = None,
 ) -> None:
-    """Draw groups of range images below one another: range, return mask and bird's-eye view of every scan.
+    """Plot groups of range images below one another: range, return mask and bird's-eye view of every scan.
 
-    All groups share one scale of range, one of height, and the limits of the bird's-eye view. The i-th scans of the
+    All groups share one scale of range, one of height, and the limits of the bird's-eye view. The i-th scans of all
     groups stand together.
 
     Args:
-        groups: a name ("real", "reconstructed", ...) and an image or a batch of 1 to 8; sensors may differ.
-        path: of the PNG; an older picture there is replaced, in one step.
-        max_range_m: end of the range scale and of the bird's-eye view; what the images reach if not given.
-        title: above everything.
+        groups: for each name ("real", "reconstructed", ...) an image or a batch of 1 to 8; sensors may differ.
+        path: path of the PNG; an older picture there is replaced in one step.
+        max_range_m: end of the range scale and of the bird's-eye view, in metres; None for the farthest return.
+        title: title of the whole picture.
         labels: names of the scans; "scan 1", ... if not given.
 
     Raises:
@@ -71,7 +71,7 @@ def plot_comparison(
 
 @dataclass(frozen=True, eq=False)
 class _Panel:
-    """One scan of one group, as arrays to draw."""
+    """One scan of one group, as arrays."""
 
     title: str
     range_m: Float[np.ndarray, "H W"]
@@ -82,7 +82,7 @@ class _Panel:
 
 @dataclass(frozen=True, eq=False)
 class _Scales:
-    """What all panels share."""
+    """Scales and colours that all panels share."""
 
     range_norm: LogNorm
     height_norm: Normalize
@@ -92,7 +92,7 @@ class _Scales:
 
     @classmethod
     def of(cls, panels: list[_Panel], max_range_m: float | None) -> _Scales:
-        """Find scales that hold all but the outermost returns of all panels."""
+        """Return scales that hold all but the outermost returns of all panels."""
         ranges = np.concatenate([panel.range_m[panel.return_mask] for panel in panels] + [np.array([1.0])])
         points = np.concatenate([panel.points_xyz_m for panel in panels] + [np.zeros((1, 3))])
         far = max_range_m or float(ranges.max())
@@ -115,7 +115,7 @@ def _with_bad(name: str, colour: str) -> Colormap:
 
 def _check(groups: dict[str, RangeImage], max_range_m: float | None) -> None:
     if not groups:
-        raise ConfigError("no group of range images to draw", "one or more", "pass for instance {'real': images}")
+        raise ConfigError("no group of range images", "one or more", "pass for instance {'real': images}")
     for name, images in groups.items():
         if not 1 <= len(images) <= SCANS_AT_MOST or images.range_m.ndim > 3:
             raise ConfigError(
@@ -140,7 +140,7 @@ def _panel(images: RangeImage, index: int, title: str) -> _Panel:
 
 
 def _plot_row(figure: Figure, height: float, bottom: float, panel: _Panel, scales: _Scales) -> None:
-    """Draw the range image above the mask, and the bird's-eye view to their right; places in inches."""
+    """Plot the range image above the return mask, and the bird's-eye view to their right; positions in inches."""
 
     def axes(left: float, up: float, wide: float, tall: float) -> Axes:
         return figure.add_axes((left / _WIDTH, (bottom + up) / height, wide / _WIDTH, tall / height))
@@ -179,16 +179,18 @@ def _plot_row(figure: Figure, height: float, bottom: float, panel: _Panel, scale
 
 
 def _plot_scales(figure: Figure, height: float, scales: _Scales) -> None:
-    """Draw the two colour bars, and what the flat colour means, along the foot."""
+    """Plot the two colour bars along the foot, and say what light grey means."""
     at = 0.55 / height, 0.14 / height
     bar = figure.add_axes((0.75 / _WIDTH, at[0], 6.6 / _WIDTH, at[1]))
     ticks = [t for t in (1, 2, 5, 10, 20, 50, 100) if scales.range_norm(t) >= 0 and scales.range_norm(t) <= 1]
-    drawn = figure.colorbar(ScalarMappable(scales.range_norm, scales.range_colours), bar, orientation="horizontal")
-    drawn.set_ticks(ticks, labels=[str(t) for t in ticks])
-    drawn.minorticks_off()
-    drawn.set_label("range [m]", fontsize=10, labelpad=1)
+    colour_bar = figure.colorbar(ScalarMappable(scales.range_norm, scales.range_colours), bar, orientation="horizontal")
+    colour_bar.set_ticks(ticks, labels=[str(t) for t in ticks])
+    colour_bar.minorticks_off()
+    colour_bar.set_label("range [m]", fontsize=10, labelpad=1)
     note = "light grey = no return"
     figure.text(7.6 / _WIDTH, at[0] + at[1] / 2, note, fontsize=10, va="center")
     bar = figure.add_axes((11.3 / _WIDTH, at[0], 2.25 / _WIDTH, at[1]))
-    drawn = figure.colorbar(ScalarMappable(scales.height_norm, scales.height_colours), bar, orientation="horizontal")
-    drawn.set_label("from above: height over the sensor [m]", fontsize=10, labelpad=1)
+    colour_bar = figure.colorbar(
+        ScalarMappable(scales.height_norm, scales.height_colours), bar, orientation="horizontal"
+    )
+    colour_bar.set_label("from above: height over the sensor [m]", fontsize=10, labelpad=1)

@@ -1,4 +1,4 @@
-"""A generator that is still in training → a PNG of scans, of what its code keeps of them, and of new ones."""
+"""A generator in training → a PNG of real scans, their reconstructions and new scans."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _SCANS = 2  # a glance; more would take training's time
 
 @torch.no_grad()
 def plot_progress(generator: Generator, stage: str, val: RangeImages, path: Path) -> None:
-    """Draw a generator in the midst of a stage; new scans from its last stage on, when there are weights for all."""
+    """Plot validation scans, their reconstructions, and new scans once the last stage is in training."""
     real = val.batch(evenly_spaced(_SCANS, len(val)))
     groups = {"val": real}
     if "encode" in generator.capabilities:

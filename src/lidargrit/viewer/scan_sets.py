@@ -1,4 +1,4 @@
-"""Anything that holds scans → range images to look at, with the labels of their points where there are any."""
+"""Sources of scans, and runs → sets of range images to look at, with the labels of their points if they have any."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from lidargrit.sources import holds_images, open_images
 from lidargrit.structures import RangeImage, Scan
 
 _CLASS_BITS = 0xFFFF  # of a label; the instance stands above them
-_BATCH = 8  # scans drawn at once: what a laptop has room for
-_NAME_LETTERS = 40  # of a place: what fits above a picture
+_BATCH = 8  # scans computed at once: what a laptop has memory for
+_NAME_LETTERS = 40  # of a source's name: what fits above a picture
 
 
 @dataclass(frozen=True, eq=False)
 class ScanSet:
-    """Some scans of one place.
+    """Scans that are sets together, under one name.
 
     Args:
-        name: of the place, and of what was made of it.
-        images: a batch.
-        scan_names: one for each image.
-        label: class of every pixel by SemanticKITTI's numbers, 0 where it is not known or nothing returned.
+        name: name of their source, and of what a model made of it.
+        images: a batch of range images.
+        scan_names: name of each image.
+        label: class of every pixel by SemanticKITTI's numbers; 0 where it is not known or there is no return.
     """
 
     name: str
@@ -43,43 +43,50 @@ class ScanSet:
 
 
 def load_scan_sets(
-    places: Sequence[str],
+    sources: Sequence[str],
     count: int,
     seed: int = 0,
     config: DataConfig | None = None,
     reporter: Reporter | None = None,
 ) -> list[ScanSet]:
-    """Read scans and samples, and draw from runs; the sensor of the first run is everybody's.
+    """Read scans and samples, and sample from runs.
+
+    Scans are projected to the sensor of the first run, if there is a run. A run gives a set of generated scans and, if
+    its generator has tokens, a set of reconstructions of the first source of scans.
 
     Args:
-        places: each a run's folder (*generated*, and *reconstructed* from the first scans beside it if its generator
-            can encode), a folder of samples, a prepared place, or a source of scans.
-        count: scans of each, evenly spaced.
-        seed: of the first generated scan.
-        config: how scans are read and projected.
-        reporter: hears of scans that are left out.
+        sources: sources of scans, folders of samples, prepared folders, and folders of runs.
+        count: number of scans of each set, evenly spaced over its source.
+        seed: seed of the first generated scan.
+        config: settings by which scans are read and projected.
+        reporter: receiver of messages about scans that are left out.
+
+    Raises:
+        ConfigError: no source.
+        DataError: no usable scan in a source.
+        ScanError: a scan that cannot be used, unless such scans are skipped.
     """
     config, reporter = config or DataConfig(), reporter or Reporter()
-    generators = {place: load(place) for place in places if is_run(locate(place))}
+    generators = {source: load(source) for source in sources if is_run(locate(source))}
     sensor = next((generator.sensor for generator in generators.values()), None)
-    shown: list[ScanSet] = []
-    for place in places:
-        if place not in generators:
-            read = _of_images if holds_images(place) else _of_scans
-            shown.append(replace(read(place, count, sensor, config, reporter), name=_short(place)))
-    scans = shown[0] if shown else None
-    for place, generator in generators.items():
+    sets: list[ScanSet] = []
+    for source in sources:
+        if source not in generators:
+            read = _of_images if holds_images(source) else _of_scans
+            sets.append(replace(read(source, count, sensor, config, reporter), name=_short(source)))
+    scans = sets[0] if sets else None
+    for source, generator in generators.items():
         if scans is not None and "encode" in generator.capabilities:
             images = scans.images
-            again = _joined(generator.reconstruct(images[part]) for part in _parts(len(images)))
-            shown.append(ScanSet(f"{_short(place)}: reconstructed", again, scans.scan_names))
+            reconstructed = _joined(generator.reconstruct(images[part]) for part in _parts(len(images)))
+            sets.append(ScanSet(f"{_short(source)}: reconstructed", reconstructed, scans.scan_names))
         seeds = range(seed, seed + count)
         names = tuple(f"seed {one}" for one in seeds)
-        drawn = _joined(generator.sample(seeds[part]) for part in _parts(count))
-        shown.append(ScanSet(f"{_short(place)}: generated", drawn, names))
-    if not shown:
-        raise ConfigError("nothing to draw", "a scan, a folder or a run", "name at least one")
-    return shown
+        generated = _joined(generator.sample(seeds[part]) for part in _parts(count))
+        sets.append(ScanSet(f"{_short(source)}: generated", generated, names))
+    if not sets:
+        raise ConfigError("no source", "a scan, a folder or a run", "name at least one")
+    return sets
 
 
 def _parts(count: int) -> list[slice]:
@@ -90,15 +97,15 @@ def _joined(batches: Iterable[RangeImage]) -> RangeImage:
     return RangeImage.stack([batch[index].to("cpu") for batch in batches for index in range(len(batch))])
 
 
-def _of_images(place: str, count: int, sensor: SensorModel | None, config: DataConfig, reporter: Reporter) -> ScanSet:
-    images = open_images(place, sensor, config, reporter)
+def _of_images(source: str, count: int, sensor: SensorModel | None, config: DataConfig, reporter: Reporter) -> ScanSet:
+    images = open_images(source, sensor, config, reporter)
     indices = evenly_spaced(count, len(images))
     names = images.provenance.names
-    return ScanSet(place, images.batch(indices), tuple(names[index].rpartition("/")[2] for index in indices))
+    return ScanSet(source, images.batch(indices), tuple(names[index].rpartition("/")[2] for index in indices))
 
 
-def _of_scans(place: str, count: int, sensor: SensorModel | None, config: DataConfig, reporter: Reporter) -> ScanSet:
-    dataset = open_dataset(place, config.bad_points)
+def _of_scans(source: str, count: int, sensor: SensorModel | None, config: DataConfig, reporter: Reporter) -> ScanSet:
+    dataset = open_dataset(source, config.bad_points)
     sensor = sensor or load_sensor(dataset.sensor)
     images, names, labels = [], [], []
     for index in evenly_spaced(count, len(dataset)):
@@ -113,10 +120,10 @@ def _of_scans(place: str, count: int, sensor: SensorModel | None, config: DataCo
         names.append(dataset.name(index))
         labels.append(_label_of_pixels(scan, images[-1], config))
     if not images:
-        raise DataError(f"no usable scan in {place}", "at least one", "see the messages above")
+        raise DataError(f"no usable scan in {source}", "at least one", "see the messages above")
     known = [label for label in labels if label is not None]
     label = torch.stack(known) if len(known) == len(images) else None
-    return ScanSet(place, RangeImage.stack(images), tuple(names), label)
+    return ScanSet(source, RangeImage.stack(images), tuple(names), label)
 
 
 def _label_of_pixels(scan: Scan, image: RangeImage, config: DataConfig) -> Int[Tensor, "H W"] | None:
@@ -127,5 +134,5 @@ def _label_of_pixels(scan: Scan, image: RangeImage, config: DataConfig) -> Int[T
     return torch.where(image.return_mask, label, 0)
 
 
-def _short(place: str) -> str:
-    return place if len(place) < _NAME_LETTERS else "..." + place[3 - _NAME_LETTERS :]
+def _short(source: str) -> str:
+    return source if len(source) < _NAME_LETTERS else "..." + source[3 - _NAME_LETTERS :]

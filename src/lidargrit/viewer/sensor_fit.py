@@ -1,4 +1,4 @@
-"""What speaks for and against a fitted sensor, as a picture: :class:`SensorFit` → one PNG."""
+"""Evidence for and against a fitted sensor as a picture: :class:`SensorFit` → PNG."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _BINS_PER_ROW = 12  # of the histogram of elevations: enough to see a gap betwee
 
 
 def plot_sensor_fit(fit: SensorFit, path: Path) -> None:
-    """Draw elevations with the fitted rows, the spread and the number of points of each ring, and firing steps.
+    """Plot elevations with the fitted rows, the spread and number of points of each ring, and steps in azimuth.
 
     Args:
-        fit: of a sensor.
-        path: of the PNG; an older picture there is replaced, in one step.
+        fit: fitted sensor with its residuals.
+        path: path of the PNG; an older picture there is replaced in one step.
 
     Raises:
         OutputError: the picture cannot be written.
@@ -71,13 +71,13 @@ def _plot_spread(axes: Axes, fit: SensorFit, rows_deg: np.ndarray) -> None:
     row = np.arange(len(rows_deg))
     gap = np.abs(np.diff(rows_deg))
     nearest = np.minimum(np.append(gap, np.inf), np.insert(gap, 0, np.inf))
-    floor = 1e-4  # degrees: single precision, and simulated scans, lie below what can be drawn
-    axes.semilogy(row, nearest, color="grey", linewidth=1, label="way to the next row")
+    lowest = 1e-4  # degrees: single precision, and simulated scans, lie below this
+    axes.semilogy(row, nearest, color="grey", linewidth=1, label="distance to the next row")
     blurred = fit.residual_deg > nearest / 2
-    axes.semilogy(row, np.maximum(fit.residual_deg, floor), "o", color=_POINT, markersize=3, label="spread of points")
+    axes.semilogy(row, np.maximum(fit.residual_deg, lowest), "o", color=_POINT, markersize=3, label="spread of points")
     axes.semilogy(row[blurred], fit.residual_deg[blurred], "o", color=_BAD, markersize=4, label="too wide")
     axes.set(xlabel="row, 0 = the highest", ylabel="degrees", title="how sharp each ring is")
-    axes.set_ylim(floor / 2, 2 * float(max(nearest.max(), fit.residual_deg.max())))
+    axes.set_ylim(lowest / 2, 2 * float(max(nearest.max(), fit.residual_deg.max())))
     axes.legend(loc="best", ncols=3, fontsize="small")
 
 

@@ -1,4 +1,4 @@
-"""Anything that holds scans, side by side on one scale: places → a PNG, or a page to turn and step through."""
+"""Sets of scans side by side on one scale: sources → a PNG, or a page to turn and step through."""
 
 from __future__ import annotations
 
@@ -14,31 +14,34 @@ from lidargrit.viewer.scan_sets import load_scan_sets
 
 
 def view(
-    places: Sequence[str],
+    sources: Sequence[str],
     out: Path,
     count: int = 3,
     seed: int = 0,
     config: DataConfig | None = None,
     reporter: Reporter | None = None,
 ) -> None:
-    """Draw scans, samples and what a run makes of them.
+    """Plot scans, samples, and what runs generate and reconstruct.
 
     Args:
-        places: each a run's folder (drawn as *generated*, and as *reconstructed* if there are scans beside it and
-            its generator can encode), a
-            folder of samples, or a source of scans.
-        out: the PNG, or the page if it ends in ``.html``.
-        count: scans of each, evenly spaced.
-        seed: of the first generated scan.
-        config: how scans are read and projected.
-        reporter: hears of scans that are left out.
+        sources: sources, as :func:`load_scan_sets` takes them.
+        out: path of the PNG, or of the page if it ends in ``.html``.
+        count: number of scans of each set, evenly spaced over its source.
+        seed: seed of the first generated scan.
+        config: settings by which scans are read and projected.
+        reporter: receiver of messages about scans that are left out.
+
+    Raises:
+        ConfigError: too few or too many scans, or no source.
+        LidarGritError: a source that cannot be used.
+        OutputError: the file cannot be written.
     """
     is_page = out.suffix.lower() == ".html"
     at_most = PAGE_SCANS_AT_MOST if is_page else SCANS_AT_MOST
     if not 1 <= count <= at_most:
-        raise ConfigError(f"{count} scans of each to draw", f"1 to {at_most}", "correct the number")
-    shown = load_scan_sets(places, count, seed, config, reporter)
+        raise ConfigError(f"{count} scans of each set", f"1 to {at_most}", "correct the number")
+    sets = load_scan_sets(sources, count, seed, config, reporter)
     if is_page:
-        write_page(shown, out)
+        write_page(sets, out)
     else:
-        plot_comparison({one.name: one.images for one in shown}, out)
+        plot_comparison({scans.name: scans.images for scans in sets}, out)
