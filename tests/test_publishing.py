@@ -181,7 +181,7 @@ def test_no_source_of_a_run_is_searched(monkeypatch):
     monkeypatch.setattr("lidargrit.datasets._files.scans_below", lambda root: pytest.fail(f"searches {root}"))
     monkeypatch.setattr("lidargrit.datasets.folder.scans_below", lambda root: pytest.fail(f"searches {root}"))
     for source in ("/", "/::all", str(Path.home()), "."):
-        assert data_set_of(source)[0] == ""
+        assert data_set_of(source)[0] in ("", "folder")
 
 
 def marginal(sensor="hdl64e_kitti_odometry"):
