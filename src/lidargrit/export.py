@@ -32,20 +32,20 @@ def export_scans(
 ) -> int:
     """Write every scan of a source to a file of its own; files that are there already are not written again.
 
-    Scans keep the points that they have; a range image gives a point for each return, on its pixel's ray. Files are
-    called as the scans are, or ``NNNNNN`` by their place in samples and prepared scans; ``export.json`` tells which
-    file holds which scan.
+    Scans keep their own points; a range image gives one point for each return, on the ray of its pixel. Files have the
+    names of the scans, or ``NNNNNN``, the index, for samples and prepared scans. ``export.json`` says which file holds
+    which scan.
 
     Args:
-        source: samples of ours or of another program, a prepared place, or what data sets are opened by.
+        source: samples of ours or of another program, a prepared folder, or a source of scans.
         out: an empty folder, or one that the same command began; more scans can be added to it.
         kind: a format's name or one of its endings ("pcd", "npz", ...), or ``kitti_odometry`` for the tree
             ``sequences/SS/velodyne/NNNNNN.bin``, with SemanticKITTI's ``labels/NNNNNN.label`` where scans have labels.
-        config: of it, ``max_scans``, ``bad_points`` and ``bad_scans`` count.
-        reporter: hears of the progress.
+        config: number of scans, and what to do with unusable points and scans; nothing else of it is used.
+        reporter: receiver of progress and messages.
 
     Returns:
-        how many scans are there now.
+        Number of scans that are there now.
 
     Raises:
         UnknownNameError: no such format.
@@ -84,7 +84,7 @@ def kinds() -> list[str]:
 
 @dataclass(frozen=True)
 class _OfDataset:
-    """The scans of a data set that are wanted."""
+    """Some scans of a data set."""
 
     dataset: ScanDataset
     indices: Sequence[int]
@@ -93,7 +93,7 @@ class _OfDataset:
         return len(self.indices)
 
     def name(self, index: int) -> str:
-        """Return what its file is to be called."""
+        """Return the name of its file, without the ending."""
         return self.dataset.name(self.indices[index])
 
     def identity(self, index: int) -> str:
@@ -106,7 +106,7 @@ class _OfDataset:
 
 @dataclass(frozen=True)
 class _OfImages:
-    """Range images as scans, numbered: they have no short names of their own."""
+    """Range images as scans; they are numbered, because they have no short names."""
 
     images: RangeImages
 
@@ -114,7 +114,7 @@ class _OfImages:
         return len(self.images)
 
     def name(self, index: int) -> str:
-        """Return its place."""
+        """Return its index."""
         return f"{index:06d}"
 
     def identity(self, index: int) -> str:
@@ -159,7 +159,7 @@ class _Tree:
         """Keep KITTI's own names; number other folders, and the scans in each, in their order."""
         if not all(map(_KITTI_NAME.fullmatch, names)):
             folders = [str(PurePosixPath(name).parent) for name in names]
-            sequences = {folder: f"{place:02d}" for place, folder in enumerate(dict.fromkeys(folders))}
+            sequences = {folder: f"{number:02d}" for number, folder in enumerate(dict.fromkeys(folders))}
             seen: Counter[str] = Counter()
             numbered = []
             for folder in folders:
@@ -173,7 +173,7 @@ class _Tree:
 
     def write(self, file: str, scan: Scan) -> None:
         path = self._out / file
-        if scan.label is not None:  # first: the points say that the scan is there
+        if scan.label is not None:  # before the points, whose file says that the scan is complete
             with atomic_path(path.parents[1] / "labels" / f"{path.stem}.label") as temporary:
                 temporary.write_bytes(scan.label.numpy().astype("<u4").tobytes())
         KittiBin.write(path, scan)
@@ -192,7 +192,7 @@ def _format(kind: str) -> tuple[type[ScanFormat], str]:
 
 
 def _claim(out: Path, facts: dict[str, Any]) -> None:
-    """Write down what the folder holds, or add to what the same command wrote before.
+    """Write the manifest of the folder, or add to the one that the same command wrote before.
 
     Raises:
         OutputError: the folder holds something else, or another scan in one of the files.
