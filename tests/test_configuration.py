@@ -3,6 +3,7 @@
 import dataclasses
 import json
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 from typing import Literal
 
 import pytest
@@ -49,8 +50,7 @@ def test_a_recipe_is_complete_and_survives_json(name):
     recipe = load_recipe(name)
     written = json.loads(json.dumps(to_json(recipe)))
     generator = load_class(recipe.generator)
-    with torch.device("meta"):
-        stages = generator(recipe.model, recipe.data.load_sensor()).stages
+    stages = generator.stages.fget(SimpleNamespace(config=recipe.model))  # no network of full size is built for it
     assert tuple(recipe.training) == stages
     assert from_json(generator.Config, written["model"], "run.json") == recipe.model
     assert from_json(DataConfig, written["data"], "run.json") == recipe.data
