@@ -1,0 +1,196 @@
+"""Pixels generated in phases from coarse to fine, with exact probabilities: what a decoder tells → range images."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from lidargrit.errors import ConfigError
+from lidargrit.nn.blocks import Network
+from lidargrit.nn.pixel_networks import Guide, MaskNetwork, PixelDecoderConfig, RangeNetwork
+from lidargrit.nn.pixel_phases import Phase, at_phases, join_phases
+from lidargrit.sensors import SensorModel
+from lidargrit.structures import RangeImage
+
+_Guided = tuple[dict[int, Tensor], dict[int, Tensor]]  # by spacing: the guide's part of the first layers, of both
+
+BITS_STEP_M = 0.01  # bits of a return are those of naming its range to a centimetre
+
+
+@dataclass(frozen=True)
+class PixelSampling:
+    """How ranges are sampled from their mixtures.
+
+    Args:
+        temperature: of the components' weights; 1 takes them as they are, below 1 prefers the likelier surface.
+        noise: multiplier of the components' scales; 1 takes them as they are.
+    """
+
+    temperature: float = 1.0
+    noise: float = 1.0
+
+
+class PixelNll(NamedTuple):
+    """Negative log-likelihood of every pixel in nats.
+
+    Args:
+        mask: of whether it returned, after the earlier pixels.
+        range: of its range as a density per metre, after the whole mask and the earlier ranges; 0 without a return.
+    """
+
+    mask: Float[Tensor, "B H W"]
+    range: Float[Tensor, "B H W"]
+
+
+class PixelDecoder(Network):
+    """Mask and range of every pixel, phase by phase, each phase given all earlier ones.
+
+    First comes the whole mask, one Bernoulli number a pixel, then the range of what returned, from a mixture that may
+    stand on either side of an edge. The pixels of one phase are independent of one another, given the earlier ones.
+
+    Args:
+        config: sizes.
+        sensor: the rays and limits of the range images.
+        features: channels of the tokenizer's features.
+
+    Source:
+        Reed et al., Parallel Multiscale Autoregressive Density Estimation, 2017: phases from coarse to fine.
+    """
+
+    def __init__(self, config: PixelDecoderConfig, sensor: SensorModel, features: int) -> None:
+        super().__init__()
+        cell = config.coarsest_cell
+        if sensor.height % cell or sensor.width % cell:
+            raise ConfigError(
+                f"range images of {sensor.height}x{sensor.width} for a pixel decoder of coarsest_cell={cell}",
+                "a coarsest_cell that divides both sides",
+                "lower coarsest_cell, or choose another number of columns",
+            )
+        self.config, self.sensor = config, sensor
+        self.mask, self.range = MaskNetwork(config, sensor, features), RangeNetwork(config, sensor, features)
+
+    def forward(self, guide: Guide, images: RangeImage) -> PixelNll:
+        """Return the exact negative log-likelihood of every pixel."""
+        guided = self.mask.guided(guide), self.range.guided(guide)
+        mask_nll, range_nll = None, None  # of the pixels of a lattice, from the coarsest to the whole image
+        for phases in self.mask.by_spacing():
+            of_mask, of_range = self._nll(phases, guided, guide, images)
+            mask_nll, range_nll = join_phases(mask_nll, of_mask), join_phases(range_nll, of_range)
+        assert mask_nll is not None and range_nll is not None
+        return PixelNll(mask_nll, range_nll)
+
+    def estimate(
+        self, guide: Guide, images: RangeImage, rng: torch.Generator
+    ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
+        """Return the mean nats of the mask a pixel and of the range a return, estimated by one phase of each spacing.
+
+        A step of training costs a third, and so there are three times as many. The estimate of the mask is unbiased.
+        """
+        guided = self.mask.guided(guide), self.range.guided(guide)
+        mask_nats, range_nats = guide.v.new_zeros(()), guide.v.new_zeros(())
+        returns = guide.v.new_zeros(())
+        for phases in self.mask.by_spacing():
+            chosen = [phases[int(torch.randint(len(phases), (), generator=rng, device=rng.device))]]
+            of_mask, of_range = self._nll(chosen, guided, guide, images)
+            mask_nats = mask_nats + len(phases) * of_mask.sum()
+            range_nats = range_nats + len(phases) * of_range.sum()
+            returns = returns + len(phases) * at_phases(images.return_mask, chosen).sum()
+        return mask_nats / guide.v.numel(), range_nats / returns.clamp(min=1)
+
+    def _nll(
+        self, phases: list[Phase], guided: _Guided, guide: Guide, images: RangeImage
+    ) -> tuple[Float[Tensor, "P B h w"], Float[Tensor, "P B h w"]]:
+        """Return the negative log-likelihood of mask and range at phases of one spacing."""
+        mask, v = images.return_mask, images.range_m.log1p()
+        returned = at_phases(mask, phases)
+        logits = self.mask.logits(phases, self.mask.outputs(phases, guided[0], guide, mask, v), guide)
+        of_mask = F.binary_cross_entropy_with_logits(logits, returned.float(), reduction="none")
+        candidates = self.range.candidates(phases, guide, mask, v)
+        output = self.range.outputs(phases, guided[1], guide, mask, v)
+        # Where nothing returned, any range within the limits stands in: its density is not used.
+        range_m = torch.where(returned, at_phases(images.range_m, phases), self.sensor.range_min_m)
+        density = self.range.mixture(phases, output, candidates, guide).log_density(range_m)
+        return of_mask, torch.where(returned, -density, 0.0)
+
+    def sample(
+        self,
+        guide: Guide,
+        rngs: Sequence[torch.Generator],
+        sampling: PixelSampling | None = None,
+        observed: tuple[RangeImage, Bool[Tensor, "B H W"]] | None = None,
+    ) -> RangeImage:
+        """Return one scan for each random generator; a scan does not depend on the others of its batch.
+
+        Args:
+            guide: what the decoder tells, for as many scans.
+            rngs: random generators on the CPU, one for each scan.
+            sampling: of the ranges.
+            observed: scans, and True where a pixel of them is known, be it a return or that there was none. These
+                pixels are taken over as they are, when their phase comes: later phases know of them, earlier ones not.
+        """
+        size = (3, self.sensor.height, self.sensor.width)
+        uniform = torch.stack([torch.rand(size, generator=rng) for rng in rngs]).to(guide.v.device)
+        # One scan after the other on a CPU: with other batch sizes its sums have other rounding errors.
+        step = 1 if guide.v.device.type == "cpu" else len(uniform)
+        images = []
+        for first in range(0, len(uniform), step):
+            part = slice(first, first + step)
+            given = None if observed is None else (observed[0][part], observed[1][part])
+            images.append(
+                self._sample(Guide(*(x[part] for x in guide)), uniform[part], sampling or PixelSampling(), given)
+            )
+        return RangeImage.stack([batch[index] for batch in images for index in range(len(batch))])
+
+    def _sample(
+        self,
+        guide: Guide,
+        uniform: Float[Tensor, "B 3 H W"],
+        sampling: PixelSampling,
+        observed: tuple[RangeImage, Bool[Tensor, "B H W"]] | None,
+    ) -> RangeImage:
+        mask = torch.zeros_like(guide.v, dtype=torch.bool)
+        range_m = torch.zeros_like(guide.v)
+        if observed is not None:
+            mask, range_m = observed[0].return_mask & observed[1], observed[0].range_m * observed[1]
+        mask = self._sample_mask(guide, uniform[:, 0], mask, None if observed is None else observed[1])
+        guided, v = self.range.guided(guide), range_m.log1p()
+        for phase in self.range.phases:
+            pixels = (..., *phase.pixels)
+            candidates = self.range.candidates([phase], guide, mask, v)
+            output = self.range.outputs([phase], guided, guide, mask, v)
+            mixture = self.range.mixture([phase], output, candidates, guide)
+            choice, within = uniform[:, 1][pixels][None], uniform[:, 2][pixels][None]
+            sampled = mixture.sample(choice, within, sampling.temperature, sampling.noise)[0]
+            keep = range_m[pixels] if observed is None else torch.where(observed[1][pixels], range_m[pixels], sampled)
+            range_m[pixels] = torch.where(mask[pixels], sampled if observed is None else keep, 0.0)
+            v[pixels] = range_m[pixels].log1p()
+        return RangeImage(range_m, mask, self.sensor)
+
+    def _sample_mask(
+        self,
+        guide: Guide,
+        uniform: Float[Tensor, "B H W"],
+        mask: Bool[Tensor, "B H W"],
+        observed: Bool[Tensor, "B H W"] | None,
+    ) -> Bool[Tensor, "B H W"]:
+        """Return the mask, generated phase by phase; ``mask`` is taken over where observed."""
+        guided = self.mask.guided(guide)
+        mask = mask.clone()
+        for phase in self.mask.phases:
+            pixels = (..., *phase.pixels)
+            output = self.mask.outputs([phase], guided, guide, mask, guide.v)
+            sampled = uniform[pixels] < self.mask.logits([phase], output, guide)[0].sigmoid()
+            mask[pixels] = sampled if observed is None else torch.where(observed[pixels], mask[pixels], sampled)
+        return mask
+
+
+def nats_to_range_bits(nats: Float[Tensor, "*P"]) -> Float[Tensor, "*P"]:
+    """Return the bits of naming a range to :data:`BITS_STEP_M`, from the negative log-density per metre in nats."""
+    return (nats - math.log(BITS_STEP_M)) / math.log(2)

@@ -1,0 +1,286 @@
+"""The two networks of a pixel decoder: what is known of a scan so far → mask and range of the next phase's pixels."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from lidargrit.errors import ConfigError
+from lidargrit.nn.blocks import Block
+from lidargrit.nn.convolution import Convolution
+from lidargrit.nn.pixel_phases import Phase, at_phases, cells_of, generated_before, neighbours_of, phases_of
+from lidargrit.nn.range_mixture import RangeMixture
+from lidargrit.sensors import SensorModel
+
+_TYPICAL_V = 2.5  # ln(1 + 11 m), the middle of what scans hold, so that inputs are near 0
+_LOGIT_BOUND = 8.0  # of the decoder's return logits, beyond which it is as good as sure
+_SAME_SURFACE_V = 3e-4  # two ranges nearer than this, 6 mm at 20 m, are on one surface
+_NEIGHBOURS = 6  # candidates of a range: an interpolation and two neighbours, of each of two pairs
+_FINEST_M, _COARSEST_M = math.exp(-6), math.exp(4)  # scales of a component: 2.5 mm to 55 m
+
+
+@dataclass(frozen=True)
+class PixelDecoderConfig:
+    """Sizes of the pixel decoder.
+
+    Args:
+        coarsest_cell: rows and columns of the cells of which the first phase generates one pixel each; a power of 2
+            that divides both sides of the image.
+        mask_features: channels of the tokenizer's features that the mask network sees.
+        range_features: the same of the range network.
+        row_channels: learned numbers of every row.
+        mask_width: channels of the mask network's layers.
+        range_width: the same of the range network.
+        blocks: residual blocks of each network.
+        free_components: components of a range that do not begin at a neighbour's range; there are 6 more that do.
+    """
+
+    coarsest_cell: int = 8
+    mask_features: int = 12
+    range_features: int = 12
+    row_channels: int = 4
+    mask_width: int = 32
+    range_width: int = 48
+    blocks: int = 2
+    free_components: int = 4
+
+    def __post_init__(self) -> None:
+        phases_of(self.coarsest_cell)
+        for name, value in vars(self).items():
+            if value < 1:
+                raise ConfigError(f"{name}={value}", "at least 1", "raise it")
+
+
+class Guide(NamedTuple):
+    """What a tokenizer's decoder tells of every pixel.
+
+    Args:
+        features: of its last layer.
+        v: ln(1 + decoded range in metres).
+        return_logits: of P(return).
+    """
+
+    features: Float[Tensor, "B C H W"]
+    v: Float[Tensor, "B H W"]
+    return_logits: Float[Tensor, "B H W"]
+
+
+class _Residual(Block):
+    """Two convolutions whose sum with the input is the input at first."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.conv1, self.conv2 = Convolution(width, width, "wrap"), Convolution(width, width, "wrap")
+        nn.init.zeros_(self.conv2.weight)
+        assert self.conv2.bias is not None
+        nn.init.zeros_(self.conv2.bias)
+
+    def forward(self, x: Float[Tensor, "B C h w"]) -> Float[Tensor, "B C h w"]:
+        return x + self.conv2(F.silu(self.conv1(F.silu(x))))
+
+
+class _SpacingNetwork(nn.Module):
+    """The network of all phases of one spacing, over cells of 2x2 pixels of the lattice.
+
+    The part of the first layer that sees the guide is computed once for all phases.
+    """
+
+    def __init__(self, guide: int, context: int, width: int, blocks: int, phases: int, outputs: int) -> None:
+        super().__init__()
+        self.guide, self.context = Convolution(guide, width, "wrap"), Convolution(context, width, "wrap")
+        self.phase_bias = nn.Parameter(torch.zeros(phases, width))
+        self.blocks = nn.Sequential(*(_Residual(width) for _ in range(blocks)))
+        self.out = nn.ModuleList(nn.Conv2d(width, outputs, 1) for _ in range(phases))
+        for layer in self.out:
+            nn.init.zeros_(layer.get_parameter("weight"))
+            nn.init.zeros_(layer.get_parameter("bias"))
+
+    def forward(
+        self, guided: Float[Tensor, "B C h w"], contexts: Float[Tensor, "P B D h w"], first: int
+    ) -> Float[Tensor, "P B O h w"]:
+        """Return the outputs of as many phases as there are contexts, from the phase ``first`` on."""
+        size = contexts.shape[:2]
+        x = self.context(contexts.flatten(0, 1)).unflatten(0, size)
+        x = x + guided + self.phase_bias[first : first + size[0], None, :, None, None]
+        x = F.silu(self.blocks(x.flatten(0, 1))).unflatten(0, size)
+        return torch.stack([layer(part) for layer, part in zip(self.out[first:], x, strict=False)]).float()
+
+
+class PhaseNetwork(nn.Module, ABC):
+    """What the mask's and the range's network share: a small network for each spacing, run anew for every phase."""
+
+    def __init__(
+        self, config: PixelDecoderConfig, sensor: SensorModel, features: int, kept: int, width: int, outputs: int
+    ) -> None:
+        super().__init__()
+        self.phases, self.sensor = phases_of(config.coarsest_cell), sensor
+        self.features = nn.Conv2d(features, kept, 1)
+        self.rows = nn.Parameter(torch.zeros(config.row_channels, sensor.height))
+        guide = 4 * (kept + config.row_channels + 2)
+        self.networks = nn.ModuleDict()
+        for spacing in dict.fromkeys(phase.spacing for phase in self.phases):
+            count = len([phase for phase in self.phases if phase.spacing == spacing])
+            network = _SpacingNetwork(guide, self.context_channels, width, config.blocks, count, outputs)
+            self.networks[str(spacing)] = network
+
+    context_channels: int
+
+    @abstractmethod
+    def context(
+        self, phase: Phase, guide: Guide, return_mask: Bool[Tensor, "B H W"], v: Float[Tensor, "B H W"]
+    ) -> Float[Tensor, "B D h w"]:
+        """Return what is known before a phase, on its cells; later pixels are not looked at."""
+
+    def guided(self, guide: Guide) -> dict[int, Float[Tensor, "B C h w"]]:
+        """Return for each spacing what its network makes of the guide, which is the same for all of its phases."""
+        rows = self.rows[None, :, :, None].expand(len(guide.v), -1, -1, guide.v.shape[-1])
+        decoded = torch.stack((guide.v - _TYPICAL_V, guide.return_logits.clamp(-_LOGIT_BOUND, _LOGIT_BOUND) / 4), 1)
+        maps = torch.cat((self.features(guide.features), rows, decoded), 1)
+        return {int(name): network.guide(cells_of(maps, int(name))) for name, network in self._networks()}
+
+    def outputs(
+        self,
+        phases: list[Phase],
+        guided: dict[int, Float[Tensor, "B C h w"]],
+        guide: Guide,
+        return_mask: Bool[Tensor, "B H W"],
+        v: Float[Tensor, "B H W"],
+    ) -> Float[Tensor, "P B O h w"]:
+        """Return the network's outputs for consecutive phases of one spacing."""
+        spacing = phases[0].spacing
+        contexts = torch.stack([self.context(phase, guide, return_mask, v) for phase in phases])
+        first = [phase for phase in self.phases if phase.spacing == spacing].index(phases[0])
+        return self.networks[str(spacing)](guided[spacing], contexts, first)
+
+    def by_spacing(self) -> list[list[Phase]]:
+        """Return the phases, those of one spacing together."""
+        spacings = dict.fromkeys(phase.spacing for phase in self.phases)
+        return [[phase for phase in self.phases if phase.spacing == spacing] for spacing in spacings]
+
+    def _networks(self) -> list[tuple[str, _SpacingNetwork]]:
+        return [(name, network) for name, network in self.networks.items() if isinstance(network, _SpacingNetwork)]
+
+
+class MaskNetwork(PhaseNetwork):
+    """The logits of P(return), given which of the earlier pixels returned: a correction of the decoder's logits."""
+
+    context_channels = 4 * 2
+
+    def __init__(self, config: PixelDecoderConfig, sensor: SensorModel, features: int) -> None:
+        super().__init__(config, sensor, features, config.mask_features, config.mask_width, 1)
+        self.row_bias = nn.Parameter(torch.zeros(sensor.height))
+
+    def context(
+        self, phase: Phase, guide: Guide, return_mask: Bool[Tensor, "B H W"], v: Float[Tensor, "B H W"]
+    ) -> Float[Tensor, "B D h w"]:
+        """Return for each pixel of a cell whether it is known to have returned, and whether it is known not to."""
+        returned = cells_of(return_mask[:, None].float(), phase.spacing)
+        known = generated_before(phase).to(returned)[:, None, None]
+        return torch.cat((known * returned, known * (1 - returned)), 1)
+
+    def logits(
+        self, phases: list[Phase], output: Float[Tensor, "P B 1 h w"], guide: Guide
+    ) -> Float[Tensor, "P B h w"]:
+        """Return the logits of the pixels of phases of one spacing."""
+        decoded = guide.return_logits.clamp(-_LOGIT_BOUND, _LOGIT_BOUND) + self.row_bias[:, None]
+        return output[:, :, 0] + at_phases(decoded, phases)
+
+
+class RangeNetwork(PhaseNetwork):
+    """The distribution of a range, given the whole mask and the ranges of earlier pixels.
+
+    Its components are free, or begin at what the neighbours suggest: at an edge the range may be that of either side.
+    """
+
+    context_channels = 4 * 3 + _NEIGHBOURS + 3
+
+    def __init__(self, config: PixelDecoderConfig, sensor: SensorModel, features: int) -> None:
+        components = config.free_components + _NEIGHBOURS
+        super().__init__(config, sensor, features, config.range_features, config.range_width, 3 * components)
+        self.limits_m = (sensor.range_min_m, sensor.range_max_m)
+        self.free = config.free_components
+        begin = torch.cat((torch.linspace(-0.2, 0.2, self.free), torch.zeros(_NEIGHBOURS)))
+        scale = torch.cat((torch.zeros(self.free), torch.full((_NEIGHBOURS,), -2.0)))
+        self.register_buffer("begin", begin[:, None, None], persistent=False)
+        self.register_buffer("begin_scale", scale[:, None, None], persistent=False)
+        elevation = sensor.elevation_rad.double().mean(1).float()
+        self.register_buffer("elevation_rad", elevation, persistent=False)
+
+    begin: Tensor
+    begin_scale: Tensor
+    elevation_rad: Tensor
+
+    def context(
+        self, phase: Phase, guide: Guide, return_mask: Bool[Tensor, "B H W"], v: Float[Tensor, "B H W"]
+    ) -> Float[Tensor, "B D h w"]:
+        """Return the mask, the known ranges beside the decoded ones, and how far the candidates are apart."""
+        returned, beside = cells_of(torch.stack((return_mask.float(), v - guide.v), 1), phase.spacing).chunk(2, 1)
+        known = generated_before(phase).to(returned)[:, None, None] * returned
+        candidates = self.candidates([phase], guide, return_mask, v)[0]
+        decoded = guide.v[(..., *phase.pixels)][:, None]
+        first, second = candidates[:, 1:3], candidates[:, 4:6]
+        apart = torch.cat((first.diff(dim=1), second.diff(dim=1), candidates[:, :1] - candidates[:, 3:4]), 1).abs()
+        apart = ((apart + _SAME_SURFACE_V).log() + 5) / 2
+        return torch.cat((known, 1 - returned, known * beside, (candidates - decoded).clamp(-2, 2), apart), 1)
+
+    def candidates(
+        self, phases: list[Phase], guide: Guide, return_mask: Bool[Tensor, "B H W"], v: Float[Tensor, "B H W"]
+    ) -> Float[Tensor, "P B 6 h w"]:
+        """Return ranges that the neighbours suggest, as ln(1 + range): for both pairs an interpolation, then the two.
+
+        One missing of a pair is taken to be as far as the other; where both are missing, as far as decoded.
+        """
+        return torch.stack([self._candidates(phase, guide, return_mask, v) for phase in phases])
+
+    def _candidates(
+        self, phase: Phase, guide: Guide, return_mask: Bool[Tensor, "B H W"], v: Float[Tensor, "B H W"]
+    ) -> Float[Tensor, "B 6 h w"]:
+        near = neighbours_of(phase, v, return_mask)
+        decoded = guide.v[(..., *phase.pixels)]
+        weights = self._weights(phase)
+        found = []
+        for pair, rows_apart in enumerate(near.rows_apart):
+            (one, other), (has_one, has_other) = near.values[:, pair].unbind(1), near.known[:, pair].unbind(1)
+            one_or_other = torch.where(has_one, one, torch.where(has_other, other, decoded))
+            other_or_one = torch.where(has_other, other, torch.where(has_one, one, decoded))
+            weight = weights if rows_apart else torch.full_like(weights, 0.5)
+            # On a plane 1 / range is linear in the sines of the angles between the rays.
+            inverse = weight[..., 0] / one_or_other.expm1() + weight[..., 1] / other_or_one.expm1()
+            found += [inverse.reciprocal().log1p(), one_or_other, other_or_one]
+        return torch.stack(found, 1)
+
+    def mixture(
+        self,
+        phases: list[Phase],
+        output: Float[Tensor, "P B O h w"],
+        candidates: Float[Tensor, "P B 6 h w"],
+        guide: Guide,
+    ) -> RangeMixture:
+        """Return the distributions of the ranges of the pixels of phases of one spacing."""
+        logits, moved, scales = output.chunk(3, 2)
+        free = at_phases(guide.v, phases)[:, :, None] + 2 * (moved + self.begin)[:, :, : self.free]
+        centres = torch.cat((free, candidates + 0.1 * moved[:, :, self.free :]), 2)
+        low, high = (math.log1p(limit) for limit in self.limits_m)
+        centres = centres.clamp(low, high)
+        log_scales_m = (1.5 * (scales + self.begin_scale)).clamp(math.log(_FINEST_M), math.log(_COARSEST_M))
+        log_scales = log_scales_m - centres  # dv = d range / (1 + range): so the scale is one in metres
+        parts = (part.movedim(2, -1).contiguous() for part in (logits, centres, log_scales))
+        return RangeMixture(*parts, self.limits_m)
+
+    def _weights(self, phase: Phase) -> Float[Tensor, "h 1 2"]:
+        """Return for each row of a phase the weights of 1 / range in the row above and in the row below."""
+        rows = torch.arange(self.sensor.height, device=self.elevation_rad.device)[phase.pixels[0]]
+        above, below = rows - phase.spacing, rows + phase.spacing
+        inside = (above >= 0) & (below < self.sensor.height)
+        here = self.elevation_rad[rows]
+        up, down = (self.elevation_rad[row.clamp(0, self.sensor.height - 1)] for row in (above, below))
+        between = (up - down).sin()
+        weights = torch.stack(((here - down).sin() / between, (up - here).sin() / between), -1)
+        return torch.where(inside[:, None], weights, 0.5)[:, None]

@@ -1,0 +1,85 @@
+"""A mixture of logistic distributions of a range, cut off at the sensor's limits: numbers → density, random ranges."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+_LEAST_MASS = 1e-6  # of a component within the limits; the logarithm stays finite
+
+
+@dataclass(frozen=True)
+class RangeMixture:
+    """The distribution of v = ln(1 + range in metres) of one pixel, for many pixels.
+
+    Every component is cut off at the limits and rescaled, so that ranges of the sensor have probability 1 together.
+
+    Args:
+        logits: of the components' weights.
+        centres: of the components, in v; within the limits.
+        log_scales: natural logarithm of the components' scales, in v.
+        limits_m: shortest and longest range of the sensor in metres.
+
+    Source:
+        Salimans et al., PixelCNN++, 2017, section 2.1: a mixture of logistics; there of bins, here of a density.
+    """
+
+    logits: Float[Tensor, "*P K"]
+    centres: Float[Tensor, "*P K"]
+    log_scales: Float[Tensor, "*P K"]
+    limits_m: tuple[float, float]
+
+    def log_density(self, range_m: Float[Tensor, "*P"]) -> Float[Tensor, "*P"]:
+        """Return the natural logarithm of the probability density per metre."""
+        v = range_m.log1p()[..., None]
+        z = (v - self.centres) * (-self.log_scales).exp()
+        # The logistic density is sigmoid'(z) / scale, and ln sigmoid'(z) = -z - 2 softplus(-z).
+        component = -z - 2 * F.softplus(-z) - self.log_scales - self._mass().clamp(min=_LEAST_MASS).log()
+        weighted = self.logits.log_softmax(-1) + component
+        return weighted.logsumexp(-1) - v[..., 0]  # dv / d range = 1 / (1 + range) = exp(-v)
+
+    def cdf(self, range_m: Float[Tensor, "*P"]) -> Float[Tensor, "*P"]:
+        """Return the probability of a range of at most ``range_m``, which lies within the limits."""
+        low, mass = self._bounds()[0], self._mass().clamp(min=_LEAST_MASS)
+        below = (range_m.log1p()[..., None] - self.centres) * (-self.log_scales).exp()
+        return (self.logits.softmax(-1) * (below.sigmoid() - low) / mass).sum(-1)
+
+    def sample(
+        self, component: Float[Tensor, "*P"], within: Float[Tensor, "*P"], temperature: float = 1.0, noise: float = 1.0
+    ) -> Float[Tensor, "*P"]:
+        """Return one range in metres for each pixel.
+
+        Args:
+            component: uniform random numbers in [0, 1) that choose a component.
+            within: uniform random numbers in [0, 1) that choose a range of the component.
+            temperature: of the components' weights: 1 takes them as they are, below 1 prefers the likelier ones.
+            noise: multiplier of the components' scales.
+        """
+        scaled = RangeMixture(
+            self.logits / temperature,
+            self.centres,
+            self.log_scales + torch.tensor(noise, dtype=self.log_scales.dtype).log(),
+            self.limits_m,
+        )
+        distribution = scaled.logits.double().softmax(-1).cumsum(-1)
+        chosen = torch.searchsorted(distribution, component.double()[..., None].clamp(max=1 - 1e-12), right=True)
+        chosen = chosen.clamp(max=scaled.logits.shape[-1] - 1)
+        low, high = (bound.gather(-1, chosen)[..., 0].double() for bound in scaled._bounds())
+        centre = scaled.centres.gather(-1, chosen)[..., 0].double()
+        scale = scaled.log_scales.gather(-1, chosen)[..., 0].double().exp()
+        level = (low + within.double() * (high - low)).clamp(1e-9, 1 - 1e-9)
+        return (centre + scale * level.logit()).expm1().clamp(*self.limits_m).float()
+
+    def _bounds(self) -> tuple[Float[Tensor, "*P K"], Float[Tensor, "*P K"]]:
+        """Return each component's distribution function at the two limits."""
+        low, high = torch.tensor(self.limits_m, dtype=self.centres.dtype, device=self.centres.device).log1p()
+        inverse = (-self.log_scales).exp()
+        return ((low - self.centres) * inverse).sigmoid(), ((high - self.centres) * inverse).sigmoid()
+
+    def _mass(self) -> Float[Tensor, "*P K"]:
+        low, high = self._bounds()
+        return high - low
