@@ -17,7 +17,7 @@ from lidargrit.nn.blocks import Network
 from lidargrit.nn.pixel_networks import Guide, MaskNetwork, PixelDecoderConfig, RangeNetwork
 from lidargrit.nn.pixel_phases import Phase, at_phases, join_phases
 from lidargrit.sensors import SensorModel
-from lidargrit.structures import RangeImage
+from lidargrit.structures import Decoded, RangeImage
 
 _Guided = tuple[dict[int, Tensor], dict[int, Tensor]]  # by spacing: the guide's part of the first layers, of both
 
@@ -76,8 +76,9 @@ class PixelDecoder(Network):
         self.config, self.sensor = config, sensor
         self.mask, self.range = MaskNetwork(config, sensor, features), RangeNetwork(config, sensor, features)
 
-    def forward(self, guide: Guide, images: RangeImage) -> PixelNll:
-        """Return the exact negative log-likelihood of every pixel."""
+    def forward(self, decoded: Decoded, images: RangeImage) -> PixelNll:
+        """Return the exact negative log-likelihood of every pixel, given what was decoded from the tokens."""
+        guide = Guide.of(decoded)
         guided = self.mask.guided(guide), self.range.guided(guide)
         mask_nll, range_nll = None, None  # of the pixels of a lattice, from the coarsest to the whole image
         for phases in self.mask.by_spacing():
@@ -87,12 +88,13 @@ class PixelDecoder(Network):
         return PixelNll(mask_nll, range_nll)
 
     def estimate(
-        self, guide: Guide, images: RangeImage, rng: torch.Generator
+        self, decoded: Decoded, images: RangeImage, rng: torch.Generator
     ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
         """Return the mean nats of the mask a pixel and of the range a return, estimated by one phase of each spacing.
 
         A step of training costs a third, and so there are three times as many. The estimate of the mask is unbiased.
         """
+        guide = Guide.of(decoded)
         guided = self.mask.guided(guide), self.range.guided(guide)
         mask_nats, range_nats = guide.v.new_zeros(()), guide.v.new_zeros(())
         returns = guide.v.new_zeros(())
@@ -121,7 +123,7 @@ class PixelDecoder(Network):
 
     def sample(
         self,
-        guide: Guide,
+        decoded: Decoded,
         rngs: Sequence[torch.Generator],
         sampling: PixelSampling | None = None,
         observed: tuple[RangeImage, Bool[Tensor, "B H W"]] | None = None,
@@ -129,66 +131,69 @@ class PixelDecoder(Network):
         """Return one scan for each random generator; a scan does not depend on the others of its batch.
 
         Args:
-            guide: what the decoder tells, for as many scans.
+            decoded: what was decoded from the tokens of as many scans.
             rngs: random generators on the CPU, one for each scan.
             sampling: of the ranges.
             observed: scans, and True where a pixel of them is known, be it a return or that there was none. These
                 pixels are taken over as they are, when their phase comes: later phases know of them, earlier ones not.
         """
+        guide = Guide.of(decoded)
         size = (3, self.sensor.height, self.sensor.width)
         uniform = torch.stack([torch.rand(size, generator=rng) for rng in rngs]).to(guide.v.device)
+        nothing = torch.zeros_like(guide.v)
+        known = torch.zeros_like(guide.v, dtype=torch.bool) if observed is None else observed[1]
+        given_m = nothing if observed is None else torch.where(known, observed[0].range_m, nothing)
         # One scan after the other on a CPU: with other batch sizes its sums have other rounding errors.
         step = 1 if guide.v.device.type == "cpu" else len(uniform)
         images = []
         for first in range(0, len(uniform), step):
             part = slice(first, first + step)
-            given = None if observed is None else (observed[0][part], observed[1][part])
-            images.append(
-                self._sample(Guide(*(x[part] for x in guide)), uniform[part], sampling or PixelSampling(), given)
-            )
-        return RangeImage.stack([batch[index] for batch in images for index in range(len(batch))])
-
-    def _sample(
-        self,
-        guide: Guide,
-        uniform: Float[Tensor, "B 3 H W"],
-        sampling: PixelSampling,
-        observed: tuple[RangeImage, Bool[Tensor, "B H W"]] | None,
-    ) -> RangeImage:
-        mask = torch.zeros_like(guide.v, dtype=torch.bool)
-        range_m = torch.zeros_like(guide.v)
-        if observed is not None:
-            mask, range_m = observed[0].return_mask & observed[1], observed[0].range_m * observed[1]
-        mask = self._sample_mask(guide, uniform[:, 0], mask, None if observed is None else observed[1])
-        guided, v = self.range.guided(guide), range_m.log1p()
-        for phase in self.range.phases:
-            pixels = (..., *phase.pixels)
-            candidates = self.range.candidates([phase], guide, mask, v)
-            output = self.range.outputs([phase], guided, guide, mask, v)
-            mixture = self.range.mixture([phase], output, candidates, guide)
-            choice, within = uniform[:, 1][pixels][None], uniform[:, 2][pixels][None]
-            sampled = mixture.sample(choice, within, sampling.temperature, sampling.noise)[0]
-            keep = range_m[pixels] if observed is None else torch.where(observed[1][pixels], range_m[pixels], sampled)
-            range_m[pixels] = torch.where(mask[pixels], sampled if observed is None else keep, 0.0)
-            v[pixels] = range_m[pixels].log1p()
-        return RangeImage(range_m, mask, self.sensor)
+            some = Guide(*(maps[part] for maps in guide))
+            mask = self._sample_mask(some, uniform[part, 0], given_m[part] > 0, known[part])
+            range_m = self._sample_range(some, uniform[part, 1:], mask, given_m[part], known[part], sampling)
+            images.append(RangeImage(range_m, mask, self.sensor))
+        return RangeImage.cat(images)
 
     def _sample_mask(
         self,
         guide: Guide,
         uniform: Float[Tensor, "B H W"],
-        mask: Bool[Tensor, "B H W"],
-        observed: Bool[Tensor, "B H W"] | None,
+        given: Bool[Tensor, "B H W"],
+        known: Bool[Tensor, "B H W"],
     ) -> Bool[Tensor, "B H W"]:
-        """Return the mask, generated phase by phase; ``mask`` is taken over where observed."""
+        """Return the mask, sampled phase by phase; what is known of it is taken from ``given``."""
         guided = self.mask.guided(guide)
-        mask = mask.clone()
+        mask = torch.zeros_like(given)
         for phase in self.mask.phases:
             pixels = (..., *phase.pixels)
             output = self.mask.outputs([phase], guided, guide, mask, guide.v)
             sampled = uniform[pixels] < self.mask.logits([phase], output, guide)[0].sigmoid()
-            mask[pixels] = sampled if observed is None else torch.where(observed[pixels], mask[pixels], sampled)
+            mask[pixels] = torch.where(known[pixels], given[pixels], sampled)
         return mask
+
+    def _sample_range(
+        self,
+        guide: Guide,
+        uniform: Float[Tensor, "B 2 H W"],
+        mask: Bool[Tensor, "B H W"],
+        given_m: Float[Tensor, "B H W"],
+        known: Bool[Tensor, "B H W"],
+        sampling: PixelSampling | None,
+    ) -> Float[Tensor, "B H W"]:
+        """Return the ranges of a whole mask, sampled phase by phase; what is known of them is taken from ``given_m``."""
+        guided, choices = self.range.guided(guide), sampling or PixelSampling()
+        range_m, v = torch.zeros_like(given_m), torch.zeros_like(given_m)
+        for phase in self.range.phases:
+            pixels = (..., *phase.pixels)
+            candidates = self.range.candidates([phase], guide, mask, v)
+            output = self.range.outputs([phase], guided, guide, mask, v)
+            mixture = self.range.mixture([phase], output, candidates, guide)
+            component, within = uniform[pixels].unbind(1)
+            sampled = mixture.sample(component[None], within[None], choices.temperature, choices.noise)[0]
+            sampled = torch.where(known[pixels], given_m[pixels], sampled)
+            range_m[pixels] = torch.where(mask[pixels], sampled, 0.0)
+            v[pixels] = range_m[pixels].log1p()
+        return range_m
 
 
 def nats_to_range_bits(nats: Float[Tensor, "*P"]) -> Float[Tensor, "*P"]:

@@ -18,6 +18,7 @@ from lidargrit.nn.convolution import Convolution
 from lidargrit.nn.pixel_phases import Phase, at_phases, cells_of, generated_before, neighbours_of, phases_of
 from lidargrit.nn.range_mixture import RangeMixture
 from lidargrit.sensors import SensorModel
+from lidargrit.structures import Decoded
 
 _TYPICAL_V = 2.5  # ln(1 + 11 m), the middle of what scans hold, so that inputs are near 0
 _LOGIT_BOUND = 8.0  # of the decoder's return logits, beyond which it is as good as sure
@@ -64,12 +65,28 @@ class Guide(NamedTuple):
     Args:
         features: of its last layer.
         v: ln(1 + decoded range in metres).
-        return_logits: of P(return).
+        return_logits: logits of the probability of a return, bounded.
     """
 
     features: Float[Tensor, "B C H W"]
     v: Float[Tensor, "B H W"]
     return_logits: Float[Tensor, "B H W"]
+
+    @classmethod
+    def of(cls, decoded: Decoded) -> Guide:
+        """Return the guide of what was decoded from tokens.
+
+        Raises:
+            ConfigError: a tokenizer whose decoder gives no features.
+        """
+        if decoded.features is None:
+            raise ConfigError(
+                "a tokenizer whose decoder gives no features",
+                "one that gives them (Decoded.features)",
+                "leave the pixel decoder out, or choose the tokenizer vqvae",
+            )
+        logits = decoded.return_logits.float().clamp(-_LOGIT_BOUND, _LOGIT_BOUND)
+        return cls(decoded.features.float(), decoded.range_m.float().log1p(), logits)
 
 
 class _Residual(Block):
@@ -138,17 +155,17 @@ class PhaseNetwork(nn.Module, ABC):
     ) -> Float[Tensor, "B D h w"]:
         """Return what is known before a phase, on its cells; later pixels are not looked at."""
 
-    def guided(self, guide: Guide) -> dict[int, Float[Tensor, "B C h w"]]:
-        """Return for each spacing what its network makes of the guide, which is the same for all of its phases."""
+    def guided(self, guide: Guide) -> dict[int, Tensor]:
+        """Return by spacing what the first layer makes of the guide, (B, C, h, w), the same for all phases of a spacing."""
         rows = self.rows[None, :, :, None].expand(len(guide.v), -1, -1, guide.v.shape[-1])
-        decoded = torch.stack((guide.v - _TYPICAL_V, guide.return_logits.clamp(-_LOGIT_BOUND, _LOGIT_BOUND) / 4), 1)
+        decoded = torch.stack((guide.v - _TYPICAL_V, guide.return_logits / 4), 1)
         maps = torch.cat((self.features(guide.features), rows, decoded), 1)
         return {int(name): network.guide(cells_of(maps, int(name))) for name, network in self._networks()}
 
     def outputs(
         self,
         phases: list[Phase],
-        guided: dict[int, Float[Tensor, "B C h w"]],
+        guided: dict[int, Tensor],
         guide: Guide,
         return_mask: Bool[Tensor, "B H W"],
         v: Float[Tensor, "B H W"],
@@ -189,7 +206,7 @@ class MaskNetwork(PhaseNetwork):
         self, phases: list[Phase], output: Float[Tensor, "P B 1 h w"], guide: Guide
     ) -> Float[Tensor, "P B h w"]:
         """Return the logits of the pixels of phases of one spacing."""
-        decoded = guide.return_logits.clamp(-_LOGIT_BOUND, _LOGIT_BOUND) + self.row_bias[:, None]
+        decoded = guide.return_logits + self.row_bias[:, None]
         return output[:, :, 0] + at_phases(decoded, phases)
 
 

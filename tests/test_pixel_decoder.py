@@ -1,0 +1,329 @@
+"""The pixel decoder: exact probabilities, phases, and scans that depend on nothing but their own seed."""
+
+from __future__ import annotations
+
+import math
+from itertools import product
+
+import pytest
+import torch
+from torch import Tensor
+
+from lidargrit.errors import ConfigError
+from lidargrit.nn.pixel_decoder import PixelDecoder, PixelSampling, nats_to_range_bits
+from lidargrit.nn.pixel_networks import Guide, PixelDecoderConfig
+from lidargrit.nn.pixel_phases import at_phases, generated_before, join_phases, phases_of
+from lidargrit.nn.range_mixture import RangeMixture
+from lidargrit.sensors import SensorModel, load_sensor
+from lidargrit.structures import Decoded, RangeImage
+
+FEATURES = 5
+
+
+def tiny_sensor(rows: int, columns: int) -> SensorModel:
+    elevation_rad = torch.linspace(0.05, -0.35, rows)[:, None]
+    azimuth_rad = math.pi - 2 * math.pi * (torch.arange(columns) + 0.5)[None] / columns
+    return SensorModel("tiny", elevation_rad, azimuth_rad, 1.0, 80.0, "spherical")
+
+
+def random_decoder(sensor: SensorModel, cell: int, spread: float = 0.3) -> PixelDecoder:
+    """Return a decoder none of whose weights are zero, so that everything depends on everything it may."""
+    torch.manual_seed(0)
+    config = PixelDecoderConfig(
+        coarsest_cell=cell, mask_features=3, range_features=3, mask_width=6, range_width=6, blocks=1
+    )
+    decoder = PixelDecoder(config, sensor, FEATURES)
+    for weight in decoder.parameters():
+        weight.data = spread * torch.randn_like(weight)
+    return decoder.eval()
+
+
+def random_decoded(sensor: SensorModel, batch: int, seed: int = 1) -> Decoded:
+    rng = torch.Generator().manual_seed(seed)
+    size = (batch, sensor.height, sensor.width)
+    return Decoded(
+        2 + 40 * torch.rand(size, generator=rng),
+        torch.randn(size, generator=rng),
+        sensor,
+        features=torch.randn((batch, FEATURES, *size[1:]), generator=rng),
+    )
+
+
+def random_images(sensor: SensorModel, batch: int, seed: int = 2) -> RangeImage:
+    rng = torch.Generator().manual_seed(seed)
+    size = (batch, sensor.height, sensor.width)
+    return RangeImage.masked(1 + 70 * torch.rand(size, generator=rng), torch.rand(size, generator=rng) < 0.7, sensor)
+
+
+def repeated(decoded: Decoded, times: int) -> Decoded:
+    assert decoded.features is not None
+    parts = (decoded.range_m, decoded.return_logits, decoded.features)
+    range_m, logits, features = (part.expand(times, *part.shape[1:]) for part in parts)
+    return Decoded(range_m, logits, decoded.sensor, features=features)
+
+
+@pytest.mark.parametrize("cell", [2, 4, 8])
+def test_phases_cover_every_pixel_once(cell: int) -> None:
+    phases, count = phases_of(cell), torch.zeros(1, 16, 32)
+    for phase in phases:
+        count[(..., *phase.pixels)] += 1
+    assert torch.equal(count, torch.ones_like(count))
+    assert len(phases) == 1 + 3 * int(math.log2(cell))
+    assert [int(generated_before(phase).sum()) for phase in phases[:4]] == [0, 1, 2, 3]
+
+
+def test_joining_phases_undoes_taking_them_apart() -> None:
+    image = torch.randn(3, 16, 32)
+    joined = None
+    for spacing in (4, 2, 1):
+        of_spacing = [phase for phase in phases_of(8) if phase.spacing == spacing]
+        joined = join_phases(joined, at_phases(image, of_spacing))
+    assert joined is not None
+    assert torch.equal(joined, image)
+
+
+@torch.no_grad()
+def test_the_probabilities_of_all_masks_sum_to_one() -> None:
+    sensor = tiny_sensor(4, 4)
+    decoder, decoded = random_decoder(sensor, 4), random_decoded(sensor, 1)
+    bits = torch.arange(2**16)[:, None] >> torch.arange(16) & 1
+    masks = bits.bool().view(-1, 4, 4)
+    images = RangeImage.masked(torch.full(masks.shape, 10.0), masks, sensor)
+    total = 0.0
+    for first in range(0, len(masks), 8192):
+        some = images[first : first + 8192]
+        nll = decoder(repeated(decoded, len(some)), some).mask.double().sum((1, 2))
+        total += float(nll.neg().exp().sum())
+    assert total == pytest.approx(1, abs=1e-4)
+
+
+@torch.no_grad()
+def test_sampled_masks_come_as_often_as_their_probability() -> None:
+    sensor = tiny_sensor(2, 4)
+    decoder, decoded = random_decoder(sensor, 2, spread=0.8), random_decoded(sensor, 1)
+    masks = torch.tensor(list(product([False, True], repeat=8))).view(-1, 2, 4)
+    images = RangeImage.masked(torch.full(masks.shape, 10.0), masks, sensor)
+    probability = decoder(repeated(decoded, len(masks)), images).mask.sum((1, 2)).neg().exp()
+    count = 600
+    sampled = decoder.sample(repeated(decoded, count), [torch.Generator().manual_seed(seed) for seed in range(count)])
+    index = (sampled.return_mask.flatten(1) * 2 ** torch.arange(7, -1, -1)).sum(1)
+    seen = torch.bincount(index, minlength=len(masks)) / count
+    # The mean distance of as many samples of the very distribution, by the normal approximation of each count.
+    expected = float((2 * probability * (1 - probability) / (math.pi * count)).sqrt().sum())
+    assert float((seen - probability).abs().sum()) < 1.25 * expected
+    independent = independent_masks(probability, masks)
+    assert float((independent - probability).abs().sum()) > 2 * expected
+
+
+def independent_masks(probability: Tensor, masks: Tensor) -> Tensor:
+    """Return the probabilities of masks whose pixels return as often, but independently."""
+    marginal = (probability[:, None, None] * masks).sum(0)
+    return torch.where(masks, marginal, 1 - marginal).flatten(1).prod(1)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("cell", [2, 8])
+def test_a_phase_knows_of_earlier_pixels_only(cell: int) -> None:
+    sensor = tiny_sensor(8, 16)
+    decoder, decoded = random_decoder(sensor, cell), random_decoded(sensor, 2)
+    truth, other = random_images(sensor, 2), random_images(sensor, 2, seed=3)
+    nll = decoder(decoded, truth)
+    phases = phases_of(cell)
+    for number, phase in enumerate(phases):
+        later = torch.ones(8, 16, dtype=torch.bool)
+        for earlier in phases[: number + 1]:
+            later[earlier.pixels] = False
+        mixed_mask = torch.where(later, other.return_mask, truth.return_mask)
+        mixed = RangeImage.masked(torch.where(later, other.range_m + 1, truth.range_m + 1), mixed_mask, sensor)
+        base = RangeImage.masked(truth.range_m + 1, truth.return_mask, sensor)
+        of_mask = decoder(decoded, mixed).mask[(..., *phase.pixels)]
+        assert torch.allclose(of_mask, nll.mask[(..., *phase.pixels)], atol=1e-6)
+        # The range may know of the whole mask, so only later ranges change here.
+        ranges = RangeImage.masked(torch.where(later, other.range_m + 3, base.range_m), truth.return_mask, sensor)
+        of_range = decoder(decoded, ranges).range[(..., *phase.pixels)]
+        assert torch.allclose(of_range, decoder(decoded, base).range[(..., *phase.pixels)], atol=1e-5)
+
+
+@torch.no_grad()
+def test_a_range_is_as_likely_as_a_loop_over_components_says() -> None:
+    sensor = tiny_sensor(4, 8)
+    decoder, decoded, images = random_decoder(sensor, 2), random_decoded(sensor, 1), random_images(sensor, 1)
+    nll = decoder(decoded, images).range[0]
+    guide, v = Guide.of(decoded), images.range_m.log1p()
+    guided = decoder.range.guided(guide)
+    low, high = math.log1p(sensor.range_min_m), math.log1p(sensor.range_max_m)
+    for phase in decoder.range.phases:
+        candidates = decoder.range.candidates([phase], guide, images.return_mask, v)
+        output = decoder.range.outputs([phase], guided, guide, images.return_mask, v)
+        mixture = decoder.range.mixture([phase], output, candidates, guide)
+        rows, columns = torch.arange(4)[phase.pixels[0]].tolist(), torch.arange(8)[phase.pixels[1]].tolist()
+        for (i, row), (j, column) in product(enumerate(rows), enumerate(columns)):
+            if not images.return_mask[0, row, column]:
+                assert nll[row, column] == 0
+                continue
+            range_m, density = float(images.range_m[0, row, column]), 0.0
+            weights = mixture.logits[0, 0, i, j].double().softmax(0).tolist()
+            centres, scales = mixture.centres[0, 0, i, j].tolist(), mixture.log_scales[0, 0, i, j].exp().tolist()
+            for weight, centre, scale in zip(weights, centres, scales, strict=True):
+                z = (math.log1p(range_m) - centre) / scale
+                mass = logistic((high - centre) / scale) - logistic((low - centre) / scale)
+                density += weight * logistic(z) * logistic(-z) / scale / mass / (1 + range_m)
+            assert float(nll[row, column]) == pytest.approx(-math.log(density), abs=1e-3)
+
+
+def logistic(z: float) -> float:
+    return 1 / (1 + math.exp(-z)) if z > -700 else 0.0
+
+
+def mixture_of(seed: int, count: int = 1) -> RangeMixture:
+    rng = torch.Generator().manual_seed(seed)
+    size = (count, 6)
+    centres = torch.linspace(math.log1p(1.0), math.log1p(80.0), 6).expand(size)
+    log_scales = torch.empty(size).uniform_(-4, 0.5, generator=rng)
+    return RangeMixture(torch.randn(size, generator=rng), centres, log_scales, (1.0, 80.0))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_density_integrates_to_one_between_the_sensors_limits(seed: int) -> None:
+    mixture = mixture_of(seed)
+    range_m = torch.linspace(1, 80, 200_001)
+    many = RangeMixture(*(part.expand(len(range_m), -1) for part in _parts(mixture)), mixture.limits_m)
+    density = many.log_density(range_m).double().exp()
+    assert float(torch.trapezoid(density, range_m.double())) == pytest.approx(1, abs=2e-3)
+    cdf = many.cdf(range_m).double()
+    assert float(cdf[0]) == pytest.approx(0, abs=1e-5)
+    assert float(cdf[-1]) == pytest.approx(1, abs=1e-5)
+    for first, last in ((1000, 1400), (20_000, 60_000), (100_000, 199_000)):
+        area = torch.trapezoid(density[first : last + 1], range_m[first : last + 1].double())
+        assert float(cdf[last] - cdf[first]) == pytest.approx(float(area), abs=1e-3)
+
+
+def _parts(mixture: RangeMixture) -> tuple[Tensor, Tensor, Tensor]:
+    return mixture.logits, mixture.centres, mixture.log_scales
+
+
+def test_sampled_ranges_follow_the_distribution_function() -> None:
+    count = 20_000
+    mixture = mixture_of(1)
+    many = RangeMixture(*(part.expand(count, -1) for part in _parts(mixture)), mixture.limits_m)
+    rng = torch.Generator().manual_seed(5)
+    range_m = many.sample(*torch.rand(2, count, generator=rng))
+    assert float(range_m.min()) >= 1
+    assert float(range_m.max()) <= 80
+    level = many.cdf(range_m).sort().values
+    expected = (torch.arange(count) + 0.5) / count
+    assert float((level - expected).abs().max()) < 1.63 / math.sqrt(count)  # Kolmogorov and Smirnov, 1 %
+
+
+def test_sharpening_takes_the_likelier_component_nearer_to_its_centre() -> None:
+    mixture = RangeMixture(
+        torch.tensor([[1.0, 0.0]]).expand(4000, -1),
+        torch.tensor([[2.0, 3.0]]).expand(4000, -1),
+        torch.full((4000, 2), -4.0),
+        (1.0, 80.0),
+    )
+    uniform = torch.rand(2, 4000, generator=torch.Generator().manual_seed(0))
+    plain, sharp = mixture.sample(*uniform), mixture.sample(*uniform, temperature=0.5, noise=0.5)
+    near_plain, near_sharp = plain.log1p() < 2.5, sharp.log1p() < 2.5
+    assert float(near_plain.float().mean()) == pytest.approx(1 / (1 + math.exp(-1)), abs=0.03)
+    assert float(near_sharp.float().mean()) == pytest.approx(1 / (1 + math.exp(-2)), abs=0.03)
+    assert float(sharp[near_sharp].std()) == pytest.approx(0.5 * float(plain[near_plain].std()), rel=0.1)
+
+
+@torch.no_grad()
+def test_turning_the_sensor_turns_everything() -> None:
+    sensor = tiny_sensor(8, 16)
+    decoder, decoded, images = random_decoder(sensor, 4), random_decoded(sensor, 2), random_images(sensor, 2)
+    assert decoded.features is not None
+    turned = Decoded(
+        decoded.range_m.roll(4, -1), decoded.return_logits.roll(4, -1), sensor, features=decoded.features.roll(4, -1)
+    )
+    plain = decoder(decoded, images)
+    rolled = decoder(turned, RangeImage(images.range_m.roll(4, -1), images.return_mask.roll(4, -1), sensor))
+    assert torch.allclose(plain.mask.roll(4, -1), rolled.mask, atol=1e-5)
+    assert torch.allclose(plain.range.roll(4, -1), rolled.range, atol=1e-4)
+
+
+@torch.no_grad()
+def test_a_seed_gives_the_same_bits_whatever_its_batch() -> None:
+    sensor = load_sensor("hdl64e_kitti_odometry").with_columns(64)
+    decoder, decoded = random_decoder(sensor, 8), random_decoded(sensor, 5)
+    assert decoded.features is not None
+
+    def sample(*seeds: int) -> RangeImage:
+        picked = Decoded(
+            *(part[list(seeds)] for part in (decoded.range_m, decoded.return_logits)),
+            sensor,
+            features=decoded.features[list(seeds)] if decoded.features is not None else None,
+        )
+        return decoder.sample(picked, [torch.Generator().manual_seed(seed) for seed in seeds])
+
+    together, apart = sample(0, 1, 2, 3, 4), [sample(seed) for seed in (4, 2)]
+    assert torch.equal(together.range_m[4], apart[0].range_m[0])
+    assert torch.equal(together.range_m[2], apart[1].range_m[0])
+    assert torch.equal(together.return_mask, together.range_m > 0)
+
+
+@torch.no_grad()
+def test_observed_pixels_come_back_as_they_are_and_move_their_neighbours() -> None:
+    sensor = tiny_sensor(8, 16)
+    decoder, decoded, images = random_decoder(sensor, 4), random_decoded(sensor, 2), random_images(sensor, 2)
+    observed = torch.zeros(2, 8, 16, dtype=torch.bool)
+    observed[:, ::4] = True
+
+    def sample(known: Tensor) -> RangeImage:
+        rngs = [torch.Generator().manual_seed(seed) for seed in (0, 1)]
+        return decoder.sample(decoded, rngs, PixelSampling(), (images, known))
+
+    free, completed = sample(torch.zeros_like(observed)), sample(observed)
+    assert torch.equal(completed.range_m[observed], images.range_m[observed])
+    assert torch.equal(completed.return_mask[observed], images.return_mask[observed])
+    assert not torch.equal(completed.range_m[~observed], free.range_m[~observed])
+    assert torch.equal(sample(torch.ones_like(observed)).range_m, images.range_m)
+
+
+def test_the_row_between_two_of_a_plane_is_interpolated_exactly() -> None:
+    sensor = tiny_sensor(8, 8)
+    decoder, decoded = random_decoder(sensor, 2), random_decoded(sensor, 1)
+    # Ranges of the ground 1.7 m below the sensor, which every second of the lower rows sees.
+    elevation_rad = sensor.elevation_rad.expand(8, 8)
+    range_m = torch.where(elevation_rad < -0.03, 1.7 / -elevation_rad.sin().clamp(max=-0.03), 10.0)[None]
+    mask = (elevation_rad < -0.03)[None]
+    phase = decoder.range.phases[3]  # below a pixel of the first phase, above another
+    candidates = decoder.range.candidates([phase], Guide.of(decoded), mask, torch.where(mask, range_m, 0.0).log1p())
+    inner = candidates[0, 0, 0, 1:3, :].expm1()
+    assert torch.allclose(inner, range_m[0][phase.pixels][1:3], rtol=1e-4)
+
+
+@torch.no_grad()
+def test_the_estimate_of_a_training_step_is_right_on_average() -> None:
+    sensor = tiny_sensor(8, 16)
+    decoder, decoded, images = random_decoder(sensor, 4), random_decoded(sensor, 2), random_images(sensor, 2)
+    exact = decoder(decoded, images)
+    rng = torch.Generator().manual_seed(0)
+    estimates = [decoder.estimate(decoded, images, rng) for _ in range(300)]
+    of_mask = torch.stack([mask for mask, _ in estimates]).mean()
+    of_range = torch.stack([nats for _, nats in estimates]).mean()
+    assert float(of_mask) == pytest.approx(float(exact.mask.mean()), rel=0.03)
+    assert float(of_range) == pytest.approx(float(exact.range.sum() / images.return_mask.sum()), rel=0.05)
+
+
+def test_bits_of_a_return_are_those_of_a_centimetre() -> None:
+    evenly = torch.tensor(math.log(2.0))  # nats of a density of 1/2 a metre, so 200 centimetres equally likely
+    assert float(nats_to_range_bits(evenly)) == pytest.approx(math.log2(200), abs=1e-4)
+
+
+def test_an_image_that_cells_do_not_divide_is_refused() -> None:
+    with pytest.raises(ConfigError, match="coarsest_cell that divides both sides"):
+        PixelDecoder(PixelDecoderConfig(), tiny_sensor(12, 16), FEATURES)
+    with pytest.raises(ConfigError, match="a power of 2"):
+        PixelDecoderConfig(coarsest_cell=6)
+    with pytest.raises(ConfigError, match="mask_width=0"):
+        PixelDecoderConfig(mask_width=0)
+
+
+def test_a_decoder_without_features_is_refused() -> None:
+    sensor = tiny_sensor(8, 16)
+    decoded = random_decoded(sensor, 1)
+    with pytest.raises(ConfigError, match="gives no features"):
+        random_decoder(sensor, 4)(Decoded(decoded.range_m, decoded.return_logits, sensor), random_images(sensor, 1))
