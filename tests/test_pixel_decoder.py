@@ -100,13 +100,15 @@ def test_the_probabilities_of_all_masks_sum_to_one() -> None:
 @torch.no_grad()
 def test_sampled_masks_come_as_often_as_their_probability() -> None:
     sensor = tiny_sensor(2, 4)
-    decoder, decoded = random_decoder(sensor, 2, spread=0.8), random_decoded(sensor, 1)
+    decoder, decoded = random_decoder(sensor, 2, spread=0.45), random_decoded(sensor, 1)
     masks = torch.tensor(list(product([False, True], repeat=8))).view(-1, 2, 4)
     images = RangeImage.masked(torch.full(masks.shape, 10.0), masks, sensor)
     probability = decoder(repeated(decoded, len(masks)), images).mask.sum((1, 2)).neg().exp()
-    count = 600
-    sampled = decoder.sample(repeated(decoded, count), [torch.Generator().manual_seed(seed) for seed in range(count)])
-    index = (sampled.return_mask.flatten(1) * 2 ** torch.arange(7, -1, -1)).sum(1)
+    count = 20_000
+    uniform = torch.rand(count, 2, 4, generator=torch.Generator().manual_seed(0))
+    unknown = torch.zeros(count, 2, 4, dtype=torch.bool)
+    sampled = decoder._sample_mask(Guide.of(repeated(decoded, count)), uniform, unknown, unknown)  # all in one batch
+    index = (sampled.flatten(1) * 2 ** torch.arange(7, -1, -1)).sum(1)
     seen = torch.bincount(index, minlength=len(masks)) / count
     # The mean distance of as many samples of the very distribution, by the normal approximation of each count.
     expected = float((2 * probability * (1 - probability) / (math.pi * count)).sqrt().sum())
@@ -297,15 +299,12 @@ def test_the_row_between_two_of_a_plane_is_interpolated_exactly() -> None:
 
 @torch.no_grad()
 def test_the_estimate_of_a_training_step_is_right_on_average() -> None:
-    sensor = tiny_sensor(8, 16)
-    decoder, decoded, images = random_decoder(sensor, 4), random_decoded(sensor, 2), random_images(sensor, 2)
-    exact = decoder(decoded, images)
+    sensor = tiny_sensor(4, 8)
+    decoder, decoded, images = random_decoder(sensor, 2), random_decoded(sensor, 2), random_images(sensor, 2)
     rng = torch.Generator().manual_seed(0)
-    estimates = [decoder.estimate(decoded, images, rng) for _ in range(300)]
-    of_mask = torch.stack([mask for mask, _ in estimates]).mean()
-    of_range = torch.stack([nats for _, nats in estimates]).mean()
-    assert float(of_mask) == pytest.approx(float(exact.mask.mean()), rel=0.03)
-    assert float(of_range) == pytest.approx(float(exact.range.sum() / images.return_mask.sum()), rel=0.05)
+    found = {round(float(decoder.estimate(decoded, images, rng)[0]), 5) for _ in range(40)}
+    assert len(found) == 4  # one for each phase
+    assert sum(found) / 4 == pytest.approx(float(decoder(decoded, images).mask.mean()), abs=1e-4)
 
 
 def test_bits_of_a_return_are_those_of_a_centimetre() -> None:
