@@ -202,9 +202,7 @@ class MaskNetwork(PhaseNetwork):
         known = generated_before(phase).to(returned)[:, None, None]
         return torch.cat((known * returned, known * (1 - returned)), 1)
 
-    def logits(
-        self, phases: list[Phase], output: Float[Tensor, "P B 1 h w"], guide: Guide
-    ) -> Float[Tensor, "P B h w"]:
+    def logits(self, phases: list[Phase], output: Float[Tensor, "P B 1 h w"], guide: Guide) -> Float[Tensor, "P B h w"]:
         """Return the logits of the pixels of phases of one spacing."""
         decoded = guide.return_logits + self.row_bias[:, None]
         return output[:, :, 0] + at_phases(decoded, phases)
