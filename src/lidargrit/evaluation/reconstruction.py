@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from lidargrit.errors import ConfigError, DataError, ScanError
-from lidargrit.generators import load
+from lidargrit.generators import Generator, load
 from lidargrit.loading import DataConfig, RangeImages
 from lidargrit.reporting import Reporter
 from lidargrit.sources import open_images, warn_of_overlap
@@ -147,7 +147,25 @@ def evaluate_run(run_folder: Path, source: str, config: DataConfig, reporter: Re
     tokenizer = generator.get_tokenizer()
     images = open_images(source, generator.sensor, config, reporter)
     warn_of_overlap(str(run_folder), None, images, reporter)
-    return asdict(score_reconstruction(tokenizer, images))
+    return {**asdict(score_reconstruction(tokenizer, images)), **score_likelihood(generator, images)}
+
+
+@torch.no_grad()
+def score_likelihood(generator: Generator, images: RangeImages) -> dict[str, float]:
+    """Return the mean bits that each part of the scans of a set takes; none from a model without a likelihood.
+
+    Every pixel of the set counts the same, and every return.
+    """
+    sums: dict[str, float] = {}
+    counts: dict[str, float] = {}
+    for first in range(0, len(images), _BATCH):
+        batch = images.batch(range(first, min(first + _BATCH, len(images))))
+        returns = batch.return_mask.sum((1, 2)).double()
+        for name, bits in generator.bits_by_stage(batch).items():
+            weight = returns if name.endswith("_per_return") else torch.full_like(returns, batch.range_m[0].numel())
+            sums[name] = sums.get(name, 0.0) + float((bits.double() * weight).sum())
+            counts[name] = counts.get(name, 0.0) + float(weight.sum())
+    return {name: total / counts[name] for name, total in sums.items()}
 
 
 # The measures of monocular depth estimation (Eigen et al., Depth map prediction from a single image, NeurIPS 2014,

@@ -2,36 +2,48 @@
 
 from __future__ import annotations
 
+import math
+from abc import abstractmethod
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lidargrit.generators import Generator
+from lidargrit.errors import ConfigError
+from lidargrit.generators import Cost, Generator
+from lidargrit.generators._checks import check_images
 from lidargrit.nn.objective import Objective
+from lidargrit.nn.pixel_decoder import PixelDecoder, PixelNll, PixelSampling, nats_to_range_bits
+from lidargrit.nn.pixel_networks import PixelDecoderConfig
 from lidargrit.nn.processes import sum_over_processes
 from lidargrit.nn.transformer import Transformer, TransformerConfig
 from lidargrit.sensors import SensorModel
-from lidargrit.structures import MaskDecoding, RangeImage, TokenGrid
+from lidargrit.structures import RangeImage, TokenGrid
 from lidargrit.tokenizers import Tokenizer, TokenizerConfig, make_tokenizer
 from lidargrit.tokenizers.vqvae import VqvaeConfig
 
 _DECODED_AT_ONCE = 4  # scans; enough to keep a GPU busy, and more would only take memory: 35 MB a layer at 64x1024
 
 
+PixelChoice = Literal["auto", "pixels", "bernoulli", "threshold"]
+"""How the pixels of sampled tokens are decided: by the pixel decoder, or by the tokenizer's decoder alone."""
+
+
 @dataclass(frozen=True)
 class TokenGeneratorConfig:
-    """The two networks of a generator of tokens.
+    """The networks of a generator of tokens.
 
     Args:
         tokenizer: configuration of any tokenizer.
         transformer: sizes of the transformer over its tokens.
+        pixels: sizes of a pixel decoder, which samples returns and ranges in phases; none in the paper.
     """
 
     tokenizer: TokenizerConfig = field(default_factory=VqvaeConfig)
     transformer: TransformerConfig = field(default_factory=TransformerConfig)
+    pixels: PixelDecoderConfig | None = None
 
 
 TokenConfigT = TypeVar("TokenConfigT", bound=TokenGeneratorConfig)
@@ -39,7 +51,10 @@ SamplingT = TypeVar("SamplingT")
 
 
 class TokenGenerator(Generator[TokenConfigT, SamplingT]):
-    """A tokenizer, trained first, and a ``transformer`` over its tokens, trained over the frozen tokenizer."""
+    """A tokenizer, trained first, and a ``transformer`` over its tokens, trained over the frozen tokenizer.
+
+    A third stage, ``pixels``, trains a pixel decoder over the frozen tokenizer, if the configuration has one.
+    """
 
     Config = TokenGeneratorConfig
     capabilities = frozenset({"tokens", "encode"})
@@ -47,6 +62,19 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
     def __init__(self, config: TokenConfigT, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
         self.tokenizer = make_tokenizer(config.tokenizer, sensor)
+        self.pixels: PixelDecoder | None = None
+        if config.pixels is not None:
+            self.pixels = PixelDecoder(config.pixels, sensor, self.tokenizer.num_features)
+
+    @abstractmethod
+    def transformer_objective(self) -> Objective:
+        """Return what trains the transformer over the frozen tokenizer."""
+
+    def objective(self, stage: str) -> Objective:
+        """Return the tokenizer itself, or the objective of a network over the frozen tokenizer."""
+        if stage == "pixels" and self.pixels is not None:
+            return PixelObjective(self.tokenizer, self.pixels)
+        return self.tokenizer if stage == "tokenizer" else self.transformer_objective()
 
     @classmethod
     def smallest_config(cls, sensor: SensorModel) -> TokenConfigT:
@@ -56,16 +84,16 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
 
     @property
     def stages(self) -> tuple[str, ...]:
-        """The tokenizer, then the transformer over its tokens."""
-        return ("tokenizer", "transformer")
+        """The tokenizer, then the transformer over its tokens, then the pixel decoder, if there is one."""
+        stages = ("tokenizer", "transformer")
+        return stages if self.config.pixels is None else (*stages, "pixels")
 
     def load_stage(self, stage: str, objective: Objective) -> None:
         """Take over a stage's trained weights."""
         if stage == "tokenizer":
             self.tokenizer.load_state_dict(objective.state_dict())
         else:
-            trained = objective.get_submodule("transformer")
-            self.get_submodule("transformer").load_state_dict(trained.state_dict())
+            self.get_submodule(stage).load_state_dict(objective.get_submodule(stage).state_dict())
 
     def get_tokenizer(self) -> Tokenizer:
         """Return the tokenizer."""
@@ -76,7 +104,12 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
         return self.tokenizer.reconstruct(images)
 
     def decode(
-        self, tokens: Int[Tensor, "B T"], rngs: list[torch.Generator], mask: MaskDecoding, tokenizer: Tokenizer
+        self,
+        tokens: Int[Tensor, "B T"],
+        rngs: list[torch.Generator],
+        mask: PixelChoice,
+        pixels: PixelSampling,
+        tokenizer: Tokenizer,
     ) -> RangeImage:
         """Return the scans of sampled tokens.
 
@@ -86,9 +119,19 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
         Args:
             tokens: tokens of ``compute_batch`` scans in raster order.
             rngs: random generators on the CPU, one for each scan.
-            mask: how returns are decided.
+            mask: how returns are decided, and ranges with them.
+            pixels: how the pixel decoder samples ranges.
             tokenizer: the generator's own, or what that gives for decoding only.
+
+        Raises:
+            ConfigError: pixels are to be decided by a pixel decoder, and there is none.
         """
+        if mask == "pixels" and self.pixels is None:
+            raise ConfigError(
+                "mask=pixels for a model without a pixel decoder",
+                "a model with one",
+                "leave mask out, or train a recipe with the stage pixels, such as compact_pixels",
+            )
         wanted, seeds = len(rngs), [rng.initial_seed() for rng in rngs]
         while wanted > 1 and seeds[wanted - 1] == seeds[wanted - 2]:
             wanted -= 1
@@ -96,8 +139,45 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
         for first in range(0, wanted, _DECODED_AT_ONCE):
             some = slice(first, first + _DECODED_AT_ONCE)
             grid = TokenGrid(tokens[some].unflatten(1, tokenizer.grid_size), tokenizer.num_codes)
-            images.append(tokenizer.sample(grid, rngs[some], mask))
+            if self.pixels is not None and mask in ("auto", "pixels"):
+                images.append(self.pixels.sample(tokenizer.decode(grid), rngs[some], pixels))
+            else:
+                images.append(tokenizer.sample(grid, rngs[some], "threshold" if mask == "threshold" else "bernoulli"))
         return RangeImage.cat(images)[[*range(wanted), *[wanted - 1] * (len(rngs) - wanted)]]
+
+    @torch.no_grad()
+    def pixel_nll(self, images: RangeImage) -> PixelNll:
+        """Return the exact negative log-likelihood of the pixels of a batch of scans in nats, given their tokens.
+
+        Raises:
+            ConfigError: the model has no pixel decoder.
+        """
+        if self.pixels is None:
+            raise ConfigError(
+                "a model without a pixel decoder",
+                "one whose pixels have a likelihood",
+                "train a recipe with the stage pixels, such as compact_pixels",
+            )
+        check_images(images, self.sensor)
+        self.eval()
+        return self.pixels(self.tokenizer.decode(self.tokenizer.encode(images)), images)
+
+    def _bits_by_stage(self, images: RangeImage) -> dict[str, Float[Tensor, "B"]]:
+        """Return the bits of mask and ranges given the tokens, if there is a pixel decoder."""
+        if self.pixels is None:
+            return {}
+        nll, returns = self.pixel_nll(images), images.return_mask.sum((1, 2)).clamp(min=1)
+        return {
+            "mask_bits_per_pixel": nll.mask.mean((1, 2)) / math.log(2),
+            "range_bits_per_return": nats_to_range_bits(nll.range.sum((1, 2)) / returns),
+        }
+
+    def decoding_cost(self, mask: PixelChoice) -> Cost:
+        """Return the cost of decoding the tokens of one scan, and of its pixel decoder if that samples them."""
+        flops = self.tokenizer.decoding_flops()
+        if self.pixels is None or mask not in ("auto", "pixels"):
+            return Cost(1, flops)
+        return Cost(1 + self.pixels.num_evaluations, flops + self.pixels.flops())
 
 
 class TokenObjective(Objective):
@@ -122,6 +202,31 @@ class TokenObjective(Objective):
             counted = torch.bincount(tokens.flatten(), minlength=len(self.token_counts))
             self.token_counts += sum_over_processes(counted)
         return tokens, -(self.token_counts / self.token_counts.sum()).log()[tokens]
+
+
+class PixelObjective(Objective):
+    """Objective of a pixel decoder over a frozen tokenizer: negative log-likelihood of the pixels given the tokens."""
+
+    def __init__(self, tokenizer: Tokenizer, pixels: PixelDecoder) -> None:
+        super().__init__(tokenizer.sensor)
+        self.pixels = pixels
+        self._frozen = [tokenizer.eval().requires_grad_(False)]  # in a list: its weights are not this stage's
+
+    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+        """Return the nats of the mask a pixel and of the range a return, together and apart, the latter in bits.
+
+        In training some phases of each scan stand for all; in validation all are counted.
+        """
+        with torch.no_grad():
+            tokenizer = self._frozen[0].to(images.range_m.device)
+            decoded = tokenizer.decode(tokenizer.encode(images))
+        if self.training:
+            mask_nats, range_nats = self.pixels.estimate(decoded, images, rng)
+        else:
+            nll = self.pixels(decoded, images)
+            mask_nats, range_nats = nll.mask.mean(), nll.range.sum() / images.return_mask.sum().clamp(min=1)
+        bits = {"mask_bits": mask_nats / math.log(2), "range_bits": nats_to_range_bits(range_nats)}
+        return {"loss": mask_nats + range_nats, **{name: value.detach() for name, value in bits.items()}}
 
 
 def sample_tokens(logits: Float[Tensor, "*B K"], uniform: Float[Tensor, "*B"]) -> Int[Tensor, "*B"]:

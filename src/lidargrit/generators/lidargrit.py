@@ -17,14 +17,21 @@ from torch import Tensor
 from lidargrit.errors import ConfigError
 from lidargrit.files import load_exactly
 from lidargrit.generators import Cost
-from lidargrit.generators._tokens import TokenGenerator, TokenGeneratorConfig, TokenObjective, sample_tokens
+from lidargrit.generators._tokens import (
+    PixelChoice,
+    TokenGenerator,
+    TokenGeneratorConfig,
+    TokenObjective,
+    sample_tokens,
+)
 from lidargrit.nn.decoding import CachedDecoder, WeightPrecision
 from lidargrit.nn.objective import Objective
+from lidargrit.nn.pixel_decoder import PixelSampling
 from lidargrit.nn.precision import Precision
 from lidargrit.nn.published import read_checkpoint
 from lidargrit.nn.transformer import CausalTransformer
 from lidargrit.sensors import SensorModel
-from lidargrit.structures import MaskDecoding, RangeImage
+from lidargrit.structures import RangeImage
 from lidargrit.tokenizers import Tokenizer
 
 START_TOKEN = 0  # the reference prepends an ordinary token, shared with the first code, not one of its own
@@ -46,8 +53,14 @@ class TokenSampling:
         top_k: number of the likeliest tokens that are sampled from; 0 for all, the model's own distribution, since the
             paper names no other. The released program takes 100, which makes a barely trained model bland.
         top_p: probability that the likeliest tokens, which alone are sampled from, hold together; 1 for all.
-        mask: ``bernoulli`` samples each return with its probability, as the released program does, so the paper's
-            scores too; ``threshold`` keeps a return that is at least as likely as not (the paper's eq. 1).
+        mask: how returns are decided, and ranges with them. ``pixels`` samples both by the pixel decoder, phase by
+            phase. ``bernoulli`` samples each return with its probability, independently of the others, and keeps the
+            decoded ranges (the released program, so what the paper's scores were computed with). ``threshold`` keeps a
+            return that is at least as likely as not (the paper's eq. 1). ``auto`` is ``pixels`` where there is a pixel
+            decoder, and ``bernoulli`` elsewhere.
+        range_temperature: divisor of the logarithms of the pixel decoder's weights of surfaces; below 1 it prefers the
+            likelier surface. Only scans sampled with 1, and a noise of 1, have the likelihood that the model tells.
+        range_noise: multiplier of the pixel decoder's spread of ranges about a surface.
         weights: number type of the transformer's weights. ``fp32`` is exact; ``bf16`` and ``int8`` (CPUs only) read
             less memory for a token and change probabilities a little, see docs/performance.md.
         decoder: number type of the decoder. ``fp32`` is exact; ``bf16`` is quicker and moves ranges a little; ``auto``
@@ -57,11 +70,14 @@ class TokenSampling:
     temperature: float = 1.0
     top_k: int = 0
     top_p: float = 1.0
-    mask: MaskDecoding = "bernoulli"
+    mask: PixelChoice = "auto"
+    range_temperature: float = PixelSampling.temperature
+    range_noise: float = PixelSampling.noise
     weights: WeightPrecision = "fp32"
     decoder: Precision = "fp32"
 
     def __post_init__(self) -> None:
+        self.pixels()
         if not (self.temperature >= 0 and self.top_k >= 0 and 0 < self.top_p <= 1):
             raise ConfigError(
                 f"temperature={self.temperature}, top_k={self.top_k}, top_p={self.top_p}",
@@ -69,10 +85,14 @@ class TokenSampling:
                 "correct the one that is out of bounds",
             )
 
+    def pixels(self) -> PixelSampling:
+        """Return the choices of the pixel decoder."""
+        return PixelSampling(self.range_temperature, self.range_noise)
+
 
 @dataclass(frozen=True)
 class LidarGritConfig(TokenGeneratorConfig):
-    """The two networks of the paper; with other tokenizers than its VQ-VAE, of systems like it."""
+    """The two networks of the paper; with other tokenizers than its VQ-VAE or a pixel decoder, of systems like it."""
 
 
 class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
@@ -93,9 +113,9 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         self.transformer = CausalTransformer(config.transformer, self.tokenizer.num_codes, height * width)
         self._prepared: _Prepared | None = None
 
-    def objective(self, stage: str) -> Objective:
-        """Return the VQ-VAE itself, or the transformer's objective over the frozen VQ-VAE."""
-        return self.tokenizer if stage == "tokenizer" else NextToken(self.tokenizer, self.transformer)
+    def transformer_objective(self) -> Objective:
+        """Return the likelihood of each token given those before it."""
+        return NextToken(self.tokenizer, self.transformer)
 
     @property
     def compute_batch(self) -> int:
@@ -107,7 +127,7 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         uniform = torch.stack([torch.rand(self.transformer.context_length, generator=rng) for rng in rngs])
         decoder, tokenizer = self._prepare(len(seeds), sampling)
         tokens = decoder.generate(uniform.to(self.device))
-        return self.decode(tokens, rngs, sampling.mask, tokenizer)
+        return self.decode(tokens, rngs, sampling.mask, sampling.pixels(), tokenizer)
 
     @torch.no_grad()
     def token_nll_bits(self, images: RangeImage) -> Float[Tensor, "B h w"]:
@@ -119,8 +139,23 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         return (nats / math.log(2)).float().view(tokens.shape)
 
     def _log_likelihood(self, images: RangeImage) -> Float[Tensor, "B"]:
-        """Return the log-likelihood of each scan's tokens in nats; what is lost in encoding is not counted."""
-        return -self.token_nll_bits(images).double().sum(dim=(1, 2)).mul(math.log(2)).float()
+        """Return the log-likelihood of each scan in nats.
+
+        With a pixel decoder it is that of the scan: of its tokens, and of its mask and ranges given those, ranges as a
+        density per metre. Without one it is that of the tokens alone; what is lost in encoding is not counted.
+        """
+        nats = self.token_nll_bits(images).double().sum(dim=(1, 2)) * math.log(2)
+        if self.pixels is not None:
+            nats = nats + sum(part.double().sum(dim=(1, 2)) for part in self.pixel_nll(images))
+        return -nats.float()
+
+    def _bits_by_stage(self, images: RangeImage) -> dict[str, Float[Tensor, "B"]]:
+        """Return the bits of the tokens, and of mask and ranges given those, if there is a pixel decoder."""
+        pixels = images.range_m[0].numel()
+        return {
+            "token_bits_per_pixel": self.token_nll_bits(images).sum((1, 2)) / pixels,
+            **super()._bits_by_stage(images),
+        }
 
     def cost(self, sampling: TokenSampling | None = None) -> Cost:
         """Return the cost of one step of the transformer for each token, with a cache, and of one decoding."""
@@ -129,7 +164,8 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         # weights by values over all tokens so far.
         products = sizes.layers * (24 * sizes.width**2 * tokens + 2 * sizes.width * tokens * (tokens + 1))
         head = 2 * sizes.width * self.transformer.num_tokens * tokens
-        return Cost(tokens + 1, products + head + self.tokenizer.decoding_flops())
+        decoding = self.decoding_cost((sampling or TokenSampling()).mask)
+        return Cost(tokens + decoding.network_evaluations, products + head + decoding.flops)
 
     def _prepare(self, batch_size: int, sampling: TokenSampling) -> tuple[CachedDecoder, Tokenizer]:
         """Return what generates tokens and what decodes them, kept from the last call if nothing has changed since."""

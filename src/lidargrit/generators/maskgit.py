@@ -13,12 +13,19 @@ from torch import Tensor
 
 from lidargrit.errors import ConfigError
 from lidargrit.generators import Cost
-from lidargrit.generators._tokens import TokenGenerator, TokenGeneratorConfig, TokenObjective, sample_tokens
+from lidargrit.generators._tokens import (
+    PixelChoice,
+    TokenGenerator,
+    TokenGeneratorConfig,
+    TokenObjective,
+    sample_tokens,
+)
 from lidargrit.nn.objective import Objective
+from lidargrit.nn.pixel_decoder import PixelSampling
 from lidargrit.nn.precision import Precision, dtype_of
 from lidargrit.nn.transformer import MaskedTransformer
 from lidargrit.sensors import SensorModel
-from lidargrit.structures import MaskDecoding, RangeImage
+from lidargrit.structures import RangeImage
 
 
 @dataclass(frozen=True)
@@ -32,8 +39,13 @@ class MaskedSampling:
         order_temperature: scale of the Gumbel noise in the choice of the tokens that a pass keeps. It is added to the
             logarithm of a token's probability and falls to 0 with the last pass; 0 keeps the likeliest tokens, and the
             larger it is, the more random the order. The default is that of the authors' program.
-        mask: ``bernoulli`` samples each return with its probability; ``threshold`` keeps a return that is at least as
-            likely as not.
+        mask: how returns are decided, and ranges with them. ``pixels`` samples both by the pixel decoder, phase by
+            phase. ``bernoulli`` samples each return with its probability, independently of the others, and keeps the
+            decoded ranges. ``threshold`` keeps a return that is at least as likely as not. ``auto`` is ``pixels`` where
+            there is a pixel decoder, and ``bernoulli`` elsewhere.
+        range_temperature: divisor of the logarithms of the pixel decoder's weights of surfaces; below 1 it prefers the
+            likelier surface.
+        range_noise: multiplier of the pixel decoder's spread of ranges about a surface.
         weights: number type of the transformer's products. ``fp32`` is exact; ``bf16`` computes them in 16 bits, as
             training does where that is quicker; ``auto`` is ``bf16`` where the machine has instructions for it.
         decoder: number type of the decoder, with the same choices.
@@ -42,17 +54,24 @@ class MaskedSampling:
     steps: int = 16
     temperature: float = 1.0
     order_temperature: float = 4.5
-    mask: MaskDecoding = "bernoulli"
+    mask: PixelChoice = "auto"
+    range_temperature: float = PixelSampling.temperature
+    range_noise: float = PixelSampling.noise
     weights: Precision = "fp32"
     decoder: Precision = "fp32"
 
     def __post_init__(self) -> None:
+        self.pixels()
         if not (self.steps >= 1 and self.temperature >= 0 and self.order_temperature >= 0):
             raise ConfigError(
                 f"steps={self.steps}, temperature={self.temperature}, order_temperature={self.order_temperature}",
                 "steps >= 1, and no negative temperature",
                 "correct the one that is out of bounds",
             )
+
+    def pixels(self) -> PixelSampling:
+        """Return the choices of the pixel decoder."""
+        return PixelSampling(self.range_temperature, self.range_noise)
 
 
 @dataclass(frozen=True)
@@ -79,9 +98,9 @@ class MaskGit(TokenGenerator[MaskGitConfig, MaskedSampling]):
         height, width = self.tokenizer.grid_size
         self.transformer = MaskedTransformer(config.transformer, self.tokenizer.num_codes, height * width)
 
-    def objective(self, stage: str) -> Objective:
-        """Return the VQ-VAE itself, or the transformer's objective over the frozen VQ-VAE."""
-        return self.tokenizer if stage == "tokenizer" else HiddenTokens(self.tokenizer, self.transformer)
+    def transformer_objective(self) -> Objective:
+        """Return the likelihood of hidden tokens given those shown."""
+        return HiddenTokens(self.tokenizer, self.transformer)
 
     @classmethod
     def quickest_sampling(cls) -> MaskedSampling:
@@ -91,7 +110,8 @@ class MaskGit(TokenGenerator[MaskGitConfig, MaskedSampling]):
     def _sample(self, seeds: Sequence[int], sampling: MaskedSampling) -> RangeImage:
         rngs = [torch.Generator().manual_seed(seed) for seed in seeds]  # on the CPU: the same numbers on every device
         tokens = generate_tokens(self.transformer, rngs, sampling)
-        return self.decode(tokens, rngs, sampling.mask, self.tokenizer.for_decoding(sampling.decoder))
+        tokenizer = self.tokenizer.for_decoding(sampling.decoder)
+        return self.decode(tokens, rngs, sampling.mask, sampling.pixels(), tokenizer)
 
     def cost(self, sampling: MaskedSampling | None = None) -> Cost:
         """Return the cost of the passes over all tokens and of one decoding."""
@@ -102,7 +122,8 @@ class MaskGit(TokenGenerator[MaskGitConfig, MaskedSampling]):
         layer = 24 * sizes.width**2 + 4 * sizes.width * tokens
         one_pass = tokens * (sizes.layers * layer + 2 * sizes.width * self.transformer.num_tokens)
         passes = len(numbers_hidden(tokens, sampling.steps))
-        return Cost(passes + 1, passes * one_pass + self.tokenizer.decoding_flops())
+        decoding = self.decoding_cost(sampling.mask)
+        return Cost(passes + decoding.network_evaluations, passes * one_pass + decoding.flops)
 
 
 class HiddenTokens(TokenObjective):

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from lidargrit.errors import ConfigError
-from lidargrit.nn.blocks import Block
+from lidargrit.nn.blocks import Block, Network
 from lidargrit.nn.convolution import Convolution
 from lidargrit.nn.pixel_phases import Phase, at_phases, cells_of, generated_before, neighbours_of, phases_of
 from lidargrit.nn.range_mixture import RangeMixture
@@ -103,7 +103,7 @@ class _Residual(Block):
         return x + self.conv2(F.silu(self.conv1(F.silu(x))))
 
 
-class _SpacingNetwork(nn.Module):
+class _SpacingNetwork(Network):
     """The network of all phases of one spacing, over cells of 2x2 pixels of the lattice.
 
     The part of the first layer that sees the guide is computed once for all phases.
@@ -156,7 +156,7 @@ class PhaseNetwork(nn.Module, ABC):
         """Return what is known before a phase, on its cells; later pixels are not looked at."""
 
     def guided(self, guide: Guide) -> dict[int, Tensor]:
-        """Return by spacing what the first layer makes of the guide, (B, C, h, w), the same for all phases of a spacing."""
+        """Return by spacing what the first layer makes of the guide, (B, C, h, w), the same for all its phases."""
         rows = self.rows[None, :, :, None].expand(len(guide.v), -1, -1, guide.v.shape[-1])
         decoded = torch.stack((guide.v - _TYPICAL_V, guide.return_logits / 4), 1)
         maps = torch.cat((self.features(guide.features), rows, decoded), 1)
@@ -175,6 +175,17 @@ class PhaseNetwork(nn.Module, ABC):
         contexts = torch.stack([self.context(phase, guide, return_mask, v) for phase in phases])
         first = [phase for phase in self.phases if phase.spacing == spacing].index(phases[0])
         return self.networks[str(spacing)](guided[spacing], contexts, first)
+
+    def flops(self) -> int:
+        """Return the floating-point operations of all phases of one scan: two for each multiplication and addition."""
+        pixels = self.sensor.height * self.sensor.width
+        total = 2 * pixels * self.features.weight.numel()
+        for name, network in self._networks():
+            once = network.guide.weight.numel() + sum(layer.get_parameter("weight").numel() for layer in network.out)
+            each = sum(weight.numel() for weight in network.blocks.parameters() if weight.ndim == 4)
+            each += network.context.weight.numel()
+            total += 2 * (pixels // (2 * int(name)) ** 2) * (once + len(network.out) * each)
+        return total
 
     def by_spacing(self) -> list[list[Phase]]:
         """Return the phases, those of one spacing together."""

@@ -1,4 +1,4 @@
-"""The order in which a pixel decoder generates pixels, from coarse to fine: image size → phases and their neighbours."""
+"""The order in which a pixel decoder generates pixels, from coarse to fine: size of a cell → phases, neighbours."""
 
 from __future__ import annotations
 

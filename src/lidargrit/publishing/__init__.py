@@ -135,7 +135,12 @@ def _public_facts(about: dict[str, Any], generator: Generator) -> dict[str, Any]
     recipe = about.get("recipe", {})
     data = recipe.get("data", {})
     sources = {part: ["::".join(data_set_of(source)) for source in data.get(part, ())] for part in ("train", "val")}
-    recipe = {**recipe, "tokenizer_from": None, "data": {**data, **sources, "sensor": generator.sensor.name}}
+    recipe = {
+        **recipe,
+        "tokenizer_from": None,
+        "stages_from": None,
+        "data": {**data, **sources, "sensor": generator.sensor.name},
+    }
     kept = {name: about[name] for name in ("files", "lidargrit", "commit", "torch", "python") if name in about}
     return {"origin": "published", **kept, "recipe": recipe}
 

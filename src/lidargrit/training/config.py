@@ -97,6 +97,8 @@ class Recipe:
         seed: seed of everything random: weights, order, augmentation, dropout.
         published: scores that a paper reports for the experiment, for the reader; empty if no paper does.
         tokenizer_from: folder of a finished run whose tokenizer is used as it is; without it, a tokenizer is trained.
+        stages_from: folder of a finished run whose stages are all used as they are; only stages that it lacks are
+            trained, such as a pixel decoder over a finished model.
     """
 
     title: str
@@ -107,8 +109,15 @@ class Recipe:
     seed: int = 0
     published: str = ""
     tokenizer_from: str | None = None
+    stages_from: str | None = None
 
     def __post_init__(self) -> None:
+        if self.tokenizer_from is not None and self.stages_from is not None:
+            raise ConfigError(
+                "tokenizer_from and stages_from together",
+                "one of them: the stages of a run include its tokenizer",
+                "leave tokenizer_from out",
+            )
         if self.seed < 0:
             raise ConfigError(f"seed={self.seed}", "0 or more", "choose another seed")
 

@@ -18,17 +18,17 @@ import torch
 
 from lidargrit import __version__, configuration
 from lidargrit.determinism import derive_seed
-from lidargrit.errors import CheckpointError, ConfigError, OutputError
+from lidargrit.errors import CheckpointError, OutputError
 from lidargrit.files import claim_folder, is_taken, read_json, write_json, write_text
-from lidargrit.generators import RUN_FILE, TRAINED_ON_FILE, Generator, load, locate, recipe_settings
+from lidargrit.generators import RUN_FILE, TRAINED_ON_FILE, Generator, locate, recipe_settings
 from lidargrit.loading import DataConfig, RangeImages, load_range_images
 from lidargrit.nn.objective import Objective
 from lidargrit.reporting import Reporter
-from lidargrit.tokenizers import Tokenizer
 from lidargrit.training.checkpoint import fingerprint
 from lidargrit.training.config import FitConfig, Recipe
 from lidargrit.training.engine import Engine
 from lidargrit.training.fit import Fit
+from lidargrit.training.taken_stages import taken_stages
 
 PlotProgress = Callable[[Generator, str, RangeImages, Path], None]
 """Plots what a half-trained generator makes at a stage, beside validation scans, into a file."""
@@ -54,7 +54,7 @@ def train(
         OutputError: the folder holds something else, another process trains in it, or it cannot be written.
         DataError, ScanError: the data cannot be used.
         TrainingError: the loss is not finite.
-        ConfigError: the tokenizer that ``tokenizer_from`` names has other settings or another sensor than the recipe.
+        ConfigError: a stage to be taken from another run has other settings or another sensor than the recipe.
     """
     engine = Engine("fp32")  # tells which of several processes is the first, the only one that writes
     reporter = reporter if reporter and engine.rank == 0 else Reporter()
@@ -71,14 +71,13 @@ def _train(recipe: Recipe, folder: Path, reporter: Reporter, plot: PlotProgress 
     with torch.random.fork_rng(range(torch.cuda.device_count())):  # the caller's own random numbers stay as they are
         torch.manual_seed(derive_seed(recipe.seed, 9))
         generator = recipe.build_generator()
-        borrowed = None if recipe.tokenizer_from is None else _tokenizer_of(Path(recipe.tokenizer_from), generator)
+        taken = taken_stages(recipe, generator)
         engine.by_first(lambda: _claim(folder, recipe, train_images, val_images))
         generator.fit_statistics(train_images)
         built_on = ""
         for number, stage in enumerate(generator.stages):
-            trained: Objective
-            if stage == "tokenizer" and borrowed is not None:
-                trained = borrowed
+            if stage in taken:
+                trained = taken[stage]
             else:
                 seed, objective = derive_seed(recipe.seed, number), generator.objective(stage)
                 picture = None if plot is None else partial(_plot, plot, generator, stage, val_images)
@@ -98,21 +97,6 @@ def _plot(
     copied = copy.deepcopy(generator)
     copied.load_stage(stage, averaged)
     plot(copied.to(next(averaged.parameters()).device).eval(), stage, val_images, path)
-
-
-def _tokenizer_of(donor: Path, generator: Generator) -> Tokenizer:
-    """Return the tokenizer of a finished run; refuse one of other settings or another sensor than the generator's."""
-    ours, theirs = generator.get_tokenizer(), load(donor).get_tokenizer()
-    mine, other = ({"name": each.config.name(), **configuration.leaves(each.config)} for each in (ours, theirs))
-    differing = [name for name in mine if mine[name] != other.get(name)]
-    if differing or not ours.sensor.same_rays(theirs.sensor):
-        setting = f"model.tokenizer.{differing[0]}={other.get(differing[0])}" if differing else "data.sensor"
-        raise ConfigError(
-            f"tokenizer_from={donor}, whose tokenizer is another ({setting})",
-            "one of this recipe's model.tokenizer and sensor",
-            "set them as there, or choose another run",
-        )
-    return theirs
 
 
 def check_folder(folder: Path, recipe: Recipe) -> None:
@@ -172,7 +156,7 @@ def _claim(folder: Path, recipe: Recipe, train_images: RangeImages, val_images: 
                     "what it began with",
                     "restore it, or choose another folder",
                 )
-        _write_trained_on(folder, train_images, recipe.tokenizer_from)
+        _write_trained_on(folder, train_images, recipe.tokenizer_from or recipe.stages_from)
         return
     about: dict[str, Any] = {
         "recipe": configuration.to_json(recipe),
@@ -184,16 +168,16 @@ def _claim(folder: Path, recipe: Recipe, train_images: RangeImages, val_images: 
         "python": platform.python_version(),
     }
     write_json(folder / RUN_FILE, about)
-    _write_trained_on(folder, train_images, recipe.tokenizer_from)
+    _write_trained_on(folder, train_images, recipe.tokenizer_from or recipe.stages_from)
 
 
-def _write_trained_on(folder: Path, train_images: RangeImages, tokenizer_from: str | None) -> None:
+def _write_trained_on(folder: Path, train_images: RangeImages, donor: str | None) -> None:
     """Write which scans the model learns from, without names of the user's files, so that samples can carry it on."""
     if not (folder / TRAINED_ON_FILE).exists():
         came_from = train_images.provenance
         facts = {"recordings": {*came_from.recordings} - {""}, "fingerprints": {*came_from.fingerprints}}
-        if tokenizer_from is not None:  # the model has learned from the tokenizer's scans too
-            theirs = read_json(locate(tokenizer_from) / TRAINED_ON_FILE)
+        if donor is not None:  # the model has learned from the scans of the stages that it takes, too
+            theirs = read_json(locate(donor) / TRAINED_ON_FILE)
             facts = {name: known | set(theirs[name]) for name, known in facts.items()}
         write_text(folder / TRAINED_ON_FILE, json.dumps({name: sorted(known) for name, known in facts.items()}) + "\n")
 

@@ -1,0 +1,33 @@
+"""The model in the package with a pixel decoder, which samples returns and ranges in phases from coarse to fine."""
+
+from dataclasses import replace
+
+from lidargrit.nn.pixel_networks import PixelDecoderConfig
+from lidargrit.recipes import compact
+from lidargrit.training import FitConfig
+
+RECIPE = replace(
+    compact.RECIPE,
+    title="LidarGRIT with a pixel decoder: 64x256 in 256 tokens, for one CPU core and two hours",
+    model=replace(
+        compact.RECIPE.model,
+        # Sizes that leave the whole model, rounded to 16 bits, below 16 MB.
+        pixels=PixelDecoderConfig(mask_features=8, range_features=10, mask_width=32, range_width=40),
+    ),
+    training={
+        **compact.RECIPE.training,
+        "pixels": FitConfig(
+            scans=8_000,
+            batch_size=2,
+            learning_rate=2e-3,
+            schedule="cosine",
+            warmup_scans=200,
+            betas=(0.9, 0.98),
+            precision="auto",
+            any_columns=True,
+            average_over_scans=700,
+            validate_every=1000,
+            checkpoint_every=500,
+        ),
+    },
+)

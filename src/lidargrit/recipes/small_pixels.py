@@ -1,0 +1,13 @@
+"""The recipe ``small`` with a pixel decoder, which samples returns and ranges in phases from coarse to fine."""
+
+from dataclasses import replace
+
+from lidargrit.nn.pixel_networks import PixelDecoderConfig
+from lidargrit.recipes import compact_pixels, small
+
+RECIPE = replace(
+    small.RECIPE,
+    title="LidarGRIT with a pixel decoder, small: 64x256, for two CPU cores and two hours",
+    model=replace(small.RECIPE.model, pixels=PixelDecoderConfig()),
+    training={**small.RECIPE.training, "pixels": compact_pixels.RECIPE.training["pixels"]},
+)

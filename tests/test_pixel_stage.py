@@ -1,0 +1,168 @@
+"""The pixel decoder as a third stage: trained over a frozen tokenizer, sampled by default, scored in bits."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+
+from lidargrit.cli import main
+from lidargrit.errors import ConfigError
+from lidargrit.evaluation.reconstruction import score_likelihood
+from lidargrit.generators import load
+from lidargrit.generators.lidargrit import LidarGrit, LidarGritConfig, TokenSampling
+from lidargrit.generators.maskgit import MaskedSampling, MaskGit, MaskGitConfig
+from lidargrit.loading import DataConfig, load_range_images
+from lidargrit.nn.pixel_networks import PixelDecoderConfig
+from lidargrit.nn.transformer import TransformerConfig
+from lidargrit.sensors import load_sensor
+from lidargrit.structures import RangeImage
+from lidargrit.tokenizers.vqvae import VqvaeConfig
+from lidargrit.training import FitConfig, Recipe, train
+
+SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(512, stride=8)  # 64x64 pixels
+TOKENIZER = VqvaeConfig(
+    channels=32, channel_multipliers=(1, 1, 1, 1), code_dim=4, num_codes=8, dropout=0.0, padding="wrap"
+)
+TRANSFORMER = TransformerConfig(layers=1, heads=2, width=16)
+PIXELS = PixelDecoderConfig(mask_features=2, range_features=2, mask_width=4, range_width=4, blocks=1)
+
+
+def made(pixels: PixelDecoderConfig | None = PIXELS) -> LidarGrit:
+    generator = LidarGrit(LidarGritConfig(TOKENIZER, TRANSFORMER, pixels), SENSOR).eval()
+    for stage in generator.stages:  # the same weights with and without a pixel decoder, whose own begin at zero
+        rng = torch.Generator().manual_seed(3)
+        for weight in generator.get_submodule(stage).parameters():
+            weight.data = torch.empty_like(weight).normal_(std=0.1, generator=rng)
+    return generator
+
+
+def scans(count: int) -> RangeImage:
+    rng = torch.Generator().manual_seed(1)
+    size = (count, SENSOR.height, SENSOR.width)
+    return RangeImage.masked(2 + 40 * torch.rand(size, generator=rng), torch.rand(size, generator=rng) < 0.8, SENSOR)
+
+
+def recipe_of(pixels: PixelDecoderConfig | None, **settings: str) -> Recipe:
+    fit = FitConfig(scans=4, batch_size=2, learning_rate=1e-3, validation_scans=1)
+    stages = ("tokenizer", "transformer") if pixels is None else ("tokenizer", "transformer", "pixels")
+    return Recipe(
+        "a test",
+        "lidargrit",
+        LidarGritConfig(TOKENIZER, TRANSFORMER, pixels),
+        DataConfig(train=("simulated:4:train",), val=("simulated:1:val",), columns=512, column_stride=8),
+        dict.fromkeys(stages, fit),
+        **settings,
+    )
+
+
+def test_the_third_stage_is_there_where_the_configuration_has_one():
+    assert made().stages == ("tokenizer", "transformer", "pixels")
+    assert made(None).stages == LidarGrit.stages == ("tokenizer", "transformer")
+
+
+def test_the_pixel_decoder_is_what_samples_unless_told_otherwise():
+    generator, plain = made(), made(None)
+    by_pixels = generator.sample([0, 1])
+    assert torch.equal(by_pixels.range_m, generator.sample([0, 1], TokenSampling(mask="pixels")).range_m)
+    before = generator.sample([0, 1], TokenSampling(mask="bernoulli"))
+    assert torch.equal(before.range_m, plain.sample([0, 1]).range_m)
+    assert not torch.equal(by_pixels.return_mask, before.return_mask)
+    both = by_pixels.return_mask & before.return_mask
+    assert not torch.equal(by_pixels.range_m[both], before.range_m[both])
+
+
+def test_a_seed_gives_the_same_scan_whatever_its_batch():
+    generator = made()
+    assert torch.equal(generator.sample([0, 1, 2, 3, 4, 5]).range_m[4], generator.sample([4]).range_m[0])
+
+
+def test_a_model_without_a_pixel_decoder_refuses_to_sample_by_one():
+    with pytest.raises(ConfigError, match="without a pixel decoder"):
+        made(None).sample([0], TokenSampling(mask="pixels"))
+    with pytest.raises(ConfigError, match="without a pixel decoder"):
+        made(None).pixel_nll(scans(1))
+    with pytest.raises(ConfigError, match="range_noise=0"):
+        TokenSampling(range_noise=0)
+
+
+def test_maskgit_takes_a_pixel_decoder_too():
+    torch.manual_seed(0)
+    generator = MaskGit(MaskGitConfig(TOKENIZER, TRANSFORMER, PIXELS), SENSOR).eval()
+    assert generator.stages == ("tokenizer", "transformer", "pixels")
+    by_pixels = generator.sample([3, 4], MaskedSampling(steps=2))
+    assert torch.equal(by_pixels.range_m[1], generator.sample([4], MaskedSampling(steps=2)).range_m[0])
+    assert generator.cost().flops > generator.cost(MaskedSampling(mask="bernoulli")).flops
+
+
+def test_the_likelihood_is_that_of_tokens_mask_and_ranges():
+    generator, images = made(), scans(3)
+    tokens = made(None).log_likelihood(images)
+    nll = generator.pixel_nll(images)
+    expected = tokens - nll.mask.sum((1, 2)) - nll.range.sum((1, 2))
+    assert torch.allclose(generator.log_likelihood(images), expected, rtol=1e-5)
+    assert bool((nll.range[~images.return_mask] == 0).all())
+    bits = generator.bits_by_stage(images)
+    assert set(bits) == {"token_bits_per_pixel", "mask_bits_per_pixel", "range_bits_per_return"}
+    assert set(made(None).bits_by_stage(images)) == {"token_bits_per_pixel"}
+    # Untrained, a return takes about as many bits as its range has centimetres, and a mask about one a pixel.
+    assert 5 < float(bits["range_bits_per_return"].mean()) < 25
+
+
+def test_its_cost_counts_every_phase():
+    generator = made()
+    cost, before = generator.cost(), generator.cost(TokenSampling(mask="threshold"))
+    assert cost.network_evaluations == before.network_evaluations + 20
+    assert cost.flops > before.flops == made(None).cost().flops
+
+
+def test_all_of_it_is_trained_saved_and_read_again(tmp_path):
+    trained = train(recipe_of(PIXELS), tmp_path / "run")
+    log = [json.loads(line) for line in (tmp_path / "run" / "pixels" / "log.jsonl").read_text().splitlines()]
+    assert {"loss", "mask_bits", "range_bits"} <= set(log[-1])
+    again = load(tmp_path / "run")
+    assert torch.equal(trained.sample([5]).range_m, again.sample([5]).range_m)
+
+
+def test_only_the_pixel_decoder_is_trained_over_a_finished_run(tmp_path):
+    first = train(recipe_of(None), tmp_path / "first")
+    second = train(recipe_of(PIXELS, stages_from=str(tmp_path / "first")), tmp_path / "second")
+    assert not (tmp_path / "second" / "tokenizer").exists()
+    assert not (tmp_path / "second" / "transformer").exists()
+    for name, weight in first.state_dict().items():
+        assert torch.equal(weight, second.state_dict()[name]), name
+    assert torch.equal(first.sample([2]).range_m, second.sample([2], TokenSampling(mask="bernoulli")).range_m)
+
+
+def test_a_run_of_other_sizes_or_another_kind_gives_no_stages(tmp_path):
+    train(recipe_of(None), tmp_path / "first")
+    recipe = recipe_of(PIXELS, stages_from=str(tmp_path / "first"))
+    wider = replace(recipe, model=replace(recipe.model, transformer=replace(TRANSFORMER, width=32)))
+    with pytest.raises(ConfigError, match=r"whose transformer is another \(model.transformer.width=16\)"):
+        train(wider, tmp_path / "second")
+    other = replace(recipe, generator="maskgit", model=MaskGitConfig(TOKENIZER, TRANSFORMER, PIXELS))
+    with pytest.raises(ConfigError, match="a run of the generator 'lidargrit'"):
+        train(other, tmp_path / "third")
+    with pytest.raises(ConfigError, match="tokenizer_from and stages_from together"):
+        replace(recipe, tokenizer_from="pretrained")
+
+
+def test_evaluate_tells_bits_by_stage(tmp_path, capsys):
+    made().save(tmp_path / "run")
+    config = DataConfig(train=("simulated:2:test",), val=("simulated:2:test",), columns=512, column_stride=8)
+    images = load_range_images(config.train, config)
+    expected = score_likelihood(made(), images)
+    single = made().bits_by_stage(images.batch([0, 1]))
+    assert expected["mask_bits_per_pixel"] == pytest.approx(float(single["mask_bits_per_pixel"].mean()), rel=1e-5)
+    assert main(["evaluate", str(tmp_path / "run"), "simulated:2:test", "--json"]) == 0
+    errors = json.loads(capsys.readouterr().out)["errors"]
+    assert errors["range_bits_per_return"] == pytest.approx(expected["range_bits_per_return"], rel=1e-3)
+    assert errors["range_mae_m"] > 0
+
+
+def test_simulated_scans_have_a_finite_likelihood():
+    config = DataConfig(train=("simulated:1:test",), val=("simulated:1:test",), columns=512, column_stride=8)
+    images = load_range_images(config.train, config).batch([0])
+    assert bool(made().log_likelihood(images).isfinite().all())
