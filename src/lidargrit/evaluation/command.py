@@ -95,5 +95,5 @@ def _run(options: Namespace, settings: EvalConfig, reporter: Reporter) -> tuple[
         "reference": options.reference,
         "projection_variant": config.projection_variant,
     }
-    table = "\n".join(f"{name:<20}{value:>10.4g}" for name, value in errors.items())
+    table = "\n".join(f"{name:<22}{value:>10.4g}" for name, value in errors.items())
     return table, {**about, "reconstruction": errors}
