@@ -61,7 +61,7 @@ def recipe_of(pixels: PixelDecoderConfig | None, **settings: str) -> Recipe:
 
 def test_the_third_stage_is_there_where_the_configuration_has_one():
     assert made().stages == ("tokenizer", "transformer", "pixels")
-    assert made(None).stages == LidarGrit.stages == ("tokenizer", "transformer")
+    assert made(None).stages == ("tokenizer", "transformer")
 
 
 def test_the_pixel_decoder_is_what_samples_unless_told_otherwise():

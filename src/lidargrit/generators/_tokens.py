@@ -13,7 +13,6 @@ from torch import Tensor
 
 from lidargrit.errors import ConfigError
 from lidargrit.generators import Cost, Generator
-from lidargrit.generators._checks import check_images
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.pixel_decoder import PixelDecoder, PixelNll, PixelSampling, nats_to_range_bits
 from lidargrit.nn.pixel_networks import PixelDecoderConfig
@@ -158,7 +157,6 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
                 "one whose pixels have a likelihood",
                 "train a recipe with the stage pixels, such as compact_pixels",
             )
-        check_images(images, self.sensor)
         self.eval()
         return self.pixels(self.tokenizer.decode(self.tokenizer.encode(images)), images)
 
