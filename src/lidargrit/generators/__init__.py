@@ -246,22 +246,9 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         check_images(images, self.sensor)
         return self.eval()._log_likelihood(images.to(self.device))
 
-    @final
-    @torch.no_grad()
     def bits_by_stage(self, images: RangeImage) -> dict[str, Float[Tensor, "B"]]:
-        """Return the bits that each part of a scan takes, by the name of the part; empty where no likelihood is known.
-
-        Args:
-            images: batch of range images (B, H, W).
-
-        Returns:
-            bits for each scan; names end in their unit, ``_per_pixel``, or ``_per_return`` of a range to a centimetre.
-
-        Raises:
-            ConfigError: images of other rays.
-        """
-        check_images(images, self.sensor)
-        return self.eval()._bits_by_stage(images.to(self.device))
+        """Return the bits of each part of a scan, by a name that ends in their unit; empty where none are known."""
+        return {}
 
     @abstractmethod
     def _sample(self, seeds: Sequence[int], sampling: SamplingT) -> RangeImage:
@@ -281,9 +268,6 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
 
     def _log_likelihood(self, images: RangeImage) -> Float[Tensor, "B"]:
         raise NotImplementedError
-
-    def _bits_by_stage(self, images: RangeImage) -> dict[str, Float[Tensor, "B"]]:
-        return {}
 
     def _in_batches(self, count: int, compute: Callable[[list[int]], RangeImage]) -> RangeImage:
         """Compute scans by their indices in batches of one size, and return those that were asked for."""

@@ -160,8 +160,8 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
         self.eval()
         return self.pixels(self.tokenizer.decode(self.tokenizer.encode(images)), images)
 
-    def _bits_by_stage(self, images: RangeImage) -> dict[str, Float[Tensor, "B"]]:
-        """Return the bits of mask and ranges given the tokens, if there is a pixel decoder."""
+    def bits_by_stage(self, images: RangeImage) -> dict[str, Float[Tensor, "B"]]:
+        """Return the bits of the mask and, to a centimetre, of the ranges, given the tokens; none without a pixel decoder."""
         if self.pixels is None:
             return {}
         nll, returns = self.pixel_nll(images), images.return_mask.sum((1, 2)).clamp(min=1)

@@ -149,12 +149,12 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
             nats = nats + sum(part.double().sum(dim=(1, 2)) for part in self.pixel_nll(images))
         return -nats.float()
 
-    def _bits_by_stage(self, images: RangeImage) -> dict[str, Float[Tensor, "B"]]:
+    def bits_by_stage(self, images: RangeImage) -> dict[str, Float[Tensor, "B"]]:
         """Return the bits of the tokens, and of mask and ranges given those, if there is a pixel decoder."""
         pixels = images.range_m[0].numel()
         return {
             "token_bits_per_pixel": self.token_nll_bits(images).sum((1, 2)) / pixels,
-            **super()._bits_by_stage(images),
+            **super().bits_by_stage(images),
         }
 
     def cost(self, sampling: TokenSampling | None = None) -> Cost:
