@@ -205,8 +205,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         settings = self._settings(sampling, self.completion_sampling)
         images, observed = images.to(self.device), observed.to(self.device)
         generated = self._in_batches(
-            len(seeds),
-            lambda some: self._complete(images[some], observed[some], [seeds[i] for i in some], settings),
+            len(seeds), lambda some: self._complete(images[some], observed[some], [seeds[i] for i in some], settings)
         )
         reflectance, range_m = None, torch.where(observed, images.range_m, generated.range_m)
         if generated.reflectance is not None and images.reflectance is not None:
@@ -280,12 +279,10 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         return RangeImage.cat(parts)
 
     def _settings(self, given: SamplingT | None, default: Callable[[], SamplingT]) -> SamplingT:
-        if given is None:
-            return default()
-        if not isinstance(given, self.Sampling):
+        if given is not None and not isinstance(given, self.Sampling):
             got, wanted = type(given).__name__, self.Sampling.__name__
             raise ConfigError(f"settings of type {got}", wanted, "make them with generator.Sampling(...)")
-        return given
+        return default() if given is None else given
 
     def _require(self, capability: str) -> None:
         if capability not in self.capabilities:

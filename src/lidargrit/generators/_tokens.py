@@ -161,7 +161,7 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
         return self.pixels(self.tokenizer.decode(self.tokenizer.encode(images)), images)
 
     def bits_by_stage(self, images: RangeImage) -> dict[str, Float[Tensor, "B"]]:
-        """Return the bits of the mask and, to a centimetre, of the ranges, given the tokens; none without a pixel decoder."""
+        """Return the bits of mask and ranges (to a centimetre), given the tokens; none without a pixel decoder."""
         if self.pixels is None:
             return {}
         nll, returns = self.pixel_nll(images), images.return_mask.sum((1, 2)).clamp(min=1)
