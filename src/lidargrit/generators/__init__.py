@@ -18,6 +18,7 @@ from lidargrit.errors import CheckpointError, ConfigError, LidarGritError
 from lidargrit.files import is_taken, read_json, read_tensors
 from lidargrit.generators._checks import check_images, check_observed, check_seeds
 from lidargrit.generators._hub import download
+from lidargrit.generators._saved import CARD_FILE as CARD_FILE
 from lidargrit.generators._saved import CONFIG_FILE, WEIGHTS_FILE, ConfigT, SavedModel
 from lidargrit.loading import RangeImages
 from lidargrit.nn.objective import Objective
