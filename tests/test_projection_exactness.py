@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from lidargrit import _discovery
 from lidargrit.errors import ScanError
 from lidargrit.projection import index_map, project
-from lidargrit.projection.placement import place
+from lidargrit.projection.pixel_coordinates import pixel_coordinates
 from lidargrit.sensors import SensorModel, column_azimuths_rad, load_sensor
 from lidargrit.simulator import simulate
 from lidargrit.structures import Scan
@@ -80,22 +80,22 @@ def test_no_point_falls_elsewhere_than_in_double_precision(seed, name):
     random = rng.normal(size=(3000, 3)).astype(np.float32) * np.float32(10 ** rng.uniform(-3, 3))
     xyz_m = np.concatenate((random, on_edges(sensor, rng, 3000)))
     xyz_m = xyz_m[np.isfinite(xyz_m).all(axis=1) & (xyz_m != 0).any(axis=1)]
-    placed = place(Scan(torch.from_numpy(xyz_m)), sensor, "spherical", "exact")
+    pixels = pixel_coordinates(Scan(torch.from_numpy(xyz_m)), sensor, "spherical", "exact")
     row, column = rows_and_columns(xyz_m, sensor)
-    assert np.array_equal(placed.row, row)
-    assert np.array_equal(placed.column, column)
-    assert np.array_equal(placed.range_m, np.linalg.norm(xyz_m, axis=1))
+    assert np.array_equal(pixels.row, row)
+    assert np.array_equal(pixels.column, column)
+    assert np.array_equal(pixels.range_m, np.linalg.norm(xyz_m, axis=1))
 
 
 @pytest.mark.parametrize("name", sorted(SENSORS))
 def test_tiny_and_huge_coordinates_fall_where_double_precision_says(name):
     xyz_m, sensor = extremes(), SENSORS[name]
-    placed = place(Scan(torch.from_numpy(xyz_m)), sensor, "spherical", "exact")
+    pixels = pixel_coordinates(Scan(torch.from_numpy(xyz_m)), sensor, "spherical", "exact")
     row, column = rows_and_columns(xyz_m, sensor)
-    assert np.array_equal(placed.row, row)
-    assert np.array_equal(placed.column, column)
+    assert np.array_equal(pixels.row, row)
+    assert np.array_equal(pixels.column, column)
     rings = plain_rings(xyz_m)
-    assert np.array_equal(place(Scan(torch.from_numpy(xyz_m)), sensor, "unfolding", "exact").row, rings)
+    assert np.array_equal(pixel_coordinates(Scan(torch.from_numpy(xyz_m)), sensor, "unfolding", "exact").row, rings)
 
 
 def plain_rings(xyz_m):
@@ -113,7 +113,7 @@ def test_rings_begin_where_the_azimuth_falls(seed, turns):
     azimuth = np.linspace(0, turns * 2 * np.pi, 4000) + rng.normal(0, 10 ** rng.uniform(-6, 0), 4000)
     y = np.where(rng.random(4000) < 0.05, rng.choice([0.0, -0.0, 1e-45, -1e-45], 4000), np.sin(azimuth))
     xyz_m = np.stack((np.cos(azimuth), y, np.ones(4000)), 1).astype(np.float32)
-    rows = place(Scan(torch.from_numpy(xyz_m)), SENSORS["three columns"], "unfolding", "exact").row
+    rows = pixel_coordinates(Scan(torch.from_numpy(xyz_m)), SENSORS["three columns"], "unfolding", "exact").row
     assert np.array_equal(rows, plain_rings(xyz_m))
 
 

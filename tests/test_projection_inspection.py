@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from lidargrit.cli import main
 from lidargrit.projection import closest_sensor, inspect, project, unproject
 from lidargrit.projection.inspection import FATES, as_json, as_table
-from lidargrit.projection.placement import place
+from lidargrit.projection.pixel_coordinates import pixel_coordinates
 from lidargrit.sensors import load_sensor
 from lidargrit.simulator import simulate
 from lidargrit.structures import RangeImage, Scan
@@ -33,10 +33,10 @@ def messy_scan(seed, count=3000):
 
 
 def fates_by_loop(scan, sensor, method, variant):
-    placed = place(scan, sensor, method, variant)
+    pixels = pixel_coordinates(scan, sensor, method, variant)
     near, far = sensor.range_min_m, sensor.range_max_m
     fates, holder = [], {}
-    points = list(zip(placed.row.tolist(), placed.column.tolist(), placed.range_m.tolist(), strict=True))
+    points = list(zip(pixels.row.tolist(), pixels.column.tolist(), pixels.range_m.tolist(), strict=True))
     for index, (row, column, range_m) in enumerate(points):
         fate = "hidden"
         if variant == "exact" and row < 0:

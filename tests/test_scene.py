@@ -229,7 +229,7 @@ def test_what_moves_moves_and_the_rest_stays(scenes):
 
 
 def test_backdrop_leaves_little_bare_sky(meshes):
-    """In most directions something placements higher than the sensor's top ring."""
+    """In most directions something stands higher than the sensor's top ring."""
     share = {theme: [] for theme in THEMES}
     for (theme, _), mesh in meshes.items():
         corner = mesh.triangles_m.reshape(-1, 3)

@@ -36,7 +36,7 @@ def wall(x_m, albedo=0.4, material=materials.PLASTER, half_width_m=40.0):
 
 
 class ToyScene:
-    """Placements where the sensor of KITTI placements; drives ahead and to the left if told to."""
+    """Mounted where KITTI's sensor is; may drive ahead and turn left."""
 
     theme = "city"
 

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from lidargrit import __version__, _discovery
-from lidargrit.cli._words import EXIT_CODES, HelpFormatter, Parser
+from lidargrit.cli._parser import EXIT_CODES, HelpFormatter, Parser
 from lidargrit.errors import LidarGritError, Terminated, UsageError
 
 _EXAMPLES = """\

@@ -18,7 +18,7 @@ from lidargrit.evaluation.scorecard import LeftOut, Score, Scorecard
 from lidargrit.evaluation.scoring import MetricFactory, score_metrics
 from lidargrit.loading import DataConfig
 from lidargrit.metrics import load_metric
-from lidargrit.projection import Variant
+from lidargrit.projection import ProjectionVariant
 from lidargrit.reporting import Reporter
 
 _FEW = 100  # scans: below that the interval itself rests on too little, and values hardly differ from real against real
@@ -45,7 +45,7 @@ class EvalConfig:
     protocol: str = DEFAULT
     metrics: tuple[str, ...] = ()
     variant: str = ""
-    projection_variant: Variant | None = None
+    projection_variant: ProjectionVariant | None = None
     max_scans: int = 0
     seed: int = 0
     resampling: Resampling = field(default_factory=Resampling)

@@ -7,7 +7,7 @@ from typing import Literal
 
 from lidargrit.errors import ConfigError
 from lidargrit.formats import BadPoints
-from lidargrit.projection import Variant
+from lidargrit.projection import ProjectionVariant
 from lidargrit.sensors import SensorModel, load_sensor
 
 
@@ -35,7 +35,7 @@ class DataConfig:
     columns: int = 0
     column_stride: int = 1
     projection: Literal["sensor", "spherical", "unfolding"] = "sensor"
-    projection_variant: Variant = "exact"
+    projection_variant: ProjectionVariant = "exact"
     max_scans: int = 0
     bad_points: BadPoints = "refuse"
     bad_scans: Literal["refuse", "skip"] = "refuse"

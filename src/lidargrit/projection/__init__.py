@@ -4,13 +4,13 @@ from lidargrit.projection.encoding import RangeEncoding
 from lidargrit.projection.fit import closest_sensor
 from lidargrit.projection.image import index_map, project
 from lidargrit.projection.inspection import Inspection, inspect
-from lidargrit.projection.placement import Variant
+from lidargrit.projection.pixel_coordinates import ProjectionVariant
 from lidargrit.projection.unproject import points_of_pixels, unproject
 
 __all__ = [
     "Inspection",
     "RangeEncoding",
-    "Variant",
+    "ProjectionVariant",
     "closest_sensor",
     "index_map",
     "inspect",

@@ -1,4 +1,4 @@
-"""What networks see of a range: metres ⇄ [-1, 1], with -1 for no return."""
+"""Encoding of ranges for networks: metres ⇄ [-1, 1], with -1 for no return."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from torch import Tensor
 class RangeEncoding:
     """A monotone map of [range_min_m, range_max_m] onto [-1, 1].
 
-    ``linear`` is the paper's; ``log`` is log2(1 + range), as R2DM's, between our own limits; ``inverse`` is 1/range, as
-    DUSty's, turned so that far is +1 in all three.
+    ``linear`` is the paper's. ``log`` is log2(1 + range) as in R2DM, but between the limits given here. ``inverse`` is
+    -1/range, after DUSty's 1/range. In all three, far is +1.
 
     Source:
         linear: hamedhaghighi/LidarGRIT@a3f86e7. The paper gives no formula.
@@ -33,7 +33,7 @@ class RangeEncoding:
         return torch.where(return_mask, (curve - low) * (2 / (high - low)) - 1, -1.0)
 
     def decode(self, encoded: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-        """Map [-1, 1] to metres; what lies outside is clamped to the limits."""
+        """Map [-1, 1] to metres; values outside are clamped to the limits."""
         low, high = self._curve(self.range_min_m), self._curve(self.range_max_m)
         curve = (encoded.clamp(-1, 1) + 1) * ((high - low) / 2) + low
         if self.kind == "log":

@@ -1,4 +1,4 @@
-"""Whether a scan fits a sensor: scan, sensor → what is wrong, and which of our sensors would fit."""
+"""Does a scan fit a sensor? Scan, sensor → the problems, and the bundled sensors that would fit."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 from lidargrit import _discovery
 from lidargrit.errors import ScanError
 from lidargrit.projection import spherical, unfolding
-from lidargrit.projection.placement import Placement, row_elevation_rad
+from lidargrit.projection.pixel_coordinates import PixelCoordinates, row_elevation_rad
 from lidargrit.sensors import ProjectionName, SensorModel, load_sensor
 from lidargrit.structures import Scan
 
@@ -19,17 +19,17 @@ _SECTORS = 36  # of 10 degrees: the coarsest sensor has several columns in each
 _SECTORS_AT_LEAST = 27  # with a return: KITTI's scans have all, a crop to the camera's view a quarter
 
 
-def misfits(
-    scan: Scan, sensor: SensorModel, method: ProjectionName, placed: Placement, partial: bool = False
+def fit_problems(
+    scan: Scan, sensor: SensorModel, method: ProjectionName, pixels: PixelCoordinates, partial: bool = False
 ) -> Iterator[ScanError]:
-    """Name each reason for which an exact projection of a scan would be wrong; none for a scan that fits."""
-    for check in (None if partial else _part_of_a_circle(scan), _wrong_rows(scan, sensor, method, placed)):
+    """Yield each problem that would make an exact projection of the scan wrong; none for a scan that fits."""
+    for check in (None if partial else _part_of_a_circle(scan), _wrong_rows(scan, sensor, method, pixels)):
         if check is not None:
             yield check
 
 
 def sensors_that_fit(scan: Scan) -> list[str]:
-    """Name our sensors whose rows span the elevations of a scan, the one with the least to spare first."""
+    """Name the bundled sensors whose rows span the elevations of a scan; the tightest comes first."""
     low_deg, high_deg = elevation_span_deg(scan)
     spans_deg = {name: _span_of_rows_deg(load_sensor(name)) for name in _discovery.names("sensors")}
     fitting = {
@@ -39,10 +39,10 @@ def sensors_that_fit(scan: Scan) -> list[str]:
 
 
 def closest_sensor(scan: Scan) -> str:
-    """Name the sensor of ours with as many rows as the scan has rings, and whose rows end nearest to its elevations.
+    """Guess the bundled sensor: as many rows as the scan has rings, then the most similar span of elevations.
 
-    It is a guess. Where the scan names no rings and is not stored ring by ring, or no sensor of ours has as many, the
-    elevations decide alone.
+    If the scan neither names its rings nor is stored ring by ring, or no sensor has as many rows, the elevations alone
+    decide.
     """
     low_deg, high_deg = elevation_span_deg(scan)
     rings = ring_count(scan)
@@ -56,14 +56,14 @@ def closest_sensor(scan: Scan) -> str:
 
 
 def ring_count(scan: Scan) -> int:
-    """Count the rings of a scan: up to the last that it names, or as many as its firing order shows."""
+    """Count the rings of a scan by its highest ring index, or by its firing order if it names no rings."""
     if scan.ring is not None:
         return int(scan.ring.max()) + 1
     return int(unfolding.rings_from_firing_order(scan.points_xyz_m.numpy().T)[-1]) + 1
 
 
 def elevation_span_deg(scan: Scan) -> tuple[float, float]:
-    """Return the elevations that all but the lowest and the highest hundredth of the points lie between."""
+    """Return the 1 % and the 99 % quantile of the elevations of the points, in degrees."""
     low, high = np.quantile(elevations_deg(scan.points_xyz_m), (0.01, 0.99))
     return float(low), float(high)
 
@@ -90,14 +90,14 @@ def _part_of_a_circle(scan: Scan) -> ScanError | None:
     )
 
 
-def _wrong_rows(scan: Scan, sensor: SensorModel, method: ProjectionName, placed: Placement) -> ScanError | None:
+def _wrong_rows(scan: Scan, sensor: SensorModel, method: ProjectionName, pixels: PixelCoordinates) -> ScanError | None:
     if method == "spherical":
-        outside = 1 - np.count_nonzero(placed.in_rows()) / len(scan)
+        outside = 1 - np.count_nonzero(pixels.in_rows()) / len(scan)
         return _wrong_elevations(scan, sensor, outside) if outside > _OUTSIDE_AT_MOST else None
-    rings = int(placed.row.max()) + 1
+    rings = int(pixels.row.max()) + 1
     if scan.ring is None and rings == sensor.height:
         return None
-    if scan.ring is not None and int(placed.row.min()) >= 0 and rings <= sensor.height:  # a ring may lack any return
+    if scan.ring is not None and int(pixels.row.min()) >= 0 and rings <= sensor.height:  # a ring may lack any return
         return None
     return ScanError(
         f"{rings} rings in {scan.source}",

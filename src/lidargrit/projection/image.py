@@ -1,4 +1,4 @@
-"""Who wins a pixel: scan → range image, by spherical projection or by scan unfolding."""
+"""Scan → range image, by spherical projection or by scan unfolding."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Float32, Int32
 
 from lidargrit.errors import ScanError
-from lidargrit.projection.fit import misfits
-from lidargrit.projection.placement import Variant, place, within_limits
+from lidargrit.projection.fit import fit_problems
+from lidargrit.projection.pixel_coordinates import ProjectionVariant, pixel_coordinates, within_limits
 from lidargrit.sensors import ProjectionName, SensorModel
 from lidargrit.structures import RangeImage, Scan
 
@@ -17,23 +17,24 @@ def project(
     scan: Scan,
     sensor: SensorModel,
     method: ProjectionName | None = None,
-    variant: Variant = "exact",
+    variant: ProjectionVariant = "exact",
     partial: bool = False,
 ) -> RangeImage:
-    """Place each point of a scan in the pixel whose ray it lies on; the nearest point wins a pixel.
+    """Assign each point of a scan to the pixel whose ray it lies on; the nearest point wins a pixel.
 
     Column w spans azimuths [pi - 2 pi w/W, pi - 2 pi (w+1)/W): pixel centres sit at w + 1/2, so that the first and
     last columns are as wide as the others. With a column stride, the columns between the kept ones are left out.
 
     Args:
-        scan: points in the sensor's frame; in firing order, or with their ring, for ``unfolding``.
-        sensor: the rays of the image and the limits of range.
-        method: ``spherical`` (rows by elevation) or ``unfolding`` (rows by ring); the sensor's own if not given.
+        scan: points in the sensor's frame; for ``unfolding`` in firing order, or with their ring.
+        sensor: sensor with the rays of the image and the range limits.
+        method: projection method, ``spherical`` (rows by elevation) or ``unfolding`` (rows by ring); the sensor's own
+            if not given.
         variant: ``exact`` floors, leaves out points beyond the sensor's span or limits before the nearest one wins, and
             refuses a scan that does not fit. ``reference`` repeats LidarGRIT's program: it rounds, clips points outside
             into the border pixels, and loses a pixel whose nearest point is beyond the limits.
-        partial: take a scan of a part of the circle too, which is refused otherwise: where it has no point is then
-            unknown, and not a beam that did not return.
+        partial: whether a scan of a part of the circle is accepted. A pixel without a point is then unknown; it does
+            not mean a beam that did not return.
 
     Returns:
         range_m (H, W) in metres and return_mask (H, W), with the reflectance if the scan has it.
@@ -45,7 +46,7 @@ def project(
         Haghighi et al., LidarGRIT, 2024, section 3.1; program hamedhaghighi/LidarGRIT@a3f86e7.
     """
     nearest = _nearest(scan, sensor, method, variant, partial)
-    point_of_pixel, range_m = (pixels[:, :: sensor.column_stride] for pixels in nearest)
+    point_of_pixel, range_m = (array[:, :: sensor.column_stride] for array in nearest)
     filled = point_of_pixel >= 0
     if not filled.any():
         raise ScanError(
@@ -65,9 +66,9 @@ def project(
 
 
 def index_map(
-    scan: Scan, sensor: SensorModel, method: ProjectionName | None = None, variant: Variant = "exact"
+    scan: Scan, sensor: SensorModel, method: ProjectionName | None = None, variant: ProjectionVariant = "exact"
 ) -> Int32[np.ndarray, "H fine_W"]:
-    """Return which point fills each pixel before any column is left out: its index in the scan, -1 for none.
+    """Return the index of the point that fills each pixel, -1 for none, before any column is left out.
 
     Args, Raises: as for :func:`project`.
     """
@@ -75,12 +76,12 @@ def index_map(
 
 
 def _nearest(
-    scan: Scan, sensor: SensorModel, method: ProjectionName | None, variant: Variant, partial: bool = False
+    scan: Scan, sensor: SensorModel, method: ProjectionName | None, variant: ProjectionVariant, partial: bool = False
 ) -> tuple[Int32[np.ndarray, "H fine_W"], Float32[np.ndarray, "H fine_W"]]:
     method = method or sensor.projection
-    placed = place(scan, sensor, method, variant)
+    pixels = pixel_coordinates(scan, sensor, method, variant)
     if variant == "reference":
-        return placed.nearest(np.ones(len(scan), dtype=bool))
-    for misfit in misfits(scan, sensor, method, placed, partial):
-        raise misfit
-    return placed.nearest(placed.in_rows() & within_limits(placed.range_m, sensor))
+        return pixels.nearest(np.ones(len(scan), dtype=bool))
+    for problem in fit_problems(scan, sensor, method, pixels, partial):
+        raise problem
+    return pixels.nearest(pixels.in_rows() & within_limits(pixels.range_m, sensor))

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int16
 
 _REFERENCE_TOP_DEG, _REFERENCE_BOTTOM_DEG = 3.0, -25.0  # the field of view that LidarGRIT fixes for KITTI-360
-_SINE_BINS = 32768  # over [-1, 1]: each 128 times as wide as a sine is wrong, and few of them crossed by an edge
-_UNSURE = -2  # in place of a row: an edge passes through this bin, or through its neighbour
-_LONE_ROW_RAD = math.radians(1)  # height of the only row of a sensor, which has no neighbour to end at
+_SINE_BINS = 32768  # over [-1, 1]: each is 128 times as wide as the error of a sine, and edges cross few of them
+_UNSURE = -2  # instead of a row: an edge passes through this bin, or through its neighbour
+_LONE_ROW_RAD = math.radians(1)  # height of the row of a sensor with only one row
 
 
 def rows(
@@ -18,17 +18,17 @@ def rows(
 ) -> Int16[np.ndarray, "n"]:
     """Return the row whose elevation lies nearest to each point; -1 for points above all rows, H for those below.
 
-    The span of a row ends midway to its neighbours; the first and the last reach as far out as in. For equal rows these
-    are the bins of Milioto et al., RangeNet++, IROS 2019, eq. 1.
+    The span of a row ends midway to its neighbours; the first and the last row reach as far outwards as inwards. For
+    equal rows these are the bins of Milioto et al., RangeNet++, IROS 2019, eq. 1.
 
-    A point counts as compared with the edges in double precision. Few need to be: a table gives the row of their sine,
-    z / range, in single precision. Of 2^-24 each, the sine has at most 3.5 rounding errors (three of squares and sums,
-    halved by the root; root; quotient) and the sum with 1 one more, together 1/128 of a bin. So only points in a bin
-    that an edge crosses, or in one beside it, remain.
+    The result is that of a comparison with the edges in double precision, but few points need one. For most, a table
+    gives the row of the sine of their elevation, z / range, in single precision. That sine has at most 3.5 rounding
+    errors of 2^-24 (three of squares and sums, halved by the root; root; quotient), and adding 1 makes one more:
+    together 1/128 of a bin. So only points in a bin that an edge crosses, or in the bin beside it, are compared.
     """
     edges = row_edges_rad(elevation_rad)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        # A range that underflows or overflows makes nonsense here; these points remain, too.
+        # Ranges that underflow or overflow give wrong values here; these points are compared below, too.
         sine = xyz_m[2] / range_m
         sine += 1
         sine *= _SINE_BINS / 2
@@ -41,7 +41,7 @@ def rows(
 
 
 def row_edges_rad(elevation_rad: Float64[np.ndarray, "H"]) -> Float64[np.ndarray, "H+1"]:
-    """Return the elevations between which each row lies, falling."""
+    """Return the elevations of the edges between rows, from the top down."""
     if len(elevation_rad) == 1:
         return elevation_rad + np.array([_LONE_ROW_RAD / 2, -_LONE_ROW_RAD / 2])
     middles = (elevation_rad[1:] + elevation_rad[:-1]) / 2
@@ -65,7 +65,7 @@ def reference_rows(
 
 
 def _row_of_sine(edges_rad: Float64[np.ndarray, "edges"]) -> Int16[np.ndarray, "bins"]:
-    """Return the row of every bin of sines from -1 to 1, or that it is unsure."""
+    """Return the row of every bin of sines from -1 to 1, _UNSURE where an edge is near."""
     sine = np.sin(np.clip(edges_rad[::-1], -np.pi / 2, np.pi / 2))  # rising; a row may reach beyond the zenith
     edge_bin = np.minimum((sine + 1) * (_SINE_BINS / 2), _SINE_BINS - 1).astype(np.int64)
     from_below = np.arange(len(edges_rad) - 1, -2, -1, dtype=np.int16)

@@ -42,10 +42,10 @@ def reference_rings(xyz_m: Float32[np.ndarray, "3 n"], height: int) -> Int32[np.
     starts = np.flatnonzero(np.roll(quadrant, 1) - quadrant == 3)
     row = np.zeros(xyz_m.shape[1], dtype=np.int32)
     end = xyz_m.shape[1]
-    for place, start in enumerate(starts[::-1]):
-        row[start:end] = (height - 1 - place) % height
+    for ring, start in enumerate(starts[::-1]):  # from the lowest ring up
+        row[start:end] = (height - 1 - ring) % height
         end = start
-        if place == height:
+        if ring == height:
             break
     return row
 
@@ -58,9 +58,10 @@ def azimuths_rad(xyz_m: Float32[np.ndarray, "3 n"]) -> Float64[np.ndarray, "n"]:
 def columns(xyz_m: Float32[np.ndarray, "3 n"], width: int) -> Int32[np.ndarray, "n"]:
     """Return the column whose span [pi - 2 pi w/W, pi - 2 pi (w+1)/W) holds each point's azimuth, around the circle.
 
-    A point counts as placed in double precision. Few need to be: in single precision, azimuths of up to pi are wrong by
-    2^-20 at most (4 units in the last place, more than any arc function in use), and the difference from pi and the
-    product by less again, together less than W 2^-21 columns. Only points within twice that of an edge remain.
+    The result is that of double precision, but only points near an edge are computed so. In single precision, azimuths
+    of up to pi are wrong by at most 2^-20 (4 units in the last place, more than any arc function in use). The
+    difference from pi and the product add less than that; together the error is below W 2^-21 columns. Only points
+    within twice that distance of an edge are computed again.
     """
     x, y, _ = torch.from_numpy(xyz_m)  # torch, for its arctan2 is fast on every processor
     at = torch.atan2(y, x).numpy()

@@ -1,4 +1,4 @@
-"""Along each ray by its range: range image → points."""
+"""Range image → points, each on its pixel's ray."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def unproject(image: RangeImage) -> Scan:
     """Return the points of one range image, row by row from the top, each on the centre of its pixel's ray.
 
     Returns:
-        as many points as the image has returns, with their ring, and their reflectance if the image has it.
+        one point for each return, with its ring, and with its reflectance if the image has it.
 
     Raises:
         ScanError: a batch instead of one image, or an image without a return.

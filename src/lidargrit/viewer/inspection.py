@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from lidargrit.files import atomic_path
 from lidargrit.projection.fit import elevations_deg
 from lidargrit.projection.inspection import FATES, Inspection
-from lidargrit.projection.placement import row_elevation_rad
+from lidargrit.projection.pixel_coordinates import row_elevation_rad
 
 _DOTS_PER_INCH = 100
 _NO_RETURN = "#e4e4e4"  # near white: no colour of the range scale comes near it

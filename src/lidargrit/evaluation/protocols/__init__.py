@@ -8,7 +8,7 @@ from typing import Any
 
 from lidargrit import _discovery
 from lidargrit.errors import UnknownNameError, nearest_names
-from lidargrit.projection import Variant
+from lidargrit.projection import ProjectionVariant
 from lidargrit.sensors import SensorModel, load_sensor
 
 DEFAULT = "exact"
@@ -55,7 +55,7 @@ class Protocol:
     sensor: str = ""
     columns: int = 0
     column_stride: int = 1
-    variant: Variant = "exact"
+    variant: ProjectionVariant = "exact"
     range_m: tuple[float, float] | None = None
     num_scans: int = 0
     data_set: str = ""

@@ -1,4 +1,4 @@
-"""Words as a user types them → options, or one line that says which word is wrong and what would be right."""
+"""The command line's parser: words as a user types them → options, or one line that names the wrong word."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from lidargrit.errors import UsageError, nearest_names, one_of
 from lidargrit.untrusted import check_path, check_word, positive_number, whole_number
 
 EXIT_CODES = """\
-exit codes: 0 done, 1 a fault of lidargrit's own (with a traceback), 2 a mistake (told in one line),
+exit codes: 0 done, 1 a fault of lidargrit's own (with a traceback), 2 a mistake of the user (explained in one line),
             130 interrupted by Ctrl-C, 143 terminated (SIGTERM)
 """
 
-_ALL_SHOWN = 9  # choices; of more, those that look most like the word
-_ABOUT_ONE = re.compile(r"argument (\S*): (.*)", re.DOTALL)
-# What argparse says, and what to say in its place. Its words differ a little from one Python to the next.
-_SAID = (
+_ALL_SHOWN = 9  # choices at most; of more, only those nearest to the user's word are shown
+_OF_ONE_ARGUMENT = re.compile(r"argument (\S*): (.*)", re.DOTALL)
+# argparse's messages → got, wanted, cure. The messages differ a little from one Python version to the next.
+_EXPLANATIONS = (
     (re.compile(r"expected (?:one|at least one) argument"), "nothing after {name}", "a value", "write one behind it"),
     (re.compile(r"ignored explicit argument (.*)"), "{name} with {0}", "{name} alone", "leave the value out"),
 )
@@ -31,8 +31,8 @@ class HelpFormatter(argparse.RawDescriptionHelpFormatter):
     def _get_help_string(self, action: argparse.Action) -> str:
         text = action.help or ""
         has_default = isinstance(action.default, (int, float, str, Path)) and not isinstance(action.default, bool)
-        is_told = "default" in text or action.default in ("", argparse.SUPPRESS)
-        shown = has_default and action.option_strings and not is_told
+        is_described = "default" in text or action.default in ("", argparse.SUPPRESS)
+        shown = has_default and action.option_strings and not is_described
         return f"{text} (default: %(default)s)" if shown else text
 
 
@@ -45,8 +45,8 @@ class Parser(argparse.ArgumentParser):
             self.register("type", kind, check)
 
     def error(self, message: str) -> NoReturn:
-        """Raise what argparse complains of, in our manner."""
-        raise UsageError(*self._told(message))
+        """Raise argparse's complaint as got, wanted and cure."""
+        raise UsageError(*self._explain(message))
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:  # pyright: ignore
         """Parse, but refuse an unknown option first, whatever else may be missing."""
@@ -59,7 +59,7 @@ class Parser(argparse.ArgumentParser):
         return super().parse_known_args(args, namespace)
 
     def _get_value(self, action: argparse.Action, arg_string: str) -> Any:
-        """Convert one word; what a type of ours says of a bad one is kept, with the option's name before it."""
+        """Convert one word; the message of our own types is kept, with the option's name before it."""
         if isinstance(action, argparse._SubParsersAction):  # all words of a verb, whose own parser converts them
             return arg_string
         convert = self._registry_get("type", action.type, action.type)
@@ -87,30 +87,30 @@ class Parser(argparse.ArgumentParser):
         )
         raise UsageError(f"{got} {word!r}", wanted, self._help())
 
-    def _told(self, message: str) -> tuple[str, str, str]:
-        about_one = _ABOUT_ONE.fullmatch(message)
-        if about_one is None:
+    def _explain(self, message: str) -> tuple[str, str, str]:
+        of_one_argument = _OF_ONE_ARGUMENT.fullmatch(message)
+        if of_one_argument is None:
             if missing := re.fullmatch(r"the following arguments are required: (.*)", message):
                 return f"no {missing[1].replace(', ', ' and no ')}", self._wanted(), self._help()
             if ambiguous := re.fullmatch(r"ambiguous option: (\S+) could match (.*)", message):
                 return ambiguous[1], one_of(ambiguous[2].split(", ")), "write it out"
             return message, "words as its help shows them", self._help()
-        name, complaint = about_one[1].partition("/")[0], about_one[2]
+        name, complaint = of_one_argument[1].partition("/")[0], of_one_argument[2]
         if chosen := re.match(r"invalid choice: '?(.*?)'? \(", complaint):
-            choices = [str(choice) for choice in self._choices(about_one[1])]
+            choices = [str(choice) for choice in self._choices(of_one_argument[1])]
             several = one_of(choices) if len(choices) <= _ALL_SHOWN else nearest_names(chosen[1], choices)
             wanted = several if len(choices) <= _ALL_SHOWN else f"one such as {several}"
             got = f"{name} {chosen[1]}" if name.startswith("-") else repr(chosen[1])
             return got, wanted, "choose one" if len(choices) <= _ALL_SHOWN else self._help()
-        for pattern, *parts in _SAID:
-            if said := pattern.match(complaint):
-                of = [group.strip("'") for group in said.groups()]
-                got, wanted, cure = (part.format(*of, name=name) for part in parts)
+        for pattern, *parts in _EXPLANATIONS:
+            if matched := pattern.match(complaint):
+                values = [group.strip("'") for group in matched.groups()]
+                got, wanted, cure = (part.format(*values, name=name) for part in parts)
                 return got, wanted, cure
         return message, "other words", self._help()
 
     def _choices(self, name: str) -> list[Any]:
-        """Return what may stand in the place that argparse calls by this name; the verb's has none."""
+        """Return the choices of the argument that argparse calls by this name; empty if it has none."""
         for action in self._actions:
             names = ("/".join(action.option_strings), action.metavar, action.dest)
             if action.choices is not None and name in names:
@@ -118,7 +118,7 @@ class Parser(argparse.ArgumentParser):
         return []
 
     def _wanted(self) -> str:
-        """Return the command with the names that it must have."""
+        """Return the command with the names of its required arguments."""
         needed = [action for action in self._actions if action.required]
         shown = [[*action.option_strings[:1], str(action.metavar or action.dest).upper()] for action in needed]
         return " ".join([self.prog, *(word for words in shown for word in words)])

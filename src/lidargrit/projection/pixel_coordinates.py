@@ -1,4 +1,4 @@
-"""Where the points of a scan fall: points → row, column and range of each, and the nearest of each pixel."""
+"""Points of a scan → their row, column and range in the image, and the nearest point of each pixel."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from lidargrit.projection import spherical, unfolding
 from lidargrit.sensors import ProjectionName, SensorModel
 from lidargrit.structures import Scan
 
-Variant = Literal["exact", "reference"]
+ProjectionVariant = Literal["exact", "reference"]
 
 
 @dataclass(frozen=True, eq=False)
-class Placement:
-    """The place of every point in the image, before any point is left out.
+class PixelCoordinates:
+    """The row, the column and the range of every point, before any point is left out.
 
     Args:
-        row: -1 above all rows, and ``height`` or more below them.
-        column: index (n,) among the fine columns.
-        range_m: Euclidean distance from the sensor.
-        height: rows of the image.
+        row: row index (n,) of each point; -1 above all rows, ``height`` or more below them.
+        column: index (n,) of each point among the fine columns.
+        range_m: Euclidean distance (n,) of each point from the sensor, in metres.
+        height: number of rows of the image.
         width: number of fine columns of the image.
     """
 
@@ -34,18 +34,18 @@ class Placement:
     width: int
 
     def in_rows(self) -> Bool[np.ndarray, "n"]:
-        """Tell which points have a row."""
+        """Return which points have a row."""
         return (self.row >= 0) & (self.row < self.height)
 
     def nearest(
         self, eligible: Bool[np.ndarray, "n"]
     ) -> tuple[Int32[np.ndarray, "H fine_W"], Float32[np.ndarray, "H fine_W"]]:
-        """Find the nearest of the eligible points in each pixel; of equally near ones the last.
+        """Find the nearest eligible point of each pixel; of equally near points, the last.
 
         Every eligible point must have a row.
 
         Returns:
-            its index, -1 for none, and its range, infinite for none.
+            index of the nearest point in the scan, -1 where a pixel has none; its range in metres, infinite for none.
         """
         spare = self.height * self.width  # a pixel beyond the image takes the points that are left out
         pixel = self.row.astype(np.int64)
@@ -61,7 +61,9 @@ class Placement:
         return point[:spare].reshape(shape), least_m[:spare].reshape(shape)
 
 
-def place(scan: Scan, sensor: SensorModel, method: ProjectionName, variant: Variant) -> Placement:
+def pixel_coordinates(
+    scan: Scan, sensor: SensorModel, method: ProjectionName, variant: ProjectionVariant
+) -> PixelCoordinates:
     """Find the row, the fine column and the range of every point."""
     xyz_m = np.ascontiguousarray(scan.points_xyz_m.numpy().T)  # NumPy is far faster along whole coordinates
     with np.errstate(over="ignore", under="ignore"):
@@ -75,18 +77,18 @@ def place(scan: Scan, sensor: SensorModel, method: ProjectionName, variant: Vari
             row = spherical.reference_rows(xyz_m, range_m, height)
         else:
             row = unfolding.reference_rings(xyz_m, height)
-        return Placement(row, unfolding.reference_columns(xyz_m, width), range_m, height, width)
+        return PixelCoordinates(row, unfolding.reference_columns(xyz_m, width), range_m, height, width)
     if method == "spherical":
         row = spherical.rows(xyz_m, range_m, row_elevation_rad(sensor))
     elif scan.ring is not None:
         row = scan.ring.numpy()
     else:
         row = unfolding.rings_from_firing_order(xyz_m)
-    return Placement(row, unfolding.columns(xyz_m, width), range_m, height, width)
+    return PixelCoordinates(row, unfolding.columns(xyz_m, width), range_m, height, width)
 
 
 def within_limits(range_m: Float32[np.ndarray, "n"], sensor: SensorModel) -> Bool[np.ndarray, "n"]:
-    """Tell which ranges the sensor can return; the limits themselves are inside."""
+    """Return which ranges lie within the sensor's limits; the limits themselves are inside."""
     return (range_m >= sensor.range_min_m) & (range_m <= sensor.range_max_m)
 
 
