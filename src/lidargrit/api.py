@@ -19,12 +19,13 @@ __all__ = ["evaluate", "inspect", "load", "load_scan", "load_sensor", "project",
 
 
 def load_scan(path: str | Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
-    """Read one scan from a file of any known format (``lidargrit list formats``), told by its name and its looks.
+    """Read one scan from a file of any known format (``lidargrit list formats``), found from its name and content.
 
     Args:
-        path: of the file.
-        index: of the scan, in a file that holds several.
-        bad_points: ``drop`` removes points with NaN or infinite coordinates and points at the origin.
+        path: path of the file.
+        index: index of the scan in a file that holds several.
+        bad_points: treatment of bad points; ``refuse`` raises an error, ``drop`` removes points with NaN or infinite
+            coordinates and points at the origin.
 
     Raises:
         ScanError: the file cannot be used; says what is wrong and what to do.
@@ -39,10 +40,10 @@ def evaluate(
 
     Args:
         generated: a folder of samples, of ours or of another program, or a source of scans.
-        reference: likewise; scans are projected with the sensor of ``generated``.
-        protocol: which numbers, and how each is defined (``lidargrit list protocols``).
-        metrics: names, in place of the protocol's.
-        max_scans: of each; 0 for the protocol's.
+        reference: a set to compare with, of the same kinds; its scans are projected with the sensor of ``generated``.
+        protocol: name of the protocol, which chooses and defines the metrics (``lidargrit list protocols``).
+        metrics: names of metrics, instead of the protocol's.
+        max_scans: largest number of scans of each set; 0 for the protocol's.
 
     Returns:
         scores with intervals and floors; ``print(card.as_table())``, or each of ``card.scores``.

@@ -22,7 +22,7 @@ class SplitScheme:
 
     Args:
         source: publication or program that defines it.
-        leak: what the parts share that they should not, in one sentence; everybody who compares figures needs it.
+        leak: one sentence on what the parts share but should not, for everybody who compares figures.
         parts: the sequences of every part: train, val, test.
     """
 

@@ -13,7 +13,7 @@ def download(name: str, revision: str | None, patterns: list[str]) -> Path:
     """Download files of a repository by the hub's own client, which keeps them in its cache.
 
     Args:
-        name: "USER/REPOSITORY".
+        name: name of the repository, "USER/REPOSITORY".
         revision: branch, tag or commit; None for the repository's main branch.
         patterns: names of the files wanted, of which ``*`` stands for any letters.
 

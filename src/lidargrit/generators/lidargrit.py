@@ -53,7 +53,7 @@ class TokenSampling:
         top_k: number of the likeliest tokens that are sampled from; 0 for all, the model's own distribution, since the
             paper names no other. The released program takes 100, which makes a barely trained model bland.
         top_p: probability that the likeliest tokens, which alone are sampled from, hold together; 1 for all.
-        mask: how returns are decided, and ranges with them. ``pixels`` samples both by the pixel decoder, phase by
+        mask: method by which returns and ranges are decided. ``pixels`` samples both by the pixel decoder, phase by
             phase. ``bernoulli`` samples each return with its probability, independently of the others, and keeps the
             decoded ranges (the released program, so what the paper's scores were computed with). ``threshold`` keeps a
             return that is at least as likely as not (the paper's eq. 1). ``auto`` is ``pixels`` where there is a pixel

@@ -39,7 +39,7 @@ class MaskedSampling:
         order_temperature: scale of the Gumbel noise in the choice of the tokens that a pass keeps. It is added to the
             logarithm of a token's probability and falls to 0 with the last pass; 0 keeps the likeliest tokens, and the
             larger it is, the more random the order. The default is that of the authors' program.
-        mask: how returns are decided, and ranges with them. ``pixels`` samples both by the pixel decoder, phase by
+        mask: method by which returns and ranges are decided. ``pixels`` samples both by the pixel decoder, phase by
             phase. ``bernoulli`` samples each return with its probability, independently of the others, and keeps the
             decoded ranges. ``threshold`` keeps a return that is at least as likely as not. ``auto`` is ``pixels`` where
             there is a pixel decoder, and ``bernoulli`` elsewhere.

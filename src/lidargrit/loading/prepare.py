@@ -172,7 +172,7 @@ def prepare_and_describe(
     """Prepare a source and return what the folder holds.
 
     Args:
-        source, config, folder, reporter, rank, world_size: as for :func:`prepare`.
+        source, config, folder, reporter, rank, world_size: the arguments of :func:`prepare`.
         verify: whether to read every image back and make damaged shards again.
 
     Raises:

@@ -57,10 +57,10 @@ def make_shard(
 
     Args:
         folder: prepared folder.
-        spec: what the folder is to hold.
+        spec: description of what the folder will hold.
         shard: number of the shard.
         dataset: source of the scans.
-        advance: function that is told how many scans more are done.
+        advance: function that receives the number of further scans done.
 
     Raises:
         ScanError: a scan that cannot be used, unless such scans are skipped.

@@ -86,7 +86,7 @@ def histograms(points_xyz_m: Float[Tensor, "B n 3"], variant: str) -> Int64[np.n
     """Count the points of every scan in the cells of the grid, those nearer than 3 m and beyond 70 m left out.
 
     Args:
-        points_xyz_m: metres.
+        points_xyz_m: points in the sensor's frame, in metres.
         variant: one of ``VARIANTS``; they differ for points on the border of two cells only.
 
     Returns:

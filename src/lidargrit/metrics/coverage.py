@@ -20,7 +20,7 @@ class Coverage(CloudMetric):
     scans.
 
     Args:
-        variant: how points are sampled from a scan, see :class:`CloudMetric`.
+        variant: published way to sample points from a scan, see :class:`CloudMetric`.
         seed: not used.
 
     Source:

@@ -20,7 +20,7 @@ class MinimumMatchingDistance(CloudMetric):
     change places), and its distance taken in double. Time grows with the product of the numbers of scans.
 
     Args:
-        variant: how points are sampled from a scan, see :class:`CloudMetric`.
+        variant: published way to sample points from a scan, see :class:`CloudMetric`.
         seed: not used.
 
     Source:

@@ -23,7 +23,7 @@ class OneNearestNeighbour(CloudMetric):
     number of scans.
 
     Args:
-        variant: how points are sampled from a scan, see :class:`CloudMetric`.
+        variant: published way to sample points from a scan, see :class:`CloudMetric`.
         seed: not used.
 
     Source:

@@ -25,9 +25,9 @@ class PointCloudJsd(CloudMetric):
     Scenes are not seen, only their sum; only the sum is kept.
 
     Args:
-        variant: how points are sampled from a scan, see :class:`CloudMetric`. Besides, ``reference`` adds 1e-8 to every
-            share of either set, and once more to their mean, as LidarGRIT's program does: a set against itself then
-            gives about 0.0024 instead of 0.
+        variant: published way to sample points from a scan, see :class:`CloudMetric`. Besides, ``reference`` adds
+            1e-8 to every share of either set, and once more to their mean, as LidarGRIT's program does: a set against
+            itself then gives about 0.0024 instead of 0.
         seed: not used.
 
     Source:
@@ -59,7 +59,7 @@ def grid_counts(points: Float32[np.ndarray, "n 3"]) -> Int64[np.ndarray, "grid"]
     half way between two goes to the lower one.
 
     Args:
-        points: in units of the longest range.
+        points: points (n, 3) in units of the longest range.
     """
     inside, number, tree = _grid()
     place = (points.astype(np.float64) + 1) * ((_SIDE - 1) / 2)

@@ -23,8 +23,8 @@ class Widths:
     """Channels of both networks.
 
     Args:
-        finest: of the level next to the image; each coarser one has twice as many,
-        widest: but not more than these.
+        finest: number of channels of the level next to the image; each coarser level has twice as many.
+        widest: largest number of channels of any level.
     """
 
     finest: int
@@ -43,9 +43,9 @@ class Synthesis(nn.Module):
 
     Args:
         latent_dim: length of a latent.
-        widths: channels.
+        widths: channels of each level.
         size: rows and columns of the image, multiples of 16, with at least 32 rows.
-        logits: maps beside the range; 0 for none.
+        logits: number of maps of return logits beside the range; 0 for none.
 
     Source:
         The networks of DUSty v1 (Nakashima and Kurazume, IROS 2021), kazuto1011/dusty-gan@0374a5e, MIT.
@@ -76,7 +76,7 @@ class Discriminator(nn.Module):
     It sees the image blurred along columns and blurred along rows, which hides single missing pixels.
 
     Args:
-        widths: channels.
+        widths: channels of each level.
         size: rows and columns of the image.
 
     Source:

@@ -27,11 +27,11 @@ def augment_differentiably(
     """Change every image of a batch at random, so that gradients flow through to it.
 
     Args:
-        images: in [-1, 1].
+        images: encoded range images in [-1, 1].
         kinds: ``brightness`` adds up to half; ``contrast`` scales the distance from the image's mean by 1/2 to 3/2;
             ``translation`` turns columns around the circle and shifts rows, with zeros coming in; ``cutout`` sets a
             window of half the rows and half the columns to zero, less where it reaches over an edge.
-        defects: what the program of DUSty v1 does otherwise. ``squared_draws``: numbers drawn from [-1, 1] for
+        defects: faults of DUSty v1's program to repeat. ``squared_draws``: numbers sampled from [-1, 1] for
             brightness and contrast are squared, so that images only become brighter and steeper. ``idle_saturation``:
             after brightness, colours are saturated, which takes a random number and changes nothing in an image of one
             channel. ``short_circle``: the circle is a column too short, so that the last column is never seen and

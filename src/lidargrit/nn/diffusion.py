@@ -75,11 +75,11 @@ def step_back(
     """Go to a cleaner image: the predicted one is cut to [-1, 1], and what it and the noisy one say is joined.
 
     Args:
-        noisy: at the log SNR ``now``.
-        predicted: the noise in it.
-        now: log SNR.
-        then: a higher log SNR.
-        fresh: noise, to draw from q(x then | x now, x₀) (DDPM); none to keep the noise that was there (DDIM).
+        noisy: noisy images at the log SNR ``now``.
+        predicted: noise in them, as the network predicts it.
+        now: log SNR of the noisy images.
+        then: log SNR to go to, higher than ``now``.
+        fresh: fresh noise, to sample from q(x then | x now, x₀) (DDPM); None keeps the predicted noise (DDIM).
 
     Source:
         Ho et al., DDPM, 2020, eq. 6 and 7; Song et al., DDIM, 2021, eq. 12 with σ = 0; in log SNR as Kingma et al.,
@@ -114,7 +114,7 @@ def sample(
 
     Args:
         denoiser: a network.
-        noise: gives fresh noise at each call.
+        noise: function that returns fresh noise at each call.
         steps: evaluations of the network.
         sampler: ``ddpm`` adds fresh noise after each step, ``ddim`` only at the beginning.
     """
@@ -133,16 +133,17 @@ def repaint(
     steps: int,
     resamples: int,
 ) -> Float[Tensor, "B C H W"]:
-    """Draw images that agree with what was observed of them.
+    """Sample images that agree with their observed pixels.
 
     Args:
         denoiser: a network.
-        noise: gives fresh noise at each call.
-        clean: what was observed, anything elsewhere.
-        observed: where.
-        steps: of time.
-        resamples: how often each step is taken: between two, the image goes back to where it was with fresh noise, so
-            that what was observed and what is made up grow together. The last step is taken once, as in the reference.
+        noise: function that returns fresh noise at each call.
+        clean: observed values; other pixels may hold anything.
+        observed: mask, True where a pixel was observed.
+        steps: number of steps of time.
+        resamples: number of times that each step is taken. Between two times, fresh noise takes the image back to the
+            noise level before, so that observed and generated pixels fit each other. The last step is taken once, as in
+            the reference.
 
     Source:
         Lugmayr et al., RePaint, CVPR 2022, algorithm 1 with jumps of one step.

@@ -31,7 +31,8 @@ class PixelSampling:
     are sampled with 1 and 1 have exactly the likelihood that the model tells; sharper ones have none.
 
     Args:
-        temperature: of the components' weights; 1 takes them as they are, below 1 prefers the likelier surface.
+        temperature: temperature of the components' weights; 1 leaves them unchanged, below 1 prefers the likelier
+            surface.
         noise: multiplier of the components' scales; 1 takes them as they are.
     """
 
@@ -51,8 +52,9 @@ class PixelNll(NamedTuple):
     """Negative log-likelihood of every pixel in nats.
 
     Args:
-        mask: of whether it returned, after the earlier pixels.
-        range: of its range as a density per metre, after the whole mask and the earlier ranges; 0 without a return.
+        mask: negative log-likelihood of the mask (a return or none), given the earlier pixels.
+        range: negative log-likelihood of the range, a density per metre, given the whole mask and the earlier ranges;
+            0 without a return.
     """
 
     mask: Float[Tensor, "B H W"]
@@ -66,7 +68,7 @@ class PixelDecoder(nn.Module):
     stand on either side of an edge. The pixels of one phase are independent of one another, given the earlier ones.
 
     Args:
-        config: sizes.
+        config: sizes of the networks.
         sensor: the rays and limits of the range images.
         features: channels of the tokenizer's features.
 
@@ -151,9 +153,9 @@ class PixelDecoder(nn.Module):
         """Return one scan for each random generator; a scan does not depend on the others of its batch.
 
         Args:
-            decoded: what was decoded from the tokens of as many scans.
+            decoded: output of the tokenizer's decoder for as many scans.
             rngs: random generators on the CPU, one for each scan.
-            sampling: of the ranges.
+            sampling: settings of the sampling of ranges.
             observed: scans, and True where a pixel of them is known, be it a return or that there was none. These
                 pixels are taken over as they are, when their phase comes: later phases know of them, earlier ones not.
         """

@@ -35,10 +35,10 @@ class PixelDecoderConfig:
         coarsest_cell: rows and columns of the cells of which the first phase generates one pixel each; a power of 2
             that divides both sides of the image.
         mask_features: channels of the tokenizer's features that the mask network sees.
-        range_features: the same of the range network.
+        range_features: channels of the tokenizer's features that the range network sees.
         row_channels: learned numbers of every row.
         mask_width: channels of the mask network's layers.
-        range_width: the same of the range network.
+        range_width: channels of the range network's layers.
         blocks: residual blocks of each network.
         free_components: components of a range that do not begin at a neighbour's range; there are 6 more that do.
     """
@@ -60,10 +60,10 @@ class PixelDecoderConfig:
 
 
 class Guide(NamedTuple):
-    """What a tokenizer's decoder tells of every pixel.
+    """Output of a tokenizer's decoder for every pixel.
 
     Args:
-        features: of its last layer.
+        features: features of the decoder's last layer.
         v: ln(1 + decoded range in metres).
         return_logits: logits of the probability of a return, bounded.
     """

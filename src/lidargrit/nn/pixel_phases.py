@@ -73,9 +73,9 @@ class Neighbours(NamedTuple):
     """The pixels around those of a phase that were generated before: two pairs that lie opposite each other.
 
     Args:
-        values: of the first and the second pair; each pair holds first and opposite neighbour.
+        values: values of the first and the second pair; each pair holds a neighbour and its opposite.
         known: True where a neighbour is in the image and holds a value.
-        rows_apart: for each pair, whether the two lie in different rows.
+        rows_apart: two flags, one a pair: True where its two neighbours lie in different rows.
     """
 
     values: Float[Tensor, "B 2 2 h w"]
@@ -116,7 +116,7 @@ def join_phases(coarser: Float[Tensor, "B h w"] | None, values: Float[Tensor, "P
 
     Args:
         coarser: None for the coarsest spacing, whose phases are four.
-        values: of three phases, or of four, in their order.
+        values: values of three phases, or of four, in their order.
     """
     corner = values[0] if coarser is None else coarser
     opposite, right, below = values[-3:]

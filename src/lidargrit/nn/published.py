@@ -23,22 +23,22 @@ class RefusedFileError(Exception):
 
 
 def read_checkpoint(
-    path: Path, place: Sequence[str], bytes_at_most: int, ignored: Sequence[str] = ()
+    path: Path, names: Sequence[str], bytes_at_most: int, ignored: Sequence[str] = ()
 ) -> dict[str, Tensor]:
     """Return the weights of one network in a checkpoint of another program.
 
     Args:
-        path: of the file.
-        place: names that lead to the weights, such as ``("G_ema",)``; they are all that is looked at.
-        bytes_at_most: of the file; a larger one is refused unread.
-        ignored: patterns of names that are passed over, such as ``loss.*``.
+        path: path of the file.
+        names: names that lead to the weights, such as ``("G_ema",)``; nothing else in the file is read.
+        bytes_at_most: largest size of the file in bytes; a larger one is refused unread.
+        ignored: patterns of names that are skipped, such as ``loss.*``.
 
     Raises:
-        CheckpointError: no file, too large a one, or anything but float32 tensors in that place.
+        CheckpointError: no file, too large a one, or anything but float32 tensors under these names.
     """
     try:
         found = read_everything(path, bytes_at_most)
-        for name in place:
+        for name in names:
             if not isinstance(found, dict) or name not in found:
                 raise RefusedFileError(f"which holds no {name!r}")
             found = found[name]
@@ -47,7 +47,7 @@ def read_checkpoint(
         return float_tensors(found, bytes_at_most)
     except (RefusedFileError, OSError) as why:
         raise CheckpointError(
-            f"{path}, {why}", f"a checkpoint with weights at {'.'.join(place)!r}", "check the path"
+            f"{path}, {why}", f"a checkpoint with weights at {'.'.join(names)!r}", "check the path"
         ) from None
 
 

@@ -19,8 +19,8 @@ class RangeMixture:
     Every component is cut off at the limits and rescaled, so that ranges of the sensor have probability 1 together.
 
     Args:
-        logits: of the components' weights.
-        centres: of the components, in v; within the limits.
+        logits: logits of the components' weights.
+        centres: centres of the components, in v, within the limits.
         log_scales: natural logarithm of the components' scales, in v.
         limits_m: shortest and longest range of the sensor in metres.
 
@@ -56,7 +56,8 @@ class RangeMixture:
         Args:
             component: uniform random numbers in [0, 1) that choose a component.
             within: uniform random numbers in [0, 1) that choose a range of the component.
-            temperature: of the components' weights: 1 takes them as they are, below 1 prefers the likelier ones.
+            temperature: temperature of the components' weights; 1 leaves them unchanged, below 1 prefers the
+                likelier ones.
             noise: multiplier of the components' scales.
         """
         scaled = RangeMixture(

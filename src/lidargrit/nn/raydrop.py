@@ -17,9 +17,9 @@ def straight_through(logits: Tensor, noise: Tensor, temperature: float) -> Float
     """Return 0 or 1 by the sign of logits + noise, with the gradient of a sigmoid as steep as the temperature is low.
 
     Args:
-        logits: of 1.
-        noise: of the same shape, or one that fits; see :func:`logistic_noise`.
-        temperature: above 0.
+        logits: logits of the probability of 1.
+        noise: noise of the same shape, or of one that broadcasts; see :func:`logistic_noise`.
+        temperature: temperature of the sigmoid, above 0.
 
     Source:
         Maddison et al., The Concrete Distribution, 2017; Jang et al., Gumbel-Softmax, 2017, section 2.2.

@@ -32,11 +32,12 @@ class UnetConfig:
     """Sizes of the network; the defaults are the published ones.
 
     Args:
-        channels: of the finest level; four times as many tell the network how noisy its input is.
-        channel_multipliers: one a level, the finest first; each further level halves both axes.
-        residual_blocks: of each level, on the way down and again on the way up.
-        norm_groups: of every group norm.
-        attention_heads: of the coarsest level, on both ways.
+        channels: channels of the finest level; the embedding of the noise level has four times as many.
+        channel_multipliers: channels of each level over those of the finest, from fine to coarse; each further level
+            halves both axes.
+        residual_blocks: number of residual blocks of each level, on the way down and again on the way up.
+        norm_groups: number of groups of every group norm.
+        attention_heads: number of attention heads of the coarsest level, on both ways.
     """
 
     channels: int = 64
@@ -72,13 +73,13 @@ class UnetConfig:
 
 
 class EfficientUnet(Network):
-    """Predicts noise in range images; azimuth wraps, and every pixel is told where its ray looks.
+    """Predicts noise in range images; azimuth wraps, and every pixel receives its ray's direction.
 
     Args:
-        config: sizes.
-        images: channels that come in and go out.
-        elevation_rad: of every pixel.
-        azimuth_rad: of every pixel.
+        config: sizes of the network.
+        images: number of channels of the input and of the output.
+        elevation_rad: elevation (H, W) of every pixel in radians.
+        azimuth_rad: azimuth (H, W) of every pixel in radians.
 
     Raises:
         ConfigError: an image that cannot be halved as often as there are levels below the first.

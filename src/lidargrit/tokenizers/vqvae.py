@@ -49,15 +49,15 @@ class VqvaeConfig(TokenizerConfig):
         code_dim: length of a code.
         num_codes: number of codes in the codebook.
         dropout: probability of dropout within residual blocks.
-        padding: what lies beyond the first and the last column: ``zero`` as in the reference; ``wrap`` closes the
-            circle of azimuth.
-        range_encoding: how metres become [-1, 1]; ``linear`` is the paper's.
+        padding: values beyond the first and the last column: ``zero`` as in the reference; ``wrap`` closes the circle
+            of azimuth.
+        range_encoding: map from metres to [-1, 1]; ``linear`` is the paper's.
         raydrop_loss: whether a return mask is decoded beside the range, with its own loss (RL in the paper's ablation).
             Without it one channel learns the range image with its holes.
         raydrop_weight: weight of that loss, lambda; 0.1 in the paper, 0.0001 in the released configuration for KITTI
             odometry.
-        reconstruction: which pixels the error of the range is of, and what it is divided by. ``paper``: the clean range
-            at returns, divided by all pixels. ``reference``: a mask is sampled first, so that only kept pixels learn,
+        reconstruction: pixels that the error of the range covers, and its divisor. ``paper``: the clean range at
+            returns, divided by the number of all pixels. ``reference``: a mask is sampled first, only its pixels count,
             and the sum is divided by the returns of each scan. ``returns``: the clean range at returns, divided by
             their number in each scan.
         error_unit: ``encoded`` for the error between encodings, as in the paper; ``metres`` for the error between

@@ -117,7 +117,7 @@ class NetworkFeatures(FeatureExtractor[Float32[np.ndarray, "B d"]]):
 
     Args:
         network: the network with its weights.
-        inputs: what turns images into the network's inputs.
+        inputs: function that turns range images into the network's inputs.
     """
 
     network: PretrainedNetwork
