@@ -112,18 +112,18 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
     ) -> RangeImage:
         """Return the scans of sampled tokens.
 
-        They are decoded in batches of one size, as tokens are sampled, because kernels differ by the size. Copies that
-        fill up the end of a batch are not decoded again, beyond what that size needs.
+        Scans are decoded in batches of one size, as tokens are sampled, because kernels differ by the size. Copies that
+        fill up the last batch are decoded only as far as that size needs them.
 
         Args:
             tokens: tokens of ``compute_batch`` scans in raster order.
             rngs: random generators on the CPU, one for each scan.
-            mask: how returns are decided, and ranges with them.
-            pixels: how the pixel decoder samples ranges.
-            tokenizer: the generator's own, or what that gives for decoding only.
+            mask: method by which returns and ranges are decided.
+            pixels: settings by which the pixel decoder samples ranges.
+            tokenizer: the generator's own tokenizer, or its copy for decoding only.
 
         Raises:
-            ConfigError: pixels are to be decided by a pixel decoder, and there is none.
+            ConfigError: ``mask`` asks for a pixel decoder, and there is none.
         """
         if mask == "pixels" and self.pixels is None:
             raise ConfigError(
