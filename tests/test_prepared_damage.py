@@ -1,6 +1,7 @@
 """Prepared folders that are damaged, or made to do harm: each is refused in one line, or made anew."""
 
 import json
+import os
 import shutil
 import sys
 
@@ -68,6 +69,10 @@ def test_damage_is_found_and_made_good(tmp_path, small_shards):
         {"range_bytes": 10**12},
         {"range_bytes": "many"},
         {"scan": 77},
+        {"scan": None},
+        {"scan": False},
+        {"offset": 8.0},
+        {"fingerprint": [1]},
         {"reflectance_bytes": 3},
     ],
 )
@@ -78,7 +83,7 @@ def test_an_index_that_lies_is_refused(folder, change):
     index = json.loads(content[-16 - length : -16])
     index["entries"][0] |= change
     told = json.dumps(index).encode()
-    for lie in (told, b"[" * 100_000, b"null"):
+    for lie in (told, b"[" * 100_000, b"null", told[:-1] + b', "x": 1e400}'):
         path.write_bytes(content[: -16 - length] + lie + len(lie).to_bytes(8, "little") + content[-8:])
         with pytest.raises(DataError, match="shard"):
             PreparedImages(str(folder)).read(0)
@@ -94,8 +99,19 @@ def test_a_blob_that_claims_to_be_gigabytes_is_refused_before_they_are_allocated
 
 
 @pytest.mark.parametrize("name", ["plan.json", "scans.json"])
-@pytest.mark.parametrize("content", ["null", "3", "[]", "[null]", '{"format": true}', "[[1, 2]]", "[" * 100_000, "{"])
+@pytest.mark.parametrize(
+    "content",
+    ["null", "3", "[]", "[null]", "1e400", "[" * 40 + "]" * 40, '{"format": true}', "[[1, 2]]", "[" * 100_000, "{"],
+)
 def test_a_plan_or_a_list_of_scans_that_is_none_is_refused(folder, name, content):
     (folder / name).write_text(content)
     with pytest.raises(DataError, match=name):
+        PreparedImages(str(folder))
+
+
+@pytest.mark.parametrize("name", ["plan.json", "scans.json", "000000.shard"])
+def test_a_pipe_in_a_prepared_folder_does_not_hang(folder, name):
+    (folder / name).unlink()
+    os.mkfifo(folder / name)
+    with pytest.raises(DataError, match=rf"{name}, which cannot be read \(not a file\)"):
         PreparedImages(str(folder))

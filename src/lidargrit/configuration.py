@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Iterable
 from typing import Any, ClassVar, TypeVar, get_origin, get_type_hints
 
 from lidargrit import _discovery
 from lidargrit.errors import ConfigError, UnknownNameError, nearest_names
+from lidargrit.untrusted import SEED_AT_MOST
 
 T = TypeVar("T")
 
@@ -55,6 +57,8 @@ def from_json(cls: type[T], data: Any, source: str) -> T:
         parser = _parser()
         parser.add_argument("--config", type=concrete)
         made = parser.instantiate(parser.parse_object({"config": data})).config
+        for name, value in leaves(made).items():
+            _check_numbers(value, f"{source}, in which {name} stands")
         return made if concrete is cls else cls(**_children(made))
     except (Exception, SystemExit) as error:  # the parser raises many kinds, for one cause: the file is not a cls
         if isinstance(error, ConfigError | UnknownNameError):
@@ -137,7 +141,23 @@ def _parsed(hint: Any, path: str, text: str) -> Any:
     except (Exception, SystemExit):  # see from_json
         name = hint.__name__ if isinstance(hint, type) else str(hint).replace("typing.", "")
         raise ConfigError(f"{path}={text}", f"a value of the type {name}", "correct the value") from None
+    _check_numbers(value, path)
     return tuple(value) if isinstance(value, list) else value
+
+
+def _check_numbers(value: Any, where: str) -> None:
+    """Refuse whole numbers that take more than 64 bits, and numbers that are NaN or infinite.
+
+    Raises:
+        ConfigError: ``where`` names the setting or the file.
+    """
+    if isinstance(value, (list, tuple)):
+        for each in value:
+            _check_numbers(each, where)
+    elif isinstance(value, int) and abs(value) > SEED_AT_MOST:
+        raise ConfigError(f"{where} with a number of {value.bit_length()} bits", "at most 63", "lower it")
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise ConfigError(f"{where} with {value}", "a finite number", "correct it")
 
 
 def _parser() -> Any:

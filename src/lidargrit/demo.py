@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,7 +13,7 @@ import torch
 from lidargrit.configuration import override
 from lidargrit.datasets import open_dataset
 from lidargrit.determinism import evenly_spaced
-from lidargrit.errors import DataError
+from lidargrit.errors import CheckpointError, DataError
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
@@ -28,6 +27,7 @@ from lidargrit.reporting import Reporter
 from lidargrit.sources.samples import read_samples, write_samples
 from lidargrit.structures import RangeImage
 from lidargrit.training import check_folder, train
+from lidargrit.training.log import LOG_FILE, read_log
 from lidargrit.viewer import plot_comparison
 from lidargrit.viewer.demo_page import DemoPage, write_demo_page
 from lidargrit.viewer.scan_sets import ScanSet
@@ -59,7 +59,7 @@ def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter
         val = load_range_images(recipe.data.val, recipe.data, reporter)
     generator = train(recipe, folder, reporter)
     for stage in generator.stages:
-        clock.add(f"train the {stage}", _trained_s(folder / stage / "log.jsonl"))
+        clock.add(f"train the {stage}", _trained_s(folder / stage / LOG_FILE))
     clock.keep()
     with clock.stage(f"sample {_NUM_SAMPLES} new scans"):
         write_samples(generator, folder, folder / "samples", range(_NUM_SAMPLES), reporter=reporter)
@@ -204,7 +204,9 @@ class _Clock:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self.seconds: dict[str, float] = dict(read_json(path)) if path.is_file() else {}
+        self.seconds: dict[str, float] = read_json(path) if path.is_file() else {}
+        if not all(type(seconds) in (int, float) for seconds in self.seconds.values()):
+            raise CheckpointError(f"{path} with times that are no numbers", "seconds by stage", "remove the file")
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -222,8 +224,8 @@ class _Clock:
 def _trained_s(log: Path) -> float:
     """Return the training time of a stage by its log, whose clock starts at 0 whenever training goes on."""
     before, total = 0.0, 0.0
-    for line in log.read_text(encoding="utf-8").splitlines():
-        seconds = float(json.loads(line)["seconds"])
+    for entry in read_log(log):
+        seconds = float(entry["seconds"])
         total += seconds - before if seconds >= before else seconds
         before = seconds
     return total

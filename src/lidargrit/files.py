@@ -62,7 +62,8 @@ def claim_folder(folder: Path, shared: bool = False) -> Iterator[None]:
         shared: allow others that claim it as shared too, such as several processes that sample into one folder.
 
     Raises:
-        OutputError: another process holds the folder, or it cannot be written to.
+        OutputError: another process holds the folder, it cannot be written to, or at the end it turns out to have been
+            removed meanwhile.
     """
     is_new = not folder.exists()
     try:
@@ -74,12 +75,20 @@ def claim_folder(folder: Path, shared: bool = False) -> Iterator[None]:
         ) from error
     try:
         yield
+        if not os.fstat(lock).st_nlink:  # only who removes the folder, or all in it, removes a lock that is held
+            raise removed_meanwhile(folder)
     finally:
         os.close(lock)
         remove_partials(folder)
         if is_new:
             with suppress(OSError):  # it holds results, as it should
                 folder.rmdir()
+
+
+def removed_meanwhile(folder: Path) -> OutputError:
+    """Return the error of a command whose files were removed while it still wrote others."""
+    wanted = "a folder that nobody removes or empties while it is written"
+    return OutputError(f"{folder}, from which files were removed meanwhile", wanted, "run the same command again")
 
 
 def remove_partials(folder: Path) -> None:

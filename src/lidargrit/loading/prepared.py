@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import threading
 from dataclasses import asdict, dataclass, fields
 from typing import Any
@@ -12,11 +11,11 @@ from lidargrit.errors import DataError
 from lidargrit.loading.images import Pixels, Provenance
 from lidargrit.loading.shards import Bytes, Entry, LocalBytes, read_image, read_index
 from lidargrit.sensors import SensorModel
-from lidargrit.untrusted import user_path
+from lidargrit.untrusted import JSON_BYTES_AT_MOST, parse_json, user_path
 
 PLAN_FILE, SCANS_FILE = "plan.json", "scans.json"
 FORMAT = 2  # to be raised whenever projection or simulation give other pixels for the same scan
-_PLAN_AT_MOST = 1 << 30  # bytes; the list of a million scans has a quarter of that
+_LIST_BYTES_AT_MOST = 2**28  # the list of a million scans takes half of it
 
 
 @dataclass(frozen=True)
@@ -120,24 +119,28 @@ class PreparedFolder:
                 f"{self.location}/{name}, which cannot be read ({error})", "what lidargrit prepare wrote", "prepare it"
             ) from None
 
-    def read_json(self, name: str) -> Any:
-        """Read a whole JSON file, or raise DataError."""
-        file = self.open(name)
+    def read_json(self, name: str, kind: type = dict, at_most: int = JSON_BYTES_AT_MOST) -> Any:
+        """Read a whole JSON file of bounded size and depth.
+
+        Args:
+            name: name of the file.
+            kind: required type of the whole, dict or list.
+            at_most: largest size, in bytes.
+
+        Raises:
+            DataError: the file cannot be read, or holds something else.
+        """
+        file, what = self.open(name), "what lidargrit prepare wrote"
         try:
-            if file.size > _PLAN_AT_MOST:
-                raise ValueError(f"{file.size} bytes")
-            return json.loads(bytes(file.read(0, file.size)))
-        except (OSError, ValueError, RecursionError) as error:
-            raise DataError(
-                f"{self.location}/{name}, which is damaged ({error})", "what lidargrit prepare wrote", "prepare again"
-            ) from None
+            data = bytes(file.read(0, min(file.size, at_most + 1)))
+        except (OSError, ValueError) as error:
+            raise DataError(f"{self.location}/{name}, which is damaged ({error})", what, "prepare again") from None
+        return parse_json(data, f"{self.location}/{name}", kind, DataError, what, "prepare again", at_most)
 
     def read_spec(self) -> PreparedSpec:
         """Read what the images were prepared from and how, or raise DataError."""
         try:
             entries = self.read_json(PLAN_FILE)
-            if not isinstance(entries, dict):
-                raise TypeError(f"{entries!r:.40} in place of entries by name")
             spec = PreparedSpec(**entries)
             for field in fields(PreparedSpec):  # the plain types; the sensor checks itself
                 kind = {"int": int, "float": (int, float), "str": str}.get(str(field.type), dict)
@@ -186,8 +189,8 @@ class PreparedImages:
         self.left_out: dict[int, str] = {}
         self._open: dict[int, Bytes] = {}
         self._lock = threading.Lock()
-        scans = self._folder.read_json(SCANS_FILE)
-        if not isinstance(scans, list) or len(scans) != self.spec.num_scans or not all(map(_is_named, scans)):
+        scans = self._folder.read_json(SCANS_FILE, list, _LIST_BYTES_AT_MOST)
+        if len(scans) != self.spec.num_scans or not all(map(_is_named, scans)):
             raise DataError(f"{location}/{SCANS_FILE}, which is damaged", "the scans of the plan", "prepare again")
         for shard in range(self.spec.num_shards):
             entries, left_out = read_index(self._bytes(shard), shard_name(shard))

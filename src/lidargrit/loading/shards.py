@@ -22,10 +22,10 @@ from lidargrit.files import atomic_path
 from lidargrit.loading.images import Pixels
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
+from lidargrit.untrusted import JSON_BYTES_AT_MOST, parse_json
 
 _MAGIC = b"LGSHARD1"
 _TAIL = 8 + len(_MAGIC)
-_INDEX_AT_MOST = 1 << 26  # bytes; a shard of a hundred images has an index of ten thousand
 _FINEST_STEP_M = 0.002  # a tenth of the scatter of a good sensor; 16 bits of it reach 131 m
 _BLOSC_HEADER = 16  # bytes: at 4 the size of the pixels, at 12 that of the blob (Blosc 1 chunk format)
 # 98 KB for a KITTI scan as 64x1024, read in 0.16 ms; level 1 takes 4 % more room, level 5 no less.
@@ -66,6 +66,8 @@ class LocalBytes:
     """A file of this machine, mapped into memory."""
 
     def __init__(self, path: Path) -> None:
+        if not path.is_file():  # a pipe would hang
+            raise FileNotFoundError("no such file" if not path.exists() else "not a file")
         with path.open("rb") as file:
             self._map = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         self.size = len(self._map)
@@ -148,17 +150,20 @@ def read_index(file: Bytes, name: str) -> tuple[list[Entry], dict[int, str]]:
         tail = bytes(file.read(max(0, file.size - _TAIL), file.size))
         length = int.from_bytes(tail[:8], "little")
         start = file.size - _TAIL - length
-        if tail[8:] != _MAGIC or not len(_MAGIC) <= start or length > _INDEX_AT_MOST:
+        if tail[8:] != _MAGIC or not len(_MAGIC) <= start or length > JSON_BYTES_AT_MOST:
             raise ValueError("no index at its end")
-        index = json.loads(bytes(file.read(start, file.size - _TAIL)))
+        index = parse_json(bytes(file.read(start, file.size - _TAIL)), "its index")
         entries = [Entry(**entry) for entry in index["entries"]]
         for entry in entries:
-            if min(entry.offset, entry.range_bytes, entry.reflectance_bytes) < 0:
-                raise ValueError("a negative length")
+            numbers = entry.scan, entry.offset, entry.range_bytes, entry.reflectance_bytes
+            if not all(type(number) is int and number >= 0 for number in numbers):
+                raise ValueError("lengths that are no whole numbers")
+            if not isinstance(entry.fingerprint, str):
+                raise ValueError("a fingerprint that is none")
             if entry.offset + entry.range_bytes + entry.reflectance_bytes > start:
                 raise ValueError("an image beyond its end")
         return entries, {int(scan): str(why) for scan, why in index["left_out"].items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise _damaged(name, error) from None
 
 

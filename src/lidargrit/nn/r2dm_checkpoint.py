@@ -72,6 +72,8 @@ def read_r2dm_checkpoint(path: Path) -> R2dmCheckpoint:
     """
     try:
         file = read_everything(path, _BYTES_AT_MOST)
+        if not isinstance(file, dict):
+            raise RefusedFileError("a file without names")
         settings = _Settings(file["cfg"])
         for name, known in _KNOWN_FORM.items():
             if name in settings and settings[name] != known:

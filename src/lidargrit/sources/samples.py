@@ -17,7 +17,16 @@ import numpy as np
 from lidargrit import configuration
 from lidargrit.arrays import HEADER_BYTES_AT_MOST, read_arrays
 from lidargrit.errors import CheckpointError, ConfigError, DataError, OutputError, ScanError
-from lidargrit.files import atomic_path, claim_folder, is_taken, read_json, remove_partials, write_json, write_text
+from lidargrit.files import (
+    atomic_path,
+    claim_folder,
+    is_taken,
+    read_json,
+    remove_partials,
+    removed_meanwhile,
+    write_json,
+    write_text,
+)
 from lidargrit.generators import RUN_FILE, TRAINED_ON_FILE, WEIGHTS_FILE, Generator, recipe_settings
 from lidargrit.loading import Pixels, Provenance, RangeImages
 from lidargrit.reporting import Reporter
@@ -48,7 +57,8 @@ def write_samples(
         reporter: hears of the progress.
 
     Raises:
-        OutputError: the folder holds samples of another model or setting, something else, or cannot be written.
+        OutputError: the folder holds samples of another model or setting, something else, cannot be written, or was
+            removed while its samples were written.
     """
     sampling = generator.Sampling() if sampling is None else sampling
     manifest: dict[str, Any] = {
@@ -74,15 +84,18 @@ def write_samples(
         write_json(folder / MANIFEST, manifest)
     if (run_folder / TRAINED_ON_FILE).is_file() and not (folder / TRAINED_ON_FILE).exists():
         write_text(folder / TRAINED_ON_FILE, (run_folder / TRAINED_ON_FILE).read_text(encoding="utf-8"))
-    there = {entry.name for entry in os.scandir(folder)}
-    missing = [seed for seed in seeds if _file(folder, seed).name not in there]
+    missing = _missing(folder, seeds)
     with (
         claim_folder(folder, shared=True) if missing else nullcontext(),
         (reporter or Reporter()).progress("sampling", len(seeds), len(seeds) - len(missing)) as progress,
     ):
         for seed, image in zip(missing, generator.stream(missing, sampling), strict=True):
+            if not is_sample_folder(folder):  # or the write would make the folder anew, without the earlier samples
+                raise removed_meanwhile(folder)
             _write_image(_file(folder, seed), image)
             progress.advance(1)
+    if not is_sample_folder(folder) or _missing(folder, seeds):
+        raise removed_meanwhile(folder)
     remove_partials(folder)
 
 
@@ -138,6 +151,12 @@ def trained_on(folder: Path) -> Provenance:
 def is_sample_folder(folder: Path) -> bool:
     """Tell whether a folder holds samples that lidargrit wrote."""
     return (folder / MANIFEST).is_file()
+
+
+def _missing(folder: Path, seeds: Sequence[int]) -> list[int]:
+    """Return the seeds whose samples are not in a folder."""
+    there = {entry.name for entry in os.scandir(folder)}
+    return [seed for seed in seeds if _file(folder, seed).name not in there]
 
 
 def _same(there: Any, manifest: dict[str, Any], defaults: dict[str, Any]) -> bool:

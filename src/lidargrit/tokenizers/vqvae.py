@@ -33,6 +33,7 @@ from lidargrit.sensors import SensorModel
 from lidargrit.structures import Decoded, RangeImage, TokenGrid
 from lidargrit.tokenizers import Tokenizer, TokenizerConfig
 
+_LEVELS_AT_MOST = 16  # each further one halves both axes; after these 65,536 columns are two
 _COLLAPSED_BELOW = 0.05  # perplexity over number of codes; healthy codebooks of ours keep above a half
 _NO_RETURN_BELOW = -0.9  # without a raydrop head, an encoded range below this is read as no return (the program's rule)
 
@@ -91,9 +92,11 @@ class VqvaeConfig(TokenizerConfig):
         for name, most in (("residual_blocks", 100), ("code_dim", 16_384), ("num_codes", 65_536)):
             if not 1 <= getattr(self, name) <= most:
                 raise ConfigError(f"{name}={getattr(self, name)}", f"1 to {most}", "correct it")
-        if not self.channel_multipliers or min(self.channel_multipliers) < 1:
+        if not 1 <= len(self.channel_multipliers) <= _LEVELS_AT_MOST or min(self.channel_multipliers) < 1:
             raise ConfigError(
-                f"channel_multipliers={self.channel_multipliers}", "one positive number a level", "e.g. (1,1,2)"
+                f"channel_multipliers={self.channel_multipliers}",
+                f"1 to {_LEVELS_AT_MOST} positive numbers, one a level",
+                "e.g. (1,1,2)",
             )
         if not 0 <= self.dropout < 1:
             raise ConfigError(f"dropout={self.dropout}", "a share in [0, 1)", "lower it")

@@ -3,11 +3,33 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from lidargrit.errors import OutputError
-from lidargrit.files import write_text
+from lidargrit.files import plain, write_text
+from lidargrit.untrusted import parse_json
+
+LOG_FILE = "log.jsonl"
+_LINE_BYTES_AT_MOST = 2**16  # of one entry; an entry of twenty terms has a thousandth
+
+
+def read_log(path: Path) -> list[dict[str, Any]]:
+    """Return the entries of a log, without lines that are none, such as one that a killed process left cut short.
+
+    Raises:
+        OSError: the log cannot be read.
+    """
+    entries = []
+    with path.open(encoding="utf-8", errors="replace") as log:
+        while line := log.readline(_LINE_BYTES_AT_MOST):
+            with suppress(ValueError):
+                entry = parse_json(line, str(path))
+                numbers = entry.get("scans_seen"), entry.get("seconds")
+                if all(type(number) in (int, float) and number >= 0 for number in numbers):
+                    entries.append(entry)
+    return entries
 
 
 class Log:
@@ -19,7 +41,7 @@ class Log:
     """
 
     def __init__(self, folder: Path, scans_seen: int) -> None:
-        self._path, self._resumed_at = folder / "log.jsonl", scans_seen
+        self._path, self._resumed_at = folder / LOG_FILE, scans_seen
         self._board: Any = None
         if self._path.is_file():
             self._trim()
@@ -40,7 +62,7 @@ class Log:
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             with self._path.open("a", encoding="utf-8") as log:
-                log.write(json.dumps(line) + "\n")
+                log.write(json.dumps(plain(line)) + "\n")
             self._plot(split, scans_seen, terms)
         except OSError as error:
             raise OutputError(
@@ -62,11 +84,5 @@ class Log:
             self._board.close()
 
     def _trim(self) -> None:
-        kept = []
-        for line in self._path.read_text(encoding="utf-8").splitlines():
-            try:
-                if json.loads(line)["scans_seen"] <= self._resumed_at:
-                    kept.append(line)
-            except ValueError:
-                continue  # a line that was cut short when the process was killed
-        write_text(self._path, "".join(f"{line}\n" for line in kept))
+        kept = [entry for entry in read_log(self._path) if entry["scans_seen"] <= self._resumed_at]
+        write_text(self._path, "".join(f"{json.dumps(entry)}\n" for entry in kept))
