@@ -1,6 +1,7 @@
 """Files that appear whole or not at all: killed writers, several writers, folders that a command holds."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -118,6 +119,21 @@ def test_a_claim_that_comes_to_nothing_leaves_no_folder(tmp_path):
     with pytest.raises(KeyError), claim_folder(tmp_path / "new" / "out"):
         raise KeyError
     assert everything_in(tmp_path) == ["new"]
+
+
+@pytest.mark.parametrize("shared", [False, True])
+@pytest.mark.parametrize("is_made_anew", [False, True])
+def test_a_claimed_folder_that_is_removed_meanwhile_is_an_error(tmp_path, shared, is_made_anew):
+    def work() -> None:
+        with claim_folder(tmp_path / "out", shared):
+            write_text(tmp_path / "out" / "a", "text")
+            shutil.rmtree(tmp_path / "out")
+            if is_made_anew:
+                write_text(tmp_path / "out" / "b", "text")
+
+    with pytest.raises(OutputError, match="out, from which files were removed meanwhile"):
+        work()
+    assert everything_in(tmp_path) == (["out", "out/b"] if is_made_anew else [])
 
 
 def test_many_threads_write_into_one_folder_and_leave_their_files_alone(tmp_path):

@@ -145,6 +145,25 @@ def test_weights_of_another_layout_are_refused_in_one_line(change, told, tmp_pat
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize(
+    "found",
+    [torch.ones(3), torch.tensor(1.0), [1, 2], 3, None, {}, {1: torch.ones(1)}, {"cfg": torch.ones(2)}, {"VQ": [1]}],
+    ids=lambda found: str(found)[:20],
+)
+def test_files_that_hold_no_weights_are_refused_in_one_line(found, tmp_path, capsys):
+    torch.save(found, tmp_path / "x.pth")
+    for recipe in (RECIPE, "r2dm_kitti_360", "dusty_kitti_odometry"):
+        files = [str(tmp_path / "x.pth")] * (2 if recipe == RECIPE else 1)
+        assert main(["import-weights", recipe, str(tmp_path / "run"), *files]) == 2
+        assert "x.pth, wh" in the_one_line(capsys.readouterr().err, "import-weights")
+
+
+def test_a_deeply_nested_file_is_refused_in_one_line(tmp_path, capsys):
+    (tmp_path / "x.pth").write_bytes(b"\x80\x02" + b"]" * 100_000 + b"a" * 99_999 + b".")
+    assert main(["import-weights", "r2dm_kitti_360", str(tmp_path / "run"), str(tmp_path / "x.pth")]) == 2
+    assert "x.pth, which cannot be read" in the_one_line(capsys.readouterr().err, "import-weights")
+
+
 def test_files_in_another_order_or_number_or_of_another_system_are_refused(files, tmp_path, capsys):
     def error(*words):
         assert main(["import-weights", *map(str, words)]) == 2

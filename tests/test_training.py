@@ -18,7 +18,7 @@ from lidargrit.reporting import Reporter
 from lidargrit.tokenizers.vqvae import Vqvae
 from lidargrit.training import FitConfig, measure, train, training_flops
 from lidargrit.training.fit import Fit
-from lidargrit.training.log import Log
+from lidargrit.training.log import Log, read_log
 from lidargrit.training.optimiser import WeightAverage, learning_rate_at, make_optimiser, memory_of_weights
 from lidargrit.viewer import plot_progress
 
@@ -254,6 +254,26 @@ def test_a_measured_plan_tells_operations_time_and_memory():
     for line, (stage, flops) in zip(told, training_flops(recipe).items(), strict=True):
         wanted = rf"{stage}: {flops:.2e} floating-point operations at [\d.e+]+ scans/s: [\d.]+ \w+ on cpu, [\d.]+ GiB"
         assert re.fullmatch(wanted.replace("e+", "e\\+", 1), line)
+
+
+def test_lines_that_are_no_entries_of_a_log_are_passed_over(tmp_path):
+    good = '{"scans_seen": 4, "split": "train", "seconds": 1.5}\n'
+    bad = [
+        "{}",
+        "[]",
+        "null",
+        '{"scans_seen": "4", "seconds": 1}',
+        "[" * 50_000,
+        '{"a": 1e400}',
+        '{"scans_seen": 4, "se',
+    ]
+    content = "".join(f"{line}\n" for line in (good.strip(), *bad, good.strip())).encode() + b"\xff\xfe"
+    (tmp_path / "log.jsonl").write_bytes(content)
+    assert [entry["seconds"] for entry in read_log(tmp_path / "log.jsonl")] == [1.5, 1.5]
+    Log(tmp_path, 4).write("val", 8, 2.0, {"loss": float("nan")})
+    lines = (tmp_path / "log.jsonl").read_text().splitlines()
+    assert lines[:-1] == [good.strip()] * 2
+    assert json.loads(lines[-1])["loss"] is None
 
 
 def test_tensorboard_draws_what_the_log_says(tmp_path):

@@ -101,6 +101,16 @@ def test_words_that_are_accepted():
         (["compare", "out", "small", "--flops", "nan"], "--flops nan"),
         (["train", "small", "out", "--set", "data.columns=1000000000", "--dry-run"], "1000000000 columns"),
         (["train", "small", "out", "--set", f"data.columns={-(2**63)}", "--dry-run"], "columns"),
+        (["train", "small", "out", "--set", f"seed={2**64}", "--dry-run"], "seed with a number of 65 bits"),
+        (["train", "small", "out", "--set", f"data.max_scans={10**20}", "--dry-run"], "max_scans with a number of 67"),
+        (["train", "small", "out", "--set", f"training.tokenizer.scans={10**20}", "--dry-run"], "scans with a number"),
+        (["train", "small", "out", "--set", "training.tokenizer.learning_rate=.inf", "--dry-run"], "rate with inf"),
+        (
+            ["train", "small", "out", "--set", f"model.tokenizer.channel_multipliers={[1] * 20_000}", "--dry-run"],
+            "1 to",
+        ),
+        (["sample", "pretrained", "out", "--set", "temperature=1e400"], "temperature with inf"),
+        (["sample", "pretrained", "out", "--set", f"top_k={10**20}"], "top_k with a number of 67 bits"),
     ],
 )
 def test_commands_refuse_in_one_line(words, got, tmp_path, monkeypatch, capsys):
