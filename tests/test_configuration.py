@@ -145,12 +145,18 @@ def test_a_setting_that_does_not_fit_is_told_in_one_line(setting, text):
         (
             VqvaeConfig,
             {"channel_multipliers": []},
-            r"^got channel_multipliers=\(\); wanted one positive number a level",
+            r"^got channel_multipliers=\(\); wanted 1 to 16 positive numbers, one a level",
         ),
         (TransformerConfig, {"width": 30}, r"^got layers=6, heads=8, width=30; wanted positive numbers"),
         (VqvaeConfig, {"channels": "many"}, r"^got a configuration in run\.json that does not fit \(.*channels"),
         (VqvaeConfig, {"padding": "mirror"}, r"^got a configuration in run\.json that does not fit \(.*padding"),
         (VqvaeConfig, {"colour": 1}, r"^got a configuration in run\.json that does not fit \(.*colour"),
+        (VqvaeConfig, {"channel_multipliers": [1] * 1001}, r"more than 1,000 values for 'channel_multipliers'"),
+        (
+            VqvaeConfig,
+            {"channel_multipliers": [2**64]},
+            r"channel_multipliers stands with a number of 65 bits",
+        ),
         (VqvaeConfig, {"channel_multipliers": [1, "x"]}, r"does not fit \(.*channel_multipliers"),
     ],
 )

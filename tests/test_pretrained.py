@@ -1,6 +1,9 @@
 """The model in the package: it is there, it is small, it draws at once, and it is what its card says."""
 
 import json
+import resource
+import shutil
+import time
 from pathlib import Path
 
 import pytest
@@ -140,3 +143,53 @@ def test_notes_end_the_card(tmp_path, capsys):
     assert main(["publish", "pretrained", str(tmp_path / "other"), "--notes", str(tmp_path / "none.md")]) == 2
     assert "none.md, which cannot be read" in the_one_line(capsys.readouterr().err, "publish")
     assert not (tmp_path / "other").exists()
+
+
+def _streaming(images: RangeImage, folder: Path, removed: str):
+    """Return a method that yields two images, before the second of which something is removed from a folder."""
+
+    def stream(*_: object):
+        yield images
+        if removed:
+            (folder / removed).unlink()
+        else:
+            shutil.rmtree(folder)
+        yield images
+
+    return stream
+
+
+@pytest.mark.parametrize("removed", ["", "samples.json", "00000000.npz"])
+def test_samples_that_are_removed_meanwhile_are_an_error(model, monkeypatch, tmp_path, capsys, removed):
+    range_m = torch.zeros(model.sensor.height, model.sensor.width)
+    empty = RangeImage(range_m, range_m > 0, model.sensor)
+    monkeypatch.setattr(Generator, "stream", _streaming(empty, tmp_path / "out", removed))
+    assert main(["sample", "pretrained", str(tmp_path / "out"), "-n", "2"]) == 2
+    told = the_one_line(capsys.readouterr().err, "sample")
+    assert "out, from which files were removed meanwhile; wanted" in told
+    assert (tmp_path / "out").exists() == bool(removed)
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        (("transformer", "layers"), 1_000_000),
+        (("transformer", "width"), 4 * 10**6),
+        (("tokenizer", "channel_multipliers"), [1_000_000] * 4),
+        (("tokenizer", "channel_multipliers"), [1] * 100_000),
+        (("tokenizer", "residual_blocks"), 1_000_000),
+        (("tokenizer", "channels"), 32 * 10**6),
+        (("tokenizer", "num_codes"), 10**9),
+    ],
+)
+def test_settings_of_a_huge_network_are_refused_at_once(model, tmp_path, capsys, setting, value):
+    folder = shutil.copytree(FOLDER, tmp_path / "run")
+    about = json.loads((folder / "config.json").read_text())
+    about["config"][setting[0]][setting[1]] = value
+    (folder / "config.json").write_text(json.dumps(about))
+    begun, before = time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    assert main(["sample", str(folder), str(tmp_path / "out"), "-n", "1"]) == 2
+    assert time.process_time() - begun < 5  # seconds of the processor; half a second on an idle laptop
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 500_000  # kilobytes
+    the_one_line(capsys.readouterr().err, "sample")
+    assert not (tmp_path / "out").exists()

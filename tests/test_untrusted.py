@@ -106,8 +106,12 @@ def test_words_that_are_accepted():
         (["train", "small", "out", "--set", f"training.tokenizer.scans={10**20}", "--dry-run"], "scans with a number"),
         (["train", "small", "out", "--set", "training.tokenizer.learning_rate=.inf", "--dry-run"], "rate with inf"),
         (
-            ["train", "small", "out", "--set", f"model.tokenizer.channel_multipliers={[1] * 20_000}", "--dry-run"],
-            "1 to",
+            ["train", "small", "out", "--set", f"model.tokenizer.channel_multipliers={[1] * 900}", "--dry-run"],
+            "wanted 1 to 16 positive numbers",
+        ),
+        (
+            ["train", "small", "out", "--set", f"model.tokenizer.channel_multipliers={[1] * 100_000}", "--dry-run"],
+            "at most 1,000 values",
         ),
         (["sample", "pretrained", "out", "--set", "temperature=1e400"], "temperature with inf"),
         (["sample", "pretrained", "out", "--set", f"top_k={10**20}"], "top_k with a number of 67 bits"),

@@ -14,6 +14,8 @@ from lidargrit.untrusted import SEED_AT_MOST
 
 T = TypeVar("T")
 
+_VALUES_AT_MOST = 1000  # of one setting; the parser takes a second for ten thousand
+_LETTERS_AT_MOST = 100_000  # of one value on the command line: a list of as many long paths
 _RENAMED = {"data.variant": "data.projection_variant"}  # run folders have the former name, and users may type it
 
 
@@ -53,6 +55,9 @@ def from_json(cls: type[T], data: Any, source: str) -> T:
     try:
         if not isinstance(data, dict):  # the parser would take the defaults
             raise TypeError(f"{str(data)[:40]!r} in place of settings by name")
+        for name, value in leaves(data).items():
+            if isinstance(value, list) and len(value) > _VALUES_AT_MOST:
+                raise TypeError(f"more than {_VALUES_AT_MOST:,} values for {name[:40]!r}")
         concrete, data = _concrete(cls, data)
         parser = _parser()
         parser.add_argument("--config", type=concrete)
@@ -130,6 +135,10 @@ def _replaced(node: Any, prefix: str, values: dict[str, Any]) -> Any:
 
 
 def _parsed(hint: Any, path: str, text: str) -> Any:
+    if len(text) > _LETTERS_AT_MOST or text.count(",") >= _VALUES_AT_MOST:
+        raise ConfigError(
+            f"{path}={text}", f"at most {_VALUES_AT_MOST:,} values and {_LETTERS_AT_MOST:,} letters", "shorten it"
+        )
     if hint == tuple[str, ...] and not text.startswith("["):
         return tuple(text.split(","))
     if get_origin(hint) is tuple and not text.startswith("["):
