@@ -196,7 +196,7 @@ def real_against_real(
         real: metrics that were fed one group of real scans each.
         real_as_generated: metrics that were fed the same scans as generated ones.
         sizes: number of scans in each group.
-        resampling: seed.
+        resampling: settings of the resampling, of which only the seed is used.
     """
     if len(real) < _AT_LEAST:
         return None

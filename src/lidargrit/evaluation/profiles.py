@@ -28,7 +28,7 @@ class Profile:
 
     Args:
         mean_range_m: over the returns of each pixel; NaN where none ever returned.
-        return_rate: of each pixel.
+        return_rate: share of scans with a return, for each pixel.
         density: points per scan in each square metre; row 0 is behind the sensor, column 0 on its right.
     """
 
@@ -42,8 +42,8 @@ class Match:
     """A generated scan and the reference scan that is most like it.
 
     Args:
-        generated: its place in the set.
-        real: likewise.
+        generated: index of the generated scan in its set.
+        real: index of the reference scan in its set.
         distance: mean absolute difference of log2(1 + range in metres) over pixels, 0 for no return.
     """
 

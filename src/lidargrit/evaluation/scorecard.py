@@ -18,10 +18,10 @@ class Score:
     """One number, how far it is to be trusted, and what the reference scores against itself.
 
     Args:
-        result: of the metric.
+        result: value of the metric.
         interval: 95 %, if wanted and possible.
         real_against_real: score of one half of the reference against the other half; None if it was not computed.
-        options: of the metric, besides variant and seed.
+        options: options of the metric, besides variant and seed.
         seconds: time that the metric, its interval and the reference row took.
     """
 
@@ -37,9 +37,9 @@ class LeftOut:
     """A number that the protocol asks for and that could not be had.
 
     Args:
-        metric: its name.
-        variant: its definition.
-        why: in one line.
+        metric: name of the metric.
+        variant: variant of the metric.
+        why: reason in one line.
     """
 
     metric: str
@@ -52,14 +52,14 @@ class SetFacts:
     """One of the two sets.
 
     Args:
-        source: as the user named it.
-        data_set: which data set it is of; "samples" for what a generator wrote.
-        split: which part of it.
-        scans: how many it has.
-        scans_used: how many of them were compared.
+        source: source, as the user named it.
+        data_set: name of the data set; "samples" for generated scans.
+        split: name of the split.
+        scans: number of scans of the set.
+        scans_used: number of scans that were compared.
         sensor: name and size of its images.
-        projection: how its scans became images.
-        sha256: of the pixels that were compared.
+        projection: description of the projection of its scans.
+        sha256: hash of the pixels that were compared.
     """
 
     source: str
@@ -77,16 +77,16 @@ class Scorecard:
     """All that an evaluation found.
 
     Args:
-        protocol: its name.
-        about: its title, source and departures.
+        protocol: name of the protocol.
+        about: title, source and departures of the protocol.
         samples: the first set.
         reference: the second.
-        scores: in the protocol's order.
-        left_out: what could not be scored.
-        deviations: how this evaluation differs from the protocol.
-        warnings: what a reader must know before believing a number.
+        scores: scores in the protocol's order.
+        left_out: metrics that could not be computed.
+        deviations: differences of this evaluation from the protocol.
+        warnings: sentences that a reader must know before trusting a score.
         settings: seeds, groups, halves.
-        versions: of this program and what it stands on.
+        versions: versions of this program and of the libraries that it uses.
     """
 
     protocol: str

@@ -60,7 +60,7 @@ class _FedMetric:
     """One metric, fed group by group.
 
     Args:
-        factory: what makes it.
+        factory: function that makes the metric.
         generated: metrics that were fed one group of generated scans each.
         real: metrics that were fed one group of real scans each.
         real_as_generated: metrics that were fed the same real scans as generated ones, for real against real.
@@ -94,9 +94,9 @@ def score_metrics(
     computed once. All others are fed one after the other, so that only one's memory is held.
 
     Args:
-        factories: what makes the metrics.
+        factories: functions that make the metrics.
         pair: the two sets.
-        resampling: how intervals and rows of real against real are computed.
+        resampling: settings of the intervals and of real against real.
         reporter: receives the progress.
 
     Returns:

@@ -32,10 +32,10 @@ from lidargrit.projection import RangeEncoding
 from lidargrit.sensors import SensorModel, load_sensor
 from lidargrit.structures import MaskDecoding, RangeImage
 
-Variant = Literal["dusty_1", "dusty_2", "baseline"]
+DustyVariant = Literal["dusty_1", "dusty_2", "baseline"]
 
-_LOGITS: dict[Variant, int] = {"dusty_1": 1, "dusty_2": 2, "baseline": 0}  # maps of returns that the network draws
-_TOLERANCE: dict[Variant, float] = {"dusty_1": 0.0, "dusty_2": 0.0, "baseline": 0.008}  # of the program
+_LOGITS: dict[DustyVariant, int] = {"dusty_1": 1, "dusty_2": 2, "baseline": 0}  # maps of returns that the network draws
+_TOLERANCE: dict[DustyVariant, float] = {"dusty_1": 0.0, "dusty_2": 0.0, "baseline": 0.008}  # of the program
 _NO_RETURN = -1.0  # as an encoded range; the same as a return at the far limit
 
 _PUBLISHED_SENSOR = "hdl64e_kitti_odometry"
@@ -47,20 +47,21 @@ class DustyConfig:
     """Networks and losses of DUSty v1; the defaults are the published ones but for two that are named.
 
     Args:
-        variant: ``dusty_1`` drops every ray by a probability of its own; ``dusty_2`` besides keeps or drops the scan as
-            a whole; ``baseline`` draws a range image with its holes, and far pixels are read as no return.
+        variant: form of the published model. ``dusty_1`` drops every ray by a probability of its own; ``dusty_2`` also
+            keeps or drops the scan as a whole; ``baseline`` generates a range image with its holes, and far pixels are
+            read as no return.
         latent_dim: length of a latent.
-        channels: of the finest level of both networks; each of four coarser ones has twice as many,
-        max_channels: but not more than these.
-        temperature: of the returns' soft copy through which gradients flow.
+        channels: channels of the finest level of both networks; each of the four coarser levels has twice as many.
+        max_channels: largest number of channels of any level.
+        temperature: temperature of the soft copy of the returns, through which gradients flow.
         penalty_weight: gamma of the penalty on the discriminator's gradient at real images (R1).
         penalty_every: steps between two penalties, each of which then counts as many times (Karras et al., StyleGAN2,
             2020). The program takes it at every step, which is a fifth more computation.
-        augmentations: what the discriminator sees on all images; see lidargrit.nn.differentiable_augmentation.
-        augmentation_defects: those of the program to repeat; none by default.
+        augmentations: changes of all images that the discriminator sees; see lidargrit.nn.differentiable_augmentation.
+        augmentation_defects: defects of the program to repeat; none by default.
     """
 
-    variant: Variant = "dusty_1"
+    variant: DustyVariant = "dusty_1"
     latent_dim: int = 512
     channels: int = 64
     max_channels: int = 512
@@ -84,17 +85,18 @@ class DustyConfig:
 
 @dataclass(frozen=True)
 class DustySampling:
-    """How scans are drawn, and how the latent of a given scan is searched.
+    """How scans are sampled, and how the latent of a given scan is searched.
 
     Args:
-        mask: ``bernoulli`` draws each return with its probability, as the program does; ``threshold`` keeps what is at
-            least as likely as not.
-        raydrop_seed: mixed with a scan's seed for its raydrop only: another one drops other rays of the same scan.
-        tolerance: what lies nearer than this to the far limit, in shares of the span of inverse range, is no return. If
-            not given it is the program's: 0 with a mask, where only the limit itself is none, and 0.008 for
-            ``baseline``, which was tuned on KITTI odometry and there is 58 m.
-        search_steps: of the optimiser that looks for a latent.
-        search_rate: its learning rate at its highest.
+        mask: method by which returns are decided. ``bernoulli`` samples each return with its probability, as the
+            program does; ``threshold`` keeps a return that is at least as likely as not.
+        raydrop_seed: number that is mixed with a scan's seed for its raydrop only; another one drops other rays of the
+            same scan.
+        tolerance: smallest distance of a return from the far limit, as a share of the span of inverse range; nearer
+            values count as no return. If not given, it is the program's: 0 with a mask, where only the limit itself
+            counts as none, and 0.008 for ``baseline``, which was tuned on KITTI odometry and is 58 m there.
+        search_steps: number of steps of the optimiser that searches for a latent.
+        search_rate: highest learning rate of that optimiser.
     """
 
     mask: MaskDecoding = "bernoulli"
@@ -298,13 +300,13 @@ class AdversarialObjective(Objective):
 def load_published(path: Path, sensor: SensorModel | None = None) -> Dusty:
     """Make a generator of a checkpoint that the authors published, or that their program saved.
 
-    Such a file is torch's, a dictionary of which this reads ``G_ema``: the moving average of the generator's weights,
-    under the names that lidargrit.nn.dcgan translates. Which variant it is, and how wide, is told by the weights. The
-    program's images are in the columns and rows of that sensor.
+    Such a file is a dictionary saved by torch. Only ``G_ema`` is read, the moving average of the generator's weights,
+    whose names lidargrit.nn.dcgan translates. The weights determine the variant and the number of channels. The
+    program's images have the columns and rows of ``sensor``.
 
     Args:
-        path: of the file; code in it is not run.
-        sensor: whose rays the images have; if not given, KITTI odometry's.
+        path: path of the file; code in it is not run.
+        sensor: sensor whose rays the images have; KITTI odometry's if not given.
 
     Raises:
         CheckpointError: no such file, or one that holds something else, or a model of images of another size.

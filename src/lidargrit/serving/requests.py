@@ -33,7 +33,7 @@ class SamplingSetting:
     Args:
         name: name of the field in the generator's ``Sampling``.
         whole: whether it is a whole number.
-        default: its default value; None where the generator computes one itself.
+        default: default value; None where the generator computes one itself.
         at_most: largest value that is accepted.
         about: description, from the docstring of ``Sampling``.
     """

@@ -60,7 +60,7 @@ class DemoPage:
         kind: kind of the scans: "real" or "simulated".
         name: name of the scan that the page follows.
         scan: a batch of this one scan; the model was not trained on it.
-        tokens: its tokens.
+        tokens: tokens of the scan.
         decoded: ranges and probabilities of a return, decoded from the tokens.
         sampled: range image decoded from the tokens, with a sampled return mask.
         sets: sets of scans to turn side by side.

@@ -38,7 +38,7 @@ def plot_comparison(
     groups stand together.
 
     Args:
-        groups: for each name ("real", "reconstructed", ...) an image or a batch of 1 to 8; sensors may differ.
+        groups: range images by name ("real", "reconstructed", ...), each one or a batch of 1 to 8; sensors may differ.
         path: path of the PNG; an older picture there is replaced in one step.
         max_range_m: end of the range scale and of the bird's-eye view, in metres; None for the farthest return.
         title: title of the whole picture.
