@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from lidargrit.errors import CheckpointError, ConfigError
-from lidargrit.generators.r2dm import DiffusionSampling, R2dm, R2dmConfig, encode, load_published
+from lidargrit.generators._log_range import encode
+from lidargrit.generators.r2dm import DiffusionSampling, R2dm, R2dmConfig, load_published
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.unet import EfficientUnet, UnetConfig
 from lidargrit.sensors import load_sensor

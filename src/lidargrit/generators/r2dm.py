@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -16,6 +16,7 @@ from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import ConfigError
 from lidargrit.files import load_exactly
 from lidargrit.generators import Cost, Generator
+from lidargrit.generators._log_range import decode, encode
 from lidargrit.loading import RangeImages
 from lidargrit.nn import diffusion
 from lidargrit.nn.diffusion import Sampler, SeededNoise
@@ -182,21 +183,8 @@ class R2dm(Generator[R2dmConfig, DiffusionSampling]):
         return diffusion.sample(self.network, noise, sampling.steps, sampling.sampler)
 
     def _decoded(self, drawn: Float[Tensor, "B C H W"], sampling: DiffusionSampling) -> RangeImage:
-        level, sensor = drawn[:, 0], self.sensor
-        exponent = (level.clamp(-1, 1) + 1) * (math.log2(1 + sensor.range_max_m) / 2)
-        range_m = torch.exp2(exponent) - 1
-        if sampling.raydrop == "calibrated":
-            returned = level >= self.return_threshold
-        else:
-            # The program cuts values to [-1, 1], decodes them and keeps what lies between the limits. The exponent of
-            # the far limit is rounded to 32 bits: that of 80 m decodes to just below it, which is a return. The power
-            # is taken in 64 bits, because in 32 its last bit differs with the size of a batch.
-            exact_m = torch.exp2(exponent.double()) - 1
-            returned = (exact_m > sensor.range_min_m) & (exact_m < sensor.range_max_m)
-        image = RangeImage.masked(range_m.clamp(sensor.range_min_m, sensor.range_max_m), returned, sensor)
-        if not self.config.reflectance:
-            return image
-        return replace(image, reflectance=((drawn[:, 1] + 1) / 2).clamp(0, 1) * returned)
+        returned = drawn[:, 0] >= self.return_threshold if sampling.raydrop == "calibrated" else None
+        return decode(drawn, self.sensor, returned)
 
     def _check(self, sampling: DiffusionSampling) -> None:
         if sampling.raydrop == "calibrated" and not bool(self.return_threshold.isfinite()):
@@ -205,30 +193,6 @@ class R2dm(Generator[R2dmConfig, DiffusionSampling]):
                 "raydrop=published",
                 "train with model.calibration_scans above 0",
             )
-
-
-def encode(images: RangeImage, with_reflectance: bool) -> Float[Tensor, "B C H W"]:
-    """Map a batch to what the network sees: log2(1 + range) over that of the limit, in [-1, 1], -1 without a return.
-
-    The shortest range of a return lies above -1: at -0.59 for 1.45 m of 80 m. Between the two is nothing, which is how
-    the published model tells a return from none.
-
-    Raises:
-        ConfigError: a single image, or images without the reflectance that is to be learned.
-    """
-    if images.range_m.ndim != 3:
-        raise ConfigError("a single range image", "a batch", "make one with RangeImage.stack([image])")
-    far = images.sensor.range_max_m
-    level = torch.log2(1 + images.range_m.clamp(max=far)) * (2 / math.log2(1 + far)) - 1
-    if not with_reflectance:
-        return level[:, None]
-    if images.reflectance is None:
-        raise ConfigError(
-            "range images without reflectance",
-            "images with it, for model.reflectance=true",
-            "use --set model.reflectance=false, or prepare scans that have it",
-        )
-    return torch.stack((level, 2 * images.reflectance * images.return_mask - 1), dim=1)
 
 
 class Denoising(Objective):

@@ -1,0 +1,62 @@
+"""Range images ⇄ log ranges in [-1, 1], beside them reflectance; no return is a level below that of every return."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lidargrit.errors import ConfigError
+from lidargrit.sensors import SensorModel
+from lidargrit.structures import RangeImage
+
+
+def encode(images: RangeImage, with_reflectance: bool) -> Float[Tensor, "B C H W"]:
+    """Map a batch to what the network sees: log2(1 + range) over that of the limit, in [-1, 1], -1 without a return.
+
+    The shortest range of a return lies above -1: at -0.59 for 1.45 m of 80 m. Between the two is nothing, which is how
+    the published models of R2DM and R2Flow tell a return from none.
+
+    Raises:
+        ConfigError: a single image, or images without the reflectance that is to be learned.
+    """
+    if images.range_m.ndim != 3:
+        raise ConfigError("a single range image", "a batch", "make one with RangeImage.stack([image])")
+    far = images.sensor.range_max_m
+    level = torch.log2(1 + images.range_m.clamp(max=far)) * (2 / math.log2(1 + far)) - 1
+    if not with_reflectance:
+        return level[:, None]
+    if images.reflectance is None:
+        raise ConfigError(
+            "range images without reflectance",
+            "images with it, for model.reflectance=true",
+            "use --set model.reflectance=false, or prepare scans that have it",
+        )
+    return torch.stack((level, 2 * images.reflectance * images.return_mask - 1), dim=1)
+
+
+def decode(
+    values: Float[Tensor, "B C H W"], sensor: SensorModel, returned: Bool[Tensor, "B H W"] | None = None
+) -> RangeImage:
+    """Map what a network generated to range images; a second channel is reflectance.
+
+    Args:
+        values: level of the range, perhaps reflectance; cut to [-1, 1].
+        sensor: sensor of the images.
+        returned: where there is a return; by default where the range lies inside the sensor's limits, as published.
+    """
+    exponent = (values[:, 0].clamp(-1, 1) + 1) * (math.log2(1 + sensor.range_max_m) / 2)
+    range_m = torch.exp2(exponent) - 1
+    if returned is None:
+        # The programs cut values to [-1, 1], decode them and keep what lies between the limits. The exponent of the far
+        # limit is rounded to 32 bits: that of 80 m decodes to just below it, which is a return. The power is taken in
+        # 64 bits, because in 32 its last bit differs with the size of a batch.
+        exact_m = torch.exp2(exponent.double()) - 1
+        returned = (exact_m > sensor.range_min_m) & (exact_m < sensor.range_max_m)
+    image = RangeImage.masked(range_m.clamp(sensor.range_min_m, sensor.range_max_m), returned, sensor)
+    if values.shape[1] == 1:
+        return image
+    return replace(image, reflectance=((values[:, 1] + 1) / 2).clamp(0, 1) * returned)

@@ -1,0 +1,181 @@
+"""R2Flow: a rectified flow of log range and reflectance, raydrop by a window of ranges; seeds → range images."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidargrit.errors import CheckpointError, ConfigError
+from lidargrit.files import load_exactly
+from lidargrit.generators import Cost, Generator
+from lidargrit.generators._log_range import decode, encode
+from lidargrit.nn import flow
+from lidargrit.nn.diffusion import SeededNoise
+from lidargrit.nn.flops import flops_of
+from lidargrit.nn.hdit import Hdit, HditConfig
+from lidargrit.nn.objective import Objective
+from lidargrit.nn.published import read_checkpoint
+from lidargrit.sensors import SensorModel
+from lidargrit.structures import RangeImage
+
+_BYTES_AT_MOST = 1 << 31  # the published network with the optimiser's state takes 1 GB
+_COST_SEED = 0
+
+
+@dataclass(frozen=True)
+class R2flowConfig:
+    """What the model learns, and its network.
+
+    Args:
+        hdit: sizes of the network.
+        reflectance: whether to learn the reflectance beside the range, as published; false where scans have none.
+    """
+
+    hdit: HditConfig = field(default_factory=HditConfig)
+    reflectance: bool = True
+
+
+@dataclass(frozen=True)
+class FlowSampling:
+    """How the flow is followed from noise to a scan.
+
+    Args:
+        solver: ``euler`` takes equal steps (published for sampling); ``dopri5`` chooses its own by ``tolerance``, and
+            evaluates the network as often as a scan needs it (published for the pairs of the second training).
+        steps: number of steps of ``euler``, with one evaluation of the network each; 256 are published.
+        tolerance: largest error of a step of ``dopri5``, absolute and relative; 1e-5 is published.
+    """
+
+    solver: Literal["euler", "dopri5"] = "euler"
+    steps: int = 256
+    tolerance: float = 1e-5
+
+    def __post_init__(self) -> None:
+        if self.steps < 1:
+            raise ConfigError(f"steps={self.steps}", "at least 1", "raise it")
+        if not 1e-7 <= self.tolerance <= 1:  # below, 32 bits of the network are the larger error
+            raise ConfigError(f"tolerance={self.tolerance:g}", "a number from 1e-7 to 1", "change it")
+
+
+class R2flow(Generator[R2flowConfig, FlowSampling]):
+    """Generates the image of log ranges, in which a missing return is a range that no return has.
+
+    This is the first training of the paper (1-RF). Its second, from pairs of noise and generated scan, and the
+    distillation to few steps are not here.
+
+    Source:
+        Nakashima et al., Fast LiDAR Data Generation with Rectified Flows, ICRA 2025; numbers from
+        kazuto1011/r2flow@3f5afeb (MIT).
+    """
+
+    Config = R2flowConfig
+    Sampling = FlowSampling
+    published_files = ("network",)
+
+    def __init__(self, config: R2flowConfig, sensor: SensorModel) -> None:
+        super().__init__(config, sensor)
+        self.shape = (1 + config.reflectance, sensor.height, sensor.width)
+        angles = torch.broadcast_tensors(sensor.elevation_rad, sensor.azimuth_rad)
+        self.network = Hdit(config.hdit, self.shape[0], *(angle.contiguous() for angle in angles))
+
+    @classmethod
+    def smallest_config(cls, sensor: SensorModel) -> R2flowConfig:
+        """Return a transformer of two levels and 8 channels."""
+        return R2flowConfig(HditConfig(8, 8, (1, 1), (1, 2)))
+
+    @classmethod
+    def quickest_sampling(cls) -> FlowSampling:
+        """Return two steps of Euler."""
+        return FlowSampling(steps=2)
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """One stage."""
+        return ("flow",)
+
+    def objective(self, stage: str) -> Objective:
+        """Return the matching of the flow."""
+        return FlowMatching(self.network, self.sensor)
+
+    def load_stage(self, stage: str, objective: Objective) -> None:
+        """Take over the trained network."""
+        assert isinstance(objective, FlowMatching)
+        self.network.load_state_dict(objective.network.state_dict())
+
+    def _sample(self, seeds: Sequence[int], sampling: FlowSampling) -> RangeImage:
+        return decode(self._solved(seeds, sampling).images, self.sensor)
+
+    @torch.no_grad()
+    def cost(self, sampling: FlowSampling | None = None) -> Cost:
+        """Return the network's passes.
+
+        With ``dopri5`` their number differs from scan to scan: those of the seed 0 are returned, which takes as long as
+        sampling it.
+        """
+        sampling = sampling or FlowSampling()
+        passes = sampling.steps
+        if sampling.solver == "dopri5":
+            passes = self.eval()._solved([_COST_SEED], sampling).evaluations
+        return Cost(passes, passes * flops_of(self.network, (1, *self.shape), (1,)))
+
+    @classmethod
+    def from_published(cls, files: Sequence[Path], config: R2flowConfig, sensor: SensorModel) -> R2flow:
+        """Make a generator of one checkpoint, which tells the sizes of its network.
+
+        The network keeps the ray angles of its training, at the edges of cells; where a pixel's point lies is the
+        sensor's.
+        """
+        weights = read_checkpoint(files[0], ("weights",), _BYTES_AT_MOST)
+        hdit, channels = _sizes(weights, files[0])
+        generator = cls(R2flowConfig(hdit, reflectance=channels > 1), sensor)
+        load_exactly(generator, {f"network.{name}": tensor for name, tensor in weights.items()}, files[0])
+        return generator.eval()
+
+    def _solved(self, seeds: Sequence[int], sampling: FlowSampling) -> flow.Solved:
+        noise = SeededNoise(seeds, self.shape, self.device)()
+        if sampling.solver == "euler":
+            return flow.euler(self.network, noise, sampling.steps)
+        return flow.dopri5(self.network, noise, sampling.tolerance)
+
+
+class FlowMatching(Objective):
+    """The objective: the squared error of the predicted velocity at a random time between noise and image."""
+
+    def __init__(self, network: Hdit, sensor: SensorModel) -> None:
+        super().__init__(sensor)
+        self.network = network
+
+    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+        """Return the mean squared error as ``loss``."""
+        clean = encode(images, with_reflectance=self.network.images > 1)
+        time = torch.rand(len(clean), generator=rng, device=clean.device)
+        noise = torch.randn(clean.shape, generator=rng, device=clean.device)
+        predicted: Float[Tensor, "B C H W"] = self.network(flow.interpolated(noise, clean, time), time).float()
+        return {"loss": (predicted - (clean - noise)).square().mean()}
+
+
+def _sizes(weights: dict[str, Tensor], path: Path) -> tuple[HditConfig, int]:
+    """Return the network's sizes and the number of its images' channels, as the shapes of its weights tell them."""
+    try:
+        channels, images, *_ = weights["tokenizer.0.weight"].shape
+        time_channels = len(weights["timestep_pe.0.linear.weight"])
+        halvings = next(n for n in itertools.count() if f"down_levels.merge_{n}.1.weight" not in weights)
+        depths, heads = [], []
+        for name in (*(f"down_levels.level_{level}" for level in range(halvings)), "mid_levels"):
+            scales = [f"{name}.{block}.residual_attn.scale" for block in range(len(weights))]
+            depths.append(next(block for block, scale in enumerate(scales) if scale not in weights))
+            heads.append(len(weights[scales[0]]))
+        return HditConfig(channels, time_channels, tuple(depths), tuple(heads)), images
+    except (KeyError, ValueError, TypeError, ConfigError) as error:
+        raise CheckpointError(
+            f"{path}, whose weights are of another network ({type(error).__name__}: {error})",
+            "a checkpoint of R2Flow's authors or of their train.py",
+            "check which program saved it, or download it from kazuto1011/r2flow, its releases",
+        ) from None

@@ -1,0 +1,207 @@
+"""R2Flow: its solvers and codec against its program, its published layout, learning."""
+
+import numpy as np
+import pytest
+import torch
+
+import lidargrit
+from lidargrit.cli import main
+from lidargrit.errors import CheckpointError, ConfigError
+from lidargrit.generators._log_range import decode, encode
+from lidargrit.generators.r2flow import FlowSampling, R2flow, R2flowConfig
+from lidargrit.nn import flow
+from lidargrit.nn.hdit import Hdit, HditConfig
+from lidargrit.recipes import load_recipe
+from lidargrit.sensors import load_sensor
+from lidargrit.structures import RangeImage
+from test_hdit import reference_network
+from tiny_runs import the_one_line
+
+SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
+TINY = HditConfig(16, 16, (1, 1), (1, 2))
+PUBLISHED = HditConfig(8, 8, (1, 2, 1), (1, 2, 2))  # small sizes for a file of the published layout
+
+
+def walls(count=2, reflectance=True):
+    rng = torch.Generator().manual_seed(0)
+    mask = torch.rand(count, 64, 32, generator=rng) < 0.8
+    range_m = torch.where(mask, (2 + 70 * torch.rand(count, 1, 32, generator=rng)).expand(-1, 64, -1), 0)
+    return RangeImage(range_m, mask, SENSOR, torch.rand(count, 64, 32, generator=rng) * mask if reflectance else None)
+
+
+def made(**settings):
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        return R2flow(R2flowConfig(TINY, **settings), SENSOR).eval()
+
+
+def stirred(generator):
+    """Fill the layers that begin at zero, so that the network says something."""
+    with torch.no_grad(), torch.random.fork_rng():
+        torch.manual_seed(3)
+        for weight in generator.parameters():
+            weight.add_(0.1 * torch.randn(weight.shape))
+    return generator
+
+
+def seeded_checkpoint():
+    """Return what the authors' program saves, with seeded weights of a small network at the published image size."""
+    with torch.random.fork_rng():
+        torch.manual_seed(5)
+        network = Hdit(PUBLISHED, 2, *torch.randn(2, 64, 1024))
+        weights = {name: torch.randn(of.shape) for name, of in network.state_dict().items()}
+    state = {"state": {0: {"step": torch.tensor(5.0), "exp_avg": torch.ones(2)}}, "param_groups": [{"lr": 1e-4}]}
+    schedule = {"last_epoch": 3, "lr_lambdas": [None]}
+    cfg = {"model": {"base_channels": 8}, "data": {"dataset": "kitti_360"}}
+    return {"cfg": cfg, "weights": weights, "optimizer": state, "lr_scheduler": schedule, "num_images": 2_560_000}
+
+
+@pytest.mark.shared
+def test_euler_goes_where_the_reference_goes(golden):
+    network, data = reference_network(golden, "tiny")
+    states = data["ode_euler4"]
+    with torch.no_grad():
+        found = flow.euler(network, torch.from_numpy(data["ode_z"]), 4)
+    assert found.evaluations == 4
+    assert np.abs(found.images.numpy() - states[-1]).max() < 1e-3 * np.abs(states[-1]).max()
+
+
+@pytest.mark.shared
+def test_dopri5_ends_where_the_reference_ends(golden):
+    network, data = reference_network(golden, "tiny")
+    with torch.no_grad():
+        found = flow.dopri5(network, torch.from_numpy(data["ode_z"]), 1e-5)
+    wanted = data["ode_dopri5"]
+    assert np.abs(found.images.numpy() - wanted).max() < 1e-2 * np.abs(wanted).max()
+    assert found.evaluations == pytest.approx(int(data["ode_dopri5_nfe"]), rel=0.15)
+
+
+@pytest.mark.shared
+def test_the_way_and_its_velocity_are_the_references(golden):
+    data = golden("rivals/r2flow")
+    noise, clean, time = (torch.from_numpy(data[f"fm_{name}"]) for name in ("x0", "x1", "t"))
+    assert np.allclose(flow.interpolated(noise, clean, time).numpy(), data["fm_x_t"], atol=1e-6)
+    assert np.allclose((clean - noise).numpy(), data["fm_u_t"], atol=1e-6)
+    loss = (torch.from_numpy(data["fm_v"]) - (clean - noise)).square().mean()
+    assert float(loss) == pytest.approx(float(data["loss_l2"]), rel=1e-6)
+
+
+@pytest.mark.shared
+def test_ranges_are_encoded_as_in_the_reference(golden):
+    data, sensor = golden("rivals/r2flow"), load_sensor("hdl64e_kitti_360")
+    metres, scaled, back = (
+        torch.from_numpy(data[f"codec_{name}"])[:, 0].repeat(1, 4, 1)
+        for name in ("metres", "logscale", "logscale_back")
+    )  # 16 rows, four times for the sensor's 64
+    inside = (metres > sensor.range_min_m) & (metres < sensor.range_max_m)
+    image = RangeImage.masked(metres.clamp(sensor.range_min_m, sensor.range_max_m), inside, sensor.with_columns(64))
+    encoded = encode(image, with_reflectance=False)
+    assert torch.allclose(encoded[:, 0], scaled, atol=1e-6)
+    assert torch.allclose(decode(encoded, image.sensor).range_m, back, rtol=1e-5)
+
+
+def test_an_adaptive_solver_takes_more_steps_for_less_error():
+    def velocity(image, time):
+        return 3 * image * time[:, None, None, None].cos()
+
+    start = torch.randn(1, 1, 4, 8, generator=torch.Generator().manual_seed(0))
+    exact = start * float(np.exp(3 * np.sin(1)))
+    coarse, fine = (flow.dopri5(velocity, start, tolerance) for tolerance in (1e-2, 1e-6))
+    errors = [float((solved.images - exact).abs().max()) for solved in (coarse, fine)]
+    assert coarse.evaluations < fine.evaluations
+    assert errors[1] < 1e-4 < errors[0]
+    steps = [float((flow.euler(velocity, start, steps).images - exact).abs().max()) for steps in (8, 64)]
+    assert steps[1] < 0.2 * steps[0]
+
+
+def test_cost_counts_the_passes_of_either_solver():
+    generator = stirred(made())
+    two, four = (generator.cost(FlowSampling(steps=steps)) for steps in (2, 4))
+    assert (two.network_evaluations, four.network_evaluations) == (2, 4)
+    assert four.flops == 2 * two.flops > 0
+    passes = []
+    generator.network.register_forward_hook(lambda *_: passes.append(1))
+    sampling = FlowSampling(solver="dopri5", tolerance=1e-3)
+    generator.sample([0], sampling)
+    assert generator.cost(sampling).network_evaluations * 2 + 1 == len(passes)  # again, and once to count operations
+    assert generator.cost().network_evaluations == 256
+
+
+def test_a_flow_that_explodes_is_told_in_one_line():
+    with pytest.raises(ConfigError, match=r"cannot be followed with tolerance=0\.001 .*; wanted a larger tolerance"):
+        flow.dopri5(lambda image, _: torch.full_like(image, torch.nan), torch.zeros(1, 1, 4, 8), 1e-3)
+    for settings in ({"steps": 0}, {"tolerance": 0.0}, {"tolerance": float("nan")}):
+        with pytest.raises(ConfigError, match=f"got {next(iter(settings))}="):
+            FlowSampling(**settings)
+
+
+def test_the_small_recipe_has_the_small_size():
+    recipe = load_recipe("r2flow_small")
+    generator = recipe.build_generator()
+    assert sum(weight.numel() for weight in generator.network.parameters()) == 2_092_972
+    assert recipe.training.keys() == set(generator.stages)
+    published = load_recipe("r2flow_kitti_360")
+    assert published.model == R2flowConfig()
+    assert (published.data.load_sensor().height, published.data.load_sensor().width) == (64, 1024)
+
+
+def test_an_imported_checkpoint_is_a_run_that_samples(tmp_path, capsys):
+    checkpoint = seeded_checkpoint()
+    torch.save(checkpoint, tmp_path / "1rf.pth")
+    assert main(["import-weights", "r2flow_kitti_360", str(tmp_path / "run"), str(tmp_path / "1rf.pth")]) == 0
+    assert "weights of r2flow for hdl64e_kitti_360 lie in" in capsys.readouterr().out
+    generator = lidargrit.load(tmp_path / "run")
+    assert generator.config == R2flowConfig(PUBLISHED, reflectance=True)
+    loaded = generator.network.state_dict()
+    assert all(torch.equal(loaded[name], tensor) for name, tensor in checkpoint["weights"].items())
+    assert generator.sample([0], FlowSampling(steps=1)).reflectance.shape == (1, 64, 1024)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda c: c.pop("weights"), "which holds no 'weights'"),
+        (lambda c: c["weights"].pop("tokenizer.0.weight"), r"another network \(KeyError: 'tokenizer\.0\.weight'\)"),
+        (lambda c: c["weights"].pop("detokenizer.0.scale"), r"the file lacks 'network\.detokenizer\.0\.scale'"),
+        (lambda c: c["weights"].update(extra=torch.ones(2)), r"the file has besides 'network\.extra'"),
+        (lambda c: c["weights"].update({"mid_levels.0.residual_attn.scale": torch.ones(3, 1)}), "another network"),
+        (lambda c: c["weights"].update(coords=torch.ones(1, 2, 64, 512)), r"'network\.coords' is \(1, 2, 64, 512\)"),
+        (lambda c: c["weights"].update(coords=torch.ones(2).half()), "'coords' is no float32 tensor"),
+    ],
+)
+def test_weights_of_another_form_are_refused(tmp_path, change, told):
+    checkpoint = seeded_checkpoint()
+    change(checkpoint)
+    torch.save(checkpoint, tmp_path / "1rf.pth")
+    recipe = load_recipe("r2flow_kitti_360")
+    with pytest.raises(CheckpointError, match=told):
+        R2flow.from_published([tmp_path / "1rf.pth"], recipe.model, recipe.data.load_sensor())
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut", b"\x80\x04cos\nsystem\n.", b"words"])
+def test_a_file_that_is_no_checkpoint_is_refused_and_nothing_is_written(tmp_path, content, capsys):
+    (tmp_path / "1rf.pth").write_bytes(content)
+    assert main(["import-weights", "r2flow_kitti_360", str(tmp_path / "run"), str(tmp_path / "1rf.pth")]) == 2
+    assert "1rf.pth, which " in the_one_line(capsys.readouterr().err, "import-weights")
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_image_is_learned_by_heart():
+    generator, images = made(reflectance=False), walls(1, reflectance=False)
+    before = generator.sample([0], FlowSampling(steps=8))
+    objective = generator.objective("flow").train()
+    optimiser = torch.optim.Adam(objective.parameters(), lr=5e-3)
+    losses, batch = [], RangeImage.stack([images[0]] * 4)
+    for step in range(80):
+        loss = objective(batch, torch.Generator().manual_seed(step))["loss"]
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        losses.append(float(loss.detach()))
+    assert sum(losses[-20:]) < 0.7 * sum(losses[:20])
+    generator.load_stage("flow", objective)
+    found = generator.sample([0], FlowSampling(steps=8))
+    error, unlearned = (float((each.range_m - images.range_m).abs().mean()) for each in (found, before))
+    assert error < 0.7 * unlearned
+    adaptive = generator.sample([0], FlowSampling(solver="dopri5", tolerance=1e-3))
+    assert float((adaptive.range_m - images.range_m).abs().mean()) < 0.7 * unlearned
