@@ -16,12 +16,12 @@ _SCANS = 2  # a glance; more would take training's time
 
 @torch.no_grad()
 def plot_progress(generator: Generator, stage: str, val: RangeImages, path: Path) -> None:
-    """Plot validation scans, their reconstructions, and new scans once the last stage is in training."""
+    """Plot validation scans, their reconstructions, and new scans once more than a tokenizer is in training."""
     real = val.batch(evenly_spaced(_SCANS, len(val)))
     groups = {"val": real}
     if "encode" in generator.capabilities:
         device = next(generator.parameters()).device
         groups["reconstructed"] = generator.reconstruct(real.to(device)).to("cpu")
-    if stage == generator.stages[-1]:
+    if stage != generator.stages[0] or len(generator.stages) == 1:
         groups["generated"] = generator.sample(range(_SCANS)).to("cpu")
     plot_comparison(groups, path, title=f"{stage}, {path.stem} scans seen")

@@ -1,0 +1,43 @@
+"""One scan after some phases of a pixel decoder, and the same tokens without it → pixel_phases.png."""
+
+import sys
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+from matplotlib.colors import LogNorm
+
+import lidargrit
+from lidargrit.errors import ConfigError, LidarGritError
+from lidargrit.generators.lidargrit import LidarGrit, TokenSampling
+from lidargrit.nn.pixel_decoder import PixelDecoder
+
+SEED = 3
+SHOWN = {1: 8, 4: 4, 7: 2, 10: 1}  # number of phases → distance of the pixels that are sampled then
+
+
+def main(run: str, folder: Path) -> None:
+    """Sample one scan with and without the pixel decoder, and show it as it grows."""
+    model = lidargrit.load(run)
+    if not isinstance(model, LidarGrit) or not isinstance(model.pixels, PixelDecoder):
+        raise ConfigError(f"{run}, which has no pixel decoder", "a run with one", "train the recipe compact_pixels")
+    scan, plain = model.sample([SEED])[0], model.sample([SEED], TokenSampling(mask="bernoulli"))[0]
+    count = len(model.pixels.mask.phases)
+    panels = [(f"after {number} of {count} phases", scan.range_m[::cell, ::cell]) for number, cell in SHOWN.items()]
+    panels.append(("the same tokens without a pixel decoder", plain.range_m))
+    figure, axes = plt.subplots(len(panels), figsize=(8, 7.5), layout="constrained")
+    for axis, (title, range_m) in zip(axes, panels, strict=True):
+        axis.set_facecolor("black")  # no return
+        seen = range_m.where(range_m > 0, float("nan"))
+        axis.imshow(seen.numpy(), aspect="auto", interpolation="none", cmap="turbo", norm=LogNorm(2, 80))
+        axis.set_title(title, fontsize=10)
+        axis.set(xticks=[], yticks=[])
+    figure.savefig(folder / "pixel_phases.png", dpi=100, metadata={"Software": None})
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    try:
+        given = sys.argv[1:]
+        main(given[0] if given else "pretrained", Path(given[1] if len(given) > 1 else "docs/pictures"))
+    except LidarGritError as error:
+        raise SystemExit(str(error)) from None
