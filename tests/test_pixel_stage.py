@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -13,9 +14,18 @@ from lidargrit.cli import main
 from lidargrit.errors import ConfigError
 from lidargrit.evaluation.reconstruction import score_likelihood
 from lidargrit.generators import load
-from lidargrit.generators.lidargrit import LidarGrit, LidarGritConfig, TokenSampling
+from lidargrit.generators._tokens import fill_from_nearest
+from lidargrit.generators.lidargrit import (
+    START_TOKEN,
+    LidarGrit,
+    LidarGritConfig,
+    TokenSampling,
+    after_start,
+    sample_token,
+)
 from lidargrit.generators.maskgit import MaskedSampling, MaskGit, MaskGitConfig
 from lidargrit.loading import DataConfig, load_range_images
+from lidargrit.nn.decoding import CachedDecoder
 from lidargrit.nn.pixel_networks import PixelDecoderConfig
 from lidargrit.nn.transformer import TransformerConfig
 from lidargrit.sensors import load_sensor
@@ -113,6 +123,60 @@ def test_the_likelihood_is_that_of_tokens_mask_and_ranges():
     weights = images.return_mask.sum((1, 2)).float()
     found = float((bits["range_bits_per_return"] * weights).sum() / weights.sum())
     assert found == pytest.approx(expected_bits, rel=1e-4)
+
+
+def test_a_scan_is_completed_from_the_tokens_and_pixels_that_were_observed():
+    generator, images = made(), scans(2)
+    observed = torch.zeros_like(images.return_mask)
+    observed[:, :, :24] = True  # three columns of tokens
+    tokens = generator.observed_tokens(images, observed).view(2, 8, 8)
+    assert bool((tokens[:, :, :3] >= 0).all())
+    assert bool((tokens[:, :, 3:] == -1).all())
+    completed = generator.complete(images, observed, [5, 6])
+    assert torch.equal(completed.range_m[observed], images.range_m[observed])
+    assert torch.equal(completed.return_mask[observed], images.return_mask[observed])
+    assert not torch.equal(completed.range_m, generator.complete(images, observed, [7, 8]).range_m)
+    assert torch.equal(completed.range_m[1], generator.complete(images[1:], observed[1:], [6]).range_m[0])
+    whole = torch.ones_like(observed)
+    assert torch.equal(generator.observed_tokens(images, whole), generator.tokenizer.encode(images).tokens.flatten(1))
+    assert torch.equal(generator.complete(images, whole, [5, 6]).range_m, images.range_m)
+
+
+def test_two_images_of_one_seed_are_completed_each_by_itself():
+    generator, images = made(), scans(2)
+    observed = torch.zeros_like(images.return_mask)
+    observed[:, ::4] = True
+    completed = generator.complete(images, observed, [5, 5])
+    assert torch.equal(completed.range_m[observed], images.range_m[observed])
+    assert torch.equal(completed.range_m[1], generator.complete(images[1:], observed[1:], [5]).range_m[0])
+
+
+@pytest.mark.parametrize("static", [False, True])
+def test_observed_tokens_stand_and_later_ones_know_of_them(static):
+    generator = made(None)
+    decoder = CachedDecoder(
+        generator.transformer, 2, partial(sample_token, sampling=TokenSampling()), START_TOKEN, static=static
+    )
+    uniform = torch.rand(2, 64, generator=torch.Generator().manual_seed(0))
+    observed = torch.full((2, 64), -1)
+    observed[:, 10:20] = 3
+    free, held = decoder.generate(uniform), decoder.generate(uniform, observed)
+    assert torch.equal(held[:, :10], free[:, :10])
+    assert bool((held[:, 10:20] == 3).all())
+    # What follows is likely as after these tokens, not as after the free ones.
+    after = generator.transformer(after_start(held[:, :-1]))[:, 20]
+    assert torch.equal(held[:, 20], sample_token(after, uniform[:, 20], TokenSampling()))
+    assert torch.equal(decoder.generate(uniform), free)
+
+
+def test_unobserved_pixels_are_filled_from_the_nearest_around_the_circle():
+    images = scans(1)
+    observed = torch.zeros_like(images.return_mask)
+    observed[:, :, 60] = True
+    filled = fill_from_nearest(images, observed)
+    assert torch.equal(filled.range_m[0, :, 2], images.range_m[0, :, 60])
+    assert torch.equal(filled.range_m[0, :, 40], images.range_m[0, :, 60])
+    assert not fill_from_nearest(images, torch.zeros_like(observed)).return_mask.any()
 
 
 def test_its_cost_counts_every_phase():

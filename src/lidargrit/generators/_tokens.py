@@ -7,8 +7,11 @@ from abc import abstractmethod
 from dataclasses import dataclass, field
 from typing import Literal, TypeVar
 
+import numpy as np
 import torch
-from jaxtyping import Float, Int
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from lidargrit.errors import ConfigError
@@ -109,6 +112,7 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
         mask: PixelChoice,
         pixels: PixelSampling,
         tokenizer: Tokenizer,
+        observed: tuple[RangeImage, Bool[Tensor, "B H W"]] | None = None,
     ) -> RangeImage:
         """Return the scans of sampled tokens.
 
@@ -121,6 +125,7 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
             mask: method by which returns and ranges are decided.
             pixels: settings by which the pixel decoder samples ranges.
             tokenizer: the generator's own tokenizer, or its copy for decoding only.
+            observed: scans and the mask of their known pixels, by which a pixel decoder goes.
 
         Raises:
             ConfigError: ``mask`` asks for a pixel decoder, and there is none.
@@ -132,17 +137,29 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
                 "leave mask out, or train a recipe with the stage pixels, such as compact_pixels",
             )
         wanted, seeds = len(rngs), [rng.initial_seed() for rng in rngs]
-        while wanted > 1 and seeds[wanted - 1] == seeds[wanted - 2]:
+        while observed is None and wanted > 1 and seeds[wanted - 1] == seeds[wanted - 2]:
             wanted -= 1
         images = []
         for first in range(0, wanted, _DECODED_AT_ONCE):
             some = slice(first, first + _DECODED_AT_ONCE)
             grid = TokenGrid(tokens[some].unflatten(1, tokenizer.grid_size), tokenizer.num_codes)
             if self.pixels is not None and mask in ("auto", "pixels"):
-                images.append(self.pixels.sample(tokenizer.decode(grid), rngs[some], pixels))
+                known = None if observed is None else (observed[0][some], observed[1][some])
+                images.append(self.pixels.sample(tokenizer.decode(grid), rngs[some], pixels, known))
             else:
                 images.append(tokenizer.sample(grid, rngs[some], "threshold" if mask == "threshold" else "bernoulli"))
         return RangeImage.cat(images)[[*range(wanted), *[wanted - 1] * (len(rngs) - wanted)]]
+
+    def observed_tokens(self, images: RangeImage, observed: Bool[Tensor, "B H W"]) -> Int[Tensor, "B T"]:
+        """Return the tokens of the cells of which a pixel was observed, and -1 for the others.
+
+        They are those of scans in which every other pixel is as the nearest observed one, around the circle.
+        """
+        filled = fill_from_nearest(images, observed)
+        rows, columns = self.tokenizer.grid_size
+        cell = (self.sensor.height // rows, self.sensor.width // columns)
+        seen = F.max_pool2d(observed[:, None].float(), cell)[:, 0] > 0
+        return torch.where(seen, self.tokenizer.encode(filled).tokens, -1).flatten(1)
 
     @torch.no_grad()
     def pixel_nll(self, images: RangeImage) -> PixelNll:
@@ -225,6 +242,24 @@ class PixelObjective(Objective):
             mask_nats, range_nats = nll.mask.mean(), nll.range.sum() / images.return_mask.sum().clamp(min=1)
         bits = {"mask_bits": mask_nats / math.log(2), "range_bits": nats_to_range_bits(range_nats)}
         return {"loss": mask_nats + range_nats, **{name: value.detach() for name, value in bits.items()}}
+
+
+def fill_from_nearest(images: RangeImage, observed: Bool[Tensor, "B H W"]) -> RangeImage:
+    """Return scans in which every pixel that was not observed is as the nearest one that was; none, where none was."""
+    width = images.range_m.shape[-1]
+    filled = []
+    for range_m, known in zip(images.range_m.cpu(), observed.cpu(), strict=True):
+        if not bool(known.any()):
+            filled.append(torch.zeros_like(range_m))
+            continue
+        thrice = np.tile(~known.numpy(), (1, 3))  # so that the circle closes
+        rows, columns = distance_transform_edt(thrice, return_distances=False, return_indices=True)
+        middle = slice(width, 2 * width)
+        filled.append(
+            range_m[torch.from_numpy(rows[:, middle]).long(), torch.from_numpy(columns[:, middle] % width).long()]
+        )
+    range_m = torch.stack(filled).to(images.range_m.device)
+    return RangeImage(range_m, range_m > 0, images.sensor)
 
 
 def sample_tokens(logits: Float[Tensor, "*B K"], uniform: Float[Tensor, "*B"]) -> Int[Tensor, "*B"]:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidargrit.errors import ConfigError
@@ -105,7 +105,7 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
     Config = LidarGritConfig
     Sampling = TokenSampling
     published_files = tuple(_PUBLISHED_NETWORKS)
-    capabilities = TokenGenerator.capabilities | {"likelihood"}
+    capabilities = TokenGenerator.capabilities | {"likelihood", "complete"}
 
     def __init__(self, config: LidarGritConfig, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
@@ -128,6 +128,19 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         decoder, tokenizer = self._prepare(len(seeds), sampling)
         tokens = decoder.generate(uniform.to(self.device))
         return self.decode(tokens, rngs, sampling.mask, sampling.pixels(), tokenizer)
+
+    def _complete(
+        self, images: RangeImage, observed: Bool[Tensor, "B H W"], seeds: Sequence[int], sampling: TokenSampling
+    ) -> RangeImage:
+        """Generate the tokens of which no pixel was observed, and with a pixel decoder the pixels around observed ones.
+
+        Tokens come row by row, pixels in phases: each knows of what was observed before its turn, and not of the rest.
+        """
+        rngs = [torch.Generator().manual_seed(seed) for seed in seeds]
+        uniform = torch.stack([torch.rand(self.transformer.context_length, generator=rng) for rng in rngs])
+        decoder, tokenizer = self._prepare(len(seeds), sampling)
+        tokens = decoder.generate(uniform.to(self.device), self.observed_tokens(images, observed))
+        return self.decode(tokens, rngs, sampling.mask, sampling.pixels(), tokenizer, (images, observed))
 
     @torch.no_grad()
     def token_nll_bits(self, images: RangeImage) -> Float[Tensor, "B h w"]:

@@ -76,18 +76,25 @@ class CachedDecoder:
         self._tokens = torch.zeros(batch_size, dtype=torch.long, device=self._device)
         self._generated = torch.zeros(batch_size, self._length, dtype=torch.long, device=self._device)
         self._uniform = torch.zeros(batch_size, self._length, device=self._device)
+        self._observed = torch.full_like(self._generated, -1)
         self._position = torch.zeros(1, dtype=torch.long, device=self._device)
         self._graphs: dict[int, Callable[[], None]] = {}
         # The products of a step: four projections and a perceptron of four times the width in each block, and the head.
         self._step_flops = 2 * batch_size * (12 * len(self._blocks) * width**2 + self._head.numel())
 
     @torch.no_grad()
-    def generate(self, uniform: Float[Tensor, "B T"]) -> Int[Tensor, "B T"]:
-        """Generate one sequence for each row of uniform numbers in [0, 1), one number a token."""
+    def generate(self, uniform: Float[Tensor, "B T"], observed: Int[Tensor, "B T"] | None = None) -> Int[Tensor, "B T"]:
+        """Generate one sequence for each row of uniform numbers in [0, 1), one number a token.
+
+        Args:
+            uniform: one random number for each token.
+            observed: tokens that stand already, and -1 where one is to be generated; later tokens know of them.
+        """
         length = uniform.shape[1]
+        observed = torch.full_like(uniform, -1, dtype=torch.long) if observed is None else observed
         if self._static:
             self._record_graphs(length)
-            self._uniform[:, :length] = uniform
+            self._uniform[:, :length], self._observed[:, :length] = uniform, observed
             self._rewind()
             for step in range(length):
                 self._graphs[step // _POSITIONS_PER_GRAPH]()
@@ -95,7 +102,8 @@ class CachedDecoder:
             self._tokens.fill_(self._start)
             with threads_for(self._step_flops):
                 for step in range(length):
-                    self._tokens = self._sample_token(self.next_logits(self._tokens, step), uniform[:, step])
+                    chosen = self._sample_token(self.next_logits(self._tokens, step), uniform[:, step])
+                    self._tokens = torch.where(observed[:, step] < 0, chosen, observed[:, step])
                     self._generated[:, step] = self._tokens
         return self._generated[:, :length].clone()
 
@@ -132,6 +140,8 @@ class CachedDecoder:
         future = torch.arange(num_positions, device=self._device) > self._position
         logits = self._logits(x, self._cache[:, :, :, :num_positions], write_cache, future)
         chosen = self._sample_token(logits, self._uniform.index_select(1, self._position)[:, 0])
+        observed = self._observed.index_select(1, self._position)[:, 0]
+        chosen = torch.where(observed < 0, chosen, observed)
         self._tokens.copy_(chosen)
         self._generated.index_copy_(1, self._position, chosen[:, None])
         self._position.add_(1)
