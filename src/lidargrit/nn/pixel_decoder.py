@@ -36,7 +36,7 @@ class PixelSampling:
         noise: multiplier of the components' scales; 1 takes them as they are.
     """
 
-    temperature: float = 0.75
+    temperature: float = 0.5
     noise: float = 0.7
 
     def __post_init__(self) -> None:

@@ -12,7 +12,7 @@ RECIPE = replace(
     model=replace(
         compact.RECIPE.model,
         # Sizes that leave the whole model, rounded to 16 bits, below 16 MB.
-        pixels=PixelDecoderConfig(mask_features=8, range_features=10, mask_width=32, range_width=40),
+        pixels=PixelDecoderConfig(mask_features=6, range_features=6, row_channels=2, range_width=36),
     ),
     training={
         **compact.RECIPE.training,
