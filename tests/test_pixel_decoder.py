@@ -189,7 +189,7 @@ def mixture_of(seed: int, count: int = 1) -> RangeMixture:
 def test_a_density_integrates_to_one_between_the_sensors_limits(seed: int) -> None:
     mixture = mixture_of(seed)
     range_m = torch.linspace(1, 80, 200_001)
-    many = RangeMixture(*(part.expand(len(range_m), -1) for part in _parts(mixture)), mixture.limits_m)
+    many = expanded(mixture, len(range_m))
     density = many.log_density(range_m).double().exp()
     assert float(torch.trapezoid(density, range_m.double())) == pytest.approx(1, abs=2e-3)
     cdf = many.cdf(range_m).double()
@@ -200,16 +200,20 @@ def test_a_density_integrates_to_one_between_the_sensors_limits(seed: int) -> No
         assert float(cdf[last] - cdf[first]) == pytest.approx(float(area), abs=1e-3)
 
 
-def _parts(mixture: RangeMixture) -> tuple[Tensor, Tensor, Tensor]:
-    return mixture.logits, mixture.centres, mixture.log_scales
+def expanded(mixture: RangeMixture, count: int) -> RangeMixture:
+    logits, centres, log_scales = (
+        part.expand(count, -1) for part in (mixture.logits, mixture.centres, mixture.log_scales)
+    )
+    return RangeMixture(logits, centres, log_scales, mixture.limits_m)
 
 
 def test_sampled_ranges_follow_the_distribution_function() -> None:
     count = 20_000
     mixture = mixture_of(1)
-    many = RangeMixture(*(part.expand(count, -1) for part in _parts(mixture)), mixture.limits_m)
+    many = expanded(mixture, count)
     rng = torch.Generator().manual_seed(5)
-    range_m = many.sample(*torch.rand(2, count, generator=rng))
+    component, within = torch.rand(2, count, generator=rng)
+    range_m = many.sample(component, within)
     assert float(range_m.min()) >= 1
     assert float(range_m.max()) <= 80
     level = many.cdf(range_m).sort().values
@@ -224,8 +228,8 @@ def test_sharpening_takes_the_likelier_component_nearer_to_its_centre() -> None:
         torch.full((4000, 2), -4.0),
         (1.0, 80.0),
     )
-    uniform = torch.rand(2, 4000, generator=torch.Generator().manual_seed(0))
-    plain, sharp = mixture.sample(*uniform), mixture.sample(*uniform, temperature=0.5, noise=0.5)
+    component, within = torch.rand(2, 4000, generator=torch.Generator().manual_seed(0))
+    plain, sharp = mixture.sample(component, within), mixture.sample(component, within, temperature=0.5, noise=0.5)
     near_plain, near_sharp = plain.log1p() < 2.5, sharp.log1p() < 2.5
     assert float(near_plain.float().mean()) == pytest.approx(1 / (1 + math.exp(-1)), abs=0.03)
     assert float(near_sharp.float().mean()) == pytest.approx(1 / (1 + math.exp(-2)), abs=0.03)
@@ -250,14 +254,11 @@ def test_turning_the_sensor_turns_everything() -> None:
 def test_a_seed_gives_the_same_bits_whatever_its_batch() -> None:
     sensor = load_sensor("hdl64e_kitti_odometry").with_columns(64)
     decoder, decoded = random_decoder(sensor, 8), random_decoded(sensor, 5)
-    assert decoded.features is not None
 
     def sample(*seeds: int) -> RangeImage:
-        picked = Decoded(
-            *(part[list(seeds)] for part in (decoded.range_m, decoded.return_logits)),
-            sensor,
-            features=decoded.features[list(seeds)] if decoded.features is not None else None,
-        )
+        assert decoded.features is not None
+        some = list(seeds)
+        picked = Decoded(decoded.range_m[some], decoded.return_logits[some], sensor, features=decoded.features[some])
         return decoder.sample(picked, [torch.Generator().manual_seed(seed) for seed in seeds])
 
     together, apart = sample(0, 1, 2, 3, 4), [sample(seed) for seed in (4, 2)]

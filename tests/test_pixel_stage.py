@@ -56,7 +56,7 @@ def scans(count: int) -> RangeImage:
     return RangeImage.masked(2 + 40 * torch.rand(size, generator=rng), torch.rand(size, generator=rng) < 0.8, SENSOR)
 
 
-def recipe_of(pixels: PixelDecoderConfig | None, **settings: str) -> Recipe:
+def recipe_of(pixels: PixelDecoderConfig | None, stages_from: str | None = None) -> Recipe:
     fit = FitConfig(scans=4, batch_size=2, learning_rate=1e-3, validation_scans=1)
     stages = ("tokenizer", "transformer") if pixels is None else ("tokenizer", "transformer", "pixels")
     return Recipe(
@@ -65,7 +65,7 @@ def recipe_of(pixels: PixelDecoderConfig | None, **settings: str) -> Recipe:
         LidarGritConfig(TOKENIZER, TRANSFORMER, pixels),
         DataConfig(train=("simulated:4:train",), val=("simulated:1:val",), columns=512, column_stride=8),
         dict.fromkeys(stages, fit),
-        **settings,
+        stages_from=stages_from,
     )
 
 

@@ -253,11 +253,10 @@ def fill_from_nearest(images: RangeImage, observed: Bool[Tensor, "B H W"]) -> Ra
             filled.append(torch.zeros_like(range_m))
             continue
         thrice = np.tile(~known.numpy(), (1, 3))  # so that the circle closes
-        rows, columns = distance_transform_edt(thrice, return_distances=False, return_indices=True)
-        middle = slice(width, 2 * width)
-        filled.append(
-            range_m[torch.from_numpy(rows[:, middle]).long(), torch.from_numpy(columns[:, middle] % width).long()]
-        )
+        nearest = np.zeros((2, *thrice.shape), dtype=np.int32)  # row and column of the nearest observed pixel
+        distance_transform_edt(thrice, return_distances=False, return_indices=True, indices=nearest)
+        row, column = torch.from_numpy(nearest[:, :, width : 2 * width]).long()
+        filled.append(range_m[row, column % width])
     range_m = torch.stack(filled).to(images.range_m.device)
     return RangeImage(range_m, range_m > 0, images.sensor)
 

@@ -297,8 +297,8 @@ class RangeNetwork(PhaseNetwork):
         centres = centres.clamp(low, high)
         log_scales_m = (1.5 * (scales + self.begin_scale)).clamp(math.log(_FINEST_M), math.log(_COARSEST_M))
         log_scales = log_scales_m - centres  # dv = d range / (1 + range): so the scale is one in metres
-        parts = (part.movedim(2, -1).contiguous() for part in (logits, centres, log_scales))
-        return RangeMixture(*parts, self.limits_m)
+        logits, centres, log_scales = (part.movedim(2, -1).contiguous() for part in (logits, centres, log_scales))
+        return RangeMixture(logits, centres, log_scales, self.limits_m)
 
     def _weights(self, phase: Phase) -> Float[Tensor, "h 1 2"]:
         """Return for each row of a phase the weights of 1 / range in the row above and in the row below."""
