@@ -17,8 +17,9 @@ import torch.nn.functional as F
 
 from lidargrit.generators import load
 from lidargrit.generators.lidargrit import LidarGrit, TokenSampling, after_start, sample_token
-from lidargrit.loading import DataConfig, load_range_images
+from lidargrit.loading import DataConfig
 from lidargrit.nn.decoding import CachedDecoder
+from lidargrit.sources import load_range_images
 from lidargrit.structures import TokenGrid
 
 

@@ -24,9 +24,10 @@ from torch import nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from lidargrit.generators import Generator
-from lidargrit.loading import RangeImages, load_range_images
+from lidargrit.loading import RangeImages
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Progress, Reporter
+from lidargrit.sources import load_range_images
 from lidargrit.training import Recipe, training_flops
 from lidargrit.training.fit import Fit
 

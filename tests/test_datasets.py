@@ -11,11 +11,12 @@ from format_examples import NAMES, can_write, written
 from lidargrit import formats
 from lidargrit.datasets import ScanDataset, load, open_dataset
 from lidargrit.errors import DataError, OutputError, ScanError
-from lidargrit.loading import DataConfig, load_range_images
+from lidargrit.loading import DataConfig
 from lidargrit.projection import project
 from lidargrit.projection.unfolding import rings_from_firing_order
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import load_sensor
+from lidargrit.sources import load_range_images
 
 ROWS = np.array([[1, 2, 3, 0.5], [4, 5, 6, 0.25], [7, 8, 9, 1]], dtype="<f4")
 

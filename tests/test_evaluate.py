@@ -143,21 +143,20 @@ def test_a_metric_that_cannot_be_had_leaves_the_others(monkeypatch, tmp_path, se
 
 
 def test_what_is_not_as_the_protocol_wants_is_told():
-    pair = pair_for_protocol(
-        "simulated:3:train", "simulated:3:test", load_protocol("lidargrit-kitti-odometry"), DataConfig(max_scans=2)
-    )
+    scans = open_source("simulated:3:train"), open_source("simulated:3:test")
+    pair = pair_for_protocol(*scans, load_protocol("lidargrit-kitti-odometry"), DataConfig(max_scans=2))
     told = " | ".join(pair.deviations)
     assert "2 of the 5,000 scans" in told
     assert "the reference is simulated, not kitti_odometry" in told
     assert "projected by 'exact', not by 'reference'" in told
     assert len(pair.samples) == len(pair.reference) == 2
-    other = pair_for_protocol("simulated:3:train", "simulated:3:test", load_protocol("exact"), DataConfig())
+    other = pair_for_protocol(*scans, load_protocol("exact"), DataConfig())
     assert other.deviations == ()
 
 
 def test_returns_outside_the_window_are_none(sets):
     protocol = Protocol("t", "s", (MetricChoice("sliced_wasserstein"),), range_m=(5.0, 20.0))
-    batch = pair_for_protocol(*sets, protocol, DataConfig()).samples.batch([0, 1])
+    batch = pair_for_protocol(*map(open_source, sets), protocol, DataConfig()).samples.batch([0, 1])
     returned = batch.range_m[batch.return_mask]
     assert float(returned.min()) > 5
     assert float(returned.max()) < 20

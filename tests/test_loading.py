@@ -22,7 +22,6 @@ from lidargrit.loading import (
     Provenance,
     RangeImages,
     damaged_shards,
-    load_range_images,
     prepare,
     shards,
     workers,
@@ -31,6 +30,7 @@ from lidargrit.loading import prepare as prepare_function
 from lidargrit.projection import project
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import load_sensor
+from lidargrit.sources import load_range_images
 
 prepare_module = sys.modules[prepare_function.__module__]
 SIMULATED = DataConfig(workers=1)

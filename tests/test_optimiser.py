@@ -6,9 +6,10 @@ import pytest
 import torch
 from torch import nn
 
-from lidargrit.loading import DataConfig, load_range_images
+from lidargrit.loading import DataConfig
 from lidargrit.nn.objective import Objective
 from lidargrit.recipes import load_recipe
+from lidargrit.sources import load_range_images
 from lidargrit.tokenizers.vqvae import Vqvae
 from lidargrit.training import FitConfig
 from lidargrit.training.engine import Engine

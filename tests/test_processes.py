@@ -13,11 +13,12 @@ import torch
 
 from lidargrit.errors import ConfigError
 from lidargrit.files import read_tensors
-from lidargrit.loading import DataConfig, load_range_images
+from lidargrit.loading import DataConfig
 from lidargrit.nn.objective import Objective
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import load_sensor
+from lidargrit.sources import load_range_images
 from lidargrit.structures import RangeImage
 from lidargrit.tokenizers.vqvae import Vqvae
 from lidargrit.training import FitConfig

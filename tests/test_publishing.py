@@ -24,7 +24,8 @@ from lidargrit.generators import Generator
 from lidargrit.generators.lidargrit import LidarGrit
 from lidargrit.generators.marginal import Marginal
 from lidargrit.loading import Provenance
-from lidargrit.publishing.card import data_set_of, model_card
+from lidargrit.publishing.card import model_card
+from lidargrit.sources import data_set_of
 from tiny_runs import MODEL, SHORT, contents, the_one_line
 
 

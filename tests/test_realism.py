@@ -10,9 +10,10 @@ import torch
 from lidargrit.cli import main
 from lidargrit.errors import ConfigError, DataError
 from lidargrit.evaluation.realism import CURVES, SimulatedScans, as_table, compare, drop_by_coin, simulate_pair
-from lidargrit.loading import DataConfig, load_range_images
+from lidargrit.loading import DataConfig
 from lidargrit.metrics import load_metric
 from lidargrit.sensors import load_sensor
+from lidargrit.sources import load_range_images
 from lidargrit.structures import RangeImage
 from lidargrit.viewer.curves import plot_curves
 

@@ -10,7 +10,7 @@ import torch
 from lidargrit import _discovery
 from lidargrit.errors import DataError, ScanError, UnknownNameError
 from lidargrit.projection import unproject
-from lidargrit.sources import open_images
+from lidargrit.sources import open_images, open_source
 from lidargrit.sources.sample_formats import (
     is_tensor_folder,
     load_sample_format,
@@ -71,7 +71,7 @@ def test_a_folder_of_tensors_is_recognised_and_gives_metres(name, tmp_path):
         else:
             assert torch.allclose(batch.reflectance[place], reflectance * (range_m > 0))
     assert images.sensor.name == "hdl64e_kitti_360"
-    assert torch.equal(open_images(str(tmp_path), samples_format=name).batch([0]).range_m, batch.range_m[:1])
+    assert torch.equal(open_source(str(tmp_path), samples_format=name).images().batch([0]).range_m, batch.range_m[:1])
 
 
 def test_points_of_r2dm_lie_half_a_cell_from_its_own(tmp_path):

@@ -12,9 +12,10 @@ import torch
 from lidargrit.datasets.kitti_odometry import KittiOdometry
 from lidargrit.errors import OutputError, TrainingError
 from lidargrit.files import claim_folder, read_tensors
-from lidargrit.loading import Batches, DataConfig, load_range_images
+from lidargrit.loading import Batches, DataConfig
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
+from lidargrit.sources import load_range_images
 from lidargrit.tokenizers.vqvae import Vqvae
 from lidargrit.training import FitConfig, measure, train, training_flops
 from lidargrit.training.fit import Fit

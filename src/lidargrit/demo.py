@@ -11,7 +11,6 @@ from pathlib import Path
 import torch
 
 from lidargrit.configuration import override
-from lidargrit.datasets import open_dataset
 from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import CheckpointError, DataError
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair
@@ -21,9 +20,10 @@ from lidargrit.evaluation.reconstruction import ReconstructionErrors, score_reco
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.files import read_json, write_json
 from lidargrit.generators import Generator, load_class
-from lidargrit.loading import DataConfig, Pixels, Provenance, RangeImages, load_range_images
+from lidargrit.loading import DataConfig, Pixels, Provenance, RangeImages
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
+from lidargrit.sources import load_range_images, open_source
 from lidargrit.sources.samples import read_samples, write_samples
 from lidargrit.structures import RangeImage
 from lidargrit.training import check_folder, train
@@ -142,7 +142,7 @@ def divided(data: str, reporter: Reporter) -> DataConfig:
     Raises:
         DataError: too few scans to hold any out.
     """
-    dataset = open_dataset(data)
+    dataset = open_source(data).scans()
     if len(dataset) < 4:
         raise DataError(f"{len(dataset)} scans in {data}", "at least 4, to hold one out", "add scans")
     source, split = f"{dataset.public_name()}:{dataset.root}", dataset.split

@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from lidargrit import _discovery, formats
-from lidargrit.datasets import ScanDataset, open_dataset
+from lidargrit.datasets import ScanDataset
 from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import DataError, OutputError, ScanError, UnknownNameError, nearest_names
 from lidargrit.files import atomic_path, claim_folder, is_taken, read_json, write_json
@@ -19,7 +19,7 @@ from lidargrit.formats.kitti_bin import KittiBin
 from lidargrit.loading import DataConfig, RangeImages
 from lidargrit.projection import unproject
 from lidargrit.reporting import Reporter
-from lidargrit.sources import holds_images, open_images
+from lidargrit.sources import DatasetSource, open_source
 from lidargrit.structures import Scan
 
 MANIFEST = "export.json"
@@ -126,9 +126,10 @@ class _OfImages:
 
 
 def _open(source: str, config: DataConfig) -> _OfDataset | _OfImages:
-    if holds_images(source):
-        return _OfImages(open_images(source, None, config))
-    dataset = open_dataset(source, config.bad_points)
+    opened = open_source(source, config.bad_points)
+    if not isinstance(opened, DatasetSource):
+        return _OfImages(opened.images(None, config))
+    dataset = opened.scans()
     return _OfDataset(dataset, evenly_spaced(config.max_scans or len(dataset), len(dataset)))
 
 

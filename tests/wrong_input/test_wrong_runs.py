@@ -11,7 +11,8 @@ import pytest
 import torch
 
 from lidargrit.cli import main
-from lidargrit.loading import DataConfig, load_range_images
+from lidargrit.loading import DataConfig
+from lidargrit.sources import load_range_images
 from lidargrit.sources.samples import read_samples
 from tiny_runs import the_one_line, train_words
 

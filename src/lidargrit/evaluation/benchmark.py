@@ -13,7 +13,6 @@ import torch
 
 from lidargrit import __version__
 from lidargrit.configuration import override
-from lidargrit.datasets import open_dataset
 from lidargrit.errors import ConfigError
 from lidargrit.evaluation.comparison import EvalConfig, chosen_metrics, compare_pair, open_pair
 from lidargrit.evaluation.protocols import load_protocol, public_name
@@ -23,7 +22,7 @@ from lidargrit.files import read_json, write_json
 from lidargrit.generators import Generator, is_run, load, load_class, locate
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
-from lidargrit.sources import holds_images
+from lidargrit.sources import Source, open_source
 from lidargrit.sources.samples import write_samples
 from lidargrit.training import Recipe, check_folder, train, training_flops, with_budget
 
@@ -81,8 +80,7 @@ def run(systems: Sequence[str], folder: Path, benchmark: Benchmark, reporter: Re
     plans = [_Plan.of(system, folder, benchmark) for system in systems]
     settings = replace(benchmark.settings, max_scans=benchmark.num_samples)
     chosen_metrics(load_protocol(settings.protocol), settings)
-    if not holds_images(benchmark.reference):
-        open_dataset(benchmark.reference)
+    reference = open_source(benchmark.reference, settings.data.bad_points)
     if (benchmark.recipe_settings or benchmark.flops) and not any(plan.recipe for plan in plans):
         raise ConfigError("settings or a budget, and no recipe", "a recipe that they are for", "leave them out")
     scores = []
@@ -95,7 +93,7 @@ def run(systems: Sequence[str], folder: Path, benchmark: Benchmark, reporter: Re
         seconds = _sample(generator, plan.run, folder / name / "samples", plan.sampling, benchmark, reporter)
         _write_costs(folder / name / COSTS, plan.recipe, generator, plan.sampling, seconds, benchmark.num_samples)
         scores.append(folder / name / f"{name}.json")
-        card = _score(str(folder / name / "samples"), benchmark.reference, settings, scores[-1], reporter)
+        card = _score(str(folder / name / "samples"), reference, settings, scores[-1], reporter)
         if card.samples.scans_used < benchmark.num_samples:
             reporter.message(f"WARNING: {benchmark.reference} has but {card.samples.scans_used} scans to compare with")
     return scores
@@ -163,9 +161,9 @@ def _sample(
     return (time.perf_counter() - begun) / drawn if drawn > 0 else None
 
 
-def _score(samples: str, reference: str, settings: EvalConfig, path: Path, reporter: Reporter) -> Scorecard:
+def _score(samples: str, reference: Source, settings: EvalConfig, path: Path, reporter: Reporter) -> Scorecard:
     """Return the scores of a file, if they are of these very images by these settings; else score, and write it."""
-    pair = open_pair(samples, reference, settings, reporter)
+    pair = open_pair(open_source(samples), reference, settings, reporter)
     told = (settings.facts(), pair.samples.facts(), pair.reference.facts(), __version__)
     wanted = (public_name(settings.protocol), *told)
     if path.is_file():

@@ -1,74 +1,100 @@
-"""What a user typed → scores: the words of ``lidargrit evaluate`` as one call of the library."""
+"""Two names and a configuration → scores or errors of reconstruction: what ``lidargrit evaluate`` does."""
 
 from __future__ import annotations
 
-from argparse import Namespace
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from lidargrit import _discovery
 from lidargrit.errors import ConfigError, nearest_names
-from lidargrit.evaluation.comparison import EvalConfig, compare_sources
+from lidargrit.evaluation.comparison import EvalConfig, compare_pair, open_pair
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.pairs import EvalPair
-from lidargrit.evaluation.reconstruction import evaluate_run
+from lidargrit.evaluation.reconstruction import score_run
 from lidargrit.evaluation.scorecard import Scorecard
-from lidargrit.files import refuse_to_overwrite
-from lidargrit.generators import is_run, locate
+from lidargrit.formats import BadPoints
 from lidargrit.loading import DataConfig
 from lidargrit.metrics import load_metric
 from lidargrit.nn.devices import usable_device
 from lidargrit.reporting import Reporter
+from lidargrit.sources import RunSource, Source, open_source
 
 
 def evaluate(
-    options: Namespace, reporter: Reporter, write_report: Callable[[Scorecard, EvalPair, Path], None]
+    samples: str,
+    reference: str,
+    config: EvalConfig,
+    reporter: Reporter,
+    report: Path | None = None,
+    write_report: Callable[[Scorecard, EvalPair, Path], None] | None = None,
 ) -> tuple[str, dict[str, Any]]:
-    """Score as the options say, write the report if they name one, and return the result for people and for programs.
+    """Score samples against a reference, or the reconstructions of a run, and return a table and its plain values.
+
+    Args:
+        samples: name of the first set: samples, any source of scans, or a finished run.
+        reference: name of the second set.
+        config: how they are compared.
+        reporter: told about progress and warnings.
+        report: file for a report; none is written for a run.
+        write_report: function that writes the report.
 
     Raises:
-        ConfigError: an option that is missing or out of its bounds.
+        ConfigError: a name is missing.
     """
-    if not (options.samples and options.reference):
-        got = f"{options.samples!r} alone" if options.samples else "nothing to score"
+    if not (samples and reference):
+        got = f"{samples!r} alone" if samples else "nothing to score"
         raise ConfigError(got, "samples and what they are compared with", "name two sets, or use --tables")
-    settings = settings_of(options)
-    refuse_to_overwrite(options.report, options.overwrite)
-    usable_device(settings.device)
-    if is_run(locate(options.samples)):
-        return _run(options, settings, reporter)
-    card, pair = compare_sources(options.samples, options.reference, settings, reporter)
+    usable_device(config.device)
+    first = open_source(samples, config.data.bad_points, config.samples_format)
+    second = open_source(reference, config.data.bad_points)
+    if isinstance(first, RunSource):
+        return _reconstruction(first, second, config, reporter)
+    pair = open_pair(first, second, config, reporter)
+    card = compare_pair(pair, config, reporter)
     for warning in card.warnings[len(pair.warnings) :]:
         reporter.message(f"WARNING: {warning}")
-    if options.report:
-        write_report(card, pair, options.report)
+    if report and write_report:
+        write_report(card, pair, report)
     return card.as_table(), card.to_json()
 
 
-def settings_of(options: Namespace) -> EvalConfig:
-    """Return the settings that a user's words name."""
+def read_config(
+    *,
+    metrics: Sequence[str] = (),
+    weights: Sequence[str] = (),
+    groups: int = 16,
+    intervals: int = 20,
+    bad_points: BadPoints = "refuse",
+    bad_scans: Literal["refuse", "skip"] = "refuse",
+    **settings: Any,
+) -> EvalConfig:
+    """Turn words and numbers, as a user types them, into a configuration.
+
+    Args:
+        metrics: names of metrics, in place of the protocol's.
+        weights: words such as ``pointnet=FILE``.
+        groups: number of groups that each set is cut into.
+        intervals: number of half-samples; 0 for no intervals.
+        bad_points: treatment of NaN, infinite and origin points.
+        bad_scans: treatment of scans that cannot be used.
+        settings: further settings of :class:`EvalConfig`, by name.
+
+    Raises:
+        ConfigError: a setting out of its bounds, or weights of a network that no metric uses.
+    """
     return EvalConfig(
-        protocol=options.protocol,
-        metrics=tuple(options.metrics),
-        variant=options.variant,
-        projection_variant=options.projection_variant,
-        max_scans=options.max_scans,
-        seed=options.seed,
-        resampling=Resampling(options.groups, options.intervals, max(options.seed, 0)),
-        weights=weights_of(options.weights),
-        samples_format=options.samples_format,
-        device=options.device,
-        data=DataConfig(bad_points=options.bad_points, bad_scans=options.bad_scans),
+        metrics=tuple(metrics),
+        resampling=Resampling(groups, intervals, max(settings.get("seed", 0), 0)),
+        weights=_weights(weights),
+        data=DataConfig(bad_points=bad_points, bad_scans=bad_scans),
+        **settings,
     )
 
 
-def weights_of(words: list[str]) -> dict[str, Path]:
-    """Turn words such as ``pointnet=FILE`` into files by the name of their network.
-
-    Raises:
-        ConfigError: a word without ``=``, or a network that no metric looks through.
-    """
+def _weights(words: Sequence[str]) -> dict[str, Path]:
+    """Turn words such as ``pointnet=FILE`` into files by the name of their network."""
     if not words:
         return {}
     known = {load_metric(name).needs_weights for name in _discovery.names("metrics")} - {""}
@@ -82,18 +108,12 @@ def weights_of(words: list[str]) -> dict[str, Path]:
     return files
 
 
-def _run(options: Namespace, settings: EvalConfig, reporter: Reporter) -> tuple[str, dict[str, Any]]:
-    config = DataConfig(
-        max_scans=settings.max_scans,
-        projection_variant=settings.projection_variant or "exact",
-        bad_points=settings.data.bad_points,
-        bad_scans=settings.data.bad_scans,
-    )
-    errors = evaluate_run(Path(options.samples), options.reference, config, reporter)
-    about = {
-        "samples": options.samples,
-        "reference": options.reference,
-        "projection_variant": config.projection_variant,
-    }
+def _reconstruction(
+    run: RunSource, reference: Source, config: EvalConfig, reporter: Reporter
+) -> tuple[str, dict[str, Any]]:
+    variant = config.projection_variant or "exact"
+    data = replace(config.data, max_scans=config.max_scans, projection_variant=variant)
+    errors = score_run(run, reference, data, reporter)
+    about = {"samples": run.text, "reference": reference.text, "projection_variant": variant}
     table = "\n".join(f"{name:<22}{value:>10.4g}" for name, value in errors.items())
     return table, {**about, "reconstruction": errors}

@@ -20,6 +20,7 @@ from lidargrit.loading import DataConfig
 from lidargrit.metrics import load_metric
 from lidargrit.projection import ProjectionVariant
 from lidargrit.reporting import Reporter
+from lidargrit.sources import Source, open_source
 
 _FEW = 100  # scans: below that the interval itself rests on too little, and values hardly differ from real against real
 
@@ -29,16 +30,16 @@ class EvalConfig:
     """How two sets are compared.
 
     Args:
-        protocol: its name.
-        metrics: names, in place of the protocol's; of those that it has the protocol's definitions are kept.
+        protocol: name of the protocol.
+        metrics: names of metrics, in place of the protocol's; metrics of the protocol keep its definitions.
         variant: one definition for all metrics, in place of the protocol's.
-        projection_variant: of real scans, in place of the protocol's.
-        max_scans: of each set at most; 0 for the protocol's.
-        seed: of whatever a metric draws.
+        projection_variant: variant by which real scans become images, in place of the protocol's.
+        max_scans: largest number of scans of each set; 0 for the protocol's.
+        seed: seed of the random numbers that metrics use.
         resampling: how intervals and real against real are computed.
-        weights: files by the name of their network.
-        samples_format: sample format of a folder of tensors.
-        device: where networks compute.
+        weights: files of published weights, by the name of their network.
+        samples_format: name of the program that wrote a folder of tensors; told from the first file if empty.
+        device: name of the device that networks compute on.
         data: how scans are read.
     """
 
@@ -59,7 +60,7 @@ class EvalConfig:
             raise ConfigError(f"-n {self.max_scans}, --seed {self.seed}", "0 or more", "correct the number")
 
     def facts(self) -> dict[str, Any]:
-        """Return what the scorecard tells of them, as plain values."""
+        """Return the entries of a scorecard, as plain values."""
         return {
             "metrics": list(self.metrics),
             "variant": self.variant,
@@ -80,10 +81,10 @@ def compare_sources(
     """Score a folder of samples, or any source of scans, against another.
 
     Args:
-        samples: a folder of samples, of ours or of another program, or a source of scans.
-        reference: likewise; scans are projected with the sensor of the samples.
-        settings: the protocol and more.
-        reporter: hears of progress and warnings.
+        samples: name of a folder of samples, of ours or of another program, or of any source of scans.
+        reference: name of the second set; its scans are projected with the sensor of the samples.
+        settings: protocol and its changes.
+        reporter: told about progress and warnings.
 
     Raises:
         ConfigError: the two sets look along different rays, or a setting is out of its bounds.
@@ -91,17 +92,18 @@ def compare_sources(
         LidarGritError: not one metric could be computed; what the first said.
     """
     settings, reporter = settings or EvalConfig(), reporter or Reporter()
-    pair = open_pair(samples, reference, settings, reporter)
+    first = open_source(samples, settings.data.bad_points, settings.samples_format)
+    pair = open_pair(first, open_source(reference, settings.data.bad_points), settings, reporter)
     return compare_pair(pair, settings, reporter), pair
 
 
-def open_pair(samples: str, reference: str, settings: EvalConfig, reporter: Reporter) -> EvalPair:
-    """Open the two sets of :func:`compare_sources`, and say what there is to say against comparing them."""
+def open_pair(samples: Source, reference: Source, settings: EvalConfig, reporter: Reporter) -> EvalPair:
+    """Read the two sets of an evaluation, and warn of what speaks against comparing them."""
     protocol = load_protocol(settings.protocol)
     chosen_metrics(protocol, settings)  # refuses unknown names before scans are projected
     variant = settings.projection_variant or protocol.variant
     config = replace(settings.data, projection_variant=variant, max_scans=settings.max_scans)
-    pair = pair_for_protocol(samples, reference, protocol, config, settings.samples_format, reporter)
+    pair = pair_for_protocol(samples, reference, protocol, config, reporter)
     for warning in pair.warnings:
         reporter.message(f"WARNING: {warning}")
     return pair

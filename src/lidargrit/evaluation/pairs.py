@@ -1,24 +1,20 @@
-"""The two sets of an evaluation: sources → range images, which of them are compared, and what is known of them."""
+"""The two sets of an evaluation: sources → equally many range images of each, and objections to comparing them."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import torch
 
-from lidargrit.datasets import open_dataset
 from lidargrit.determinism import evenly_spaced
-from lidargrit.errors import ConfigError, LidarGritError
+from lidargrit.errors import ConfigError
 from lidargrit.evaluation.protocols import Protocol
 from lidargrit.evaluation.scorecard import SetFacts
-from lidargrit.loading import DataConfig, PreparedImages, RangeImages, is_prepared
+from lidargrit.loading import DataConfig, RangeImages
 from lidargrit.reporting import Reporter
-from lidargrit.sources import open_images, overlap
-from lidargrit.sources.sample_formats import is_tensor_folder, load_sample_format, recognise
-from lidargrit.sources.samples import is_sample_folder, projection_of
+from lidargrit.sources import Source, overlap
 from lidargrit.structures import RangeImage
 
 _BATCH = 16
@@ -26,16 +22,16 @@ _BATCH = 16
 
 @dataclass(frozen=True, eq=False)
 class EvalSet:
-    """One set of range images.
+    """One set of range images that goes into the metrics.
 
     Args:
-        source: as the user named it.
-        images: all of them.
-        indices: of those that are compared.
-        range_m: returns that are not strictly between these are none; None for all.
-        data_set: which data set they are of; "samples" for generated ones, "" where that is not known.
-        split: which part of it.
-        variant: of the projection; "" where that is not known.
+        source: name of the source, as the user typed it.
+        images: all images of the source.
+        indices: indices of the images that are compared.
+        range_m: nearest and farthest range of a return, in metres, both excluded; None for no limits.
+        data_set: name of the data set; "samples" for generated images, "" where it is not known.
+        split: part of the data set.
+        projection_variant: variant by which scans became images; "" where it is not known.
     """
 
     source: str
@@ -44,14 +40,14 @@ class EvalSet:
     range_m: tuple[float, float] | None = None
     data_set: str = ""
     split: str = ""
-    variant: str = ""
+    projection_variant: str = ""
 
     def __len__(self) -> int:
         return len(self.indices)
 
-    def batch(self, places: Sequence[int]) -> RangeImage:
-        """Return the images at these places among those that are compared."""
-        images = self.images.batch([self.indices[place] for place in places])
+    def batch(self, indices: Sequence[int]) -> RangeImage:
+        """Return some of the compared images, by their index among these, as one batch."""
+        images = self.images.batch([self.indices[index] for index in indices])
         if self.range_m is None:
             return images
         near, far = self.range_m
@@ -61,7 +57,7 @@ class EvalSet:
         return kept if reflectance is None else replace(kept, reflectance=torch.where(mask, reflectance, 0))
 
     def facts(self) -> SetFacts:
-        """Return what the scorecard tells of the set, with the hash of what was compared."""
+        """Return the entry of the set in a scorecard, with the hash of the compared pixels."""
         sensor = self.images.sensor
         return SetFacts(
             self.source,
@@ -70,7 +66,7 @@ class EvalSet:
             len(self.images),
             len(self),
             f"{sensor.name} {sensor.height}x{sensor.width}",
-            f"{sensor.projection}, {self.variant or 'variant not known'}",
+            f"{sensor.projection}, {self.projection_variant or 'variant not known'}",
             self._sha256(),
         )
 
@@ -79,7 +75,7 @@ class EvalSet:
         known = self.images.provenance.fingerprints
         if len(known) == len(self.images):  # of the images with all fine columns: of which some were compared
             sensor = self.images.sensor
-            content.update(f"{sensor.height}x{sensor.width} {sensor.projection} {self.variant} ".encode())
+            content.update(f"{sensor.height}x{sensor.width} {sensor.projection} {self.projection_variant} ".encode())
             for index in self.indices:
                 content.update(known[index].encode())
         else:
@@ -91,13 +87,13 @@ class EvalSet:
 
 @dataclass(frozen=True, eq=False)
 class EvalPair:
-    """Samples and what they are compared with, equally many of both, and what there is to say against it.
+    """Two sets of equally many images that are compared, and the objections to comparing them.
 
     Args:
-        samples: the first set.
-        reference: the second.
-        deviations: how the two differ from what the protocol wants.
-        warnings: why their scores may flatter, or say something else than one thinks.
+        samples: first set, usually generated.
+        reference: second set, usually real.
+        deviations: differences from what the protocol wants, one sentence each.
+        warnings: reasons why the scores may mislead, one sentence each.
     """
 
     samples: EvalSet
@@ -107,22 +103,16 @@ class EvalPair:
 
 
 def pair_for_protocol(
-    samples: str,
-    reference: str,
-    protocol: Protocol,
-    config: DataConfig,
-    samples_format: str = "",
-    reporter: Reporter | None = None,
+    samples: Source, reference: Source, protocol: Protocol, config: DataConfig, reporter: Reporter | None = None
 ) -> EvalPair:
-    """Open two sets as a protocol wants them.
+    """Read two sets as a protocol wants them.
 
     Args:
-        samples: a folder of samples of ours or in a known sample_format, or a source of scans.
-        reference: likewise; scans are projected with the sensor of the samples.
-        protocol: which sensor, window, data set and number of scans are wanted.
-        config: how scans are read and projected; ``max_scans`` further limits how many.
-        samples_format: the sample_format of a folder of tensors; recognised if empty.
-        reporter: hears of the projection.
+        samples: source of the first set.
+        reference: source of the second set; scans are projected with the sensor of the first.
+        protocol: definition of the sensor, range window, data set and number of scans that are wanted.
+        config: how scans are read and projected; ``max_scans`` further limits their number.
+        reporter: told about the projection.
 
     Raises:
         ConfigError: the two sets look along different rays.
@@ -130,34 +120,25 @@ def pair_for_protocol(
     reporter = reporter or Reporter()
     at_most = min((n for n in (config.max_scans, protocol.num_scans) if n), default=0)
     config = replace(config, max_scans=at_most)
-    first = open_images(samples, protocol.load_sensor(), config, reporter, samples_format)
-    second = open_images(reference, first.sensor, config, reporter)
-    require_same_rays(first, second)
+    first = samples.images(protocol.load_sensor(), config, reporter)
+    second = reference.images(first.sensor, config, reporter)
+    _require_same_rays(first, second)
     count = min(len(first), len(second), at_most or len(first))
     both = [
-        EvalSet(source, images, evenly_spaced(count, len(images)), protocol.range_m, *known_of(source, config, form))
-        for source, images, form in ((samples, first, samples_format), (reference, second, ""))
+        EvalSet(
+            source.text,
+            images,
+            evenly_spaced(count, len(images)),
+            protocol.range_m,
+            source.data_set,
+            source.split,
+            source.projection_variant(config),
+        )
+        for source, images in ((samples, first), (reference, second))
     ]
     pair = EvalPair(both[0], both[1])
-    return replace(pair, deviations=deviations(pair, protocol), warnings=warnings(pair))
-
-
-def known_of(source: str, config: DataConfig, samples_format: str = "") -> tuple[str, str, str]:
-    """Return of which data set a source is, which part of it, and by which variant its scans were projected."""
-    folder = Path(source)
-    if is_sample_folder(folder):
-        return "samples", "", projection_of(folder)
-    if samples_format or is_tensor_folder(folder):
-        name = samples_format or recognise(folder)
-        return "samples", name, load_sample_format(name).variant
-    try:
-        if is_prepared(source):
-            spec = PreparedImages(source).spec
-            return *known_of(spec.source, config)[:2], spec.variant
-        dataset = open_dataset(source, config.bad_points)
-    except LidarGritError:  # a prepared place outlives the scans that it was made of
-        return "", "", ""
-    return dataset.public_name(), dataset.split, config.projection_variant
+    shared = overlap(samples, first, second)
+    return replace(pair, deviations=deviations(pair, protocol), warnings=_warnings(pair, shared))
 
 
 def deviations(pair: EvalPair, protocol: Protocol) -> tuple[str, ...]:
@@ -175,26 +156,27 @@ def deviations(pair: EvalPair, protocol: Protocol) -> tuple[str, ...]:
         found.append(f"the reference is {reference.data_set or 'of an unknown data set'}, not {protocol.data_set}")
     elif protocol.splits and reference.split not in protocol.splits:
         found.append(f"the reference is {reference.split!r} of {reference.data_set}, not {protocol.splits[0]!r}")
-    if protocol.sensor and reference.variant not in {protocol.variant, ""}:
-        found.append(f"the reference is projected by {reference.variant!r}, not by {protocol.variant!r}")
+    if protocol.sensor and reference.projection_variant not in {protocol.variant, ""}:
+        found.append(f"the reference is projected by {reference.projection_variant!r}, not by {protocol.variant!r}")
     return tuple(found)
 
 
-def warnings(pair: EvalPair) -> tuple[str, ...]:
+def _warnings(pair: EvalPair, shared: str) -> tuple[str, ...]:
     """Say what flatters the scores of two sets, or makes them measure something else."""
     found = []
     first, second = pair.samples, pair.reference
-    if shared := overlap(first.source, first.images, second.images):
+    if shared:
         found.append(f"{first.source} and the reference overlap ({shared}): the scores flatter it")
-    if first.variant and second.variant and first.variant != second.variant:
+    theirs, ours = first.projection_variant, second.projection_variant
+    if theirs and ours and theirs != ours:
         found.append(
-            f"the two sets took different roads: the samples' scans were projected by {first.variant!r}, those of the "
-            f"reference by {second.variant!r}; scores mix this with what the model does"
+            f"the two sets took different roads: the samples' scans were projected by {theirs!r}, those of the "
+            f"reference by {ours!r}; scores mix this with what the model does"
         )
     return tuple(found)
 
 
-def require_same_rays(generated: RangeImages, reference: RangeImages) -> None:
+def _require_same_rays(generated: RangeImages, reference: RangeImages) -> None:
     """Refuse two sets that look along different rays, with ConfigError."""
     if not generated.sensor.same_rays(reference.sensor):
         raise ConfigError(

@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from lidargrit.datasets import open_dataset
 from lidargrit.errors import ConfigError, DataError
 from lidargrit.loading import DataConfig, RangeImages
 from lidargrit.metrics import load_metric
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel, load_sensor
 from lidargrit.simulator import Observation, observe
-from lidargrit.sources import open_images
+from lidargrit.sources import open_source
 from lidargrit.structures import MetricResult, RangeImage
 
 CURVES = (
@@ -142,9 +141,10 @@ def compare_source(
     if count < 2 or seed < 0:
         raise ConfigError(f"{count} scans from seed {seed}", "at least 2, and no negative seed", "correct the number")
     config, reporter = config or DataConfig(), reporter or Reporter()
-    rays = load_sensor(sensor or open_dataset(source, config.bad_points).sensor)
+    scans = open_source(source, config.bad_points)
+    rays = load_sensor(sensor) if sensor else scans.sensor
     rays = rays.fine() if fine else rays
-    real = open_images(source, rays, replace(config, max_scans=count), reporter)
+    real = scans.images(rays, replace(config, max_scans=count), reporter)
     pairs = []
     with reporter.progress("simulating", count) as progress:
         for each in range(seed, seed + count):

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from lidargrit.errors import ConfigError, DataError, ScanError
-from lidargrit.generators import Generator, load
+from lidargrit.generators import Generator
 from lidargrit.loading import DataConfig, RangeImages
 from lidargrit.reporting import Reporter
-from lidargrit.sources import open_images, warn_of_overlap
+from lidargrit.sources import RunSource, Source, overlap
 from lidargrit.structures import RangeImage
 from lidargrit.tokenizers import Tokenizer
 
@@ -128,7 +127,7 @@ def _share(part: int, whole: int) -> float:
 
 @torch.no_grad()
 def score_reconstruction(tokenizer: Tokenizer, images: RangeImages) -> ReconstructionErrors:
-    """Return how well a tokenizer gives back every scan of a set, its mask decoded by threshold."""
+    """Return how well a tokenizer reconstructs all images of a set; a pixel returns where its logit is 0 or more."""
     score = ReconstructionScore()
     for first in range(0, len(images), _BATCH):
         batch = images.batch(range(first, min(first + _BATCH, len(images))))
@@ -137,17 +136,23 @@ def score_reconstruction(tokenizer: Tokenizer, images: RangeImages) -> Reconstru
     return score.compute()
 
 
-def evaluate_run(run_folder: Path, source: str, config: DataConfig, reporter: Reporter) -> dict[str, float]:
-    """Return how well the tokenizer of a finished run gives back scans, by the name of each error.
+def score_run(run: RunSource, source: Source, config: DataConfig, reporter: Reporter) -> dict[str, float]:
+    """Return how well the tokenizer of a finished run reconstructs scans, by the name of each error.
+
+    Args:
+        run: finished run.
+        source: scans that the tokenizer encodes and decodes.
+        config: how scans are read and projected.
+        reporter: told about progress, and warned if the model has learned from these scans.
 
     Raises:
         ConfigError: a run whose generator has no tokenizer.
     """
-    generator = load(run_folder)
-    tokenizer = generator.get_tokenizer()
-    images = open_images(source, generator.sensor, config, reporter)
-    warn_of_overlap(str(run_folder), None, images, reporter)
-    return {**asdict(score_reconstruction(tokenizer, images)), **score_likelihood(generator, images)}
+    tokenizer = run.generator.get_tokenizer()
+    images = source.images(run.sensor, config, reporter)
+    if shared := overlap(run, None, images):
+        reporter.message(f"WARNING: {run.text} and the reference overlap ({shared}): the scores flatter it")
+    return {**asdict(score_reconstruction(tokenizer, images)), **score_likelihood(run.generator, images)}
 
 
 @torch.no_grad()

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from lidargrit.datasets import open_dataset
 from lidargrit.errors import ConfigError
 from lidargrit.evaluation.benchmark import Benchmark, as_table
 from lidargrit.evaluation.benchmark import run as run_benchmark
@@ -16,11 +15,10 @@ from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.evaluation.protocols import load_protocol
 from lidargrit.evaluation.tables import Format
 from lidargrit.generators import is_run
-from lidargrit.loading import load_range_images
 from lidargrit.metrics import load_metric
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
-from lidargrit.sources import open_images
+from lidargrit.sources import load_range_images, open_source
 from lidargrit.training import Recipe, gpu_time, plan_training, with_budget
 
 SIMULATED = "simulated"  # in place of a root
@@ -184,7 +182,7 @@ def plan(wanted: Reproduction, folder: Path) -> dict[str, Any]:
     benchmark = wanted.benchmark()
     recipes = {system: _recipe(system, benchmark) for system in wanted.systems().values()}
     data = next(iter(recipes.values())).data
-    counted = {source: len(open_dataset(source)) for source in (*data.train, *data.val, benchmark.reference)}
+    counted = {source: len(open_source(source).scans()) for source in (*data.train, *data.val, benchmark.reference)}
     systems = {}
     for system, recipe in recipes.items():
         run = folder / "runs" / system
@@ -218,13 +216,14 @@ def _recipe(system: str, benchmark: Benchmark) -> Recipe:
 def _prepare(benchmark: Benchmark, systems: list[str], reporter: Reporter) -> None:
     """Project everything before anything is trained: a scan that cannot be used is told now, not after days."""
     protocol = load_protocol(benchmark.settings.protocol)
+    reference = open_source(benchmark.reference)
     for system in systems:
         data = load_recipe(system, benchmark.recipe_settings).data
         load_range_images(data.train, data, reporter)
         load_range_images(data.val, data, reporter)
         at_most = min(benchmark.num_samples, protocol.num_scans)
         config = replace(benchmark.settings.data, projection_variant=protocol.variant, max_scans=at_most)
-        open_images(benchmark.reference, data.load_sensor(), config, reporter)
+        reference.images(data.load_sensor(), config, reporter)
 
 
 def _words(wanted: Reproduction) -> str:

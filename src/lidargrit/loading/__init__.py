@@ -5,11 +5,10 @@ from lidargrit.loading.config import DataConfig
 from lidargrit.loading.images import ImageStore, Pixels, Provenance, RangeImages
 from lidargrit.loading.prepare import (
     damaged_shards,
-    load_range_images,
     prepare,
     prepare_and_describe,
 )
-from lidargrit.loading.prepared import PreparedImages, is_prepared
+from lidargrit.loading.prepared import PreparedFolder, PreparedImages, is_prepared
 
 __all__ = [
     "Batches",
@@ -17,11 +16,11 @@ __all__ = [
     "ImageStore",
     "Pixels",
     "Provenance",
+    "PreparedFolder",
     "PreparedImages",
     "RangeImages",
     "damaged_shards",
     "is_prepared",
-    "load_range_images",
     "prepare",
     "prepare_and_describe",
 ]

@@ -75,6 +75,11 @@ class RangeImages:
         self._stores = [store for store in stores if len(store)]
         self._ends = list(accumulate(len(store) for store in self._stores))
 
+    @classmethod
+    def joined(cls, sensor: SensorModel, parts: Sequence[RangeImages]) -> RangeImages:
+        """Return the images of several sets as one set, in their order."""
+        return cls(sensor, [store for part in parts for store in part._stores])
+
     def __len__(self) -> int:
         return self._ends[-1] if self._ends else 0
 

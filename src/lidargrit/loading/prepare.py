@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,7 +17,6 @@ from lidargrit.environment import cache_folder
 from lidargrit.errors import DataError, OutputError
 from lidargrit.files import claim_folder, is_taken, remove_partials, write_json, write_text
 from lidargrit.loading.config import DataConfig
-from lidargrit.loading.images import RangeImages
 from lidargrit.loading.prepared import (
     FORMAT,
     PLAN_FILE,
@@ -26,7 +24,6 @@ from lidargrit.loading.prepared import (
     PreparedFolder,
     PreparedImages,
     PreparedSpec,
-    is_prepared,
     shard_name,
 )
 from lidargrit.loading.shards import LocalBytes, range_step_m, read_index
@@ -39,42 +36,6 @@ _SHARD_SCANS = 128  # 12 MB of KITTI-360 size images, and 625 files for 80,000 s
 _WAIT_S, _PATIENCE_S = 0.5, 1800.0  # for shards that other machines make
 
 
-def load_range_images(
-    sources: Sequence[str], config: DataConfig, reporter: Reporter | None = None, sensor: SensorModel | None = None
-) -> RangeImages:
-    """Open the range images of sources; scans are projected the first time, and then found in the cache.
-
-    The cache is ``$LIDARGRIT_CACHE``, else ``lidargrit`` in the user's cache folder. It may be deleted at any time.
-
-    Args:
-        sources: sources of scans or of prepared images, as in :class:`DataConfig`.
-        config: settings by which scans become images; its own sources are ignored.
-        reporter: receiver of progress and messages.
-        sensor: sensor of the images, in place of the config's.
-
-    Raises:
-        DataError: no source, a source without a scan, or prepared scans of another sensor.
-        ScanError: a scan that cannot be used; ``bad_scans=skip`` leaves it out.
-    """
-    if not sources:
-        raise DataError("no source of scans", "at least one", "name one with --set data.train=FOLDER")
-    reporter, sensor = reporter or Reporter(), sensor or config.load_sensor()
-    stores: list[PreparedImages] = []
-    for source in sources:
-        if is_prepared(source):
-            prepared = PreparedImages(source, config.max_scans)
-            _require_same_projection(source, prepared, sensor, config)
-        else:
-            prepared = PreparedImages(str(prepare(source, config, reporter=reporter, sensor=sensor)))
-        for why in prepared.left_out.values():
-            reporter.message(f"left out: {why}")
-        stores.append(prepared)
-    images = RangeImages(sensor, stores)
-    if not len(images):
-        raise DataError(f"no usable scan in {', '.join(sources)}", "at least one", "see the messages above")
-    return images
-
-
 def prepare(
     source: str,
     config: DataConfig,
@@ -83,6 +44,7 @@ def prepare(
     sensor: SensorModel | None = None,
     rank: int | None = None,
     world_size: int | None = None,
+    dataset: ScanDataset | None = None,
 ) -> Path:
     """Project every scan of a source into a folder of shards; shards that are there already are kept.
 
@@ -95,6 +57,7 @@ def prepare(
         rank: number of this machine, from 0; it makes its part of the shards and waits for those of the others. If not
             given, the environment's ``RANK``, else 0.
         world_size: number of machines that share the work; if not given, the environment's ``WORLD_SIZE``, else 1.
+        dataset: data set of the source, where it is open already.
 
     Returns:
         the folder, complete.
@@ -105,7 +68,7 @@ def prepare(
     """
     reporter, sensor = reporter or Reporter(), sensor or config.load_sensor()
     rank, world_size = rank_and_world_size(rank, world_size)
-    dataset = open_dataset(source, config.bad_points)
+    dataset = dataset or open_dataset(source, config.bad_points)
     if dataset.sensor != sensor.name and not config.sensor.endswith(".json"):
         reporter.message(f"WARNING: {source} was made by {dataset.sensor}, and is imaged as {sensor.name}")
     spec, scans = _spec(source, dataset, sensor, config)
@@ -286,23 +249,3 @@ def _wait_for(folder: Path, shards: list[int], reporter: Reporter) -> None:
                 )
             shards = still
             time.sleep(_WAIT_S if still else 0)
-
-
-def _require_same_projection(source: str, images: PreparedImages, sensor: SensorModel, config: DataConfig) -> None:
-    """Refuse prepared images of other rays, or of another projection, than are wanted."""
-    prepared, wanted = images.sensor, sensor.fine()
-    if not prepared.same_rays(wanted):
-        raise DataError(
-            f"{source}, prepared for {prepared.name!r} ({prepared.height}x{prepared.width})",
-            f"the rays of {sensor.name!r} ({wanted.height}x{wanted.width} with every fine column)",
-            "name the sensor that it was prepared for, or prepare it for this one",
-        )
-    theirs = (images.spec.variant, prepared.projection, prepared.range_min_m, prepared.range_max_m)
-    ours = (config.projection_variant, wanted.projection, wanted.range_min_m, wanted.range_max_m)
-    if theirs != ours:
-        told = [f"{variant}, {projection}, {near:g} to {far:g} m" for variant, projection, near, far in (theirs, ours)]
-        raise DataError(
-            f"{source}, prepared by the projection {told[0]}",
-            told[1],
-            "choose that projection, or prepare the scans anew",
-        )

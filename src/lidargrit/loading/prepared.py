@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import threading
 from dataclasses import asdict, dataclass, fields
 from typing import Any
@@ -174,13 +175,12 @@ class PreparedImages:
 
     Args:
         location: path of the folder, or its URL.
-        max_scans: largest number of images, evenly spaced over the folder; 0 for all.
 
     Raises:
         DataError: the folder is not a prepared one, is not complete, or is damaged.
     """
 
-    def __init__(self, location: str, max_scans: int = 0) -> None:
+    def __init__(self, location: str) -> None:
         self._folder = PreparedFolder(location)
         self.spec = self._folder.read_spec()
         self.sensor = SensorModel.from_json(self.spec.sensor)
@@ -198,8 +198,6 @@ class PreparedImages:
                 raise DataError(f"{shard_name(shard)} with other scans", "those of the plan", "prepare again")
             self._entries += [(shard, entry) for entry in entries]
             self.left_out |= left_out
-        if max_scans:
-            self._entries = [self._entries[index] for index in evenly_spaced(max_scans, len(self._entries))]
         self.provenance = Provenance(
             tuple(scans[entry.scan][0] for _, entry in self._entries),
             tuple(scans[entry.scan][1] for _, entry in self._entries),
@@ -208,6 +206,16 @@ class PreparedImages:
 
     def __len__(self) -> int:
         return len(self._entries)
+
+    def evenly_spaced(self, count: int) -> PreparedImages:
+        """Return so many of the images, evenly spaced, without opening the folder again."""
+        chosen, known, indices = copy.copy(self), self.provenance, evenly_spaced(count, len(self))
+        chosen._entries = [self._entries[index] for index in indices]
+        names, recordings, fingerprints = (
+            tuple(of[index] for index in indices) for of in (known.names, known.recordings, known.fingerprints)
+        )
+        chosen.provenance = Provenance(names, recordings, fingerprints)
+        return chosen
 
     def read(self, index: int, verify: bool = False) -> Pixels:
         """Return the pixels of one image.

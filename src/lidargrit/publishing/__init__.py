@@ -24,8 +24,9 @@ from lidargrit.generators import (
     load_class,
     locate,
 )
-from lidargrit.publishing.card import data_set_of, model_card
+from lidargrit.publishing.card import model_card
 from lidargrit.recipes import load_recipe
+from lidargrit.sources import data_set_of
 from lidargrit.sources.samples import MANIFEST, is_sample_folder, trained_on
 
 

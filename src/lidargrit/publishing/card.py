@@ -10,12 +10,11 @@ from typing import Any
 
 from lidargrit import _discovery
 from lidargrit.datasets import load as load_dataset
-from lidargrit.datasets import without_place
-from lidargrit.errors import LidarGritError, one_line
+from lidargrit.errors import one_line
 from lidargrit.evaluation.scorecard import Scorecard, format_value
 from lidargrit.generators import Generator, recipe_settings
 from lidargrit.loading import Provenance
-from lidargrit.loading.prepared import PreparedFolder, is_prepared
+from lidargrit.sources import data_set_of
 
 _PIPELINE = "unconditional-image-generation"  # of the hub's tasks the nearest; it has none for scans
 _CREATIVE_COMMONS = re.compile(r"CC ([A-Z-]+) (\d\.\d) \([a-z-]+\)")  # without terms beside it
@@ -60,16 +59,6 @@ def model_card(
         *([_scores(scores)] if scores else ["## Scores\n\nNo scores were published with this model."]),
     ]
     return "\n\n".join(parts) + "\n"
-
-
-def data_set_of(source: str) -> tuple[str, str]:
-    """Return the data set and the split of a source; of prepared scans, those that they were prepared from."""
-    if "://" in source:  # an address stays out of the card, and a request to it may take long
-        return "", ""
-    try:
-        return without_place(PreparedFolder(source).read_spec().source if is_prepared(source) else source)
-    except LidarGritError:
-        return "", ""
 
 
 def _what(generator: Generator, half: bool) -> str:

@@ -1,77 +1,375 @@
-"""What a user names as a source → range images: samples, prepared scans, scans on disk, or simulated."""
+"""What a user names as a source → one object that knows what it is, so that nobody has to ask again."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
+from typing import ClassVar
 
-from lidargrit.datasets import open_dataset
-from lidargrit.generators import is_run, locate
-from lidargrit.loading import (
-    DataConfig,
-    PreparedImages,
-    Provenance,
-    RangeImages,
-    is_prepared,
-    load_range_images,
-)
+from lidargrit.datasets import ScanDataset, open_dataset, without_place
+from lidargrit.errors import DataError, LidarGritError
+from lidargrit.formats import BadPoints
+from lidargrit.generators import Generator, is_run, load, locate
+from lidargrit.loading import DataConfig, PreparedFolder, PreparedImages, Provenance, RangeImages, is_prepared, prepare
 from lidargrit.reporting import Reporter
-from lidargrit.sensors import SensorModel
-from lidargrit.sources.sample_formats import is_tensor_folder, read_tensor_folder
-from lidargrit.sources.samples import is_sample_folder, read_samples, trained_on
+from lidargrit.sensors import SensorModel, load_sensor
+from lidargrit.sources.sample_formats import is_tensor_folder, load_sample_format, read_tensor_folder, recognise
+from lidargrit.sources.samples import is_sample_folder, projection_of, read_samples, trained_on
+
+
+class Source(ABC):
+    """A place that a user named and that scans come from; :func:`open_source` tells its kind.
+
+    Args:
+        text: name of the source, as the user typed it.
+    """
+
+    kind: ClassVar[str]
+    """What the source is, in words for a message."""
+    data_set: str = ""
+    """Name of the data set; ``samples`` for what a generator made; "" where it is not known."""
+    split: str = ""
+    """Part of the data set, or the sample format of tensors; "" where there is none."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+
+    @property
+    @abstractmethod
+    def sensor(self) -> SensorModel:
+        """Sensor whose rays the scans or images lie on."""
+
+    @abstractmethod
+    def projection_variant(self, config: DataConfig) -> str:
+        """Return the variant of the projection by which scans become, or became, images; "" where it is not known."""
+
+    @abstractmethod
+    def images(
+        self, sensor: SensorModel | None = None, config: DataConfig | None = None, reporter: Reporter | None = None
+    ) -> RangeImages:
+        """Return the range images of the source; pixels are read when they are asked for.
+
+        Args:
+            sensor: sensor that scans are projected with; the source's own if not given. Samples keep theirs.
+            config: how scans are read and projected, and their largest number; its sources and sensor are ignored.
+            reporter: told about progress and about scans that are left out.
+
+        Raises:
+            DataError: no usable scan, or prepared scans of another sensor or projection.
+            ScanError: a scan or a sample that cannot be used.
+        """
+
+    def scans(self) -> ScanDataset:
+        """Return the points of the scans; only a data set has them.
+
+        Raises:
+            DataError: a source that holds range images, or a run.
+        """
+        raise DataError(f"{self.text}, which holds {self.kind}", "the points of scans", "name a data set or its folder")
+
+    def learned_from(self) -> Provenance | None:
+        """Return the training scans of the model behind the source; None where no model is behind it."""
+        return None
+
+
+class DatasetSource(Source):
+    """Scans of a data set: files in a known layout, or simulated scans.
+
+    Args:
+        text: name of the source.
+        bad_points: treatment of NaN, infinite and origin points.
+    """
+
+    kind = "scans"
+
+    def __init__(self, text: str, bad_points: BadPoints = "refuse") -> None:
+        super().__init__(text)
+        self._dataset = open_dataset(text, bad_points)
+        self.data_set, self.split = self._dataset.public_name(), self._dataset.split
+
+    @property
+    def sensor(self) -> SensorModel:
+        """Sensor that made the scans."""
+        return load_sensor(self._dataset.sensor)
+
+    def projection_variant(self, config: DataConfig) -> str:
+        """Return the variant that the configuration names."""
+        return config.projection_variant
+
+    def scans(self) -> ScanDataset:
+        """Return the data set, as it was opened."""
+        return self._dataset
+
+    def images(
+        self, sensor: SensorModel | None = None, config: DataConfig | None = None, reporter: Reporter | None = None
+    ) -> RangeImages:
+        """Project the scans once, and find them in the cache from then on."""
+        config, reporter = config or DataConfig(), reporter or Reporter()
+        if sensor is None:
+            config = replace(config, sensor=self._dataset.sensor)
+            sensor = config.load_sensor()
+        folder = prepare(self.text, config, reporter=reporter, sensor=sensor, dataset=self._dataset)
+        return _read_prepared(self.text, PreparedImages(str(folder)), sensor, reporter)
+
+
+class PreparedSource(Source):
+    """Range images that ``lidargrit prepare`` wrote into a folder, here or behind a URL."""
+
+    kind = "prepared range images"
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self._prepared = PreparedImages(text)
+        self.data_set, self.split = _data_set_or_nothing(self._prepared.spec.source)
+
+    @property
+    def sensor(self) -> SensorModel:
+        """Sensor of the images, with all its fine columns."""
+        return self._prepared.sensor
+
+    def projection_variant(self, config: DataConfig) -> str:
+        """Return the variant that the scans were prepared by."""
+        return self._prepared.spec.variant
+
+    def images(
+        self, sensor: SensorModel | None = None, config: DataConfig | None = None, reporter: Reporter | None = None
+    ) -> RangeImages:
+        """Read the images as they are."""
+        config, sensor = config or DataConfig(), sensor or self.sensor
+        _require_same_projection(self.text, self._prepared, sensor, config)
+        chosen = self._prepared.evenly_spaced(config.max_scans) if config.max_scans else self._prepared
+        return _read_prepared(self.text, chosen, sensor, reporter or Reporter())
+
+
+class SampleSource(Source):
+    """A folder of samples that ``lidargrit sample`` wrote."""
+
+    kind, data_set = "generated range images", "samples"
+
+    def __init__(self, text: str, folder: Path) -> None:
+        super().__init__(text)
+        self.folder = folder
+
+    @cached_property
+    def sensor(self) -> SensorModel:
+        """Sensor of the samples."""
+        return read_samples(self.folder).sensor
+
+    def projection_variant(self, config: DataConfig) -> str:
+        """Return the variant by which the training scans of the model became images."""
+        return projection_of(self.folder)
+
+    def images(
+        self, sensor: SensorModel | None = None, config: DataConfig | None = None, reporter: Reporter | None = None
+    ) -> RangeImages:
+        """Read the samples of the first seeds."""
+        return read_samples(self.folder, (config or DataConfig()).max_scans or None)
+
+    def learned_from(self) -> Provenance:
+        """Return the training scans of the model that generated the samples."""
+        return trained_on(self.folder)
+
+
+class TensorSource(Source):
+    """A folder of samples as another program writes them, in files of tensors.
+
+    Args:
+        text: name of the source.
+        folder: folder of ``.pth`` files.
+        samples_format: name of the sample format; told from the first file if empty.
+    """
+
+    kind, data_set = "generated range images", "samples"
+
+    def __init__(self, text: str, folder: Path, samples_format: str = "") -> None:
+        super().__init__(text)
+        self._folder, self.split = folder, samples_format or recognise(folder)
+        self._format = load_sample_format(self.split)
+
+    @cached_property
+    def sensor(self) -> SensorModel:
+        """Sensor that the size of the first tensor fits."""
+        return read_tensor_folder(self._folder, self.split, 1).sensor
+
+    def projection_variant(self, config: DataConfig) -> str:
+        """Return the variant that the program projects its training scans by."""
+        return self._format.variant
+
+    def images(
+        self, sensor: SensorModel | None = None, config: DataConfig | None = None, reporter: Reporter | None = None
+    ) -> RangeImages:
+        """Read the first samples."""
+        return read_tensor_folder(self._folder, self.split, (config or DataConfig()).max_scans or None)
+
+
+class RunSource(Source):
+    """A finished run: it holds no scans, but scans can be generated with it."""
+
+    kind = "a trained model"
+
+    def __init__(self, text: str, folder: Path) -> None:
+        super().__init__(text)
+        self.folder = folder
+
+    @cached_property
+    def generator(self) -> Generator:
+        """Trained generator, read when it is first asked for."""
+        return load(self.folder)
+
+    @property
+    def sensor(self) -> SensorModel:
+        """Sensor of the scans that are generated."""
+        return self.generator.sensor
+
+    def projection_variant(self, config: DataConfig) -> str:
+        """Return the variant by which the training scans became images."""
+        return projection_of(self.folder)
+
+    def images(
+        self, sensor: SensorModel | None = None, config: DataConfig | None = None, reporter: Reporter | None = None
+    ) -> RangeImages:
+        """Refuse: scans have to be generated first.
+
+        Raises:
+            DataError: always.
+        """
+        cure = f"generate some first with: lidargrit sample {self.text} FOLDER"
+        raise DataError(f"{self.text}, which holds {self.kind}", "scans or samples", cure)
+
+    def learned_from(self) -> Provenance:
+        """Return the training scans of the model."""
+        return trained_on(self.folder)
+
+
+def open_source(text: str, bad_points: BadPoints = "refuse", samples_format: str = "") -> Source:
+    """Find out what a user named, and open it once.
+
+    Args:
+        text: folder of a finished run or the word ``pretrained``; folder of samples, of ours or of another program
+            (``.pth``); folder or URL of prepared scans; or what data sets are opened by ("kitti_raw:ROOT:SPLIT",
+            "FOLDER", "simulated:COUNT", ...).
+        bad_points: treatment of NaN, infinite and origin points in scans.
+        samples_format: name of the program that wrote a folder of ``.pth`` files; told from the first file if empty.
+
+    Raises:
+        DataError: nothing that is known lies there.
+        UnknownNameError: no data set or sample format of that name.
+
+    Example:
+        >>> open_source("simulated:8:test").data_set
+        'simulated'
+    """
+    try:
+        folder = Path(locate(text)).expanduser()
+        here = folder.is_dir()
+    except (OSError, ValueError, RuntimeError):  # a name that no folder can have: too long, or of an unknown user
+        folder, here = Path(), False
+    if samples_format:
+        return TensorSource(text, folder, samples_format)
+    if here and is_run(folder):
+        return RunSource(text, folder)
+    if here and is_sample_folder(folder):
+        return SampleSource(text, folder)
+    if here and is_tensor_folder(folder):
+        return TensorSource(text, folder)
+    return PreparedSource(text) if is_prepared(text) else DatasetSource(text, bad_points)
+
+
+def load_range_images(
+    sources: Sequence[str], config: DataConfig, reporter: Reporter | None = None, sensor: SensorModel | None = None
+) -> RangeImages:
+    """Open the range images of several sources as one set, to train from or to watch.
+
+    Scans are projected once and then found in the cache: ``$LIDARGRIT_CACHE``, else ``lidargrit`` in the user's cache
+    folder. It may be deleted at any time.
+
+    Args:
+        sources: names of data sets, folders of scans, and prepared folders, as in :class:`DataConfig`.
+        config: how scans become images; its own sources are ignored.
+        reporter: told about progress.
+        sensor: sensor to project with, in place of the configuration's.
+
+    Raises:
+        DataError: no source, a source without a scan, generated scans, or prepared scans of another sensor.
+        ScanError: a scan that cannot be used; ``bad_scans=skip`` leaves it out.
+    """
+    if not sources:
+        raise DataError("no source of scans", "at least one", "name one with --set data.train=FOLDER")
+    sensor, parts = sensor or config.load_sensor(), []
+    for text in sources:
+        source = open_source(text, config.bad_points)
+        if not isinstance(source, (DatasetSource, PreparedSource)):
+            cure = "export samples first if you do want to learn from them: lidargrit export SAMPLES FOLDER"
+            raise DataError(f"{text}, which holds {source.kind}", "scans, or scans that were prepared", cure)
+        parts.append(source.images(sensor, config, reporter))
+    return RangeImages.joined(sensor, parts)
 
 
 def open_images(
-    source: str,
-    sensor: SensorModel | None = None,
-    config: DataConfig | None = None,
-    reporter: Reporter | None = None,
-    samples_format: str = "",
+    text: str, sensor: SensorModel | None = None, config: DataConfig | None = None, reporter: Reporter | None = None
 ) -> RangeImages:
-    """Open a folder of samples, or any source of scans as range images of a sensor.
+    """Open the range images of one source; see :func:`open_source` and :meth:`Source.images`."""
+    return open_source(text, config.bad_points if config else "refuse").images(sensor, config, reporter)
+
+
+def overlap(source: Source, images: RangeImages | None, reference: RangeImages) -> str:
+    """Say in a few words which scans a source, or the model behind it, shares with the reference; "" for none.
 
     Args:
-        source: a folder of samples, of ours or of another program (``.pth``), or what data sets are opened by
-            ("kitti_raw:ROOT:SPLIT", "FOLDER", ...).
-        sensor: of scans; the data set's own if not given. Samples have theirs.
-        config: how scans are read and projected, and how many at most; its sources and its sensor are not looked at.
-        reporter: hears of the projection.
-        samples_format: which program wrote a folder of ``.pth`` files; told from what is in them if empty.
+        source: source of the set; of samples and runs, the training scans of the model count.
+        images: images of the set, where it holds any.
+        reference: set that it is compared with.
     """
-    config = config or DataConfig()
-    if is_sample_folder(Path(source)):
-        return read_samples(Path(source), config.max_scans or None)
-    if samples_format or is_tensor_folder(Path(source)):
-        return read_tensor_folder(Path(source), samples_format, config.max_scans or None)
-    if is_prepared(source):
-        prepared = PreparedImages(source)
-        return load_range_images((source,), config, reporter, sensor or prepared.sensor)
-    dataset = open_dataset(source, config.bad_points)
-    return load_range_images((source,), replace(config, sensor=dataset.sensor), reporter, sensor)
+    seen = source.learned_from()
+    if seen is None:
+        seen = Provenance() if images is None else images.provenance
+    return seen.overlap(reference.provenance)
 
 
-def holds_images(source: str) -> bool:
-    """Tell whether a source holds range images, as samples and prepared scans are, and not the points of scans."""
-    return is_sample_folder(Path(source)) or is_tensor_folder(Path(source)) or is_prepared(source)
+def data_set_of(text: str) -> tuple[str, str]:
+    """Return the data set and the split of a source without opening its scans; "" for what is not known.
 
-
-def warn_of_overlap(source: str, images: RangeImages | None, reference: RangeImages, reporter: Reporter) -> None:
-    """Say what a set, or the model that made it, has seen of the reference.
-
-    Args:
-        source: of the set: samples or a run, whose training scans count, or scans.
-        images: of the set, where it holds scans.
-        reference: what it is compared with.
-        reporter: hears of it.
+    Prepared scans are of the data set that they were prepared from. A URL is not asked: that may take long.
     """
-    if shared := overlap(source, images, reference):
-        reporter.message(f"WARNING: {source} and the reference overlap ({shared}): the scores flatter it")
+    if "://" in text:
+        return "", ""
+    try:
+        return _data_set_or_nothing(PreparedFolder(text).read_spec().source if is_prepared(text) else text)
+    except LidarGritError:
+        return "", ""
 
 
-def overlap(source: str, images: RangeImages | None, reference: RangeImages) -> str:
-    """Say in a few words what a set, or the model that made it, has in common with the reference; "" if nothing."""
-    learned = Provenance() if images is None else images.provenance
-    folder = locate(source)
-    if is_sample_folder(folder) or is_run(folder):
-        learned = trained_on(folder)
-    return learned.overlap(reference.provenance)
+def _data_set_or_nothing(text: str) -> tuple[str, str]:
+    try:
+        return without_place(text)
+    except LidarGritError:
+        return "", ""
+
+
+def _read_prepared(text: str, prepared: PreparedImages, sensor: SensorModel, reporter: Reporter) -> RangeImages:
+    for why in prepared.left_out.values():
+        reporter.message(f"left out: {why}")
+    if not len(prepared):
+        raise DataError(f"no usable scan in {text}", "at least one", "see the messages above")
+    return RangeImages(sensor, [prepared])
+
+
+def _require_same_projection(text: str, images: PreparedImages, sensor: SensorModel, config: DataConfig) -> None:
+    """Refuse images that were prepared for other rays, or projected in another way than is wanted."""
+    prepared, wanted = images.sensor, sensor.fine()
+    if not prepared.same_rays(wanted):
+        raise DataError(
+            f"{text}, prepared for {prepared.name!r} ({prepared.height}x{prepared.width})",
+            f"the rays of {sensor.name!r} ({wanted.height}x{wanted.width} with every fine column)",
+            "name the sensor that it was prepared for, or prepare it for this one",
+        )
+    theirs = (images.spec.variant, prepared.projection, prepared.range_min_m, prepared.range_max_m)
+    ours = (config.projection_variant, wanted.projection, wanted.range_min_m, wanted.range_max_m)
+    if theirs != ours:
+        told = [f"{variant}, {projection}, {near:g} to {far:g} m" for variant, projection, near, far in (theirs, ours)]
+        raise DataError(
+            f"{text}, prepared by the projection {told[0]}", told[1], "ask for what was prepared, or prepare it anew"
+        )

@@ -21,9 +21,10 @@ from lidargrit.determinism import derive_seed
 from lidargrit.errors import CheckpointError, OutputError
 from lidargrit.files import claim_folder, is_taken, read_json, write_json, write_text
 from lidargrit.generators import RUN_FILE, TRAINED_ON_FILE, Generator, locate, recipe_settings
-from lidargrit.loading import DataConfig, RangeImages, load_range_images
+from lidargrit.loading import DataConfig, RangeImages
 from lidargrit.nn.objective import Objective
 from lidargrit.reporting import Reporter
+from lidargrit.sources import load_range_images
 from lidargrit.training.checkpoint import fingerprint
 from lidargrit.training.config import FitConfig, Recipe
 from lidargrit.training.engine import Engine

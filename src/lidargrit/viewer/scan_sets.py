@@ -9,15 +9,13 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from lidargrit.datasets import open_dataset
 from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import ConfigError, DataError, ScanError
-from lidargrit.generators import is_run, load, locate
 from lidargrit.loading import DataConfig
 from lidargrit.projection import index_map, project
 from lidargrit.reporting import Reporter
-from lidargrit.sensors import SensorModel, load_sensor
-from lidargrit.sources import holds_images, open_images
+from lidargrit.sensors import SensorModel
+from lidargrit.sources import DatasetSource, RunSource, Source, open_source
 from lidargrit.structures import RangeImage, Scan
 
 _CLASS_BITS = 0xFFFF  # of a label; the instance stands above them
@@ -67,23 +65,24 @@ def load_scan_sets(
         ScanError: a scan that cannot be used, unless such scans are skipped.
     """
     config, reporter = config or DataConfig(), reporter or Reporter()
-    generators = {source: load(source) for source in sources if is_run(locate(source))}
+    opened = [open_source(source, config.bad_points) for source in sources]
+    generators = {source.text: source.generator for source in opened if isinstance(source, RunSource)}
     sensor = next((generator.sensor for generator in generators.values()), None)
     sets: list[ScanSet] = []
-    for source in sources:
-        if source not in generators:
-            read = _of_images if holds_images(source) else _of_scans
-            sets.append(replace(read(source, count, sensor, config, reporter), name=_short(source)))
+    for source in opened:
+        if not isinstance(source, RunSource):
+            read = _of_scans if isinstance(source, DatasetSource) else _of_images
+            sets.append(replace(read(source, count, sensor, config, reporter), name=_short(source.text)))
     scans = sets[0] if sets else None
-    for source, generator in generators.items():
+    for name, generator in generators.items():
         if scans is not None and "encode" in generator.capabilities:
             images = scans.images
             reconstructed = _joined(generator.reconstruct(images[part]) for part in _parts(len(images)))
-            sets.append(ScanSet(f"{_short(source)}: reconstructed", reconstructed, scans.scan_names))
+            sets.append(ScanSet(f"{_short(name)}: reconstructed", reconstructed, scans.scan_names))
         seeds = range(seed, seed + count)
         names = tuple(f"seed {one}" for one in seeds)
         generated = _joined(generator.sample(seeds[part]) for part in _parts(count))
-        sets.append(ScanSet(f"{_short(source)}: generated", generated, names))
+        sets.append(ScanSet(f"{_short(name)}: generated", generated, names))
     if not sets:
         raise ConfigError("no source", "a scan, a folder or a run", "name at least one")
     return sets
@@ -97,16 +96,20 @@ def _joined(batches: Iterable[RangeImage]) -> RangeImage:
     return RangeImage.stack([batch[index].to("cpu") for batch in batches for index in range(len(batch))])
 
 
-def _of_images(source: str, count: int, sensor: SensorModel | None, config: DataConfig, reporter: Reporter) -> ScanSet:
-    images = open_images(source, sensor, config, reporter)
+def _of_images(
+    source: Source, count: int, sensor: SensorModel | None, config: DataConfig, reporter: Reporter
+) -> ScanSet:
+    images = source.images(sensor, config, reporter)
     indices = evenly_spaced(count, len(images))
     names = images.provenance.names
-    return ScanSet(source, images.batch(indices), tuple(names[index].rpartition("/")[2] for index in indices))
+    return ScanSet(source.text, images.batch(indices), tuple(names[index].rpartition("/")[2] for index in indices))
 
 
-def _of_scans(source: str, count: int, sensor: SensorModel | None, config: DataConfig, reporter: Reporter) -> ScanSet:
-    dataset = open_dataset(source, config.bad_points)
-    sensor = sensor or load_sensor(dataset.sensor)
+def _of_scans(
+    source: Source, count: int, sensor: SensorModel | None, config: DataConfig, reporter: Reporter
+) -> ScanSet:
+    dataset = source.scans()
+    sensor = sensor or source.sensor
     images, names, labels = [], [], []
     for index in evenly_spaced(count, len(dataset)):
         try:
@@ -120,10 +123,10 @@ def _of_scans(source: str, count: int, sensor: SensorModel | None, config: DataC
         names.append(dataset.name(index))
         labels.append(_label_of_pixels(scan, images[-1], config))
     if not images:
-        raise DataError(f"no usable scan in {source}", "at least one", "see the messages above")
+        raise DataError(f"no usable scan in {source.text}", "at least one", "see the messages above")
     known = [label for label in labels if label is not None]
     label = torch.stack(known) if len(known) == len(images) else None
-    return ScanSet(source, RangeImage.stack(images), tuple(names), label)
+    return ScanSet(source.text, RangeImage.stack(images), tuple(names), label)
 
 
 def _label_of_pixels(scan: Scan, image: RangeImage, config: DataConfig) -> Int[Tensor, "H W"] | None:

@@ -1,0 +1,120 @@
+"""A source is recognised once, by one function, and the object that it returns is passed on."""
+
+import ast
+import json
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from lidargrit import sources
+from lidargrit.errors import DataError, UnknownNameError
+from lidargrit.evaluation.comparison import EvalConfig, compare_sources
+from lidargrit.evaluation.intervals import Resampling
+from lidargrit.loading import DataConfig, PreparedImages, prepare
+from lidargrit.sources import (
+    DatasetSource,
+    PreparedSource,
+    RunSource,
+    SampleSource,
+    data_set_of,
+    load_range_images,
+    open_source,
+)
+from lidargrit.sources.samples import write_samples
+from test_generator_contract import made
+
+ONE = DataConfig(workers=1)
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    """Return a folder of every kind that a source may be."""
+    root = tmp_path_factory.mktemp("sources")
+    generator, _ = made("marginal")
+    generator.save(root / "run")
+    write_samples(generator, root / "run", root / "samples", range(2))
+    for split in ("train", "test"):
+        prepare(f"simulated:4:{split}", ONE, root / split)
+    return root
+
+
+def test_every_kind_is_told_from_its_name(folders):
+    kinds = {"run": RunSource, "samples": SampleSource, "train": PreparedSource}
+    for name, kind in kinds.items():
+        assert type(open_source(str(folders / name))) is kind
+    assert type(open_source("simulated:4:test")) is DatasetSource
+    assert type(open_source("pretrained")) is RunSource
+    prepared = open_source(str(folders / "test"))
+    assert (prepared.data_set, prepared.split) == ("simulated", "test")
+    assert prepared.projection_variant(DataConfig(projection_variant="reference")) == "exact", "as they were prepared"
+    samples = open_source(str(folders / "samples"))
+    assert (samples.data_set, len(samples.images())) == ("samples", 2)
+    assert samples.sensor.same_rays(open_source(str(folders / "run")).sensor)
+
+
+def test_two_prepared_folders_are_opened_once_each(folders, monkeypatch):
+    opened: Counter[str] = Counter()
+    plain = PreparedImages.__init__
+
+    def counted(self, location):
+        opened[Path(location).name] += 1
+        plain(self, location)
+
+    monkeypatch.setattr(PreparedImages, "__init__", counted)
+    quick = EvalConfig(metrics=("return_rate_per_ring",), resampling=Resampling(halves=0), data=ONE)
+    card, pair = compare_sources(str(folders / "train"), str(folders / "test"), quick)
+    assert opened == {"train": 1, "test": 1}
+    assert (card.samples.split, card.reference.split) == ("train", "test")
+    assert len(pair.samples) == 4
+
+
+def test_a_part_of_a_prepared_folder_is_the_same_as_of_its_scans(folders):
+    some = DataConfig(workers=1, max_scans=2)
+    prepared = open_source(str(folders / "train")).images(None, some)
+    names = open_source(str(folders / "train")).images().provenance.names
+    assert prepared.provenance.names == (names[0], names[2])
+    assert len(prepared) == 2
+
+
+def test_what_a_kind_cannot_give_is_refused_in_one_line(folders):
+    with pytest.raises(DataError, match="which holds a trained model; wanted scans or samples; generate some first"):
+        open_source(str(folders / "run")).images()
+    with pytest.raises(DataError, match="which holds generated range images; wanted the points of scans"):
+        open_source(str(folders / "samples")).scans()
+    with pytest.raises(DataError, match="which holds generated range images; wanted scans, or scans that were prepare"):
+        load_range_images((str(folders / "samples"),), ONE)
+
+
+@pytest.mark.parametrize("name", ["~nobody-of-that-name/x", "x" * 5000, "x/" * 3000, "no such folder"])
+def test_names_that_no_folder_can_have(name):
+    with pytest.raises((DataError, UnknownNameError)):
+        open_source(name)
+
+
+def test_the_data_set_of_prepared_scans_is_told_when_the_scans_are_gone(tmp_path):
+    prepare("simulated:1", ONE, tmp_path / "prepared")
+    plan = json.loads((tmp_path / "prepared" / "plan.json").read_text())
+    plan["source"] = "kitti_360:/nowhere/kitti_360:test"
+    (tmp_path / "prepared" / "plan.json").write_text(json.dumps(plan))
+    source = open_source(str(tmp_path / "prepared"))
+    assert (source.data_set, source.split) == data_set_of(str(tmp_path / "prepared")) == ("kitti_360", "test")
+
+
+def test_nobody_else_asks_what_a_source_is():
+    """Only ``sources`` recognises; ``loading`` and the data sets define what it recognises by."""
+    asking = {"is_prepared", "is_sample_folder", "is_tensor_folder", "open_dataset", "PreparedFolder"}
+    root = Path(sources.__file__).parents[1]
+    allowed = {"sources", "datasets", "loading"}
+    found = {}
+    for path in root.rglob("*.py"):
+        if path.relative_to(root).parts[0] not in allowed:
+            names = {node.id for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Name)}
+            if asked := sorted(names & asking):
+                found[path.relative_to(root).as_posix()] = asked
+    assert found == {
+        "fitting/__init__.py": ["open_dataset"],  # below the room of sources; takes points of scans only
+        "cli/inspect.py": ["open_dataset"],
+        "cli/prepare.py": ["open_dataset"],
+        "publishing/__init__.py": ["is_sample_folder"],
+    }
