@@ -265,7 +265,9 @@ def open_source(text: str, bad_points: BadPoints = "refuse", samples_format: str
     try:
         folder = Path(locate(text)).expanduser()
         here = folder.is_dir()
-    except (OSError, ValueError, RuntimeError):  # a name that no folder can have: too long, or of an unknown user
+    except (OSError, ValueError, RuntimeError) as error:  # a name too long, or of an unknown user, or with NUL
+        if ":" not in text:
+            raise DataError(f"{text[:40]!r}, which names no folder ({error})", "a source", "check the path") from None
         folder, here = Path(), False
     if samples_format:
         return TensorSource(text, folder, samples_format)
@@ -275,7 +277,9 @@ def open_source(text: str, bad_points: BadPoints = "refuse", samples_format: str
         return SampleSource(text, folder)
     if here and is_tensor_folder(folder):
         return TensorSource(text, folder)
-    return PreparedSource(text) if is_prepared(text) else DatasetSource(text, bad_points)
+    if "://" in text or (here and is_prepared(text)):
+        return PreparedSource(text)
+    return DatasetSource(text, bad_points)
 
 
 def load_range_images(
