@@ -68,7 +68,7 @@ def prepare(
     """
     reporter, sensor = reporter or Reporter(), sensor or config.load_sensor()
     rank, world_size = rank_and_world_size(rank, world_size)
-    dataset = dataset or open_dataset(source, config.bad_points)
+    dataset = open_dataset(source, config.bad_points) if dataset is None else dataset
     if dataset.sensor != sensor.name and not config.sensor.endswith(".json"):
         reporter.message(f"WARNING: {source} was made by {dataset.sensor}, and is imaged as {sensor.name}")
     spec, scans = _spec(source, dataset, sensor, config)

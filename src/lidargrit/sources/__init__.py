@@ -375,5 +375,7 @@ def _require_same_projection(text: str, images: PreparedImages, sensor: SensorMo
     if theirs != ours:
         told = [f"{variant}, {projection}, {near:g} to {far:g} m" for variant, projection, near, far in (theirs, ours)]
         raise DataError(
-            f"{text}, prepared by the projection {told[0]}", told[1], "ask for what was prepared, or prepare it anew"
+            f"{text}, prepared by the projection {told[0]}",
+            told[1],
+            "choose that projection, or prepare the scans anew",
         )
