@@ -2,13 +2,15 @@
 
 import ast
 import json
+import shutil
 from collections import Counter
 from pathlib import Path
 
 import pytest
 
 from lidargrit import sources
-from lidargrit.errors import DataError, UnknownNameError
+from lidargrit.errors import ConfigError, DataError, OutputError, UnknownNameError
+from lidargrit.evaluation.benchmark import Benchmark
 from lidargrit.evaluation.comparison import EvalConfig, compare_sources
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.loading import DataConfig, PreparedImages, prepare
@@ -84,6 +86,32 @@ def test_what_a_kind_cannot_give_is_refused_in_one_line(folders):
         open_source(str(folders / "samples")).scans()
     with pytest.raises(DataError, match="which holds generated range images; wanted scans, or scans that were prepare"):
         load_range_images((str(folders / "samples"),), ONE)
+
+
+@pytest.mark.parametrize("gone", ["folder", "samples.json"])
+def test_samples_that_vanish_meanwhile_are_no_success(tmp_path, gone):
+    generator, _ = made("marginal")
+    generator.save(tmp_path / "run")
+    plain = generator.stream
+
+    def stream(seeds, sampling, batch_size):
+        for number, image in enumerate(plain(seeds, sampling, batch_size)):
+            if number == 1:
+                shutil.rmtree(tmp_path / "out") if gone == "folder" else (tmp_path / "out" / gone).unlink()
+            yield image
+
+    generator.stream = stream
+    with pytest.raises(OutputError, match="removed while .* written; wanted a folder that no other program changes"):
+        write_samples(generator, tmp_path / "run", tmp_path / "out", range(3))
+
+
+def test_numbers_too_large_are_refused_before_any_work():
+    with pytest.raises(ConfigError, match=r"-n 1e\+20, --seed 0; wanted 0 to 2\^63 - 1"):
+        EvalConfig(max_scans=10**20)
+    with pytest.raises(ConfigError, match="wanted 0 to"):
+        EvalConfig(seed=2**64)
+    with pytest.raises(ConfigError, match=r"1e\+20 samples"):
+        Benchmark("simulated:2:test", 10**20)
 
 
 @pytest.mark.parametrize("name", ["~nobody-of-that-name/x", "x" * 5000, "x/" * 3000, "no such folder"])

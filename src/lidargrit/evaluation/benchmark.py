@@ -27,6 +27,7 @@ from lidargrit.sources.samples import write_samples
 from lidargrit.training import Recipe, check_folder, train, training_flops, with_budget
 
 COSTS = "costs.json"
+_SAMPLES_AT_MOST = 10**8  # names of files have eight digits
 
 
 @dataclass(frozen=True)
@@ -48,10 +49,10 @@ class Benchmark:
     flops: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.num_samples < 2 or not 0 <= self.flops < math.inf:
+        if not 2 <= self.num_samples <= _SAMPLES_AT_MOST or not 0 <= self.flops < math.inf:
             raise ConfigError(
-                f"{self.num_samples} samples, {self.flops:g} operations",
-                "at least 2 samples, and a budget from 0 on",
+                f"{str(self.num_samples)[:25]} samples, {self.flops:g} operations",
+                f"2 to {_SAMPLES_AT_MOST:,} samples, and a budget from 0 on",
                 "correct the number",
             )
 

@@ -23,6 +23,7 @@ from lidargrit.reporting import Reporter
 from lidargrit.sources import Source, open_source
 
 _FEW = 100  # scans: below that the interval itself rests on too little, and values hardly differ from real against real
+_LARGEST = 2**63  # above the largest seed that torch takes
 
 
 @dataclass(frozen=True)
@@ -56,8 +57,8 @@ class EvalConfig:
     data: DataConfig = field(default_factory=DataConfig)
 
     def __post_init__(self) -> None:
-        if self.max_scans < 0 or self.seed < 0:
-            raise ConfigError(f"-n {self.max_scans}, --seed {self.seed}", "0 or more", "correct the number")
+        if not (0 <= self.max_scans < _LARGEST and 0 <= self.seed < _LARGEST):
+            raise ConfigError(f"-n {self.max_scans:.3g}, --seed {self.seed:.3g}", "0 to 2^63 - 1", "correct the number")
 
     def facts(self) -> dict[str, Any]:
         """Return the entries of a scorecard, as plain values."""

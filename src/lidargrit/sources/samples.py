@@ -97,6 +97,19 @@ def write_samples(
     if not is_sample_folder(folder) or _missing(folder, seeds):
         raise removed_meanwhile(folder)
     remove_partials(folder)
+    names = {entry.name for entry in os.scandir(folder)} if folder.is_dir() else set()
+    if gone := [seed for seed in seeds if _file(folder, seed).name not in names]:
+        raise OutputError(
+            f"{folder}, from which {len(gone):,} samples were removed while others were written",
+            "a folder that no other program changes",
+            "give the same command again",
+        )
+    if MANIFEST not in names:
+        raise OutputError(
+            f"{folder}, whose {MANIFEST} was removed while samples were written",
+            "a folder that no other program changes",
+            "remove the folder and give the same command again",
+        )
 
 
 def read_samples(folder: Path, count: int | None = None) -> RangeImages:
