@@ -58,7 +58,9 @@ class EvalConfig:
 
     def __post_init__(self) -> None:
         if not (0 <= self.max_scans < _LARGEST and 0 <= self.seed < _LARGEST):
-            raise ConfigError(f"-n {self.max_scans:.3g}, --seed {self.seed:.3g}", "0 to 2^63 - 1", "correct the number")
+            raise ConfigError(
+                f"-n {str(self.max_scans)[:25]}, --seed {str(self.seed)[:25]}", "0 to 2^63 - 1", "correct the number"
+            )
 
     def facts(self) -> dict[str, Any]:
         """Return the entries of a scorecard, as plain values."""
