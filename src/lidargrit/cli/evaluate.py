@@ -47,17 +47,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Score and print a table."""
     from lidargrit.evaluation.command import evaluate, read_config
-    from lidargrit.evaluation.tables import side_by_side
-    from lidargrit.files import read_json, refuse_to_overwrite
+    from lidargrit.evaluation.tables import read_tables
     from lidargrit.reporting import TerminalReporter
     from lidargrit.viewer.report import write_report
 
     refuse_taken(options)
     if options.tables:
-        table = side_by_side(options.tables, options.format)
-        return tell(options, table, {path.stem: read_json(path) for path in options.tables})
+        return tell(options, *read_tables(options.tables, options.format))
     names = "protocol metrics variant projection_variant max_scans seed samples_format device weights groups intervals"
     config = read_config(**{name: vars(options)[name] for name in (*names.split(), "bad_points", "bad_scans")})
-    refuse_to_overwrite(options.report, options.overwrite)
-    words = (options.samples, options.reference, config, TerminalReporter(), options.report)
-    tell(options, *evaluate(*words, write_report))
+    sets, report = (options.samples, options.reference), (options.report, write_report, options.overwrite)
+    tell(options, *evaluate(*sets, config, TerminalReporter(), *report))

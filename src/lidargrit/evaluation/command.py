@@ -14,6 +14,7 @@ from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.pairs import EvalPair
 from lidargrit.evaluation.reconstruction import score_run
 from lidargrit.evaluation.scorecard import Scorecard
+from lidargrit.files import refuse_to_overwrite
 from lidargrit.formats import BadPoints
 from lidargrit.loading import DataConfig
 from lidargrit.metrics import load_metric
@@ -29,6 +30,7 @@ def evaluate(
     reporter: Reporter,
     report: Path | None = None,
     write_report: Callable[[Scorecard, EvalPair, Path], None] | None = None,
+    overwrite: bool = False,
 ) -> tuple[str, dict[str, Any]]:
     """Score samples against a reference, or the reconstructions of a run, and return a table and its plain values.
 
@@ -39,13 +41,16 @@ def evaluate(
         reporter: told about progress and warnings.
         report: file for a report; none is written for a run.
         write_report: function that writes the report.
+        overwrite: whether a report that is there already is replaced.
 
     Raises:
         ConfigError: a name is missing.
+        OutputError: the report is there already.
     """
     if not (samples and reference):
         got = f"{samples!r} alone" if samples else "nothing to score"
         raise ConfigError(got, "samples and what they are compared with", "name two sets, or use --tables")
+    refuse_to_overwrite(report, overwrite)
     usable_device(config.device)
     first = open_source(samples, config.data.bad_points, config.samples_format)
     second = open_source(reference, config.data.bad_points)

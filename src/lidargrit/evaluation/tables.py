@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 from lidargrit.errors import DataError
 from lidargrit.evaluation.scorecard import Score, Scorecard, format_value
+from lidargrit.files import read_json
 
 Format = Literal["text", "markdown", "latex"]
 Column = tuple[str, str]  # metric, variant
@@ -56,6 +57,11 @@ def side_by_side(paths: Sequence[Path], form: Format = "text") -> str:
         measured.setdefault(key, []).append((path.stem, card))
     blocks = [block for cards in measured.values() for block in (_measured(cards), *_published(cards))]
     return "\n\n".join(_DRAWN[form](block) for block in blocks)
+
+
+def read_tables(paths: Sequence[Path], form: Format = "text") -> tuple[str, dict[str, Any]]:
+    """Return the scores of several files side by side, and the content of each file by its name."""
+    return side_by_side(paths, form), {path.stem: read_json(path) for path in paths}
 
 
 def _measured(cards: Sequence[tuple[str, Scorecard]]) -> Block:

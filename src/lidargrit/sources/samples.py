@@ -70,18 +70,7 @@ def write_samples(
     }
     if variant := projection_of(run_folder):
         manifest["projection_variant"] = variant
-    if (folder / MANIFEST).exists():
-        there = read_json(folder / MANIFEST)
-        if not _same(there, manifest, configuration.to_json(generator.Sampling())):
-            raise OutputError(
-                f"{folder}, which holds samples of another model or drawn in another way",
-                "an empty folder, or one that this very command began",
-                "choose another folder",
-            )
-    elif is_taken(folder) and not (folder / MANIFEST).exists():  # another process may just have begun it
-        raise OutputError(f"{folder}, which is not empty and holds no samples", "an empty folder", "choose another one")
-    else:
-        write_json(folder / MANIFEST, manifest)
+    _claim(folder, manifest, configuration.to_json(generator.Sampling()))
     if (run_folder / TRAINED_ON_FILE).is_file() and not (folder / TRAINED_ON_FILE).exists():
         write_text(folder / TRAINED_ON_FILE, (run_folder / TRAINED_ON_FILE).read_text(encoding="utf-8"))
     missing = _missing(folder, seeds)
@@ -97,6 +86,27 @@ def write_samples(
     if not is_sample_folder(folder) or _missing(folder, seeds):
         raise removed_meanwhile(folder)
     remove_partials(folder)
+    _require_written(folder, seeds)
+
+
+def _claim(folder: Path, manifest: dict[str, Any], defaults: dict[str, Any]) -> None:
+    """Write the manifest into a free folder, or find that the samples there are of the same kind."""
+    if (folder / MANIFEST).exists():
+        there = read_json(folder / MANIFEST)
+        if not _same(there, manifest, defaults):
+            raise OutputError(
+                f"{folder}, which holds samples of another model or drawn in another way",
+                "an empty folder, or one that this very command began",
+                "choose another folder",
+            )
+    elif is_taken(folder) and not (folder / MANIFEST).exists():  # another process may just have begun it
+        raise OutputError(f"{folder}, which is not empty and holds no samples", "an empty folder", "choose another one")
+    else:
+        write_json(folder / MANIFEST, manifest)
+
+
+def _require_written(folder: Path, seeds: Sequence[int]) -> None:
+    """Refuse to call it a success if files were removed while others were written."""
     names = {entry.name for entry in os.scandir(folder)} if folder.is_dir() else set()
     if gone := [seed for seed in seeds if _file(folder, seed).name not in names]:
         raise OutputError(
