@@ -1,4 +1,4 @@
-"""The floor: every pixel drawn from its own histogram, as if it had no neighbours; seeds → range images."""
+"""Pixel statistics: every pixel sampled from its own histogram, as if it had no neighbours; seeds → range images."""
 
 from __future__ import annotations
 

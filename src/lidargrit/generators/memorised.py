@@ -1,4 +1,4 @@
-"""The ceiling, and a cheat: the training scans themselves; seeds → range images."""
+"""Memorised: the training scans themselves, which is cheating; seeds → range images."""
 
 from __future__ import annotations
 

@@ -1,11 +1,11 @@
-"""The floor of every table: each pixel from its own histogram over simulated or your own scans; trains in seconds."""
+"""Pixel statistics: each pixel from its own histogram over simulated or your own scans; trains in seconds."""
 
 from lidargrit.generators.marginal import MarginalConfig
 from lidargrit.loading import DataConfig
 from lidargrit.training import Recipe
 
 RECIPE = Recipe(
-    title="marginal: every pixel drawn from its own histogram, the floor of every table",
+    title="marginal: every pixel sampled from its own histogram, a reference row of every table",
     generator="marginal",
     model=MarginalConfig(),
     data=DataConfig(train=("simulated:2000:train",), val=("simulated:32:val",)),

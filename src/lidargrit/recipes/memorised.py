@@ -1,11 +1,11 @@
-"""The ceiling of every table, and a cheat: training scans given back; simulated or your own; trains in seconds."""
+"""Memorised: training scans given back, which is cheating; simulated or your own scans; trains in seconds."""
 
 from lidargrit.generators.memorised import MemorisedConfig
 from lidargrit.loading import DataConfig
 from lidargrit.training import Recipe
 
 RECIPE = Recipe(
-    title="memorised: training scans given back, the ceiling of every table",
+    title="memorised: training scans given back, a reference row of every table",
     generator="memorised",
     model=MemorisedConfig(),
     data=DataConfig(train=("simulated:2000:train",), val=("simulated:32:val",)),
