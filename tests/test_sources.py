@@ -94,8 +94,8 @@ def test_samples_that_vanish_meanwhile_are_no_success(tmp_path, gone):
     generator.save(tmp_path / "run")
     plain = generator.stream
 
-    def stream(seeds, sampling, batch_size):
-        for number, image in enumerate(plain(seeds, sampling, batch_size)):
+    def stream(seeds, sampling):
+        for number, image in enumerate(plain(seeds, sampling)):
             if number == 1:
                 shutil.rmtree(tmp_path / "out") if gone == "folder" else (tmp_path / "out" / gone).unlink()
             yield image

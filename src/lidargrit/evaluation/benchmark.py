@@ -51,8 +51,6 @@ class Benchmark:
     def __post_init__(self) -> None:
         if not 2 <= self.num_samples <= _SAMPLES_AT_MOST or not 0 <= self.flops < math.inf:
             raise ConfigError(
-        if not 2 <= self.num_samples <= _SAMPLES_AT_MOST or not 0 <= self.flops < math.inf:
-            raise ConfigError(
                 f"{str(self.num_samples)[:25]} samples, {self.flops:g} operations",
                 f"2 to {_SAMPLES_AT_MOST:,} samples, and a budget from 0 on",
                 "correct the number",
