@@ -24,11 +24,12 @@ from lidargrit.generators.lidargrit import (
     sample_token,
 )
 from lidargrit.generators.maskgit import MaskedSampling, MaskGit, MaskGitConfig
-from lidargrit.loading import DataConfig, load_range_images
+from lidargrit.loading import DataConfig
 from lidargrit.nn.decoding import CachedDecoder
 from lidargrit.nn.pixel_networks import PixelDecoderConfig
 from lidargrit.nn.transformer import TransformerConfig
 from lidargrit.sensors import load_sensor
+from lidargrit.sources import load_range_images
 from lidargrit.structures import RangeImage
 from lidargrit.tokenizers.vqvae import VqvaeConfig
 from lidargrit.training import FitConfig, Recipe, train
