@@ -96,7 +96,7 @@ def without_folders(text: str) -> str:
     """Return a text in which absolute paths have lost their folders, for pages and files that others will read.
 
     Example:
-        >>> without_folders("kitti_360:/home/me/data/kitti_360:train against ~/runs/mine/samples")
+        >>> without_folders("kitti_360:/data/mine/kitti_360:train against ~/runs/mine/samples")
         'kitti_360:…/kitti_360:train against …/samples'
     """
     return _ABSOLUTE_PATH.sub(lambda found: "…/" + re.split(r"[/\\]", found[0].rstrip("/\\"))[-1], text)

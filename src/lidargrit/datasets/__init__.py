@@ -212,4 +212,5 @@ def _root_and_split(text: str) -> tuple[Path, str]:
     root, colon, split = before.rpartition(":")
     if not colon:
         root, split = before, "all"
-    return user_path(root), split + (share[0] if share else "")
+    folder = user_path(root) if root else Path()  # published runs name a data set and a split, and no folder
+    return folder, split + (share[0] if share else "")
