@@ -46,7 +46,7 @@ def decode(
     Args:
         values: level of the range, perhaps reflectance; cut to [-1, 1].
         sensor: sensor of the images.
-        returned: where there is a return; by default where the range lies inside the sensor's limits, as published.
+        returned: mask of the returns; by default the pixels whose range lies inside the sensor's limits, as published.
     """
     exponent = (values[:, 0].clamp(-1, 1) + 1) * (math.log2(1 + sensor.range_max_m) / 2)
     range_m = torch.exp2(exponent) - 1
