@@ -120,7 +120,8 @@ def test_a_plan_tells_scans_cost_and_what_is_missing(tmp_path, capsys, monkeypat
     assert "train r2dm_kitti_360 (to do)" in told
     assert "1.00e+18 floating-point operations, by estimate" in told
     assert "sample 5,000 scans" in told
-    assert "not available: LiDARGen" in told
+    assert "train lidargen_kitti_360 (to do)" in told
+    assert "not available: UltraLiDAR" in told
     assert not (tmp_path / "out").exists()
 
 

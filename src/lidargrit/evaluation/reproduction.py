@@ -61,11 +61,14 @@ TABLES = {
         "lidargrit_kitti_360",
         "kitti_360",
         "train_without_val",
-        {"R2DM": ("r2dm_kitti_360", "r2dm_small"), "LidarGRIT": ("lidargrit_kitti_360", "small")},
+        {
+            "LiDARGen": ("lidargen_kitti_360", "lidargen_small"),
+            "R2DM": ("r2dm_kitti_360", "r2dm_small"),
+            "LidarGRIT": ("lidargrit_kitti_360", "small"),
+        },
         _KITTI_360_IMAGES,
         (*_KITTI_360_IMAGES[:2], "data.column_stride=8"),
         {
-            "LiDARGen": "no generator here; its own samples can be scored (lidargrit evaluate)",
             "UltraLiDAR (unofficial program)": "no generator here, and its voxels make no range image",
         },
         ("R2DM learns here from the images that it is scored against; the paper's were projected otherwise",),

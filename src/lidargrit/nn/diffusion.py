@@ -64,6 +64,10 @@ class SeededNoise:
         """Draw the next image of each seed."""
         return torch.stack([torch.randn(self._shape, generator=rng) for rng in self._rngs]).to(self._device)
 
+    def uniform(self) -> Float[Tensor, "B C H W"]:
+        """Sample the next image of each seed, with values that are uniform in [0, 1)."""
+        return torch.stack([torch.rand(self._shape, generator=rng) for rng in self._rngs]).to(self._device)
+
 
 def step_back(
     noisy: Float[Tensor, "B C H W"],
