@@ -267,7 +267,8 @@ def test_an_image_is_learned_by_heart():
     sensor = load_sensor("vlp16").with_columns(16)
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        generator = LidarGen(LidarGenConfig(channels=8, reflectance=False, sigma_largest=1.0, levels=8, steps_each=3), sensor)
+        config = LidarGenConfig(channels=8, reflectance=False, sigma_largest=1.0, levels=8, steps_each=3)
+        generator = LidarGen(config, sensor)
     range_m = (5 + 40 * torch.rand(1, 1, 16, generator=torch.Generator().manual_seed(0))).expand(4, 16, 16)
     images = RangeImage(range_m.clone(), range_m > 0, sensor)
     sampling = LangevinSampling(step_lr=2e-5, raydrop="sensor")
@@ -322,7 +323,10 @@ def test_a_checkpoint_of_the_program_becomes_a_run(image_channels, tmp_path):
         (lambda c: c[4].pop("res1.0.conv1.bias"), r"lacks 'network\.res1\.0\.conv1\.bias'"),
         (lambda c: c[4].update({"more": torch.ones(1)}), r"has besides 'network\.more'"),
         (lambda c: c[4].update({"normalizer.beta": torch.ones(4).half()}), r"'normalizer\.beta' is no float32 tensor"),
-        (lambda c: c[4].update({"begin_conv.weight": torch.ones(1 << 16, 4, 3, 3)}), r"with a network (of more than|that cannot be built)"),
+        (
+            lambda c: c[4].update({"begin_conv.weight": torch.ones(1 << 16, 4, 3, 3)}),
+            "with a network (of more|that can)",
+        ),
         (lambda c: c[4].update({"end_conv.weight": torch.ones(7, 4, 3, 3)}), "images of 7 channels"),
     ],
 )
