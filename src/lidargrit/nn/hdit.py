@@ -219,12 +219,12 @@ class _Attention(nn.Module):
         sharpness = self.scale.clamp(max=math.log(100)).exp().sqrt()[:, None, None]
         turn = self.rope(angles_rad)
         q, k = (_turned(_unit(each) * sharpness, turn) for each in (q, k))
+        q, k = q.type_as(v), k.type_as(v)
         if self.everywhere:
-            rows = q.shape[2]
-            flat = [each.flatten(2, 3) for each in (q.type_as(v), k.type_as(v), v)]
-            mixed = F.scaled_dot_product_attention(*flat, scale=1.0).unflatten(2, (rows, -1))
+            mixed = F.scaled_dot_product_attention(q.flatten(2, 3), k.flatten(2, 3), v.flatten(2, 3), scale=1.0)
+            mixed = mixed.unflatten(2, q.shape[2:4])
         else:
-            mixed = neighbourhood_attention(q.type_as(v), k.type_as(v), v)
+            mixed = neighbourhood_attention(q, k, v)
         return x + self.out_proj(mixed.permute(0, 2, 3, 1, 4).flatten(-2))
 
 
