@@ -36,10 +36,10 @@ class Benchmark:
 
     Args:
         reference: a source of scans that none was trained on.
-        num_samples: of each system.
-        settings: of the evaluation; its protocol above all.
-        recipe_settings: of every recipe, as ``train --set`` takes them: the same data for all.
-        flops: what the training of each takes; 0 leaves every recipe's own budget.
+        num_samples: number of samples of each system.
+        settings: settings of the evaluation, above all its protocol.
+        recipe_settings: settings of every recipe, as for ``train --set``: the same data for all.
+        flops: operations of the training of each system; 0 keeps every recipe's own budget.
     """
 
     reference: str
@@ -58,15 +58,15 @@ class Benchmark:
 
 
 def run(systems: Sequence[str], folder: Path, benchmark: Benchmark, reporter: Reporter | None = None) -> list[Path]:
-    """Train or load each system, draw its samples and score them, and return the files of scores.
+    """Train or load each system, sample from it and score the samples, and return the files of scores.
 
     Args:
-        systems: each a recipe's name or the folder of a finished run, and after a colon, if wanted, how it is drawn
-            from: ``r2dm_small:steps=32``. A recipe is trained once, in how many ways ever it is drawn from.
-        folder: gets a run folder ``runs/RECIPE``, and for each system ``SYSTEM/samples``, ``SYSTEM/SYSTEM.json`` with
-            its scores and ``SYSTEM/costs.json``. What is there is not made again, nor scored again.
-        benchmark: what all have in common.
-        reporter: hears of the progress.
+        systems: names of recipes or folders of finished runs, each with sampling choices after a colon if wanted:
+            ``r2dm_small:steps=32``. A recipe that occurs with several sampling choices is trained once.
+        folder: output folder. It gets a run folder ``runs/RECIPE``, and for each system ``SYSTEM/samples``,
+            ``SYSTEM/SYSTEM.json`` with its scores and ``SYSTEM/costs.json``. Existing results are kept.
+        benchmark: settings that all systems share.
+        reporter: receiver of the progress.
 
     Raises:
         ConfigError: a system that occurs twice, or a recipe that does not take a setting.
@@ -128,7 +128,7 @@ class _Plan:
     Args:
         run: folder of a finished run, or of the one that the recipe gets.
         recipe: None for a finished run.
-        sampling: how it is drawn from, of the generator's own ``Sampling``.
+        sampling: settings of the generator's own ``Sampling``.
     """
 
     run: Path

@@ -37,7 +37,7 @@ def evaluate(
     Args:
         samples: name of the first set: samples, any source of scans, or a finished run.
         reference: name of the second set.
-        config: how they are compared.
+        config: metrics, protocol and projection of the comparison.
         reporter: told about progress and warnings.
         report: file for a report; none is written for a run.
         write_report: function that writes the report.

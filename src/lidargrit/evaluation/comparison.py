@@ -37,11 +37,11 @@ class EvalConfig:
         projection_variant: variant by which real scans become images, in place of the protocol's.
         max_scans: largest number of scans of each set; 0 for the protocol's.
         seed: seed of the random numbers that metrics use.
-        resampling: how intervals and real against real are computed.
+        resampling: settings of the intervals and of real against real.
         weights: files of published weights, by the name of their network.
         samples_format: name of the program that wrote a folder of tensors; told from the first file if empty.
         device: name of the device that networks compute on.
-        data: how scans are read.
+        data: settings of reading scans.
     """
 
     protocol: str = DEFAULT

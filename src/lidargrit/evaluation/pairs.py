@@ -111,7 +111,7 @@ def pair_for_protocol(
         samples: source of the first set.
         reference: source of the second set; scans are projected with the sensor of the first.
         protocol: definition of the sensor, range window, data set and number of scans that are wanted.
-        config: how scans are read and projected; ``max_scans`` further limits their number.
+        config: settings of reading and projecting scans; ``max_scans`` further limits their number.
         reporter: told about the projection.
 
     Raises:

@@ -38,8 +38,8 @@ class SimulatedScans:
     """Scans of the simulator, before and after the question which rays return.
 
     Args:
-        clean: where all surfaces within the sensor's limits return.
-        measured: what the sensor records.
+        clean: range images where all surfaces within the sensor's limits return.
+        measured: range images as the sensor records them.
     """
 
     clean: RangeImage
@@ -51,9 +51,9 @@ class CurveScore:
     """How far one curve of real scans is from others, each a Jensen-Shannon distance from 0 (alike) to 1.
 
     Args:
-        simulated: from simulated scans, the generated side of the result.
-        bernoulli: from clean simulated ranges with each return dropped by a coin of one constant rate.
-        real_against_real: from the second half of the real scans to the first, which tells how much real scans differ.
+        simulated: distance of simulated scans; they are the generated side of the result.
+        bernoulli: distance of clean simulated ranges, each return of which is dropped with one constant probability.
+        real_against_real: distance between the two halves of the real scans, which shows how much real scans differ.
     """
 
     simulated: MetricResult
@@ -71,7 +71,7 @@ def compare(simulated: SimulatedScans, real: RangeImages, curves: Sequence[str] 
 
     Args:
         simulated: scans of the real ones' sensor, as many as wanted.
-        real: at least two, in the order in which they were recorded.
+        real: real scans, at least two, in the order of their recording.
         curves: names of metrics. ``reflectance_histogram`` is left out where a real scan has no reflectance.
 
     Raises:
@@ -108,8 +108,8 @@ def drop_by_coin(clean: RangeImage, return_share: float, seed: int = 0) -> Range
 
     Args:
         clean: a batch where all surfaces return.
-        return_share: of all pixels, in [0, 1]; where fewer pixels see a surface, all of these return.
-        seed: of the coin.
+        return_share: share of all pixels that return, in [0, 1]; if fewer pixels see a surface, all of these return.
+        seed: seed of the random numbers.
     """
     rng = torch.Generator().manual_seed(seed)
     keep = return_share / max(float(clean.return_mask.float().mean()), 1e-9)
@@ -130,13 +130,13 @@ def compare_source(
     """Simulate scans and compare them with those of a source.
 
     Args:
-        source: of real scans.
-        count: of simulated scans, and of real ones at most, evenly spaced.
-        sensor: its name or ``.json`` file; the data set's own if empty.
-        fine: take every column that the sensor fires, not only those that its image keeps.
-        seed: of the first simulated scan.
-        config: how scans are read and projected.
-        reporter: hears how far it is.
+        source: source of real scans.
+        count: number of simulated scans, and largest number of real ones, which are evenly spaced.
+        sensor: name or ``.json`` file of the sensor; the data set's own if empty.
+        fine: whether every column that the sensor fires is taken, not only those that its image keeps.
+        seed: seed of the first simulated scan.
+        config: settings for reading and projecting scans.
+        reporter: receiver of the progress.
     """
     if count < 2 or seed < 0:
         raise ConfigError(f"{count} scans from seed {seed}", "at least 2, and no negative seed", "correct the number")

@@ -34,7 +34,7 @@ class ReconstructionErrors:
         drop_precision: share of the decoded ray drops that are real ones.
         drop_recall: share of the real ray drops that are decoded as such.
         drop_iou: ray drops common to both by those of either.
-        num_scans: how many pairs went in.
+        num_scans: number of pairs.
     """
 
     range_mae_m: float
@@ -61,9 +61,9 @@ class ReconstructionScore:
         """Take in a batch of pairs.
 
         Args:
-            real: what the tokenizer was shown, a batch.
-            clean_range_m: what its decoder gave for every pixel, in metres, no ray dropped.
-            return_mask: which pixels it decoded as a return.
+            real: batch of scans that the tokenizer encoded.
+            clean_range_m: decoded range (B, H, W) of every pixel in metres, without ray drop.
+            return_mask: decoded mask (B, H, W), True = a return.
 
         Raises:
             ConfigError: the two pair differ in shape.
@@ -142,7 +142,7 @@ def score_run(run: RunSource, source: Source, config: DataConfig, reporter: Repo
     Args:
         run: finished run.
         source: scans that the tokenizer encodes and decodes.
-        config: how scans are read and projected.
+        config: settings of reading and projecting scans.
         reporter: told about progress, and warned if the model has learned from these scans.
 
     Raises:

@@ -31,15 +31,15 @@ class PaperTable:
     """One table of the paper.
 
     Args:
-        title: what it compares.
-        protocol: by which its figures are measured.
-        data_set: whose scans.
-        train: split to learn from; ``val`` and ``test`` are called so, and share no drive with it or with each other.
+        title: title of the table.
+        protocol: name of the protocol that measures its figures.
+        data_set: name of the data set.
+        train: split to train on; ``val`` and ``test`` are called so, and share no drive with it or with each other.
         images: settings that make the protocol's images of the data set's scans.
-        small_images: the same with fewer columns.
+        small_images: settings that make images with fewer columns.
         rows: the paper's name of each row that there are recipes for: of its size, and a small one.
         missing: the others, and why.
-        remarks: what a reader of the measured rows must know.
+        remarks: sentences that a reader of the measured rows must know.
     """
 
     title: str
@@ -100,15 +100,15 @@ TABLES = {
 
 @dataclass(frozen=True)
 class Reproduction:
-    """What is wanted of a table.
+    """A table of the paper to reproduce.
 
     Args:
-        number: of the table, 1 to 3.
-        root: of its data set, or ``simulated`` for simulated streets.
-        small: by the small recipes, images of 64x256, and only the metrics that need no published weights.
+        number: number of the table, 1 to 3.
+        root: root folder of its data set, or ``simulated`` for simulated streets.
+        small: whether to use the small recipes, images of 64x256, and only the metrics that need no published weights.
         count: samples of each system, compared with as many scans; 0 for 5,000, or 64 if small.
-        flops: what the training of each takes; None for the recipes' own budgets, or, if small, 5e13 for each.
-        settings: of every recipe, besides the table's own.
+        flops: operations of the training of each system; None for the recipes' own budgets, or 5e13 if small.
+        settings: settings of every recipe, besides the table's own.
     """
 
     number: int
@@ -158,13 +158,13 @@ class Reproduction:
 
 
 def reproduce(wanted: Reproduction, folder: Path, reporter: Reporter | None = None) -> list[Path]:
-    """Prepare, train, sample and score every row that there is a recipe for, and return the files of scores.
+    """Prepare, train, sample and score every row that has a recipe, and return the files of scores.
 
     Args:
-        wanted: the table, and on what.
-        folder: as that of :func:`lidargrit.evaluation.benchmark.run`. The same call goes on there: prepared scans (in
-            the cache), checkpoints, samples and scores are not made again.
-        reporter: hears of the progress.
+        wanted: the table and its data.
+        folder: output folder, as in :func:`lidargrit.evaluation.benchmark.run`. The same call continues there:
+            prepared scans (in the cache), checkpoints, samples and scores are not made again.
+        reporter: receiver of the progress.
 
     Raises:
         DataError: the root does not hold the data set, or a split of it.

@@ -22,7 +22,7 @@ class Block:
     """Rows that may be compared with one another.
 
     Args:
-        title: what they have in common.
+        title: title of the block.
         columns: metrics and variants.
         rows: a system and its figures, "" where there is none.
         notes: lines below.
@@ -43,7 +43,7 @@ def side_by_side(paths: Sequence[Path], form: Format = "text") -> str:
 
     Args:
         paths: files that ``lidargrit evaluate --json`` wrote.
-        form: of the table.
+        form: format of the table.
 
     Raises:
         DataError: a file that cannot be read, or is none of these.

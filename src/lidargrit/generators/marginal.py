@@ -23,7 +23,7 @@ class MarginalConfig:
     """How finely ranges are counted.
 
     Args:
-        bins: of a logarithmic axis between the sensor's limits; 128 make each 4 % wide.
+        bins: number of bins of a logarithmic axis between the sensor's limits; with 128, each is 4 % wide.
     """
 
     bins: int = 128

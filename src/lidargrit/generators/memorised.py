@@ -23,7 +23,7 @@ class MemorisedConfig:
     """How many scans are kept.
 
     Args:
-        scans: of the training set at most, evenly spaced; each of 64x1024 pixels takes 0.26 MB.
+        scans: largest number of training scans that are kept, evenly spaced; 64x1024 pixels take 0.26 MB each.
     """
 
     scans: int = 1000

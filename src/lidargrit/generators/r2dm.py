@@ -38,7 +38,7 @@ class R2dmConfig:
     """What the model learns, and its network.
 
     Args:
-        unet: sizes.
+        unet: sizes of the U-Net.
         reflectance: learn it beside the range, as published; set it to false where scans have none, or for a sharper
             range (the authors' own remark).
         calibration_scans: drawn at the end of training to fit the threshold of the ``calibrated`` raydrop; 0 for none.
@@ -63,7 +63,7 @@ class DiffusionSampling:
         raydrop: ``published`` has a return where the drawn range lies inside the sensor's limits. ``calibrated``, which
             is not of the paper, has one where the drawn value is above a threshold, fitted so that as many rays return
             as in the training scans; from a barely trained model that may take near returns away.
-        resamples: how often each step is taken when a scan is completed.
+        resamples: number of times that each step is taken when a scan is completed.
     """
 
     steps: int = 256

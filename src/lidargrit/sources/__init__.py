@@ -54,7 +54,7 @@ class Source(ABC):
 
         Args:
             sensor: sensor that scans are projected with; the source's own if not given. Samples keep theirs.
-            config: how scans are read and projected, and their largest number; its sources and sensor are ignored.
+            config: settings of reading and projecting scans; its sources and sensor are ignored.
             reporter: told about progress and about scans that are left out.
 
         Raises:
@@ -292,7 +292,7 @@ def load_range_images(
 
     Args:
         sources: names of data sets, folders of scans, and prepared folders, as in :class:`DataConfig`.
-        config: how scans become images; its own sources are ignored.
+        config: settings of projecting scans; its own sources are ignored.
         reporter: told about progress.
         sensor: sensor to project with, in place of the configuration's.
 

@@ -48,13 +48,13 @@ def write_samples(
     """Write one file for each seed, at bounded memory; seeds that are there already are not drawn again.
 
     Args:
-        generator: what to sample from, as loaded from
-        run_folder: whose weights identify it.
-        folder: gets ``samples.json`` and ``SEED.npz`` with ``range_m`` (H, W) in metres, 0 where nothing returned,
+        generator: generator to sample from, as loaded from
+        run_folder: run folder whose weights identify it.
+        folder: output folder for ``samples.json`` and ``SEED.npz`` with ``range_m`` (H, W) in metres, 0 for no return,
             and ``reflectance`` in [0, 1] if the generator writes it.
-        seeds: one a scan; other processes may write others into the same folder meanwhile.
-        sampling: choices, of the generator's own ``Sampling``; its defaults if not given.
-        reporter: hears of the progress.
+        seeds: one seed for each scan; other processes may write other seeds into the same folder meanwhile.
+        sampling: choices of the generator's own ``Sampling``; its defaults if not given.
+        reporter: receiver of progress messages.
 
     Raises:
         OutputError: the folder holds samples of another model or setting, something else, cannot be written, or was
@@ -126,8 +126,8 @@ def read_samples(folder: Path, count: int | None = None) -> RangeImages:
     """Return the samples of a folder in the order of their seeds; read when asked for.
 
     Args:
-        folder: that :func:`write_samples` wrote.
-        count: at most so many, those of the first seeds: seeds have no order that would favour any.
+        folder: folder that :func:`write_samples` wrote.
+        count: largest number of scans; those of the lowest seeds are taken, since the order of seeds favours none.
 
     Raises:
         DataError: no samples in the folder.

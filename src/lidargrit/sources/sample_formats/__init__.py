@@ -32,11 +32,11 @@ class SampleFormat:
     """How one program writes a scan.
 
     Args:
-        title: whose samples.
-        source: where the facts come from.
-        channels: of its tensors, (channels, rows, columns) each, or (scans, channels, rows, columns).
-        sensors: whose images they may be: name, fine columns, every n-th of them kept; 0 columns for the sensor's own.
-        variant: of the projection by which its training scans became images.
+        title: name of the program that writes such samples.
+        source: origin of the facts.
+        channels: channels of its tensors, (channels, rows, columns) or (scans, channels, rows, columns).
+        sensors: possible sensors: name, fine columns, every n-th of them kept; 0 columns for the sensor's own.
+        variant: projection variant of its training scans.
         decode: turns what is in a tensor into metres.
     """
 
@@ -92,9 +92,9 @@ def read_tensor_folder(folder: Path, name: str = "", count: int | None = None) -
     """Return the samples of a folder of tensors, in the order of their numbers; read when asked for.
 
     Args:
-        folder: of ``.pth`` files, one scan or one batch of scans each.
-        name: of the sample_format; told from the number of channels if empty.
-        count: at most so many, the first.
+        folder: folder of ``.pth`` files, with one scan or one batch of scans each.
+        name: name of the sample format; recognised from the number of channels if empty.
+        count: largest number of scans; the first are taken.
 
     Raises:
         DataError: no tensor in the folder.
