@@ -2,14 +2,13 @@
 
 import ast
 import json
-import shutil
 from collections import Counter
 from pathlib import Path
 
 import pytest
 
 from lidargrit import sources
-from lidargrit.errors import ConfigError, DataError, OutputError, UnknownNameError
+from lidargrit.errors import ConfigError, DataError, UnknownNameError
 from lidargrit.evaluation.benchmark import Benchmark
 from lidargrit.evaluation.comparison import EvalConfig, compare_sources
 from lidargrit.evaluation.intervals import Resampling
@@ -86,23 +85,6 @@ def test_what_a_kind_cannot_give_is_refused_in_one_line(folders):
         open_source(str(folders / "samples")).scans()
     with pytest.raises(DataError, match="which holds generated range images; wanted scans, or scans that were prepare"):
         load_range_images((str(folders / "samples"),), ONE)
-
-
-@pytest.mark.parametrize("gone", ["folder", "samples.json"])
-def test_samples_that_vanish_meanwhile_are_no_success(tmp_path, gone):
-    generator, _ = made("marginal")
-    generator.save(tmp_path / "run")
-    plain = generator.stream
-
-    def stream(seeds, sampling):
-        for number, image in enumerate(plain(seeds, sampling)):
-            if number == 1:
-                shutil.rmtree(tmp_path / "out") if gone == "folder" else (tmp_path / "out" / gone).unlink()
-            yield image
-
-    generator.stream = stream
-    with pytest.raises(OutputError, match=r"removed while .* written; wanted a folder that no other program changes"):
-        write_samples(generator, tmp_path / "run", tmp_path / "out", range(3))
 
 
 def test_numbers_too_large_are_refused_before_any_work():

@@ -153,7 +153,7 @@ class SampleSource(Source):
         super().__init__(text)
         self.folder = folder
 
-    @cached_property
+    @property
     def sensor(self) -> SensorModel:
         """Sensor of the samples."""
         return read_samples(self.folder).sensor
@@ -189,7 +189,7 @@ class TensorSource(Source):
         self._folder, self.split = folder, samples_format or recognise(folder)
         self._format = load_sample_format(self.split)
 
-    @cached_property
+    @property
     def sensor(self) -> SensorModel:
         """Sensor that the size of the first tensor fits."""
         return read_tensor_folder(self._folder, self.split, 1).sensor

@@ -86,7 +86,6 @@ def write_samples(
     if not is_sample_folder(folder) or _missing(folder, seeds):
         raise removed_meanwhile(folder)
     remove_partials(folder)
-    _require_written(folder, seeds)
 
 
 def _claim(folder: Path, manifest: dict[str, Any], defaults: dict[str, Any]) -> None:
@@ -103,23 +102,6 @@ def _claim(folder: Path, manifest: dict[str, Any], defaults: dict[str, Any]) -> 
         raise OutputError(f"{folder}, which is not empty and holds no samples", "an empty folder", "choose another one")
     else:
         write_json(folder / MANIFEST, manifest)
-
-
-def _require_written(folder: Path, seeds: Sequence[int]) -> None:
-    """Refuse to call it a success if files were removed while others were written."""
-    names = {entry.name for entry in os.scandir(folder)} if folder.is_dir() else set()
-    if gone := [seed for seed in seeds if _file(folder, seed).name not in names]:
-        raise OutputError(
-            f"{folder}, from which {len(gone):,} samples were removed while others were written",
-            "a folder that no other program changes",
-            "give the same command again",
-        )
-    if MANIFEST not in names:
-        raise OutputError(
-            f"{folder}, whose {MANIFEST} was removed while samples were written",
-            "a folder that no other program changes",
-            "remove the folder and give the same command again",
-        )
 
 
 def read_samples(folder: Path, count: int | None = None) -> RangeImages:
