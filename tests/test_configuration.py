@@ -177,7 +177,7 @@ def test_settings_of_a_recipe_are_checked_with_the_words_of_their_class():
         load_recipe("small", ["model.tokenizer.channels=40"])
     with pytest.raises(ConfigError, match=r"^got batch_size=0; wanted at least 1; raise it$"):
         load_recipe("small", ["training.tokenizer.batch_size=0"])
-    with pytest.raises(ConfigError, match=r"^got learning_rate=nan; wanted a positive number"):
+    with pytest.raises(ConfigError, match=r"^got training.tokenizer.learning_rate=nan; wanted a finite number"):
         load_recipe("small", ["training.tokenizer.learning_rate=.nan"])
 
 

@@ -166,7 +166,7 @@ def _check_numbers(value: Any, where: str) -> None:
     elif isinstance(value, int) and abs(value) > SEED_AT_MOST:
         raise ConfigError(f"{where} with a number of {value.bit_length()} bits", "at most 63", "lower it")
     elif isinstance(value, float) and not math.isfinite(value):
-        raise ConfigError(f"{where} with {value}", "a finite number", "correct it")
+        raise ConfigError(f"{where}={value}", "a finite number", "correct it")
 
 
 def _parser() -> Any:
