@@ -29,7 +29,7 @@ def test_a_folder_with_foreign_files(refused, run_folder, tmp_path):
     for words, what in (
         (train_words(tmp_path / "thesis"), "which is not empty and holds no run; wanted an empty folder"),
         (train_words(tmp_path / "thesis" / "chapter.tex"), "which is not empty and holds no run"),
-        (train_words(tmp_path / "thesis" / "chapter.tex" / "x"), "while writing"),
+        (train_words(tmp_path / "thesis" / "chapter.tex" / "x"), "wanted a folder that may be written to"),
         (["demo", "--out", tmp_path / "thesis"], "which is not empty and holds no run"),
         (["sample", run_folder, tmp_path / "thesis"], "which is not empty and holds no samples; wanted an empty"),
         (["sample", run_folder, run_folder], "which is not empty and holds no samples"),

@@ -265,7 +265,9 @@ def open_source(text: str, bad_points: BadPoints = "refuse", samples_format: str
     try:
         folder = Path(locate(text)).expanduser()
         here = folder.is_dir()
-    except (OSError, ValueError, RuntimeError) as error:  # a name too long, or of an unknown user, or with NUL
+    except RuntimeError:  # what pathlib raises
+        raise DataError(f"{text[:40]!r}, in a home folder that is not there", "another user's", "check it") from None
+    except (OSError, ValueError) as error:  # a name too long, or with NUL
         if ":" not in text:
             raise DataError(f"{text[:40]!r}, which names no folder ({error})", "a source", "check the path") from None
         folder, here = Path(), False
