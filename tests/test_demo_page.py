@@ -97,7 +97,7 @@ def test_a_browser_shows_it(written, tmp_path):
 
 def test_times_are_those_of_the_first_time(tmp_path):
     log = tmp_path / "log.jsonl"
-    log.write_text("".join(json.dumps({"seconds": one}) + "\n" for one in (3.0, 5.5, 1.0, 4.0)))
+    log.write_text("".join(json.dumps({"scans_seen": 8, "seconds": one}) + "\n" for one in (3.0, 5.5, 1.0, 4.0)))
     assert demo._trained_s(log) == 9.5, "stopped after 5.5 s, and 4 s more"
     clock = demo._Clock(tmp_path / "timings.json")
     with clock.stage("a"):

@@ -159,7 +159,7 @@ def test_ouster_recordings_that_are_refused_in_one_line(capture):
     refused(whole[:24], text, "a.pcap, which cannot be used|no revolution of the sensor in a.json")
     refused(whole, "", r"a\.json, which cannot be read \(an empty file\)")
     refused(whole, "{", "a.json, which cannot be used")
-    refused(whole, "[]", "a.json, which cannot be used .no named entries")
+    refused(whole, "[]", "a.json, which cannot be used .a list in place of an object")
     refused(whole, "{}", "a.json, which cannot be used")
     refused(
         whole,

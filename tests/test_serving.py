@@ -57,12 +57,16 @@ def browser(tmp_path_factory):
 
 def test_numbers_of_every_generator_can_be_chosen():
     found = {name: [setting.name for setting in sampling_settings(made(name)[0].Sampling())] for name in MODELS}
-    assert found == {"lidargrit": ["temperature", "top_k", "top_p"], "marginal": [], "r2dm": ["steps", "resamples"]}
+    assert found == {
+        "lidargrit": ["temperature", "top_k", "top_p", "range_temperature", "range_noise"],
+        "marginal": [],
+        "r2dm": ["steps", "resamples"],
+    }
     settings = {setting.name: setting for setting in sampling_settings(made("dusty")[0].Sampling())}
     assert settings["tolerance"].default is None
     assert not settings["tolerance"].whole
     assert settings["search_steps"].at_most == 1024
-    assert settings["search_rate"].about == "its learning rate at its highest."
+    assert settings["search_rate"].about == "highest learning rate of that optimiser."
 
 
 GOOD = {"model": 0, "seed": 3, "count": 2, "sampling": {"temperature": 1, "top_k": 5}}
@@ -130,7 +134,7 @@ def test_a_part_of_the_circle_and_rings_that_nobody_told(tmp_path):
     assert completed.images.return_mask.sum() > kept.sum()
     assert torch.equal(completed.images.range_m[kept], uploaded.images.range_m[kept])
     with pytest.raises(ScanError, match=r"degrees of azimuth in mine\.bin"):
-        compute_result(made("lidargrit")[0], replace(request, sampling={}))
+        compute_result(made("maskgit")[0], replace(request, sampling={}))
 
 
 # In a browser.
@@ -230,7 +234,7 @@ def test_a_scan_that_is_uploaded_is_completed(opened, scan_file):
     fill(opened, "#model", "0")
     opened.click("#complete")
     finish(opened)
-    assert names(opened)[-1] == "reconstructed by tiny-lidargrit"
+    assert names(opened)[-1] == "completed by tiny-lidargrit"
     assert len(names(opened)) == 4
     fill(opened, "#model", "1")
     assert opened.run("document.querySelector('#complete').disabled")

@@ -13,8 +13,10 @@ from lidargrit.datasets.kitti_odometry import KittiOdometry
 from lidargrit.errors import OutputError, TrainingError
 from lidargrit.files import claim_folder, read_tensors
 from lidargrit.loading import Batches, DataConfig
+from lidargrit.nn.objective import Objective
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
+from lidargrit.sensors import load_sensor
 from lidargrit.sources import load_range_images
 from lidargrit.tokenizers.vqvae import Vqvae
 from lidargrit.training import FitConfig, measure, train, training_flops
@@ -146,8 +148,19 @@ def test_other_columns_of_the_same_scan_can_be_kept(images):
     assert len(kept) > 12  # of 6 scans at most 6 without it
 
 
+class OneWeight(Objective):
+    """The smallest objective."""
+
+    def __init__(self, sensor):
+        super().__init__(sensor)
+        self.weight = torch.nn.Parameter(torch.rand(1))
+
+    def forward(self, images, rng, player=""):
+        return {"loss": self.weight.sum()}
+
+
 def test_weight_average_follows_as_a_slow_loop_says():
-    weight = torch.nn.Linear(1, 1, bias=False)
+    weight = OneWeight(load_sensor("vlp16"))
     average = WeightAverage(weight, half_life_scans=8)
     slow = weight.weight.item()
     for step in range(1, 50):

@@ -18,10 +18,10 @@ MISTAKES = {
     "sample --cuont 3": "got the option '--cuont'; wanted one such as --count; see: lidargrit sample --help",
     "sample run out more": "got a word more, 'more'; wanted fewer;",
     "sample run out -x": "got the option '-x'; wanted one such as",
-    "simulate here -n two": "got -n two; wanted a whole number;",
-    "simulate here -n 1 --wet very": "got --wet very; wanted a number;",
+    "simulate here -n two": "got -n 'two'; wanted a whole number;",
+    "simulate here -n 1 --wet very": "got --wet 'very'; wanted a number;",
     "evaluate a b --format pdf": "got --format pdf; wanted text, markdown or latex; choose one",
-    "list metric": "got 'metric'; wanted datasets, formats, sensors,",
+    "list metric": "got 'metric'; wanted one such as metrics; see: lidargrit list --help",
     "demo --set": "got nothing after --set; wanted a value;",
     "evaluate --pr x": "got --pr; wanted --protocol or --projection-variant; write it out",
     "view a --overwrite=3": "got --overwrite with 3; wanted --overwrite alone;",
@@ -145,7 +145,7 @@ def test_bash_completes(capsys, tmp_path):
     for words, offered in (
         ("tra", "train"),
         ("list met", "metrics"),
-        ("train sma", "small"),
+        ("train small_p", "small_pixels"),
         ("train --dr", "--dry-run"),
     ):
         typed = (

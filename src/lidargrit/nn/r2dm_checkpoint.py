@@ -94,7 +94,9 @@ def read_r2dm_checkpoint(path: Path) -> R2dmCheckpoint:
         }
         weights = float_tensors(weights, _BYTES_AT_MOST)
         reflectance = bool(settings["data.train_reflectance"]) if "data.train_reflectance" in settings else True
-    except ConfigError:
+    except ConfigError as error:
+        raise CheckpointError(f"{path}, in which {error.got}", error.wanted, "check which program saved it") from None
+    except CheckpointError:
         raise
     except (OSError, KeyError, TypeError, ValueError, AttributeError, RefusedFileError) as error:
         told = str(error).partition("\n")[0][:100]

@@ -12,9 +12,10 @@ import json
 import os
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 import torch
@@ -40,23 +41,23 @@ NO_ROOM = OutputError(
 
 def run_worker(runs: Sequence[Path], device: str) -> None:
     """Describe the models of the runs, then answer requests from standard input until it ends."""
-    answers = sys.stdout
+    write_line = partial(print, file=sys.stdout, flush=True)
     sys.stdout = sys.stderr  # whatever a library prints is no answer
     try:
         generators = [load(run).to(device or ("cuda" if torch.cuda.is_available() else "cpu")) for run in runs]
     except LidarGritError as error:
-        _send(answers, {"refused": [type(error).__name__, error.got, error.wanted, error.cure]})
+        _send(write_line, {"refused": [type(error).__name__, error.got, error.wanted, error.cure]})
         return
     except (RuntimeError, AssertionError) as error:  # torch's ways to say: no such device, or not in this build
         got = f"--device {device} ({_first_line(error)})"
-        _send(answers, {"refused": ["ConfigError", got, "cpu or cuda", "leave it out"]})
+        _send(write_line, {"refused": ["ConfigError", got, "cpu or cuda", "leave it out"]})
         return
     models = [describe_model(run.resolve().name, model) for run, model in zip(runs, generators, strict=True)]
-    _send(answers, {"models": models})
+    _send(write_line, {"models": models})
     for line in sys.stdin:
         message = json.loads(line)
         request = SampleRequest(**message["request"])
-        _send(answers, _answer_request(generators[request.model], request, Path(message["folder"])))
+        _send(write_line, _answer_request(generators[request.model], request, Path(message["folder"])))
 
 
 def describe_model(name: str, generator: Generator) -> dict[str, Any]:
@@ -166,6 +167,5 @@ def _first_line(error: Exception) -> str:
     return f"{type(error).__name__}: {str(error).partition(os.linesep)[0][:100]}"
 
 
-def _send(answers: TextIO, message: dict[str, Any]) -> None:
-    answers.write(json.dumps(message) + "\n")
-    answers.flush()
+def _send(write_line: Callable[[str], None], message: dict[str, Any]) -> None:
+    write_line(json.dumps(message))

@@ -21,7 +21,7 @@ def taken_stages(recipe: Recipe, generator: Generator) -> dict[str, Objective]:
     """
     if recipe.tokenizer_from is not None:
         tokenizer = load(Path(recipe.tokenizer_from)).get_tokenizer()
-        theirs = {"name": tokenizer.config.name(), **configuration.leaves(tokenizer.config)}
+        theirs = {"name": tokenizer.config.name(), **configuration.leaves(configuration.to_json(tokenizer.config))}
         same_rays = generator.sensor.same_rays(tokenizer.sensor)
         _check(f"tokenizer_from={recipe.tokenizer_from}", generator, "tokenizer", theirs, same_rays)
         return {"tokenizer": tokenizer}
