@@ -114,7 +114,7 @@ def test_the_picture_has_every_panel(scores, tmp_path):
     widths, heights = zip(*((int.from_bytes(s[:4]), int.from_bytes(s[4:])) for s in sizes), strict=True)
     assert widths == (1400, 1400)
     assert heights[0] > heights[1] > 300
-    with pytest.raises(ConfigError, match="^got no curve; wanted at least one"):
+    with pytest.raises(ConfigError, match=r"^got no curve; wanted at least one"):
         plot_curves([], tmp_path / "none.png")
 
 
