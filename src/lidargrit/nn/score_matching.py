@@ -32,7 +32,7 @@ def score_matching_errors(
 
     Args:
         network: score network.
-        clean: images.
+        clean: clean images (B, C, H, W).
         sigma: noise level of each.
         noise: standard normal values.
     """
@@ -59,7 +59,7 @@ def langevin(
         sigmas: noise levels, the largest first.
         steps_each: number of steps at each level.
         step_lr: size of a step at the last level; at other levels it grows with sigma squared.
-        pull: what is added to images in each step to draw them towards observed pixels; none to sample freely.
+        pull: term added to the images in each step, which moves them towards observed pixels; None to sample freely.
     """
     image, residual = start, None
     for sigma in sigmas.to(start.device):
