@@ -112,9 +112,14 @@ def _partial_file(folder: Path) -> Iterator[Path]:
         while path is None:
             with suppress(FileNotFoundError):  # another process has just removed the hidden folder, empty
                 lock, name = tempfile.mkstemp(suffix=".partial", dir=_hidden(folder))
-                with suppress(OSError):  # a file system without locks, or a process that removes the file as abandoned
+                try:
                     fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                if Path(name).exists():
+                    is_ours = os.fstat(lock).st_nlink > 0
+                except BlockingIOError:  # a process that takes the file for an abandoned one is about to remove it
+                    is_ours = False
+                except OSError:  # a file system without locks
+                    is_ours = True
+                if is_ours:
                     path = Path(name)
                 else:
                     os.close(lock)
