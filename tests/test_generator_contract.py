@@ -222,6 +222,17 @@ def test_an_objective_has_a_finite_loss_and_gradients(name):
     generator.eval().requires_grad_(True)  # a stage may have frozen another's weights
 
 
+def test_tells_what_it_writes_and_where_it_comes_from(name):
+    cls = load_class(name)
+    assert cls.facts is not Generator.facts, "the class names no facts of its own"
+    told = cls.about()
+    assert told[0] == f"writes {cls.facts.writes}"
+    assert any(line == "from: this project" or cls.facts.paper in line for line in told)
+    assert bool(cls.facts.weights_licence) or not cls.published_files, (
+        "weights can be imported, their licence is not told"
+    )
+
+
 def test_tells_what_a_scan_costs(name):
     generator, sampling = made(name)
     cost = generator.cost(sampling)

@@ -20,7 +20,8 @@ def entries(kind: str, in_full: bool = False) -> list[dict[str, Any]]:
     Args:
         kind: one of ``KINDS``.
         in_full: also what their classes tell: licence, splits and leaks of data sets; endings of formats; size and
-            limits of sensors; abilities and choices of generators; direction, variants and weights of metrics.
+            limits of sensors; abilities, origin, licences and choices of generators; direction, variants and weights of
+            metrics.
 
     Example:
         >>> entries("sensors")[0]["name"]
@@ -74,8 +75,8 @@ def _of_generator(name: str) -> dict[str, Any]:
     from lidargrit.generators import load_class
 
     cls = load_class(name)
-    sampling = configuration.to_json(cls.Sampling())
-    return {"capabilities": sorted(cls.capabilities), "sampling": sampling, "facts": cls.about()}
+    sampling, told = configuration.to_json(cls.Sampling()), configuration.to_json(cls.facts)
+    return {"capabilities": sorted(cls.capabilities), **told, "sampling": sampling, "facts": cls.about()}
 
 
 def _of_metric(name: str) -> dict[str, Any]:

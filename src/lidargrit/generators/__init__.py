@@ -17,6 +17,7 @@ from lidargrit import _discovery, configuration
 from lidargrit.errors import CheckpointError, ConfigError, LidarGritError
 from lidargrit.files import is_taken, read_json, read_tensors
 from lidargrit.generators._checks import check_images, check_observed, check_seeds
+from lidargrit.generators._facts import CAPABILITIES, SystemFacts
 from lidargrit.generators._hub import download
 from lidargrit.generators._saved import CARD_FILE as CARD_FILE
 from lidargrit.generators._saved import CONFIG_FILE, WEIGHTS_FILE, ConfigT, SavedModel
@@ -50,14 +51,6 @@ class Cost:
     flops: int
 
 
-CAPABILITIES = {  # name → what a generator with it can do besides sampling, for messages
-    "tokens": "turn scans into tokens and back",
-    "encode": "give scans back from a code of its own",
-    "complete": "fill in the pixels of a scan that were not observed",
-    "invert": "search the scan nearest to a given one among those it can generate",
-    "likelihood": "tell how likely a scan is",
-}
-
 SamplingT = TypeVar("SamplingT")
 
 
@@ -75,6 +68,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
 
     Sampling: ClassVar[type] = NoSampling
     capabilities: ClassVar[frozenset[str]] = frozenset()
+    facts: ClassVar[SystemFacts] = SystemFacts(writes="range images")
     published_files: ClassVar[tuple[str, ...]] = ()
     """Contents of the files in which the system's authors published weights, in order; empty if we read none."""
 
@@ -299,8 +293,8 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
 
     @classmethod
     def about(cls) -> list[str]:
-        """Return lines for a person: what the generator can do, and its sampling settings with their defaults."""
-        facts = [f"can {told} ({name})" for name, told in CAPABILITIES.items() if name in cls.capabilities]
+        """Return lines for a person: the system's facts, and the sampling settings with their defaults."""
+        facts = cls.facts.lines(cls.capabilities)
         settings = [f"{name}={value}" for name, value in configuration.leaves(cls.Sampling()).items()]
         return [*facts, f"sample --set: {', '.join(settings)}"] if settings else facts
 

@@ -16,7 +16,7 @@ from torch.func import functional_call
 from lidargrit.determinism import derive_seed
 from lidargrit.errors import CheckpointError, ConfigError
 from lidargrit.files import load_exactly
-from lidargrit.generators import Cost, Generator
+from lidargrit.generators import Cost, Generator, SystemFacts
 from lidargrit.nn.dcgan import LEVELS, Discriminator, Synthesis, Widths, from_published
 from lidargrit.nn.differentiable_augmentation import (
     AugmentationDefect,
@@ -121,6 +121,12 @@ class Dusty(Generator[DustyConfig, DustySampling]):
     """
 
     Config = DustyConfig
+    facts = SystemFacts(
+        writes="range and raydrop, sampled over a scan without holes",
+        paper="Nakashima and Kurazume, Learning to Drop Points for LiDAR Scan Synthesis, IROS 2021",
+        program="kazuto1011/dusty-gan@0374a5e (MIT)",
+        weights_licence="MIT, as the program",
+    )
     Sampling = DustySampling
     capabilities = frozenset({"complete", "invert"})
     published_files = ("generator",)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from lidargrit.errors import CheckpointError, ConfigError
 from lidargrit.files import load_exactly
-from lidargrit.generators import Cost, Generator
+from lidargrit.generators import Cost, Generator, SystemFacts
 from lidargrit.nn.diffusion import SeededNoise
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.lidargen_checkpoint import read_lidargen_checkpoint
@@ -106,6 +106,12 @@ class LidarGen(Generator[LidarGenConfig, LangevinSampling]):
     """
 
     Config = LidarGenConfig
+    facts = SystemFacts(
+        writes="range and reflectance; a range outside a window is no return",
+        paper="Zyrianov, Zhu and Wang, Learning to Generate Realistic LiDAR Point Clouds, ECCV 2022",
+        program="vzyrianov/lidargen@4c3226c (MIT)",
+        weights_licence="MIT, as the program",
+    )
     Sampling = LangevinSampling
     capabilities = frozenset({"complete"})
     published_files = ("checkpoint",)

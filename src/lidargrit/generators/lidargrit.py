@@ -16,7 +16,7 @@ from torch import Tensor
 
 from lidargrit.errors import ConfigError
 from lidargrit.files import load_exactly
-from lidargrit.generators import Cost
+from lidargrit.generators import Cost, SystemFacts
 from lidargrit.generators._tokens import (
     PixelChoice,
     TokenGenerator,
@@ -103,6 +103,12 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
     """
 
     Config = LidarGritConfig
+    facts = SystemFacts(
+        writes="range and raydrop, decoded apart from each other",
+        paper="Haghighi et al., Taming Transformers for Realistic Lidar Point Cloud Generation, 2024",
+        program="hamedhaghighi/LidarGRIT@a3f86e7 (no licence)",
+        weights_licence="no licence stated",
+    )
     Sampling = TokenSampling
     published_files = tuple(_PUBLISHED_NETWORKS)
     capabilities = TokenGenerator.capabilities | {"likelihood", "complete"}

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidargrit.errors import CheckpointError, ConfigError
-from lidargrit.generators import Cost, Generator, NoSampling
+from lidargrit.generators import Cost, Generator, NoSampling, SystemFacts
 from lidargrit.loading import RangeImages
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
@@ -41,6 +41,7 @@ class Marginal(Generator[MarginalConfig, NoSampling]):
     """
 
     Config = MarginalConfig
+    facts = SystemFacts(writes="range and raydrop, every pixel by itself")
     scans: Tensor
     counts: Tensor
 

@@ -12,7 +12,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from lidargrit.errors import ConfigError
-from lidargrit.generators import Cost
+from lidargrit.generators import Cost, SystemFacts
 from lidargrit.generators._tokens import (
     PixelChoice,
     TokenGenerator,
@@ -91,6 +91,11 @@ class MaskGit(TokenGenerator[MaskGitConfig, MaskedSampling]):
     """
 
     Config = MaskGitConfig
+    facts = SystemFacts(
+        writes="range and raydrop, decoded apart from each other",
+        paper="Chang et al., MaskGIT: Masked Generative Image Transformer, CVPR 2022, over LidarGRIT's tokens",
+        program="google-research/maskgit (Apache 2.0)",
+    )
     Sampling = MaskedSampling
 
     def __init__(self, config: MaskGitConfig, sensor: SensorModel) -> None:

@@ -12,7 +12,7 @@ from torch import Tensor
 from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import CheckpointError, ConfigError
 from lidargrit.files import load_exactly
-from lidargrit.generators import Cost, Generator, NoSampling
+from lidargrit.generators import Cost, Generator, NoSampling, SystemFacts
 from lidargrit.loading import RangeImages
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
@@ -41,6 +41,7 @@ class Memorised(Generator[MemorisedConfig, NoSampling]):
     """
 
     Config = MemorisedConfig
+    facts = SystemFacts(writes="scans of the training set, unchanged")
     scans: Tensor
     range_m: Tensor
 

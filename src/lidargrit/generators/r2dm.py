@@ -15,7 +15,7 @@ from torch import Tensor
 from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import ConfigError
 from lidargrit.files import load_exactly
-from lidargrit.generators import Cost, Generator
+from lidargrit.generators import Cost, Generator, SystemFacts
 from lidargrit.generators._log_range import decode, encode
 from lidargrit.loading import RangeImages
 from lidargrit.nn import diffusion
@@ -88,6 +88,12 @@ class R2dm(Generator[R2dmConfig, DiffusionSampling]):
     """
 
     Config = R2dmConfig
+    facts = SystemFacts(
+        writes="range and reflectance; a range outside the sensor's limits is no return",
+        paper="Nakashima and Kurazume, LiDAR Data Synthesis with Denoising Diffusion Probabilistic Models, ICRA 2024",
+        program="kazuto1011/r2dm@1c5963d (MIT)",
+        weights_licence="MIT, as the program",
+    )
     Sampling = DiffusionSampling
     capabilities = frozenset({"complete"})
     published_files = ("settings and network",)

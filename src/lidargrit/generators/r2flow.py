@@ -14,7 +14,7 @@ from torch import Tensor
 
 from lidargrit.errors import CheckpointError, ConfigError
 from lidargrit.files import load_exactly
-from lidargrit.generators import Cost, Generator
+from lidargrit.generators import Cost, Generator, SystemFacts
 from lidargrit.generators._log_range import decode, encode
 from lidargrit.nn import flow
 from lidargrit.nn.diffusion import SeededNoise
@@ -76,6 +76,12 @@ class R2flow(Generator[R2flowConfig, FlowSampling]):
     """
 
     Config = R2flowConfig
+    facts = SystemFacts(
+        writes="range and reflectance; a range outside the sensor's limits is no return",
+        paper="Nakashima et al., Fast LiDAR Data Generation with Rectified Flows, ICRA 2025",
+        program="kazuto1011/r2flow@3f5afeb (MIT)",
+        weights_licence="MIT, as the program",
+    )
     Sampling = FlowSampling
     published_files = ("network",)
 

@@ -1,0 +1,41 @@
+"""What is known of a system before one is made: what it generates and where it comes from → lines for a person."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+CAPABILITIES = {  # name → what a generator with it can do besides sampling, for messages
+    "tokens": "turn scans into tokens and back",
+    "encode": "give scans back from a code of its own",
+    "complete": "fill in the pixels of a scan that were not observed",
+    "invert": "search the scan nearest to a given one among those it can generate",
+    "likelihood": "tell how likely a scan is",
+}
+
+
+@dataclass(frozen=True)
+class SystemFacts:
+    """What a generator writes and where its method comes from; ``lidargrit list generators`` prints it.
+
+    Args:
+        writes: values of a generated scan, and the rule by which a ray has no return.
+        paper: authors, title, conference and year; empty for a method of this project.
+        program: program of the authors, ``OWNER/REPOSITORY@COMMIT``, with its licence; empty where there is none.
+        weights_licence: licence of the weights that the authors published; empty where they published none.
+    """
+
+    writes: str
+    paper: str = ""
+    program: str = ""
+    weights_licence: str = ""
+
+    def lines(self, capabilities: Iterable[str]) -> list[str]:
+        """Return the facts as lines for a person, and between them what a generator with these capabilities can do."""
+        origin = "; ".join(part for part in (self.paper, self.program) if part) or "this project"
+        return [
+            f"writes {self.writes}",
+            *(f"can {told} ({name})" for name, told in CAPABILITIES.items() if name in capabilities),
+            f"from: {origin}",
+            f"published weights: {self.weights_licence or 'none'}",
+        ]
