@@ -14,6 +14,7 @@ from lidargrit.cli import main
 from lidargrit.errors import ConfigError
 from lidargrit.evaluation.reconstruction import score_likelihood
 from lidargrit.generators import load
+from lidargrit.generators._batches import in_batches
 from lidargrit.generators._tokens import fill_from_nearest
 from lidargrit.generators.lidargrit import (
     START_TOKEN,
@@ -235,3 +236,17 @@ def test_simulated_scans_have_a_finite_likelihood():
     config = DataConfig(train=("simulated:1:test",), val=("simulated:1:test",), columns=512, column_stride=8)
     images = load_range_images(config.train, config).batch([0])
     assert bool(made().log_likelihood(images).isfinite().all())
+
+
+def test_the_last_batch_is_filled_up_with_copies():
+    """A generator learns how many scans are wanted, so that it need not decode the copies."""
+    taken = []
+
+    def compute(indices, seeds):
+        taken.append((indices, list(seeds), seeds.num_asked_for))
+        range_m = torch.tensor(seeds, dtype=torch.float32)[: seeds.num_asked_for, None, None].expand(-1, 64, 64)
+        return RangeImage(range_m, range_m > 0, SENSOR)
+
+    images = in_batches([7, 8, 9, 5, 6], 3, compute)
+    assert taken == [([0, 1, 2], [7, 8, 9], 3), ([3, 4, 4], [5, 6, 6], 2)]
+    assert images.range_m[:, 0, 0].tolist() == [7, 8, 9, 5, 6]

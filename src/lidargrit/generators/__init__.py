@@ -16,6 +16,7 @@ from torch import Tensor
 from lidargrit import _discovery, configuration
 from lidargrit.errors import CheckpointError, ConfigError, LidarGritError
 from lidargrit.files import is_taken, read_json, read_tensors
+from lidargrit.generators._batches import BatchSeeds, in_batches
 from lidargrit.generators._checks import check_images, check_observed, check_seeds
 from lidargrit.generators._facts import CAPABILITIES, SystemFacts
 from lidargrit.generators._hub import download
@@ -139,7 +140,8 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         """
         check_seeds(seeds)
         settings = self._settings(sampling, self.Sampling)
-        return self._in_batches(len(seeds), lambda some: self._sample([seeds[i] for i in some], settings))
+        self.eval()
+        return in_batches(seeds, self.compute_batch, lambda _, some: self._sample(some, settings))
 
     @final
     def stream(self, seeds: Iterable[int], sampling: SamplingT | None = None) -> Iterator[RangeImage]:
@@ -199,8 +201,9 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         check_seeds(seeds, len(images))
         settings = self._settings(sampling, self.completion_sampling)
         images, observed = images.to(self.device), observed.to(self.device)
-        generated = self._in_batches(
-            len(seeds), lambda some: self._complete(images[some], observed[some], [seeds[i] for i in some], settings)
+        self.eval()
+        generated = in_batches(
+            seeds, self.compute_batch, lambda at, some: self._complete(images[at], observed[at], some, settings)
         )
         reflectance, range_m = None, torch.where(observed, images.range_m, generated.range_m)
         if generated.reflectance is not None and images.reflectance is not None:
@@ -224,7 +227,8 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         check_images(images, self.sensor)
         check_seeds(seeds, len(images))
         settings, images = self._settings(sampling, self.Sampling), images.to(self.device)
-        return self._in_batches(len(seeds), lambda some: self._invert(images[some], [seeds[i] for i in some], settings))
+        self.eval()
+        return in_batches(seeds, self.compute_batch, lambda at, some: self._invert(images[at], some, settings))
 
     @final
     @torch.no_grad()
@@ -245,16 +249,16 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         return {}
 
     @abstractmethod
-    def _sample(self, seeds: Sequence[int], sampling: SamplingT) -> RangeImage:
-        """Generate one scan for each of ``compute_batch`` seeds."""
+    def _sample(self, seeds: BatchSeeds, sampling: SamplingT) -> RangeImage:
+        """Generate one scan for each of ``compute_batch`` seeds; scans of copies at their end may be left out."""
 
     def _complete(
-        self, images: RangeImage, observed: Bool[Tensor, "B H W"], seeds: Sequence[int], sampling: SamplingT
+        self, images: RangeImage, observed: Bool[Tensor, "B H W"], seeds: BatchSeeds, sampling: SamplingT
     ) -> RangeImage:
         """Generate scans that agree with the observed pixels; the caller then puts these in."""
         raise NotImplementedError
 
-    def _invert(self, images: RangeImage, seeds: Sequence[int], sampling: SamplingT) -> RangeImage:
+    def _invert(self, images: RangeImage, seeds: BatchSeeds, sampling: SamplingT) -> RangeImage:
         raise NotImplementedError
 
     def _reconstruct(self, images: RangeImage) -> RangeImage:
@@ -262,16 +266,6 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
 
     def _log_likelihood(self, images: RangeImage) -> Float[Tensor, "B"]:
         raise NotImplementedError
-
-    def _in_batches(self, count: int, compute: Callable[[list[int]], RangeImage]) -> RangeImage:
-        """Compute scans by their indices in batches of one size, and return those that were asked for."""
-        self.eval()
-        size, parts = self.compute_batch, []
-        for first in range(0, count, size):
-            wanted = list(range(first, min(first + size, count)))
-            filled = wanted + wanted[-1:] * (size - len(wanted))
-            parts.append(compute(filled)[: len(wanted)])
-        return RangeImage.cat(parts)
 
     def _settings(self, given: SamplingT | None, default: Callable[[], SamplingT]) -> SamplingT:
         if given is not None and not isinstance(given, self.Sampling):

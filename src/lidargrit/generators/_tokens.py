@@ -108,19 +108,20 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
     def decode(
         self,
         tokens: Int[Tensor, "B T"],
+        wanted: int,
         rngs: list[torch.Generator],
         mask: PixelChoice,
         pixels: PixelSampling,
         tokenizer: Tokenizer,
         observed: tuple[RangeImage, Bool[Tensor, "B H W"]] | None = None,
     ) -> RangeImage:
-        """Return the scans of sampled tokens.
+        """Return the first scans of sampled tokens: those that are wanted, and what its batch takes along.
 
-        Scans are decoded in batches of one size, as tokens are sampled, because kernels differ by the size. Copies that
-        fill up the last batch are decoded only as far as that size needs them.
+        Scans are decoded in batches of one size, as tokens are sampled, because kernels differ by the size.
 
         Args:
             tokens: tokens of ``compute_batch`` scans in raster order.
+            wanted: number of scans that are wanted; see ``BatchSeeds``.
             rngs: random generators on the CPU, one for each scan.
             mask: method by which returns and ranges are decided.
             pixels: settings by which the pixel decoder samples ranges.
@@ -136,9 +137,6 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
                 "a model with one",
                 "leave mask out, or train a recipe with the stage pixels, such as compact_pixels",
             )
-        wanted, seeds = len(rngs), [rng.initial_seed() for rng in rngs]
-        while observed is None and wanted > 1 and seeds[wanted - 1] == seeds[wanted - 2]:
-            wanted -= 1
         images = []
         for first in range(0, wanted, _DECODED_AT_ONCE):
             some = slice(first, first + _DECODED_AT_ONCE)
@@ -148,7 +146,7 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
                 images.append(self.pixels.sample(tokenizer.decode(grid), rngs[some], pixels, known))
             else:
                 images.append(tokenizer.sample(grid, rngs[some], "threshold" if mask == "threshold" else "bernoulli"))
-        return RangeImage.cat(images)[[*range(wanted), *[wanted - 1] * (len(rngs) - wanted)]]
+        return RangeImage.cat(images)
 
     def observed_tokens(self, images: RangeImage, observed: Bool[Tensor, "B H W"]) -> Int[Tensor, "B T"]:
         """Return the tokens of the cells of which a pixel was observed, and -1 for the others.

@@ -17,6 +17,7 @@ from torch import Tensor
 from lidargrit.errors import ConfigError
 from lidargrit.files import load_exactly
 from lidargrit.generators import Cost, SystemFacts
+from lidargrit.generators._batches import BatchSeeds
 from lidargrit.generators._tokens import (
     PixelChoice,
     TokenGenerator,
@@ -128,15 +129,15 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         """Number of scans whose tokens are sampled at once: a step takes little longer for several than for one."""
         return 8 if self.device.type == "cpu" else 32
 
-    def _sample(self, seeds: Sequence[int], sampling: TokenSampling) -> RangeImage:
+    def _sample(self, seeds: BatchSeeds, sampling: TokenSampling) -> RangeImage:
         rngs = [torch.Generator().manual_seed(seed) for seed in seeds]  # on the CPU: the same numbers on every device
         uniform = torch.stack([torch.rand(self.transformer.context_length, generator=rng) for rng in rngs])
         decoder, tokenizer = self._prepare(len(seeds), sampling)
         tokens = decoder.generate(uniform.to(self.device))
-        return self.decode(tokens, rngs, sampling.mask, sampling.pixels(), tokenizer)
+        return self.decode(tokens, seeds.num_asked_for, rngs, sampling.mask, sampling.pixels(), tokenizer)
 
     def _complete(
-        self, images: RangeImage, observed: Bool[Tensor, "B H W"], seeds: Sequence[int], sampling: TokenSampling
+        self, images: RangeImage, observed: Bool[Tensor, "B H W"], seeds: BatchSeeds, sampling: TokenSampling
     ) -> RangeImage:
         """Generate the tokens of which no pixel was observed, and with a pixel decoder the pixels around observed ones.
 
@@ -146,7 +147,9 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         uniform = torch.stack([torch.rand(self.transformer.context_length, generator=rng) for rng in rngs])
         decoder, tokenizer = self._prepare(len(seeds), sampling)
         tokens = decoder.generate(uniform.to(self.device), self.observed_tokens(images, observed))
-        return self.decode(tokens, rngs, sampling.mask, sampling.pixels(), tokenizer, (images, observed))
+        return self.decode(
+            tokens, seeds.num_asked_for, rngs, sampling.mask, sampling.pixels(), tokenizer, (images, observed)
+        )
 
     @torch.no_grad()
     def token_nll_bits(self, images: RangeImage) -> Float[Tensor, "B h w"]:

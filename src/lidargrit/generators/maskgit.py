@@ -13,6 +13,7 @@ from torch import Tensor
 
 from lidargrit.errors import ConfigError
 from lidargrit.generators import Cost, SystemFacts
+from lidargrit.generators._batches import BatchSeeds
 from lidargrit.generators._tokens import (
     PixelChoice,
     TokenGenerator,
@@ -112,11 +113,11 @@ class MaskGit(TokenGenerator[MaskGitConfig, MaskedSampling]):
         """Return 4 passes."""
         return MaskedSampling(steps=4)
 
-    def _sample(self, seeds: Sequence[int], sampling: MaskedSampling) -> RangeImage:
+    def _sample(self, seeds: BatchSeeds, sampling: MaskedSampling) -> RangeImage:
         rngs = [torch.Generator().manual_seed(seed) for seed in seeds]  # on the CPU: the same numbers on every device
         tokens = generate_tokens(self.transformer, rngs, sampling)
         tokenizer = self.tokenizer.for_decoding(sampling.decoder)
-        return self.decode(tokens, rngs, sampling.mask, sampling.pixels(), tokenizer)
+        return self.decode(tokens, seeds.num_asked_for, rngs, sampling.mask, sampling.pixels(), tokenizer)
 
     def cost(self, sampling: MaskedSampling | None = None) -> Cost:
         """Return the cost of the passes over all tokens and of one decoding."""
