@@ -10,7 +10,7 @@ import torch
 from lidargrit import _discovery
 from lidargrit.cli import main
 from lidargrit.errors import ConfigError, DataError, LidarGritError, UnknownNameError
-from lidargrit.evaluation.comparison import EvalConfig, chosen_metrics, compare_sources
+from lidargrit.evaluation.comparison import EvalConfig, compare_sources
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.pairs import pair_for_protocol
 from lidargrit.evaluation.protocols import MetricChoice, Protocol, load_protocol
@@ -176,20 +176,29 @@ def test_sets_that_overlap_and_roads_that_differ_are_told(sets, tmp_path):
 
 
 def test_metrics_by_name_take_the_protocols_definitions():
-    protocol = load_protocol("r2dm")
-    by_name = chosen_metrics(protocol, EvalConfig("r2dm", metrics=("bev-jsd", "sliced_wasserstein", "bev_jsd")))
+    by_name = EvalConfig("r2dm", metrics=("bev-jsd", "sliced_wasserstein", "bev_jsd")).chosen_metrics()
     assert [(c.metric, c.variant) for c in by_name] == [
         ("bev_jsd", "r2dm"),
         ("sliced_wasserstein", "reference"),
         ("sliced_wasserstein", "textbook"),
     ]
-    every = chosen_metrics(load_protocol("exact"), EvalConfig(metrics=("sliced_wasserstein",)))
+    every = EvalConfig(metrics=("sliced_wasserstein",)).chosen_metrics()
     assert [c.variant for c in every] == ["reference", "textbook"]
-    assert chosen_metrics(protocol, EvalConfig("r2dm", variant="exact"))[0].variant == "exact"
-    with pytest.raises(UnknownNameError, match="bev_jsd"):
-        chosen_metrics(protocol, EvalConfig(metrics=("bev_jds",)))
-    with pytest.raises(ConfigError, match="wanted 0 to"):
-        EvalConfig(seed=-1)
+    assert EvalConfig("r2dm", variant="exact").chosen_metrics()[0].variant == "exact"
+
+
+@pytest.mark.parametrize(
+    ("words", "error", "why"),
+    [
+        ({"metrics": ("bev_jds",)}, UnknownNameError, "bev_jsd"),
+        ({"protocol": "r2mm"}, UnknownNameError, "r2dm"),
+        ({"variant": "exakt"}, ConfigError, "exact"),
+        ({"seed": -1}, ConfigError, "wanted 0 to"),
+    ],
+)
+def test_wrong_words_are_refused_before_anything_is_opened(words, error, why):
+    with pytest.raises(error, match=why):
+        EvalConfig(**words)
 
 
 def test_a_scorecard_is_read_back_and_nothing_else_is(card, tmp_path):

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from lidargrit import sources
+from lidargrit.cli import main
 from lidargrit.errors import ConfigError, DataError, UnknownNameError
 from lidargrit.evaluation.benchmark import Benchmark
 from lidargrit.evaluation.comparison import EvalConfig, compare_sources
@@ -124,7 +125,11 @@ def test_nobody_else_asks_what_a_source_is():
                 found[path.relative_to(root).as_posix()] = asked
     assert found == {
         "fitting/__init__.py": ["open_dataset"],  # below the room of sources; takes points of scans only
-        "cli/inspect.py": ["open_dataset"],
-        "cli/prepare.py": ["open_dataset"],
         "publishing/__init__.py": ["is_sample_folder"],
     }
+
+
+@pytest.mark.parametrize("verb", ["prepare", "inspect"])
+def test_a_verb_that_wants_points_says_what_a_source_holds_instead(verb, capsys):
+    assert main([verb, "pretrained"]) == 2
+    assert "pretrained, which holds a trained model; wanted the points of scans" in capsys.readouterr().err

@@ -32,11 +32,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Project one scan and print what became of it."""
     from lidargrit.api import load_scan
-    from lidargrit.datasets import open_dataset
     from lidargrit.files import refuse_to_overwrite
     from lidargrit.projection.fit import closest_sensor
     from lidargrit.projection.inspection import as_json, as_table, inspect
     from lidargrit.sensors import load_sensor
+    from lidargrit.sources import open_source
     from lidargrit.viewer.inspection import plot_inspection
 
     refuse_to_overwrite(options.out, options.overwrite, ".png")
@@ -45,7 +45,7 @@ def run(options: argparse.Namespace) -> None:
     if Path(options.scan).is_file():
         scan = load_scan(options.scan, bad_points=options.bad_points)
     else:
-        dataset = open_dataset(options.scan, options.bad_points)
+        dataset = open_source(options.scan, options.bad_points).scans()
         scan = dataset.scan(0)
         name = name or dataset.sensor
     sensor = load_sensor(name or closest_sensor(scan))

@@ -28,8 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     rows = "rows by elevation (spherical) or by ring (unfolding) (default: the sensor's own)"
     parser.add_argument("--projection", choices=["sensor", "spherical", "unfolding"], default="sensor", help=rows)
     add_projection_variant(parser)
-    count = "number of scans to prepare, evenly spaced; 0 for all"
-    parser.add_argument("-n", "--max-scans", type=int, default=0, help=count)
+    parser.add_argument("-n", "--max-scans", type=int, default=0, help="number of scans, evenly spaced; 0 for all")
     add_bad_scans(parser)
     parser.add_argument("--workers", type=int, default=2, help="number of processes on this machine")
     add_rank(parser, "machine")
@@ -39,13 +38,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Prepare, and say what was made."""
-    from lidargrit.datasets import open_dataset
     from lidargrit.loading import DataConfig, prepare_and_describe
     from lidargrit.reporting import TerminalReporter
+    from lidargrit.sources import open_source
 
     refuse_taken(options)
+    dataset = open_source(options.source, options.bad_points).scans()
     config = DataConfig(
-        sensor=options.sensor or open_dataset(options.source, options.bad_points).sensor,
+        sensor=options.sensor or dataset.sensor,
         columns=options.columns,
         column_stride=options.column_stride,
         projection=options.projection,
@@ -55,6 +55,6 @@ def run(options: argparse.Namespace) -> None:
         bad_scans=options.bad_scans,
         workers=options.workers,
     )
-    reporter, place = TerminalReporter(), (options.rank, options.world_size)
-    made = prepare_and_describe(options.source, config, options.out, reporter, *place, verify=options.verify)
-    tell(options, made.as_line(), made.to_json())
+    reporter, machines = TerminalReporter(), (options.rank, options.world_size)
+    made = prepare_and_describe(options.source, dataset, config, options.out, reporter, *machines, options.verify)
+    tell(options, made.as_text(), made.to_json())

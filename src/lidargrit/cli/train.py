@@ -42,7 +42,7 @@ def run(options: argparse.Namespace) -> None:
     if options.dry_run or options.measure:
         refuse_taken(options)
         planned, measured = plan_training(recipe), measure(recipe) if options.measure else []
-        text = "\n".join([planned.as_text(), *(stage.as_line() for stage in measured)])
+        text = "\n".join([planned.as_text(), *(stage.as_text() for stage in measured)])
         tell(options, text, {**planned.to_json(), "measured": [vars(stage) for stage in measured]})
         return
     if options.json:

@@ -14,8 +14,8 @@ import torch
 from lidargrit import __version__
 from lidargrit.configuration import override
 from lidargrit.errors import ConfigError
-from lidargrit.evaluation.comparison import EvalConfig, chosen_metrics, compare_pair, open_pair
-from lidargrit.evaluation.protocols import load_protocol, public_name
+from lidargrit.evaluation.comparison import EvalConfig, compare_pair, open_pair
+from lidargrit.evaluation.protocols import public_name
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.evaluation.tables import Format, side_by_side
 from lidargrit.files import read_json, write_json
@@ -80,7 +80,6 @@ def run(systems: Sequence[str], folder: Path, benchmark: Benchmark, reporter: Re
     # Wrong words and runs of other recipes are told before anything is trained.
     plans = [_Plan.of(system, folder, benchmark) for system in systems]
     settings = replace(benchmark.settings, max_scans=benchmark.num_samples)
-    chosen_metrics(load_protocol(settings.protocol), settings)
     reference = open_source(benchmark.reference, settings.data.bad_points)
     if (benchmark.recipe_settings or benchmark.flops) and not any(plan.recipe for plan in plans):
         raise ConfigError("settings or a budget, and no recipe", "a recipe that they are for", "leave them out")

@@ -9,10 +9,9 @@ from typing import Any, Literal
 
 from lidargrit import _discovery
 from lidargrit.errors import ConfigError, nearest_names
-from lidargrit.evaluation.comparison import EvalConfig, chosen_metrics, compare_pair, open_pair
+from lidargrit.evaluation.comparison import EvalConfig, compare_pair, open_pair
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.pairs import EvalPair
-from lidargrit.evaluation.protocols import load_protocol
 from lidargrit.evaluation.reconstruction import score_run
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.files import refuse_to_overwrite
@@ -53,7 +52,6 @@ def evaluate(
         raise ConfigError(got, "samples and what they are compared with", "name two sets, or use --tables")
     refuse_to_overwrite(report, overwrite)
     usable_device(config.device)
-    chosen_metrics(load_protocol(config.protocol), config)  # refuses unknown names before anything is opened
     first = open_source(samples, config.data.bad_points, config.samples_format)
     second = open_source(reference, config.data.bad_points)
     if isinstance(first, RunSource):

@@ -13,7 +13,7 @@ from lidargrit import __version__, _discovery
 from lidargrit.errors import ConfigError, LidarGritError, nearest_names
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.pairs import EvalPair, pair_for_protocol
-from lidargrit.evaluation.protocols import DEFAULT, MetricChoice, Protocol, load_protocol, public_name
+from lidargrit.evaluation.protocols import DEFAULT, MetricChoice, load_protocol, public_name
 from lidargrit.evaluation.scorecard import LeftOut, Score, Scorecard
 from lidargrit.evaluation.scoring import MetricFactory, score_metrics
 from lidargrit.loading import DataConfig
@@ -21,9 +21,9 @@ from lidargrit.metrics import load_metric
 from lidargrit.projection import ProjectionVariant
 from lidargrit.reporting import Reporter
 from lidargrit.sources import Source, open_source
+from lidargrit.untrusted import SEED_AT_MOST
 
 _FEW = 100  # scans: below that the interval itself rests on too little, and values hardly differ from real against real
-_LARGEST = 2**63  # above the largest seed that torch takes
 
 
 @dataclass(frozen=True)
@@ -57,10 +57,37 @@ class EvalConfig:
     data: DataConfig = field(default_factory=DataConfig)
 
     def __post_init__(self) -> None:
-        if not (0 <= self.max_scans < _LARGEST and 0 <= self.seed < _LARGEST):
+        if not (0 <= self.max_scans <= SEED_AT_MOST and 0 <= self.seed <= SEED_AT_MOST):
             raise ConfigError(
                 f"-n {str(self.max_scans)[:25]}, --seed {str(self.seed)[:25]}", "0 to 2^63 - 1", "correct the number"
             )
+        self.chosen_metrics()  # refuses unknown names before anything is opened
+
+    def chosen_metrics(self) -> list[MetricChoice]:
+        """Return the metrics to compute: the protocol's, or those that the user named.
+
+        Raises:
+            UnknownNameError: no such protocol, or the user named a metric that does not exist.
+            ConfigError: none of the metrics has the variant that the user named.
+        """
+        protocol = load_protocol(self.protocol)
+        wanted = list(protocol.metrics)
+        if self.metrics:
+            wanted = []
+            for name in map(public_name, self.metrics):
+                cls = load_metric(name)
+                its_own = [choice for choice in protocol.metrics if choice.metric == name]
+                # Of the default protocol all definitions are shown: whoever asks for one metric wants to see them.
+                every = [MetricChoice(name, variant) for variant in cls.variants]
+                wanted += every if public_name(self.protocol) == DEFAULT or not its_own else its_own
+        if self.variant:
+            _require_known(self.variant, wanted)
+            wanted = [replace(choice, variant=self.variant) for choice in wanted]
+        kept: list[MetricChoice] = []
+        for choice in wanted:
+            if choice not in kept:
+                kept.append(choice)
+        return kept
 
     def facts(self) -> dict[str, Any]:
         """Return the entries of a scorecard, as plain values."""
@@ -103,7 +130,6 @@ def compare_sources(
 def open_pair(samples: Source, reference: Source, settings: EvalConfig, reporter: Reporter) -> EvalPair:
     """Read the two sets of an evaluation, and warn of what speaks against comparing them."""
     protocol = load_protocol(settings.protocol)
-    chosen_metrics(protocol, settings)  # refuses unknown names before scans are projected
     variant = settings.projection_variant or protocol.variant
     config = replace(settings.data, projection_variant=variant, max_scans=settings.max_scans)
     pair = pair_for_protocol(samples, reference, protocol, config, reporter)
@@ -119,7 +145,7 @@ def compare_pair(pair: EvalPair, settings: EvalConfig, reporter: Reporter | None
         LidarGritError: not one metric could be computed; the reason of the first.
     """
     reporter, protocol = reporter or Reporter(), load_protocol(settings.protocol)
-    wanted = chosen_metrics(protocol, settings)
+    wanted = settings.chosen_metrics()
     factories = [_factory(choice, settings, reporter) for choice in wanted]
     found = score_metrics(factories, pair, settings.resampling, reporter)
     scores = [score for score in found if isinstance(score, Score)]
@@ -155,32 +181,6 @@ def compare_pair(pair: EvalPair, settings: EvalConfig, reporter: Reporter | None
             **{name: metadata.version(name) for name in ("torch", "numpy", "scipy")},
         },
     )
-
-
-def chosen_metrics(protocol: Protocol, settings: EvalConfig) -> list[MetricChoice]:
-    """Return the metrics to compute: the protocol's, or those that the user named.
-
-    Raises:
-        UnknownNameError: the user named a metric that does not exist.
-        ConfigError: none of the metrics has the variant that the user named.
-    """
-    wanted = list(protocol.metrics)
-    if settings.metrics:
-        wanted = []
-        for name in map(public_name, settings.metrics):
-            cls = load_metric(name)
-            its_own = [choice for choice in protocol.metrics if choice.metric == name]
-            # Of the default protocol all definitions are shown: whoever asks for one metric wants to see them.
-            every = [MetricChoice(name, variant) for variant in cls.variants]
-            wanted += every if public_name(settings.protocol) == DEFAULT or not its_own else its_own
-    if settings.variant:
-        _require_known(settings.variant, wanted)
-        wanted = [replace(choice, variant=settings.variant) for choice in wanted]
-    kept: list[MetricChoice] = []
-    for choice in wanted:
-        if choice not in kept:
-            kept.append(choice)
-    return kept
 
 
 def _require_known(variant: str, wanted: Sequence[MetricChoice]) -> None:

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lidargrit.errors import ConfigError
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
-
-SEEDS_BELOW = 1 << 63  # what torch.Generator.manual_seed takes without folding two seeds into one
+from lidargrit.untrusted import SEED_AT_MOST
 
 
 def check_seeds(seeds: Sequence[int], count: int | None = None) -> None:
@@ -27,7 +26,7 @@ def check_seeds(seeds: Sequence[int], count: int | None = None) -> None:
     if not len(seeds):
         raise ConfigError("no seeds", "at least one, such as seeds=[0]", "name a seed for each scan")
     for seed in seeds:
-        if not 0 <= seed < SEEDS_BELOW:
+        if not 0 <= seed <= SEED_AT_MOST:
             raise ConfigError(f"the seed {str(seed)[:30]}", "a whole number from 0 to 2^63 - 1", "choose another seed")
 
 
@@ -55,3 +54,14 @@ def check_observed(observed: Bool[Tensor, "..."], images: RangeImage) -> None:
             f"{tuple(images.range_m.shape)} and torch.bool, one for each pixel of the images",
             "give a mask for each image",
         )
+
+
+def reflectance_to_learn(images: RangeImage) -> Float[Tensor, "*B H W"]:
+    """Return the reflectance of training scans, in [0, 1]; refuse scans without it."""
+    if images.reflectance is None:
+        raise ConfigError(
+            "range images without reflectance",
+            "images with it, for model.reflectance=true",
+            "use --set model.reflectance=false, or prepare scans that have it",
+        )
+    return images.reflectance

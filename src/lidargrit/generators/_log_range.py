@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lidargrit.errors import ConfigError
+from lidargrit.generators._checks import reflectance_to_learn
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
@@ -29,13 +30,7 @@ def encode(images: RangeImage, with_reflectance: bool) -> Float[Tensor, "B C H W
     level = torch.log2(1 + images.range_m.clamp(max=far)) * (2 / math.log2(1 + far)) - 1
     if not with_reflectance:
         return level[:, None]
-    if images.reflectance is None:
-        raise ConfigError(
-            "range images without reflectance",
-            "images with it, for model.reflectance=true",
-            "use --set model.reflectance=false, or prepare scans that have it",
-        )
-    return torch.stack((level, 2 * images.reflectance * images.return_mask - 1), dim=1)
+    return torch.stack((level, 2 * reflectance_to_learn(images) * images.return_mask - 1), dim=1)
 
 
 def decode(

@@ -15,6 +15,7 @@ from torch import Tensor
 from lidargrit.errors import CheckpointError, ConfigError
 from lidargrit.files import load_exactly
 from lidargrit.generators import Cost, Generator, SystemFacts
+from lidargrit.generators._checks import reflectance_to_learn
 from lidargrit.nn.diffusion import SeededNoise
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.lidargen_checkpoint import read_lidargen_checkpoint
@@ -253,13 +254,7 @@ def encode(images: RangeImage, config: LidarGenConfig) -> Float[Tensor, "B C H W
     level = (torch.log2(images.range_m + _NOTHING_M + 1) / config.log2_scale).clamp(0, 1)
     if not config.reflectance:
         return level[:, None]
-    if images.reflectance is None:
-        raise ConfigError(
-            "range images without reflectance",
-            "images with it, for model.reflectance=true",
-            "use --set model.reflectance=false, or prepare scans that have it",
-        )
-    return torch.stack((level, images.reflectance.clamp(0, 1) * images.return_mask), dim=1)
+    return torch.stack((level, reflectance_to_learn(images).clamp(0, 1) * images.return_mask), dim=1)
 
 
 def _check_counts(levels: int, steps_each: int) -> None:

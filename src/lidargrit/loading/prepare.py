@@ -110,7 +110,7 @@ class Prepared:
     seconds: float
     left_out: tuple[str, ...]
 
-    def as_line(self) -> str:
+    def as_text(self) -> str:
         """Return all of it as a line for a person."""
         return (
             f"{self.images} range images of {self.rows}x{self.columns} in {self.folder}: "
@@ -125,6 +125,7 @@ class Prepared:
 
 def prepare_and_describe(
     source: str,
+    dataset: ScanDataset,
     config: DataConfig,
     folder: Path | None,
     reporter: Reporter,
@@ -135,19 +136,19 @@ def prepare_and_describe(
     """Prepare a source and return what the folder holds.
 
     Args:
-        source, config, folder, reporter, rank, world_size: the arguments of :func:`prepare`.
+        source, dataset, config, folder, reporter, rank, world_size: the arguments of :func:`prepare`.
         verify: whether to read every image back and make damaged shards again.
 
     Raises:
         OutputError, ScanError: as for :func:`prepare`.
     """
     begun = time.monotonic()
-    folder = prepare(source, config, folder, reporter, rank=rank, world_size=world_size)
+    folder = prepare(source, config, folder, reporter, None, rank, world_size, dataset)
     if verify and (damaged := damaged_shards(folder, reporter)):
         reporter.message(f"damaged and made again: {', '.join(map(shard_name, damaged))}")
         for shard in damaged:
             (folder / shard_name(shard)).unlink()
-        prepare(source, config, folder, reporter, rank=rank, world_size=world_size)
+        prepare(source, config, folder, reporter, None, rank, world_size, dataset)
     images, seconds = PreparedImages(str(folder)), time.monotonic() - begun
     for why in images.left_out.values():
         reporter.message(f"left out: {why}")

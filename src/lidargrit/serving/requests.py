@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-import json
 import math
 import re
 from dataclasses import dataclass, field
@@ -13,10 +12,11 @@ from typing import Any, get_type_hints
 
 from lidargrit import formats
 from lidargrit._discovery import names
-from lidargrit.errors import ConfigError, nearest_names
+from lidargrit.errors import CheckpointError, ConfigError, nearest_names
 from lidargrit.serving.limits import Limits
+from lidargrit.untrusted import parse_json
 
-SEED_AT_MOST = 2**32 - 1  # what fits a field on a page; more seeds than anyone will try
+PAGE_SEED_AT_MOST = 2**32 - 1  # what fits a field on a page; more seeds than anyone will try
 HIDDEN = {  # part of an uploaded scan that is hidden from the model → its description on the page
     "nothing": "nothing: fill in the rays without a point",
     "ahead": "the quarter straight ahead",
@@ -89,12 +89,11 @@ def parse_json_object(data: bytes) -> dict[str, Any]:
         ConfigError: the bytes are not a JSON object.
     """
     try:
-        values = json.loads(data.decode("utf-8"), parse_constant=_refuse_constant)
-    except (ValueError, RecursionError):
-        values = None
-    if not isinstance(values, dict):
-        raise ConfigError("a request that is not a JSON object", '{"model": 0, "seed": 0, ...}', "use the page")
-    return values
+        return parse_json(data, "a request")
+    except CheckpointError:
+        raise ConfigError(
+            "a request that is not a JSON object", '{"model": 0, "seed": 0, ...}', "use the page"
+        ) from None
 
 
 def parse_request(values: dict[str, Any], settings: list[list[SamplingSetting]], limits: Limits) -> SampleRequest:
@@ -126,7 +125,7 @@ def parse_request(values: dict[str, Any], settings: list[list[SamplingSetting]],
             raise ConfigError(f"the setting {name[:40]!r}, which this model does not have", wanted, "use the page")
     return SampleRequest(
         model,
-        _whole("seed", values.get("seed", 0), 0, SEED_AT_MOST),
+        _whole("seed", values.get("seed", 0), 0, PAGE_SEED_AT_MOST),
         _whole("count", values.get("count", 1), 1, limits.scans),
         {name: _number(by_name[name], value) for name, value in changed.items()},
         hidden,
@@ -152,10 +151,6 @@ def _about(sampling: type, name: str) -> str:
     text = inspect.cleandoc(sampling.__doc__ or "")
     found = re.search(rf"^    {name}: (.*?)(?=^    \w+: |^\S|\Z)", text, re.MULTILINE | re.DOTALL)
     return " ".join(found[1].split()).replace("``", "") if found else ""
-
-
-def _refuse_constant(word: str) -> None:
-    raise ValueError(word)  # NaN and Infinity, which JSON does not have
 
 
 def _whole(name: str, value: Any, at_least: int, at_most: int) -> int:

@@ -36,7 +36,7 @@ class Measured:
     device: str
     peak_gib: float
 
-    def as_line(self) -> str:
+    def as_text(self) -> str:
         """Return all of it for a person."""
         return (
             f"{self.stage}: {self.flops:.2e} floating-point operations at {self.scans_per_s:.3g} scans/s: "

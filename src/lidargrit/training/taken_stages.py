@@ -20,11 +20,9 @@ def taken_stages(recipe: Recipe, generator: Generator) -> dict[str, Objective]:
         CheckpointError: no finished run.
     """
     if recipe.tokenizer_from is not None:
-        tokenizer = load(Path(recipe.tokenizer_from)).get_tokenizer()
-        theirs = {"name": tokenizer.config.name(), **configuration.leaves(configuration.to_json(tokenizer.config))}
-        same_rays = generator.sensor.same_rays(tokenizer.sensor)
-        _check(f"tokenizer_from={recipe.tokenizer_from}", generator, "tokenizer", theirs, same_rays)
-        return {"tokenizer": tokenizer}
+        donor = load(Path(recipe.tokenizer_from))
+        _check(f"tokenizer_from={recipe.tokenizer_from}", generator, donor, "tokenizer")
+        return {"tokenizer": donor.get_tokenizer()}
     if recipe.stages_from is None:
         return {}
     donor = load(Path(recipe.stages_from))
@@ -36,16 +34,15 @@ def taken_stages(recipe: Recipe, generator: Generator) -> dict[str, Objective]:
         )
     stages = [stage for stage in generator.stages if stage in donor.stages]
     for stage in stages:
-        theirs, same_rays = _settings(donor, stage), generator.sensor.same_rays(donor.sensor)
-        _check(f"stages_from={recipe.stages_from}", generator, stage, theirs, same_rays)
+        _check(f"stages_from={recipe.stages_from}", generator, donor, stage)
     return {stage: donor.objective(stage) for stage in stages}
 
 
-def _check(setting: str, generator: Generator, stage: str, theirs: dict[str, Any], same_rays: bool) -> None:
+def _check(setting: str, generator: Generator, donor: Generator, stage: str) -> None:
     """Refuse a stage whose sizes or sensor are not the generator's."""
-    ours = _settings(generator, stage)
+    ours, theirs = _settings(generator, stage), _settings(donor, stage)
     differing = [name for name in ours if ours[name] != theirs.get(name)]
-    if differing or not same_rays:
+    if differing or not generator.sensor.same_rays(donor.sensor):
         other = f"model.{stage}.{differing[0]}={theirs.get(differing[0])}" if differing else "data.sensor"
         raise ConfigError(
             f"{setting}, whose {stage} is another ({other})",
