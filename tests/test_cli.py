@@ -30,6 +30,7 @@ TINY = [
     "training.tokenizer.scans=8",
     "training.transformer.scans=8",
 ]
+COUNTED = ("lidargen_kitti_360", "lidargrit_kitti_360", "r2flow_kitti_360")  # counting takes seconds for each recipe
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -117,7 +118,10 @@ def test_dry_run_tells_the_plan_and_writes_nothing(tmp_path, typed):
 
 
 @pytest.mark.parametrize("recipe", _discovery.names("recipes"))
-def test_every_recipe_has_a_plan(recipe, tmp_path, typed):
+def test_every_recipe_has_a_plan(recipe, tmp_path, typed, monkeypatch):
+    if recipe not in COUNTED:
+        told_at_once = lambda recipe: dict.fromkeys(recipe.training, 10**18)  # noqa: E731
+        monkeypatch.setattr(sys.modules["lidargrit.training.plan"], "training_flops", told_at_once)
     told = typed("train", recipe, tmp_path / "none", "--dry-run")
     assert "published: " in told
     assert (" parameters, " in told) == bool(load_recipe(recipe).training)

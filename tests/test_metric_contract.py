@@ -12,6 +12,7 @@ from lidargrit import _discovery
 from lidargrit.errors import ConfigError, DataError, UnknownNameError
 from lidargrit.metrics import Metric, load_metric
 from lidargrit.metrics._accumulators import Total
+from lidargrit.metrics._networks.network import PretrainedNetwork
 from lidargrit.sensors import load_sensor
 from lidargrit.structures import MetricResult, RangeImage
 from seeded_networks import weights_folder
@@ -28,10 +29,25 @@ pytestmark = [pytest.mark.parametrize(("name", "variant"), CASES)]
 
 @pytest.fixture(autouse=True)
 def _network(name, monkeypatch):
-    """Give metrics that look through a network random weights for it, and small images, since it takes its time."""
+    """Give metrics that look through a network random weights for it, and small images, since it takes its time.
+
+    Images are looked at one by one, so that an image that was seen before need not be looked at again.
+    """
     if load_metric(name).needs_weights:
         monkeypatch.setenv("LIDARGRIT_WEIGHTS", str(weights_folder()))
+        monkeypatch.setattr(PretrainedNetwork, "_forward", seen_once)
         monkeypatch.setattr(sys.modules[__name__], "SENSOR", SMALL)
+
+
+FORWARD, SEEN = PretrainedNetwork._forward, {}
+
+
+def seen_once(network, image):
+    """Return the features of an image, from the second time on without the network."""
+    key = network.name, image.numpy().tobytes()
+    if key not in SEEN:
+        SEEN[key] = FORWARD(network, image)
+    return SEEN[key]
 
 
 def scenes(seed, count=16, walls=6, drop_share=0.1, noise_m=0.0):

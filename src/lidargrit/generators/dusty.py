@@ -253,6 +253,7 @@ class AdversarialObjective(Objective):
     def __init__(self, synthesis: Synthesis, config: DustyConfig, sensor: SensorModel) -> None:
         super().__init__(sensor)
         self.config, self.encoding = config, InverseRange(sensor)
+        self.period = config.penalty_every if config.penalty_weight > 0 else 1
         self.synthesis, self.discriminator = synthesis, Discriminator(_widths(config), _size(sensor))
         self.register_buffer("turns", torch.zeros((), dtype=torch.int64))  # of the discriminator
 

@@ -25,6 +25,8 @@ class Objective(nn.Module, ABC):
     Every step asks the objective once for each player, and moves the weights that this player's loss reaches before it
     asks for the next. The objective itself keeps the other players' weights out of a player's reach.
     """
+    period: int = 1
+    """Number of training steps after which the same operations come again; more than 1 if some terms come rarely."""
 
     def __init__(self, sensor: SensorModel) -> None:
         super().__init__()

@@ -82,10 +82,10 @@ class VectorQuantiser(nn.Module):
         """Return the codes of tokens."""
         return self.embedding(tokens).movedim(-1, 1)
 
-    def perplexity(self) -> float:
+    def perplexity(self) -> Float[Tensor, ""]:
         """Return exp(entropy) of how often codes are used: the number of codes in effective use."""
         share = self.usage / self.usage.sum().clamp(min=1e-9)
-        return float(torch.special.entr(share).sum().exp())
+        return torch.special.entr(share).sum().exp()
 
     def used_share(self) -> float:
         """Return the share of codes that are used often enough not to be dead."""
@@ -94,12 +94,13 @@ class VectorQuantiser(nn.Module):
     @torch.no_grad()
     def _update_codes(self, flat: Tensor, tokens: Tensor, rng: torch.Generator | None) -> None:
         """Count how often codes are used, move codes that follow the mean of their latents, and restart dead ones."""
-        num_codes = self.embedding.num_embeddings
-        counts = sum_over_processes(torch.bincount(tokens, minlength=num_codes).to(flat.dtype))
+        # Nothing here reads a value: a GPU does not wait, and operations can be counted on tensors without values.
+        ones = torch.ones_like(tokens, dtype=flat.dtype)
+        counts = sum_over_processes(torch.zeros_like(self.usage).index_add_(0, tokens, ones))
         sums = sum_over_processes(torch.zeros_like(self.code_sums).index_add_(0, tokens, flat))
-        fresh = bool(self.usage.sum() == 0)
-        self.usage.copy_(counts if fresh else torch.lerp(counts, self.usage, _EMA_DECAY))
-        self.code_sums.copy_(sums if fresh else torch.lerp(sums, self.code_sums, _EMA_DECAY))
+        fresh = self.usage.sum() == 0
+        self.usage.copy_(torch.where(fresh, counts, torch.lerp(counts, self.usage, _EMA_DECAY)))
+        self.code_sums.copy_(torch.where(fresh, sums, torch.lerp(sums, self.code_sums, _EMA_DECAY)))
         if self.loss == "ema":
             smoothed = (self.usage + 1e-5).unsqueeze(1)
             alive = (self.usage > 1e-3).unsqueeze(1)

@@ -286,7 +286,7 @@ class Vqvae(Tokenizer[VqvaeConfig]):
             pair = encoding.unit_range(range_m), torch.where(mask, encoding.unit_range(target_m), -1.0)
         else:
             pair = encoded, encoding.encode(images.range_m, mask)
-        terms = {"commitment": z.loss, "codebook_perplexity": torch.tensor(self.quantize.perplexity())}
+        terms = {"commitment": z.loss, "codebook_perplexity": self.quantize.perplexity()}
         if self.config.raydrop_loss:
             kind = self.config.reconstruction
             kept = torch.bernoulli(return_logits.detach().sigmoid(), generator=rng) > 0 if kind == "reference" else mask
@@ -304,7 +304,7 @@ class Vqvae(Tokenizer[VqvaeConfig]):
 
     def warnings(self) -> list[str]:
         """Return a line with the remedy if the codebook has collapsed."""
-        perplexity, used = self.quantize.perplexity(), self.quantize.used_share()
+        perplexity, used = float(self.quantize.perplexity()), self.quantize.used_share()
         if perplexity >= _COLLAPSED_BELOW * self.num_codes:
             return []
         remedy = (

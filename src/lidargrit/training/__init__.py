@@ -1,6 +1,6 @@
 """Recipe → run folder, by one training loop for every generator."""
 
-from lidargrit.training.compute import estimated_training_flops, gpu_time, training_flops, with_budget
+from lidargrit.training.compute import gpu_time, training_flops, with_budget
 from lidargrit.training.config import FitConfig, Recipe
 from lidargrit.training.measure import Measured, measure
 from lidargrit.training.plan import TrainingPlan, plan_training
@@ -13,7 +13,6 @@ __all__ = [
     "Recipe",
     "TrainingPlan",
     "check_folder",
-    "estimated_training_flops",
     "gpu_time",
     "measure",
     "plan_training",

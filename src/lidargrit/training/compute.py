@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
+from itertools import chain, product
 
 import torch
+from torch import Tensor
+from torch.func import functional_call
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 from torch.utils.module_tracker import ModuleTracker
@@ -15,13 +19,11 @@ from lidargrit.nn.precision import Precision
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 from lidargrit.training.config import FitConfig, Recipe
-from lidargrit.training.engine import Engine
 
 _SCANS = 2  # in a counted batch: some objectives compare the scans of a batch
-_STEPS = 16  # counted of adversarial objectives, some of whose terms come only every 16th step
+_STEPS_AT_MOST = 64  # that are counted; rarer terms hardly cost
 _A100_FP32_FLOPS_PER_S, _A100_BF16_FLOPS_PER_S = 19.5e12, 312e12
 _SHARE = 0.25  # of a card's peak: a guess for networks as small as these; small batches reach less
-_STRIP = 16  # columns: the deepest of our networks halves their number four times
 
 
 def training_flops(recipe: Recipe) -> dict[str, int]:
@@ -30,50 +32,20 @@ def training_flops(recipe: Recipe) -> dict[str, int]:
     Matrix products and convolutions are counted while a few steps run, on scans whose every pixel returns at 10 m. A
     multiplication with its addition counts as two operations. Validation and the optimiser are not counted.
 
+    The steps run on weights that have a shape and no values, so that nothing is computed. Only where the operations of
+    an objective depend on values, as MaskGIT's do, are the steps computed.
+
     Returns:
         number of operations, by the name of the stage.
     """
-    return _counted(recipe, recipe.data.load_sensor())
-
-
-def estimated_training_flops(recipe: Recipe) -> dict[str, int]:
-    """Estimate what :func:`training_flops` counts, in seconds and little memory also where images are large.
-
-    The operations of a convolution grow with the number of columns, those of attention with its square. So counts on
-    images of 16, 32 and 48 columns determine the count on the whole image. The estimate is 3 % too high for R2DM, some
-    of whose layers depend on the number of columns in another way.
-    """
-    # Torch's fake tensors, which take no memory, stop at the codebook, whose counts depend on values.
-    sensor = recipe.data.load_sensor()
-    strips = sensor.width / _STRIP
-    if strips <= 6 or sensor.width % _STRIP:
-        return training_flops(recipe)
-    try:
-        narrow = [_counted(recipe, _strip(sensor, number * _STRIP)) for number in (1, 2, 3)]
-    except ConfigError:  # a network that halves the columns more often
-        return training_flops(recipe)
-    # The parabola through three points at 1, 2 and 3 (Lagrange).
-    weights = ((strips - 2) * (strips - 3) / 2, -(strips - 1) * (strips - 3), (strips - 1) * (strips - 2) / 2)
-    return {
-        stage: round(sum(weight * one[stage] for weight, one in zip(weights, narrow, strict=True)))
-        for stage in narrow[0]
-    }
-
-
-def _counted(recipe: Recipe, sensor: SensorModel) -> dict[str, int]:
     with torch.random.fork_rng(range(torch.cuda.device_count())):
         torch.manual_seed(0)
+        sensor = recipe.data.load_sensor()
         generator = recipe.build_generator(sensor)
-        found = {}
-        for stage in generator.stages:
-            found[stage] = round(_flops_per_scan(generator.objective(stage), sensor) * recipe.training[stage].scans)
-        return found
-
-
-def _strip(sensor: SensorModel, columns: int) -> SensorModel:
-    elevation = sensor.elevation_rad
-    kept = elevation if elevation.shape[1] == 1 else elevation[:, :columns]
-    return replace(sensor, elevation_rad=kept, azimuth_rad=sensor.azimuth_rad[:, :columns])
+        return {
+            stage: round(_flops_per_scan(generator.objective(stage), sensor) * recipe.training[stage].scans)
+            for stage in generator.stages
+        }
 
 
 def gpu_time(flops: int, precision: Precision) -> str:
@@ -143,18 +115,38 @@ def uniform_images(sensor: SensorModel, count: int) -> RangeImage:
 
 
 def _flops_per_scan(objective: Objective, sensor: SensorModel) -> float:
-    images = uniform_images(sensor, _SCANS)
-    engine = Engine("fp32", bool(objective.players))
-    engine.set_up(objective, torch.optim.SGD(objective.parameters(), lr=0.0))  # the cheapest; it is not counted
-    steps = _STEPS if objective.players else 1
+    from torch._subclasses import fake_tensor  # noqa: PLC0415  takes two seconds, and only counting needs it
+
+    images, steps = uniform_images(sensor, _SCANS), min(objective.period, _STEPS_AT_MOST)
+    objective.train()
+    mode = fake_tensor.FakeTensorMode(allow_non_fake_inputs=True)
+    own = chain(objective.named_parameters(), objective.named_buffers())
+    # Counters, by which steps differ, keep their values.
+    without_values = {name: mode.from_tensor(tensor) for name, tensor in own if tensor.is_floating_point()}
+    try:
+        total = _total_flops(objective, without_values, images, steps)
+    except (
+        fake_tensor.DataDependentOutputException,
+        fake_tensor.DynamicOutputShapeException,
+        fake_tensor.UnsupportedOperatorException,
+    ):
+        total = _total_flops(objective, {}, images, steps)
+    return total / (steps * _SCANS)
+
+
+def _total_flops(objective: Objective, tensors: dict[str, Tensor], images: RangeImage, steps: int) -> int:
+    """Count the operations of some steps of all players, with other tensors in place of the objective's own."""
     counter = FlopCounterMode(display=False)
     # The counter's tracker of modules fails on gradient penalties, and counts by module are not needed.
     counter.mod_tracker = _NoModules()
     # The counter does not see the matrix products within the fused attention of a CPU.
-    with counter, sdpa_kernel(SDPBackend.MATH):
-        for step in range(steps):
-            engine.step(images.to(engine.device), step, 0.0)
-    return counter.get_total_flops() / (steps * _SCANS)
+    with counter, sdpa_kernel(SDPBackend.MATH), warnings.catch_warnings():
+        # Torch asks an image of which a penalty takes the gradient for one that was not kept, and warns itself of it.
+        warnings.filterwarnings("ignore", "The .grad attribute of a Tensor")
+        for step, player in product(range(steps), objective.players or ("",)):
+            rng = torch.Generator().manual_seed(step)
+            functional_call(objective, tensors, (images, rng, player))["loss"].backward()
+    return counter.get_total_flops()
 
 
 class _NoModules(ModuleTracker):

@@ -7,7 +7,7 @@ from typing import Any
 
 from lidargrit import configuration
 from lidargrit.nn.precision import Precision
-from lidargrit.training.compute import estimated_training_flops, gpu_time
+from lidargrit.training.compute import gpu_time, training_flops
 from lidargrit.training.config import Recipe
 from lidargrit.training.optimiser import memory_of_weights
 
@@ -22,7 +22,7 @@ class StagePlan:
         scans: number of scans seen.
         batch_size: number of scans in a step, over all processes.
         memory: bytes of weights, their average, gradients and the optimiser's moments, without activations.
-        flops: floating-point operations of all steps, estimated.
+        flops: number of floating-point operations of all steps.
         precision: precision of the operations.
     """
 
@@ -80,7 +80,7 @@ def plan_training(recipe: Recipe) -> TrainingPlan:
     """Return what the training of a recipe would do; nothing is read or written."""
     sensor = recipe.data.load_sensor()
     generator = recipe.build_generator(sensor)
-    stages, flops = [], estimated_training_flops(recipe)
+    stages, flops = [], training_flops(recipe)
     for name in generator.stages:
         objective, budget = generator.objective(name), recipe.training[name]
         parameters = sum(weight.numel() for weight in objective.parameters())
