@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from lidargrit import configuration
 from lidargrit.datasets.kitti_odometry import KittiOdometry
 from lidargrit.errors import OutputError, TrainingError
-from lidargrit.files import claim_folder, read_tensors
+from lidargrit.files import claim_folder, read_tensors, write_json
 from lidargrit.loading import Batches, DataConfig
 from lidargrit.nn.objective import Objective
 from lidargrit.recipes import load_recipe
@@ -19,7 +20,7 @@ from lidargrit.reporting import Reporter
 from lidargrit.sensors import load_sensor
 from lidargrit.sources import load_range_images
 from lidargrit.tokenizers.vqvae import Vqvae
-from lidargrit.training import FitConfig, measure, train, training_flops
+from lidargrit.training import FitConfig, check_folder, measure, train, training_flops
 from lidargrit.training.fit import Fit
 from lidargrit.training.log import Log, read_log
 from lidargrit.training.optimiser import WeightAverage, learning_rate_at, make_optimiser, memory_of_weights
@@ -225,6 +226,15 @@ def test_stages_use_their_own_settings():
     assert recipe.training["transformer"].learning_rate == 0.5
     assert recipe.training["tokenizer"] == load_recipe("demo").training["tokenizer"]
     assert replace(recipe, seed=1) != recipe
+
+
+def test_a_run_goes_on_though_the_words_about_its_recipe_have_changed(tmp_path):
+    recipe = load_recipe("marginal")
+    older = replace(recipe, title="another title", published="other words")
+    write_json(tmp_path / "run.json", {"recipe": configuration.to_json(older)})
+    check_folder(tmp_path, recipe)
+    with pytest.raises(OutputError, match=r"there seed=0, here 1"):
+        check_folder(tmp_path, replace(recipe, seed=1))
 
 
 def test_a_folder_is_trained_in_by_one_process_at_a_time(tmp_path):

@@ -46,7 +46,8 @@ def evaluate(
         max_scans: largest number of scans of each set; 0 for the protocol's.
 
     Returns:
-        scores with intervals and floors; ``print(card.as_table())``, or each of ``card.scores``.
+        scores with their intervals, beside them those of real scans against real scans; ``print(card.as_table())``, or
+        each of ``card.scores``.
     """
     settings = EvalConfig(protocol=protocol, metrics=tuple(metrics), max_scans=max_scans)
     return compare_sources(generated, reference, settings)[0]

@@ -40,8 +40,8 @@ def test_a_folder_with_foreign_files(refused, run_folder, tmp_path):
 
 def test_samples_of_another_model_or_drawn_otherwise(refused, finished, samples):
     told = refused("sample", finished["deeper"], samples)
-    assert "samples, which holds samples of another model or drawn in another way; wanted" in told
-    assert "drawn in another way" in refused("sample", finished["run"], samples, "--set", "temperature=0.5")
+    assert "samples, which holds samples of another model or sampled in another way; wanted" in told
+    assert "sampled in another way" in refused("sample", finished["run"], samples, "--set", "temperature=0.5")
     assert main(["sample", str(finished["run"]), str(samples), "-n", "2"]) == 0
 
 

@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Simulate, compare, print a table and draw the curves."""
+    """Simulate, compare, print a table and plot the curves."""
     from lidargrit.evaluation.realism import as_json, as_table, compare_source
     from lidargrit.files import refuse_to_overwrite
     from lidargrit.loading import DataConfig

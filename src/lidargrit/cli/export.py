@@ -8,7 +8,7 @@ from pathlib import Path
 from lidargrit.cli._options import add_bad_scans
 
 EXAMPLES = """\
-  lidargrit export samples clouds --format pcd                what a model drew, a file a scan
+  lidargrit export samples clouds --format pcd                what a model generated, a file a scan
   lidargrit export samples tree --format kitti_odometry       sequences/00/velodyne/000000.bin, ...
   lidargrit export simulated:100 streets --format ply         with labels and rings
   lidargrit export kitti_raw:/data/kitti_raw las -n 20 --format las

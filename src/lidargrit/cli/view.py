@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Draw the picture, or write the page."""
+    """Render the picture, or write the page."""
     from lidargrit.files import refuse_to_overwrite
     from lidargrit.loading import DataConfig
     from lidargrit.reporting import TerminalReporter

@@ -35,7 +35,7 @@ class Simulated(ScanDataset):
     schemes: ClassVar[dict[str, SplitScheme]] = {
         "seeds": SplitScheme(
             source="lidargrit",
-            leak="None: every street is drawn anew.",
+            leak="None: every street is sampled anew.",
             parts={"train": ("0",), "val": ("1000000",), "test": ("2000000",)},  # the first seed of each
         )
     }

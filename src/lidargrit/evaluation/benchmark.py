@@ -77,7 +77,7 @@ def run(systems: Sequence[str], folder: Path, benchmark: Benchmark, reporter: Re
         raise ConfigError(
             f"the systems {', '.join(systems) or '(none)'}", "each once, and at least one", "correct them"
         )
-    # Wrong words and runs of other recipes are told before anything is trained.
+    # Wrong words and runs of other recipes are refused before anything is trained.
     plans = [_Plan.of(system, folder, benchmark) for system in systems]
     settings = replace(benchmark.settings, max_scans=benchmark.num_samples)
     reference = open_source(benchmark.reference, settings.data.bad_points)
@@ -153,19 +153,19 @@ class _Plan:
 def _sample(
     generator: Generator, run: Path, folder: Path, sampling: Any, benchmark: Benchmark, reporter: Reporter
 ) -> float | None:
-    """Draw what is not there yet, and return the seconds for a scan; None if all was there."""
+    """Sample what is not there yet, and return the seconds for a scan; None if all was there."""
     before = len(list(folder.glob("[!.]*.npz"))) if folder.is_dir() else 0
     begun = time.perf_counter()
     write_samples(generator, run, folder, range(benchmark.num_samples), sampling, reporter)
-    drawn = benchmark.num_samples - before
-    return (time.perf_counter() - begun) / drawn if drawn > 0 else None
+    sampled = benchmark.num_samples - before
+    return (time.perf_counter() - begun) / sampled if sampled > 0 else None
 
 
 def _score(samples: str, reference: Source, settings: EvalConfig, path: Path, reporter: Reporter) -> Scorecard:
     """Return the scores of a file, if they are of these very images by these settings; else score, and write it."""
     pair = open_pair(open_source(samples), reference, settings, reporter)
-    told = (settings.facts(), pair.samples.facts(), pair.reference.facts(), __version__)
-    wanted = (public_name(settings.protocol), *told)
+    facts = (settings.facts(), pair.samples.facts(), pair.reference.facts(), __version__)
+    wanted = (public_name(settings.protocol), *facts)
     if path.is_file():
         there = Scorecard.read(path)
         if (there.protocol, there.settings, there.samples, there.reference, there.versions.get("lidargrit")) == wanted:
@@ -179,7 +179,7 @@ def _score(samples: str, reference: Source, settings: EvalConfig, path: Path, re
 def _write_costs(
     path: Path, recipe: Recipe | None, generator: Generator, sampling: Any, seconds: float | None, num_samples: int
 ) -> None:
-    """Write what a system costs, once: a later call that draws nothing would have no time to tell."""
+    """Write what a system costs, once: a later call that samples nothing has measured no time."""
     if seconds is None and path.exists():
         return
     cost = generator.cost(sampling)

@@ -38,7 +38,7 @@ def evaluate(
         samples: name of the first set: samples, any source of scans, or a finished run.
         reference: name of the second set.
         config: metrics, protocol and projection of the comparison.
-        reporter: told about progress and warnings.
+        reporter: receiver of progress and warnings.
         report: file for a report; none is written for a run.
         write_report: function that writes the report.
         overwrite: whether a report that is there already is replaced.

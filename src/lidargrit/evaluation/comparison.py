@@ -39,7 +39,7 @@ class EvalConfig:
         seed: seed of the random numbers that metrics use.
         resampling: settings of the intervals and of real against real.
         weights: files of published weights, by the name of their network.
-        samples_format: name of the program that wrote a folder of tensors; told from the first file if empty.
+        samples_format: name of the program that wrote a folder of tensors; recognised from the first file if empty.
         device: name of the device that networks compute on.
         data: settings of reading scans.
     """
@@ -114,7 +114,7 @@ def compare_sources(
         samples: name of a folder of samples, of ours or of another program, or of any source of scans.
         reference: name of the second set; its scans are projected with the sensor of the samples.
         settings: protocol and its changes.
-        reporter: told about progress and warnings.
+        reporter: receiver of progress and warnings.
 
     Raises:
         ConfigError: the two sets look along different rays, or a setting is out of its bounds.
@@ -207,6 +207,5 @@ def _doubts(pair: EvalPair, scores: Sequence[Score], resampling: Resampling) -> 
         found.append(f"too few scans for the intervals of {', '.join(dict.fromkeys(without))}")
     for score in scores:
         name = f"{score.result.metric} ({score.result.variant})"
-        told = score.result.details.get("warnings", [])
-        found += [f"{name}: {text}" for text in told]
+        found += [f"{name}: {text}" for text in score.result.details.get("warnings", [])]
     return found

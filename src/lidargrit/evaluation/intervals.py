@@ -27,7 +27,7 @@ from lidargrit.errors import ConfigError, DataError
 from lidargrit.metrics import Metric
 from lidargrit.structures import MetricResult
 
-_HALVINGS = 5  # of the reference against itself: their mean is what is told, not their spread
+_HALVINGS = 5  # of the reference against itself: their mean is reported, not their spread
 _AT_LEAST = 4  # groups: fewer have too few halves
 _LARGE_BYTES = 8 << 20
 

@@ -112,7 +112,7 @@ def pair_for_protocol(
         reference: source of the second set; scans are projected with the sensor of the first.
         protocol: definition of the sensor, range window, data set and number of scans that are wanted.
         config: settings of reading and projecting scans; ``max_scans`` further limits their number.
-        reporter: told about the projection.
+        reporter: receiver of the progress of the projection.
 
     Raises:
         ConfigError: the two sets look along different rays.

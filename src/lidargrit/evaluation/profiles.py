@@ -1,4 +1,4 @@
-"""What a set of range images looks like as a whole, and which scans of two sets are alike: sets → arrays to draw."""
+"""What a set of range images looks like as a whole, and which scans of two sets are alike: sets → arrays to plot."""
 
 from __future__ import annotations
 

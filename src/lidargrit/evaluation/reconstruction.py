@@ -143,7 +143,7 @@ def score_run(run: RunSource, source: Source, config: DataConfig, reporter: Repo
         run: finished run.
         source: scans that the tokenizer encodes and decodes.
         config: settings of reading and projecting scans.
-        reporter: told about progress, and warned if the model has learned from these scans.
+        reporter: receiver of progress, and of a warning if the model has learned from these scans.
 
     Raises:
         ConfigError: a run whose generator has no tokenizer.

@@ -217,7 +217,7 @@ def _recipe(system: str, benchmark: Benchmark) -> Recipe:
 
 
 def _prepare(benchmark: Benchmark, systems: list[str], reporter: Reporter) -> None:
-    """Project everything before anything is trained: a scan that cannot be used is told now, not after days."""
+    """Project everything before anything is trained: a scan that cannot be used is refused now, not after days."""
     protocol = load_protocol(benchmark.settings.protocol)
     reference = open_source(benchmark.reference)
     for system in systems:

@@ -56,7 +56,7 @@ def side_by_side(paths: Sequence[Path], form: Format = "text") -> str:
         key = (card.protocol, card.reference.sha256, card.reference.scans_used)
         measured.setdefault(key, []).append((path.stem, card))
     blocks = [block for cards in measured.values() for block in (_measured(cards), *_published(cards))]
-    return "\n\n".join(_DRAWN[form](block) for block in blocks)
+    return "\n\n".join(_RENDERERS[form](block) for block in blocks)
 
 
 def read_tables(paths: Sequence[Path], form: Format = "text") -> tuple[str, dict[str, Any]]:
@@ -175,4 +175,4 @@ def _typeset(text: str) -> str:
     return " ".join("".join(signs.get(letter, letter) for letter in text).split())
 
 
-_DRAWN = {"text": _as_text, "markdown": _as_markdown, "latex": _as_latex}
+_RENDERERS = {"text": _as_text, "markdown": _as_markdown, "latex": _as_latex}

@@ -1,4 +1,4 @@
-"""DUSty: a GAN that draws a clean scan, then drops rays from it; seeds → range images."""
+"""DUSty: a GAN that generates a clean scan, then drops rays from it; seeds → range images."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from lidargrit.structures import MaskDecoding, RangeImage
 
 DustyVariant = Literal["dusty_1", "dusty_2", "baseline"]
 
-_LOGITS: dict[DustyVariant, int] = {"dusty_1": 1, "dusty_2": 2, "baseline": 0}  # maps of returns that the network draws
+_LOGITS: dict[DustyVariant, int] = {"dusty_1": 1, "dusty_2": 2, "baseline": 0}  # maps of returns of the network
 _TOLERANCE: dict[DustyVariant, float] = {"dusty_1": 0.0, "dusty_2": 0.0, "baseline": 0.008}  # of the program
 _NO_RETURN = -1.0  # as an encoded range; the same as a return at the far limit
 
@@ -194,14 +194,14 @@ class Dusty(Generator[DustyConfig, DustySampling]):
         return RangeImage.masked(range_m, returned, self.sensor)
 
     def _logistic(self, seeds: Sequence[int], sampling: DustySampling) -> Tensor:
-        """Return what is added to logits, whose signs then are draws; numbers of their own for each seed."""
+        """Return what is added to logits, whose signs then are sampled returns; each seed has its own numbers."""
         if sampling.mask == "threshold":
             return self._latent_like(torch.zeros(()))
         rngs = [torch.Generator().manual_seed(derive_seed(seed, sampling.raydrop_seed)) for seed in seeds]
         return self._latent_like(torch.stack([logistic_noise(_size(self.sensor), rng) for rng in rngs]))
 
     def _normal(self, seeds: Sequence[int], count: int) -> Float[Tensor, "B count D"]:
-        """Draw latents for each seed, on the CPU: the same numbers on every device."""
+        """Sample latents for each seed, on the CPU: the same numbers on every device."""
         rngs = [torch.Generator().manual_seed(seed) for seed in seeds]
         size = (count, self.config.latent_dim)
         return self._latent_like(torch.stack([torch.randn(size, generator=rng) for rng in rngs]))
@@ -242,9 +242,10 @@ class InverseRange:
 class AdversarialObjective(Objective):
     """What DUSty trains: two players who take turns, each with the same random numbers.
 
-    The discriminator learns to tell real scans from drawn ones, the network to be taken for real (the non-saturating
-    loss of Goodfellow et al., 2014). Every so often the discriminator's gradient at real scans is held down (R1,
-    Mescheder et al., 2018). It sees the composed image only, never the mask.
+    The discriminator learns to tell real scans from generated ones. The other player, the generating network, learns to
+    make it take its scans for real (the non-saturating loss of Goodfellow et al., 2014). At every ``penalty_every``-th
+    step the discriminator's gradient at real scans is penalised (R1, Mescheder et al., 2018). The discriminator sees
+    ranges with their missing returns, never the mask.
     """
 
     players = ("discriminator", "generator")
@@ -261,15 +262,15 @@ class AdversarialObjective(Objective):
         """Return a player's loss; the other one's weights are out of its reach."""
         if player == "discriminator":
             with torch.no_grad():
-                drawn, _ = self._draw(len(images), rng)
-            return self._discriminate(self.encoding.encode(images), drawn, rng)
-        drawn, return_rate = self._draw(len(images), rng)
+                generated, _ = self._generate_encoded(len(images), rng)
+            return self._discriminate(self.encoding.encode(images), generated, rng)
+        generated, return_rate = self._generate_encoded(len(images), rng)
         frozen = {name: weight.detach() for name, weight in self.discriminator.named_parameters()}
-        logits = functional_call(self.discriminator, frozen, (self._augment(drawn, rng),))
+        logits = functional_call(self.discriminator, frozen, (self._augment(generated, rng),))
         real_rate = images.return_mask.float().mean()
         return {"loss": F.softplus(-logits.float()).mean(), "return_rate": return_rate, "real_return_rate": real_rate}
 
-    def _discriminate(self, real: Tensor, drawn: Tensor, rng: torch.Generator) -> dict[str, Tensor]:
+    def _discriminate(self, real: Tensor, generated: Tensor, rng: torch.Generator) -> dict[str, Tensor]:
         seen, config = self._augment(real, rng), self.config
         takes_penalty = False
         if self.training:
@@ -277,9 +278,9 @@ class AdversarialObjective(Objective):
             takes_penalty = config.penalty_weight > 0 and int(self.turns) % config.penalty_every == 0
         seen.requires_grad_(takes_penalty)
         of_real = self.discriminator(seen).float()
-        of_drawn = self.discriminator(self._augment(drawn, rng)).float()
-        loss = F.softplus(-of_real).mean() + F.softplus(of_drawn).mean()
-        terms = {"loss": loss, "real_logit": of_real.mean(), "drawn_logit": of_drawn.mean()}
+        of_generated = self.discriminator(self._augment(generated, rng)).float()
+        loss = F.softplus(-of_real).mean() + F.softplus(of_generated).mean()
+        terms = {"loss": loss, "real_logit": of_real.mean(), "drawn_logit": of_generated.mean()}
         if takes_penalty:
             (gradient,) = torch.autograd.grad(of_real.sum(), seen, create_graph=True)
             penalty = gradient.float().square().sum((1, 2, 3)).mean()
@@ -287,8 +288,8 @@ class AdversarialObjective(Objective):
             terms["loss"] = loss + config.penalty_weight / 2 * config.penalty_every * penalty
         return terms
 
-    def _draw(self, count: int, rng: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Draw encoded scans, and tell the share of pixels that return."""
+    def _generate_encoded(self, count: int, rng: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Generate encoded scans, and return beside them the share of pixels that return."""
         latents = torch.randn(count, self.config.latent_dim, generator=rng, device=rng.device)
         encoded, logits = self.synthesis(latents)
         if logits is None:

@@ -80,12 +80,12 @@ class Marginal(Generator[MarginalConfig, NoSampling]):
         images = []
         for seed in seeds:
             rng = torch.Generator().manual_seed(seed)  # on the CPU: the same numbers on every device
-            draws = torch.rand(3, self.sensor.height, self.sensor.width, generator=rng).to(self.counts.device)
-            returned = draws[0] < total[-1] / self.scans
-            # The first bin at which the counts so far exceed the drawn share of all.
-            chosen = (total <= draws[1] * total[-1]).sum(dim=0).clamp(max=self.config.bins - 1)
+            uniform = torch.rand(3, self.sensor.height, self.sensor.width, generator=rng).to(self.counts.device)
+            returned = uniform[0] < total[-1] / self.scans
+            # The first bin at which the counts so far exceed the sampled share of all.
+            chosen = (total <= uniform[1] * total[-1]).sum(dim=0).clamp(max=self.config.bins - 1)
             low, high = edges[chosen], edges[chosen + 1]
-            images.append(RangeImage.masked(low * (high / low) ** draws[2], returned, self.sensor))
+            images.append(RangeImage.masked(low * (high / low) ** uniform[2], returned, self.sensor))
         return RangeImage.stack(images)
 
     def cost(self, sampling: NoSampling | None = None) -> Cost:

@@ -30,7 +30,7 @@ from lidargrit.structures import RangeImage
 _BATCH = 8
 _PUBLISHED_SENSOR = "hdl64e_kitti_360"
 _SHARE_SCANS = 1000  # whose returns are counted: more would not change their share
-_CALIBRATION_SEED = 1 << 40  # of the first scan that is drawn for it: no one draws their samples there
+_CALIBRATION_SEED = 1 << 40  # of the first scan that is sampled for it: no user samples from there on
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,8 @@ class R2dmConfig:
         unet: sizes of the U-Net.
         reflectance: learn it beside the range, as published; set it to false where scans have none, or for a sharper
             range (the authors' own remark).
-        calibration_scans: drawn at the end of training to fit the threshold of the ``calibrated`` raydrop; 0 for none.
+        calibration_scans: number of scans sampled at the end of training to fit the threshold of the ``calibrated``
+            raydrop; 0 for none.
     """
 
     unet: UnetConfig = field(default_factory=UnetConfig)
@@ -55,14 +56,14 @@ class R2dmConfig:
 
 @dataclass(frozen=True)
 class DiffusionSampling:
-    """How images are drawn, and where there is no return.
+    """How images are sampled, and where there is no return.
 
     Args:
         steps: evaluations of the network; 256 are published, for completion 32.
         sampler: ``ddpm`` adds fresh noise after each step (published), ``ddim`` only at the beginning.
-        raydrop: ``published`` has a return where the drawn range lies inside the sensor's limits. ``calibrated``, which
-            is not of the paper, has one where the drawn value is above a threshold, fitted so that as many rays return
-            as in the training scans; from a barely trained model that may take near returns away.
+        raydrop: rule by which a pixel is a return. ``published``: its range lies inside the sensor's limits.
+            ``calibrated``, which is not of the paper: its value is above a threshold, fitted so that as many rays
+            return as in the training scans; a barely trained model may lose near returns by it.
         resamples: number of times that each step is taken when a scan is completed.
     """
 
@@ -80,7 +81,7 @@ _CALIBRATION = DiffusionSampling(steps=32)
 
 
 class R2dm(Generator[R2dmConfig, DiffusionSampling]):
-    """Draws the image of log ranges, in which a missing return is a range that no return has.
+    """Generates the image of log ranges, in which a missing return is a range that no return has.
 
     Source:
         Nakashima and Kurazume, LiDAR Data Synthesis with Denoising Diffusion Probabilistic Models, ICRA 2024; numbers
@@ -148,18 +149,20 @@ class R2dm(Generator[R2dmConfig, DiffusionSampling]):
         self.calibrate()
 
     def calibrate(self) -> None:
-        """Fit the threshold above which as many drawn values lie as rays returned in the training scans."""
+        """Fit the threshold above which as many sampled values lie as rays returned in the training scans."""
         seeds = range(_CALIBRATION_SEED, _CALIBRATION_SEED + self.config.calibration_scans)
         if not seeds or not bool(self.return_share.isfinite()):
             return
-        parts = [self._draw(seeds[first : first + _BATCH], _CALIBRATION) for first in range(0, len(seeds), _BATCH)]
+        parts = [
+            self._sample_values(seeds[first : first + _BATCH], _CALIBRATION) for first in range(0, len(seeds), _BATCH)
+        ]
         levels = torch.cat([part[:, 0].flatten() for part in parts]).sort().values
         dropped = min(round((1 - float(self.return_share)) * len(levels)), len(levels) - 1)
         self.return_threshold.fill_(float(levels[dropped]))
 
     def _sample(self, seeds: Sequence[int], sampling: DiffusionSampling) -> RangeImage:
         self._check(sampling)
-        return self._decoded(self._draw(seeds, sampling), sampling)
+        return self._decoded(self._sample_values(seeds, sampling), sampling)
 
     def _complete(
         self, images: RangeImage, observed: Bool[Tensor, "B H W"], seeds: Sequence[int], sampling: DiffusionSampling
@@ -183,14 +186,14 @@ class R2dm(Generator[R2dmConfig, DiffusionSampling]):
         return load_published(files[0], sensor)
 
     @torch.no_grad()
-    def _draw(self, seeds: Sequence[int], sampling: DiffusionSampling) -> Float[Tensor, "B C H W"]:
+    def _sample_values(self, seeds: Sequence[int], sampling: DiffusionSampling) -> Float[Tensor, "B C H W"]:
         self.eval()
         noise = SeededNoise(seeds, self.shape, self.device)
         return diffusion.sample(self.network, noise, sampling.steps, sampling.sampler)
 
-    def _decoded(self, drawn: Float[Tensor, "B C H W"], sampling: DiffusionSampling) -> RangeImage:
-        returned = drawn[:, 0] >= self.return_threshold if sampling.raydrop == "calibrated" else None
-        return decode(drawn, self.sensor, returned)
+    def _decoded(self, sampled: Float[Tensor, "B C H W"], sampling: DiffusionSampling) -> RangeImage:
+        returned = sampled[:, 0] >= self.return_threshold if sampling.raydrop == "calibrated" else None
+        return decode(sampled, self.sensor, returned)
 
     def _check(self, sampling: DiffusionSampling) -> None:
         if sampling.raydrop == "calibrated" and not bool(self.return_threshold.isfinite()):

@@ -62,7 +62,7 @@ class Synthesis(nn.Module):
     def forward(
         self, latents: Float[Tensor, "B D"]
     ) -> tuple[Float[Tensor, "B 1 H W"], Float[Tensor, "B logits H W"] | None]:
-        """Draw the maps; the range is in [-1, 1]."""
+        """Generate the maps; the range is in [-1, 1]."""
         features = _rectify(self.project(latents[..., None, None]))
         for layer in self.up:
             features = _rectify(layer(features))
@@ -92,7 +92,7 @@ class Discriminator(nn.Module):
         self.verdict = _Convolution(inputs[-1], 1, (size[0] >> LEVELS, size[1] >> LEVELS), 1, _GAIN)
 
     def forward(self, images: Float[Tensor, "B 1 H W"]) -> Float[Tensor, "B"]:
-        """Judge."""
+        """Return the logit of each image."""
         # In 16 bits all that is farther than some 60 m would be next to the same value.
         with torch.autocast("cuda" if images.is_cuda else "cpu", enabled=False):
             features = self.down[0](_pad(_blurred_both_ways(images)))
@@ -141,7 +141,7 @@ class _Double(nn.ConvTranspose2d):
 
 
 def _start(layer: nn.Conv2d | nn.ConvTranspose2d, gain: float) -> float:
-    """Draw a layer's first weights and return by what they are multiplied when used.
+    """Set a layer's first weights at random, and return the factor by which they are multiplied when used.
 
     It is the program's scale, which for transposed convolutions counts outputs where it means to count inputs.
     """

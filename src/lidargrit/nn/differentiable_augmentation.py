@@ -43,18 +43,18 @@ def augment_differentiably(
         utils/diff_augment.py, for the circle and the defects.
     """
 
-    def draw() -> Float[Tensor, "B 1 1 1"]:
+    def random_change() -> Float[Tensor, "B 1 1 1"]:
         uniform = torch.rand(len(images), 1, 1, 1, generator=rng, device=images.device) * 2 - 1
         return uniform**2 if "squared_draws" in defects else uniform
 
     for kind in kinds:
         if kind == "brightness":
-            images = images + _STRENGTH * draw()
+            images = images + _STRENGTH * random_change()
             if "idle_saturation" in defects:
-                draw()
+                random_change()
         elif kind == "contrast":
             mean = images.mean(dim=(1, 2, 3), keepdim=True)
-            images = mean + (images - mean) * (1 + _STRENGTH * draw())
+            images = mean + (images - mean) * (1 + _STRENGTH * random_change())
         elif kind == "translation":
             images = _translated(images, images.shape[-1] - ("short_circle" in defects), rng)
         else:
@@ -78,11 +78,11 @@ def _cut_out(images: Tensor, rng: torch.Generator) -> Tensor:
     for size in images.shape[-2:]:
         cut = round(_CUT * size)
         first = _whole(0, size, len(images), rng) - cut // 2
-        place = torch.arange(size, device=images.device)
-        inside.append((place >= first) & (place < first + cut))
+        pixel = torch.arange(size, device=images.device)
+        inside.append((pixel >= first) & (pixel < first + cut))
     return images * ~(inside[0][:, None, :, None] & inside[1][:, None, None, :])
 
 
 def _whole(low: int, high: int, count: int, rng: torch.Generator) -> Tensor:
-    """Draw whole numbers between two limits, both of them included, as a column."""
+    """Sample whole numbers between two limits, both of them included, as a column."""
     return torch.randint(low, high + 1, (count, 1), generator=rng, device=rng.device)

@@ -54,14 +54,14 @@ def min_snr_weight(log_snr: Float[Tensor, "*B"], most: float = 5.0) -> Float[Ten
 
 
 class SeededNoise:
-    """Standard normal images, each drawn by its own seed's generator on the CPU: the same on every device and batch."""
+    """Standard normal images, each sampled on the CPU by its own seed: the same on every device and in every batch."""
 
     def __init__(self, seeds: Sequence[int], shape: tuple[int, int, int], device: torch.device) -> None:
         self._rngs = [torch.Generator().manual_seed(seed) for seed in seeds]
         self._shape, self._device = shape, device
 
     def __call__(self) -> Float[Tensor, "B C H W"]:
-        """Draw the next image of each seed."""
+        """Sample the next image of each seed."""
         return torch.stack([torch.randn(self._shape, generator=rng) for rng in self._rngs]).to(self._device)
 
     def uniform(self) -> Float[Tensor, "B C H W"]:
@@ -101,7 +101,7 @@ def step_back(
 def step_forward(
     image: Float[Tensor, "B C H W"], now: Float[Tensor, ""], then: Float[Tensor, ""], fresh: Float[Tensor, "B C H W"]
 ) -> Float[Tensor, "B C H W"]:
-    """Go to a noisier image, drawn from q(x then | x now).
+    """Go to a noisier image, sampled from q(x then | x now).
 
     Source:
         Kingma et al., 2021, appendix A.
@@ -114,7 +114,7 @@ def step_forward(
 def sample(
     denoiser: Denoiser, noise: Callable[[], Float[Tensor, "B C H W"]], steps: int, sampler: Sampler
 ) -> Float[Tensor, "B C H W"]:
-    """Draw images in equal steps of time.
+    """Sample images in equal steps of time.
 
     Args:
         denoiser: a network.

@@ -1,4 +1,4 @@
-"""The latent from which a network draws what is nearest to a given thing: an error of latents → latents."""
+"""The latent from which a network generates what is nearest to a given scan: an error of latents → latents."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _RISE, _FALL = 0.05, 0.25  # shares of steps in which the rate rises from 0, and
 
 
 def search_latents(
-    error_of: Callable[[Tensor], Tensor], draws: Float[Tensor, "B steps_and_start D"], rate: float
+    error_of: Callable[[Tensor], Tensor], noise: Float[Tensor, "B steps_and_start D"], rate: float
 ) -> Float[Tensor, "B D"]:
     """Search for each row of a batch the latent of the least error, each for itself.
 
@@ -22,21 +22,21 @@ def search_latents(
 
     Args:
         error_of: latents (B, D) → an error for each, of which nothing but the own latent matters.
-        draws: standard normal numbers: where to start, then one shake for each step.
+        noise: standard normal numbers: where to start, then one shake for each step.
         rate: the learning rate of Adam at its highest.
 
     Source:
         Karras et al., StyleGAN2, 2020, appendix D, with the numbers and the sphere of kazuto1011/dusty-gan@0374a5e,
         evaluate_reconstruction.py.
     """
-    steps = draws.shape[1] - 1
-    latents = _on_sphere(draws[:, 0]).requires_grad_()
+    steps = noise.shape[1] - 1
+    latents = _on_sphere(noise[:, 0]).requires_grad_()
     optimiser = torch.optim.Adam([latents], lr=rate)
     for step in range(steps):
         done = step / steps
         optimiser.param_groups[0]["lr"] = rate * rate_share(done)
         with torch.enable_grad():
-            shaken = latents + _NOISE * max(0.0, 1 - done / _NOISE_ENDS) ** 2 * draws[:, step + 1]
+            shaken = latents + _NOISE * max(0.0, 1 - done / _NOISE_ENDS) ** 2 * noise[:, step + 1]
             (latents.grad,) = torch.autograd.grad(error_of(shaken).sum(), latents)
         optimiser.step()
         latents.data = _on_sphere(latents.data)

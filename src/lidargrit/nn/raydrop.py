@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 def logistic_noise(size: tuple[int, ...], rng: torch.Generator) -> Float[Tensor, "..."]:
-    """Draw numbers that turn a logit into a coin: logit + noise is above 0 with the logit's probability."""
+    """Sample numbers that turn a logit into a coin: logit + noise is above 0 with the logit's probability."""
     uniform = torch.rand(size, generator=rng, device=rng.device).clamp(min=torch.finfo(torch.float32).tiny)
     return uniform.log() - (-uniform).log1p()
 

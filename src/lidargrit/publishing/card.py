@@ -176,9 +176,9 @@ def _scores(card: Scorecard) -> str:
     for score in card.scores:
         interval, result = score.interval, score.result
         between = f"{format_value(interval.low)} to {format_value(interval.high)}" if interval else "-"
-        floor = format_value(score.real_against_real.value) if score.real_against_real else "-"
+        real = format_value(score.real_against_real.value) if score.real_against_real else "-"
         better = "higher" if result.higher_is_better else "lower"
-        cells = (_text(result.metric), _text(result.variant), format_value(result.value), between, floor, better)
+        cells = (_text(result.metric), _text(result.variant), format_value(result.value), between, real, better)
         lines.append(f"| {' | '.join(cells)} |")
     notes = [f"- not as in the protocol: {_text(_PATH.sub('…', each))}" for each in card.deviations]
     notes += [f"- warning: {_text(_PATH.sub('…', each))}" for each in card.warnings]

@@ -3,14 +3,14 @@
 What differs from ``lidargrit_kitti_360``:
 
 - projection: 2048 columns, rounded and clipped, of which every second is kept (paper: bins of equal width);
-- reconstruction loss: the range with a drawn mask, over each scan's returns (paper, eq. 2: clean range, all pixels);
+- reconstruction loss: the range with a sampled mask, over each scan's returns (paper, eq. 2: clean range, all pixels);
 - codebook loss: 0.25 on the term that moves the codes (paper: both terms alike);
 - no geometric preservation: ``do_gp: False`` (paper, section 3.2.2: on);
 - no moving average of the weights, which the paper does not mention either, and which is ours.
 
 Learning rates, batches and epochs are the same in both: the paper gives none, and ``lidargrit_kitti_360`` has them
 from here. The configuration's ``row_drop`` and ``col_drop``, which hide rows and columns of the input, are not built.
-Its program draws among the 100 likeliest tokens: ``lidargrit sample --set top_k=100``. It trains on drive 0005, too,
+Its program samples among the 100 likeliest tokens: ``lidargrit sample --set top_k=100``. It trains on drive 0005, too,
 and chooses weights by drives that it trains or is tested on; that is not repeated (see docs/data.md).
 
 Source:

@@ -4,7 +4,7 @@ What differs from ``lidargrit_kitti_odometry``:
 
 - raydrop loss: weight 0.0001 (paper: 0.1; so had the configuration of April 2024);
 - projection: columns rounded and clipped (paper: bins of equal width);
-- reconstruction loss: the range with a drawn mask, over each scan's returns (paper, eq. 2: clean range, all pixels);
+- reconstruction loss: the range with a sampled mask, over each scan's returns (paper, eq. 2: clean range, all pixels);
 - codebook loss: 0.25 on the term that moves the codes (paper: both terms alike);
 - no geometric preservation: ``do_gp: False`` (paper, section 3.2.2: on);
 - no moving average of the weights, which the paper does not mention either, and which is ours.

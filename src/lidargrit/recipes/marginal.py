@@ -5,7 +5,7 @@ from lidargrit.loading import DataConfig
 from lidargrit.training import Recipe
 
 RECIPE = Recipe(
-    title="marginal: every pixel drawn from its own histogram, the floor of every table",
+    title="marginal: every pixel sampled from its own histogram; any model should score better",
     generator="marginal",
     model=MarginalConfig(),
     data=DataConfig(train=("simulated:2000:train",), val=("simulated:32:val",)),

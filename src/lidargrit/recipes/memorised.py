@@ -5,7 +5,7 @@ from lidargrit.loading import DataConfig
 from lidargrit.training import Recipe
 
 RECIPE = Recipe(
-    title="memorised: training scans given back, the ceiling of every table",
+    title="memorised: training scans given back; few models can score better",
     generator="memorised",
     model=MemorisedConfig(),
     data=DataConfig(train=("simulated:2000:train",), val=("simulated:32:val",)),

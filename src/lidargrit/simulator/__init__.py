@@ -16,7 +16,7 @@ from lidargrit.structures import Scan
 __all__ = ["Observation", "RaydropModel", "Scene", "Theme", "observe", "scene_of", "simulate"]
 
 FRAME_S = 0.1  # from one frame to the next: KITTI's sensor turns at 10 Hz
-_FRAMES_AT_MOST = 100_000  # each draws on a stream of its own, and they are set up one after the other
+_FRAMES_AT_MOST = 100_000  # each has a random stream of its own, and they are set up one after the other
 _HDL64E_OF_KITTI = RaydropModel()
 
 
@@ -31,7 +31,7 @@ def simulate(
     kept_columns_only: bool = False,
     model: RaydropModel = _HDL64E_OF_KITTI,
 ) -> Scan:
-    """Simulate one revolution of a sensor in a street drawn from a seed.
+    """Simulate one revolution of a sensor in a street sampled from a seed.
 
     A beam is lost when its received power, which falls with range, with incidence and on dark, glossy or transparent
     surfaces, stays below a threshold. The power's random part is alike along a ring and over an object, so that drops

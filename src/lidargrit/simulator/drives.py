@@ -39,7 +39,7 @@ class DriveConfig:
         motion: leave the distortion by the car's own motion in the scans; KITTI odometry has it removed.
         wet: wetness of the ground, from 0 (dry) to 1 (soaked).
         clean: also write what a raydrop model learns from and is judged by: the clean range of every pixel, the
-            probability of a return, the drawn mask, reflectance and label, as ``observation/NNNNNN.npz``.
+            probability of a return, the sampled mask, reflectance and label, as ``observation/NNNNNN.npz``.
     """
 
     sensor: SensorModel

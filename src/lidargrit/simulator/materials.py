@@ -35,7 +35,7 @@ ASPHALT, CONCRETE, PLASTER, BRICK, METAL, PAINT, GLASS, FOIL, LEAVES, BARK, CLOT
 )
 
 # Fitted to 67 scans of KITTI by benchmarks/fit_raydrop.py: diffuse of asphalt to leaves and grass, all of paint,
-# diffuse and passes of glass, foil. With them come the albedos that the scenes draw, so a diffuse may be above 1.
+# diffuse and passes of glass, foil. With them come the albedos that the scenes sample, so a diffuse may be above 1.
 # Mottle is set so that neighbouring readings differ as in KITTI: by 0.12 on the ground, and 0.20 above it.
 # The other numbers are set by eye: bodies of cars fade out in rows, their windows are dark.
 MATERIALS: tuple[Material, ...] = (

@@ -181,7 +181,7 @@ def _beside(
 
 
 def _object_gains(mesh: Mesh, rng: np.random.Generator, model: RaydropModel) -> Float32[np.ndarray, " objects"]:
-    """Draw the natural log of the gain of every object by its number; what is no single object has none."""
+    """Sample the natural log of the gain of every object by its number; what is no single object has none."""
     gains = rng.standard_normal(int(mesh.instance.max()) + 1, dtype=np.float32) * np.float32(model.object_spread)
     gains[0] = 0
     return gains

@@ -178,7 +178,7 @@ class Lasers:
 
     @classmethod
     def of(cls, sensor: SensorModel, model: RaydropModel) -> Lasers:
-        """Look up the lasers of KITTI's own sensor, or draw those of another.
+        """Look up the lasers of KITTI's own sensor, or sample those of another.
 
         Rows of equal elevations, as in KITTI-360's images, are no lasers: several meet in one.
         """
@@ -204,7 +204,7 @@ class BeamNoise:
 
     @classmethod
     def sample(cls, rng: np.random.Generator, height: int, width: int, model: RaydropModel) -> BeamNoise:
-        """Draw the noise of a scan of one size."""
+        """Sample the noise of a scan of one size."""
         num_knots = max(round(360 / model.patch_deg), 1)
         knots = rng.standard_normal((height, num_knots), dtype=np.float32) * np.float32(model.patch_spread)
         place = np.arange(width, dtype=np.float32) * np.float32(num_knots / width)

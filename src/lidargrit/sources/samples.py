@@ -45,7 +45,7 @@ def write_samples(
     sampling: Any = None,
     reporter: Reporter | None = None,
 ) -> None:
-    """Write one file for each seed, at bounded memory; seeds that are there already are not drawn again.
+    """Write one file for each seed, at bounded memory; seeds that are there already are not sampled again.
 
     Args:
         generator: generator to sample from, as loaded from
@@ -94,7 +94,7 @@ def _claim(folder: Path, manifest: dict[str, Any], defaults: dict[str, Any]) -> 
         there = read_json(folder / MANIFEST)
         if not _same(there, manifest, defaults):
             raise OutputError(
-                f"{folder}, which holds samples of another model or drawn in another way",
+                f"{folder}, which holds samples of another model or sampled in another way",
                 "an empty folder, or one that this very command began",
                 "choose another folder",
             )
@@ -122,8 +122,10 @@ def read_samples(folder: Path, count: int | None = None) -> RangeImages:
         raise CheckpointError(f"{folder / MANIFEST}, in which {told}", "what lidargrit wrote", "sample anew") from None
     paths = sorted(folder.glob("[!.]*.npz"))[:count]  # not what a killed process left half-written
     if not paths:
-        raise DataError(f"no sample in {folder}", "at least one", "draw some with: lidargrit sample RUN " + str(folder))
-    return RangeImages(sensor, [_Files(paths, sensor, _drawn_as(manifest))])
+        raise DataError(
+            f"no sample in {folder}", "at least one", "generate some with: lidargrit sample RUN " + str(folder)
+        )
+    return RangeImages(sensor, [_Files(paths, sensor, _model_and_sampling(manifest))])
 
 
 def projection_of(folder: Path) -> str:
@@ -165,7 +167,7 @@ def _missing(folder: Path, seeds: Sequence[int]) -> list[int]:
 
 
 def _same(there: Any, manifest: dict[str, Any], defaults: dict[str, Any]) -> bool:
-    """Tell whether samples there are drawn as these will be; their cost follows from the rest, and is only told.
+    """Tell whether samples there were sampled as these will be; their cost follows from the rest.
 
     A choice that folders of before it existed do not name was what is now its default.
     """
@@ -179,9 +181,9 @@ def _same(there: Any, manifest: dict[str, Any], defaults: dict[str, Any]) -> boo
 class _Files:
     """Sample files as a store of images."""
 
-    def __init__(self, paths: list[Path], sensor: SensorModel, drawn_as: str) -> None:
+    def __init__(self, paths: list[Path], sensor: SensorModel, model_and_sampling: str) -> None:
         self._paths, self._shape = paths, (sensor.height, sensor.width)
-        self.provenance = Provenance(tuple(f"{drawn_as}/sample {path.stem}" for path in paths))
+        self.provenance = Provenance(tuple(f"{model_and_sampling}/sample {path.stem}" for path in paths))
 
     def __len__(self) -> int:
         return len(self._paths)
@@ -212,10 +214,10 @@ class _Files:
         return range_m, reflectance
 
 
-def _drawn_as(manifest: dict[str, Any]) -> str:
+def _model_and_sampling(manifest: dict[str, Any]) -> str:
     """Return what two sets of samples share if equal seeds in them are the same scans: model and settings."""
-    drawn = [manifest.get("weights_sha256"), manifest.get("sampling")]
-    return hashlib.sha256(json.dumps(drawn, sort_keys=True).encode()).hexdigest()[:8]
+    facts = [manifest.get("weights_sha256"), manifest.get("sampling")]
+    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:8]
 
 
 def _write_image(path: Path, image: RangeImage) -> None:

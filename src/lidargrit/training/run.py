@@ -31,6 +31,8 @@ from lidargrit.training.engine import Engine
 from lidargrit.training.fit import Fit
 from lidargrit.training.taken_stages import taken_stages
 
+_WORDS = {"title", "published"}  # of a recipe; they change nothing that is computed
+
 PlotProgress = Callable[[Generator, str, RangeImages, Path], None]
 """Plots what a half-trained generator makes at a stage, beside validation scans, into a file."""
 
@@ -116,9 +118,8 @@ def check_folder(folder: Path, recipe: Recipe) -> None:
                 f"{folder}, whose weights were {about['origin']}", "a run of train's", "choose another folder"
             )
         mine, other = configuration.leaves(ours), {**_defaults(recipe), **theirs}
-        differing = [
-            name for name in mine.keys() | other.keys() if (mine.get(name) or None) != (other.get(name) or None)
-        ]
+        settings = (mine.keys() | other.keys()) - _WORDS
+        differing = [name for name in settings if (mine.get(name) or None) != (other.get(name) or None)]
         if differing:
             name = sorted(differing)[0]
             raise OutputError(

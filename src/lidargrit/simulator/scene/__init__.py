@@ -75,7 +75,7 @@ class Scene:
 
 
 def sample_scene(rng: np.random.Generator, theme: Theme = "mixed") -> Scene:
-    """Draw a street scene; the same state of the generator gives the same scene, bit for bit.
+    """Sample a street scene; the same state of the generator gives the same scene, bit for bit.
 
     Args:
         rng: source of all random numbers.

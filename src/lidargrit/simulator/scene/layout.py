@@ -87,7 +87,7 @@ def _plantable(plan: StreetPlan, town: Settlement, places: np.ndarray, spare_m: 
 
 
 def _parks(rng: np.random.Generator, town: Settlement) -> list[np.ndarray]:
-    """Draw places in the stretches without houses, denser near the road."""
+    """Sample positions in the stretches without houses, denser near the road."""
     lots = []
     for u_from, u_to, side in town.parks_m:
         count = rng.poisson((u_to - u_from) * rng.uniform(0.1, 0.5))
@@ -97,7 +97,7 @@ def _parks(rng: np.random.Generator, town: Settlement) -> list[np.ndarray]:
 
 
 def _woods(rng: np.random.Generator) -> list[np.ndarray]:
-    """Draw clumps of trees, and long rows of them that bound fields."""
+    """Sample clumps of trees, and long rows of them that bound fields."""
     lots = []
     for _ in range(rng.poisson(2.5)):
         count = rng.integers(12, 36)
@@ -113,7 +113,7 @@ def _woods(rng: np.random.Generator) -> list[np.ndarray]:
 
 
 def _tree_rows(rng: np.random.Generator, plan: StreetPlan) -> list[np.ndarray]:
-    """Draw rows of trees along our road."""
+    """Sample rows of trees along our road."""
     rows = []
     for which, side in enumerate((-1, 1)):
         wide = plan.theme == "country" or plan.pavement_m[which] > 1.8
@@ -187,7 +187,7 @@ def _beside(plan: StreetPlan, u: np.ndarray, v_m: float, turn_rad: float) -> np.
 
 
 def parked(rng: np.random.Generator, plan: StreetPlan, town: Settlement) -> Placements:
-    """Draw where vehicles park: along our kerbs, in side streets, and before houses."""
+    """Sample where vehicles park: along our kerbs, in side streets, and before houses."""
     placements = []
     for which, side in enumerate((-1, 1)):
         if plan.parked[which]:
@@ -216,7 +216,7 @@ def parked(rng: np.random.Generator, plan: StreetPlan, town: Settlement) -> Plac
 
 
 def driving(rng: np.random.Generator, plan: StreetPlan, speed_m_s: float) -> Placements:
-    """Draw who drives: ahead of us and behind at our speed, towards us, and away into side streets."""
+    """Sample who drives: ahead of us and behind at our speed, towards us, and away into side streets."""
     placements = []
     for ahead in (-1, 1):
         count = rng.poisson(_TRAFFIC[plan.theme] / 3)
@@ -241,7 +241,7 @@ def driving(rng: np.random.Generator, plan: StreetPlan, speed_m_s: float) -> Pla
 
 
 def traffic(rng: np.random.Generator, plan: StreetPlan, town: Settlement) -> list[ObjectBatch]:
-    """Draw all vehicles, people and bicycles, each with an instance of its own."""
+    """Sample all vehicles, people and bicycles, each with an instance of its own."""
     resting, going = parked(rng, plan, town), driving(rng, plan, plan.speed_m_s)
     placements = Placements.join([resting, going])
     kinds = np.concatenate(

@@ -46,7 +46,7 @@ _FRAME = np.array(  # metres: start, end, radii
 
 
 def make_walkers(rng: np.random.Generator, placements: Placements, first_instance: int) -> ObjectBatch:
-    """Draw people on foot, 1 to 1.95 m tall, most of them grown up."""
+    """Sample people on foot, 1 to 1.95 m tall, most of them grown up."""
     tall = np.where(rng.random(len(placements)) < 0.12, rng.uniform(1.0, 1.5, len(placements)), 0.0)
     tall = np.where(tall > 0, tall, rng.normal(1.72, 0.08, len(placements)).clip(1.5, 1.95))
     label = np.where(placements.speed_m_s != 0, labels.MOVING_PERSON, labels.PERSON)
@@ -57,7 +57,7 @@ def make_walkers(rng: np.random.Generator, placements: Placements, first_instanc
 def make_cyclists(
     rng: np.random.Generator, placements: Placements, first_instance: int, ridden: bool = True
 ) -> ObjectBatch:
-    """Draw bicycles with somebody on them, or without."""
+    """Sample bicycles with somebody on them, or without."""
     count = len(placements)
     bicycle, material, albedo = _bicycles(rng, count)
     if not ridden:

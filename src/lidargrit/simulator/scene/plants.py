@@ -16,7 +16,7 @@ _BLOBS = 7  # round tufts that make up a crown
 
 
 def _places_in_tuft(count: int = 4096) -> np.ndarray:
-    """Return places in a ball, denser at its surface, from which those of all leaves are drawn."""
+    """Return positions in a ball, denser at its surface, from which those of all leaves are sampled."""
     rng = np.random.default_rng(0)
     way = rng.normal(size=(count, 3))
     way /= np.linalg.norm(way, axis=1, keepdims=True)

@@ -66,7 +66,7 @@ def free_spans(plan: StreetPlan, side: int, spare_m: float = 0.5) -> list[tuple[
 
 
 def lay_out_houses(rng: np.random.Generator, plan: StreetPlan) -> Settlement:
-    """Draw where houses stand."""
+    """Sample where houses stand."""
     rows, gaps, parks = [], [np.zeros((0, 3))], [np.zeros((0, 3))]
     for side in (-1, 1):
         for span in free_spans(plan, side):

@@ -240,7 +240,7 @@ class StreetPlan:
 
 
 def sample_street_plan(rng: np.random.Generator, theme: Theme) -> StreetPlan:
-    """Draw roads and ground of one theme."""
+    """Sample roads and ground of one theme."""
     kind = str(rng.choice(["suburb", "city", "country"], p=[0.52, 0.38, 0.10])) if theme == "mixed" else theme
     lanes = 2 if kind == "country" or rng.random() < {"city": 0.8, "suburb": 0.5}[kind] else 1
     lane = rng.uniform(*_LANE_M[kind]) * (1.0 if lanes == 2 else rng.uniform(1.15, 1.35))
@@ -287,7 +287,7 @@ def _sample_side_streets(rng: np.random.Generator, kind: str) -> tuple[SideStree
 
 
 def _sample_line(rng: np.random.Generator, kind: str) -> np.ndarray:
-    """Draw a gentle arc, in half of the streets with a bend or two."""
+    """Sample a gentle arc, in half of the streets with a bend or two."""
     u = np.arange(-260.0, 261.0, 2.0)
     yaw = rng.normal(0, 0.0012) * u
     for side in (-1, 1):
@@ -302,7 +302,7 @@ def _sample_line(rng: np.random.Generator, kind: str) -> np.ndarray:
 
 
 def _sample_waves(rng: np.random.Generator) -> np.ndarray:
-    """Draw waves of the ground whose slopes have a spread of about one in sixty each."""
+    """Sample waves of the ground whose slopes have a spread of about one in sixty each."""
     length, turn = np.exp(rng.uniform(np.log(45), np.log(260), 4)), rng.uniform(0, 2 * np.pi, 4)
     number = 2 * np.pi / length
     amplitude = rng.normal(0, 0.012, 4) / number

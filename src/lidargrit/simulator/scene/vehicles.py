@@ -47,7 +47,7 @@ _MOVING = np.array([labels.MOVING_CAR] * 5 + [labels.MOVING_TRUCK])
 
 
 def sample_vehicle_kinds(rng: np.random.Generator, count: int, trucks: float = 0.03) -> Int[np.ndarray, " n"]:
-    """Draw what kinds of vehicle stand or drive in a European street."""
+    """Sample what kinds of vehicle stand or drive in a European street."""
     shares = np.array([0.36, 0.2, 0.22, 0.12, 0.10, 0.0]) * (1 - trucks)
     shares[TRUCK] = trucks
     return rng.choice(6, count, p=shares)
@@ -60,7 +60,7 @@ def make_vehicles(
     first_instance: int,
     away_m: Float[np.ndarray, " n"],
 ) -> list[ObjectBatch]:
-    """Draw vehicles of given kinds; far ones are cruder, and trucks come with a box in a objects of its own."""
+    """Sample vehicles of given kinds; far ones are cruder, and trucks come with a box that is an object of its own."""
     count = len(kinds)
     size = _SIZE_M[kinds] * (1 + _SPREAD[kinds] * np.clip(rng.normal(size=(count, 3)), -1.6, 1.6))
     length, width, height = size.T

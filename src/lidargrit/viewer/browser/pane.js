@@ -91,7 +91,7 @@ class Pane {
     }
     this.scan = scan;
     this.points = pointsOf(this.source, this.scan);
-    this.fresh = true; // points and colours are drawn together, once all panes have theirs
+    this.fresh = true; // points and colours are rendered together, once all panes have theirs
     const number = this.source.scanIndex(index) + 1;
     const share = Math.round((100 * this.scan.returns) / this.source.size);
     const returns = this.scan.returns.toLocaleString("en");
