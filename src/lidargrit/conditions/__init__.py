@@ -1,0 +1,155 @@
+"""What is known about a wanted scan: range images and masks of what was observed → :class:`Condition`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lidargrit.errors import ConfigError, ScanError
+from lidargrit.sensors import SensorModel
+from lidargrit.structures import RangeImage
+
+ConditionKind = Literal["pixels", "surfaces"]
+"""What a condition knows of a pixel: whether the beam returned, and how far; or only how far the surface is."""
+
+KINDS: dict[ConditionKind, str] = {
+    "pixels": "pixels of which range and return are known",
+    "surfaces": "ranges of surfaces of which it is not known whether they return",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Condition:
+    """What is known about a batch of wanted scans, on the sensor's grid; where nothing is observed, all is generated.
+
+    Every quantity has a mask of its own that says where it was observed. Values elsewhere have no influence.
+
+    Args:
+        range_m: range of the surface that the beam meets, in metres.
+        range_observed: True where the range is known.
+        return_mask: True where the beam came back.
+        return_observed: True where it is known whether the beam came back.
+        sensor: sensor whose rays the pixels are.
+        reflectance: reflectance in [0, 1] of the observed returns; None if it is not known.
+
+    Raises:
+        ConfigError: masks of another size or type than the ranges, or no batch.
+        ScanError: an observed range that is not positive and finite, or an observed return without a range.
+    """
+
+    range_m: Float[Tensor, "B H W"]
+    range_observed: Bool[Tensor, "B H W"]
+    return_mask: Bool[Tensor, "B H W"]
+    return_observed: Bool[Tensor, "B H W"]
+    sensor: SensorModel
+    reflectance: Float[Tensor, "B H W"] | None = None
+
+    def __post_init__(self) -> None:
+        check_observed(self.range_observed, self.range_m)
+        check_observed(self.return_observed, self.range_m)
+        known = self.range_m[self.range_observed]
+        if not bool(((known > 0) & known.isfinite()).all()):
+            raise ScanError("an observed range of 0 metres, NaN or infinity", "positive metres", "mark it as unknown")
+        if bool((self.return_observed & self.return_mask & ~self.range_observed).any()):
+            raise ScanError("an observed return of unknown range", "both, or neither", "mark it as unknown")
+
+    @classmethod
+    def of_pixels(cls, images: RangeImage, observed: Bool[Tensor, "B H W"]) -> Condition:
+        """Return the condition that some pixels of scans are known, be it as a return or as none.
+
+        Args:
+            images: batch of range images (B, H, W); pixels that were not observed have no influence.
+            observed: True for pixels that are known.
+        """
+        check_observed(observed, images.range_m)
+        returned = images.return_mask & observed
+        range_m = torch.where(returned, images.range_m, 0.0)
+        reflectance = None if images.reflectance is None else torch.where(returned, images.reflectance, 0.0)
+        return cls(range_m, returned, returned, observed, images.sensor, reflectance)
+
+    @classmethod
+    def of_surfaces(cls, clean: RangeImage, unknown: Bool[Tensor, "B H W"] | None = None) -> Condition:
+        """Return the condition that the ranges of all surfaces are known, and that only surfaces can return.
+
+        Args:
+            clean: batch of range images (B, H, W) in which every beam that meets a surface returns.
+            unknown: True for pixels of which nothing is known; none if not given.
+        """
+        unknown = torch.zeros_like(clean.return_mask) if unknown is None else unknown
+        hit = clean.return_mask & ~unknown
+        return cls(clean.range_m, hit, torch.zeros_like(hit), ~clean.return_mask & ~unknown, clean.sensor)
+
+    @classmethod
+    def nothing(cls, sensor: SensorModel, count: int) -> Condition:
+        """Return the condition of a number of scans of which nothing is known."""
+        none = torch.zeros(count, sensor.height, sensor.width, dtype=torch.bool)
+        return cls(none.float(), none, none, none, sensor)
+
+    def __len__(self) -> int:
+        return len(self.range_m)
+
+    def __getitem__(self, index: slice | list[int]) -> Condition:
+        """Return the conditions of some of the scans."""
+        return replace(
+            self,
+            range_m=self.range_m[index],
+            range_observed=self.range_observed[index],
+            return_mask=self.return_mask[index],
+            return_observed=self.return_observed[index],
+            reflectance=None if self.reflectance is None else self.reflectance[index],
+        )
+
+    def to(self, device: torch.device | str) -> Condition:
+        """Return the condition with its pixels on another device."""
+        return replace(
+            self,
+            range_m=self.range_m.to(device),
+            range_observed=self.range_observed.to(device),
+            return_mask=self.return_mask.to(device),
+            return_observed=self.return_observed.to(device),
+            reflectance=None if self.reflectance is None else self.reflectance.to(device),
+        )
+
+    @property
+    def kinds(self) -> frozenset[ConditionKind]:
+        """What the condition knows; empty where nothing is observed."""
+        found: dict[ConditionKind, Tensor] = {
+            "pixels": self.return_observed,
+            "surfaces": self.range_observed & ~self.return_observed,
+        }
+        return frozenset(kind for kind, mask in found.items() if bool(mask.any()))
+
+    @property
+    def images(self) -> RangeImage:
+        """The observed returns as range images, without a return in all other pixels."""
+        kept = self.return_mask & self.return_observed
+        return RangeImage.masked(self.range_m, kept, self.sensor, self.reflectance)
+
+    @property
+    def surfaces(self) -> RangeImage:
+        """Range images in which every surface of known range returns."""
+        return RangeImage.masked(self.range_m, self.range_observed, self.sensor, self.reflectance)
+
+    def put_into(self, generated: RangeImage) -> RangeImage:
+        """Return generated scans in which whatever was observed stands as it is, bit for bit."""
+        returned = torch.where(self.return_observed, self.return_mask, generated.return_mask)
+        range_m = torch.where(self.range_observed, self.range_m, generated.range_m)
+        reflectance = None
+        if generated.reflectance is not None and self.reflectance is not None:
+            known = self.return_observed & self.return_mask
+            reflectance = torch.where(known, self.reflectance, generated.reflectance)
+        return RangeImage.masked(range_m, returned, self.sensor, reflectance)
+
+
+def check_observed(observed: Bool[Tensor, "..."], range_m: Float[Tensor, "..."]) -> None:
+    """Refuse a mask of observed pixels whose shape is not that of the ranges, with ConfigError."""
+    if observed.shape != range_m.shape or observed.dtype != torch.bool or range_m.ndim != 3:
+        raise ConfigError(
+            f"observed pixels of shape {tuple(observed.shape)} and type {observed.dtype}",
+            f"{tuple(range_m.shape)} and torch.bool, one for each pixel of a batch of images",
+            "give a mask for each image",
+        )
