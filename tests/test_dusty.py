@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from lidargrit.conditions import Condition
 from lidargrit.errors import ConfigError
 from lidargrit.generators.dusty import Dusty, DustyConfig, DustySampling, InverseRange
 from lidargrit.nn.latent_search import rate_share, search_latents
@@ -247,7 +248,8 @@ def test_completion_keeps_what_was_observed():
     observed = torch.zeros_like(whole.return_mask)
     observed[:, ::2] = True
     hidden = RangeImage.masked(whole.range_m, whole.return_mask & observed, NARROW)
-    found, again = (generator.complete(images, observed, [1, 2], sampling) for images in (whole, hidden))
+    known = [Condition.of_pixels(images, observed) for images in (whole, hidden)]
+    found, again = (generator.complete(each, [1, 2], sampling) for each in known)
     assert torch.equal(found.range_m, again.range_m)  # what was not observed is not looked at
     assert torch.equal(found.range_m[observed], whole.range_m[observed])
     both = ~observed & whole.return_mask & found.return_mask

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from lidargrit import _discovery
+from lidargrit.conditions import Condition
 from lidargrit.errors import ConfigError
 from lidargrit.generators import CAPABILITIES, Generator, load, load_class
 from lidargrit.loading import Provenance, RangeImages
@@ -64,12 +65,12 @@ def same(one: RangeImage, other: RangeImage) -> bool:
     return all(torch.equal(*pair) for pair in pairs)
 
 
-def calls(images, observed, seeds, sampling):
+def calls(images, condition, seeds, sampling):
     """Return the arguments of every public method besides ``sample``, by capability."""
     return {
         "tokens": ("get_tokenizer",),
         "encode": ("reconstruct", images),
-        "complete": ("complete", images, observed, seeds, sampling),
+        "complete": ("complete", condition, seeds, sampling),
         "invert": ("invert", images, seeds, sampling),
         "likelihood": ("log_likelihood", images),
     }
@@ -120,21 +121,24 @@ def test_images_and_masks_of_others_are_refused(name):
     generator, sampling = made(name)
     images, seeds = IMAGES.batch([0, 1]), [3, 4]
     observed = torch.ones(2, 64, 32, dtype=torch.bool)
+    condition = Condition.of_pixels(images, observed)
     other = RangeImage(images.range_m, images.return_mask, load_sensor("hdl64e_kitti_360").with_columns(32))
     for capability in sorted(generator.capabilities - {"tokens"}):
         with pytest.raises(ConfigError, match=r"^got range images of the sensor 'hdl64e_kitti_360', 64x32; wanted "):
-            call(generator, calls(other, observed, seeds, sampling)[capability])
-        with pytest.raises(ConfigError, match=r"^got range images of shape \(64, 32\); wanted a batch"):
-            call(generator, calls(images[0], observed, seeds, sampling)[capability])
+            call(generator, calls(other, Condition.of_pixels(other, observed), seeds, sampling)[capability])
+        if capability != "complete":
+            with pytest.raises(ConfigError, match=r"^got range images of shape \(64, 32\); wanted a batch"):
+                call(generator, calls(images[0], None, seeds, sampling)[capability])
         if capability in ("complete", "invert"):
             with pytest.raises(ConfigError, match=r"^got 3 seeds for 2 images; wanted one seed for each image"):
-                call(generator, calls(images, observed, [0, 1, 2], sampling)[capability])
+                call(generator, calls(images, condition, [0, 1, 2], sampling)[capability])
             with pytest.raises(ConfigError, match=r"^got the seed -2; "):
-                call(generator, calls(images, observed, [0, -2], sampling)[capability])
+                call(generator, calls(images, condition, [0, -2], sampling)[capability])
         if capability == "complete":
-            for mask in (observed[:1], observed[:, :32]):
-                with pytest.raises(ConfigError, match=r"^got observed pixels of shape "):
-                    call(generator, calls(images, mask, seeds, sampling)[capability])
+            assert "pixels" in generator.conditions
+            if "surfaces" not in generator.conditions:
+                with pytest.raises(ConfigError, match=r"^got ranges of surfaces .*; wanted pixels of which range and "):
+                    generator.complete(Condition.of_surfaces(images), seeds, sampling)
 
 
 def test_scans_are_those_of_its_sensor(name):
@@ -180,7 +184,8 @@ def test_has_exactly_the_capabilities_that_it_declares(name):
 def test_what_it_cannot_do_is_told_with_who_can(name):
     generator, sampling = made(name)
     images = IMAGES.batch([0, 1])
-    for capability, arguments in calls(images, images.return_mask, [0, 1], sampling).items():
+    condition = Condition.of_pixels(images, images.return_mask)
+    for capability, arguments in calls(images, condition, [0, 1], sampling).items():
         if capability in generator.capabilities:
             continue
         able = [other for other in NAMES if capability in load_class(other).capabilities]
@@ -200,12 +205,11 @@ def test_what_it_can_do_besides_keeps_to_the_seeds_and_the_sensor(name):
         assert generator.reconstruct(images).range_m.shape == (2, 64, 32)
     if "likelihood" in generator.capabilities:
         assert bool((generator.log_likelihood(images) < 0).all())
-    for capability, arguments in (("complete", (observed,)), ("invert", ())):
+    for capability, given in (("complete", Condition.of_pixels(images, observed)), ("invert", images)):
         if capability in generator.capabilities:
             method = getattr(generator, capability)
-            found = method(images, *arguments, [3, 4], sampling)
-            alone = method(images[1:], *(each[1:] for each in arguments), [4], sampling)
-            assert same(found[1:2], alone)
+            found = method(given, [3, 4], sampling)
+            assert same(found[1:2], method(given[1:], [4], sampling))
 
 
 def test_an_objective_has_a_finite_loss_and_gradients(name):

@@ -9,6 +9,7 @@ import torch
 
 import lidargrit
 from lidargrit.cli import main
+from lidargrit.conditions import Condition
 from lidargrit.errors import CheckpointError, ConfigError
 from lidargrit.generators.lidargen import LangevinSampling, LidarGen, LidarGenConfig, encode
 from lidargrit.nn.ncsn import InstanceNormPlus, Ncsn
@@ -247,19 +248,20 @@ def test_a_completed_scan_keeps_what_was_observed_whichever_pixels_these_are():
     generator, images = made(), walls()
     sampling = LangevinSampling(levels=3, steps_each=2, step_lr=1e-9)
     observed = torch.rand(2, 64, 32, generator=torch.Generator().manual_seed(4)) < 0.3
-    done = generator.complete(images, observed, [0, 1], sampling)
+    done = generator.complete(Condition.of_pixels(images, observed), [0, 1], sampling)
     for name in ("range_m", "return_mask", "reflectance"):
         assert torch.equal(getattr(done, name)[observed], getattr(images, name)[observed])
     hidden = RangeImage.masked(
         torch.where(observed, images.range_m, 9.0), images.return_mask | ~observed, SENSOR, images.reflectance
     )
-    assert torch.equal(generator.complete(hidden, observed, [0, 1], sampling).range_m, done.range_m)
+    again = generator.complete(Condition.of_pixels(hidden, observed), [0, 1], sampling)
+    assert torch.equal(again.range_m, done.range_m)
     # What the network sees of the observed pixels reaches the others.
     nothing = torch.zeros_like(observed)
-    free = generator.complete(images, nothing, [0, 1], sampling)
+    free = generator.complete(Condition.of_pixels(images, nothing), [0, 1], sampling)
     assert torch.equal(free.range_m, generator.sample([0, 1], sampling).range_m)
     assert not torch.equal(done.range_m[~observed], free.range_m[~observed])
-    weaker = generator.complete(images, observed, [0, 1], replace(sampling, pull=0.1))
+    weaker = generator.complete(Condition.of_pixels(images, observed), [0, 1], replace(sampling, pull=0.1))
     assert not torch.equal(weaker.range_m[~observed], done.range_m[~observed])
 
 

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from lidargrit.conditions import Condition
 from lidargrit.errors import ConfigError
 from lidargrit.nn.pixel_decoder import PixelDecoder, PixelSampling, nats_to_range_bits
 from lidargrit.nn.pixel_networks import Guide, PixelDecoderConfig
@@ -106,8 +107,8 @@ def test_sampled_masks_come_as_often_as_their_probability() -> None:
     probability = decoder(repeated(decoded, len(masks)), images).mask.sum((1, 2)).neg().exp()
     count = 20_000
     uniform = torch.rand(count, 2, 4, generator=torch.Generator().manual_seed(0))
-    unknown = torch.zeros(count, 2, 4, dtype=torch.bool)
-    sampled = decoder._sample_mask(Guide.of(repeated(decoded, count)), uniform, unknown, unknown)  # all in one batch
+    nothing = Condition.nothing(sensor, count)
+    sampled = decoder._sample_mask(Guide.of(repeated(decoded, count)), uniform, nothing)  # all in one batch
     index = (sampled.flatten(1) * 2 ** torch.arange(7, -1, -1)).sum(1)
     seen = torch.bincount(index, minlength=len(masks)) / count
     # The mean distance of as many samples of the very distribution, by the normal approximation of each count.
@@ -276,7 +277,7 @@ def test_observed_pixels_come_back_as_they_are_and_move_their_neighbours() -> No
 
     def sample(known: Tensor) -> RangeImage:
         rngs = [torch.Generator().manual_seed(seed) for seed in (0, 1)]
-        return decoder.sample(decoded, rngs, PixelSampling(), (images, known))
+        return decoder.sample(decoded, rngs, PixelSampling(), Condition.of_pixels(images, known))
 
     free, completed = sample(torch.zeros_like(observed)), sample(observed)
     assert torch.equal(completed.range_m[observed], images.range_m[observed])

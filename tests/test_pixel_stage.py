@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from lidargrit.cli import main
+from lidargrit.conditions import Condition
 from lidargrit.errors import ConfigError
 from lidargrit.evaluation.reconstruction import score_likelihood
 from lidargrit.generators import load
@@ -131,26 +132,40 @@ def test_a_scan_is_completed_from_the_tokens_and_pixels_that_were_observed():
     generator, images = made(), scans(2)
     observed = torch.zeros_like(images.return_mask)
     observed[:, :, :24] = True  # three columns of tokens
-    tokens = generator.observed_tokens(images, observed).view(2, 8, 8)
+    known = Condition.of_pixels(images, observed)
+    tokens = generator.observed_tokens(known).view(2, 8, 8)
     assert bool((tokens[:, :, :3] >= 0).all())
     assert bool((tokens[:, :, 3:] == -1).all())
-    completed = generator.complete(images, observed, [5, 6])
+    completed = generator.complete(known, [5, 6])
     assert torch.equal(completed.range_m[observed], images.range_m[observed])
     assert torch.equal(completed.return_mask[observed], images.return_mask[observed])
-    assert not torch.equal(completed.range_m, generator.complete(images, observed, [7, 8]).range_m)
-    assert torch.equal(completed.range_m[1], generator.complete(images[1:], observed[1:], [6]).range_m[0])
-    whole = torch.ones_like(observed)
-    assert torch.equal(generator.observed_tokens(images, whole), generator.tokenizer.encode(images).tokens.flatten(1))
-    assert torch.equal(generator.complete(images, whole, [5, 6]).range_m, images.range_m)
+    assert not torch.equal(completed.range_m, generator.complete(known, [7, 8]).range_m)
+    assert torch.equal(completed.range_m[1], generator.complete(known[1:], [6]).range_m[0])
+    whole = Condition.of_pixels(images, torch.ones_like(observed))
+    assert torch.equal(generator.observed_tokens(whole), generator.tokenizer.encode(images).tokens.flatten(1))
+    assert torch.equal(generator.complete(whole, [5, 6]).range_m, images.range_m)
+
+
+def test_returns_are_sampled_where_only_the_ranges_of_surfaces_are_known():
+    generator, images = made(), scans(2)
+    clean = Condition.of_surfaces(images)
+    assert generator.conditions == {"pixels", "surfaces"}
+    dropped = generator.complete(clean, [5, 6])
+    assert not bool((dropped.return_mask & ~images.return_mask).any())
+    assert 0 < int(dropped.return_mask.sum()) < int(images.return_mask.sum())
+    assert torch.equal(dropped.range_m, images.range_m * dropped.return_mask)
+    assert not torch.equal(dropped.return_mask, generator.complete(clean, [7, 8]).return_mask)
+    assert torch.equal(dropped.range_m[1], generator.complete(clean[1:], [6]).range_m[0])
 
 
 def test_two_images_of_one_seed_are_completed_each_by_itself():
     generator, images = made(), scans(2)
     observed = torch.zeros_like(images.return_mask)
     observed[:, ::4] = True
-    completed = generator.complete(images, observed, [5, 5])
+    known = Condition.of_pixels(images, observed)
+    completed = generator.complete(known, [5, 5])
     assert torch.equal(completed.range_m[observed], images.range_m[observed])
-    assert torch.equal(completed.range_m[1], generator.complete(images[1:], observed[1:], [5]).range_m[0])
+    assert torch.equal(completed.range_m[1], generator.complete(known[1:], [5]).range_m[0])
 
 
 @pytest.mark.parametrize("static", [False, True])

@@ -6,6 +6,7 @@ import math
 import pytest
 import torch
 
+from lidargrit.conditions import Condition
 from lidargrit.errors import CheckpointError, ConfigError
 from lidargrit.generators._log_range import encode
 from lidargrit.generators.r2dm import DiffusionSampling, R2dm, R2dmConfig, load_published
@@ -285,7 +286,7 @@ def test_a_completed_scan_keeps_what_was_observed():
     generator, images = made(), walls()
     observed = torch.zeros(2, 64, 32, dtype=torch.bool)
     observed[:, ::4] = True
-    done = generator.complete(images, observed, [0, 1], DiffusionSampling(steps=3, resamples=2))
+    done = generator.complete(Condition.of_pixels(images, observed), [0, 1], DiffusionSampling(steps=3, resamples=2))
     for name in ("range_m", "return_mask", "reflectance"):
         assert torch.equal(getattr(done, name)[observed], getattr(images, name)[observed])
     assert not torch.equal(done.range_m[~observed], images.range_m[~observed])
@@ -296,14 +297,14 @@ def test_a_completed_scan_keeps_what_was_observed():
         SENSOR,
         torch.where(observed, images.reflectance, 0),
     )
-    again = generator.complete(hidden, observed, [0, 1], DiffusionSampling(steps=3, resamples=2))
+    again = generator.complete(Condition.of_pixels(hidden, observed), [0, 1], DiffusionSampling(steps=3, resamples=2))
     assert torch.equal(again.range_m, done.range_m)
     with pytest.raises(ConfigError, match="1 seeds for 2 images"):
-        generator.complete(images, observed, [0])
+        generator.complete(Condition.of_pixels(images, observed), [0])
     with pytest.raises(ConfigError, match="sampler=ddim for completion"):
-        generator.complete(images, observed, [0, 1], DiffusionSampling(sampler="ddim"))
+        generator.complete(Condition.of_pixels(images, observed), [0, 1], DiffusionSampling(sampler="ddim"))
     with pytest.raises(ConfigError, match="observed pixels of shape"):
-        generator.complete(images, observed[:1], [0, 1])
+        generator.complete(Condition.of_pixels(images, observed[:1]), [0, 1])
 
 
 def test_reflectance_is_saved_with_samples_and_read_back(tmp_path):

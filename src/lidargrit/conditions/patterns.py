@@ -32,8 +32,7 @@ class Pattern:
     text: str
 
     def __post_init__(self) -> None:
-        name, _, rest = self.text.partition(":")
-        if name in ("rows", "sector", "pixels"):
+        if self.text.partition(":")[0] in ("rows", "sector", "pixels"):
             self._numbers()
         elif self.text != "returns" and not self.text.lower().endswith(".npy"):
             raise UsageError(f"--observed {self.text[:80]}", FORMS, "choose one")
@@ -97,11 +96,14 @@ class Pattern:
             numbers = [float(word) for word in rest.split(",")]
         except ValueError:
             numbers = []
-        fits = len(numbers) == count and {
-            "rows": lambda: numbers[0] in range(2, 65),
-            "sector": lambda: all(-360 <= number <= 360 for number in numbers) and numbers[0] != numbers[1],
-            "pixels": lambda: 0 < numbers[0] < 1,
-        }[name]()
+        fits = (
+            len(numbers) == count
+            and {
+                "rows": lambda: numbers[0] in range(2, 65),
+                "sector": lambda: all(-360 <= number <= 360 for number in numbers) and numbers[0] != numbers[1],
+                "pixels": lambda: 0 < numbers[0] < 1,
+            }[name]()
+        )
         if not fits:
             raise UsageError(f"--observed {self.text[:80]}", wanted, "correct it")
         return numbers

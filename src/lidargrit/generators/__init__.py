@@ -10,14 +10,15 @@ from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar, final
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from lidargrit import _discovery, configuration
+from lidargrit.conditions import Condition, ConditionKind
 from lidargrit.errors import CheckpointError, ConfigError, LidarGritError
 from lidargrit.files import is_taken, read_json, read_tensors
 from lidargrit.generators._batches import BatchSeeds, in_batches
-from lidargrit.generators._checks import check_images, check_observed, check_seeds
+from lidargrit.generators._checks import check_condition, check_images, check_seeds
 from lidargrit.generators._facts import CAPABILITIES, SystemFacts
 from lidargrit.generators._hub import download
 from lidargrit.generators._saved import CARD_FILE as CARD_FILE
@@ -91,6 +92,11 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     def completion_sampling(cls) -> SamplingT:
         """Return the settings by which scans are completed if the caller names none."""
         return cls.Sampling()
+
+    @property
+    def conditions(self) -> frozenset[ConditionKind]:
+        """Kinds of what may be known of a scan that is completed; they may depend on ``config``."""
+        return frozenset({"pixels"} if "complete" in self.capabilities else set())
 
     @property
     def stages(self) -> tuple[str, ...]:
@@ -178,37 +184,31 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     @torch.no_grad()
     def complete(
         self,
-        images: RangeImage,
-        observed: Bool[Tensor, "B H W"],
+        condition: Condition,
         seeds: Sequence[int],
         sampling: SamplingT | None = None,
     ) -> RangeImage:
-        """Return scans that keep the observed pixels and generate the others (capability ``complete``).
+        """Return scans that keep what was observed, bit for bit, and generate the rest (capability ``complete``).
 
         Args:
-            images: batch of range images (B, H, W); pixels that were not observed have no influence.
-            observed: True for pixels that are known, be it as a return or as none.
-            seeds: one for each image, from 0 to 2^63 - 1.
+            condition: what is known of each scan, such as ``Condition.of_pixels(images, observed)``; of the kinds in
+                :attr:`conditions`.
+            seeds: one for each scan, from 0 to 2^63 - 1.
             sampling: settings of the generator's own ``Sampling``; :meth:`completion_sampling` if not given.
 
         Raises:
-            ConfigError: images of other rays, a mask of another shape, seeds that are too many, too few or out of
-                bounds, settings of another generator, or a generator without the capability.
+            ConfigError: images of other rays, a condition of a kind that the generator does not take, seeds that are
+                too many, too few or out of bounds, settings of another generator, or one without the capability.
         """
         self._require("complete")
-        check_images(images, self.sensor)
-        check_observed(observed, images)
-        check_seeds(seeds, len(images))
-        settings = self._settings(sampling, self.completion_sampling)
-        images, observed = images.to(self.device), observed.to(self.device)
+        check_condition(condition, self.conditions, self.sensor, self.public_name())
+        check_seeds(seeds, len(condition))
+        settings, condition = self._settings(sampling, self.completion_sampling), condition.to(self.device)
         self.eval()
         generated = in_batches(
-            seeds, self.compute_batch, lambda at, some: self._complete(images[at], observed[at], some, settings)
+            seeds, self.compute_batch, lambda at, some: self._complete(condition[at], some, settings)
         )
-        reflectance, range_m = None, torch.where(observed, images.range_m, generated.range_m)
-        if generated.reflectance is not None and images.reflectance is not None:
-            reflectance = torch.where(observed, images.reflectance, generated.reflectance)
-        return RangeImage(range_m, range_m > 0, self.sensor, reflectance)
+        return condition.put_into(generated)
 
     @final
     @torch.no_grad()
@@ -252,10 +252,8 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     def _sample(self, seeds: BatchSeeds, sampling: SamplingT) -> RangeImage:
         """Generate one scan for each of ``compute_batch`` seeds; scans of copies at their end may be left out."""
 
-    def _complete(
-        self, images: RangeImage, observed: Bool[Tensor, "B H W"], seeds: BatchSeeds, sampling: SamplingT
-    ) -> RangeImage:
-        """Generate scans that agree with the observed pixels; the caller then puts these in."""
+    def _complete(self, condition: Condition, seeds: BatchSeeds, sampling: SamplingT) -> RangeImage:
+        """Generate scans that agree with what was observed; the caller then puts this in."""
         raise NotImplementedError
 
     def _invert(self, images: RangeImage, seeds: BatchSeeds, sampling: SamplingT) -> RangeImage:

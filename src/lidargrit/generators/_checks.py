@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
-import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
+from lidargrit.conditions import KINDS, Condition, ConditionKind
 from lidargrit.errors import ConfigError
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
@@ -30,7 +30,7 @@ def check_seeds(seeds: Sequence[int], count: int | None = None) -> None:
             raise ConfigError(f"the seed {str(seed)[:30]}", "a whole number from 0 to 2^63 - 1", "choose another seed")
 
 
-def check_images(images: RangeImage, sensor: SensorModel) -> None:
+def check_images(images: RangeImage | Condition, sensor: SensorModel) -> None:
     """Refuse a single image, an empty batch, and images whose pixels are other rays than the sensor's."""
     if images.range_m.ndim != 3 or not len(images):
         raise ConfigError(
@@ -46,13 +46,21 @@ def check_images(images: RangeImage, sensor: SensorModel) -> None:
         )
 
 
-def check_observed(observed: Bool[Tensor, "..."], images: RangeImage) -> None:
-    """Refuse a mask of observed pixels whose shape is not that of the images."""
-    if observed.shape != images.range_m.shape or observed.dtype != torch.bool:
+def check_condition(condition: Condition, kinds: Collection[ConditionKind], sensor: SensorModel, name: str) -> None:
+    """Refuse a condition of other rays, and one of a kind that a generator does not take.
+
+    Args:
+        condition: condition that a caller gave.
+        kinds: kinds that the generator takes.
+        sensor: sensor of the generator.
+        name: name of the generator, for the message.
+    """
+    check_images(condition, sensor)
+    if not condition.kinds <= set(kinds):
         raise ConfigError(
-            f"observed pixels of shape {tuple(observed.shape)} and type {observed.dtype}",
-            f"{tuple(images.range_m.shape)} and torch.bool, one for each pixel of the images",
-            "give a mask for each image",
+            " and ".join(KINDS[kind] for kind in sorted(condition.kinds - set(kinds))),
+            " or ".join(KINDS[kind] for kind in sorted(kinds)) + f", which is what this {name!r} takes",
+            "choose a model of lidargrit, such as pretrained",
         )
 
 

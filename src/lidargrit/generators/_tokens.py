@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
+from lidargrit.conditions import Condition
 from lidargrit.errors import ConfigError
 from lidargrit.generators import Cost, Generator
 from lidargrit.nn.objective import Objective
@@ -113,7 +114,7 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
         mask: PixelChoice,
         pixels: PixelSampling,
         tokenizer: Tokenizer,
-        observed: tuple[RangeImage, Bool[Tensor, "B H W"]] | None = None,
+        condition: Condition | None = None,
     ) -> RangeImage:
         """Return the first scans of sampled tokens: those that are wanted, and what its batch takes along.
 
@@ -126,7 +127,7 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
             mask: method by which returns and ranges are decided.
             pixels: settings by which the pixel decoder samples ranges.
             tokenizer: the generator's own tokenizer, or its copy for decoding only.
-            observed: scans and the mask of their known pixels, by which a pixel decoder goes.
+            condition: what is known of the scans, by which a pixel decoder goes.
 
         Raises:
             ConfigError: ``mask`` asks for a pixel decoder, and there is none.
@@ -142,18 +143,19 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
             some = slice(first, first + _DECODED_AT_ONCE)
             grid = TokenGrid(tokens[some].unflatten(1, tokenizer.grid_size), tokenizer.num_codes)
             if self.pixels is not None and mask in ("auto", "pixels"):
-                known = None if observed is None else (observed[0][some], observed[1][some])
+                known = None if condition is None else condition[some]
                 images.append(self.pixels.sample(tokenizer.decode(grid), rngs[some], pixels, known))
             else:
                 images.append(tokenizer.sample(grid, rngs[some], "threshold" if mask == "threshold" else "bernoulli"))
         return RangeImage.cat(images)
 
-    def observed_tokens(self, images: RangeImage, observed: Bool[Tensor, "B H W"]) -> Int[Tensor, "B T"]:
+    def observed_tokens(self, condition: Condition) -> Int[Tensor, "B T"]:
         """Return the tokens of the cells of which a pixel was observed, and -1 for the others.
 
         They are those of scans in which every other pixel is as the nearest observed one, around the circle.
         """
-        filled = fill_from_nearest(images, observed)
+        observed = condition.return_observed | condition.range_observed
+        filled = fill_from_nearest(condition.surfaces, observed)
         rows, columns = self.tokenizer.grid_size
         cell = (self.sensor.height // rows, self.sensor.width // columns)
         seen = F.max_pool2d(observed[:, None].float(), cell)[:, 0] > 0

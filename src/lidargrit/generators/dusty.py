@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.func import functional_call
 
+from lidargrit.conditions import Condition
 from lidargrit.determinism import derive_seed
 from lidargrit.errors import CheckpointError, ConfigError
 from lidargrit.files import load_exactly
@@ -176,11 +177,10 @@ class Dusty(Generator[DustyConfig, DustySampling]):
     def _invert(self, images: RangeImage, seeds: Sequence[int], sampling: DustySampling) -> RangeImage:
         return self._generate(self._search(images, images.return_mask, seeds, sampling), seeds, sampling)
 
-    def _complete(
-        self, images: RangeImage, observed: Bool[Tensor, "B H W"], seeds: Sequence[int], sampling: DustySampling
-    ) -> RangeImage:
+    def _complete(self, condition: Condition, seeds: Sequence[int], sampling: DustySampling) -> RangeImage:
         """Return the nearest scans that the network generates, by the observed returns alone."""
-        return self._generate(self._search(images, images.return_mask & observed, seeds, sampling), seeds, sampling)
+        latents = self._search(condition.images, condition.images.return_mask, seeds, sampling)
+        return self._generate(latents, seeds, sampling)
 
     def _generate(self, latents: Tensor, seeds: Sequence[int], sampling: DustySampling) -> RangeImage:
         encoded, logits = self.synthesis(latents)

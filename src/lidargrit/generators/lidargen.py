@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
+from lidargrit.conditions import Condition
 from lidargrit.errors import CheckpointError, ConfigError
 from lidargrit.files import load_exactly
 from lidargrit.generators import Cost, Generator, SystemFacts
@@ -159,13 +160,12 @@ class LidarGen(Generator[LidarGenConfig, LangevinSampling]):
         images = langevin(self.network, noise.uniform(), noise, levels, steps_each, sampling.step_lr)
         return self._decoded(images, sampling)
 
-    def _complete(
-        self, images: RangeImage, observed: Bool[Tensor, "B H W"], seeds: Sequence[int], sampling: LangevinSampling
-    ) -> RangeImage:
+    def _complete(self, condition: Condition, seeds: Sequence[int], sampling: LangevinSampling) -> RangeImage:
         """Generate scans that agree with the observed pixels, as the paper makes dense scans of sparse ones."""
         noise = SeededNoise(seeds, self.shape, self.device)
         levels, steps_each = self._counts(sampling)
-        pull = pull_towards(observed[:, None], encode(images, self.config), sampling.pull)
+        observed, images = condition.return_observed[:, None], condition.images
+        pull = pull_towards(observed, encode(images, self.config), sampling.pull)
         generated = langevin(self.network, noise.uniform(), noise, levels, steps_each, sampling.step_lr, pull)
         return self._decoded(generated, sampling)
 

@@ -11,9 +11,10 @@ from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
+from lidargrit.conditions import Condition, ConditionKind
 from lidargrit.errors import ConfigError
 from lidargrit.files import load_exactly
 from lidargrit.generators import Cost, SystemFacts
@@ -136,9 +137,12 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         tokens = decoder.generate(uniform.to(self.device))
         return self.decode(tokens, seeds.num_asked_for, rngs, sampling.mask, sampling.pixels(), tokenizer)
 
-    def _complete(
-        self, images: RangeImage, observed: Bool[Tensor, "B H W"], seeds: BatchSeeds, sampling: TokenSampling
-    ) -> RangeImage:
+    @property
+    def conditions(self) -> frozenset[ConditionKind]:
+        """Known pixels, and known ranges of surfaces, of which it is sampled which return."""
+        return frozenset({"pixels", "surfaces"})
+
+    def _complete(self, condition: Condition, seeds: BatchSeeds, sampling: TokenSampling) -> RangeImage:
         """Generate the tokens of which no pixel was observed, and with a pixel decoder the pixels around observed ones.
 
         Tokens come row by row, pixels in phases: each knows of what was observed before its turn, and not of the rest.
@@ -146,10 +150,10 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         rngs = [torch.Generator().manual_seed(seed) for seed in seeds]
         uniform = torch.stack([torch.rand(self.transformer.context_length, generator=rng) for rng in rngs])
         decoder, tokenizer = self._prepare(len(seeds), sampling)
-        tokens = decoder.generate(uniform.to(self.device), self.observed_tokens(images, observed))
-        return self.decode(
-            tokens, seeds.num_asked_for, rngs, sampling.mask, sampling.pixels(), tokenizer, (images, observed)
-        )
+        tokens = self.observed_tokens(condition)
+        if bool((tokens < 0).any()):
+            tokens = decoder.generate(uniform.to(self.device), tokens)
+        return self.decode(tokens, seeds.num_asked_for, rngs, sampling.mask, sampling.pixels(), tokenizer, condition)
 
     @torch.no_grad()
     def token_nll_bits(self, images: RangeImage) -> Float[Tensor, "B h w"]:

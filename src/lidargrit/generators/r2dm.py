@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
+from lidargrit.conditions import Condition
 from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import ConfigError
 from lidargrit.files import load_exactly
@@ -164,15 +165,14 @@ class R2dm(Generator[R2dmConfig, DiffusionSampling]):
         self._check(sampling)
         return self._decoded(self._sample_values(seeds, sampling), sampling)
 
-    def _complete(
-        self, images: RangeImage, observed: Bool[Tensor, "B H W"], seeds: Sequence[int], sampling: DiffusionSampling
-    ) -> RangeImage:
+    def _complete(self, condition: Condition, seeds: Sequence[int], sampling: DiffusionSampling) -> RangeImage:
         """Generate scans that agree with the observed pixels, by RePaint over DDPM."""
         self._check(sampling)
         if sampling.sampler != "ddpm":
             raise ConfigError(f"sampler={sampling.sampler} for completion", "sampler=ddpm", "RePaint adds fresh noise")
-        noise, clean = SeededNoise(seeds, self.shape, self.device), encode(images, self.config.reflectance)
-        generated = diffusion.repaint(self.network, noise, clean, observed[:, None], sampling.steps, sampling.resamples)
+        noise, clean = SeededNoise(seeds, self.shape, self.device), encode(condition.images, self.config.reflectance)
+        observed = condition.return_observed[:, None]
+        generated = diffusion.repaint(self.network, noise, clean, observed, sampling.steps, sampling.resamples)
         return self._decoded(generated, sampling)
 
     def cost(self, sampling: DiffusionSampling | None = None) -> Cost:

@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from lidargrit.conditions import Condition
 from lidargrit.errors import ConfigError
 from lidargrit.nn.pixel_networks import Guide, MaskNetwork, PixelDecoderConfig, RangeNetwork
 from lidargrit.nn.pixel_phases import Phase, at_phases, join_phases
@@ -148,7 +149,7 @@ class PixelDecoder(nn.Module):
         decoded: Decoded,
         rngs: Sequence[torch.Generator],
         sampling: PixelSampling | None = None,
-        observed: tuple[RangeImage, Bool[Tensor, "B H W"]] | None = None,
+        condition: Condition | None = None,
     ) -> RangeImage:
         """Return one scan for each random generator; a scan does not depend on the others of its batch.
 
@@ -156,41 +157,32 @@ class PixelDecoder(nn.Module):
             decoded: output of the tokenizer's decoder for as many scans.
             rngs: random generators on the CPU, one for each scan.
             sampling: settings of the sampling of ranges.
-            observed: scans, and True where a pixel of them is known, be it a return or that there was none. These
-                pixels are taken over as they are, when their phase comes: later phases know of them, earlier ones not.
+            condition: what is known of the scans; nothing if not given. Known returns and ranges are taken over as they
+                are, when their phase comes: later phases know of them, earlier ones not.
         """
-        guide = Guide.of(decoded)
-        size = (3, self.sensor.height, self.sensor.width)
+        guide, size = Guide.of(decoded), (3, self.sensor.height, self.sensor.width)
         uniform = torch.stack([torch.rand(size, generator=rng) for rng in rngs]).to(guide.v.device)
-        nothing = torch.zeros_like(guide.v)
-        known = torch.zeros_like(guide.v, dtype=torch.bool) if observed is None else observed[1]
-        given_m = nothing if observed is None else torch.where(known, observed[0].range_m, nothing)
+        known = (condition or Condition.nothing(self.sensor, len(rngs))).to(guide.v.device)
         # One scan after the other on a CPU: with other batch sizes its sums have other rounding errors.
         step = 1 if guide.v.device.type == "cpu" else len(uniform)
         images = []
         for first in range(0, len(uniform), step):
             part = slice(first, first + step)
             some = Guide(*(maps[part] for maps in guide))
-            mask = self._sample_mask(some, uniform[part, 0], given_m[part] > 0, known[part])
-            range_m = self._sample_range(some, uniform[part, 1:], mask, given_m[part], known[part], sampling)
+            mask = self._sample_mask(some, uniform[part, 0], known[part])
+            range_m = self._sample_range(some, uniform[part, 1:], mask, known[part], sampling)
             images.append(RangeImage(range_m, mask, self.sensor))
         return RangeImage.cat(images)
 
-    def _sample_mask(
-        self,
-        guide: Guide,
-        uniform: Float[Tensor, "B H W"],
-        given: Bool[Tensor, "B H W"],
-        known: Bool[Tensor, "B H W"],
-    ) -> Bool[Tensor, "B H W"]:
-        """Return the mask, sampled phase by phase; what is known of it is taken from ``given``."""
+    def _sample_mask(self, guide: Guide, uniform: Float[Tensor, "B H W"], known: Condition) -> Bool[Tensor, "B H W"]:
+        """Return the mask, sampled phase by phase around what is known of it."""
         guided = self.mask.guided(guide)
-        mask = torch.zeros_like(given)
+        mask = torch.zeros_like(known.return_mask)
         for phase in self.mask.phases:
             pixels = (..., *phase.pixels)
             output = self.mask.outputs([phase], guided, guide, mask, guide.v)
             sampled = uniform[pixels] < self.mask.logits([phase], output, guide)[0].sigmoid()
-            mask[pixels] = torch.where(known[pixels], given[pixels], sampled)
+            mask[pixels] = torch.where(known.return_observed[pixels], known.return_mask[pixels], sampled)
         return mask
 
     def _sample_range(
@@ -198,13 +190,12 @@ class PixelDecoder(nn.Module):
         guide: Guide,
         uniform: Float[Tensor, "B 2 H W"],
         mask: Bool[Tensor, "B H W"],
-        given_m: Float[Tensor, "B H W"],
-        known: Bool[Tensor, "B H W"],
+        known: Condition,
         sampling: PixelSampling | None,
     ) -> Float[Tensor, "B H W"]:
-        """Return the ranges of a whole mask, sampled phase by phase; known ones are taken from ``given_m``."""
+        """Return the ranges of a whole mask, sampled phase by phase around those that are known."""
         guided, choices = self.range.guided(guide), sampling or PixelSampling()
-        range_m, v = torch.zeros_like(given_m), torch.zeros_like(given_m)
+        range_m, v = torch.zeros_like(guide.v), torch.zeros_like(guide.v)
         for phase in self.range.phases:
             pixels = (..., *phase.pixels)
             candidates = self.range.candidates([phase], guide, mask, v)
@@ -212,7 +203,7 @@ class PixelDecoder(nn.Module):
             mixture = self.range.mixture([phase], output, candidates, guide)
             component, within = uniform[pixels].unbind(1)
             sampled = mixture.sample(component[None], within[None], choices.temperature, choices.noise)[0]
-            sampled = torch.where(known[pixels], given_m[pixels], sampled)
+            sampled = torch.where(known.range_observed[pixels], known.range_m[pixels], sampled)
             range_m[pixels] = torch.where(mask[pixels], sampled, 0.0)
             v[pixels] = range_m[pixels].log1p()
         return range_m

@@ -23,6 +23,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from lidargrit import formats
+from lidargrit.conditions import Condition
 from lidargrit.errors import ConfigError, LidarGritError, OutputError, ScanError
 from lidargrit.files import atomic_path, write_text
 from lidargrit.generators import Generator, load
@@ -95,7 +96,8 @@ def compute_result(generator: Generator, request: SampleRequest) -> list[ScanSet
     if request.hidden != "nothing":
         sets.append(ScanSet("what the model saw", _without(image, hidden).to("cpu"), (request.name,)))
     images = RangeImage.stack([image[0]] * request.count)
-    completed = generator.complete(images, ~hidden.expand_as(images.return_mask), seeds, sampling)
+    condition = Condition.of_pixels(images, ~hidden.expand_as(images.return_mask))
+    completed = generator.complete(condition, seeds, sampling)
     return [*sets, ScanSet("completed", completed.to("cpu"), tuple(f"{request.name}, seed {seed}" for seed in seeds))]
 
 

@@ -1,0 +1,181 @@
+"""Classical ways to fill a scan in, without a network: observed pixels of one scan → all its pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64, Int64
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial import Delaunay, QhullError
+
+from lidargrit.conditions import Condition
+from lidargrit.sensors import SensorModel
+from lidargrit.structures import RangeImage
+
+EDGE = 0.8  # of ln(1 + range in metres): two observed returns further apart lie on two surfaces
+_BESIDE_RAD = np.deg2rad(135.0)  # copied on either side of the image, so that triangles close the circle
+
+
+@dataclass(frozen=True)
+class Observed:
+    """What is observed of one scan, by the angles of its rays.
+
+    Args:
+        range_m: observed ranges in metres, 0 elsewhere.
+        returned: True where a return was observed.
+        known: True where it was observed whether there is a return.
+        elevation_rad: mean elevation of each row.
+        azimuth_rad: azimuth of each column, falling; a full circle later it begins anew.
+    """
+
+    range_m: Float64[np.ndarray, "H W"]
+    returned: Bool[np.ndarray, "H W"]
+    known: Bool[np.ndarray, "H W"]
+    elevation_rad: Float64[np.ndarray, " H"]
+    azimuth_rad: Float64[np.ndarray, " W"]
+
+    @classmethod
+    def of(cls, condition: Condition, index: int) -> Observed:
+        """Return what a condition knows of one of its scans."""
+        sensor, image = condition.sensor, condition.images[index]
+        return cls(
+            image.range_m.double().cpu().numpy(),
+            image.return_mask.cpu().numpy(),
+            condition.return_observed[index].cpu().numpy(),
+            *_angles(sensor),
+        )
+
+    def nearest(self, wanted: Bool[np.ndarray, "H W"]) -> tuple[Int64[np.ndarray, "H W"], Int64[np.ndarray, "H W"]]:
+        """Return for every pixel row and column of the nearest wanted one by angle; of itself if none is wanted."""
+        height, width = wanted.shape
+        if not wanted.any():
+            rows, columns = np.indices((height, width))
+            return rows, columns
+        thrice = np.tile(~wanted, (1, 3))  # so that the circle closes
+        steps = (np.abs(np.diff(self.elevation_rad)).mean() if height > 1 else 1.0, 2 * np.pi / width)
+        rows, columns = distance_transform_edt(thrice, steps, return_distances=False, return_indices=True)
+        middle = slice(width, 2 * width)
+        return rows[:, middle].astype(np.int64), columns[:, middle].astype(np.int64) % width
+
+    def nearest_range_m(self) -> Float64[np.ndarray, "H W"]:
+        """Return for every pixel the range of the nearest return by angle."""
+        return self.range_m[self.nearest(self.returned)]
+
+
+def nearest(seen: Observed) -> Float64[np.ndarray, "H W"]:
+    """Return for every pixel the range of the nearest observed return, in metres."""
+    return seen.nearest_range_m()
+
+
+def linear(seen: Observed) -> Float64[np.ndarray, "H W"]:
+    """Interpolate 1 / range along the row or the column, whichever has the nearer pair of observed returns.
+
+    Where the two lie on two surfaces, the nearer one by angle counts alone; where there is no pair, the nearest return.
+    """
+    by_row, row_span = _between(np.tile(seen.range_m, (1, 3)), _thrice(seen.azimuth_rad))
+    width = len(seen.azimuth_rad)
+    by_row, row_span = by_row[:, width : 2 * width], row_span[:, width : 2 * width]
+    by_column, column_span = (part.T for part in _between(seen.range_m.T, seen.elevation_rad))
+    found = np.where(row_span < column_span, by_row, by_column)
+    return np.where(np.isfinite(found), found, seen.nearest_range_m())
+
+
+def triangulation(seen: Observed) -> Float64[np.ndarray, "H W"]:
+    """Interpolate 1 / range linearly in the triangles of Delaunay between observed returns.
+
+    Where a triangle spans an edge, and outside of all, the nearest return counts. Of a plane 1 / range is nearly
+    linear in the angles.
+    """
+    beside = min(len(seen.azimuth_rad), int(np.ceil(_BESIDE_RAD / (2 * np.pi) * len(seen.azimuth_rad))))
+    width, found = len(seen.azimuth_rad), seen.nearest_range_m()
+    columns = np.arange(-beside, width + beside)
+    rows, at = np.nonzero(seen.returned[:, columns % width])
+    azimuth_rad = seen.azimuth_rad[columns % width] - 2 * np.pi * (columns // width)
+    corners = np.stack((seen.elevation_rad[rows], azimuth_rad[at]), axis=1)
+    range_m = seen.range_m[rows, columns[at] % width]
+    try:
+        triangles = Delaunay(corners)
+    except (QhullError, ValueError):  # too few returns, or all on one line
+        return linear(seen)
+    missing = np.nonzero(~seen.returned)
+    points = np.stack((seen.elevation_rad[missing[0]], seen.azimuth_rad[missing[1]]), axis=1)
+    triangle = triangles.find_simplex(points)
+    transform = triangles.transform[triangle]
+    first_two = np.einsum("nij,nj->ni", transform[:, :2], points - transform[:, 2])
+    weights = np.concatenate((first_two, 1 - first_two.sum(1, keepdims=True)), axis=1)
+    of_corners_m = range_m[triangles.simplices[triangle]]
+    log_m = np.log1p(of_corners_m)
+    with np.errstate(invalid="ignore"):  # triangles without an area have no weights
+        inverse = (weights / of_corners_m).sum(1)
+        one_surface = (triangle >= 0) & (np.ptp(log_m, axis=1) <= EDGE) & (inverse > 0)
+    chosen = tuple(part[one_surface] for part in missing)
+    found[chosen] = 1 / inverse[one_surface]
+    return found
+
+
+FILLS: dict[str, Callable[[Observed], Float64[np.ndarray, "H W"]]] = {
+    "nearest": nearest,
+    "linear": linear,
+    "triangulation": triangulation,
+}
+"""Classical ways by the name that a user types."""
+
+
+def fill(method: str, condition: Condition) -> RangeImage:
+    """Complete scans by a classical way: ranges by it, returns and reflectance as those of the nearest observed pixel.
+
+    Args:
+        method: name of the way, one of :data:`FILLS`.
+        condition: observed pixels of a batch of scans; of a scan without an observed return nothing returns.
+    """
+    sensor = condition.sensor
+    ranges, masks, reflectances = [], [], []
+    for index in range(len(condition)):
+        seen = Observed.of(condition, index)
+        mask = seen.returned[seen.nearest(seen.known)]
+        range_m = np.clip(FILLS[method](seen), sensor.range_min_m, sensor.range_max_m) if seen.returned.any() else None
+        masks.append(torch.from_numpy(mask))
+        ranges.append(torch.from_numpy(seen.range_m if range_m is None else range_m).float())
+        if condition.reflectance is not None:
+            rows, columns = (torch.from_numpy(part) for part in seen.nearest(seen.returned))
+            reflectances.append(condition.reflectance[index].cpu()[rows, columns])
+    reflectance = torch.stack(reflectances) if reflectances else None
+    filled = RangeImage.masked(torch.stack(ranges), torch.stack(masks), sensor, reflectance)
+    return condition.to("cpu").put_into(filled)
+
+
+def _angles(sensor: SensorModel) -> tuple[Float64[np.ndarray, " H"], Float64[np.ndarray, " W"]]:
+    elevation_rad = sensor.elevation_rad.double().mean(1).cpu().numpy()
+    return elevation_rad, sensor.azimuth_rad.double().mean(0).cpu().numpy()
+
+
+def _thrice(azimuth_rad: Float64[np.ndarray, " W"]) -> Float64[np.ndarray, " W*3"]:
+    return np.concatenate([azimuth_rad - turn * 2 * np.pi for turn in (-1, 0, 1)])
+
+
+def _between(
+    range_m: Float64[np.ndarray, "lines n"], angle_rad: Float64[np.ndarray, " n"]
+) -> tuple[Float64[np.ndarray, "lines n"], Float64[np.ndarray, "lines n"]]:
+    """Interpolate between the last and the next return along lines, with the angle between the two; infinite without.
+
+    Args:
+        range_m: ranges along each line, 0 where none was observed.
+        angle_rad: angle of each pixel of a line, falling or rising.
+    """
+    place = np.arange(range_m.shape[1])
+    before = np.maximum.accumulate(np.where(range_m > 0, place, -1), axis=1)
+    after = np.minimum.accumulate(np.where(range_m > 0, place, len(place))[:, ::-1], axis=1)[:, ::-1]
+    both = (before >= 0) & (after < len(place))
+    before, after = np.where(both, before, 0), np.where(both, after, 0)
+    first_m, second_m = (np.take_along_axis(range_m, at, axis=1) for at in (before, after))
+    to_first, to_second = np.abs(angle_rad - angle_rad[before]), np.abs(angle_rad - angle_rad[after])
+    span = to_first + to_second
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.where(span > 0, to_first / span, 0.0)
+        one_surface = np.abs(np.log1p(first_m) - np.log1p(second_m)) <= EDGE
+        smooth = 1 / ((1 - share) / first_m + share / second_m)
+    found = np.where(one_surface, smooth, np.where(share <= 0.5, first_m, second_m))
+    return np.where(both, found, np.inf), np.where(both, span, np.inf)

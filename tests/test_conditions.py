@@ -1,0 +1,92 @@
+"""What is known of a scan: its checks, the patterns of observed pixels, and what stands in a completed scan."""
+
+import numpy as np
+import pytest
+import torch
+
+from lidargrit.conditions import Condition
+from lidargrit.conditions.patterns import Pattern
+from lidargrit.errors import ConfigError, ScanError, UsageError
+from lidargrit.sensors import load_sensor
+from lidargrit.structures import RangeImage
+
+SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
+
+
+def scans(count: int = 2) -> RangeImage:
+    rng = torch.Generator().manual_seed(1)
+    size = (count, 64, 32)
+    mask = torch.rand(size, generator=rng) < 0.8
+    return RangeImage.masked(2 + 40 * torch.rand(size, generator=rng), mask, SENSOR, torch.rand(size, generator=rng))
+
+
+def test_what_was_observed_stands_bit_for_bit_and_the_rest_is_generated():
+    images, generated = scans(), RangeImage.masked(torch.full((2, 64, 32), 7.0), scans().return_mask.roll(1), SENSOR)
+    observed = torch.rand(2, 64, 32) < 0.3
+    known = Condition.of_pixels(images, observed)
+    assert known.kinds == {"pixels"}
+    done = known.put_into(generated)
+    assert torch.equal(done.range_m[observed], images.range_m[observed])
+    assert torch.equal(done.range_m[~observed], generated.range_m[~observed])
+    assert Condition.nothing(SENSOR, 2).kinds == frozenset()
+    assert torch.equal(Condition.nothing(SENSOR, 2).put_into(generated).range_m, generated.range_m)
+
+
+def test_of_clean_surfaces_only_what_returned_is_kept():
+    images = scans()
+    known, generated = Condition.of_surfaces(images), RangeImage.masked(images.range_m + 1, images.return_mask, SENSOR)
+    assert known.kinds == {"pixels", "surfaces"}  # a beam that meets nothing is known not to return
+    dropped = RangeImage.masked(generated.range_m, generated.return_mask.roll(1) & generated.return_mask, SENSOR)
+    assert torch.equal(known.put_into(dropped).range_m, images.range_m * dropped.return_mask)
+
+
+def test_conditions_that_cannot_be_are_refused():
+    images = scans()
+    with pytest.raises(ConfigError, match=r"^got observed pixels of shape .*; wanted \(2, 64, 32\) and torch.bool"):
+        Condition.of_pixels(images, torch.ones(1, 64, 32, dtype=torch.bool))
+    every = torch.ones(2, 64, 32, dtype=torch.bool)
+    with pytest.raises(ScanError, match="an observed range of 0 metres"):
+        Condition(images.range_m, every, images.return_mask, every, SENSOR)
+    with pytest.raises(ScanError, match="an observed return of unknown range"):
+        Condition(images.range_m, ~every, images.return_mask, every, SENSOR)
+
+
+def test_patterns_choose_rows_sectors_pixels_and_files(tmp_path):
+    image = scans(1)[0]
+    rows = Pattern("rows:4").mask(image)
+    assert rows.any(1).nonzero()[:, 0].tolist() == list(range(2, 64, 4))
+    sector = Pattern("sector:45,315").mask(image)[0]
+    ahead = image.sensor.azimuth_rad[0].rad2deg().abs() < 45
+    assert torch.equal(sector, ~ahead)
+    assert Pattern("sector:-45,45").mask(image)[0].sum() == 32 - sector.sum()
+    pixels = [Pattern("pixels:0.1").mask(image, seed) for seed in (0, 0, 1)]
+    assert torch.equal(pixels[0], pixels[1])
+    assert not torch.equal(pixels[0], pixels[2])
+    assert 0.07 < float(pixels[0].float().mean()) < 0.13
+    assert torch.equal(Pattern("returns").mask(image), image.return_mask)
+    np.save(tmp_path / "mask.npy", rows.numpy().astype(np.uint8))
+    assert torch.equal(Pattern(f"{tmp_path}/mask.npy").mask(image), rows)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("columns:4", "--observed columns:4; wanted rows:4, "),
+        ("rows:1", "--observed rows:1; wanted rows:N with a whole N from 2 to 64"),
+        ("rows:x", "--observed rows:x; wanted rows:N"),
+        ("sector:4", "--observed sector:4; wanted sector:A,B"),
+        ("sector:9,9", "--observed sector:9,9; wanted sector:A,B"),
+        ("pixels:1", "--observed pixels:1; wanted pixels:SHARE between 0 and 1"),
+        ("pixels:nan", "--observed pixels:nan; wanted pixels:SHARE"),
+        ("nowhere.npy", r"--observed nowhere.npy, which cannot be used \(it is no file\); wanted an .npy of 64x32"),
+        ("small.npy", "--observed .*small.npy, a mask of 3x4 bool; wanted an .npy of 64x32"),
+        ("all.npy", "--observed .*all.npy, by which all pixels are observed; wanted some returns"),
+        ("none.npy", "--observed .*none.npy, by which no return is observed; wanted some returns"),
+    ],
+)
+def test_observed_words_that_cannot_be_are_refused_in_one_line(text, told, tmp_path):
+    for name, mask in (("small", np.ones((3, 4), bool)), ("all", np.ones((64, 32))), ("none", np.zeros((64, 32)))):
+        np.save(tmp_path / f"{name}.npy", mask)
+    text = f"{tmp_path}/{text}" if text.endswith(".npy") and text != "nowhere.npy" else text
+    with pytest.raises(UsageError, match=f"^got {told}"):
+        Pattern(text).mask(scans(1)[0])
