@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from lidargrit.api import evaluate, inspect, load, load_scan, load_sensor, project, simulate, unproject
+    from lidargrit.api import Condition, evaluate, inspect, load, load_scan, load_sensor, project, simulate, unproject
 
-__all__ = ["evaluate", "inspect", "load", "load_scan", "load_sensor", "project", "simulate", "unproject"]
+__all__ = ["Condition", "evaluate", "inspect", "load", "load_scan", "load_sensor", "project", "simulate", "unproject"]
 
 
 def __getattr__(name: str) -> Any:

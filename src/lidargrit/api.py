@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lidargrit import formats
+from lidargrit.conditions import Condition
 from lidargrit.evaluation.comparison import EvalConfig, compare_sources
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.formats import BadPoints
@@ -15,7 +16,7 @@ from lidargrit.sensors import load_sensor
 from lidargrit.simulator import simulate
 from lidargrit.structures import Scan
 
-__all__ = ["evaluate", "inspect", "load", "load_scan", "load_sensor", "project", "simulate", "unproject"]
+__all__ = ["Condition", "evaluate", "inspect", "load", "load_scan", "load_sensor", "project", "simulate", "unproject"]
 
 
 def load_scan(path: str | Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:

@@ -54,12 +54,14 @@ def export_scans(
         ScanError: a scan that cannot be used.
     """
     config, reporter = config or DataConfig(), reporter or Reporter()
-    layout = _Tree(out) if kind == TREE else _Flat(out, *_format(kind))
+    layout = _Tree(out) if kind == TREE else _Flat(out, *writable_format(kind))
     scans = _open(source, config)
     files = layout.files([scans.name(index) for index in range(len(scans))])
     identities = [scans.identity(index) for index in range(len(scans))]
     with claim_folder(out):
-        _claim(out, {"source": source, "format": kind, "scans": dict(zip(files, identities, strict=True))})
+        claim_scans(
+            out / MANIFEST, {"source": source, "format": kind, "scans": dict(zip(files, identities, strict=True))}
+        )
         missing = [index for index, file in enumerate(files) if not layout.is_there(file)]
         left_out = 0
         with reporter.progress("exporting", len(files), len(files) - len(missing)) as progress:
@@ -180,8 +182,12 @@ class _Tree:
         KittiBin.write(path, scan)
 
 
-def _format(kind: str) -> tuple[type[ScanFormat], str]:
-    """Return the format of a name or an ending, and the ending of its files."""
+def writable_format(kind: str) -> tuple[type[ScanFormat], str]:
+    """Return the format of a name or an ending, and the ending of its files.
+
+    Raises:
+        UnknownNameError: no such format, or one that cannot be written.
+    """
     if kind in _discovery.names("formats"):
         form, suffix = formats.load(kind), formats.load(kind).suffixes[0]
     else:
@@ -192,21 +198,27 @@ def _format(kind: str) -> tuple[type[ScanFormat], str]:
     return form, suffix
 
 
-def _claim(out: Path, facts: dict[str, Any]) -> None:
-    """Write the manifest of the folder, or add to the one that the same command wrote before.
+def claim_scans(manifest: Path, facts: dict[str, Any]) -> None:
+    """Write the manifest of a folder of scans, or add to the one that the same command wrote before.
+
+    Args:
+        manifest: file in the folder that says how its scans were made.
+        facts: entries of the manifest; under ``scans`` the identity of the scan in each file, below the folder.
 
     Raises:
         OutputError: the folder holds something else, or another scan in one of the files.
     """
+    out = manifest.parent
     escaping = [file for file in facts["scans"] if file.startswith("/") or ".." in PurePosixPath(file).parts]
     if escaping:
         raise OutputError(f"a scan that would lie outside, in {escaping[0]}", "names below a folder", "rename it")
-    if is_taken(out) and not (out / MANIFEST).is_file():
-        raise OutputError(f"{out}, which is not empty and holds no export", "an empty folder", "choose another one")
-    if (out / MANIFEST).is_file():
-        there = read_json(out / MANIFEST)
+    if is_taken(out) and not manifest.is_file():
+        got = f"{out}, which is not empty and holds no {manifest.stem}"
+        raise OutputError(got, "an empty folder", "choose another one")
+    if manifest.is_file():
+        there = read_json(manifest)
         known = there.get("scans") if isinstance(there, dict) else None
-        if not isinstance(known, dict) or any(there.get(name) != facts[name] for name in ("source", "format")):
+        if not isinstance(known, dict) or any(there.get(name) != of for name, of in facts.items() if name != "scans"):
             raise OutputError(
                 f"{out}, which holds other scans or another format", "an empty folder", "choose another one"
             )
@@ -220,4 +232,4 @@ def _claim(out: Path, facts: dict[str, Any]) -> None:
         if facts["scans"].keys() <= known.keys():
             return
         facts = {**facts, "scans": {**known, **facts["scans"]}}
-    write_json(out / MANIFEST, facts)
+    write_json(manifest, facts)

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
+
+from lidargrit.untrusted import seed_number
 
 
 def add_bad_points(parser: argparse.ArgumentParser) -> None:
@@ -50,3 +53,21 @@ def add_device(parser: argparse.ArgumentParser) -> None:
     """Add ``--device``."""
     device = "device to compute on: cpu, cuda or cuda:1 (default: cuda if there is one)"
     parser.add_argument("--device", default="", help=device)
+
+
+def add_completion(parser: argparse.ArgumentParser, model: str) -> None:
+    """Add what the verbs that complete scans share: where from, where to, by which ``model``, how many, which files."""
+    scans = "scans: a file, a folder, NAME:ROOT:SPLIT, samples, prepared scans, or range images as .npy"
+    parser.add_argument("scans", help=scans)
+    parser.add_argument("out", type=Path, help="folder for the files: empty, or begun by the same command")
+    parser.add_argument("--model", default="pretrained", help=model)
+    each = "number of completions of each scan; several lie in OUT/completion_0, OUT/completion_1, ..."
+    parser.add_argument("-n", "--count", type=int, default=1, help=each)
+    parser.add_argument("--seed", type=seed_number, default=0, help="seed of the first completion")
+    some = "number of scans to take, evenly spaced; 0 for all"
+    parser.add_argument("--max-scans", type=int, default=0, help=some)
+    kind = "format of the files: bin, pcd, ply, npz, a name from: lidargrit list formats, or image for range images as "
+    kind += ".npy (default: that of each scan's file)"
+    parser.add_argument("--format", default="", help=kind)
+    add_settings(parser, "sampling settings to change, such as temperature=0.9; see: lidargrit list generators")
+    add_device(parser)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -88,6 +89,19 @@ class Condition:
         """Return the condition of a number of scans of which nothing is known."""
         none = torch.zeros(count, sensor.height, sensor.width, dtype=torch.bool)
         return cls(none.float(), none, none, none, sensor)
+
+    @classmethod
+    def cat(cls, conditions: Sequence[Condition]) -> Condition:
+        """Return the conditions of several batches as one; reflectance is kept if every batch has it."""
+        reflectance = [one.reflectance for one in conditions if one.reflectance is not None]
+        return cls(
+            torch.cat([one.range_m for one in conditions]),
+            torch.cat([one.range_observed for one in conditions]),
+            torch.cat([one.return_mask for one in conditions]),
+            torch.cat([one.return_observed for one in conditions]),
+            conditions[0].sensor,
+            torch.cat(reflectance) if len(reflectance) == len(conditions) else None,
+        )
 
     def __len__(self) -> int:
         return len(self.range_m)

@@ -191,7 +191,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         """Return scans that keep what was observed, bit for bit, and generate the rest (capability ``complete``).
 
         Args:
-            condition: what is known of each scan, such as ``Condition.of_pixels(images, observed)``; of the kinds in
+            condition: known part of each scan, such as ``Condition.of_pixels(images, observed)``, of the kinds in
                 :attr:`conditions`.
             seeds: one for each scan, from 0 to 2^63 - 1.
             sampling: settings of the generator's own ``Sampling``; :meth:`completion_sampling` if not given.

@@ -127,7 +127,7 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
             mask: method by which returns and ranges are decided.
             pixels: settings by which the pixel decoder samples ranges.
             tokenizer: the generator's own tokenizer, or its copy for decoding only.
-            condition: what is known of the scans, by which a pixel decoder goes.
+            condition: known part of the scans, by which a pixel decoder goes.
 
         Raises:
             ConfigError: ``mask`` asks for a pixel decoder, and there is none.

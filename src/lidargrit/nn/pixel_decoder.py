@@ -157,7 +157,7 @@ class PixelDecoder(nn.Module):
             decoded: output of the tokenizer's decoder for as many scans.
             rngs: random generators on the CPU, one for each scan.
             sampling: settings of the sampling of ranges.
-            condition: what is known of the scans; nothing if not given. Known returns and ranges are taken over as they
+            condition: known part of the scans; nothing if not given. Known returns and ranges are taken over as they
                 are, when their phase comes: later phases know of them, earlier ones not.
         """
         guide, size = Guide.of(decoded), (3, self.sensor.height, self.sensor.width)

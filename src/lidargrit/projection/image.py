@@ -66,13 +66,17 @@ def project(
 
 
 def index_map(
-    scan: Scan, sensor: SensorModel, method: ProjectionName | None = None, variant: ProjectionVariant = "exact"
+    scan: Scan,
+    sensor: SensorModel,
+    method: ProjectionName | None = None,
+    variant: ProjectionVariant = "exact",
+    partial: bool = False,
 ) -> Int32[np.ndarray, "H fine_W"]:
     """Return the index of the point that fills each pixel, -1 for none, before any column is left out.
 
     Args, Raises: as for :func:`project`.
     """
-    return _nearest(scan, sensor, method, variant)[0]
+    return _nearest(scan, sensor, method, variant, partial)[0]
 
 
 def _nearest(

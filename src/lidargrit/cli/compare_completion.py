@@ -1,0 +1,55 @@
+"""Hide parts of whole scans, complete them by models and by classical ways, and measure how near they come."""
+
+from __future__ import annotations
+
+import argparse
+
+from lidargrit.cli._options import add_bad_scans, add_device
+from lidargrit.cli._results import add_json, refuse_taken, tell
+from lidargrit.untrusted import seed_number
+
+EXAMPLES = """\
+  lidargrit compare-completion simulated:64:test
+  lidargrit compare-completion /data/kitti_odometry pretrained runs/r2dm linear triangulation -n 32
+  lidargrit compare-completion /data/held_out --observed rows:8 pixels:0.05 --json table.json
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Name the options."""
+    parser.add_argument("scans", help="source of whole scans, which no model has learned from")
+    models = "runs, nearest, linear or triangulation (default: pretrained and all three)"
+    parser.add_argument("models", nargs="*", metavar="MODEL", help=models)
+    patterns = "what is kept, as of lidargrit complete (default: rows:4 sector:45,315 pixels:0.1)"
+    parser.add_argument("--observed", nargs="+", default=[], metavar="PATTERN", help=patterns)
+    parser.add_argument("-n", "--count", type=int, default=32, help="largest number of scans, evenly spaced")
+    each = "number of completions of each scan by a model that is random"
+    parser.add_argument("--completions", type=int, default=2, help=each)
+    parser.add_argument("--seed", type=seed_number, default=0, help="seed of the completions and of random pixels")
+    parser.add_argument("--sensor", default="", help="sensor of the scans, if only classical ways are compared")
+    add_bad_scans(parser)
+    add_device(parser)
+    add_json(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Complete, measure and print a table."""
+    from lidargrit.completion import is_classical, open_completers
+    from lidargrit.completion.inputs import sensor_of
+    from lidargrit.conditions.fills import FILLS
+    from lidargrit.conditions.patterns import Pattern
+    from lidargrit.evaluation.completion import PATTERNS, as_json, as_table, compare_completion
+    from lidargrit.loading import DataConfig
+    from lidargrit.reporting import TerminalReporter
+    from lidargrit.sources import open_images
+
+    refuse_taken(options)
+    patterns = [Pattern(text) for text in options.observed or PATTERNS]
+    words = options.models or ["pretrained", *FILLS]
+    named = options.sensor or all(is_classical(word) for word in words)
+    sensor = sensor_of(options.scans, options.sensor) if named else None
+    completers = open_completers(words, sensor, options.device)
+    config = DataConfig(max_scans=options.count, bad_points=options.bad_points, bad_scans=options.bad_scans)
+    images = open_images(options.scans, completers[0].sensor, config, TerminalReporter())
+    scores = compare_completion(images, completers, patterns, options.completions, options.seed, TerminalReporter())
+    tell(options, as_table(scores), {"scans": options.scans, "scores": as_json(scores)})

@@ -1,0 +1,45 @@
+"""Fill in what a scan lacks: rows, a sector, pixels, or rays without a point."""
+
+from __future__ import annotations
+
+import argparse
+
+from lidargrit.cli._options import add_bad_scans, add_completion
+
+EXAMPLES = """\
+  lidargrit complete /data/scans whole                             fill in every ray without a point
+  lidargrit complete scan.bin four -n 4 --observed sector:45,315   90 degrees ahead anew, in four ways
+  lidargrit complete /data/scans dense --observed rows:4 --model triangulation --sensor hdl64e_kitti_360
+  lidargrit complete samples filled --observed mask.npy --format image
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Name the options."""
+    observed = "what is kept: returns, rows:N (every N-th), sector:A,B (degrees from A counter-clockwise to B, 0 is "
+    observed += "ahead), pixels:SHARE (a random share), or an .npy of truth values, one for each pixel"
+    parser.add_argument("--observed", default="returns", help=observed)
+    sensor = "sensor of the scans, for a classical way (default: the source's); a run has its own"
+    parser.add_argument("--sensor", default="", help=sensor)
+    add_completion(parser, "run that completes, or nearest, linear or triangulation")
+    add_bad_scans(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Complete the scans, and say where they are."""
+    from lidargrit.completion import is_classical, open_completer
+    from lidargrit.completion.command import complete_scans
+    from lidargrit.completion.files import Wanted
+    from lidargrit.completion.inputs import sensor_of
+    from lidargrit.conditions.patterns import Pattern
+    from lidargrit.loading import DataConfig
+    from lidargrit.reporting import TerminalReporter
+
+    pattern = Pattern(options.observed)
+    named = options.sensor or is_classical(options.model)
+    sensor = sensor_of(options.scans, options.sensor) if named else None
+    completer = open_completer(options.model, "pixels", sensor, options.set, options.device)
+    wanted = Wanted(options.count, options.seed, options.format, options.bad_scans == "skip")
+    config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points)
+    count = complete_scans(options.scans, options.out, completer, pattern, wanted, config, TerminalReporter())
+    print(f"done: {count} completed scans in {options.out}; how they were made is told by completed.json")

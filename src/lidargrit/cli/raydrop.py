@@ -1,0 +1,37 @@
+"""Drop from clean simulated scans the returns that a real sensor would not get."""
+
+from __future__ import annotations
+
+import argparse
+
+from lidargrit.cli._options import add_bad_scans, add_completion
+
+EXAMPLES = """\
+  lidargrit raydrop /data/carla_scans dropped
+  lidargrit raydrop clean.npy dropped --format image --probability 32      a range image, and P(return)
+  lidargrit raydrop /data/carla_scans dropped -n 4 --seed 100              each scan in four ways
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Name the options."""
+    share = "also write NAME.probability.npy, the share of returns of each pixel over this many samples"
+    parser.add_argument("--probability", type=int, default=0, metavar="SAMPLES", help=share)
+    add_completion(parser, "run whose sensor's raydrop is wanted")
+    add_bad_scans(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Drop returns, and say where the scans are."""
+    from lidargrit.completion import open_completer
+    from lidargrit.completion.command import raydrop_scans
+    from lidargrit.completion.files import Wanted
+    from lidargrit.loading import DataConfig
+    from lidargrit.reporting import TerminalReporter
+
+    completer = open_completer(options.model, "surfaces", None, options.set, options.device)
+    skips = options.bad_scans == "skip"
+    wanted = Wanted(options.count, options.seed, options.format, skips, options.probability)
+    config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points)
+    count = raydrop_scans(options.scans, options.out, completer, wanted, config, TerminalReporter())
+    print(f"done: {count} scans with raydrop in {options.out}")

@@ -1,0 +1,40 @@
+"""Make scans of a sensor with few rows into scans of one with more rows."""
+
+from __future__ import annotations
+
+import argparse
+
+from lidargrit.cli._options import add_bad_scans, add_completion
+
+EXAMPLES = """\
+  lidargrit upsample /data/vlp16 dense --sensor vlp16                          by the model of the package
+  lidargrit upsample nuscenes:/data/nuscenes dense -n 4                        in four ways
+  lidargrit upsample scan.pcd dense --sensor vlp16 --to os1_64 --model triangulation
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Name the options."""
+    parser.add_argument("--sensor", default="", help="sensor that made the scans (default: that of the source)")
+    parser.add_argument("--to", default="", help="sensor of the dense scans (default: that of the run)")
+    add_completion(parser, "run that adds the rows, or nearest, linear or triangulation")
+    add_bad_scans(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Add the rows, and say where the scans are."""
+    from lidargrit.completion import open_completer
+    from lidargrit.completion.command import upsample_scans
+    from lidargrit.completion.files import Wanted
+    from lidargrit.completion.inputs import sensor_of
+    from lidargrit.loading import DataConfig
+    from lidargrit.reporting import TerminalReporter
+    from lidargrit.sensors import load_sensor
+
+    scans_sensor = sensor_of(options.scans, options.sensor)
+    wanted_sensor = load_sensor(options.to) if options.to else None
+    completer = open_completer(options.model, "pixels", wanted_sensor, options.set, options.device)
+    wanted = Wanted(options.count, options.seed, options.format, options.bad_scans == "skip")
+    config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points)
+    count = upsample_scans(options.scans, options.out, completer, scans_sensor, wanted, config, TerminalReporter())
+    print(f"done: {count} scans of {completer.sensor.name} in {options.out}")

@@ -1,0 +1,179 @@
+"""What completes scans: the word of a run or of a classical way → one object that fills in what was not observed."""
+
+from __future__ import annotations
+
+import hashlib
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Generic
+
+import torch
+
+from lidargrit import configuration
+from lidargrit.conditions import KINDS, Condition, ConditionKind
+from lidargrit.conditions.fills import FILLS, fill
+from lidargrit.configuration import override
+from lidargrit.errors import ConfigError
+from lidargrit.generators import WEIGHTS_FILE, Generator, SamplingT, load, locate
+from lidargrit.loading import Provenance
+from lidargrit.nn.devices import usable_device
+from lidargrit.projection import ProjectionVariant
+from lidargrit.sensors import SensorModel
+from lidargrit.sources.samples import projection_of, trained_on
+from lidargrit.structures import RangeImage
+
+
+class Completer(ABC):
+    """Whatever completes scans, learned or not.
+
+    Args:
+        name: word by which the user named it.
+        sensor: sensor of the scans that it completes.
+    """
+
+    def __init__(self, name: str, sensor: SensorModel) -> None:
+        self.name, self.sensor = name, sensor
+
+    random: bool
+    """Whether two seeds give two completions."""
+    batch: int = 1
+    """Number of scans that are best completed at once."""
+    projection_variant: ProjectionVariant = "exact"
+    """Variant by which scans become range images."""
+
+    @abstractmethod
+    def complete(self, condition: Condition, seeds: Sequence[int]) -> RangeImage:
+        """Return scans that keep what was observed, one for each seed."""
+
+    @abstractmethod
+    def takes(self) -> frozenset[ConditionKind]:
+        """Return the kinds of conditions that it takes."""
+
+    def learned_from(self) -> Provenance:
+        """Return the training scans; none of a classical way."""
+        return Provenance()
+
+    @abstractmethod
+    def identity(self) -> dict[str, Any]:
+        """Return, for a file, what tells its completions from those of another or of other settings."""
+
+
+class ClassicalCompleter(Completer):
+    """A way without a network; it completes scans of any sensor, always in the same way."""
+
+    random = False
+
+    def complete(self, condition: Condition, seeds: Sequence[int]) -> RangeImage:
+        """Return the scans, filled in from their observed returns."""
+        return fill(self.name, condition)
+
+    def takes(self) -> frozenset[ConditionKind]:
+        """Return known pixels."""
+        return frozenset({"pixels"})
+
+    def identity(self) -> dict[str, Any]:
+        """Return its name."""
+        return {"model": self.name, "sensor": self.sensor.to_json()}
+
+
+class LearnedCompleter(Completer, Generic[SamplingT]):
+    """The generator of a finished run.
+
+    Args:
+        name: word by which the user named the run.
+        folder: folder of the run.
+        generator: generator of the run.
+        sampling: settings by which it completes.
+    """
+
+    random = True
+
+    def __init__(self, name: str, folder: Path, generator: Generator[Any, SamplingT], sampling: SamplingT) -> None:
+        super().__init__(name, generator.sensor)
+        self._folder, self._generator, self._sampling = folder, generator, sampling
+        self.batch = generator.compute_batch
+        if projection_of(folder) == "reference":
+            self.projection_variant = "reference"
+
+    def complete(self, condition: Condition, seeds: Sequence[int]) -> RangeImage:
+        """Return what the generator makes of the conditions, in the computer's memory."""
+        return self._generator.complete(condition, seeds, self._sampling).to("cpu")
+
+    def takes(self) -> frozenset[ConditionKind]:
+        """Return what the generator takes."""
+        return self._generator.conditions
+
+    def learned_from(self) -> Provenance:
+        """Return the training scans of the run."""
+        return trained_on(self._folder)
+
+    def identity(self) -> dict[str, Any]:
+        """Return the hash of its weights, and its settings."""
+        weights = hashlib.sha256((self._folder / WEIGHTS_FILE).read_bytes()).hexdigest()
+        return {"weights_sha256": weights, "sampling": configuration.to_json(self._sampling)}
+
+
+def open_completer(
+    word: str,
+    kind: ConditionKind = "pixels",
+    sensor: SensorModel | None = None,
+    settings: Sequence[str] = (),
+    device: str = "",
+) -> Completer:
+    """Return what a user named to complete scans with.
+
+    Args:
+        word: folder of a run, ``pretrained``, or a classical way: nearest, linear or triangulation.
+        kind: kind of the conditions that it will be given.
+        sensor: sensor of the scans, which a classical way needs; a run has its own.
+        settings: settings of the run's sampling, as NAME=VALUE.
+        device: device of the run; a GPU if there is one and none is named.
+
+    Raises:
+        ConfigError: a run that cannot complete such scans, or one of another sensor than the named one.
+    """
+    if is_classical(word):
+        if kind != "pixels" or settings:
+            what = "a task for a model" if kind != "pixels" else f"--set {settings[0]}"
+            raise ConfigError(f"--model {word} for {what}", "a run, such as pretrained", "name a run")
+        if sensor is None:
+            raise ConfigError(f"{word} without a sensor", "that of the scans", "name the sensor")
+        return ClassicalCompleter(word, sensor)
+    folder = locate(word)
+    generator = load(folder).to(usable_device(device or ("cuda" if torch.cuda.is_available() else "cpu")))
+    if kind not in generator.conditions:
+        takes = " or ".join(KINDS[one] for one in sorted(generator.conditions)) or "no condition at all"
+        raise ConfigError(
+            f"--model {word}, of a generator {generator.public_name()!r} that takes {takes}",
+            f"one that takes {KINDS[kind]}",
+            "name another run, such as pretrained",
+        )
+    if sensor is not None and not generator.sensor.same_rays(sensor):
+        own = f"{generator.sensor.name!r}, {generator.sensor.height}x{generator.sensor.width}"
+        raise ConfigError(
+            f"the sensor {sensor.name!r}, {sensor.height}x{sensor.width}, for --model {word}",
+            f"its own, {own}",
+            "leave the sensor out, or name another model",
+        )
+    owner = f"completion by {generator.public_name()!r}"
+    sampling = override(generator.completion_sampling(), settings, owner, "see all with: lidargrit list generators")
+    return LearnedCompleter(word, folder, generator, sampling)
+
+
+def open_completers(words: Sequence[str], sensor: SensorModel | None = None, device: str = "") -> list[Completer]:
+    """Return several to be compared on the same scans: classical ways have the sensor of the first run among them.
+
+    Args:
+        words: words of :func:`open_completer`.
+        sensor: sensor of the scans; only needed where no run is among the words.
+        device: device of the runs.
+    """
+    runs = {word: open_completer(word, "pixels", sensor, (), device) for word in words if not is_classical(word)}
+    own = next((run.sensor for run in runs.values()), sensor)
+    return [runs[word] if word in runs else open_completer(word, "pixels", own) for word in words]
+
+
+def is_classical(word: str) -> bool:
+    """Tell whether a word names a classical way, and no folder that is called so."""
+    return word in FILLS and not Path(word).exists()

@@ -1,0 +1,117 @@
+"""The verbs complete, upsample and raydrop: a source, a model and a folder → files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lidargrit.completion import Completer
+from lidargrit.completion.files import Wanted, write_completions
+from lidargrit.completion.inputs import Inputs, InputScan, ScanReader, open_inputs
+from lidargrit.completion.sparse import SparseReader, observed_rows
+from lidargrit.conditions import Condition
+from lidargrit.conditions.patterns import Pattern
+from lidargrit.errors import ConfigError
+from lidargrit.loading import DataConfig
+from lidargrit.reporting import Reporter
+from lidargrit.sensors import SensorModel
+from lidargrit.structures import RangeImage
+
+
+def complete_scans(
+    source: str,
+    out: Path,
+    completer: Completer,
+    pattern: Pattern,
+    wanted: Wanted,
+    config: DataConfig | None = None,
+    reporter: Reporter | None = None,
+) -> int:
+    """Write completions of the scans of a source, in which the observed pixels stand as they are.
+
+    Args:
+        source: a file, a folder or another source of scans, samples, prepared scans, or range images as ``.npy``.
+        out: an empty folder, or one that the same command began.
+        completer: model or classical way; see :func:`lidargrit.completion.open_completer`.
+        pattern: choice of the observed pixels.
+        wanted: number and kind of files.
+        config: number of scans, and what to do with unusable points; nothing else of it is used.
+        reporter: receiver of progress and messages.
+
+    Returns:
+        Number of files.
+
+    Raises:
+        UsageError: all pixels or no return are observed, or a mask of another size.
+        ScanError: a scan that cannot be used, or of another sensor.
+    """
+    if wanted.count > 1 and not completer.random:
+        raise ConfigError(
+            f"-n {wanted.count} for {completer.name}", "1: it completes a scan in one way", "leave it out"
+        )
+
+    def condition_of(scan: InputScan, seed: int) -> Condition:
+        return Condition.of_pixels(_batch(scan.image), pattern.mask(scan.image, seed)[None])
+
+    inputs = open_inputs(source, _reader(completer, pattern.partial), config or DataConfig())
+    facts = {"verb": "complete", "source": source, "observed": pattern.text}
+    return write_completions(inputs, out, completer, condition_of, wanted, facts, reporter or Reporter())
+
+
+def upsample_scans(
+    source: str,
+    out: Path,
+    completer: Completer,
+    scans_sensor: SensorModel,
+    wanted: Wanted,
+    config: DataConfig | None = None,
+    reporter: Reporter | None = None,
+) -> int:
+    """Write the scans of a sensor with few rows as those of the completer's sensor, which has more.
+
+    Args:
+        scans_sensor: sensor that made the scans.
+        source, out, completer, wanted, config, reporter: the arguments of :func:`complete_scans`.
+
+    Raises:
+        ConfigError: sensors whose rows hardly look the same ways.
+        ScanError: a scan that cannot be used, or of another sensor.
+    """
+
+    def condition_of(scan: InputScan, seed: int) -> Condition:
+        return Condition.of_pixels(_batch(scan.image), observed_rows(scan)[None])
+
+    reader = SparseReader(completer.sensor, completer.projection_variant, source=scans_sensor)
+    inputs = open_inputs(source, reader, config or DataConfig())
+    facts = {"verb": "upsample", "source": source, "scans_sensor": scans_sensor.to_json()}
+    return write_completions(inputs, out, completer, condition_of, wanted, facts, reporter or Reporter())
+
+
+def raydrop_scans(
+    source: str,
+    out: Path,
+    completer: Completer,
+    wanted: Wanted,
+    config: DataConfig | None = None,
+    reporter: Reporter | None = None,
+) -> int:
+    """Write clean scans, such as a simulator casts, with the returns dropped that the model's sensor would not get.
+
+    Args:
+        source, out, completer, wanted, config, reporter: the arguments of :func:`complete_scans`; the completer takes
+            ranges of surfaces.
+    """
+
+    def condition_of(scan: InputScan, seed: int) -> Condition:
+        return Condition.of_surfaces(_batch(scan.image))
+
+    inputs: Inputs = open_inputs(source, _reader(completer, partial=False), config or DataConfig())
+    facts = {"verb": "raydrop", "source": source}
+    return write_completions(inputs, out, completer, condition_of, wanted, facts, reporter or Reporter())
+
+
+def _reader(completer: Completer, partial: bool) -> ScanReader:
+    return ScanReader(completer.sensor, completer.projection_variant, partial)
+
+
+def _batch(image: RangeImage) -> RangeImage:
+    return RangeImage.stack([image])

@@ -1,0 +1,197 @@
+"""Scans of a user → their completions in files, which have the names of the scans."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import chain, islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidargrit import formats
+from lidargrit.completion import Completer
+from lidargrit.completion.inputs import PROBABILITY, Inputs, InputScan
+from lidargrit.conditions import Condition
+from lidargrit.determinism import derive_seed
+from lidargrit.errors import ConfigError, DataError, ScanError
+from lidargrit.export import claim_scans, writable_format
+from lidargrit.files import atomic_path, claim_folder
+from lidargrit.reporting import Reporter
+from lidargrit.structures import RangeImage
+
+IMAGE = "image"  # the word for range images as .npy
+_UNWRITABLE = ".npz"  # for scans whose own format cannot be written, and for range images
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """How many completions are wanted, and as which files.
+
+    Args:
+        count: number of completions of each scan.
+        seed: seed of the first completion; the next has the next.
+        format: name or ending of a format, or ``image`` for range images (H, W) in metres as ``.npy``; if empty, each
+            file is in the format of its scan where that can be written, and else ``.npz``.
+        skip_bad: whether a scan that cannot be used is left out, in place of ending the work.
+        probability: number of samples from which ``NAME.probability.npy`` tells each pixel's share of returns; 0 for
+            no such files.
+    """
+
+    count: int = 1
+    seed: int = 0
+    format: str = ""
+    skip_bad: bool = False
+    probability: int = 0
+
+    def __post_init__(self) -> None:
+        if self.count < 1:
+            raise ConfigError(f"-n {self.count}", "at least 1 completion of each scan", "raise it")
+
+
+@dataclass(frozen=True, eq=False)
+class _Job:
+    index: int
+    turn: int
+    scan: InputScan
+    condition: Condition
+
+
+def write_completions(
+    inputs: Inputs,
+    out: Path,
+    completer: Completer,
+    condition_of: Callable[[InputScan, int], Condition],
+    wanted: Wanted,
+    facts: dict[str, Any],
+    reporter: Reporter,
+) -> int:
+    """Complete every scan and write it; files that are there already are not written again.
+
+    With one completion of each scan the files lie in ``out``, with several in ``out/completion_0`` and so on, each
+    a whole set of scans. ``completed.json`` says how they were made.
+
+    Args:
+        inputs: scans of the user.
+        out: an empty folder, or one that the same command began.
+        completer: model or classical way.
+        condition_of: function from a scan and a seed to what is taken as known of it.
+        wanted: number and kind of files.
+        facts: further entries that tell these files from others, for ``completed.json``.
+        reporter: receiver of progress and messages.
+
+    Returns:
+        Number of completed scans that are there now.
+
+    Raises:
+        OutputError: the folder holds something else, or cannot be written.
+        ScanError: a scan that cannot be used.
+        DataError: no usable scan.
+    """
+    files = {
+        (index, turn): _folder(turn, wanted.count) + inputs.name(index) + _suffix(inputs.suffix(index), wanted.format)
+        for index in range(len(inputs))
+        for turn in range(wanted.count)
+    }
+    manifest = {**facts, **completer.identity(), "count": wanted.count, "seed": wanted.seed, "format": wanted.format}
+    scans = {file: inputs.name(index) for (index, _), file in files.items()}
+    left_out: set[int] = set()
+    missing = [job for job, file in files.items() if not (out / file).exists()]
+    remaining = _jobs(inputs, missing, condition_of, wanted, left_out, reporter)
+    jobs = chain(
+        list(islice(remaining, 1)), remaining
+    )  # a mistake in the first scan is told before anything is written
+    with claim_folder(out):
+        claim_scans(out / "completed.json", {**manifest, "scans": scans})
+        with reporter.progress("completing", len(files), len(files) - len(missing)) as progress:
+            while batch := list(islice(jobs, completer.batch)):
+                for job, image in zip(batch, _completed(completer, batch, wanted.seed), strict=True):
+                    file = files[job.index, job.turn]
+                    if wanted.probability and job.turn == 0:
+                        share = _return_share(completer, job, wanted)
+                        _write_array(out / f"{file.removesuffix(Path(file).suffix)}{PROBABILITY}", share)
+                    _write(out / file, wanted.format, image, job)
+                    progress.advance(1)
+    if len(left_out) == len(inputs):
+        raise DataError("no usable scan", "at least one", "see the messages above")
+    return len(files) - len(left_out) * wanted.count
+
+
+def _jobs(
+    inputs: Inputs,
+    missing: Sequence[tuple[int, int]],
+    condition_of: Callable[[InputScan, int], Condition],
+    wanted: Wanted,
+    left_out: set[int],
+    reporter: Reporter,
+) -> Iterator[_Job]:
+    """Read each scan of missing files once."""
+    last, scan, condition = -1, None, None
+    for index, turn in missing:
+        if index != last:
+            last, scan = index, None
+            try:
+                scan = inputs.read(index)
+                condition = condition_of(scan, derive_seed(wanted.seed, index))
+            except ScanError as error:
+                if not wanted.skip_bad:
+                    raise
+                reporter.message(f"left out: {error}")
+                left_out.add(index)
+                scan = None
+        if scan is not None and condition is not None:
+            yield _Job(index, turn, scan, condition)
+
+
+def _completed(completer: Completer, jobs: Sequence[_Job], seed: int) -> list[RangeImage]:
+    condition = Condition.cat([job.condition for job in jobs])
+    images = completer.complete(condition, [_seed(seed, job) for job in jobs])
+    return [images[index] for index in range(len(jobs))]
+
+
+def _return_share(completer: Completer, job: _Job, wanted: Wanted) -> Float[Tensor, "H W"]:
+    """Return how often each pixel returns, over samples that are not written themselves."""
+    total = torch.zeros(job.condition.return_mask.shape[1:])
+    remaining = iter(range(wanted.probability))
+    while turns := list(islice(remaining, completer.batch)):
+        condition = Condition.cat([job.condition] * len(turns))
+        seeds = [derive_seed(wanted.seed, job.index, turn, 1) for turn in turns]
+        total += completer.complete(condition, seeds).return_mask.float().sum(0)
+    return total / wanted.probability
+
+
+def _seed(seed: int, job: _Job) -> int:
+    return derive_seed(seed + job.turn, job.index)
+
+
+def _folder(turn: int, count: int) -> str:
+    return f"completion_{turn}/" if count > 1 else ""
+
+
+def _suffix(of_input: str, kind: str) -> str:
+    """Return the ending of a scan's file."""
+    if kind == IMAGE:
+        return ".npy"
+    if kind:
+        return writable_format(kind)[1]
+    known = formats.candidates(Path(f"scan{of_input}")) if of_input else ()
+    return of_input if any(one.can_write() and of_input in one.suffixes for one in known) else _UNWRITABLE
+
+
+def _write(path: Path, kind: str, image: RangeImage, job: _Job) -> None:
+    if kind == IMAGE:
+        _write_array(path, image.range_m)
+        return
+    scan = job.scan.joined(image, job.condition)
+    named = [one for one in formats.candidates(path) if one.can_write()]
+    form = writable_format(kind)[0] if kind else named[0]
+    form.write(path, scan)
+
+
+def _write_array(path: Path, pixels: Float[Tensor, "H W"]) -> None:
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        np.save(file, pixels.cpu().numpy())

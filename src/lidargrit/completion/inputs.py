@@ -1,0 +1,251 @@
+"""A user's scans → range images on the grid of a sensor, and the points that lie in their pixels."""
+
+from __future__ import annotations
+
+import contextlib
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Int64
+from torch import Tensor
+
+from lidargrit import formats
+from lidargrit.arrays import ARRAY_BYTES_AT_MOST, parse_array
+from lidargrit.conditions import Condition
+from lidargrit.datasets import ScanDataset
+from lidargrit.datasets.folder import Folder
+from lidargrit.determinism import evenly_spaced
+from lidargrit.errors import LidarGritError, ScanError
+from lidargrit.formats import read_bytes
+from lidargrit.loading import DataConfig, RangeImages
+from lidargrit.projection import ProjectionVariant, index_map, project, unproject
+from lidargrit.sensors import ProjectionName, SensorModel, load_sensor
+from lidargrit.sources import DatasetSource, open_source
+from lidargrit.structures import RangeImage, Scan
+
+PROBABILITY = ".probability.npy"  # how files end that tell the share of returns, and are no scans
+_IMAGE = "a range image: an .npy of (H, W) ranges in metres"
+
+
+@dataclass(frozen=True, eq=False)
+class InputScan:
+    """One scan of a user.
+
+    Args:
+        image: range image (H, W).
+        points: points of the scan; None where it was an image.
+        point_of_pixel: index of the point that fills each pixel, -1 for none; None where it was an image.
+        on_grid: True for pixels that the scan tells anything about; all if None.
+    """
+
+    image: RangeImage
+    points: Scan | None = None
+    point_of_pixel: Int64[Tensor, "H W"] | None = None
+    on_grid: Bool[Tensor, "H W"] | None = None
+
+    def joined(self, completed: RangeImage, condition: Condition) -> Scan:
+        """Return the points of a completed scan: its own where ranges were observed, else on the rays of pixels.
+
+        Reflectance is kept where the whole completed scan has it.
+        """
+        kept = condition.range_observed[0] & completed.return_mask
+        if self.points is None or self.point_of_pixel is None or not bool(kept.any()):
+            return unproject(completed)
+        own = self.points
+        at = self.point_of_pixel[kept]
+        added = completed.return_mask & ~kept
+        new = RangeImage.masked(completed.range_m, added, completed.sensor, completed.reflectance)
+        rows = torch.arange(completed.sensor.height)[:, None].expand_as(kept)
+        whole = Scan(
+            own.points_xyz_m[at], None if own.reflectance is None else own.reflectance[at], rows[kept], None, own.source
+        )
+        return _together(whole, unproject(new)) if bool(added.any()) else whole
+
+
+class Inputs(ABC):
+    """The scans of a source, one after the other."""
+
+    @abstractmethod
+    def __len__(self) -> int: ...
+
+    @abstractmethod
+    def name(self, index: int) -> str:
+        """Return the name of its file, without the ending."""
+
+    def suffix(self, index: int) -> str:
+        """Return the ending of its file; "" where it has none that can be written."""
+        return ""
+
+    @abstractmethod
+    def read(self, index: int) -> InputScan:
+        """Read one scan.
+
+        Raises:
+            ScanError: a scan that cannot be used, or of another sensor.
+        """
+
+
+class _OfDataset(Inputs):
+    def __init__(self, dataset: ScanDataset, indices: Sequence[int], reader: ScanReader) -> None:
+        self._dataset, self._indices, self._reader = dataset, indices, reader
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    def name(self, index: int) -> str:
+        return self._dataset.name(self._indices[index])
+
+    def suffix(self, index: int) -> str:
+        path = self._dataset.path(self._indices[index])
+        return "" if path is None else path.name[len(formats.stem(path)) :]
+
+    def read(self, index: int) -> InputScan:
+        return self._reader.read(self._dataset.scan(self._indices[index]))
+
+
+class _OfImages(Inputs):
+    def __init__(self, images: RangeImages) -> None:
+        self._images = images
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def name(self, index: int) -> str:
+        return f"{index:06d}"
+
+    def read(self, index: int) -> InputScan:
+        return InputScan(self._images.batch([index])[0])
+
+
+class _OfImageFiles(Inputs):
+    """Range images as ``.npy``, 0 or what is not finite where nothing returned."""
+
+    def __init__(self, paths: list[Path], sensor: SensorModel) -> None:
+        self._paths, self._sensor = paths, sensor
+
+    def __len__(self) -> int:
+        return len(self._paths)
+
+    def name(self, index: int) -> str:
+        return self._paths[index].stem
+
+    def read(self, index: int) -> InputScan:
+        path, sensor = self._paths[index], self._sensor
+        array = _array(path)
+        if array.shape != (sensor.height, sensor.width):
+            raise ScanError(
+                f"{path}, a range image of {'x'.join(map(str, array.shape))}",
+                f"{sensor.height}x{sensor.width}, as the sensor {sensor.name!r} has",
+                "render it with the rows and columns of this sensor",
+            )
+        range_m = torch.from_numpy(array.astype(np.float32))
+        within = (range_m >= sensor.range_min_m) & (range_m <= sensor.range_max_m)
+        if not bool(within.any()):
+            raise ScanError(f"no range within the sensor's limits in {path}", "ranges in metres", "check the unit")
+        return InputScan(RangeImage.masked(range_m.nan_to_num(0, 0, 0), within, sensor))
+
+
+@dataclass(frozen=True)
+class ScanReader:
+    """How points become a range image.
+
+    Args:
+        sensor: sensor of the image.
+        variant: variant of the projection.
+        partial: whether a scan of a part of the circle will do.
+    """
+
+    sensor: SensorModel
+    variant: ProjectionVariant = "exact"
+    partial: bool = False
+
+    def read(self, scan: Scan) -> InputScan:
+        """Project a scan; one without rings, for a sensor that needs them, by elevation."""
+        rings = self.sensor.height if scan.ring is None else int(scan.ring.max()) + 1
+        if 2 * rings <= self.sensor.height:
+            raise ScanError(
+                f"{rings} rings in {scan.source}",
+                f"the {self.sensor.height} of the sensor {self.sensor.name!r}",
+                "add the missing rows with: lidargrit upsample",
+            )
+        try:
+            return self._read(scan, self.sensor.projection)
+        except ScanError:
+            if self.sensor.projection == "spherical":
+                raise
+            with contextlib.suppress(ScanError):
+                return self._read(scan, "spherical")
+            raise
+
+    def _read(self, scan: Scan, method: ProjectionName) -> InputScan:
+        image = project(scan, self.sensor, method, self.variant, self.partial)
+        at = index_map(scan, self.sensor, method, self.variant, self.partial)[:, :: self.sensor.column_stride]
+        return InputScan(image, scan, torch.from_numpy(at.astype(np.int64)))
+
+
+def open_inputs(source: str, reader: ScanReader, config: DataConfig) -> Inputs:
+    """Open the scans that a user named.
+
+    Args:
+        source: a file, a folder or another source of scans, samples, prepared scans, or range images as ``.npy``.
+        reader: projection of points to range images.
+        config: number of scans, and what to do with unusable points.
+    """
+    paths = _image_files(source)
+    if paths:
+        return _OfImageFiles([paths[index] for index in _chosen(len(paths), config)], reader.sensor)
+    opened = open_source(source, config.bad_points)
+    if isinstance(opened, DatasetSource):
+        dataset = opened.scans()
+        return _OfDataset(dataset, _chosen(len(dataset), config), reader)
+    return _OfImages(opened.images(reader.sensor, config))
+
+
+def sensor_of(source: str, name: str = "") -> SensorModel:
+    """Return the sensor of a source of scans, or the one that is named for it by a name or a ``.json`` file."""
+    if _image_files(source):
+        return load_sensor(name or Folder.sensor)
+    return load_sensor(name) if name else open_source(source).sensor
+
+
+def _chosen(count: int, config: DataConfig) -> list[int]:
+    return evenly_spaced(config.max_scans or count, count)
+
+
+def _image_files(source: str) -> list[Path]:
+    """Return the range images that a source names: one ``.npy``, or a folder of nothing else."""
+    path = Path(source)
+    try:
+        found = [path] if path.is_file() else sorted(path.iterdir())
+    except (OSError, ValueError):
+        return []
+    found = [one for one in found if one.is_file() and not one.name.startswith(".") and formats.candidates(one)]
+    found = [one for one in found if not one.name.endswith(PROBABILITY)]
+    if not found or any(one.suffix.lower() != ".npy" for one in found):
+        return []
+    array = _array(found[0])
+    return found if array.ndim == 2 and array.shape[1] > 5 else []  # else rows of x, y, z and more
+
+
+def _array(path: Path) -> np.ndarray:
+    try:
+        array = parse_array(read_bytes(path, ARRAY_BYTES_AT_MOST, _IMAGE))
+    except LidarGritError:
+        raise
+    except ValueError as error:
+        raise ScanError(f"{path}, which cannot be read ({error})", _IMAGE, "save it anew") from None
+    return array
+
+
+def _together(own: Scan, added: Scan) -> Scan:
+    assert own.ring is not None
+    assert added.ring is not None
+    reflectance = None
+    if own.reflectance is not None and added.reflectance is not None:
+        reflectance = torch.cat((own.reflectance, added.reflectance))
+    points = torch.cat((own.points_xyz_m, added.points_xyz_m))
+    return Scan(points, reflectance, torch.cat((own.ring, added.ring)), None, own.source)

@@ -1,0 +1,262 @@
+"""How well scans are completed: whole scans, of which parts are hidden → errors of the filled pixels."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy.stats import t as student
+from torch import Tensor
+
+from lidargrit.completion import Completer
+from lidargrit.conditions import Condition
+from lidargrit.conditions.patterns import Pattern
+from lidargrit.determinism import derive_seed
+from lidargrit.errors import ConfigError, DataError
+from lidargrit.evaluation.intervals import blocks
+from lidargrit.loading import RangeImages
+from lidargrit.metrics import load_metric
+from lidargrit.projection import points_of_pixels
+from lidargrit.reporting import Reporter
+from lidargrit.structures import RangeImage
+
+PATTERNS = ("rows:4", "sector:45,315", "pixels:0.1")
+"""Patterns that are compared unless others are named: every fourth row, all but 90 degrees ahead, a tenth."""
+BASELINE = "triangulation"
+VOXEL_M = 0.1
+_GROUPS = 16
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A mean over scans.
+
+    Args:
+        value: mean; NaN where no scan has it.
+        low: lower end of its 95 % interval, from groups of neighbouring scans; NaN with fewer than two groups.
+        high: upper end of the interval.
+    """
+
+    value: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> Estimate:
+        """Return the mean of one value a scan, without those that are NaN, with Student's interval over groups."""
+        groups = [np.asarray([values[index] for index in group]) for group in blocks(len(values), _GROUPS)]
+        means = np.asarray([group[~np.isnan(group)].mean() for group in groups if not np.isnan(group).all()])
+        every = np.asarray(values)[~np.isnan(values)]
+        mean = float(every.mean()) if len(every) else math.nan
+        if len(means) < 2:
+            return cls(mean, math.nan, math.nan)
+        reach = float(student.ppf(0.975, len(means) - 1) * means.std(ddof=1) / math.sqrt(len(means)))
+        return cls(mean, mean - reach, mean + reach)
+
+
+@dataclass(frozen=True)
+class CompletionScore:
+    """How well one model or classical way fills in one pattern; only pixels that were not observed count.
+
+    Args:
+        model: word by which it was named.
+        observed: pattern of the observed pixels.
+        num_scans: number of scans.
+        mae_m: mean absolute error of the range, over pixels that return in both scans; lower is better.
+        found: share of the true returns that are filled in with a return. An error over fewer pixels is over easier
+            ones.
+        iou: intersection over union of the 0.1 m voxels that hold a point; higher is better.
+        drop_run_lengths: distance between the lengths of runs of drops in the completed and in the true scans.
+        diversity_m: mean absolute difference between two completions of a scan, where both return; None for one alone.
+        seconds_per_scan: time that one completion takes, here and now.
+        beside_triangulation_m: difference of the errors of the same scans from triangulation's, negative if better.
+    """
+
+    model: str
+    observed: str
+    num_scans: int
+    mae_m: Estimate
+    found: Estimate
+    iou: Estimate
+    drop_run_lengths: float
+    diversity_m: Estimate | None
+    seconds_per_scan: float
+    beside_triangulation_m: Estimate | None = None
+
+
+def compare_completion(
+    images: RangeImages,
+    completers: Sequence[Completer],
+    patterns: Sequence[Pattern],
+    completions: int = 2,
+    seed: int = 0,
+    reporter: Reporter | None = None,
+) -> list[CompletionScore]:
+    """Hide parts of scans, have every model fill them in, and compare.
+
+    Args:
+        images: whole scans.
+        completers: models and classical ways, of the sensor of the images.
+        patterns: choices of the observed pixels; each scan has its own random pixels, the same for all models.
+        completions: number of completions of each scan by a model that is random.
+        seed: seed of the first completion, and of the random pixels.
+        reporter: receiver of progress and warnings.
+
+    Returns:
+        scores of all models by the first pattern, then by the next.
+
+    Raises:
+        ConfigError: a model of another sensor.
+        DataError: no scan.
+    """
+    reporter = reporter or Reporter()
+    if not len(images) or completions < 1:
+        raise DataError(f"{len(images)} scans, {completions} completions", "at least 1 of both", "raise the number")
+    for completer in completers:
+        _check(completer, images, reporter)
+    whole = images.batch(range(len(images)))
+    scores = []
+    with reporter.progress("completing", len(patterns) * len(completers)) as progress:
+        for pattern in patterns:
+            masks = [pattern.mask(whole[index], derive_seed(seed, index)) for index in range(len(whole))]
+            known = Condition.of_pixels(whole, torch.stack(masks))
+            of_pattern = []
+            for completer in completers:
+                of_pattern.append(_score(completer, pattern, whole, known, completions, seed))
+                progress.advance(1, completer.name)
+            scores += _beside(of_pattern)
+    return scores
+
+
+def as_table(scores: Sequence[CompletionScore]) -> str:
+    """Return scores as lines for a terminal."""
+    lines = []
+    width = max(len(score.model) for score in scores) + 2
+    for pattern in dict.fromkeys(score.observed for score in scores):
+        lines.append(f"observed: {pattern}")
+        head = f"{'error [m]':>24}{'beside triangles [m]':>24}{'found':>8}{'IoU':>8}{'drop runs':>11}"
+        lines.append(" " * width + head + f"{'diversity [m]':>15}{'s a scan':>10}")
+        for score in scores:
+            if score.observed != pattern:
+                continue
+            beside = "" if score.beside_triangulation_m is None else _told(score.beside_triangulation_m, signed=True)
+            diversity = "" if score.diversity_m is None else f"{score.diversity_m.value:.3f}"
+            lines.append(
+                f"{score.model:<{width}}{_told(score.mae_m):>24}{beside:>24}{score.found.value:>8.3f}"
+                f"{score.iou.value:>8.3f}{score.drop_run_lengths:>11.4f}{diversity:>15}{score.seconds_per_scan:>10.3f}"
+            )
+    return "\n".join(lines)
+
+
+def as_json(scores: Sequence[CompletionScore]) -> list[dict[str, Any]]:
+    """Return scores for a file."""
+    return [asdict(score) for score in scores]
+
+
+@dataclass(frozen=True, eq=False)
+class _OfPattern:
+    score: CompletionScore
+    errors_m: list[float]
+
+
+def _check(completer: Completer, images: RangeImages, reporter: Reporter) -> None:
+    if not completer.sensor.same_rays(images.sensor):
+        raise ConfigError(
+            f"the model {completer.name} of {completer.sensor.name!r}",
+            f"one of {images.sensor.name!r}, {images.sensor.height}x{images.sensor.width}, as the first",
+            "compare models of one sensor",
+        )
+    if shared := completer.learned_from().overlap(images.provenance):
+        reporter.message(f"WARNING: {completer.name} and the scans overlap ({shared}): the scores flatter it")
+
+
+def _score(
+    completer: Completer, pattern: Pattern, whole: RangeImage, known: Condition, completions: int, seed: int
+) -> _OfPattern:
+    turns = completions if completer.random else 1
+    begin = time.perf_counter()
+    filled = [_complete(completer, known, turn, seed) for turn in range(turns)]
+    seconds = (time.perf_counter() - begin) / (len(whole) * turns)
+    hidden = ~known.return_observed
+    errors = [_mean([_error_m(images[i], whole[i], hidden[i]) for images in filled]) for i in range(len(whole))]
+    found = [_mean([_found(images[i], whole[i], hidden[i]) for images in filled]) for i in range(len(whole))]
+    ious = [_mean([_iou(images[i], whole[i], hidden[i]) for images in filled]) for i in range(len(whole))]
+    apart = [
+        _mean([_error_m(one[i], other[i], hidden[i]) for one, other in combinations(filled, 2)])
+        for i in range(len(whole))
+    ]
+    runs = load_metric("drop_run_lengths")()
+    runs.update(filled[0], real=False)
+    runs.update(whole, real=True)
+    score = CompletionScore(
+        completer.name,
+        pattern.text,
+        len(whole),
+        Estimate.of(errors),
+        Estimate.of(found),
+        Estimate.of(ious),
+        runs.compute().value,
+        Estimate.of(apart) if turns > 1 else None,
+        seconds,
+    )
+    return _OfPattern(score, errors)
+
+
+def _complete(completer: Completer, known: Condition, turn: int, seed: int) -> RangeImage:
+    parts = []
+    for first in range(0, len(known), completer.batch):
+        some = known[first : first + completer.batch]
+        seeds = [derive_seed(seed + turn, index) for index in range(first, first + len(some))]
+        parts.append(completer.complete(some, seeds))
+    return RangeImage.cat(parts)
+
+
+def _beside(scores: Sequence[_OfPattern]) -> list[CompletionScore]:
+    """Return the scores of one pattern with their differences from triangulation's, if that is among them."""
+    base = next((of.errors_m for of in scores if of.score.model == BASELINE), None)
+    found = []
+    for each in scores:
+        if base is None or each.score.model == BASELINE:
+            found.append(each.score)
+            continue
+        difference = Estimate.of([own - its for own, its in zip(each.errors_m, base, strict=True)])
+        found.append(CompletionScore(**{**vars(each.score), "beside_triangulation_m": difference}))
+    return found
+
+
+def _error_m(one: RangeImage, other: RangeImage, hidden: Bool[Tensor, "H W"]) -> float:
+    both = hidden & one.return_mask & other.return_mask
+    return float((one.range_m - other.range_m)[both].double().abs().mean()) if bool(both.any()) else math.nan
+
+
+def _found(filled: RangeImage, true: RangeImage, hidden: Bool[Tensor, "H W"]) -> float:
+    wanted = hidden & true.return_mask
+    return float(filled.return_mask[wanted].double().mean()) if bool(wanted.any()) else math.nan
+
+
+def _iou(filled: RangeImage, true: RangeImage, hidden: Bool[Tensor, "H W"]) -> float:
+    """Return the intersection over union of the voxels with a point, of hidden pixels alone."""
+    ours, theirs = (_voxels(points_of_pixels(image)[image.return_mask & hidden]) for image in (filled, true))
+    union = len(ours | theirs)
+    return len(ours & theirs) / union if union else math.nan
+
+
+def _voxels(points_xyz_m: Float[Tensor, "n 3"]) -> set[tuple[int, int, int]]:
+    return {(x, y, z) for x, y, z in (points_xyz_m.double() / VOXEL_M).floor().long().unique(dim=0).tolist()}
+
+
+def _mean(values: Sequence[float]) -> float:
+    known = [value for value in values if not math.isnan(value)]
+    return sum(known) / len(known) if known else math.nan
+
+
+def _told(of: Estimate, signed: bool = False) -> str:
+    sign = "+" if signed else ""
+    return f"{of.value:{sign}.3f} [{of.low:{sign}.3f}, {of.high:{sign}.3f}]"

@@ -1,0 +1,177 @@
+"""Scans that are completed, upsampled and dropped on the command line, by classical ways and by a small model."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from lidargrit.cli import main
+from lidargrit.conditions import Condition
+from lidargrit.conditions.fills import FILLS, fill
+from lidargrit.formats.numpy_array import NumpyArray
+from lidargrit.formats.ply import Ply
+from lidargrit.generators.lidargrit import LidarGrit
+from lidargrit.nn.pixel_networks import PixelDecoderConfig
+from lidargrit.projection import unproject
+from lidargrit.sensors import SensorModel, load_sensor
+from lidargrit.structures import RangeImage
+
+SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
+SIXTEEN = load_sensor("vlp16")
+
+
+def street(sensor: SensorModel) -> RangeImage:
+    """Return the ground, a wall around the sensor, and beams at the sky and at black spots that do not return."""
+    elevation = sensor.elevation_rad.expand(sensor.height, sensor.width)
+    wall_m = 12 + 4 * sensor.azimuth_rad.cos().expand_as(elevation)
+    ground_m = torch.where(elevation < -0.02, 1.7 / -elevation.clamp(max=-0.02).sin(), 1e3)
+    range_m = torch.minimum(wall_m / elevation.cos(), ground_m)
+    spots = torch.rand(range_m.shape, generator=torch.Generator().manual_seed(0)) < 0.1
+    return RangeImage.masked(range_m, (elevation < 0.03) & ~spots, sensor)
+
+
+@pytest.fixture(scope="module")
+def places(tmp_path_factory):
+    """Write two scans, their sensor, scans of another sensor, and a small run with a pixel decoder."""
+    root = tmp_path_factory.mktemp("completion")
+    for name, sensor in (("scans", SENSOR), ("sparse", SIXTEEN)):
+        for number in (1, 2):
+            NumpyArray.write(root / name / "drive" / f"{number}.npz", unproject(street(sensor)))
+    (root / "sensor.json").write_text(json.dumps(SENSOR.to_json()))
+    torch.manual_seed(0)
+    pixels = PixelDecoderConfig(mask_features=2, range_features=2, mask_width=4, range_width=4, blocks=1)
+    model = LidarGrit(replace(LidarGrit.smallest_config(SENSOR), pixels=pixels), SENSOR).eval()
+    model.save(root / "run")
+    return root
+
+
+def points_of(path, form=NumpyArray):
+    return {tuple(point) for point in form.read(path).points_xyz_m.tolist()}
+
+
+@pytest.mark.parametrize("method", FILLS)
+def test_a_plane_and_a_wall_are_filled_in(method):
+    image = RangeImage.stack([street(SENSOR)])
+    observed = torch.zeros_like(image.return_mask)
+    observed[:, 1::2] = True
+    done = fill(method, Condition.of_pixels(image, observed))
+    assert torch.equal(done.range_m[observed], image.range_m[observed])
+    both = ~observed & image.return_mask & done.return_mask
+    assert float(both.float().sum() / (~observed & image.return_mask).float().sum()) > 0.7
+    error = (done.range_m - image.range_m)[both].abs().mean()
+    assert float(error) < {"nearest": 0.6, "linear": 0.15, "triangulation": 0.15}[method]
+
+
+def test_triangles_close_the_circle_and_are_exact_on_a_wall_where_rows_lack():
+    inverse = 0.1 + 0.02 * SENSOR.elevation_rad.double().expand(64, 32)
+    image = RangeImage.stack([RangeImage((1 / inverse).float(), torch.ones(64, 32, dtype=torch.bool), SENSOR)])
+    observed = torch.ones(1, 64, 32, dtype=torch.bool)
+    observed[:, 8:50, :3], observed[:, 8:50, -3:] = False, False  # around the seam
+    done = fill("triangulation", Condition.of_pixels(image, observed))
+    assert torch.allclose(done.range_m, image.range_m, rtol=1e-5)
+
+
+def test_an_edge_is_not_smeared():
+    range_m = torch.full((64, 32), 5.0)
+    range_m[:, 16:] = 40.0
+    image = RangeImage.stack([RangeImage(range_m, range_m > 0, SENSOR)])
+    observed = torch.zeros(1, 64, 32, dtype=torch.bool)
+    observed[:, :, ::3] = True
+    for method in FILLS:
+        assert set(fill(method, Condition.of_pixels(image, observed)).range_m.unique().tolist()) == {5.0, 40.0}
+
+
+def test_complete_keeps_names_and_observed_points_and_goes_on(places, tmp_path, capsys):
+    words = ["complete", f"{places}/scans", str(tmp_path / "out"), "--observed", "rows:4"]
+    words += ["--model", "triangulation", "--sensor", f"{places}/sensor.json"]
+    assert main(words) == 0
+    assert "done: 2 completed scans" in capsys.readouterr().out
+    for number in (1, 2):
+        scan = NumpyArray.read(places / "scans/drive" / f"{number}.npz")
+        done = NumpyArray.read(tmp_path / "out/drive" / f"{number}.npz")
+        kept = scan.ring % 4 == 2
+        own = {tuple(point) for point in scan.points_xyz_m[kept].tolist()}
+        assert own <= points_of(tmp_path / f"out/drive/{number}.npz")
+        assert len(done) > 3 * int(kept.sum())
+    (tmp_path / "out/drive/2.npz").unlink()
+    before = (tmp_path / "out/drive/1.npz").stat().st_mtime_ns
+    assert main(words) == 0
+    assert (tmp_path / "out/drive/1.npz").stat().st_mtime_ns == before
+    assert (tmp_path / "out/drive/2.npz").exists()
+    assert main([*words[:-3], "linear", *words[-2:]]) == 2
+    assert "which holds other scans or another format" in capsys.readouterr().err
+
+
+def test_a_model_completes_in_several_ways_and_into_any_format(places, tmp_path):
+    out = tmp_path / "out"
+    words = ["complete", f"{places}/scans", str(out), "--model", f"{places}/run", "--observed", "sector:90,270"]
+    assert main([*words, "-n", "2", "--format", "ply", "--device", "cpu"]) == 0
+    ways = [points_of(out / f"completion_{way}/drive/1.ply", Ply) for way in (0, 1)]
+    own = points_of(places / "scans/drive/1.npz")
+    behind = {point for point in own if point[0] < -0.5}
+    assert all(behind <= way for way in ways)
+    assert ways[0] != ways[1]
+    assert points_of(out / "completion_0/drive/2.ply", Ply) != ways[0]  # another scan has another seed
+
+
+def test_raydrop_drops_points_of_clean_scans_and_tells_how_often(places, tmp_path):
+    clean = street(SENSOR).range_m.numpy()
+    np.save(tmp_path / "clean.npy", np.where(clean > 0, clean, np.inf))
+    words = ["raydrop", str(tmp_path / "clean.npy"), str(tmp_path / "out"), "--model", f"{places}/run"]
+    assert main([*words, "--format", "image", "--probability", "9"]) == 0
+    dropped, share = np.load(tmp_path / "out/clean.npy"), np.load(tmp_path / "out/clean.probability.npy")
+    assert set(np.unique(share * 9).round(4)) <= set(range(10))
+    assert not share[clean == 0].any()
+    assert 0.05 < share[clean > 0].mean() < 0.95
+    assert 0 < (dropped > 0).sum() < (clean > 0).sum()
+    assert np.array_equal(dropped[dropped > 0], clean[dropped > 0])
+    assert main(["raydrop", f"{places}/scans", str(tmp_path / "points"), "--model", f"{places}/run"]) == 0
+    assert points_of(tmp_path / "points/drive/1.npz") < points_of(places / "scans/drive/1.npz")
+
+
+def test_upsample_adds_the_rows_that_lack(places, tmp_path):
+    words = ["upsample", f"{places}/sparse", str(tmp_path / "out"), "--sensor", "vlp16"]
+    assert main([*words, "--to", f"{places}/sensor.json", "--model", "triangulation"]) == 0
+    done = NumpyArray.read(tmp_path / "out/drive/1.npz")
+    own = points_of(places / "sparse/drive/1.npz")
+    assert own & points_of(tmp_path / "out/drive/1.npz")
+    assert len(done.ring.unique()) > 40
+    ground = done.points_xyz_m[(done.ring > 30) & (done.ring < 42)]  # between its rows that see the ground
+    assert float((ground[:, 2] + 1.7).abs().median()) < 0.2
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["complete", "{}/sparse", "--model", "{}/run"], "16 rings in .*; wanted the 64 of the sensor"),
+        (["complete", "{}/scans", "--model", "{}/run", "--observed", "{}/small.npy"], "a mask of 3x4 bool"),
+        (["complete", "{}/scans", "--model", "{}/run", "--observed", "{}/all.npy"], "by which all pixels are observed"),
+        (["complete", "{}/scans", "--model", "{}/run", "--observed", "{}/none.npy"], "by which no return is observed"),
+        (["complete", "{}/empty.npz", "--model", "{}/run"], "an empty file"),
+        (["complete", "{}/wide.npy", "--model", "{}/run"], "a range image of 64x33; wanted 64x32"),
+        (["complete", "{}/scans", "--model", "nothing"], "nothing, which holds no finished model"),
+        (["complete", "{}/scans", "--model", "linear", "-n", "2"], "-n 2 for linear; wanted 1"),
+        (["complete", "{}/scans", "--model", "{}/run", "-n", "0"], "-n 0; wanted at least 1"),
+        (["complete", "{}/scans", "--model", "{}/run", "--format", "las2"], "the format 'las2' to write"),
+        (["raydrop", "{}/scans", "--model", "linear"], "--model linear for a task for a model"),
+        (["upsample", "{}/scans", "--model", "{}/run", "--sensor", "hdl64e_kitti_odometry"], "with 64 rows from"),
+        (
+            ["upsample", "{}/sparse", "--model", "{}/run", "--sensor", "vlp16", "--to", "os1_64"],
+            "the sensor 'os1_64', 64x1024, for",
+        ),
+    ],
+)
+def test_mistakes_are_told_in_one_line_and_nothing_is_written(words, told, places, tmp_path, capsys):
+    np.save(places / "small.npy", np.ones((3, 4), bool))
+    np.save(places / "all.npy", np.ones((64, 32), bool))
+    np.save(places / "none.npy", np.zeros((64, 32), bool))
+    np.save(places / "wide.npy", np.ones((64, 33), np.float32))
+    (places / "empty.npz").write_bytes(b"")
+    words = [word.replace("{}", str(places)) for word in words]
+    assert main([*words[:2], str(tmp_path / "out"), *words[2:]]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert told.split("; ")[0].replace(".*", "").split(" in ")[0] in error
+    assert not (tmp_path / "out").exists()
