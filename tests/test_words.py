@@ -131,9 +131,7 @@ def test_a_shell_learns_all_verbs_and_what_may_follow(shell, capsys, tmp_path):
     script = tmp_path / "script"
     script.write_text(capsys.readouterr().out)
     for word in (*_discovery.names("cli"), *_discovery.names("recipes"), "lidargrit-kitti-360", "dry-run"):
-        assert word in script.read_text().replace("compare-sim", "compare_sim").replace(
-            "fit-sensor", "fit_sensor"
-        ).replace("import-weights", "import_weights")
+        assert word in script.read_text() or word.replace("_", "-") in script.read_text()
     if shutil.which(shell):
         subprocess.run([shell, "-n", str(script)], check=True)
 
