@@ -74,8 +74,8 @@ def test_masks_follow_the_logits():
     with torch.no_grad():
         _, logits = generator.synthesis(generator._normal([4], 1)[:, 0])
         assert torch.equal(generator.sample([4], DustySampling(mask="threshold")).return_mask, logits[:, 0] > 0)
-        drawn = torch.stack([generator.sample([4], DustySampling(raydrop_seed=s)).return_mask[0] for s in range(400)])
-    assert torch.allclose(drawn.float().mean(0), logits[0, 0].sigmoid(), atol=0.13)  # five standard errors
+        sampled = torch.stack([generator.sample([4], DustySampling(raydrop_seed=s)).return_mask[0] for s in range(400)])
+    assert torch.allclose(sampled.float().mean(0), logits[0, 0].sigmoid(), atol=0.13)  # five standard errors
 
 
 def test_the_second_variant_drops_scans_as_a_whole():
@@ -87,10 +87,10 @@ def test_the_second_variant_drops_scans_as_a_whole():
         assert bool((generator.sample([0]).return_mask == returns).all())
     head.bias.data = torch.tensor([30.0, 0.5])
     game = generator.objective("adversarial").train()
-    rates = [float(game._draw(1, torch.Generator().manual_seed(seed))[1]) for seed in range(300)]
+    rates = [float(game._generate_encoded(1, torch.Generator().manual_seed(seed))[1]) for seed in range(300)]
     assert set(rates) == {0.0, 1.0}  # one coin a scan while it learns
     assert np.mean(rates) == pytest.approx(1 / (1 + math.exp(-0.5)), abs=0.11)
-    assert float(game.eval()._draw(1, torch.Generator().manual_seed(0))[1]) == 1.0  # and none after
+    assert float(game.eval()._generate_encoded(1, torch.Generator().manual_seed(0))[1]) == 1.0  # and none after
 
 
 def test_the_baseline_reads_far_pixels_as_no_return():
@@ -107,7 +107,7 @@ def test_the_baseline_reads_far_pixels_as_no_return():
     assert 0 < float(coarse.return_mask.float().mean()) < 1
 
 
-def test_what_is_drawn_at_the_far_limit_is_no_return():
+def test_what_is_generated_at_the_far_limit_is_no_return():
     """No return and the far limit are one value to DUSty's networks, so that either may stand for the other."""
     generator = made()
     generator.synthesis.return_head.bias.data.fill_(30.0)
@@ -148,11 +148,11 @@ def test_losses_are_the_formulas(images):
     game = game_of(penalty_weight=0.0)
     with torch.no_grad():
         real = game.discriminator(game.encoding.encode(images))
-        drawn = game.discriminator(game._draw(4, rng())[0])
+        generated = game.discriminator(game._generate_encoded(4, rng())[0])
     found = {phase: loss_of(game, images, phase) for phase in game.players}
-    of_discriminator = (-real.sigmoid().log()).mean() - (1 - drawn.sigmoid()).log().mean()
+    of_discriminator = (-real.sigmoid().log()).mean() - (1 - generated.sigmoid()).log().mean()
     assert found["discriminator"] == pytest.approx(float(of_discriminator), rel=1e-5)
-    assert found["generator"] == pytest.approx(float(-drawn.sigmoid().log().mean()), rel=1e-5)
+    assert found["generator"] == pytest.approx(float(-generated.sigmoid().log().mean()), rel=1e-5)
 
 
 def test_the_penalty_is_the_squared_gradient_at_real_images(images):
@@ -218,10 +218,10 @@ def test_a_player_whose_loss_is_not_finite_does_not_move(images):
 def test_a_search_finds_the_least_error_of_each_row():
     target = torch.randn(3, 6, generator=torch.Generator().manual_seed(2))
     target *= (6 / target.square().sum(1, keepdim=True)).sqrt()  # on the sphere
-    draws = torch.randn(3, 301, 6, generator=torch.Generator().manual_seed(4))
-    found = search_latents(lambda latents: (latents - target).abs().sum(1), draws, 0.1)
+    noise = torch.randn(3, 301, 6, generator=torch.Generator().manual_seed(4))
+    found = search_latents(lambda latents: (latents - target).abs().sum(1), noise, 0.1)
     assert torch.allclose(found, target, atol=0.02)
-    alone = search_latents(lambda latents: (latents - target[1:2]).abs().sum(1), draws[1:2], 0.1)
+    alone = search_latents(lambda latents: (latents - target[1:2]).abs().sum(1), noise[1:2], 0.1)
     assert torch.allclose(alone, found[1:2], atol=1e-5)
 
 
