@@ -88,7 +88,6 @@ def test_a_budget_scales_all_stages_alike():
     half = with_budget(recipe, cost / 2)
     for stage, fit in recipe.training.items():
         assert half.training[stage].scans == pytest.approx(fit.scans / 2, abs=fit.batch_size)
-    assert sum(training_flops(half).values()) == pytest.approx(cost / 2, rel=1e-2)
     assert with_budget(load_recipe("marginal"), 1.0) == load_recipe("marginal")
     with pytest.raises(ConfigError, match="at least one batch"):
         with_budget(recipe, 1e6)

@@ -21,7 +21,7 @@ from lidargrit.evaluation.scorecard import format_value
 from lidargrit.formats import read_scan as read_bin
 from lidargrit.recipes import load_recipe
 from lidargrit.sources.samples import read_samples
-from tiny_runs import MODEL
+from tiny_runs import MODEL, the_one_line
 
 TINY = [
     "data.train=[simulated:6:train]",
@@ -117,14 +117,38 @@ def test_dry_run_tells_the_plan_and_writes_nothing(tmp_path, typed):
     assert not (tmp_path / "none").exists()
 
 
+@pytest.mark.parametrize("data", ["data.train=gone/scans", "data.val=simulated:2:val,gone/scans"])
+def test_dry_run_fails_where_the_training_would_for_lack_of_scans(data, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    settings = ["data.train=simulated:2", "data.val=simulated:2", data]
+    assert main(["train", "marginal", "none", "--dry-run", "--set", *settings]) == 2
+    captured = capsys.readouterr()
+    assert "data.columns = " in captured.out, "the plan is told all the same"
+    assert the_one_line(captured.err, "train").startswith("lidargrit train: got gone/scans, which is not a folder; ")
+    assert not list(tmp_path.iterdir())
+
+
+def test_dry_run_finds_prepared_scans_of_another_sensor(tmp_path, capsys):
+    words = ["-o", str(tmp_path / "prepared"), "--columns", "64", "--workers", "1"]
+    assert main(["prepare", "simulated:2:train", *words]) == 0
+    settings = [f"data.train={tmp_path / 'prepared'}", "data.val=simulated:2", "data.columns=128"]
+    capsys.readouterr()
+    assert main(["train", "marginal", str(tmp_path / "none"), "--dry-run", "--set", *settings]) == 2
+    assert "(64x64); wanted the rays of " in the_one_line(capsys.readouterr().err, "train")
+
+
 @pytest.mark.parametrize("recipe", _discovery.names("recipes"))
-def test_every_recipe_has_a_plan(recipe, tmp_path, typed, monkeypatch):
+def test_every_recipe_has_a_plan(recipe, tmp_path, capsys, monkeypatch):
     if recipe not in COUNTED:
         told_at_once = lambda recipe: dict.fromkeys(recipe.training, 10**18)  # noqa: E731
         monkeypatch.setattr(sys.modules["lidargrit.training.plan"], "training_flops", told_at_once)
-    told = typed("train", recipe, tmp_path / "none", "--dry-run")
-    assert "published: " in told
-    assert (" parameters, " in told) == bool(load_recipe(recipe).training)
+    monkeypatch.chdir(tmp_path)
+    is_simulated = load_recipe(recipe).data.train[0].startswith("simulated:")
+    assert main(["train", recipe, "none", "--dry-run"]) == (0 if is_simulated else 2)
+    captured = capsys.readouterr()
+    assert ("data/kitti" in captured.err) is not is_simulated, "where data sets are looked for"
+    assert "published: " in captured.out
+    assert (" parameters, " in captured.out) == bool(load_recipe(recipe).training)
 
 
 def test_sample_writes_one_file_a_seed_and_draws_no_seed_twice(run_folder, samples, typed, monkeypatch):

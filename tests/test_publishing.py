@@ -114,14 +114,11 @@ def test_scores_of_other_weights_and_taken_folders_are_refused(run, tmp_path, ca
         assert main(["publish", *map(str, words)]) == 2
         return the_one_line(capsys.readouterr().err, "publish")
 
-    samples = run.parent / "samples" / "samples.json"
-    before = samples.read_text()
-    try:
-        samples.write_text(before.replace(json.loads(before)["weights_sha256"], "0" * 64))
-        told = error(run, tmp_path / "new", "--scores", run.parent / "scores.json")
-    finally:
-        samples.write_text(before)
-    assert "which were not sampled from" in told
+    scores = (run.parent / "scores.json").read_text()
+    weights = json.loads(scores)["inputs"]["samples"]["weights_sha256"]
+    moved = scores.replace(str(run.parent), "/elsewhere")  # as if they came from another machine
+    (tmp_path / "other.json").write_text(moved.replace(weights, "0" * 64))
+    assert "which were not sampled from" in error(run, tmp_path / "new", "--scores", tmp_path / "other.json")
     assert "then rounded" in error(run, tmp_path / "new", "--half", "--scores", run.parent / "scores.json")
     assert not (tmp_path / "new").exists()
     (tmp_path / "taken").mkdir()
@@ -134,6 +131,40 @@ def test_scores_of_other_weights_and_taken_folders_are_refused(run, tmp_path, ca
         (tmp_path / "edited" / "run.json").write_text(edited)
         assert "run.json, which cannot be used" in error(tmp_path / "edited", tmp_path / "new")
     assert not (tmp_path / "new").exists()
+
+
+def test_scores_of_before_they_told_their_weights_are_asked_for_their_samples(run, tmp_path, capsys):
+    old = json.loads((run.parent / "scores.json").read_text())
+    del old["inputs"]["samples"]["weights_sha256"]
+    shutil.copytree(run.parent / "samples", tmp_path / "samples")
+    old["inputs"]["samples"]["source"] = str(tmp_path / "samples")
+    (tmp_path / "old.json").write_text(json.dumps(old))
+    assert main(["publish", str(run), str(tmp_path / "public"), "--scores", str(tmp_path / "old.json")]) == 0
+    manifest = json.loads((tmp_path / "samples" / "samples.json").read_text())
+    (tmp_path / "samples" / "samples.json").write_text(json.dumps({**manifest, "weights_sha256": "0" * 64}))
+    capsys.readouterr()
+    assert main(["publish", str(run), str(tmp_path / "new"), "--scores", str(tmp_path / "old.json")]) == 2
+    assert "which were not sampled from" in the_one_line(capsys.readouterr().err, "publish")
+
+
+def test_a_model_of_prepared_scans_names_what_they_were_prepared_from(tmp_path, capsys, monkeypatch):
+    """A prepared folder is called by its path, which is the user's; it says itself which scans it holds."""
+    monkeypatch.chdir(tmp_path)
+    private = tmp_path / "private_place"
+    for split in ("train", "val"):
+        words = ["-o", str(private / split), "--columns", "64", "--workers", "1"]
+        assert main(["prepare", f"simulated:2:{split}", *words]) == 0
+    data = [f"data.train={private / 'train'}", "data.val=private_place/val", "data.columns=64"]
+    assert main(["train", "marginal", str(private / "run"), "--set", *data]) == 0
+    assert main(["publish", str(private / "run"), "public"]) == 0
+    files = contents(tmp_path / "public")
+    assert all(b"private_place" not in of and bytes(tmp_path) not in of for of in files.values())
+    data = json.loads(files["run.json"])["recipe"]["data"]
+    assert (data["train"], data["val"]) == (["simulated::train"], ["simulated::val"])
+    head, body = head_of(files["README.md"].decode())
+    assert "license" not in head
+    assert "| train | simulated | train | " in body
+    assert "| val | simulated | val | " in body
 
 
 @pytest.mark.parametrize("written", [1, 2, 3, 4])

@@ -35,7 +35,7 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.errors import ConfigError
     from lidargrit.recipes import load_recipe
     from lidargrit.reporting import TerminalReporter
-    from lidargrit.training import measure, plan_training, tracked, train
+    from lidargrit.training import check_data, measure, plan_training, tracked, train
     from lidargrit.viewer import plot_progress
 
     recipe = load_recipe(options.recipe, options.set)
@@ -44,6 +44,7 @@ def run(options: argparse.Namespace) -> None:
         planned, measured = plan_training(recipe), measure(recipe) if options.measure else []
         text = "\n".join([planned.as_text(), *(stage.as_text() for stage in measured)])
         tell(options, text, {**planned.to_json(), "measured": [vars(stage) for stage in measured]})
+        check_data(recipe)  # last: the plan of a recipe is worth reading on a machine without its data too
         return
     if options.json:
         raise ConfigError(

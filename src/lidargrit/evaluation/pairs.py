@@ -32,6 +32,7 @@ class EvalSet:
         data_set: name of the data set; "samples" for generated images, "" where it is not known.
         split: part of the data set.
         projection_variant: variant by which scans became images; "" where it is not known.
+        weights_sha256: hash of the weights that generated the images; "" where there are none, or it is not known.
     """
 
     source: str
@@ -41,6 +42,7 @@ class EvalSet:
     data_set: str = ""
     split: str = ""
     projection_variant: str = ""
+    weights_sha256: str = ""
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -68,6 +70,7 @@ class EvalSet:
             f"{sensor.name} {sensor.height}x{sensor.width}",
             f"{sensor.projection}, {self.projection_variant or 'variant not known'}",
             self._sha256(),
+            self.weights_sha256,
         )
 
     def _sha256(self) -> str:
@@ -133,6 +136,7 @@ def pair_for_protocol(
             source.data_set,
             source.split,
             source.projection_variant(config),
+            source.weights_sha256(),
         )
         for source, images in ((samples, first), (reference, second))
     ]

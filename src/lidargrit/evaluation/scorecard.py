@@ -60,6 +60,8 @@ class SetFacts:
         sensor: name and size of its images.
         projection: description of the projection of its scans.
         sha256: hash of the pixels that were compared.
+        weights_sha256: hash of the weights that generated the scans; "" for scans of other origins, and in files of
+            before this was written.
     """
 
     source: str
@@ -70,6 +72,7 @@ class SetFacts:
     sensor: str
     projection: str
     sha256: str
+    weights_sha256: str = field(default="", compare=False)  # equal pixels are equal, and old files lack it
 
 
 @dataclass(frozen=True)
@@ -192,7 +195,12 @@ def _row(score: Score) -> tuple[str, ...]:
 
 def _input(data: dict[str, Any]) -> SetFacts:
     words = {name: str(data[name]) for name in ("source", "data_set", "split", "sensor", "projection", "sha256")}
-    return SetFacts(**words, scans=int(data["scans"]), scans_used=int(data["scans_used"]))
+    return SetFacts(
+        **words,
+        scans=int(data["scans"]),
+        scans_used=int(data["scans_used"]),
+        weights_sha256=str(data.get("weights_sha256", "")),
+    )
 
 
 def _score(data: dict[str, Any]) -> Score:

@@ -27,7 +27,7 @@ from lidargrit.generators import (
 from lidargrit.publishing.card import model_card
 from lidargrit.recipes import load_recipe
 from lidargrit.sources import data_set_of
-from lidargrit.sources.samples import MANIFEST, is_sample_folder, trained_on
+from lidargrit.sources.samples import is_sample_folder, trained_on, weights_of
 
 
 def import_weights(recipe: str, folder: Path, files: Sequence[Path], settings: Sequence[str] = ()) -> Generator:
@@ -147,12 +147,16 @@ def _public_facts(about: dict[str, Any], generator: Generator) -> dict[str, Any]
 
 
 def _check_scores(scores: Scorecard, run: Path) -> None:
-    """Raise ConfigError if the scores are of other weights, as far as their samples are still there to tell."""
-    samples = Path(scores.samples.source)
-    if not is_sample_folder(samples):
-        return
-    theirs = read_json(samples / MANIFEST)
-    if not isinstance(theirs, dict) or theirs.get("weights_sha256") != _sha256(run / WEIGHTS_FILE):
+    """Raise ConfigError if the scores are of other weights.
+
+    Scores of before they told their weights are believed, unless the samples are still where they were and tell.
+    """
+    theirs, samples = scores.samples.weights_sha256, scores.samples.source
+    if not theirs:
+        if not is_sample_folder(Path(samples)):
+            return
+        theirs = weights_of(Path(samples))
+    if theirs != _sha256(run / WEIGHTS_FILE):
         raise ConfigError(
             f"scores of {samples}, which were not sampled from {run}", "scores of this run's samples", "evaluate those"
         )

@@ -17,7 +17,7 @@ from lidargrit.loading import DataConfig, PreparedFolder, PreparedImages, Proven
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel, load_sensor
 from lidargrit.sources.sample_formats import is_tensor_folder, load_sample_format, read_tensor_folder, recognise
-from lidargrit.sources.samples import is_sample_folder, projection_of, read_samples, trained_on
+from lidargrit.sources.samples import is_sample_folder, projection_of, read_samples, trained_on, weights_of
 
 
 class Source(ABC):
@@ -73,6 +73,10 @@ class Source(ABC):
     def learned_from(self) -> Provenance | None:
         """Return the training scans of the model behind the source; None where no model is behind it."""
         return None
+
+    def weights_sha256(self) -> str:
+        """Return the hash of the weights that generated the scans; "" where there are none, or it is not known."""
+        return ""
 
 
 class DatasetSource(Source):
@@ -171,6 +175,10 @@ class SampleSource(Source):
     def learned_from(self) -> Provenance:
         """Return the training scans of the model that generated the samples."""
         return trained_on(self.folder)
+
+    def weights_sha256(self) -> str:
+        """Return the hash of the weights of this model."""
+        return weights_of(self.folder)
 
 
 class TensorSource(Source):
@@ -302,16 +310,23 @@ def load_range_images(
         DataError: no source, a source without a scan, generated scans, or prepared scans of another sensor.
         ScanError: a scan that cannot be used; ``bad_scans=skip`` leaves it out.
     """
+    sensor = sensor or config.load_sensor()
+    opened = open_to_train(sources, config)
+    return RangeImages.joined(sensor, [source.images(sensor, config, reporter) for source in opened])
+
+
+def open_to_train(sources: Sequence[str], config: DataConfig) -> list[DatasetSource | PreparedSource]:
+    """Open sources of real or simulated scans, or raise DataError where :func:`load_range_images` would."""
     if not sources:
         raise DataError("no source of scans", "at least one", "name one with --set data.train=FOLDER")
-    sensor, parts = sensor or config.load_sensor(), []
+    opened = []
     for text in sources:
         source = open_source(text, config.bad_points)
         if not isinstance(source, (DatasetSource, PreparedSource)):
             cure = "export samples first if you do want to learn from them: lidargrit export SAMPLES FOLDER"
             raise DataError(f"{text}, which holds {source.kind}", "scans, or scans that were prepared", cure)
-        parts.append(source.images(sensor, config, reporter))
-    return RangeImages.joined(sensor, parts)
+        opened.append(source)
+    return opened
 
 
 def open_images(

@@ -155,6 +155,13 @@ def trained_on(folder: Path) -> Provenance:
         ) from None
 
 
+def weights_of(folder: Path) -> str:
+    """Return the hash of the weights that generated the samples of a folder; "" where the folder does not tell."""
+    manifest = read_json(folder / MANIFEST)
+    found = manifest.get("weights_sha256") if isinstance(manifest, dict) else None
+    return found if isinstance(found, str) else ""
+
+
 def is_sample_folder(folder: Path) -> bool:
     """Tell whether a folder holds samples that lidargrit wrote."""
     return (folder / MANIFEST).is_file()

@@ -3,7 +3,7 @@
 from lidargrit.training.compute import gpu_time, training_flops, with_budget
 from lidargrit.training.config import FitConfig, Recipe
 from lidargrit.training.measure import Measured, measure
-from lidargrit.training.plan import TrainingPlan, plan_training
+from lidargrit.training.plan import TrainingPlan, check_data, plan_training
 from lidargrit.training.run import check_folder, train
 from lidargrit.training.tracking import tracked
 
@@ -12,6 +12,7 @@ __all__ = [
     "Measured",
     "Recipe",
     "TrainingPlan",
+    "check_data",
     "check_folder",
     "gpu_time",
     "measure",

@@ -7,6 +7,7 @@ from typing import Any
 
 from lidargrit import configuration
 from lidargrit.nn.precision import Precision
+from lidargrit.sources import PreparedSource, open_to_train
 from lidargrit.training.compute import gpu_time, training_flops
 from lidargrit.training.config import Recipe
 from lidargrit.training.optimiser import memory_of_weights
@@ -74,6 +75,18 @@ class TrainingPlan:
     def to_json(self) -> dict[str, Any]:
         """Return all of it as plain values."""
         return asdict(self)
+
+
+def check_data(recipe: Recipe) -> None:
+    """Refuse training and validation scans that cannot be used, as far as that is known before one is read.
+
+    Raises:
+        DataError: a source that is not there, holds no scans, or was prepared for another sensor or projection.
+    """
+    for sources in (recipe.data.train, recipe.data.val):
+        for source in open_to_train(sources, recipe.data):
+            if isinstance(source, PreparedSource):
+                source.images(recipe.data.load_sensor(), recipe.data)
 
 
 def plan_training(recipe: Recipe) -> TrainingPlan:
