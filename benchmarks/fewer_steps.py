@@ -5,7 +5,7 @@
 Every system writes the same number of samples, which are scored against simulated scans that none was trained on, by
 three metrics with their 95 % intervals; OUT keeps samples and scores, and the same command goes on there. Seconds are
 of whole scans, seed to range image, the best of the repeats; with OMP_NUM_THREADS=1 they are the processor's, which do
-not count waiting for neighbours. Prints the table and draws the plot.
+not count waiting for neighbours. Prints the table and plots them.
 """
 
 import argparse
@@ -41,8 +41,8 @@ def seconds_per_scan(generator: Generator, sampling: object, batch: int) -> floa
     return min(times)
 
 
-def draw(rows: list[dict], path: Path, title: str) -> None:
-    """Draw a panel for each metric: its value with the interval over the seconds of one scan at a time."""
+def plot(rows: list[dict], path: Path, title: str) -> None:
+    """Plot a panel for each metric: its value with the interval over the seconds of one scan at a time."""
     figure = Figure(figsize=(13.0, 4.2), dpi=100)
     FigureCanvasAgg(figure)
     for index, metric in enumerate(METRICS):
@@ -112,9 +112,9 @@ def main() -> None:
     benchmark = Benchmark(f"simulated:{options.n}:test", options.n, EvalConfig(metrics=tuple(METRICS)))
     scores = run_benchmark(systems, options.out, benchmark, TerminalReporter())
     exact, masked = load(options.exact_run), load(options.masked_run)
-    drawn = [(exact, exact.Sampling()), *((masked, override(masked.Sampling(), chosen)) for chosen in choices)]
+    choices_of = [(exact, exact.Sampling()), *((masked, override(masked.Sampling(), chosen)) for chosen in choices)]
     rows = []
-    for (generator, sampling), steps, path in zip(drawn, [None, *options.steps], scores, strict=True):
+    for (generator, sampling), steps, path in zip(choices_of, [None, *options.steps], scores, strict=True):
         seconds = [seconds_per_scan(generator, sampling, batch) for batch in options.batch]
         rows.append(row_of(generator.public_name(), steps, path, seconds))
     heads = [*(f"seconds, batch {batch}" for batch in options.batch), *METRICS]
@@ -123,8 +123,8 @@ def main() -> None:
         cells = [*(f"{each:.3f}" for each in row["seconds"])]
         cells += [f"{row[metric][0]:.4f} ({row[metric][1]:.4f} to {row[metric][2]:.4f})" for metric in METRICS]
         print(f"| {row['name']} | {row['steps'] or 'one a token'} | {' | '.join(cells)} |")
-    print("floor: " + ", ".join(f"{metric} {rows[0][metric][3]:.4f}" for metric in METRICS))
-    draw(rows, options.picture, options.title)
+    print("real against real: " + ", ".join(f"{metric} {rows[0][metric][3]:.4f}" for metric in METRICS))
+    plot(rows, options.picture, options.title)
 
 
 if __name__ == "__main__":

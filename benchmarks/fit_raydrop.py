@@ -2,7 +2,7 @@
 
     python benchmarks/fit_raydrop.py TRAIN [TRAIN ...] [--val VAL] [--scans 48] [--rounds 3] [--json FILE]
 
-Rays are cast once a scene; the physics is then drawn again for every trial with the same random numbers, so that two
+Rays are cast once a scene; the physics is then sampled again for every trial with the same random numbers, so that two
 trials differ by their parameters alone. Each round first fits the 64 lasers, whose rows do not depend on one another,
 then moves one parameter after the other up and down, and keeps a move that lowers the sum of the Jensen-Shannon
 distances to the TRAIN scans; steps shrink from round to round. Scans named by --val are only looked at in the end, with
@@ -216,7 +216,7 @@ def main() -> None:
     begun = time.perf_counter()
     streets = [Street(seed, sensor) for seed in range(FIRST_SEED, FIRST_SEED + options.scans)]
     assert streets[0].sample(model)[1].range_m.equal(simulate_pair(FIRST_SEED, sensor)[1].range_m)
-    print(f"{len(real)} real scans, {len(streets)} scenes drawn in {time.perf_counter() - begun:.0f} s")
+    print(f"{len(real)} real scans, {len(streets)} scenes sampled in {time.perf_counter() - begun:.0f} s")
     fitted = search(streets, Target(real), Rows.of(real.batch(range(len(real)))), model, options.rounds)
     print(f"gains {fitted.laser_gains}\nreadings {fitted.laser_readings}\nspread {fitted.laser_spread}")
     if options.json:

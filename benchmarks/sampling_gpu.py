@@ -3,7 +3,7 @@
     python benchmarks/sampling_gpu.py [--batch 1 64 512] [--weights bf16] [--compile]
 
 Random weights: the time does not depend on them. Ours runs in full: tokens by CUDA graphs, decoding in 16 bits, masks
-drawn. Recomputation reads the whole prefix again for every token, in 16 bits too, and takes the logits of the last
+sampled. Recomputation reads the whole prefix again for every token, in 16 bits too, and takes the logits of the last
 position only; its steps are timed in the middle of four equal spans of the length and summed. Of R2DM one step is timed
 and taken as often as is published. Batches too large for the memory are left out. On a CPU (``--device cpu --recipe
 small --r2dm r2dm_small --batch 1``) it shows that the script runs, and nothing else.

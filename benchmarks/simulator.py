@@ -2,8 +2,8 @@
 
     python benchmarks/simulator.py [--sensor hdl64e_kitti_360] [-n 200] [--processes 1 2] [--repeats 3]
 
-The scene is drawn anew for every scan, as training needs it. The best of several repeats counts, for other work on the
-machine only slows things down. With -n 10000 the memory of a process shows whether anything is left behind.
+The scene is sampled anew for every scan, as training needs it. The best of several repeats counts, because other work
+on the machine only slows things down. With -n 10000 the memory of a process shows whether anything is left behind.
 """
 
 import argparse

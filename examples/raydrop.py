@@ -12,7 +12,7 @@ from lidargrit.simulator import observe
 
 
 def main(folder: Path) -> None:
-    """Observe one street and draw its part straight ahead."""
+    """Observe one street and plot its part straight ahead."""
     seen = observe(8, load_sensor("hdl64e_kitti_360"))
     clean = np.where(seen.clean_range_m > 0, seen.clean_range_m, np.nan)
     coin = np.random.default_rng(0).random(clean.shape) < seen.return_mask.mean()
@@ -22,7 +22,7 @@ def main(folder: Path) -> None:
     panels = [
         ("clean range: what each ray meets (white: nothing)", clean, metres),
         ("probability that it comes back: dark on glass, far away, and on our own car", chance, likely),
-        ("drawn from it: the range as measured", np.where(seen.return_mask, seen.range_m, np.nan), metres),
+        ("sampled from it: the range as measured", np.where(seen.return_mask, seen.range_m, np.nan), metres),
         ("as many rays dropped by a coin: no sensor looks like this", np.where(coin, clean, np.nan), metres),
     ]
     columns = clean.shape[1]

@@ -15,7 +15,7 @@ COUNT = 16  # scans of each set: few, so that this takes seconds; score thousand
 
 
 def main(folder: Path) -> None:
-    """Score five sets against one reference, print a table and draw it."""
+    """Score five sets against one reference, print a table and plot it."""
     reference, others, train = (scans(first) for first in (0, 1000, 2000))
     rng = torch.Generator().manual_seed(0)
     pixel = torch.randint(COUNT, train.range_m.shape, generator=rng)  # each pixel from another scan: no shapes at all

@@ -10,7 +10,7 @@ import lidargrit
 
 
 def main(folder: Path) -> None:
-    """Simulate, project, unproject and draw."""
+    """Simulate, project, unproject and plot."""
     sensor = lidargrit.load_sensor("hdl64e_kitti_360")
     scan = lidargrit.simulate(seed=8, sensor=sensor)  # or lidargrit.load_scan("scan.bin")
     image = lidargrit.project(scan, sensor)
@@ -24,9 +24,9 @@ def main(folder: Path) -> None:
     axes["S"].scatter(-y, x, s=0.6, c=scan.points_xyz_m.norm(dim=1).numpy(), linewidths=0, **look)
     axes["S"].set(xlim=(-25, 25), ylim=(-30, 30), aspect="equal", title="a scan, from above", xlabel="metres")
     ranges = image.range_m.where(image.return_mask, float("nan")).numpy()
-    drawn = axes["R"].imshow(ranges, aspect="auto", interpolation="none", **look)
+    plotted = axes["R"].imshow(ranges, aspect="auto", interpolation="none", **look)
     axes["R"].set(title="its range image: 64 rows, 1,024 columns", ylabel="row", xticks=[])
-    figure.colorbar(drawn, ax=axes["R"], label="range [m]", ticks=[2, 5, 10, 20, 50], format="%d").minorticks_off()
+    figure.colorbar(plotted, ax=axes["R"], label="range [m]", ticks=[2, 5, 10, 20, 50], format="%d").minorticks_off()
     axes["M"].imshow(image.return_mask.numpy(), aspect="auto", cmap="gray", interpolation="none")
     axes["M"].set(title="its return mask: white where the ray came back", ylabel="row")
     axes["M"].set_xlabel("column; straight ahead is in the middle, the left is on the left")

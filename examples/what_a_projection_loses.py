@@ -17,7 +17,7 @@ WAYS = {
 
 
 def main(folder: Path) -> None:
-    """Inspect the scan in four ways, and draw of each the part straight ahead."""
+    """Inspect the scan in four ways, and plot of each the part straight ahead."""
     scan = lidargrit.simulate(seed=8)  # the HDL-64E, whose rows are not equally far apart
     figure, axes = plt.subplots(len(WAYS), figsize=(10, 6.4), layout="constrained")
     for axis, (way, (name, columns)) in zip(axes, WAYS.items(), strict=True):

@@ -10,6 +10,7 @@ import pytest
 import yaml
 from PIL import Image
 
+from lidargrit import _discovery
 from lidargrit.cli import build_parser
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -51,6 +52,14 @@ def test_links_lead_to_pages_and_headings():
                 wrong.append(f"{page.name}: {link}")
     assert wrong == []
     assert count > 60
+
+
+def test_the_readme_counts_what_there_is():
+    counts = re.findall(r"\b(\d+) (metrics|protocols|sensors)\b", TEXTS[ROOT / "README.md"])
+    assert len(counts) == 3
+    for count, kind in counts:
+        folder = "evaluation.protocols" if kind == "protocols" else kind
+        assert int(count) == len(_discovery.names(folder)), kind
 
 
 def test_every_page_is_in_the_navigation():

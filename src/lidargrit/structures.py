@@ -1,4 +1,4 @@
-"""The nouns that cross folder borders: scan, range image, token grid, decoded scans, metric result.
+"""The data types that packages pass to one another: scan, range image, token grid, decoded scans, metric result.
 
 Each is valid once it exists. Ranges are always metres and the return mask is always True = a return. Normalised
 tensors live inside one model.
