@@ -1,10 +1,10 @@
 """Ranks and folders that the environment names."""
 
 import os
-from pathlib import Path
 
 import pytest
 
+from lidargrit.cli import main
 from lidargrit.environment import cache_folder, folder_in
 from lidargrit.errors import ConfigError
 from lidargrit.processes import rank_and_world_size
@@ -52,13 +52,17 @@ def test_a_folder_of_nobody_is_refused_in_one_line(monkeypatch):
     assert folder_in("A_FOLDER") is None
 
 
-def test_scans_are_kept_in_the_home_of_the_user(monkeypatch, tmp_path):
-    from lidargrit.loading import DataConfig, prepare
-
+def test_commands_keep_scans_in_the_home_of_the_user_and_find_them_there(monkeypatch, tmp_path, capsys):
     monkeypatch.setenv("LIDARGRIT_CACHE", "~/x")
-    folder = prepare("simulated:1", DataConfig(workers=1, columns=512, column_stride=8))
-    assert folder.parent == tmp_path / "home" / "x"
-    assert not Path("~").exists()
+    words = ["data.train=simulated:1:train", "data.val=simulated:1:val", "data.workers=1", "data.columns=64"]
+    assert main(["train", "marginal", "run", "--set", *words]) == 0
+    kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "home" / "x").glob("*/*.shard")}
+    assert len(kept) == 2
+    assert main(["train", "memorised", "again", "--set", *words]) == 0
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "home" / "x").glob("*/*.shard")} == kept
+    assert main(["doctor"]) == 0
+    assert str(tmp_path / "home" / "x") in capsys.readouterr().out
+    assert {path.name for path in tmp_path.iterdir()} == {"home", "run", "again"}, "no folder called ~"
 
 
 def test_a_rank_is_what_is_given_or_what_a_launcher_says(monkeypatch):

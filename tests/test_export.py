@@ -1,7 +1,9 @@
 """Exported scans: read back by other libraries and by our readers, resumed, and never written over what is not ours."""
 
 import json
+import os
 import re
+import signal
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from lidargrit.loading import DataConfig, prepare
 from lidargrit.projection import unproject
 from lidargrit.sensors import load_sensor
 from lidargrit.sources import open_images
+from tiny_runs import contents
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(512, 8)
 
@@ -74,6 +77,22 @@ def by_library(path):
     cloud = trimesh.load(path)
     rows = cloud.metadata["_ply_raw"]["vertex"]["data"]
     return np.asarray(cloud.vertices), {name: rows[name] for name in rows.dtype.names}
+
+
+def test_an_export_that_was_killed_leaves_nothing_half_written(samples, tmp_path):
+    """Killed when its list and its first scan are written, and its second has no name yet."""
+    words = ["export", str(samples), str(tmp_path / "tree"), "--format", "kitti_odometry"]
+    child = os.fork()
+    if not child:
+        calls = iter(range(9))
+        os.fsync = lambda _: os.kill(os.getpid(), signal.SIGKILL) if next(calls) == 2 else None
+        os._exit(main(words))
+    assert os.waitpid(child, 0)[1] == signal.SIGKILL
+    assert [path.suffix for path in (tmp_path / "tree").rglob("*") if path.is_file()].count(".partial") == 1
+    assert len(open_dataset(f"kitti_odometry:{tmp_path / 'tree'}")) == 1, "readers take nothing half-written for a scan"
+    assert main(words) == 0
+    assert main([*words[:2], str(tmp_path / "whole"), *words[3:]]) == 0
+    assert contents(tmp_path / "tree") == contents(tmp_path / "whole")
 
 
 @pytest.mark.parametrize("kind", ["kitti_bin", "npz", "pcd", "ply", "las"])

@@ -1,5 +1,6 @@
-"""Names of files that the C locale cannot show, or that no file can have: one line in ASCII, whatever the name."""
+"""Names of files that some locales cannot show, or that no file can have: used, or refused in one line in ASCII."""
 
+import json
 import os
 import subprocess
 import sys
@@ -7,17 +8,19 @@ from pathlib import Path
 
 import pytest
 
+from lidargrit.datasets import load
 from tiny_runs import the_one_line
 
+ASCII = {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}
 
-def lidargrit(words: list[str | bytes], folder: Path) -> tuple[int, str]:
-    """Run a command in a folder under the C locale, without Python's UTF-8 mode; return its exit code and stderr."""
-    plain = {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}
-    command = [sys.executable, "-m", "lidargrit", *words]
+
+def python(words: list[str | bytes], folder: Path, environment: dict[str, str]) -> tuple[int, str]:
+    """Run Python in a folder; return its exit code and stderr, in ASCII as some terminals need it."""
+    environment = {**os.environ, **environment}
     done = subprocess.run(
-        command, cwd=folder, env={**os.environ, **plain}, capture_output=True, timeout=120, check=False
+        [sys.executable, *words], cwd=folder, env=environment, capture_output=True, timeout=120, check=False
     )
-    return done.returncode, done.stderr.decode("ascii")  # a terminal of that locale shows nothing else
+    return done.returncode, done.stderr.decode("ascii")
 
 
 @pytest.mark.parametrize(
@@ -26,6 +29,32 @@ def lidargrit(words: list[str | bytes], folder: Path) -> tuple[int, str]:
     ids=["German", "Chinese", "no UTF-8", "long"],
 )
 def test_names_of_missing_files_under_the_c_locale(name, tmp_path):
-    code, told = lidargrit(["inspect", name], tmp_path)
+    code, told = python(["-m", "lidargrit", "inspect", name], tmp_path, ASCII)
     assert code == 2
     the_one_line(told, "inspect")
+
+
+SEVERAL = """
+import sys
+from lidargrit.cli import main
+for words in sys.argv[1].split(", "):
+    if main([*words.split()[:1], sys.argv[2], *words.split()[1:]]):
+        sys.exit(words)
+"""
+
+
+def test_files_with_such_names_are_used_under_the_c_locale_or_told_in_one_line(tmp_path):
+    load("folder").write_example(tmp_path / "scans", 1)
+    (tmp_path / "scans" / "000000.bin").rename(tmp_path / "scans" / "straße.bin")
+    (tmp_path / "scans").rename(tmp_path / "走")
+    words = ["-c", SEVERAL, "inspect -o scan.png, view -o page.html -n 1, export out --format pcd", "走".encode()]
+    cache = {"LIDARGRIT_CACHE": str(tmp_path / "cache")}
+    code, told = python(words, tmp_path, cache | ASCII)
+    assert code == 1
+    assert "in a locale without such letters; wanted a locale of UTF-8; set PYTHONUTF8=1" in told
+    the_one_line("\n".join(told.splitlines()[:-1]), "inspect")
+    code, told = python(words, tmp_path, cache | {"LC_ALL": "C"})
+    assert code == 0, told
+    assert (tmp_path / "out" / "straße.pcd").is_file()
+    assert "straße" in json.loads((tmp_path / "out" / "export.json").read_text(encoding="utf-8"))["scans"].values()
+    assert (tmp_path / "page.html").is_file()

@@ -71,7 +71,7 @@ def check_word(word: str) -> str:
     """Return a word of the command line if messages, files and other programs can hold it.
 
     Raises:
-        UsageError: it holds NUL, or is not UTF-8.
+        UsageError: it holds NUL, is not UTF-8, or the locale cannot show it: libraries fail at such text.
     """
     shown = ascii(word if len(word) <= 40 else word[:40] + "...")
     if "\0" in word:
@@ -80,6 +80,8 @@ def check_word(word: str) -> str:
         os.fsencode(word).decode("utf-8")
     except UnicodeError:
         raise UsageError(f"{shown}, which is not UTF-8", "a name in UTF-8", "rename the file") from None
+    if any("\ud800" <= letter <= "\udfff" for letter in word):  # bytes that Python could not decode
+        raise UsageError(f"{shown} in a locale without such letters", "a locale of UTF-8", "set PYTHONUTF8=1")
     return word
 
 
