@@ -13,6 +13,7 @@ EXAMPLES = """\
   lidargrit import-weights r2dm_kitti_360 runs/r2dm r2dm-h-kitti360-300k.pth
   lidargrit import-weights lidargen_kitti_360 runs/lidargen checkpoint.pth
   lidargrit import-weights r2flow_kitti_360 runs/r2flow r2flow-kitti360-1rf.pth
+  lidargrit import-weights ultralidar_kitti_360 runs/ultralidar epoch_200.pth
   lidargrit import-weights dusty_kitti_odometry runs/dusty dusty1.pth
 """
 
