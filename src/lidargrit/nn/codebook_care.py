@@ -54,7 +54,7 @@ class CodebookCare(nn.Module):
         """Take in the latents of a step, and move the codes, in place, if it is time.
 
         Args:
-            codes: codebook.
+            codes: codes of the codebook, changed in place.
             latents: latents of the step, of this process.
             tokens: index of the code that each of them chose.
             rng: source of random numbers.

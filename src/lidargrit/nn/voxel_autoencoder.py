@@ -65,7 +65,7 @@ class VoxelAutoencoder(nn.Module):
     """Encoder, codebook and decoder of voxels.
 
     Args:
-        config: sizes.
+        config: sizes of the networks, and the cells of the voxels.
     """
 
     def __init__(self, config: VoxelAutoencoderConfig) -> None:
