@@ -1,17 +1,22 @@
 """Learning rate, decay, clipping and the sum of the loss: what a silent slip would leave untested."""
 
+import copy
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
 from torch import nn
 
+from lidargrit.errors import ConfigError
 from lidargrit.loading import DataConfig
 from lidargrit.nn.objective import Objective
+from lidargrit.nn.transformer import CausalTransformer, TransformerConfig
 from lidargrit.recipes import load_recipe
 from lidargrit.sources import load_range_images
 from lidargrit.tokenizers.vqvae import Vqvae
 from lidargrit.training import FitConfig
+from lidargrit.training.checkpoint import load_checkpoint, save_checkpoint
 from lidargrit.training.engine import Engine
 from lidargrit.training.optimiser import learning_rate_at, make_optimiser
 
@@ -37,6 +42,64 @@ def test_only_weights_of_linear_layers_decay():
     assert len(decaying) == 1
     assert decaying[0] is module[1].weight
     assert {group["weight_decay"] for group in optimiser.param_groups} == {0.3, 0.0}
+
+
+def small_transformer():
+    torch.manual_seed(0)
+    return CausalTransformer(TransformerConfig(layers=2, heads=2, width=8), num_tokens=5, context_length=4)
+
+
+def muon_step(optimiser, model, seed):
+    tokens = torch.randint(0, 5, (3, 4), generator=torch.Generator().manual_seed(seed))
+    optimiser.zero_grad()
+    model.eval()(tokens).logsumexp(-1).mean().backward()
+    optimiser.step()
+
+
+def test_muon_moves_the_matrices_of_blocks_and_adamw_all_else():
+    ours, theirs = small_transformer(), small_transformer()
+    matrices = [p for name, p in theirs.named_parameters() if name.startswith("blocks.") and p.ndim == 2]
+    others = [p for name, p in theirs.named_parameters() if not (name.startswith("blocks.") and p.ndim == 2)]
+    assert len(matrices) == 12
+    muon = torch.optim.Muon(matrices, lr=0.1, weight_decay=0.3, adjust_lr_fn="match_rms_adamw")
+    head = [p for p in others if p is theirs.head.weight]
+    rest = [p for p in others if p is not theirs.head.weight]
+    groups = [{"params": head, "weight_decay": 0.3}, {"params": rest, "weight_decay": 0.0}]
+    adamw = torch.optim.AdamW(groups, lr=0.1, betas=(0.9, 0.95))
+    together = make_optimiser(ours, config(optimiser="muon", weight_decay=0.3))
+    for seed in range(3):
+        muon_step(together, ours, seed)
+        muon.zero_grad()
+        muon_step(adamw, theirs, seed)
+        muon.step()
+    for (name, got), wanted in zip(ours.named_parameters(), theirs.parameters(), strict=True):
+        assert torch.equal(got, wanted), name
+
+
+def test_muon_goes_on_from_its_checkpoint(tmp_path):
+    whole, cut = small_transformer(), small_transformer()
+    optimiser = make_optimiser(whole, config(optimiser="muon"))
+    first = make_optimiser(cut, config(optimiser="muon"))
+    for seed in range(4):
+        muon_step(optimiser, whole, seed)
+    for seed in range(2):
+        muon_step(first, cut, seed)
+    average = SimpleNamespace(objective=copy.deepcopy(cut))
+    save_checkpoint(tmp_path / "c", cut, average, first, 20, "")
+    resumed = small_transformer()
+    again = make_optimiser(resumed, config(optimiser="muon"))
+    assert load_checkpoint(tmp_path / "c", resumed, average, again, "") == 20
+    for group in again.param_groups:
+        group["lr"] = 0.1  # as the training sets it before every step
+    for seed in (2, 3):
+        muon_step(again, resumed, seed)
+    for got, wanted in zip(resumed.parameters(), whole.parameters(), strict=True):
+        assert torch.equal(got, wanted)
+
+
+def test_muon_is_refused_where_no_block_has_a_matrix():
+    with pytest.raises(ConfigError, match="optimiser=muon"):
+        make_optimiser(nn.Linear(4, 4), config(optimiser="muon"))
 
 
 @pytest.fixture

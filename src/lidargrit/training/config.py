@@ -30,6 +30,9 @@ class FitConfig:
             ``linear_second_half`` stays constant for the first half and falls to 0 over the second, as LidarGRIT's
             program does for its KITTI-360 transformer.
         warmup_scans: number of scans over which the learning rate rises linearly from 0.
+        optimiser: ``adamw``, as in all papers here, or ``muon``: Muon for the linear layers in a transformer's blocks,
+            which makes their updates orthogonal (Jordan et al., 2024), and AdamW for all other weights. A transformer
+            learns more from as many scans with it.
         betas: decay rates of Adam's two moments.
         weight_decay: decay of the weights of linear layers; other weights do not decay, as in LidarGRIT's program.
         gradient_clip: largest norm of the gradient; 0 for no limit.
@@ -54,6 +57,7 @@ class FitConfig:
     learning_rate: float
     schedule: Literal["constant", "cosine", "linear_second_half"] = "constant"
     warmup_scans: int = 0
+    optimiser: Literal["adamw", "muon"] = "adamw"
     betas: tuple[float, float] = (0.9, 0.95)
     weight_decay: float = 0.0
     gradient_clip: float = 1.0

@@ -4,25 +4,83 @@ from __future__ import annotations
 
 import copy
 import math
+from typing import Any
 
 import torch
 from torch import nn
 
+from lidargrit.errors import ConfigError
+from lidargrit.nn.blocks import Block
 from lidargrit.nn.objective import Objective
 from lidargrit.training.config import FitConfig
 
 
-def make_optimiser(objective: nn.Module, config: FitConfig) -> torch.optim.AdamW:
-    """Return AdamW with weight decay for linear layers only: not for biases, norms, convolutions or embeddings."""
-    decaying = {id(module.weight) for module in objective.modules() if isinstance(module, nn.Linear)}
+def make_optimiser(objective: nn.Module, config: FitConfig) -> torch.optim.Optimizer:
+    """Return the optimiser that the configuration names.
+
+    Weights of linear layers decay; biases, norms, convolutions and embeddings do not.
+
+    Raises:
+        ConfigError: Muon is asked for, and no block of the networks has a linear layer.
+    """
     learned = [parameter for parameter in objective.parameters() if parameter.requires_grad]
+    decaying = _ids_of_linear_weights(objective)
+    blocks = [module for module in objective.modules() if isinstance(module, Block)]
+    hidden = set().union(*map(_ids_of_linear_weights, blocks)) if config.optimiser == "muon" else set()
+    matrices = [p for p in learned if id(p) in hidden]
+    others = [p for p in learned if id(p) not in hidden]
     groups = [
-        {"params": [p for p in learned if id(p) in decaying], "weight_decay": config.weight_decay},
-        {"params": [p for p in learned if id(p) not in decaying], "weight_decay": 0.0},
+        {"params": [p for p in others if id(p) in decaying], "weight_decay": config.weight_decay},
+        {"params": [p for p in others if id(p) not in decaying], "weight_decay": 0.0},
     ]
-    return torch.optim.AdamW(
+    adamw = torch.optim.AdamW(
         [group for group in groups if group["params"]], lr=config.learning_rate, betas=config.betas
     )
+    if config.optimiser == "adamw":
+        return adamw
+    if not matrices:
+        raise ConfigError(
+            "optimiser=muon for networks without linear layers in blocks",
+            "a stage with a transformer",
+            "leave the stage's optimiser out: adamw is the default",
+        )
+    muon = torch.optim.Muon(
+        matrices,
+        lr=config.learning_rate,
+        weight_decay=config.weight_decay,
+        adjust_lr_fn="match_rms_adamw",  # so that one learning rate suits both optimisers
+    )
+    return _Together([muon, adamw])
+
+
+def _ids_of_linear_weights(module: nn.Module) -> set[int]:
+    return {id(part.weight) for part in module.modules() if isinstance(part, nn.Linear)}
+
+
+class _Together(torch.optim.Optimizer):
+    """Several optimisers that step as one; their parameter groups and their states are those of this one."""
+
+    def __init__(self, parts: list[torch.optim.Optimizer]) -> None:
+        super().__init__([group for part in parts for group in part.param_groups], {})
+        self._parts = parts
+        self._share()
+
+    def _share(self) -> None:
+        first = 0
+        for part in self._parts:
+            last = first + len(part.param_groups)
+            part.param_groups, part.state, first = self.param_groups[first:last], self.state, last
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Load groups and states, and hand them to the parts."""
+        super().load_state_dict(state_dict)
+        self._share()
+
+    @torch.no_grad()
+    def step(self, closure: None = None) -> None:  # type: ignore[override]
+        """Let every part take its step."""
+        for part in self._parts:
+            part.step()
 
 
 def memory_of_weights(objective: nn.Module) -> int:
