@@ -33,6 +33,9 @@ TINY = [
 COUNTED = ("lidargen_kitti_360", "lidargrit_kitti_360", "r2flow_kitti_360")  # counting takes seconds for each recipe
 
 
+PIXELS = ["training.pixels.scans=2", "model.pixels.mask_width=4", "model.pixels.range_width=4", "model.pixels.blocks=1"]
+
+
 @pytest.fixture(scope="module", autouse=True)
 def _cache(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
@@ -287,8 +290,8 @@ def test_doctor_tells_versions_and_room(typed):
     assert os.environ["LIDARGRIT_CACHE"] in told
 
 
-def test_demo_tells_the_whole_story_and_tells_it_again(tmp_path, typed):
-    words = ("demo", "--out", tmp_path / "demo", "--set", *TINY)
+def test_demo_writes_its_page_and_writes_it_again(tmp_path, typed):
+    words = ("demo", "--out", tmp_path / "demo", "--set", *TINY, *PIXELS)
     assert f"done: look at {tmp_path / 'demo'}" in typed(*words)
     before = contents(tmp_path / "demo")
     for name in (
@@ -313,7 +316,7 @@ def test_demo_tells_the_whole_story_and_tells_it_again(tmp_path, typed):
 def test_demo_on_a_users_own_drives(tmp_path, typed, monkeypatch):
     load("kitti_odometry").write_example(tmp_path / "own scans", 4)
     monkeypatch.chdir(tmp_path)
-    typed("demo", "--data", tmp_path / "own scans", "--set", *TINY[2:])
+    typed("demo", "--data", tmp_path / "own scans", "--set", *TINY[2:], *PIXELS)
     recipe = json.loads((tmp_path / "runs" / "demo-own scans" / "run.json").read_text())["recipe"]
     assert recipe["data"]["train"] == [f"kitti_odometry:{tmp_path / 'own scans'}:00"]
     assert recipe["data"]["val"] == [f"kitti_odometry:{tmp_path / 'own scans'}:08"]
@@ -323,7 +326,7 @@ def test_demo_on_a_users_own_drives(tmp_path, typed, monkeypatch):
 def test_demo_on_one_drive_holds_its_last_scans_out_and_warns(tmp_path, capsys):
     load("kitti_odometry").write_example(tmp_path / "tree", 8)
     words = ["demo", "--data", str(tmp_path / "tree" / "sequences" / "00"), "--out", str(tmp_path / "run")]
-    assert main([*words, "--set", *TINY[2:]]) == 0
+    assert main([*words, "--set", *TINY[2:], *PIXELS]) == 0
     assert "WARNING: the last scans are held out" in capsys.readouterr().err
     recipe = json.loads((tmp_path / "run" / "run.json").read_text())["recipe"]
     assert recipe["data"]["val"][0].endswith("[85%:]")

@@ -11,7 +11,9 @@ import pytest
 from browser import CHROMIUM, Browser
 from lidargrit import demo
 from lidargrit.evaluation.reconstruction import score_reconstruction
+from lidargrit.generators.lidargrit import LidarGrit
 from lidargrit.loading import Provenance, RangeImages
+from lidargrit.nn.pixel_networks import PixelDecoderConfig
 from lidargrit.reporting import Reporter
 from lidargrit.viewer.report_charts import score_chart
 from test_generator_contract import SENSOR, Store, made
@@ -39,6 +41,18 @@ def written(tmp_path_factory, cards) -> Path:
     generator, val = made("lidargrit")[0], RangeImages(SENSOR, [Named()])
     errors = score_reconstruction(generator.get_tokenizer(), val)
     demo.write_results_page(generator, "simulated", val, *cards[:1], errors, cards[1], SECONDS, ("a <fact>",), folder)
+    return folder / "demo.html"
+
+
+@pytest.fixture(scope="module")
+def with_pixel_decoder(tmp_path_factory, cards) -> Path:
+    """Return the page of a model that has a pixel decoder."""
+    folder, plain = tmp_path_factory.mktemp("run"), made("lidargrit")[0]
+    sizes = PixelDecoderConfig(mask_width=4, range_width=4, blocks=1)
+    generator = LidarGrit(replace(plain.config, pixels=sizes), SENSOR).eval()
+    val = RangeImages(SENSOR, [Named()])
+    errors = score_reconstruction(generator.get_tokenizer(), val)
+    demo.write_results_page(generator, "simulated", val, *cards[:1], errors, cards[1], SECONDS, (), folder)
     return folder / "demo.html"
 
 
@@ -70,6 +84,18 @@ def test_the_page_tells_all_of_it_and_fetches_nothing(written, cards):
     shown = [int(number) for number in re.findall(r'text-anchor="middle" style="fill:#\w+">(\d+)</text>', text)]
     assert shown == tokens[1:7].flatten().tolist(), "the middle six of eight rows, as numbers"
     assert text.count('<th scope="row">') == len(cards[1][0].scores) + len(SECONDS)
+
+
+def test_a_pixel_decoder_is_shown_phase_by_phase(written, with_pixel_decoder):
+    plain, text = written.read_text(encoding="utf-8"), with_pixel_decoder.read_text(encoding="utf-8")
+    titles = re.findall(r"<h2>(.*?)</h2>", text)
+    assert [title[:2] for title in titles] == ["1.", "2.", "3.", "4.", "5.", "6.", "7.", "8.", "Wh"]
+    assert "phase by phase" in titles[4]
+    assert "pixel decoder" not in plain
+    numbers = re.findall(r"<figcaption>return mask after (\d+) phases?</figcaption>", text)
+    assert numbers == ["1", "4", "7", "10"]
+    assert len(re.findall(r"<figcaption>after \d+ phases?; \d+% of rays returned</figcaption>", text)) == len(numbers)
+    assert "in 10 phases" in text
 
 
 def test_a_browser_shows_it(written, tmp_path):

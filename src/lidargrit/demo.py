@@ -1,4 +1,4 @@
-"""The main job from end to end: scans → range images → two trained networks → new scans → scores → one page."""
+"""The main job from end to end: scans → range images → trained networks → new scans → scores → one page."""
 
 from __future__ import annotations
 
@@ -20,7 +20,9 @@ from lidargrit.evaluation.reconstruction import ReconstructionErrors, score_reco
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.files import read_json, write_json
 from lidargrit.generators import Generator, load_class
+from lidargrit.generators.lidargrit import LidarGrit
 from lidargrit.loading import DataConfig, Pixels, Provenance, RangeImages
+from lidargrit.nn.pixel_decoder import PixelSampling
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
 from lidargrit.sources import load_range_images, open_source
@@ -47,12 +49,12 @@ def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter
         settings: changed settings of the recipe, as ``--set`` takes them.
         reporter: receiver of progress and messages.
     """
-    recipe = load_recipe("demo")
+    recipe = load_recipe("demo_pixels")
     if data is not None:
         recipe = replace(recipe, data=divided(data, reporter))
     recipe = override(recipe, settings)
     check_folder(folder, recipe)
-    reporter.message("lidargrit demo: about 11 minutes on two cores; stop it at any time, the same command goes on")
+    reporter.message("lidargrit demo: about 14 minutes on two cores; stop it at any time, the same command goes on")
     clock = _Clock(folder / TIMINGS)
     with clock.stage("read the scans and project them" if data else "simulate scans and project them"):
         real = load_range_images(recipe.data.train, recipe.data, reporter)
@@ -122,6 +124,10 @@ def write_results_page(
         tokens = tokenizer.encode(held_out[:1])
         decoded = tokenizer.decode(tokens)
         sampled = tokenizer.sample(tokens, [torch.Generator().manual_seed(0)])
+        by_phases, coarsest_cell = None, 1
+        if isinstance(generator, LidarGrit) and generator.pixels is not None:
+            by_phases = generator.pixels.sample(decoded, [torch.Generator().manual_seed(0)], PixelSampling())
+            coarsest_cell = generator.pixels.config.coarsest_cell
         reconstructed = generator.reconstruct(held_out)
     new = samples.batch(range(min(_SCANS_OF_A_SET, len(samples))))
     seeds = tuple(f"seed {seed}" for seed in range(len(new)))
@@ -131,7 +137,10 @@ def write_results_page(
         ScanSet("new", new, seeds),
     )
     results = errors, *cards, seconds, facts, folder
-    write_demo_page(DemoPage(kind, names[0], held_out[:1], tokens, decoded, sampled, sets, *results), folder / PAGE)
+    write_demo_page(
+        DemoPage(kind, names[0], held_out[:1], tokens, decoded, sampled, by_phases, coarsest_cell, sets, *results),
+        folder / PAGE,
+    )
 
 
 def divided(data: str, reporter: Reporter) -> DataConfig:

@@ -7,7 +7,11 @@ from lidargrit.recipes import compact_pixels, small
 
 RECIPE = replace(
     small.RECIPE,
-    title="LidarGRIT with a pixel decoder, small: 64x256, for two CPU cores and two hours",
+    title="LidarGRIT with a pixel decoder, small: 64x256, for two CPU cores and three hours",
     model=replace(small.RECIPE.model, pixels=PixelDecoderConfig()),
-    training={**small.RECIPE.training, "pixels": compact_pixels.RECIPE.training["pixels"]},
+    training={
+        **small.RECIPE.training,
+        "transformer": compact_pixels.TRANSFORMER,
+        "pixels": compact_pixels.RECIPE.training["pixels"],
+    },
 )

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -37,6 +38,7 @@ main{display:block;max-width:1240px}
 .step>p{max-width:85ch;margin:0 0 .8em}
 .head h2{margin:0;font-size:1rem}
 .three{display:grid;grid-template-columns:repeat(3,1fr);gap:4px 20px}
+.phases{display:grid;grid-template-columns:repeat(4,1fr);gap:4px 14px;margin-bottom:1em}
 .points{min-height:380px}
 @media (min-width:1000px){#panes{grid-template-columns:repeat(3,1fr)}}
 .pixels{fill:var(--soft);stroke:var(--paper);stroke-width:1.5}
@@ -48,7 +50,7 @@ main{display:block;max-width:1240px}
 #panes .about{font-size:.78rem;overflow:hidden;white-space:nowrap;text-overflow:ellipsis}
 figure img{max-height:170px}
 code{overflow-wrap:anywhere}
-@media (max-width:760px){.three{grid-template-columns:1fr}}
+@media (max-width:760px){.three,.phases{grid-template-columns:1fr}}
 """
 
 
@@ -63,6 +65,8 @@ class DemoPage:
         tokens: tokens of the scan.
         decoded: ranges and probabilities of a return, decoded from the tokens.
         sampled: range image decoded from the tokens, with a sampled return mask.
+        by_phases: range image that a pixel decoder sampled from the same tokens; None for a model without one.
+        coarsest_cell: distance between the pixels of the pixel decoder's first phase.
         sets: sets of scans to turn side by side.
         errors: errors of reconstruction over all held-out scans.
         card: scores of new scans against training scans.
@@ -79,6 +83,8 @@ class DemoPage:
     tokens: TokenGrid
     decoded: Decoded
     sampled: RangeImage
+    by_phases: RangeImage | None
+    coarsest_cell: int
     sets: Sequence[ScanSet]
     errors: ReconstructionErrors
     card: Scorecard
@@ -102,7 +108,10 @@ def page(demo: DemoPage) -> str:
     """Return the page as text; names of files and other foreign text are escaped."""
     script = interactive.opening_script()
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    parts = (_lead, _the_scan, _its_tokens, _its_reconstruction, _its_raydrop, _new_scans, _scores, _timings, _next)
+    steps = [_the_scan, _its_tokens, _its_reconstruction, _its_raydrop, _its_phases, _new_scans, _scores, _timings]
+    if demo.by_phases is None:
+        steps.remove(_its_phases)
+    parts = [_lead(demo), *(_step(f"{number}. ", *step(demo)) for number, step in enumerate(steps, 1)), _next(demo)]
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
@@ -112,26 +121,34 @@ def page(demo: DemoPage) -> str:
         f"style-src 'unsafe-inline'; script-src 'sha256-{digest}'\">\n"
         f"<title>lidargrit demo: {escape(demo.name)}</title>\n"
         f"<style>{interactive.style()}{STYLE}{_STYLE}</style>\n</head>\n<body>\n<main>\n"
-        + "\n".join(part(demo) for part in parts)
+        + "\n".join(parts)
         + f'\n</main>\n<script type="application/json" id="scans">{interactive.as_json(demo.sets)}</script>\n'
         f"<script>{script}</script>\n</body>\n</html>\n"
     )
+
+
+class _Step(NamedTuple):
+    """A numbered part of the page: title, text in HTML and what stands below it."""
+
+    title: str
+    text: str
+    body: str
 
 
 def _lead(demo: DemoPage) -> str:
     facts = "".join(f"<li>{escape(fact)}</li>" for fact in demo.facts)
     return (
         "<h1>A LiDAR scan, its tokens, and new scans</h1>\n"
-        '<p class="lead">This page shows what <code>lidargrit demo</code> has just done. Two networks were trained '
-        f"on {demo.kind} LiDAR scans for a few minutes. Together they now generate scans that no sensor recorded. A "
+        '<p class="lead">This page shows what <code>lidargrit demo</code> has just done. The networks were trained '
+        f"on {demo.kind} LiDAR scans for a few minutes. They now generate scans that no sensor recorded. A "
         "model so small, trained for so short a time, is a demonstration and not a good model: its scores cannot be "
         "compared with published tables.</p>"
         f'<ul class="facts">{facts}</ul>'
     )
 
 
-def _step(title: str, text: str, body: str) -> str:
-    return f'<div class="step"><h2>{escape(title)}</h2><p>{text}</p>{body}</div>'
+def _step(number: str, title: str, text: str, body: str) -> str:
+    return f'<div class="step"><h2>{number}{escape(title)}</h2><p>{text}</p>{body}</div>'
 
 
 def _figure(picture: str, caption: str) -> str:
@@ -144,13 +161,15 @@ def _limits_m(demo: DemoPage) -> tuple[float, float]:
     return near, max(far, 2 * near)
 
 
-def _ranges(demo: DemoPage, image: RangeImage, caption: str) -> str:
-    share = float(image.return_mask.float().mean())
-    picture = range_picture(image.range_m[0].numpy(), image.return_mask[0].numpy(), _limits_m(demo))
-    return _figure(picture, f"{caption}; {share:.0%} of rays returned")
+def _ranges(demo: DemoPage, image: RangeImage, caption: str, every: int = 1) -> str:
+    """Render a range image, or the pixels of every n-th row and column of it."""
+    range_m, returned = image.range_m[0, ::every, ::every].numpy(), image.return_mask[0, ::every, ::every].numpy()
+    return _figure(
+        range_picture(range_m, returned, _limits_m(demo)), f"{caption}; {returned.mean():.0%} of rays returned"
+    )
 
 
-def _the_scan(demo: DemoPage) -> str:
+def _the_scan(demo: DemoPage) -> _Step:
     rows, columns = demo.scan.range_m.shape[1:]
     near, far = _limits_m(demo)
     text = (
@@ -160,10 +179,10 @@ def _the_scan(demo: DemoPage) -> str:
         f"({near:.0f} m) to violet ({far:.0f} m). Grey marks rays without a return: no light came back to the sensor. "
         "The model was not trained on this scan."
     )
-    return _step("1. A scan", text, _ranges(demo, demo.scan, f"{demo.kind} scan {demo.name}"))
+    return _Step("A scan", text, _ranges(demo, demo.scan, f"{demo.kind} scan {demo.name}"))
 
 
-def _its_tokens(demo: DemoPage) -> str:
+def _its_tokens(demo: DemoPage) -> _Step:
     tokens = demo.tokens.tokens[0].numpy()
     colours = _colours(demo)
     top = (tokens.shape[0] - _PIECE[0]) // 2
@@ -177,8 +196,8 @@ def _its_tokens(demo: DemoPage) -> str:
         f"{len(np.unique(tokens))} of the {demo.tokens.num_codes} codes. Each code has its own colour here; the "
         "colours are in the order of the distances that the codes decode to."
     )
-    return _step(
-        "2. Its tokens", text, _grid(colours, rows, columns) + _numbers(tokens[rows, columns], colours[rows, columns])
+    return _Step(
+        "Its tokens", text, _grid(colours, rows, columns) + _numbers(tokens[rows, columns], colours[rows, columns])
     )
 
 
@@ -232,7 +251,7 @@ def _numbers(tokens: Int[np.ndarray, "h w"], colours: Float[np.ndarray, "h w 3"]
     )
 
 
-def _its_reconstruction(demo: DemoPage) -> str:
+def _its_reconstruction(demo: DemoPage) -> _Step:
     clean_m = demo.decoded.range_m[0].numpy()
     every = range_picture(clean_m, np.ones(clean_m.shape, dtype=bool), _limits_m(demo))
     text = (
@@ -240,10 +259,10 @@ def _its_reconstruction(demo: DemoPage) -> str:
         f"no return: a clean range image without holes. Over {demo.errors.num_scans} held-out scans, the mean error of "
         f"the distance is {demo.errors.range_mae_m:.2f} m where the scan has a return."
     )
-    return _step("3. Its reconstruction", text, _figure(every, "decoded range, before any ray is dropped"))
+    return _Step("Its reconstruction", text, _figure(every, "decoded range, before any ray is dropped"))
 
 
-def _its_raydrop(demo: DemoPage) -> str:
+def _its_raydrop(demo: DemoPage) -> _Step:
     likely = demo.decoded.return_logits[0].sigmoid().numpy()
     text = (
         "Real sensors lose rays: dark, wet, shiny or far surfaces send too little light back. For each pixel, the "
@@ -262,22 +281,46 @@ def _its_raydrop(demo: DemoPage) -> str:
         )
     )
     both = _ranges(demo, demo.sampled, "decoded range with the sampled return mask: a complete scan")
-    return _step("4. Its raydrop", text, f'<div class="three">{pictures}</div>{both}')
+    return _Step("Its raydrop", text, f'<div class="three">{pictures}</div>{both}')
 
 
-def _new_scans(demo: DemoPage) -> str:
+def _its_phases(demo: DemoPage) -> _Step:
+    whole = demo.by_phases
+    assert whole is not None
+    spacings = [demo.coarsest_cell >> halved for halved in range(demo.coarsest_cell.bit_length())]
+    text = (
+        "So far every ray is dropped by itself and every edge is blurred, because the decoder gives each pixel one "
+        "distance and one probability. A third network, the pixel decoder, samples the pixels of the same tokens in "
+        f"{3 * len(spacings) - 2} phases from coarse to fine: first the return mask, then the distances. Each pixel is "
+        "sampled given all pixels of the phases before it. So dropped rays cluster as real ones do, and a point at an "
+        "edge lies on the near surface or on the far one, not between them."
+    )
+    masks, ranges = [], []
+    for halved, spacing in enumerate(spacings):
+        after = f"after {3 * halved + 1} phase" + ("s" if halved else "")
+        mask = whole.return_mask[0, ::spacing, ::spacing].float().numpy()
+        masks.append(_figure(rate_picture(mask), f"return mask {after}"))
+        ranges.append(_ranges(demo, whole, after, spacing))
+    before_and_after = (
+        _ranges(demo, demo.scan, "the scan itself")
+        + _ranges(demo, demo.sampled, "its tokens, without the pixel decoder")
+        + _ranges(demo, whole, "its tokens, with the pixel decoder")
+    )
+    grid = f'<div class="phases">{"".join(masks)}{"".join(ranges)}</div>'
+    return _Step("Its pixels, phase by phase", text, f'{grid}<div class="three">{before_and_after}</div>')
+
+
+def _new_scans(demo: DemoPage) -> _Step:
     text = (
         "The second network, a transformer, samples new tokens one after another, each from probabilities that depend "
-        "on the tokens before it. The decoder turns them into new scans, in the set called <i>new</i>. Drag to turn "
+        "on the tokens before it. The decoders turn them into new scans, in the set called <i>new</i>. Drag to turn "
         "the points, use the wheel to zoom, and step through the scans with the arrows."
     )
     buttons = button("bin", ".bin") + button("ply", ".ply")
-    return _step(
-        "5. New scans", text, interactive.viewer_html("", f"Save {buttons}", f"Made by lidargrit {__version__}.")
-    )
+    return _Step("New scans", text, interactive.viewer_html("", f"Save {buttons}", f"Made by lidargrit {__version__}."))
 
 
-def _scores(demo: DemoPage) -> str:
+def _scores(demo: DemoPage) -> _Step:
     real_scores, pixel_scores = (
         {(score.result.metric, score.result.variant): score.result.value for score in card.scores}
         for card in (demo.real_against_real, demo.pixel_statistics)
@@ -306,17 +349,17 @@ def _scores(demo: DemoPage) -> str:
     )
     heads = ("metric", "real against real", "this model", "pixel statistics", "chart, from 0")
     head = "".join(f'<th scope="col">{name}</th>' for name in heads)
-    return _step(
-        "6. Scores of the new scans",
+    return _Step(
+        "Scores of the new scans",
         text,
         '<div class="wide" tabindex="0" role="region" aria-label="scores"><table><thead><tr>'
         f"{head}</tr></thead><tbody>{''.join(rows)}</tbody></table></div>",
     )
 
 
-def _timings(demo: DemoPage) -> str:
+def _timings(demo: DemoPage) -> _Step:
     text = "The time of each stage on the machine that made this page."
-    return _step("7. How long it took", text, bar_chart(demo.seconds, "s"))
+    return _Step("How long it took", text, bar_chart(demo.seconds, "s"))
 
 
 def _next(demo: DemoPage) -> str:
@@ -330,4 +373,4 @@ def _next(demo: DemoPage) -> str:
         ("lidargrit train small runs/small", "train for an hour or two instead of minutes, for better scans"),
     )
     items = "".join(f"<li><code>{command}</code>: {purpose}</li>" for command, purpose in commands)
-    return _step("What to do next", "", f"<ul>{items}</ul>")
+    return _step("", "What to do next", "", f"<ul>{items}</ul>")
