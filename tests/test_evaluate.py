@@ -286,19 +286,7 @@ def test_the_command_line_writes_scores_page_and_table(tmp_path, capsys, sets):
     files = ["--json", str(tmp_path / "s.json"), "--report", str(tmp_path / "s.html")]
     assert main([*words, *files]) == 0
     head, *rows = capsys.readouterr().out.splitlines()
-    assert head.split() == [
-        "metric",
-        "variant",
-        "score",
-        "95",
-        "%",
-        "interval",
-        "real",
-        "against",
-        "real",
-        "better",
-        "scans",
-    ]
+    assert " ".join(head.split()) == "metric variant score 95 % interval real against real better scans"
     assert len(rows) == 2
     assert (tmp_path / "s.html").read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
     assert main(["evaluate", "--tables", str(tmp_path / "s.json"), "--format", "latex"]) == 0

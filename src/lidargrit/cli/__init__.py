@@ -17,7 +17,7 @@ from lidargrit.errors import LidarGritError, Terminated, UsageError
 
 _EXAMPLES = """\
 examples:
-  lidargrit demo                                    the whole story in minutes, no data needed
+  lidargrit demo                                    everything once, in minutes; no data needed
   lidargrit demo --data /data/kitti_odometry        the same on your own scans
   lidargrit train small runs/mine --set data.train=/data/scans data.val=/data/held_out
   lidargrit sample runs/mine samples -n 100
