@@ -12,6 +12,7 @@ EXAMPLES = """\
       --set data.projection_variant=reference data.columns=2048 data.column_stride=2
   lidargrit import-weights r2dm_kitti_360 runs/r2dm r2dm-h-kitti360-300k.pth
   lidargrit import-weights lidargen_kitti_360 runs/lidargen checkpoint.pth
+  lidargrit import-weights lidargan_kitti_odometry runs/lidargan gen_999.pth
   lidargrit import-weights r2flow_kitti_360 runs/r2flow r2flow-kitti360-1rf.pth
   lidargrit import-weights ultralidar_kitti_360 runs/ultralidar epoch_200.pth
   lidargrit import-weights dusty_kitti_odometry runs/dusty dusty1.pth

@@ -14,7 +14,7 @@ from lidargrit.errors import ConfigError, LidarGritError, nearest_names
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.pairs import EvalPair, pair_for_protocol
 from lidargrit.evaluation.protocols import DEFAULT, MetricChoice, load_protocol, public_name
-from lidargrit.evaluation.scorecard import LeftOut, Score, Scorecard
+from lidargrit.evaluation.scorecard import NOT_APPLICABLE, LeftOut, Score, Scorecard
 from lidargrit.evaluation.scoring import MetricFactory, score_metrics
 from lidargrit.loading import DataConfig
 from lidargrit.metrics import load_metric
@@ -145,7 +145,7 @@ def compare_pair(pair: EvalPair, settings: EvalConfig, reporter: Reporter | None
         LidarGritError: not one metric could be computed; the reason of the first.
     """
     reporter, protocol = reporter or Reporter(), load_protocol(settings.protocol)
-    wanted = settings.chosen_metrics()
+    wanted, not_applicable = _applicable(settings.chosen_metrics(), pair)
     factories = [_factory(choice, settings, reporter) for choice in wanted]
     found = score_metrics(factories, pair, settings.resampling, reporter)
     scores = [score for score in found if isinstance(score, Score)]
@@ -171,7 +171,7 @@ def compare_pair(pair: EvalPair, settings: EvalConfig, reporter: Reporter | None
         pair.samples.facts(),
         pair.reference.facts(),
         tuple(scores),
-        tuple(left_out),
+        (*left_out, *not_applicable),
         pair.deviations,
         tuple(warnings),
         settings.facts(),
@@ -181,6 +181,20 @@ def compare_pair(pair: EvalPair, settings: EvalConfig, reporter: Reporter | None
             **{name: metadata.version(name) for name in ("torch", "numpy", "scipy")},
         },
     )
+
+
+def _applicable(wanted: Sequence[MetricChoice], pair: EvalPair) -> tuple[list[MetricChoice], list[LeftOut]]:
+    """Return the metrics that apply to two sets, and the others, which measure the raydrop of a set that has none."""
+    why = pair.without_raydrop()
+    kept: list[MetricChoice] = []
+    others: list[LeftOut] = []
+    for choice in wanted:
+        cls = load_metric(choice.metric) if choice.metric in _discovery.names("metrics") else None
+        if why and cls is not None and cls.measures_raydrop:
+            others.append(LeftOut(choice.metric, choice.variant or cls.variants[0], why, NOT_APPLICABLE))
+        else:
+            kept.append(choice)
+    return kept, others
 
 
 def _require_known(variant: str, wanted: Sequence[MetricChoice]) -> None:

@@ -14,7 +14,8 @@ from lidargrit.evaluation.protocols import Protocol
 from lidargrit.evaluation.scorecard import SetFacts
 from lidargrit.loading import DataConfig, RangeImages
 from lidargrit.reporting import Reporter
-from lidargrit.sources import Source, overlap
+from lidargrit.sources import SampleSource, Source, overlap
+from lidargrit.sources.samples import full_rows_of
 from lidargrit.structures import RangeImage
 
 _BATCH = 16
@@ -33,6 +34,7 @@ class EvalSet:
         split: part of the data set.
         projection_variant: variant by which scans became images; "" where it is not known.
         weights_sha256: hash of the weights that generated the images; "" where there are none, or it is not known.
+        full_rows: rows in which every ray returns, with none in the others; None where rays may drop.
     """
 
     source: str
@@ -43,6 +45,7 @@ class EvalSet:
     split: str = ""
     projection_variant: str = ""
     weights_sha256: str = ""
+    full_rows: range | None = None
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -104,6 +107,16 @@ class EvalPair:
     deviations: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
+    def without_raydrop(self) -> str:
+        """Say in a sentence which set has no raydrop, to which metrics of raydrop do not apply; "" if both have it."""
+        for side in (self.samples, self.reference):
+            if (rows := side.full_rows) is not None:
+                return (
+                    f"{side.source} has no raydrop: its generator fills rows {rows.start} to {rows.stop - 1} of "
+                    f"{side.images.sensor.height} with returns, and none of the others"
+                )
+        return ""
+
 
 def pair_for_protocol(
     samples: Source, reference: Source, protocol: Protocol, config: DataConfig, reporter: Reporter | None = None
@@ -137,6 +150,7 @@ def pair_for_protocol(
             source.split,
             source.projection_variant(config),
             source.weights_sha256(),
+            full_rows_of(source.folder) if isinstance(source, SampleSource) else None,
         )
         for source, images in ((samples, first), (reference, second))
     ]
@@ -169,6 +183,8 @@ def _warnings(pair: EvalPair, shared: str) -> tuple[str, ...]:
     """Say what flatters the scores of two sets, or makes them measure something else."""
     found = []
     first, second = pair.samples, pair.reference
+    if told := pair.without_raydrop():
+        found.append(f"{told}; metrics of pixels and points count the empty rows as missing")
     if shared:
         found.append(f"{first.source} and the reference overlap ({shared}): the scores flatter it")
     theirs, ours = first.projection_variant, second.projection_variant

@@ -12,6 +12,8 @@ from lidargrit.evaluation.intervals import Interval, RealAgainstReal
 from lidargrit.files import read_json
 from lidargrit.structures import MetricResult
 
+LEFT_OUT, NOT_APPLICABLE = "left out", "not applicable"
+
 
 @dataclass(frozen=True)
 class Score:
@@ -40,11 +42,13 @@ class LeftOut:
         metric: name of the metric.
         variant: variant of the metric.
         why: reason in one line.
+        verdict: words in place of the number: ``left out``, or ``not applicable`` to sets of this kind.
     """
 
     metric: str
     variant: str
     why: str
+    verdict: str = LEFT_OUT
 
 
 @dataclass(frozen=True)
@@ -159,7 +163,7 @@ class Scorecard:
         """Return the scores as lines for a terminal."""
         cells = [("metric", "variant", "score", "95 % interval", "real against real", "better", "scans")]
         cells += [_row(score) for score in self.scores]
-        cells += [(each.metric, each.variant or "-", "left out", *[""] * 4) for each in self.left_out]
+        cells += [(each.metric, each.variant or "-", each.verdict, *[""] * 4) for each in self.left_out]
         widths = [max(len(row[column]) for row in cells) for column in range(len(cells[0]))]
         lines = [
             "  ".join(
@@ -168,7 +172,7 @@ class Scorecard:
             ).rstrip()
             for row in cells
         ]
-        lines += [f"left out: {each.metric}: {each.why}" for each in self.left_out]
+        lines += [f"{each.verdict}: {each.metric}: {each.why}" for each in self.left_out]
         lines += [f"not the protocol {self.protocol}: {each}" for each in self.deviations]
         return "\n".join(lines)
 

@@ -6,11 +6,12 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
 from lidargrit.errors import DataError
-from lidargrit.evaluation.scorecard import Score, Scorecard, format_value
+from lidargrit.evaluation.scorecard import NOT_APPLICABLE, LeftOut, Score, Scorecard, format_value
 from lidargrit.files import read_json
 
 Format = Literal["text", "markdown", "latex"]
@@ -65,11 +66,13 @@ def read_tables(paths: Sequence[Path], form: Format = "text") -> tuple[str, dict
 
 
 def _measured(cards: Sequence[tuple[str, Scorecard]]) -> Block:
-    columns = list(dict.fromkeys(_column(score) for _, card in cards for score in card.scores))
+    words = [{(each.metric, each.variant): each.verdict for each in _not_applicable(card)} for _, card in cards]
+    scored = (_column(score) for _, card in cards for score in card.scores)
+    columns = list(dict.fromkeys([*scored, *chain.from_iterable(words)]))
     rows, notes = [], []
-    for name, card in cards:
-        scores = {_column(score): score for score in card.scores}
-        rows.append((name, tuple(_cell(scores[column]) if column in scores else "" for column in columns)))
+    for (name, card), told in zip(cards, words, strict=True):
+        cells = told | {_column(score): _cell(score) for score in card.scores}
+        rows.append((name, tuple(cells.get(column, "") for column in columns)))
         notes += [f"{name}: {text}" for text in (*card.deviations, *card.warnings)]
     card = cards[0][1]
     reference_row = {_column(score): score.real_against_real for score in card.scores if score.real_against_real}
@@ -84,6 +87,10 @@ def _measured(cards: Sequence[tuple[str, Scorecard]]) -> Block:
         f"against {card.reference.source} (sha256 {card.reference.sha256[:8]})"
     )
     return Block(title, tuple(columns), tuple(rows), tuple(notes))
+
+
+def _not_applicable(card: Scorecard) -> list[LeftOut]:
+    return [each for each in card.left_out if each.verdict == NOT_APPLICABLE]
 
 
 def _published(cards: Sequence[tuple[str, Scorecard]]) -> list[Block]:

@@ -104,6 +104,11 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         return ()
 
     @property
+    def full_rows(self) -> range | None:
+        """Rows in which every ray returns, none in the others; None for a generator with raydrop."""
+        return None
+
+    @property
     def compute_batch(self) -> int:
         """Number of scans that are computed at once, always.
 

@@ -96,6 +96,8 @@ class Metric(ABC, Generic[Features, Kept]):
     """The published definitions on offer, the default first."""
     needs_weights: ClassVar[str] = ""
     """Name of the pretrained network whose features the metric compares; empty for most."""
+    measures_raydrop: ClassVar[bool] = False
+    """Whether the metric compares which rays return: it does not apply to a generator without raydrop."""
     fewest_images: ClassVar[int] = 2
     """Number of images that each set needs."""
     accumulator: type[Accumulator[Kept]]

@@ -21,6 +21,7 @@ class DropCorrelation(CurveMetric):
     """
 
     title = "How often neighbours of drops drop too"
+    measures_raydrop = True
     axis_label = "lag [pixels; negative: rows]"
     curve_label = "share of drops"
 

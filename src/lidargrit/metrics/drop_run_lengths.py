@@ -20,6 +20,7 @@ class DropRunLengths(CurveMetric):
     """
 
     title = "Lengths of runs of drops along rows"
+    measures_raydrop = True
     axis_label = "length of a run [pixels]"
     curve_label = "share of runs"
 

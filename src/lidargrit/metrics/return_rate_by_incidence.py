@@ -21,6 +21,7 @@ class ReturnRateByIncidence(CurveMetric):
     """
 
     title = "Share of returns against incidence"
+    measures_raydrop = True
     axis_label = "incidence [degrees]"
     curve_label = "share of returns"
 

@@ -30,6 +30,7 @@ class ReturnRatePerRange(CurveMetric):
     """
 
     title = "Share of returns against range"
+    measures_raydrop = True
     axis_label = "range [m]"
     curve_label = "share of returns"
 

@@ -14,6 +14,7 @@ class ReturnRatePerRing(CurveMetric):
     """Compare the share of pixels that return in every row, by the divergence in each row."""
 
     title = "Share of returns in every row"
+    measures_raydrop = True
     axis_label = "row, from the top"
     curve_label = "share of returns"
 

@@ -11,7 +11,7 @@ from typing import Any
 from lidargrit import _discovery
 from lidargrit.datasets import load as load_dataset
 from lidargrit.errors import one_line
-from lidargrit.evaluation.scorecard import Scorecard, format_value
+from lidargrit.evaluation.scorecard import NOT_APPLICABLE, Scorecard, format_value
 from lidargrit.generators import Generator, recipe_settings
 from lidargrit.loading import Provenance
 from lidargrit.sources import data_set_of
@@ -180,6 +180,11 @@ def _scores(card: Scorecard) -> str:
         better = "higher" if result.higher_is_better else "lower"
         cells = (_text(result.metric), _text(result.variant), format_value(result.value), between, real, better)
         lines.append(f"| {' | '.join(cells)} |")
+    lines += [
+        f"| {_text(each.metric)} | {_text(each.variant)} | {NOT_APPLICABLE} | - | - | - |"
+        for each in card.left_out
+        if each.verdict == NOT_APPLICABLE
+    ]
     notes = [f"- not as in the protocol: {_text(_PATH.sub('…', each))}" for each in card.deviations]
     notes += [f"- warning: {_text(_PATH.sub('…', each))}" for each in card.warnings]
     return "\n".join([*lines, "", *notes]).rstrip()

@@ -70,6 +70,8 @@ def write_samples(
     }
     if variant := projection_of(run_folder):
         manifest["projection_variant"] = variant
+    if generator.full_rows is not None:
+        manifest["full_rows"] = [generator.full_rows.start, generator.full_rows.stop]
     _claim(folder, manifest, configuration.to_json(generator.Sampling()))
     if (run_folder / TRAINED_ON_FILE).is_file() and not (folder / TRAINED_ON_FILE).exists():
         write_text(folder / TRAINED_ON_FILE, (run_folder / TRAINED_ON_FILE).read_text(encoding="utf-8"))
@@ -141,6 +143,19 @@ def projection_of(folder: Path) -> str:
     else:
         variant = recipe_settings(about).get("data.projection_variant")
     return variant if isinstance(variant, str) else ""
+
+
+def full_rows_of(folder: Path) -> range | None:
+    """Return the rows in which every ray of the samples returns, with none in the others; None where rays may drop."""
+    manifest = read_json(folder / MANIFEST)
+    rows = manifest.get("full_rows") if isinstance(manifest, dict) else None
+    if rows is None:
+        return None
+    if not (isinstance(rows, list) and len(rows) == 2 and all(type(row) is int for row in rows)):
+        raise CheckpointError(
+            f"{folder / MANIFEST}, whose full_rows are no two rows", "what lidargrit wrote", "restore it"
+        )
+    return range(*rows)
 
 
 def trained_on(folder: Path) -> Provenance:

@@ -13,7 +13,7 @@ from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import without_folders
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
 from lidargrit.evaluation.profiles import HALF_VIEW_M, Match, Profile, matches, profile
-from lidargrit.evaluation.scorecard import Score, Scorecard, SetFacts, format_value
+from lidargrit.evaluation.scorecard import NOT_APPLICABLE, Score, Scorecard, SetFacts, format_value
 from lidargrit.files import write_text
 from lidargrit.metrics import load_metric
 from lidargrit.viewer.report_charts import line_chart, score_chart
@@ -57,7 +57,7 @@ def page(card: Scorecard, pair: EvalPair) -> str:
         _scores(card),
         _matches(found, pair, limits_m),
         _means(both, limits_m),
-        _rings(both),
+        _rings(both, pair.without_raydrop()),
         _densities(both),
         _sheet(pair.samples, limits_m),
         _settings(card),
@@ -110,6 +110,11 @@ def _notes(title: str, lines: Sequence[str], kind: str) -> str:
 
 def _scores(card: Scorecard) -> str:
     rows = "".join(_score_row(score) for score in card.scores)
+    rows += "".join(
+        f'<tr><th scope="row">{_metric(each.metric, each.variant)}</th><td colspan="5">{NOT_APPLICABLE}</td></tr>'
+        for each in card.left_out
+        if each.verdict == NOT_APPLICABLE
+    )
     left_out = "".join(f"<li><b>{escape(each.metric)}</b>: {_escaped(each.why)}</li>" for each in card.left_out)
     return (
         "<section><h2>Scores</h2><p>The dot is the score and the bar its 95 % interval. The upright dashed line is "
@@ -145,13 +150,17 @@ def _score_row(score: Score) -> str:
     result, interval, real = score.result, score.interval, score.real_against_real
     caption = f"{format_value(interval.low)} to {format_value(interval.high)}" if interval else "not known"
     baseline = f"{format_value(real.value)} <small>(n = {real.num_scans:,})</small>" if real else "not known"
-    title = escape(load_metric(result.metric).title)
     return (
-        f'<tr><th scope="row">{title}<br><small>{escape(result.metric)}, {escape(result.variant)}</small></th>'
+        f'<tr><th scope="row">{_metric(result.metric, result.variant)}</th>'
         f'<td class="number">{format_value(result.value)}</td><td class="number">{caption}</td>'
         f'<td class="number">{baseline}</td>'
         f"<td>{score_chart(score)}</td><td>{'higher' if result.higher_is_better else 'lower'}</td></tr>"
     )
+
+
+def _metric(name: str, variant: str) -> str:
+    """Return a metric's title with its name and variant below, for the head of a row."""
+    return f"{escape(load_metric(name).title)}<br><small>{escape(name)}, {escape(variant)}</small>"
 
 
 def _limits_m(pair: EvalPair) -> tuple[float, float]:
@@ -227,7 +236,10 @@ def _means(both: tuple[Profile, Profile], limits_m: tuple[float, float]) -> str:
     return f'<section><h2>Mean images</h2><p>{why}</p><div class="pair">{"".join(figures)}</div></section>'
 
 
-def _rings(both: tuple[Profile, Profile]) -> str:
+def _rings(both: tuple[Profile, Profile], without_raydrop: str) -> str:
+    if without_raydrop:
+        told = f"{NOT_APPLICABLE}: {without_raydrop}"
+        return f"<section><h2>Return rate by ring</h2><p>{_escaped(told[0].upper() + told[1:])}.</p></section>"
     rates = {name: scans.return_rate.mean(axis=1) for name, scans in zip(("samples", "reference"), both, strict=True)}
     count = len(rates["samples"])
     chart = line_chart(rates, "ring, 0 = the highest", "return rate", range(0, count, max(1, count // 8)))

@@ -1,0 +1,27 @@
+"""LidarGAN's autoencoder at a size that two CPU cores can train in minutes, on simulated or on your own scans."""
+
+from lidargrit.generators.lidarvae import LidarVaeConfig
+from lidargrit.loading import DataConfig
+from lidargrit.training import FitConfig, Recipe
+
+RECIPE = Recipe(
+    title="LiDAR-VAE, small: 40 of 64 rows without raydrop, for two CPU cores and an hour",
+    generator="lidarvae",
+    model=LidarVaeConfig(latent_dim=64, channels=32, warmup_scans=20_000),
+    data=DataConfig(train=("simulated:2000:train",), val=("simulated:32:val",)),
+    training={
+        "autoencoder": FitConfig(
+            scans=60_000,
+            batch_size=16,
+            learning_rate=1e-3,
+            schedule="cosine",
+            betas=(0.9, 0.999),
+            gradient_clip=0.0,
+            augmentations=("flip",),
+            any_columns=True,
+            average_over_scans=1000,
+            validate_every=4000,
+            checkpoint_every=4000,
+        )
+    },
+)

@@ -1,0 +1,84 @@
+"""Weights of LidarGAN and its VAE in the layout of the authors' files: read as tensors only, or refused."""
+
+import pytest
+import torch
+
+import lidargrit
+from lidargrit.cli import main
+from lidargrit.errors import CheckpointError
+from lidargrit.generators.lidargan import LidarGan
+from lidargrit.generators.lidarvae import LidarVae
+from lidargrit.sensors import load_sensor
+
+
+def checkpoint(cls):
+    """Return what the program saves; programs of its time kept no counters of batches."""
+    rng = torch.Generator().manual_seed(5)
+    generator = cls(cls.Config(latent_dim=5, channels=2), load_sensor("hdl64e_kitti_odometry"))
+    part = (
+        generator.decoder
+        if cls is LidarGan
+        else torch.nn.ModuleDict({"encode": generator.encode, "decode": generator.decode})
+    )
+    return {
+        name: torch.rand(of.shape, generator=rng) for name, of in part.state_dict().items() if of.dtype == torch.float32
+    }
+
+
+@pytest.mark.parametrize(
+    ("cls", "recipe"), [(LidarGan, "lidargan_kitti_odometry"), (LidarVae, "lidarvae_kitti_odometry")]
+)
+def test_a_checkpoint_of_the_program_becomes_a_run(cls, recipe, tmp_path):
+    saved = checkpoint(cls)
+    torch.save(saved, tmp_path / "gen_999.pth", _use_new_zipfile_serialization=False)
+    assert main(["import-weights", recipe, str(tmp_path / "run"), str(tmp_path / "gen_999.pth")]) == 0
+    generator = lidargrit.load(tmp_path / "run")
+    assert (generator.config.latent_dim, generator.config.channels) == (5, 2)
+    assert generator.sensor.width == 256
+    weights = (generator.decoder if cls is LidarGan else generator).state_dict()
+    assert all(torch.equal(weights[name], of) for name, of in saved.items())
+    assert float(generator.image.scale_m) == pytest.approx(41.1245)
+    assert bool(generator.sample([0]).return_mask[0, 17:57].all())
+
+
+@pytest.mark.parametrize(
+    ("cls", "change", "told"),
+    [
+        (LidarGan, lambda c: c.pop("main.12.weight"), "holds no generator of LidarGAN"),
+        (LidarGan, lambda c: c.update({"main.12.weight": torch.ones(2, 3, 4, 4)}), "generates 3 coordinates"),
+        (
+            LidarGan,
+            lambda c: c.update({"main.0.weight": torch.ones(5, 16, 2, 32)}),
+            r"'main\.0\.weight' is \(5, 16, 2, 32\)",
+        ),
+        (LidarGan, lambda c: c.pop("main.1.bias"), r"lacks 'main\.1\.bias'"),
+        (LidarVae, lambda c: c.pop("encode.main.0.weight"), "holds no autoencoder"),
+        (LidarVae, lambda c: c.update({"encode.main.0.weight": torch.ones(2, 3, 4, 4)}), "encodes 3 coordinates"),
+        (LidarVae, lambda c: c.update({"more": torch.ones(1)}), "has besides 'more'"),
+        (LidarVae, lambda c: c.update({"encode.out.weight": torch.ones(1).half()}), "is no float32 tensor"),
+    ],
+)
+def test_checkpoints_of_another_form_are_refused(cls, change, told, tmp_path):
+    saved, path = checkpoint(cls), tmp_path / "gen_999.pth"
+    change(saved)
+    torch.save(saved, path)
+    with pytest.raises(CheckpointError, match=told):
+        cls.from_published([path], cls.Config(), load_sensor("hdl64e_kitti_odometry"))
+
+
+@pytest.mark.parametrize("recipe", ["lidargan_kitti_odometry", "lidarvae_kitti_odometry"])
+def test_code_in_a_checkpoint_is_never_run_and_cut_ones_write_nothing(recipe, tmp_path, capsys):
+    class Bomb:
+        def __reduce__(self):
+            return (open, (str(tmp_path / "ran"), "w"))
+
+    path, out = tmp_path / "gen_999.pth", tmp_path / "run"
+    torch.save({"main.0.weight": Bomb()}, path)
+    assert main(["import-weights", recipe, str(out), str(path)]) == 2
+    assert "which does not hold tensors only" in capsys.readouterr().err
+    torch.save(checkpoint(LidarGan), path)
+    path.write_bytes(path.read_bytes()[:-2000])
+    assert main(["import-weights", recipe, str(out), str(path)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not (tmp_path / "ran").exists()
+    assert not out.exists()
