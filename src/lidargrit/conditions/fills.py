@@ -56,9 +56,10 @@ class Observed:
             return rows, columns
         thrice = np.tile(~wanted, (1, 3))  # so that the circle closes
         steps = (np.abs(np.diff(self.elevation_rad)).mean() if height > 1 else 1.0, 2 * np.pi / width)
-        rows, columns = distance_transform_edt(thrice, steps, return_distances=False, return_indices=True)
-        middle = slice(width, 2 * width)
-        return rows[:, middle].astype(np.int64), columns[:, middle].astype(np.int64) % width
+        nearest = np.empty((2, height, 3 * width), dtype=np.int32)
+        distance_transform_edt(thrice, steps, return_distances=False, return_indices=True, indices=nearest)
+        rows, columns = nearest[:, :, width : 2 * width].astype(np.int64)
+        return rows, columns % width
 
     def nearest_range_m(self) -> Float64[np.ndarray, "H W"]:
         """Return for every pixel the range of the nearest return by angle."""

@@ -17,7 +17,7 @@ class BatchSeeds(Sequence[int]):
     """
 
     def __init__(self, asked_for: Sequence[int], size: int) -> None:
-        self._seeds = (*asked_for, *asked_for[-1:] * (size - len(asked_for)))
+        self._seeds = (*asked_for, *[asked_for[-1]] * (size - len(asked_for)))
         self.num_asked_for = len(asked_for)
 
     def __len__(self) -> int:

@@ -122,7 +122,9 @@ def _flops_per_scan(objective: Objective, sensor: SensorModel) -> float:
     mode = fake_tensor.FakeTensorMode(allow_non_fake_inputs=True)
     own = chain(objective.named_parameters(), objective.named_buffers())
     # Counters, by which steps differ, keep their values.
-    without_values = {name: mode.from_tensor(tensor) for name, tensor in own if tensor.is_floating_point()}
+    without_values: dict[str, Tensor] = {
+        name: mode.from_tensor(tensor) for name, tensor in own if tensor.is_floating_point()
+    }
     try:
         total = _total_flops(objective, without_values, images, steps)
     except (
