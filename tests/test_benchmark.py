@@ -149,5 +149,5 @@ def test_a_penalty_that_comes_rarely_is_counted_as_rarely():
 
 
 def test_an_a100_takes_days_or_seconds():
-    assert "3.9 days of one A100 at 25%" in gpu_time(1643 * 10**15, "fp32")
-    assert "13 s of one A100" in gpu_time(10**15, "auto")
+    assert "3.9 days on one A100 at 25%" in gpu_time(1643 * 10**15, "fp32")
+    assert "13 s on one A100" in gpu_time(10**15, "auto")

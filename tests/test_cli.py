@@ -127,7 +127,7 @@ def test_dry_run_fails_where_the_training_would_for_lack_of_scans(data, tmp_path
     assert main(["train", "marginal", "none", "--dry-run", "--set", *settings]) == 2
     captured = capsys.readouterr()
     assert "data.columns = " in captured.out, "the plan is told all the same"
-    assert the_one_line(captured.err, "train").startswith("lidargrit train: got gone/scans, which is not a folder; ")
+    assert the_one_line(captured.err, "train").startswith("lidargrit train: got gone/scans, which does not exist; ")
     assert not list(tmp_path.iterdir())
 
 

@@ -78,7 +78,7 @@ def test_pcd_of_absurd_counts(refused, scan, encoding, count):
             b"FIELDS u",
             "whose columns are 'u', 'y', 'z', 'intensity', 'stamp', 'channel'; wanted x",
         ),
-        (b"DATA ", b"ATAD ", "no header that ends with DATA"),
+        (b"DATA ", b"ATAD ", "a header that does not end with DATA"),
         (b"DATA binary_compressed", b"DATA zip", "bytes of DATA 'zip'"),
     ],
 )

@@ -79,8 +79,8 @@ def test_kitti_rows_are_kept_in_their_order(file):
         (b"", "got an empty file, .*; wanted float32 rows x, y, z, reflectance, 16 bytes a point; download it again"),
         (bytes(33), "got 33 bytes in .*, 1 more than whole points; .*; download it again: the file was cut short"),
         (bytes(20), "got 20 bytes in .*, 4 more than .*; if its rows have 5 columns, as nuScenes writes them"),
-        (with_cell(1, 0, np.nan), "got 1 of 3 points NaN or infinite coordinates in .*bad_points=drop"),
-        (with_cell(1, 2, np.inf), "got 1 of 3 points NaN or infinite coordinates in .*bad_points=drop"),
+        (with_cell(1, 0, np.nan), "got 1 of 3 points with NaN or infinite coordinates in .*bad_points=drop"),
+        (with_cell(1, 2, np.inf), "got 1 of 3 points with NaN or infinite coordinates in .*bad_points=drop"),
         (with_cell(1, slice(0, 3), 0), "got 1 of 3 points at the origin .* in .*bad_points=drop"),
         (with_cell(1, 3, 200), "got reflectance from 0.5 to 200 in .*; wanted values in .*divide an intensity"),
         (with_cell(1, 3, np.nan), "got reflectance from nan to nan in "),
@@ -272,7 +272,7 @@ def test_rows_that_are_nan_are_placeholders_of_ordered_clouds(file, scan):
     head = "# made by hand\nVERSION 0.6\nFIELDS x y z intensity ring\nSIZE 4 4 4 4 2\nTYPE F F F F U\n"
     head += f"WIDTH {len(rows) // 2}\nHEIGHT 2\nPOINTS {len(rows)}\nDATA ascii\n"
     path = file((head + text).encode(), "ordered.pcd")
-    assert "points NaN or infinite coordinates in" in refusal(path)
+    assert "points with NaN or infinite coordinates in" in refusal(path)
     got, kept = read_scan(path, bad_points="drop"), np.flatnonzero(np.isfinite(rows).all(axis=1))
     assert torch.allclose(got.points_xyz_m, scan.points_xyz_m[kept])
     assert torch.equal(got.ring, scan.ring[kept])

@@ -259,7 +259,7 @@ def test_colours_are_chosen_and_explained(opened):
     ring = seen["ring"][:, :, 0].astype(int)
     assert np.median(np.abs(np.diff(ring, axis=1))) == 0, "a row has one colour"
     assert opened.run("document.querySelector('#mode').value") == "label"
-    assert opened.run("document.querySelector('#legend').textContent") == "roadbuildingnothing came back"
+    assert opened.run("document.querySelector('#legend').textContent") == "roadbuildingno return"
     assert words(opened, "missing") == ["", "No label is known here."]
 
 

@@ -56,7 +56,7 @@ class Scan:
         # Point by point takes twenty times as long as over all coordinates at once, and is seldom needed.
         low, high = self.points_xyz_m.aminmax()  # NaN where any is: no comparison holds
         if not (bool(low > -torch.inf) and bool(high < torch.inf)):
-            self._refuse(~self.points_xyz_m.isfinite().all(dim=1), "NaN or infinite coordinates")
+            self._refuse(~self.points_xyz_m.isfinite().all(dim=1), "with NaN or infinite coordinates")
         if self.points_xyz_m.count_nonzero() < self.points_xyz_m.numel():
             self._refuse((self.points_xyz_m == 0).all(dim=1), "at the origin (placeholders for no return)")
         if self.reflectance is not None:

@@ -27,8 +27,8 @@ def changed(rows: np.ndarray, name: str) -> bytes:
 DAMAGE = {
     "cut short": r"got \d+ bytes in .*BAD.*, 13 more than whole points; wanted .*16 bytes a point; download it again",
     "empty": r"got an empty file, .*BAD.*; wanted float32 rows .*; download it again, or remove it",
-    "NaN": r"got 1 of \d+ points NaN or infinite coordinates in .*BAD.*; --?.*|.*bad_points=drop",
-    "infinite": r"got 2 of \d+ points NaN or infinite coordinates in .*BAD.*; .*--set data\.bad_points=drop",
+    "NaN": r"got 1 of \d+ points with NaN or infinite coordinates in .*BAD.*; --?.*|.*bad_points=drop",
+    "infinite": r"got 2 of \d+ points with NaN or infinite coordinates in .*BAD.*; .*--set data\.bad_points=drop",
     "origin": r"got 1 of \d+ points at the origin .* in .*BAD.*; .*--set data\.bad_points=drop",
     "reflectance": r"got reflectance from 0 to \d+.* in .*BAD.*; wanted values in \[0, 1\]; .*divide",
 }
@@ -103,7 +103,7 @@ def test_a_folder_with_no_scan_in_it(refused, tmp_path):
     (tmp_path / "empty").mkdir()
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "notes.txt").write_text("no scan")
-    for folder, what in (("empty", "is an empty folder"), ("other", "holds"), ("none", "is not a folder")):
+    for folder, what in (("empty", "is an empty folder"), ("other", "holds"), ("none", "does not exist")):
         place = tmp_path / folder
         for words in (
             [*train_words(tmp_path / "run"), f"data.train=[{place}]"],

@@ -41,4 +41,4 @@ def run(options: argparse.Namespace) -> None:
 
     config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)
     count = export_scans(options.source, options.out, options.format, config, TerminalReporter())
-    print(f"done: {count} scans in {options.out}; which is which is told by export.json")
+    print(f"done: {count} scans in {options.out}; export.json says which file holds which scan")

@@ -215,7 +215,7 @@ def _doubts(pair: EvalPair, scores: Sequence[Score], resampling: Resampling) -> 
     found = []
     count = len(pair.samples)
     if count < _FEW:
-        found.append(f"{count} scans of each set: too few to tell from real against real, and intervals rest on little")
+        found.append(f"{count} scans in each set: too few for reliable scores and intervals")
     if resampling.halves and any(score.interval is None for score in scores):
         without = [score.result.metric for score in scores if score.interval is None]
         found.append(f"too few scans for the intervals of {', '.join(dict.fromkeys(without))}")

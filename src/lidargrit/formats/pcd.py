@@ -156,7 +156,7 @@ def _entries(data: bytes, path: Path) -> tuple[dict[str, list[str]], int]:
     while "DATA" not in words:
         start, end = end, data.find(b"\n", end, _HEADER_BYTES_AT_MOST) + 1
         if not end:
-            raise _refused("no header that ends with DATA", path)
+            raise _refused("a header that does not end with DATA", path)
         key, *values = data[start:end].decode("latin1").split() or ["#"]
         if not key.startswith("#"):
             words[key.upper()] = values

@@ -23,6 +23,7 @@ from lidargrit.nn.unet import UnetConfig
 
 _BYTES_AT_MOST = 1 << 30  # the published files, with optimiser and average, take half a gigabyte
 _WANTED = "a checkpoint of R2DM's authors or of their train.py"
+_CURE = "check which program saved it, or download it from kazuto1011/r2dm, release 'weights'"
 _PREFIXES = ("denoiser", "model")
 _CONSTANTS = ("scale", "kernel", "freqs", "phase")  # buffers that lidargrit.nn.unet builds by itself
 _KNOWN_FORM: dict[str, Any] = {
@@ -73,7 +74,7 @@ def read_r2dm_checkpoint(path: Path) -> R2dmCheckpoint:
     try:
         file = read_everything(path, _BYTES_AT_MOST)
         if not isinstance(file, dict):
-            raise RefusedFileError("a file without names")
+            raise RefusedFileError("which holds no values by name")
         settings = _Settings(file["cfg"])
         for name, known in _KNOWN_FORM.items():
             if name in settings and settings[name] != known:
@@ -98,12 +99,14 @@ def read_r2dm_checkpoint(path: Path) -> R2dmCheckpoint:
         raise CheckpointError(f"{path}, in which {error.got}", error.wanted, "check which program saved it") from None
     except CheckpointError:
         raise
-    except (OSError, KeyError, TypeError, ValueError, AttributeError, RefusedFileError) as error:
+    except RefusedFileError as why:
+        raise CheckpointError(f"{path}, {why}", _WANTED, _CURE) from None
+    except (OSError, KeyError, TypeError, ValueError, AttributeError) as error:
         told = str(error).partition("\n")[0][:100]
         raise CheckpointError(
             f"{path}, which cannot be read ({type(error).__name__}: {told})",
             _WANTED,
-            "check which program saved it, or download it from kazuto1011/r2dm, release 'weights'",
+            _CURE,
         ) from None
     _check_sizes(path, unet, weights)
     return R2dmCheckpoint(unet, reflectance, weights)

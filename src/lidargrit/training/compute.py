@@ -60,7 +60,7 @@ def gpu_time(flops: int, precision: Precision) -> str:
     """
     kind, peak = ("fp32", _A100_FP32_FLOPS_PER_S) if precision == "fp32" else ("bf16", _A100_BF16_FLOPS_PER_S)
     return (
-        f"{flops:.2e} floating-point operations, by estimate {duration(flops / (_SHARE * peak))} of one A100 "
+        f"{flops:.2e} floating-point operations, by estimate {duration(flops / (_SHARE * peak))} on one A100 "
         f"at {_SHARE:.0%} of its {peak / 1e12:g} TFLOP/s in {kind}"
     )
 

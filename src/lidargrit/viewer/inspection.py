@@ -27,7 +27,7 @@ _COLOURS = {
     "hidden": "#d7191c",
     "kept": "#1a9641",
 }
-_DOTS_AT_MOST = 20_000  # of one fate in a view; more hide one another and take seconds to plot
+_DOTS_AT_MOST = 20_000  # of one kind in a view; more hide one another and take seconds to plot
 
 
 def plot_inspection(inspection: Inspection, path: Path) -> None:
@@ -76,8 +76,8 @@ def _plot_collisions(figure: Figure, axes: Axes, inspection: Inspection) -> None
     bar = figure.colorbar(plotted, ax=axes, label="points", pad=0.01)
     bar.set_ticks([0.5, 1.5, 2.5, 3.5, 5, 500], labels=["0", "1", "2", "3", "4, 5", "6 ..."])
     hidden = inspection.counts()["hidden"]
-    axes.set_title(f"points per pixel; {hidden} are behind a nearer one of their pixel", loc="left")
-    axes.set(ylabel="row", xlabel="column, from straight behind by the left to straight ahead and the right")
+    axes.set_title(f"points per pixel; {hidden} hidden behind a nearer point of the same pixel", loc="left")
+    axes.set(ylabel="row", xlabel="column: straight behind, left, ahead (in the middle), right, and behind again")
 
 
 def _plot_lost(above: Axes, side: Axes, inspection: Inspection) -> None:
@@ -97,8 +97,8 @@ def _plot_lost(above: Axes, side: Axes, inspection: Inspection) -> None:
     above.plot(0, 0, marker="+", color="black")
     above.set(xlim=(half, -half), ylim=(-half, half), aspect="equal", xlabel="left [m]", ylabel="forward [m]")
     above.set_title("from above", loc="left")
-    side.set(xlim=(0, half), ylim=(low - 0.5, high + 0.5), xlabel="distance from the axis [m]", ylabel="height [m]")
-    side.set_title("from the side, turned about the axis", loc="left")
+    side.set(xlim=(0, half), ylim=(low - 0.5, high + 0.5), xlabel="horizontal distance [m]", ylabel="height [m]")
+    side.set_title("from the side: height over horizontal distance", loc="left")
     side.legend(loc="upper right", fontsize=8)
 
 

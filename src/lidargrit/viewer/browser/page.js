@@ -164,7 +164,7 @@ function legendOf(look) {
       names.set(css(one.colour), [...(names.get(css(one.colour)) ?? []), one.name]);
     }
     const chips = [...names].map(([colour, together]) => chip(colour, together.join(", ")));
-    return [...chips, chip(css(look.noReturn), "nothing came back")];
+    return [...chips, chip(css(look.noReturn), "no return")];
   }
   const ramp = document.createElement("span");
   ramp.className = "ramp";
@@ -176,5 +176,5 @@ function legendOf(look) {
     reflectance: ["weak, 0", "1, strong"],
     ring: ["top row", "bottom row"],
   }[look.mode];
-  return [text(ends[0]), ramp, text(ends[1]), chip(css(look.noReturn), "nothing came back")];
+  return [text(ends[0]), ramp, text(ends[1]), chip(css(look.noReturn), "no return")];
 }

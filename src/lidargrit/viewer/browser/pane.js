@@ -162,7 +162,7 @@ class Pane {
     const { source, scan } = this;
     const facts = scan.label && scan.steps[pixel] ? [this.page.classes[scan.label[pixel]].name] : [];
     if (scan.steps[pixel] === 0) {
-      facts.push("nothing came back");
+      facts.push("no return");
     } else {
       facts.push(`${rangeM(source, scan, pixel).toFixed(2)} m away`, `height ${this.points[4 * pixel + 2].toFixed(2)} m`);
     }
