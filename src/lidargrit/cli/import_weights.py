@@ -15,6 +15,7 @@ EXAMPLES = """\
   lidargrit import-weights lidargan_kitti_odometry runs/lidargan gen_999.pth
   lidargrit import-weights r2flow_kitti_360 runs/r2flow r2flow-kitti360-1rf.pth
   lidargrit import-weights ultralidar_kitti_360 runs/ultralidar epoch_200.pth
+  lidargrit import-weights lidm_kitti_360 runs/lidm model.ckpt
   lidargrit import-weights dusty_kitti_odometry runs/dusty dusty1.pth
 """
 

@@ -18,31 +18,51 @@ Padding = Literal["zero", "wrap"]
 
 
 class Convolution(nn.Conv2d):
-    """A 3x3 convolution that keeps the size; rows are padded with zeros, columns with zeros or around the circle."""
+    """A convolution that keeps the size; rows are padded with zeros, columns with zeros or around the circle.
 
-    def __init__(self, inputs: int, outputs: int, padding: Padding) -> None:
-        super().__init__(inputs, outputs, 3, padding=(1, 0) if padding == "wrap" else 1)
+    Args:
+        inputs: number of channels of the input.
+        outputs: number of channels of the output.
+        padding: values beyond the first and the last column.
+        kernel: odd number of rows, and number of columns, of the kernel. It may be an even number of columns where they
+            wrap; the kernel then reaches one column further to the right than to the left.
+    """
+
+    def __init__(self, inputs: int, outputs: int, padding: Padding, kernel: tuple[int, int] = (3, 3)) -> None:
+        rows, columns = kernel
+        super().__init__(inputs, outputs, kernel, padding=(rows // 2, 0 if padding == "wrap" else columns // 2))
         self.wraps = padding == "wrap"
+        self.left, self.right = (columns - 1) // 2, columns // 2
 
     def forward(self, input: Float[Tensor, "B C H W"]) -> Float[Tensor, "B D H W"]:
         """Convolve."""
+        if not self.wraps:
+            return super().forward(input)
         # Not by F.pad: its circular mode takes several times as long, most of all backwards.
-        return super().forward(torch.cat((input[..., -1:], input, input[..., :1]), dim=-1) if self.wraps else input)
+        first = input.shape[-1] - self.left
+        return super().forward(torch.cat((input[..., first:], input, input[..., : self.right]), dim=-1))
 
 
 class Downsample(nn.Module):
-    """Halve both axes by a 3x3 convolution of stride 2, one row padded below and one column to the right."""
+    """Halve the columns, and perhaps the rows, by a 3x3 convolution; one column is padded to the right.
 
-    def __init__(self, channels: int, padding: Padding) -> None:
+    Args:
+        channels: number of channels of the input and of the output.
+        padding: values beyond the last column; beyond the rows there are zeros.
+        row_stride: 2 to halve the rows, with one row padded below; 1 to keep them, with one above, too.
+    """
+
+    def __init__(self, channels: int, padding: Padding, row_stride: int = 2) -> None:
         super().__init__()
-        self.conv = nn.Conv2d(channels, channels, 3, stride=2)
+        self.conv = nn.Conv2d(channels, channels, 3, stride=(row_stride, 2))
         self.wraps = padding == "wrap"
+        self.above = 2 - row_stride
 
     def forward(self, x: Float[Tensor, "B C H W"]) -> Float[Tensor, "B C h w"]:
-        """Halve the rows and the columns."""
+        """Halve the columns, and the rows if so made."""
         if self.wraps:
-            return self.conv(F.pad(F.pad(x, (0, 1, 0, 0), mode="circular"), (0, 0, 0, 1)))
-        return self.conv(F.pad(x, (0, 1, 0, 1)))
+            return self.conv(F.pad(F.pad(x, (0, 1, 0, 0), mode="circular"), (0, 0, self.above, 1)))
+        return self.conv(F.pad(x, (0, 1, self.above, 1)))
 
 
 class Upsample(nn.Module):
@@ -89,17 +109,26 @@ def group_norm(channels: int) -> nn.GroupNorm:
 class ResidualBlock(Block):
     """Norm, swish, convolution, twice, plus the input (through a 1x1 convolution if the channels change).
 
+    Args:
+        inputs: number of channels of the input.
+        outputs: number of channels of the output.
+        dropout: probability of dropout before the second convolution.
+        padding: values beyond the first and the last column.
+        kernel: rows and columns of both convolutions' kernels.
+
     Source:
         The block of the reference's first stage, hamedhaghighi/LidarGRIT@a3f86e7, without its time embedding.
     """
 
-    def __init__(self, inputs: int, outputs: int, dropout: float, padding: Padding) -> None:
+    def __init__(
+        self, inputs: int, outputs: int, dropout: float, padding: Padding, kernel: tuple[int, int] = (3, 3)
+    ) -> None:
         super().__init__()
         self.norm1 = group_norm(inputs)
-        self.conv1 = Convolution(inputs, outputs, padding)
+        self.conv1 = Convolution(inputs, outputs, padding, kernel)
         self.norm2 = group_norm(outputs)
         self.dropout = nn.Dropout(dropout)
-        self.conv2 = Convolution(outputs, outputs, padding)
+        self.conv2 = Convolution(outputs, outputs, padding, kernel)
         if inputs != outputs:
             self.nin_shortcut = nn.Conv2d(inputs, outputs, 1)
 

@@ -57,16 +57,16 @@ class SeededNoise:
     """Standard normal images, each sampled on the CPU by its own seed: the same on every device and in every batch."""
 
     def __init__(self, seeds: Sequence[int], shape: tuple[int, int, int], device: torch.device) -> None:
-        self._rngs = [torch.Generator().manual_seed(seed) for seed in seeds]
+        self.rngs = [torch.Generator().manual_seed(seed) for seed in seeds]
         self._shape, self._device = shape, device
 
     def __call__(self) -> Float[Tensor, "B C H W"]:
         """Sample the next image of each seed."""
-        return torch.stack([torch.randn(self._shape, generator=rng) for rng in self._rngs]).to(self._device)
+        return torch.stack([torch.randn(self._shape, generator=rng) for rng in self.rngs]).to(self._device)
 
     def uniform(self) -> Float[Tensor, "B C H W"]:
         """Sample the next image of each seed, with values that are uniform in [0, 1)."""
-        return torch.stack([torch.rand(self._shape, generator=rng) for rng in self._rngs]).to(self._device)
+        return torch.stack([torch.rand(self._shape, generator=rng) for rng in self.rngs]).to(self._device)
 
 
 def step_back(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal, NamedTuple
 
 import torch
@@ -90,6 +91,18 @@ class VectorQuantiser(nn.Module):
     def used_share(self) -> float:
         """Return the share of codes that are used often enough not to be dead."""
         return float((self.usage > self._dead_below()).float().mean())
+
+    @torch.no_grad()
+    def spread(self) -> float:
+        """Return the standard deviation of the numbers in codes, each as often as its code is used.
+
+        Before any training, all codes count alike.
+        """
+        codes, share = self.embedding.weight, self.usage / self.usage.sum().clamp(min=1e-9)
+        if not bool(share.any()):
+            share = torch.full_like(share, 1 / len(codes))
+        means = [(share[:, None] * power).sum() / codes.shape[1] for power in (codes, codes.square())]
+        return math.sqrt(float(means[1] - means[0].square()))
 
     @torch.no_grad()
     def _update_codes(self, flat: Tensor, tokens: Tensor, rng: torch.Generator | None) -> None:

@@ -8,13 +8,18 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, TypeVar
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from lidargrit import _discovery
 from lidargrit.configuration import NamedConfig
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.precision import Precision
+from lidargrit.nn.quantiser import VectorQuantiser
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import Decoded, MaskDecoding, RangeImage, TokenGrid
+
+_COLLAPSED_BELOW = 0.05  # perplexity over number of codes; healthy codebooks of ours keep above a half
 
 
 @dataclass(frozen=True)
@@ -84,6 +89,46 @@ class Tokenizer(Objective, Generic[Config]):
     def reconstruct(self, images: RangeImage) -> RangeImage:
         """Return what the tokens keep of a batch of scans, nothing of it at random."""
         return self.decode(self.encode(images)).threshold()
+
+
+class CodebookTokenizer(Tokenizer[Config]):
+    """A tokenizer whose tokens are the codes nearest to continuous latents.
+
+    A generator may sample latents instead of tokens, and have them quantised before they are decoded.
+
+    Attributes:
+        quantize: codebook.
+    """
+
+    quantize: VectorQuantiser
+
+    @abstractmethod
+    def latents(self, images: RangeImage) -> Float[Tensor, "B D h w"]:
+        """Return the continuous latents of a batch, before quantisation."""
+
+    def encode(self, images: RangeImage) -> TokenGrid:
+        """Return the tokens (B, h, w) of a batch."""
+        return self.quantised(self.latents(images).float())
+
+    def quantised(self, latents: Float[Tensor, "B D h w"]) -> TokenGrid:
+        """Return the tokens (B, h, w) of latents."""
+        tokens = self.quantize.nearest(latents.movedim(1, -1).flatten(0, -2))
+        return TokenGrid(tokens.unflatten(0, (len(latents), *latents.shape[2:])), self.num_codes)
+
+    def warnings(self) -> list[str]:
+        """Return a line with the remedy if the codebook has collapsed."""
+        perplexity, used = float(self.quantize.perplexity()), self.quantize.used_share()
+        if perplexity >= _COLLAPSED_BELOW * self.num_codes:
+            return []
+        remedy = (
+            "raise the budget or lower model.tokenizer.num_codes"
+            if self.quantize.restart_dead
+            else "--set model.tokenizer.restart_dead_codes=true model.tokenizer.codebook_loss=ema"
+        )
+        return [
+            f"the codebook has collapsed: {perplexity:.1f} of {self.num_codes} codes in effect, {used:.0%} alive; "
+            f"the remedy: {remedy}"
+        ]
 
 
 def make_tokenizer(config: TokenizerConfig, sensor: SensorModel) -> Tokenizer[Any]:

@@ -31,10 +31,9 @@ from lidargrit.nn.quantiser import CodebookLoss, VectorQuantiser
 from lidargrit.projection import RangeEncoding
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import Decoded, RangeImage, TokenGrid
-from lidargrit.tokenizers import Tokenizer, TokenizerConfig
+from lidargrit.tokenizers import CodebookTokenizer, TokenizerConfig
 
 _LEVELS_AT_MOST = 16  # each further one halves both axes; after these 65,536 columns are two
-_COLLAPSED_BELOW = 0.05  # perplexity over number of codes; healthy codebooks of ours keep above a half
 _NO_RETURN_BELOW = -0.9  # without a raydrop head, an encoded range below this is read as no return (the program's rule)
 
 
@@ -210,7 +209,7 @@ class Decoder(Network):
         return fast
 
 
-class Vqvae(Tokenizer[VqvaeConfig]):
+class Vqvae(CodebookTokenizer[VqvaeConfig]):
     """The adapted VQ-VAE of LidarGRIT.
 
     Args:
@@ -251,12 +250,6 @@ class Vqvae(Tokenizer[VqvaeConfig]):
             raise ConfigError("a single range image", "a batch", "make one with RangeImage.stack([image])")
         encoded = self.range_encoding.encode(images.range_m, images.return_mask)
         return self.quant_conv(self.encoder(encoded[:, None]))
-
-    def encode(self, images: RangeImage) -> TokenGrid:
-        """Return the tokens (B, h, w) of a batch."""
-        z = self.latents(images).float()
-        tokens = self.quantize.nearest(z.movedim(1, -1).flatten(0, -2)).unflatten(0, (len(z), *z.shape[2:]))
-        return TokenGrid(tokens, self.num_codes)
 
     def decode(self, tokens: TokenGrid) -> Decoded:
         """Return clean range, return logits and the last feature maps of a batch of tokens."""
@@ -301,21 +294,6 @@ class Vqvae(Tokenizer[VqvaeConfig]):
             terms["range_mae_m"] = (error_m * mask).sum() / mask.sum().clamp(min=1)
             terms["mask_accuracy"] = ((return_logits >= 0) == mask).float().mean()
         return {"loss": loss, **terms}
-
-    def warnings(self) -> list[str]:
-        """Return a line with the remedy if the codebook has collapsed."""
-        perplexity, used = float(self.quantize.perplexity()), self.quantize.used_share()
-        if perplexity >= _COLLAPSED_BELOW * self.num_codes:
-            return []
-        remedy = (
-            "raise the budget or lower model.tokenizer.num_codes"
-            if self.config.restart_dead_codes
-            else "--set model.tokenizer.restart_dead_codes=true model.tokenizer.codebook_loss=ema"
-        )
-        return [
-            f"the codebook has collapsed: {perplexity:.1f} of {self.num_codes} codes in effect, {used:.0%} alive; "
-            f"the remedy: {remedy}"
-        ]
 
     def _heads(self, raw: Float[Tensor, "B heads H W"]) -> tuple[Float[Tensor, "B H W"], Float[Tensor, "B H W"]]:
         """Return encoded range and return logits of what the decoder's last layer gives."""

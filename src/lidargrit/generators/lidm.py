@@ -1,0 +1,263 @@
+"""LiDM: a diffusion model over the latents of a VQ autoencoder, LiDM's own or LidarGRIT's; seeds → range images."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidargrit.errors import CheckpointError, ConfigError
+from lidargrit.files import load_exactly
+from lidargrit.generators import Cost, Generator, SystemFacts
+from lidargrit.nn import latent_diffusion
+from lidargrit.nn.diffusion import SeededNoise
+from lidargrit.nn.flops import flops_of
+from lidargrit.nn.latent_unet import LatentUnet, LatentUnetConfig
+from lidargrit.nn.objective import Objective
+from lidargrit.nn.published import read_checkpoint
+from lidargrit.sensors import SensorModel
+from lidargrit.structures import MaskDecoding, RangeImage
+from lidargrit.tokenizers import CodebookTokenizer, Tokenizer, TokenizerConfig, make_tokenizer
+from lidargrit.tokenizers.curve_vqvae import CurveVqvaeConfig
+
+_CACHE_BYTES_AT_MOST = 1 << 30  # of latents in memory: 65,000 scans of the small recipe, or 16,000 published ones
+
+_PUBLISHED_BYTES_AT_MOST = 1 << 32  # the authors' file has 3.9 GB, by their README
+_FIRST_STAGE, _RAW, _AVERAGE = "first_stage_model.", "model.diffusion_model.", "model_ema."
+_NOT_READ = (f"{_FIRST_STAGE}loss.*", f"{_AVERAGE}decay", f"{_AVERAGE}num_updates", "cond_stage_model.*", "loss.*")
+
+
+@dataclass(frozen=True)
+class LidmConfig:
+    """The two networks, and the noise between scan and nothing; the defaults are the published ones.
+
+    Args:
+        tokenizer: configuration of a tokenizer with a codebook; ``curve_vqvae`` is LiDM's own, ``vqvae`` LidarGRIT's.
+        denoiser: sizes of the network that removes noise from its latents.
+        beta_first: variance of the noise that the first of 1,000 steps adds.
+        beta_last: variance of the noise that the last step adds.
+        scale_latents: whether latents are divided by the standard deviation of the codebook's numbers before noise is
+            added. LiDM takes its own latents as they are; those of another tokenizer may be of any size.
+    """
+
+    tokenizer: TokenizerConfig = field(default_factory=CurveVqvaeConfig)
+    denoiser: LatentUnetConfig = field(default_factory=LatentUnetConfig)
+    beta_first: float = 0.0015
+    beta_last: float = 0.0195
+    scale_latents: bool = False
+
+    def __post_init__(self) -> None:
+        latent_diffusion.signal_shares(self.beta_first, self.beta_last)
+
+
+@dataclass(frozen=True)
+class LidmSampling:
+    """How latents and returns are sampled.
+
+    Args:
+        steps: number of evaluations of the network; 50 are published.
+        eta: share of each step's noise that is fresh: 1 in the authors' ``sample.py``, 0 for none after the beginning.
+        mask: method by which returns are decided where the tokenizer tells their probability. ``bernoulli`` samples
+            each return, ``threshold`` keeps one that is at least as likely as not. LiDM's tokenizer tells none.
+    """
+
+    steps: int = 50
+    eta: float = 1.0
+    mask: MaskDecoding = "bernoulli"
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.steps <= latent_diffusion.STEPS_AT_MOST:
+            raise ConfigError(f"steps={self.steps}", f"1 to {latent_diffusion.STEPS_AT_MOST}", "50 are published")
+        if not 0 <= self.eta <= 1:
+            raise ConfigError(f"eta={self.eta}", "a share from 0 to 1", "1 is published")
+
+
+class Lidm(Generator[LidmConfig, LidmSampling]):
+    """Samples latents by diffusion, replaces each by its nearest code, and decodes them.
+
+    The tokenizer is trained first, then the denoiser over the frozen tokenizer. The authors' models with conditions
+    (semantic maps, cameras, text) are not here.
+
+    Source:
+        Ran et al., Towards Realistic Scene Generation with LiDAR Diffusion Models, CVPR 2024; numbers from
+        hancyran/LiDAR-Diffusion@8416ddb (MIT).
+    """
+
+    Config = LidmConfig
+    facts = SystemFacts(
+        writes="range and raydrop, the latter as its tokenizer decodes it",
+        paper="Ran et al., Towards Realistic Scene Generation with LiDAR Diffusion Models, CVPR 2024",
+        program="hancyran/LiDAR-Diffusion@8416ddb (MIT)",
+        weights_licence="MIT, as the program",
+    )
+    Sampling = LidmSampling
+    capabilities = frozenset({"tokens", "encode"})
+    published_files = ("first stage and diffusion model",)
+    latent_scale: Tensor
+
+    def __init__(self, config: LidmConfig, sensor: SensorModel) -> None:
+        super().__init__(config, sensor)
+        tokenizer = make_tokenizer(config.tokenizer, sensor)
+        if not isinstance(tokenizer, CodebookTokenizer):
+            raise ConfigError(
+                f"a tokenizer {config.tokenizer.name()!r} for lidm", "one with a codebook", "e.g. curve_vqvae or vqvae"
+            )
+        self.tokenizer = tokenizer
+        self.latent_shape = (tokenizer.quantize.embedding.embedding_dim, *tokenizer.grid_size)
+        self.denoiser = LatentUnet(config.denoiser, self.latent_shape[0], tokenizer.grid_size)
+        self.register_buffer("latent_scale", torch.ones(()))
+
+    @classmethod
+    def smallest_config(cls, sensor: SensorModel) -> LidmConfig:
+        """Return an autoencoder and a U-Net of two levels, 32 channels and one block a level."""
+        tokenizer = CurveVqvaeConfig(32, (1, 1), (2,), 1, code_dim=4, num_codes=32, range_scale=7.0)
+        return LidmConfig(tokenizer, LatentUnetConfig(32, (1, 1), 1, ()))
+
+    @classmethod
+    def quickest_sampling(cls) -> LidmSampling:
+        """Return 2 steps."""
+        return LidmSampling(steps=2)
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """The tokenizer, then the denoiser of its latents."""
+        return ("tokenizer", "denoiser")
+
+    def objective(self, stage: str) -> Objective:
+        """Return the tokenizer itself, or the denoising of its latents."""
+        if stage == "tokenizer":
+            return self.tokenizer
+        if self.config.scale_latents:
+            self.latent_scale.fill_(self.tokenizer.quantize.spread())
+        return LatentDenoising(self.tokenizer, self.denoiser, self.latent_scale, self._shares())
+
+    def load_stage(self, stage: str, objective: Objective) -> None:
+        """Take over a stage's trained weights."""
+        if isinstance(objective, LatentDenoising):
+            self.denoiser.load_state_dict(objective.denoiser.state_dict())
+            self.latent_scale.copy_(objective.latent_scale)
+        else:
+            self.tokenizer.load_state_dict(objective.state_dict())
+
+    def get_tokenizer(self) -> Tokenizer:
+        """Return the tokenizer, from whose codes every sampled scan is decoded."""
+        return self.tokenizer
+
+    def _reconstruct(self, images: RangeImage) -> RangeImage:
+        """Return what the tokens keep of a batch of scans, the mask by threshold."""
+        return self.tokenizer.reconstruct(images)
+
+    def _sample(self, seeds: Sequence[int], sampling: LidmSampling) -> RangeImage:
+        noise = SeededNoise(seeds, self.latent_shape, self.device)
+        latents = latent_diffusion.ddim(self.denoiser, noise, self._shares(), sampling.steps, sampling.eta)
+        return self.tokenizer.sample(self.tokenizer.quantised(latents * self.latent_scale), noise.rngs, sampling.mask)
+
+    def cost(self, sampling: LidmSampling | None = None) -> Cost:
+        """Return the denoiser's passes, one a step, and one of the decoder."""
+        steps = (sampling or LidmSampling()).steps
+        flops = steps * flops_of(self.denoiser, (1, *self.latent_shape), (1,)) + self.tokenizer.decoding_flops()
+        return Cost(steps + 1, flops)
+
+    @classmethod
+    def from_published(cls, files: Sequence[Path], config: LidmConfig, sensor: SensorModel) -> Lidm:
+        """Make a generator of one checkpoint, which holds both networks and tells whether there is a mask channel.
+
+        Other sizes are the configuration's. The moving average of the denoiser's weights is taken, or the weights
+        themselves where the file has none. No file of the authors could be tried: the layout is their program's.
+        """
+        (path,) = files
+        found = read_checkpoint(path, ("state_dict",), _PUBLISHED_BYTES_AT_MOST, _NOT_READ)
+        first_stage, last_layer = _below(found, _FIRST_STAGE), found.get(f"{_FIRST_STAGE}decoder.conv_out.weight")
+        if last_layer is None or last_layer.ndim != 4 or not isinstance(config.tokenizer, CurveVqvaeConfig):
+            raise CheckpointError(
+                f"{path}, which holds no decoder of a tokenizer {config.tokenizer.name()!r}",
+                "a checkpoint of LiDM's diffusion model, which holds its first stage too",
+                "check the path, and use the recipe lidm_kitti_360",
+            )
+        tokenizer = replace(config.tokenizer, mask_head=len(last_layer) > 1)
+        generator = cls(replace(config, tokenizer=tokenizer, scale_latents=False), sensor)
+        # The program's average names weights without dots.
+        averaged = _below(found, _AVERAGE)
+        plain = {f"diffusion_model{name.replace('.', '')}": name for name in generator.denoiser.state_dict()}
+        denoiser = {plain.get(name, name): tensor for name, tensor in averaged.items()} or _below(found, _RAW)
+        counts = generator.tokenizer.quantize.named_buffers(prefix="quantize")  # of which the program keeps none
+        load_exactly(generator.tokenizer, first_stage | dict(counts), path)
+        load_exactly(generator.denoiser, denoiser, path)
+        return generator.eval()
+
+    def _shares(self) -> Float[Tensor, "1000"]:
+        return latent_diffusion.signal_shares(self.config.beta_first, self.config.beta_last)
+
+
+class LatentDenoising(Objective):
+    """The objective: the squared error of the predicted noise in the latents of a frozen tokenizer, at random steps."""
+
+    latent_scale: Tensor
+
+    def __init__(
+        self,
+        tokenizer: CodebookTokenizer,
+        denoiser: LatentUnet,
+        latent_scale: Float[Tensor, ""],
+        shares: Float[Tensor, "1000"],
+    ) -> None:
+        super().__init__(tokenizer.sensor)
+        self.denoiser = denoiser
+        self._latents = LatentCache(tokenizer)
+        self._shares = shares
+        self.register_buffer("latent_scale", latent_scale.clone())
+
+    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+        """Return the mean squared error as ``loss``, and the standard deviation of the scaled latents beside it."""
+        clean = self._latents(images) / self.latent_scale
+        step = torch.randint(latent_diffusion.TIME_STEPS, (len(clean),), generator=rng, device=clean.device)
+        noise = torch.randn(clean.shape, generator=rng, device=clean.device)
+        noisy = latent_diffusion.noised(clean, self._shares.to(clean.device)[step], noise)
+        error = (self.denoiser(noisy, step.float()).float() - noise).square().mean()
+        return {"loss": error, "latent_std": clean.std()}
+
+
+class LatentCache:
+    """The latents of a frozen tokenizer, each computed once for all times that training sees an image.
+
+    An image is known again by its pixels, so that augmented images are told apart. Once a bound of memory is reached,
+    further images are encoded anew each time. Images are encoded one by one: the last bits of a latent do not depend
+    on what else is in a batch, nor on whether training was resumed.
+
+    Args:
+        tokenizer: tokenizer, which is frozen.
+        bytes_at_most: bound of the memory that latents take.
+    """
+
+    def __init__(self, tokenizer: CodebookTokenizer, bytes_at_most: int = _CACHE_BYTES_AT_MOST) -> None:
+        self._tokenizer = tokenizer.eval().requires_grad_(False)
+        self._kept: dict[bytes, Tensor] = {}
+        self._free = bytes_at_most
+
+    @torch.no_grad()
+    def __call__(self, images: RangeImage) -> Float[Tensor, "B D h w"]:
+        """Return the latents of a batch, on its device."""
+        device, pixels = images.range_m.device, images.range_m.cpu().numpy()
+        keys = [hashlib.blake2b(one.tobytes(), digest_size=16).digest() for one in pixels]
+        latents = [self._kept.get(key) for key in keys]
+        for index, (key, known) in enumerate(zip(keys, latents, strict=True)):
+            if known is None:
+                latents[index] = encoded = self._encoded(images[index : index + 1])
+                if encoded.nbytes <= self._free:
+                    self._free -= encoded.nbytes
+                    self._kept[key] = encoded.cpu()
+        return torch.cat([one.to(device) for one in latents if one is not None])
+
+    def _encoded(self, image: RangeImage) -> Float[Tensor, "1 D h w"]:
+        # In full precision, as when a scan is encoded outside of training.
+        with torch.autocast(image.range_m.device.type, enabled=False):
+            return self._tokenizer.to(image.range_m.device).latents(image).float()
+
+
+def _below(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}

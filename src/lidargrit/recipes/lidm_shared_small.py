@@ -1,0 +1,16 @@
+"""The diffusion of lidm_small over the VQ-VAE of the recipe small: diffusion against an autoregressive transformer.
+
+With ``--set tokenizer_from=RUN`` it takes the very tokenizer of a trained run of small, and the two systems differ in
+nothing but what generates the codes.
+"""
+
+from dataclasses import replace
+
+from lidargrit.recipes import lidm_small, small
+
+RECIPE = replace(
+    lidm_small.RECIPE,
+    title="LiDM's diffusion over LidarGRIT's VQ-VAE, small: 64x256, for two CPU cores and an hour or two",
+    model=replace(lidm_small.RECIPE.model, tokenizer=small.RECIPE.model.tokenizer),
+    training={**lidm_small.RECIPE.training, "tokenizer": small.RECIPE.training["tokenizer"]},
+)
