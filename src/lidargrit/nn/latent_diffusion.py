@@ -50,7 +50,7 @@ def noised(
     """Mix latents with noise.
 
     Args:
-        clean: latents.
+        clean: latents without noise.
         share: ᾱ of each, in 64 bits.
         noise: standard normal noise.
     """
@@ -79,7 +79,7 @@ def ddim(
     noise of a standard deviation of 0.039, which the codebook absorbs.
 
     Args:
-        denoiser: network.
+        denoiser: network that predicts the noise in latents.
         noise: function that returns fresh noise at each call.
         shares: ᾱ of every time step; see :func:`signal_shares`.
         steps: number of evaluations of the network.
