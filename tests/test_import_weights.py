@@ -173,7 +173,7 @@ def test_files_in_another_order_or_number_or_of_another_system_are_refused(files
     assert "gpt.pth, which holds no 'VQ'" in error(RECIPE, out, *reversed(files), "--set", *SMALL)
     assert "got 1 file; wanted 2, for the tokenizer and the transformer" in error(RECIPE, out, files[0])
     assert "which holds no 'G_ema'" in error("dusty_kitti_odometry", out, files[0])
-    able = "of which nobody published weights; wanted a recipe of dusty, lidargan, lidargen, lidargrit, lidarvae, lidm, r2dm"
+    able = "nobody published weights; wanted a recipe of dusty, lidargan, lidargen, lidargrit, lidarvae, lidm, r2dm"
     assert able in error("marginal", out, "x")
     assert "none.pth, which is no file" in error(RECIPE, out, tmp_path / "none.pth", files[1])
     torch.save(r2dm_checkpoint(), tmp_path / "r2dm.pth")

@@ -200,8 +200,8 @@ class CurveDecoder(Network):
 class CurveVqvae(CodebookTokenizer[CurveVqvaeConfig]):
     """The autoencoder of LiDM.
 
-    Not here: its discriminator, whose weight is 0 after the first two steps, because the program's condition is inverted;
-    and its terms of geometry and of perception, which are off in the published configuration.
+    Its discriminator is left out, whose weight is 0 after the first two steps because the program's condition is
+    inverted, and so are its terms of geometry and of perception, which are off in the published configuration.
 
     Args:
         config: sizes and losses.
