@@ -16,7 +16,7 @@ import yaml
 
 import lidargrit
 from lidargrit.cli import main
-from lidargrit.datasets import _files, load, without_place
+from lidargrit.datasets import _files, data_set_and_split, load
 from lidargrit.datasets import folder as folder_of_scans
 from lidargrit.datasets.kitti_odometry import KittiOdometry
 from lidargrit.errors import CheckpointError
@@ -285,7 +285,7 @@ def test_a_card_of_imported_weights_names_their_files_and_their_authors_rights()
     ],
 )
 def test_a_source_without_its_place(source, name, split):
-    assert without_place(source) == data_set_of(source) == (name, split)
+    assert data_set_and_split(source) == data_set_of(source) == (name, split)
 
 
 def test_the_name_of_a_source_is_not_worth_a_walk_through_a_disk(tmp_path, monkeypatch):

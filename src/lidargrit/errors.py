@@ -8,7 +8,7 @@ LidarGritError (ValueError)
 ├── ConfigError       a recipe's setting is unknown or out of its bounds
 ├── CheckpointError   weights or a run that are damaged or of another configuration
 ├── WeightsError      published weights of a network that are not to be had, or not what they should be
-├── OutputError       a place to write to is taken, or could not be written
+├── OutputError       a file or folder to write is taken, or could not be written
 └── TrainingError     training cannot go on: the loss is not a number, the codebook collapsed
 """
 
@@ -66,7 +66,7 @@ class WeightsError(LidarGritError):
 
 
 class OutputError(LidarGritError):
-    """A place to write to is taken, or could not be written."""
+    """A file or folder to write is taken, or could not be written."""
 
 
 class TrainingError(LidarGritError):

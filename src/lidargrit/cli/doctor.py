@@ -48,6 +48,6 @@ def run(options: argparse.Namespace) -> None:
     told = {name.replace("_gib", "").replace("_", " "): fact for name, fact in facts.items()}
     told |= {name: f"{told[name]:.1f} GiB" for name in ("memory", "cache free")}
     told["bfloat16"] = "yes" if has_bf16() else "no: training takes two to three times as long in 32 bits"
-    none = "none that torch can use: the small and demo recipes are made for this"
+    none = "none that torch can use; the recipes small and demo are made for CPUs"
     told["gpus"] = ", ".join(f"{card['name']}, {card['memory_gib']} GiB" for card in facts["gpus"]) or none
     tell(options, "\n".join(f"{name:<18}{fact}" for name, fact in told.items()), facts)

@@ -138,8 +138,8 @@ def open_dataset(source: str, bad_points: BadPoints = "refuse") -> ScanDataset:
     if not source.strip():
         raise DataError("an empty source", "a folder, or NAME:ROOT", "name one; a comma at the end leaves an empty one")
     head, colon, rest = source.partition(":")
-    is_place = "/" in head or _is_there(head)
-    if head in _discovery.names("datasets") and (colon or not is_place):
+    is_path = "/" in head or _is_there(head)
+    if head in _discovery.names("datasets") and (colon or not is_path):
         if not rest:
             raise DataError(
                 f"the source {source!r} alone",
@@ -148,7 +148,7 @@ def open_dataset(source: str, bad_points: BadPoints = "refuse") -> ScanDataset:
             )
         root, split = _root_and_split(rest)
         return load(head)(root, split, bad_points)
-    if colon and not is_place:
+    if colon and not is_path:
         load(head)  # raises: no such name
     root, split = _root_and_split(source)
     name = recognise(root)
@@ -161,11 +161,11 @@ def open_dataset(source: str, bad_points: BadPoints = "refuse") -> ScanDataset:
     return load(name)(root, split, bad_points)
 
 
-def without_place(source: str) -> tuple[str, str]:
-    """Return a source's data set and split, of which nothing tells where a user keeps it; "" for what is not known.
+def data_set_and_split(source: str) -> tuple[str, str]:
+    """Return a source's data set and split, without the folder where a user keeps it; "" for what is not known.
 
     Example:
-        >>> without_place("kitti_360:/data/kitti_360:train")
+        >>> data_set_and_split("kitti_360:/data/kitti_360:train")
         ('kitti_360', 'train')
     """
     head, colon, rest = source.partition(":")

@@ -86,13 +86,13 @@ def matches(samples: EvalSet, reference: EvalSet) -> list[Match]:
     return sorted(found, key=lambda match: match.distance)
 
 
-def _outlines(side: EvalSet, places: list[int]) -> Float[torch.Tensor, "n pixels"]:
+def _outlines(scans: EvalSet, indices: list[int]) -> Float[torch.Tensor, "n pixels"]:
     """Return some pixels of each scan, as logarithms: a metre matters more nearby."""
-    sensor = side.images.sensor
+    sensor = scans.images.sensor
     rows = torch.linspace(0, sensor.height - 1, _ROWS).round().long()
     columns = torch.linspace(0, sensor.width - 1, _COLUMNS).round().long()
     parts = []
-    for first in range(0, len(places), _BATCH):
-        range_m = side.batch(places[first : first + _BATCH]).range_m
+    for first in range(0, len(indices), _BATCH):
+        range_m = scans.batch(indices[first : first + _BATCH]).range_m
         parts.append(torch.log2(1 + range_m[:, rows][:, :, columns]).flatten(1))
     return torch.cat(parts)

@@ -148,7 +148,7 @@ def _as_text(block: Block) -> str:
     lines = [block.title]
     if block.columns:
         grid = _grid(block)
-        widths = [max(len(row[place]) for row in grid) for place in range(len(grid[0]))]
+        widths = [max(len(row[column]) for row in grid) for column in range(len(grid[0]))]
         lines += ["  ".join(t.ljust(w) for t, w in zip(row, widths, strict=True)).rstrip() for row in grid]
     return "\n".join([*lines, *block.notes])
 

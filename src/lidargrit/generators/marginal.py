@@ -62,8 +62,8 @@ class Marginal(Generator[MarginalConfig, NoSampling]):
         self.scans.zero_()
         for first in range(0, len(images), _BATCH):
             batch = images.batch(range(first, min(first + _BATCH, len(images))))
-            place = torch.bucketize(batch.range_m, edges)
-            for one, mask in zip(place, batch.return_mask, strict=True):
+            bins = torch.bucketize(batch.range_m, edges)
+            for one, mask in zip(bins, batch.return_mask, strict=True):
                 self.counts.scatter_add_(0, one[None], mask[None].int())
             self.scans += len(batch)
 

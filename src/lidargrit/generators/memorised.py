@@ -59,8 +59,8 @@ class Memorised(Generator[MemorisedConfig, NoSampling]):
         """Keep the images, in an order that does not follow the drive, so that the first seeds are not neighbours."""
         kept = evenly_spaced(self.config.scans, len(images))
         self.range_m = torch.zeros(len(kept), self.sensor.height, self.sensor.width)
-        for place, index in enumerate(torch.randperm(len(kept), generator=torch.Generator().manual_seed(0)).tolist()):
-            self.range_m[place] = images.batch([kept[index]]).range_m[0]
+        for slot, index in enumerate(torch.randperm(len(kept), generator=torch.Generator().manual_seed(0)).tolist()):
+            self.range_m[slot] = images.batch([kept[index]]).range_m[0]
         self.scans.fill_(len(kept))
 
     @classmethod

@@ -95,8 +95,8 @@ def histograms(points_xyz_m: Float[Tensor, "B n 3"], variant: str) -> Int64[np.n
     points = points_xyz_m.float().numpy()
     squared = np.square(points[..., 0]) + np.square(points[..., 1]) + np.square(points[..., 2])
     range_m = np.sqrt(squared)
-    scan, place = np.nonzero((range_m > _NEAR_M) & (range_m < _FAR_M))
-    x, y = (_CELL_OF[variant](points[scan, place, axis]) for axis in (0, 1))
+    scan, pixel = np.nonzero((range_m > _NEAR_M) & (range_m < _FAR_M))
+    x, y = (_CELL_OF[variant](points[scan, pixel, axis]) for axis in (0, 1))
     cells = CELLS * CELLS
     return np.bincount(scan * cells + x * CELLS + y, minlength=len(points) * cells).reshape(-1, cells)
 
@@ -107,7 +107,7 @@ def occupied_cells(images: RangeImage, cells_per_m: int) -> Int64[np.ndarray, "c
     LiDM's toolbox finds cells in single precision, here nothing is rounded.
 
     Returns:
-        every occupied cell once: (scan * side + place along x) * side + place along y.
+        every occupied cell once: (scan * side + cell along x) * side + cell along y.
     """
     points = points_of_pixels(images).float().numpy()[..., :2]
     inside = images.return_mask.numpy() & (np.abs(points) < LIDM_HALF_M).all(axis=-1)

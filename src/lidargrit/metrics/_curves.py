@@ -231,8 +231,8 @@ def _nearest(
 
 
 def count_shares(
-    place: Float[Tensor, "B H W"], happened: Tensor, edges: Float64[np.ndarray, " edges"]
+    quantity: Float[Tensor, "B H W"], happened: Tensor, edges: Float64[np.ndarray, " edges"]
 ) -> Int64[np.ndarray, "2 bins"]:
-    """Count, for bins of a quantity known at some pixels (NaN elsewhere), all pixels and those where it happened."""
-    known = ~place.isnan()
-    return np.stack((histogram(place[known], edges), histogram(place[known & happened], edges)))
+    """Count, in bins of a quantity (NaN where it is unknown), all pixels and those where something happened."""
+    known = ~quantity.isnan()
+    return np.stack((histogram(quantity[known], edges), histogram(quantity[known & happened], edges)))

@@ -22,7 +22,7 @@ class LidmBevMatching(ImageMetric):
     """Find for every real scan the generated one whose occupied cells are nearest; the value is the mean of these.
 
     LiDM's tables call it "MMD"; it is a minimum matching distance, not a maximum mean discrepancy. A scan is the set
-    of its occupied cells of 0.5 m within +-50 m, their places in [0, 1). Two scans are apart by half the sum of both
+    of its occupied cells of 0.5 m within +-50 m, their positions in [0, 1). Two scans are apart by half the sum of both
     means of the squared distance from a cell of one to the nearest of the other. A generated set that lacks kinds of
     scenes scores badly; one that adds wrong ones does not. A scan without a point in the grid counts as one occupied
     cell at the sensor.

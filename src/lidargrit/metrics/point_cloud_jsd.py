@@ -62,11 +62,11 @@ def grid_counts(points: Float32[np.ndarray, "n 3"]) -> Int64[np.ndarray, "grid"]
         points: points (n, 3) in units of the longest range.
     """
     inside, number, tree = _grid()
-    place = (points.astype(np.float64) + 1) * ((_SIDE - 1) / 2)
-    nearest = np.ceil(place - 0.5).clip(0, _SIDE - 1).astype(np.int64)
+    position = (points.astype(np.float64) + 1) * ((_SIDE - 1) / 2)
+    nearest = np.ceil(position - 0.5).clip(0, _SIDE - 1).astype(np.int64)
     found = number[nearest[:, 0], nearest[:, 1], nearest[:, 2]]
     rim = found < 0
-    found[rim] = tree.query(place[rim])[1]
+    found[rim] = tree.query(position[rim])[1]
     return np.bincount(found, minlength=int(inside.sum()))
 
 

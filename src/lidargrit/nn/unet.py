@@ -246,8 +246,8 @@ class _Sinusoids(nn.Module):
         self.frequencies = channels // 2
 
     def forward(self, x: Tensor) -> Tensor:
-        place = torch.arange(self.frequencies, device=x.device) / (self.frequencies - 1)
-        phases = x[:, None] * _LONGEST_PERIOD**-place
+        exponent = torch.arange(self.frequencies, device=x.device) / (self.frequencies - 1)
+        phases = x[:, None] * _LONGEST_PERIOD**-exponent
         return torch.cat((phases.sin(), phases.cos()), dim=1)
 
 

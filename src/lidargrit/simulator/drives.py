@@ -164,7 +164,7 @@ def _write_sequence_files(out: Path, config: DriveConfig, num_scans: int) -> Non
     for sequence, relative in poses.items():
         folder = out / "sequences" / sequence
         write_text(folder / "poses.txt", "".join(f"{_numbers(pose[:3])}\n" for pose in relative))
-        write_text(folder / "times.txt", "".join(f"{place * _FRAME_S:e}\n" for place in range(len(relative))))
+        write_text(folder / "times.txt", "".join(f"{number * _FRAME_S:e}\n" for number in range(len(relative))))
         write_text(folder / "calib.txt", "".join(f"{line}\n" for line in calibration))
 
 

@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import ClassVar
 
-from lidargrit.datasets import ScanDataset, open_dataset, without_place
+from lidargrit.datasets import ScanDataset, data_set_and_split, open_dataset
 from lidargrit.errors import DataError, LidarGritError
 from lidargrit.formats import BadPoints
 from lidargrit.generators import Generator, is_run, load, locate
@@ -21,7 +21,7 @@ from lidargrit.sources.samples import is_sample_folder, projection_of, read_samp
 
 
 class Source(ABC):
-    """A place that a user named and that scans come from; :func:`open_source` tells its kind.
+    """What a user named to take scans from; :func:`open_source` finds out its kind.
 
     Args:
         text: name of the source, as the user typed it.
@@ -365,7 +365,7 @@ def data_set_of(text: str) -> tuple[str, str]:
 
 def _data_set_or_nothing(text: str) -> tuple[str, str]:
     try:
-        return without_place(text)
+        return data_set_and_split(text)
     except LidarGritError:
         return "", ""
 
