@@ -1,5 +1,6 @@
 """Protocols, scorecards and tables: what is compared, what is told of it, and what never stands side by side."""
 
+import itertools
 import json
 from dataclasses import replace
 
@@ -216,6 +217,12 @@ def test_a_scorecard_is_read_back_and_nothing_else_is(card, tmp_path):
     write_json(path, data)
     with pytest.raises(DataError, match="evaluate again"):
         Scorecard.read(path)
+    for name, bad in itertools.product(("interval", "floor"), (0, "", [], False)):
+        data = card.to_json()
+        data["scores"][0][name] = bad
+        write_json(path, data)
+        with pytest.raises(DataError, match=r"scores\.json, which cannot be used"):
+            Scorecard.read(path)
     with pytest.raises(DataError, match="no such file"):
         Scorecard.read(tmp_path / "none.json")
 

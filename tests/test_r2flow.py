@@ -1,5 +1,7 @@
 """R2Flow: its solvers and codec against its program, its published layout, learning."""
 
+import resource
+
 import numpy as np
 import pytest
 import torch
@@ -176,6 +178,19 @@ def test_weights_of_another_form_are_refused(tmp_path, change, told):
     recipe = load_recipe("r2flow_kitti_360")
     with pytest.raises(CheckpointError, match=told):
         R2flow.from_published([tmp_path / "1rf.pth"], recipe.model, recipe.data.load_sensor())
+
+
+def test_a_small_file_that_tells_of_a_vast_network_is_refused_before_memory_is_taken(tmp_path, capsys):
+    checkpoint = seeded_checkpoint()
+    for name, tensor in checkpoint["weights"].items():  # one number, repeated to fill any shape
+        checkpoint["weights"][name] = torch.zeros(1).expand(tensor.shape)
+    checkpoint["weights"]["tokenizer.0.weight"] = torch.zeros(1).expand(16384, 2, 1, 4)
+    torch.save(checkpoint, tmp_path / "1rf.pth")
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    assert main(["import-weights", "r2flow_kitti_360", str(tmp_path / "run"), str(tmp_path / "1rf.pth")]) == 2
+    assert "1rf.pth with a network of more than" in the_one_line(capsys.readouterr().err, "import-weights")
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000, "kibibytes"
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut", b"\x80\x04cos\nsystem\n.", b"words"])

@@ -31,6 +31,7 @@ def test_weights_and_buffers_of_all_modules_are_counted():
         "model.tokenizer.code_dim=1000000000",
         "model.tokenizer.residual_blocks=1000000",
         "model.tokenizer.channels=1048576",
+        "model.tokenizer.channel_multipliers=[1,1,1,9223372036854775807]",
     ],
 )
 def test_a_word_of_the_user_builds_no_network_that_fills_the_memory(setting):

@@ -74,6 +74,12 @@ def test_json_that_is_not_ours(refused, run_folder, tmp_path, damaged, name):
     assert name in told or "not among the generators" in told
 
 
+def test_a_run_whose_data_have_no_names(refused, run_folder):
+    about = json.loads((run_folder / "run.json").read_text())
+    (run_folder / "run.json").write_text(json.dumps({**about, "data": -1}))
+    assert "run.json, whose 'data' hold no names; wanted" in refused(*train_words(run_folder))
+
+
 @pytest.mark.parametrize(
     "change",
     [

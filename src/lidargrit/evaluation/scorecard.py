@@ -220,14 +220,15 @@ def _score(data: dict[str, Any]) -> Score:
     interval, real = data["interval"], data["floor"]
     return Score(
         result,
-        interval
-        and Interval(
+        None
+        if interval is None
+        else Interval(
             float(interval["low"]),
             float(interval["high"]),
             float(interval["standard_error"]),
             int(interval["halves"]),
         ),
-        real and RealAgainstReal(float(real["value"]), int(real["num_scans"]), int(real["halvings"])),
+        None if real is None else RealAgainstReal(float(real["value"]), int(real["num_scans"]), int(real["halvings"])),
         dict(data["options"]),
         float(data["seconds"]),
     )

@@ -140,7 +140,8 @@ class _Positions(nn.Module):
 
     def __init__(self, tokens: tuple[int, int], channels: int) -> None:
         super().__init__()
-        self.embedding = nn.Parameter(nn.init.trunc_normal_(torch.empty(1, *tokens, channels), std=0.02))
+        self.embedding = nn.Parameter(torch.empty(1, *tokens, channels))
+        nn.init.trunc_normal_(self.embedding, std=0.02)
 
     def forward(self, x: Tensor) -> Tensor:
         return x + self.embedding

@@ -43,7 +43,9 @@ def numbers_at_most(
     hooks = [register_module_parameter_registration_hook(add), register_module_buffer_registration_hook(add)]
     try:
         yield
-    except (RuntimeError, MemoryError, OverflowError) as error:  # a single tensor that no machine can hold
+    except (RuntimeError, MemoryError, OverflowError, TypeError) as error:  # a single tensor that no machine can hold
+        if isinstance(error, TypeError) and "Overflow" not in str(error):  # torch's of sizes beyond 64 bits
+            raise
         reason = str(error).partition("\n")[0][:100]
         raise ConfigError(f"{what} that cannot be built ({reason})", f"at most {count:,} numbers", cure) from None
     finally:

@@ -127,8 +127,8 @@ class VoxelEncoder(Network):
         super().__init__()
         width = config.blocks.width
         self.patch_embed = _Patches(config.grid.cells[2], config.patch, width)
-        self.register_buffer("pos_embed", sine_cosine_positions(config.tokens, width), persistent=False)
         self.blocks = swin_blocks(config.blocks, config.tokens)
+        self.register_buffer("pos_embed", sine_cosine_positions(config.tokens, width), persistent=False)
         self.norm = nn.Sequential(nn.LayerNorm(width), nn.GELU())
         self.pre_quant = nn.Linear(width, config.code_dim)
         self.apply(initialise_linear)
@@ -148,8 +148,8 @@ class VoxelDecoder(Network):
         width = config.blocks.width
         self._cut = (*config.tokens, config.patch, config.patch, config.grid.cells[2])
         self.decoder_embed = nn.Linear(config.code_dim, width)
-        self.register_buffer("pos_embed", sine_cosine_positions(config.tokens, width), persistent=False)
         self.blocks = swin_blocks(config.blocks, config.tokens)
+        self.register_buffer("pos_embed", sine_cosine_positions(config.tokens, width), persistent=False)
         self.norm = nn.Sequential(nn.LayerNorm(width), nn.GELU())
         self.pred = nn.Linear(width, config.patch**2 * config.grid.cells[2])
         self.apply(initialise_linear)

@@ -24,6 +24,7 @@ from lidargrit.generators import (
     load_class,
     locate,
 )
+from lidargrit.nn.size import numbers_at_most
 from lidargrit.publishing.card import model_card
 from lidargrit.recipes import load_recipe
 from lidargrit.sources import data_set_of
@@ -40,7 +41,8 @@ def import_weights(recipe: str, folder: Path, files: Sequence[Path], settings: S
         settings: changed settings of the recipe, such as ``data.projection_variant=reference``.
 
     Raises:
-        ConfigError: another number of files than the generator's published weights consist of.
+        ConfigError: another number of files than the generator's published weights consist of, or a network that is
+            larger than its file.
         CheckpointError: a file that holds something else, or weights of other sizes; names the first.
         OutputError: the folder holds something else.
     """
@@ -52,7 +54,10 @@ def import_weights(recipe: str, folder: Path, files: Sequence[Path], settings: S
             f"{len(cls.published_files)}, for the {' and the '.join(cls.published_files)} of {made_of.generator!r}",
             "name them in this order",
         )
-    generator = cls.from_published(files, made_of.model, made_of.data.load_sensor())
+    # The sizes of a network are what the files say, and no network is larger than its file.
+    numbers = sum(path.stat().st_size for path in files if path.is_file()) // 2 + 2**20
+    with numbers_at_most(numbers, f"{files[0]} with a network", "check which program saved it"):
+        generator = cls.from_published(files, made_of.model, made_of.data.load_sensor())
     about: dict[str, Any] = {
         "origin": "imported",
         "files": [{"name": path.name, "sha256": _sha256(path)} for path in files],

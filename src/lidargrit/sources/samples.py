@@ -163,7 +163,10 @@ def trained_on(folder: Path) -> Provenance:
     if not (folder / TRAINED_ON_FILE).is_file():
         return Provenance()
     try:
-        return Provenance(**{name: tuple(of) for name, of in read_json(folder / TRAINED_ON_FILE).items()})
+        facts = {name: tuple(of) for name, of in read_json(folder / TRAINED_ON_FILE).items()}
+        if not all(isinstance(each, str) for of in facts.values() for each in of):
+            raise TypeError("something is no text")
+        return Provenance(**facts)
     except (TypeError, AttributeError) as error:
         raise CheckpointError(
             f"{folder / TRAINED_ON_FILE}, in which {error}", "what lidargrit wrote", "restore it, or remove it"

@@ -25,6 +25,7 @@ from lidargrit.loading import DataConfig, RangeImages
 from lidargrit.nn.objective import Objective
 from lidargrit.reporting import Reporter
 from lidargrit.sources import load_range_images
+from lidargrit.sources.samples import trained_on
 from lidargrit.training.checkpoint import fingerprint
 from lidargrit.training.config import FitConfig, Recipe
 from lidargrit.training.engine import Engine
@@ -151,6 +152,10 @@ def _claim(folder: Path, recipe: Recipe, train_images: RangeImages, val_images: 
     }
     if (folder / RUN_FILE).exists():
         before = read_json(folder / RUN_FILE).get("data", data)
+        if not isinstance(before, dict):
+            raise CheckpointError(
+                f"{folder / RUN_FILE}, whose 'data' hold no names", "what lidargrit wrote", "restore it"
+            )
         for name, value in data.items():
             if before.get(name) != value:
                 raise OutputError(
@@ -179,8 +184,11 @@ def _write_trained_on(folder: Path, train_images: RangeImages, donor: str | None
         came_from = train_images.provenance
         facts = {"recordings": {*came_from.recordings} - {""}, "fingerprints": {*came_from.fingerprints}}
         if donor is not None:  # the model has learned from the scans of the stages that it takes, too
-            theirs = read_json(locate(donor) / TRAINED_ON_FILE)
-            facts = {name: known | set(theirs[name]) for name, known in facts.items()}
+            theirs = trained_on(locate(donor))
+            facts = {
+                "recordings": facts["recordings"] | {*theirs.recordings},
+                "fingerprints": facts["fingerprints"] | {*theirs.fingerprints},
+            }
         write_text(folder / TRAINED_ON_FILE, json.dumps({name: sorted(known) for name, known in facts.items()}) + "\n")
 
 
