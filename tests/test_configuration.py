@@ -56,7 +56,8 @@ def test_a_recipe_is_complete_and_survives_json(name):
     assert from_json(DataConfig, written["data"], "run.json") == recipe.data
     for stage, config in recipe.training.items():
         assert from_json(FitConfig, written["training"][stage], "run.json") == config
-    assert leaves(written).keys() == leaves(recipe).keys()
+    kind = {"model.tokenizer.name"}  # written for other tokenizers than the default one; no setting by itself
+    assert leaves(written).keys() - kind == leaves(recipe).keys()
 
 
 @pytest.mark.parametrize("name", RECIPES)
