@@ -1,4 +1,4 @@
-"""The generators that mark the floor and the ceiling."""
+"""The two baselines of every table: scans of pixel statistics alone, and training scans given back."""
 
 import pytest
 import torch

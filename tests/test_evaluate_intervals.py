@@ -1,4 +1,4 @@
-"""Intervals and floors: against laws that are known, and what every metric has to bear for them."""
+"""Intervals and real against real: against laws that are known, and what every metric has to bear for them."""
 
 import math
 
@@ -122,7 +122,7 @@ def test_an_interval_ends_where_the_metric_does():
     assert around(0.01, [0.0, 0.1, 0.2], 16, unbiased).low == 0.0  # nothing says that it is below
 
 
-def test_the_floor_is_the_mean_of_halves_against_halves():
+def test_real_against_real_is_the_mean_of_halves_against_halves():
     rng = np.random.default_rng(3)
     numbers = rng.gamma(4, 1, 400)
     groups = blocks(400, 16)

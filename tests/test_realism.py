@@ -66,7 +66,7 @@ def test_the_coin_keeps_a_share_whatever_it_meets(simulated):
 
 
 def test_scans_are_nearer_to_the_simulator_that_made_them_than_to_a_coin(simulated, recorded, scores):
-    """Between the two lie only projection and the half scans that make the floor."""
+    """The two differ only by the projection and by the halves of the scans that real against real compares."""
     assert recorded.batch([0]).return_mask.sum() > 0
     named = {score.simulated.metric: score for score in scores}
     assert set(CURVES) - {"reflectance_histogram"} <= set(named) <= set(CURVES)
