@@ -108,7 +108,7 @@ def test_sampled_masks_come_as_often_as_their_probability() -> None:
     count = 20_000
     uniform = torch.rand(count, 2, 4, generator=torch.Generator().manual_seed(0))
     nothing = Condition.nothing(sensor, count)
-    sampled = decoder._sample_mask(Guide.of(repeated(decoded, count)), uniform, nothing)  # all in one batch
+    sampled = decoder.mask.sample(Guide.of(repeated(decoded, count)), uniform, nothing)  # all in one batch
     index = (sampled.flatten(1) * 2 ** torch.arange(7, -1, -1)).sum(1)
     seen = torch.bincount(index, minlength=len(masks)) / count
     # The mean distance of as many samples of the very distribution, by the normal approximation of each count.

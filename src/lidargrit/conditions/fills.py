@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float64, Int64
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import distance_transform_edt, maximum_filter1d
 from scipy.spatial import Delaunay, QhullError
 
 from lidargrit.conditions import Condition
@@ -16,7 +17,7 @@ from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
 EDGE = 0.8  # of ln(1 + range in metres): two observed returns further apart lie on two surfaces
-_BESIDE_RAD = np.deg2rad(135.0)  # copied on either side of the image, so that triangles close the circle
+_ROWS_NEAR, _COLUMNS_NEAR = 9, 17  # window in which a return helps to fill an unknown pixel in; farther are others
 
 
 @dataclass(frozen=True)
@@ -40,13 +41,10 @@ class Observed:
     @classmethod
     def of(cls, condition: Condition, index: int) -> Observed:
         """Return what a condition knows of one of its scans."""
-        sensor, image = condition.sensor, condition.images[index]
-        return cls(
-            image.range_m.double().cpu().numpy(),
-            image.return_mask.cpu().numpy(),
-            condition.return_observed[index].cpu().numpy(),
-            *_angles(sensor),
-        )
+        known = condition.return_observed[index]
+        returned = condition.return_mask[index] & known
+        range_m = torch.where(returned, condition.range_m[index], 0.0).double()
+        return cls(range_m.cpu().numpy(), returned.cpu().numpy(), known.cpu().numpy(), *_angles(condition.sensor))
 
     def nearest(self, wanted: Bool[np.ndarray, "H W"]) -> tuple[Int64[np.ndarray, "H W"], Int64[np.ndarray, "H W"]]:
         """Return for every pixel row and column of the nearest wanted one by angle; of itself if none is wanted."""
@@ -61,14 +59,20 @@ class Observed:
         rows, columns = nearest[:, :, width : 2 * width].astype(np.int64)
         return rows, columns % width
 
+    @cached_property
+    def nearest_return(self) -> tuple[Int64[np.ndarray, "H W"], Int64[np.ndarray, "H W"]]:
+        """Row and column of the nearest observed return of every pixel."""
+        return self.nearest(self.returned)
+
+    @property
     def nearest_range_m(self) -> Float64[np.ndarray, "H W"]:
-        """Return for every pixel the range of the nearest return by angle."""
-        return self.range_m[self.nearest(self.returned)]
+        """Range of the nearest observed return of every pixel."""
+        return self.range_m[self.nearest_return]
 
 
 def nearest(seen: Observed) -> Float64[np.ndarray, "H W"]:
     """Return for every pixel the range of the nearest observed return, in metres."""
-    return seen.nearest_range_m()
+    return seen.nearest_range_m
 
 
 def linear(seen: Observed) -> Float64[np.ndarray, "H W"]:
@@ -81,7 +85,7 @@ def linear(seen: Observed) -> Float64[np.ndarray, "H W"]:
     by_row, row_span = by_row[:, width : 2 * width], row_span[:, width : 2 * width]
     by_column, column_span = (part.T for part in _between(seen.range_m.T, seen.elevation_rad))
     found = np.where(row_span < column_span, by_row, by_column)
-    return np.where(np.isfinite(found), found, seen.nearest_range_m())
+    return np.where(np.isfinite(found), found, seen.nearest_range_m)
 
 
 def triangulation(seen: Observed) -> Float64[np.ndarray, "H W"]:
@@ -90,10 +94,13 @@ def triangulation(seen: Observed) -> Float64[np.ndarray, "H W"]:
     Where a triangle spans an edge, and outside of all, the nearest return counts. Of a plane 1 / range is nearly
     linear in the angles.
     """
-    beside = min(len(seen.azimuth_rad), int(np.ceil(_BESIDE_RAD / (2 * np.pi) * len(seen.azimuth_rad))))
-    width, found = len(seen.azimuth_rad), seen.nearest_range_m()
+    width, found = len(seen.azimuth_rad), seen.nearest_range_m.copy()
+    near = maximum_filter1d(maximum_filter1d(~seen.known, _ROWS_NEAR, 0), _COLUMNS_NEAR, 1, mode="wrap")
+    helpful = seen.returned & near
+    # The circle closes if as many columns as the widest gap are copied on either side.
+    beside = min(width, _widest_gap(helpful.any(0)) + _COLUMNS_NEAR)
     columns = np.arange(-beside, width + beside)
-    rows, at = np.nonzero(seen.returned[:, columns % width])
+    rows, at = np.nonzero(helpful[:, columns % width])
     azimuth_rad = seen.azimuth_rad[columns % width] - 2 * np.pi * (columns // width)
     corners = np.stack((seen.elevation_rad[rows], azimuth_rad[at]), axis=1)
     range_m = seen.range_m[rows, columns[at] % width]
@@ -101,7 +108,7 @@ def triangulation(seen: Observed) -> Float64[np.ndarray, "H W"]:
         triangles = Delaunay(corners)
     except (QhullError, ValueError):  # too few returns, or all on one line
         return linear(seen)
-    missing = np.nonzero(~seen.returned)
+    missing = np.nonzero(~seen.known)
     points = np.stack((seen.elevation_rad[missing[0]], seen.azimuth_rad[missing[1]]), axis=1)
     triangle = triangles.find_simplex(points)
     transform = triangles.transform[triangle]
@@ -141,7 +148,7 @@ def fill(method: str, condition: Condition) -> RangeImage:
         masks.append(torch.from_numpy(mask))
         ranges.append(torch.from_numpy(seen.range_m if range_m is None else range_m).float())
         if condition.reflectance is not None:
-            rows, columns = (torch.from_numpy(part) for part in seen.nearest(seen.returned))
+            rows, columns = (torch.from_numpy(part) for part in seen.nearest_return)
             reflectances.append(condition.reflectance[index].cpu()[rows, columns])
     reflectance = torch.stack(reflectances) if reflectances else None
     filled = RangeImage.masked(torch.stack(ranges), torch.stack(masks), sensor, reflectance)
@@ -155,6 +162,14 @@ def _angles(sensor: SensorModel) -> tuple[Float64[np.ndarray, " H"], Float64[np.
 
 def _thrice(azimuth_rad: Float64[np.ndarray, " W"]) -> Float64[np.ndarray, " W*3"]:
     return np.concatenate([azimuth_rad - turn * 2 * np.pi for turn in (-1, 0, 1)])
+
+
+def _widest_gap(some: Bool[np.ndarray, " W"]) -> int:
+    """Return the length of the longest run of columns around the circle that have nothing."""
+    places = np.nonzero(some)[0]
+    if not len(places):
+        return len(some)
+    return int(np.diff(np.append(places, places[0] + len(some))).max()) - 1
 
 
 def _between(

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -26,6 +26,8 @@ from lidargrit.generators._tokens import (
     TokenObjective,
     sample_tokens,
 )
+from lidargrit.nn.completion_network import CompletionNetwork, CompletionNetworkConfig
+from lidargrit.nn.completion_objective import CompletionObjective
 from lidargrit.nn.decoding import CachedDecoder, WeightPrecision
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.pixel_decoder import PixelSampling
@@ -63,6 +65,9 @@ class TokenSampling:
         range_temperature: divisor of the logarithms of the pixel decoder's weights of surfaces; below 1 it prefers the
             likelier surface. Only scans sampled with 1, and a noise of 1, have the likelihood that the model tells.
         range_noise: multiplier of the pixel decoder's spread of ranges about a surface.
+        completion: method by which scans are completed. ``network`` estimates ranges and samples the mask by a network
+            for completion; ``tokens`` samples the tokens of which no pixel is known, and then all unknown pixels.
+            ``auto`` is ``network`` where a model has one and pixels are known.
         weights: number type of the transformer's weights. ``fp32`` is exact; ``bf16`` and ``int8`` (CPUs only) read
             less memory for a token and change probabilities a little, see docs/performance.md.
         decoder: number type of the decoder. ``fp32`` is exact; ``bf16`` is quicker and moves ranges a little; ``auto``
@@ -75,6 +80,7 @@ class TokenSampling:
     mask: PixelChoice = "auto"
     range_temperature: float = PixelSampling.temperature
     range_noise: float = PixelSampling.noise
+    completion: Literal["auto", "network", "tokens"] = "auto"
     weights: WeightPrecision = "fp32"
     decoder: Precision = "fp32"
 
@@ -94,7 +100,13 @@ class TokenSampling:
 
 @dataclass(frozen=True)
 class LidarGritConfig(TokenGeneratorConfig):
-    """The two networks of the paper; with other tokenizers than its VQ-VAE or a pixel decoder, of systems like it."""
+    """The two networks of the paper; with other tokenizers than its VQ-VAE or further networks, of systems like it.
+
+    Args:
+        completion: sizes of a network that completes scans; none in the paper.
+    """
+
+    completion: CompletionNetworkConfig | None = None
 
 
 class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
@@ -120,6 +132,20 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         height, width = self.tokenizer.grid_size
         self.transformer = CausalTransformer(config.transformer, self.tokenizer.num_codes, height * width)
         self._prepared: _Prepared | None = None
+        self.completion: CompletionNetwork | None = None
+        if config.completion is not None:
+            self.completion = CompletionNetwork(config.completion, sensor)
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """Those of every generator of tokens, then the network that completes scans, if there is one."""
+        return super().stages if self.completion is None else (*super().stages, "completion")
+
+    def objective(self, stage: str) -> Objective:
+        """Return the objective of a stage."""
+        if stage == "completion" and self.completion is not None:
+            return CompletionObjective(self.completion, self.sensor)
+        return super().objective(stage)
 
     def transformer_objective(self) -> Objective:
         """Return the likelihood of each token given those before it."""
@@ -148,12 +174,25 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         Tokens come row by row, pixels in phases: each knows of what was observed before its turn, and not of the rest.
         """
         rngs = [torch.Generator().manual_seed(seed) for seed in seeds]
+        if self._completes_by_network(condition, sampling):
+            assert self.completion is not None
+            return self.completion.sample(condition, rngs[: seeds.num_asked_for])
         uniform = torch.stack([torch.rand(self.transformer.context_length, generator=rng) for rng in rngs])
         decoder, tokenizer = self._prepare(len(seeds), sampling)
         tokens = self.observed_tokens(condition)
         if bool((tokens < 0).any()):
             tokens = decoder.generate(uniform.to(self.device), tokens)
         return self.decode(tokens, seeds.num_asked_for, rngs, sampling.mask, sampling.pixels(), tokenizer, condition)
+
+    def _completes_by_network(self, condition: Condition, sampling: TokenSampling) -> bool:
+        """Tell whether the network for completion is what completes such a scan."""
+        if sampling.completion == "network" and self.completion is None:
+            raise ConfigError(
+                "completion=network for a model without a network that completes scans",
+                "a model with one",
+                "leave completion out, or train a recipe with the stage completion, such as compact_completion",
+            )
+        return sampling.completion != "tokens" and self.completion is not None and condition.kinds == {"pixels"}
 
     @torch.no_grad()
     def token_nll_bits(self, images: RangeImage) -> Float[Tensor, "B h w"]:

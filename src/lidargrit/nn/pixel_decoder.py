@@ -168,22 +168,11 @@ class PixelDecoder(nn.Module):
         images = []
         for first in range(0, len(uniform), step):
             part = slice(first, first + step)
-            some = Guide(*(maps[part] for maps in guide))
-            mask = self._sample_mask(some, uniform[part, 0], known[part])
+            some = guide.part(part)
+            mask = self.mask.sample(some, uniform[part, 0], known[part])
             range_m = self._sample_range(some, uniform[part, 1:], mask, known[part], sampling)
             images.append(RangeImage(range_m, mask, self.sensor))
         return RangeImage.cat(images)
-
-    def _sample_mask(self, guide: Guide, uniform: Float[Tensor, "B H W"], known: Condition) -> Bool[Tensor, "B H W"]:
-        """Return the mask, sampled phase by phase around what is known of it."""
-        guided = self.mask.guided(guide)
-        mask = torch.zeros_like(known.return_mask)
-        for phase in self.mask.phases:
-            pixels = (..., *phase.pixels)
-            output = self.mask.outputs([phase], guided, guide, mask, guide.v)
-            sampled = uniform[pixels] < self.mask.logits([phase], output, guide)[0].sigmoid()
-            mask[pixels] = torch.where(known.return_observed[pixels], known.return_mask[pixels], sampled)
-        return mask
 
     def _sample_range(
         self,

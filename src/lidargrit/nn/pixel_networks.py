@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from lidargrit.conditions import Condition
 from lidargrit.errors import ConfigError
 from lidargrit.nn.blocks import Block, Network
 from lidargrit.nn.convolution import Convolution
@@ -66,11 +67,18 @@ class Guide(NamedTuple):
         features: features of the decoder's last layer.
         v: ln(1 + decoded range in metres).
         return_logits: logits of the probability of a return, bounded.
+        known: True where the return is known before the first phase; None if it is known nowhere.
     """
 
     features: Float[Tensor, "B C H W"]
     v: Float[Tensor, "B H W"]
     return_logits: Float[Tensor, "B H W"]
+    known: Bool[Tensor, "B H W"] | None = None
+
+    def part(self, some: slice) -> Guide:
+        """Return the guide of some of the scans."""
+        known = None if self.known is None else self.known[some]
+        return Guide(self.features[some], self.v[some], self.return_logits[some], known)
 
     @classmethod
     def of(cls, decoded: Decoded) -> Guide:
@@ -89,7 +97,7 @@ class Guide(NamedTuple):
         return cls(decoded.features.float(), decoded.range_m.float().log1p(), logits)
 
 
-class _Residual(Block):
+class Residual(Block):
     """Two convolutions whose sum with the input is the input at first."""
 
     def __init__(self, width: int) -> None:
@@ -100,6 +108,7 @@ class _Residual(Block):
         nn.init.zeros_(self.conv2.bias)
 
     def forward(self, x: Float[Tensor, "B C h w"]) -> Float[Tensor, "B C h w"]:
+        """Add what the two convolutions find to the input."""
         return x + self.conv2(F.silu(self.conv1(F.silu(x))))
 
 
@@ -113,7 +122,7 @@ class _SpacingNetwork(Network):
         super().__init__()
         self.guide, self.context = Convolution(guide, width, "wrap"), Convolution(context, width, "wrap")
         self.phase_bias = nn.Parameter(torch.zeros(phases, width))
-        self.blocks = nn.Sequential(*(_Residual(width) for _ in range(blocks)))
+        self.blocks = nn.Sequential(*(Residual(width) for _ in range(blocks)))
         self.out = nn.ModuleList(nn.Conv2d(width, outputs, 1) for _ in range(phases))
         for layer in self.out:
             nn.init.zeros_(layer.get_parameter("weight"))
@@ -211,7 +220,26 @@ class MaskNetwork(PhaseNetwork):
         """Return for each pixel of a cell whether it is known to have returned, and whether it is known not to."""
         returned = cells_of(return_mask[:, None].float(), phase.spacing)
         known = generated_before(phase).to(returned)[:, None, None]
+        if guide.known is not None:
+            known = torch.maximum(known, cells_of(guide.known[:, None].float(), phase.spacing))
         return torch.cat((known * returned, known * (1 - returned)), 1)
+
+    def sample(self, guide: Guide, uniform: Float[Tensor, "B H W"], condition: Condition) -> Bool[Tensor, "B H W"]:
+        """Return the mask, sampled phase by phase around what is known of it.
+
+        Args:
+            guide: what the decoder tells of every pixel.
+            uniform: random numbers in [0, 1).
+            condition: known part of the scans, whose returns are taken over as they are.
+        """
+        guided = self.guided(guide)
+        mask = condition.return_mask & condition.return_observed
+        for phase in self.phases:
+            pixels = (..., *phase.pixels)
+            output = self.outputs([phase], guided, guide, mask, guide.v)
+            sampled = uniform[pixels] < self.logits([phase], output, guide)[0].sigmoid()
+            mask[pixels] = torch.where(condition.return_observed[pixels], mask[pixels], sampled)
+        return mask
 
     def logits(self, phases: list[Phase], output: Float[Tensor, "P B 1 h w"], guide: Guide) -> Float[Tensor, "P B h w"]:
         """Return the logits of the pixels of phases of one spacing."""

@@ -1,0 +1,84 @@
+"""What classical ways make of observed pixels → maps for a network that completes scans, and ranges to choose from."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, Float64
+from scipy.ndimage import uniform_filter
+from torch import Tensor
+
+from lidargrit.conditions import Condition
+from lidargrit.conditions.fills import Observed, linear, triangulation
+
+NUM_MAPS, NUM_CANDIDATES = 15, 7
+_TYPICAL_V = 2.5  # ln(1 + 11 m), the middle of what scans hold, so that maps are near 0
+_FAR_PIXELS, _FARTHEST = 16.0, 4.0  # a distance is told in units of 16 pixels, up to 64 of them
+_WINDOW = 9  # rows and columns in which shares are counted
+
+
+class Hints(NamedTuple):
+    """What is easily told of every pixel of partly observed scans; ranges are ln(1 + range in metres).
+
+    Args:
+        maps: what was observed, how the nearest return and its neighbours differ from triangulation, how far they are.
+        candidates: ranges by triangulation, by interpolation, of the nearest return, and of the next return above,
+            below, to the left and to the right.
+    """
+
+    maps: Float[Tensor, "B 15 H W"]
+    candidates: Float[Tensor, "B 7 H W"]
+
+
+def hints_of(condition: Condition) -> Hints:
+    """Return the hints of a batch of scans, on the device of the condition."""
+    both = [_of_one(Observed.of(condition, index)) for index in range(len(condition))]
+    maps, candidates = (torch.from_numpy(np.stack(part)).to(condition.range_m) for part in zip(*both, strict=True))
+    return Hints(maps, candidates)
+
+
+def _of_one(seen: Observed) -> tuple[Float32[np.ndarray, "15 H W"], Float32[np.ndarray, "7 H W"]]:
+    if not seen.returned.any():
+        empty = np.zeros((NUM_MAPS, *seen.returned.shape), dtype=np.float32)
+        empty[0] = seen.known
+        return empty, np.full((NUM_CANDIDATES, *seen.returned.shape), _TYPICAL_V, dtype=np.float32)
+    triangles, lines, near = (np.log1p(part) for part in (triangulation(seen), linear(seen), seen.nearest_range_m))
+    sides, distances = zip(
+        *(_next_return(seen, down, right) for down, right in ((-1, 0), (1, 0), (0, -1), (0, 1))), strict=True
+    )
+    sides = [np.where(np.isnan(side), triangles, side) for side in sides]
+    drops = seen.known & ~seen.returned
+    share_known, share_dropped = (
+        uniform_filter(part.astype(np.float64), _WINDOW, mode=("constant", "wrap")) for part in (seen.known, drops)
+    )
+    maps = [
+        seen.known,
+        seen.returned,
+        drops,
+        near - triangles,
+        triangles - _TYPICAL_V,
+        *(side - triangles for side in sides),
+        *distances,
+        share_dropped / np.maximum(share_known, 1e-6),
+        share_known,
+    ]
+    return np.stack(maps).astype(np.float32), np.stack([triangles, lines, near, *sides]).astype(np.float32)
+
+
+def _next_return(
+    seen: Observed, down: int, right: int
+) -> tuple[Float64[np.ndarray, "H W"], Float64[np.ndarray, "H W"]]:
+    """Return ln(1 + range) of the next observed return on one side, NaN without one, and how far away it is."""
+    lines = np.tile(seen.range_m, (1, 3)) if right else seen.range_m.T
+    backwards = down + right < 0
+    lines = lines if backwards else lines[:, ::-1]
+    place = np.arange(lines.shape[1])
+    last = np.maximum.accumulate(np.where(lines > 0, place, -1), axis=1)
+    last = np.concatenate((np.full((len(lines), 1), -1), last[:, :-1]), axis=1)  # not the pixel itself
+    range_m = np.where(last >= 0, np.take_along_axis(lines, np.maximum(last, 0), axis=1), np.nan)
+    away = np.where(last >= 0, np.minimum((place - last) / _FAR_PIXELS, _FARTHEST), _FARTHEST)
+    found = [part if backwards else part[:, ::-1] for part in (np.log1p(range_m), away)]
+    width = seen.range_m.shape[1]
+    return tuple(part[:, width : 2 * width] if right else part.T for part in found)

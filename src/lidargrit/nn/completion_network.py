@@ -1,0 +1,180 @@
+"""A network that completes scans: observed pixels and classical fills → a range and the chance of a return."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from lidargrit.conditions import Condition
+from lidargrit.conditions.hints import NUM_CANDIDATES, NUM_MAPS, Hints, hints_of
+from lidargrit.errors import ConfigError
+from lidargrit.nn.blocks import Network
+from lidargrit.nn.convolution import Convolution
+from lidargrit.nn.pixel_networks import Guide, MaskNetwork, PixelDecoderConfig, Residual
+from lidargrit.nn.pixel_phases import at_phases
+from lidargrit.sensors import SensorModel
+from lidargrit.structures import RangeImage
+
+_CELL = 8  # rows and columns of an image are multiples of it
+_TRUST = 3.0  # logit by which triangulation is preferred to the other candidates at first
+_LOGIT_BOUND = 8.0
+
+
+@dataclass(frozen=True)
+class CompletionNetworkConfig:
+    """Sizes of the network that completes scans.
+
+    Args:
+        widths: channels at a half, a quarter and an eighth of the image's rows and columns.
+        blocks: residual blocks at an eighth.
+        features: channels that the phases of the mask see.
+        mask_width: channels of the layers of the mask's phases.
+        row_channels: learned numbers of every row.
+    """
+
+    widths: tuple[int, int, int] = (48, 64, 96)
+    blocks: int = 4
+    features: int = 32
+    mask_width: int = 24
+    row_channels: int = 2
+
+    def __post_init__(self) -> None:
+        if min(*self.widths, self.blocks, self.features, self.mask_width, self.row_channels) < 1:
+            raise ConfigError(f"{self}", "sizes of at least 1", "raise the one that is lower")
+
+
+class Point(NamedTuple):
+    """The network's estimate of every pixel.
+
+    Args:
+        guide: what the phases of the mask go by.
+        v: ln(1 + range in metres), with its gradient.
+        return_logits: logits of the probability of a return by itself, with their gradient.
+    """
+
+    guide: Guide
+    v: Float[Tensor, "B H W"]
+    return_logits: Float[Tensor, "B H W"]
+
+
+class CompletionNetwork(nn.Module):
+    """A small U-Net that weighs what classical ways say of each range, and a mask that is sampled in phases behind it.
+
+    The range is a point estimate, the best single guess, and not a sample; the mask is sampled, each phase given the
+    observed pixels and the earlier phases, so that drops cluster as real ones do.
+
+    Args:
+        config: sizes of the network.
+        sensor: the rays and limits of the range images.
+    """
+
+    def __init__(self, config: CompletionNetworkConfig, sensor: SensorModel) -> None:
+        super().__init__()
+        if sensor.height % _CELL or sensor.width % _CELL:
+            raise ConfigError(
+                f"range images of {sensor.height}x{sensor.width} for a network that completes scans",
+                f"rows and columns in multiples of {_CELL}",
+                "choose another sensor or number of columns",
+            )
+        self.limits_v = (math.log1p(sensor.range_min_m), math.log1p(sensor.range_max_m))
+        self.rows = nn.Parameter(torch.zeros(config.row_channels, sensor.height))
+        self.unet = _Unet(config, NUM_MAPS + config.row_channels, config.features + NUM_CANDIDATES + 2)
+        sizes = PixelDecoderConfig(
+            coarsest_cell=_CELL, mask_features=config.features, mask_width=config.mask_width, blocks=2
+        )
+        self.mask = MaskNetwork(sizes, sensor, config.features)
+        preferred = torch.zeros(NUM_CANDIDATES)
+        preferred[0] = _TRUST
+        self.register_buffer("preferred", preferred[:, None, None], persistent=False)
+        self.num_features = config.features
+
+    preferred: Tensor
+
+    def forward(self, hints: Hints, known: Bool[Tensor, "B H W"]) -> Point:
+        """Return the estimate of every pixel.
+
+        Args:
+            hints: what classical ways make of the observed pixels.
+            known: True where it was observed whether there is a return.
+        """
+        rows = self.rows[None, :, :, None].expand(len(known), -1, -1, known.shape[-1])
+        output = self.unet(torch.cat((hints.maps, rows), 1)).float()
+        features, weights, moved, logits = output.split((self.num_features, NUM_CANDIDATES, 1, 1), 1)
+        shares = (4 * weights + self.preferred).softmax(1)
+        v = (shares * hints.candidates).sum(1) + 0.3 * moved[:, 0]
+        return_logits = (2 * logits[:, 0] + 1.5).clamp(-_LOGIT_BOUND, _LOGIT_BOUND)
+        v = v.clamp(*self.limits_v)
+        return Point(Guide(features, v.detach(), return_logits.detach(), known), v, return_logits)
+
+    def sample(self, condition: Condition, rngs: Sequence[torch.Generator]) -> RangeImage:
+        """Return completed scans: the range estimated, the mask sampled; a scan does not depend on the others.
+
+        Args:
+            condition: known pixels of as many scans.
+            rngs: random generators on the CPU, one for each scan.
+        """
+        images = []
+        for index, rng in enumerate(rngs):
+            one = condition[index : index + 1]
+            point = self(hints_of(one), one.return_observed)
+            uniform = torch.rand(one.range_m.shape, generator=rng).to(one.range_m.device)
+            mask = self.mask.sample(point.guide, uniform, one)
+            low_m, high_m = condition.sensor.range_min_m, condition.sensor.range_max_m
+            images.append(RangeImage.masked(point.v.expm1().clamp(low_m, high_m), mask, condition.sensor))
+        return RangeImage.cat(images)
+
+    def mask_nats(
+        self, point: Point, returned: Bool[Tensor, "B H W"], rng: torch.Generator | None
+    ) -> Float[Tensor, " B"]:
+        """Return the negative log-likelihood of the unknown part of each mask in nats.
+
+        Args:
+            point: estimate of every pixel.
+            returned: true masks.
+            rng: chooses one phase of each spacing, which stands for all; every phase is counted without it.
+        """
+        guide, total = point.guide, point.v.new_zeros(len(returned))
+        assert guide.known is not None
+        guided = self.mask.guided(guide)
+        for phases in self.mask.by_spacing():
+            chosen = phases
+            if rng is not None:
+                chosen = [phases[int(torch.randint(len(phases), (), generator=rng, device=rng.device))]]
+            logits = self.mask.logits(chosen, self.mask.outputs(chosen, guided, guide, returned, guide.v), guide)
+            nll = F.binary_cross_entropy_with_logits(logits, at_phases(returned, chosen).float(), reduction="none")
+            unknown = ~at_phases(guide.known, chosen)
+            total = total + (nll * unknown).sum((0, 2, 3)) * (len(phases) / len(chosen))
+        return total
+
+
+class _Unet(Network):
+    """Maps at full size → maps at full size, through a half, a quarter and an eighth of the rows and columns."""
+
+    def __init__(self, config: CompletionNetworkConfig, inputs: int, outputs: int) -> None:
+        super().__init__()
+        first, second, third = config.widths
+        self.enter, self.level1 = Convolution(4 * inputs, first, "wrap"), Residual(first)
+        self.down1, self.level2 = nn.Conv2d(4 * first, second, 1), Residual(second)
+        self.down2 = nn.Conv2d(4 * second, third, 1)
+        self.level3 = nn.Sequential(*(Residual(third) for _ in range(config.blocks)))
+        self.up2, self.after2 = nn.Conv2d(third, 4 * second, 1), Residual(second)
+        self.up1, self.after1 = nn.Conv2d(second, 4 * first, 1), Residual(first)
+        self.out = nn.Conv2d(first, 4 * outputs, 1)
+        nn.init.normal_(self.out.weight, std=0.02)
+        assert self.out.bias is not None
+        nn.init.zeros_(self.out.bias)
+
+    def forward(self, maps: Float[Tensor, "B C H W"]) -> Float[Tensor, "B D H W"]:
+        one = self.level1(self.enter(F.pixel_unshuffle(maps, 2)))
+        two = self.level2(self.down1(F.pixel_unshuffle(one, 2)))
+        three = self.level3(self.down2(F.pixel_unshuffle(two, 2)))
+        two = self.after2(two + F.pixel_shuffle(self.up2(three), 2))
+        one = self.after1(one + F.pixel_shuffle(self.up1(two), 2))
+        return F.pixel_shuffle(self.out(F.silu(one)), 2)

@@ -1,0 +1,81 @@
+"""What trains a network that completes scans: whole scans, of which random parts are hidden → the terms of a loss."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool
+from torch import Tensor
+
+from lidargrit.conditions import Condition
+from lidargrit.conditions.hints import hints_of
+from lidargrit.nn.completion_network import CompletionNetwork
+from lidargrit.nn.objective import Objective
+from lidargrit.sensors import SensorModel
+from lidargrit.structures import RangeImage
+
+_ROW_STEPS = (2, 4, 4, 8)  # one of so many rows is observed; four as often as the others together
+_KINDS = (0.42, 0.7)  # up to these: rows, then sectors, then pixels
+_SECTORS = (24 / 256, 128 / 256)  # of the columns, hidden
+_SHARES = (0.03, 0.5)  # of the pixels, observed
+_MASK_WEIGHT, _ALONE_WEIGHT, _LOG_WEIGHT, _METRE_WEIGHT = 3.0, 0.5, 3.0, 0.15
+
+
+class CompletionObjective(Objective):
+    """The errors of the hidden pixels: of the range, and of the mask, by its likelihood in phases and pixel by pixel.
+
+    Every scan has a random pattern: rows, a sector or single pixels. A scan of which more is hidden counts more, with
+    the root of the hidden share.
+
+    Args:
+        network: network that is trained.
+        sensor: sensor whose range images it completes.
+    """
+
+    def __init__(self, network: CompletionNetwork, sensor: SensorModel) -> None:
+        super().__init__(sensor)
+        self.completion = network
+
+    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+        """Return the loss, and beside it the error in metres of hidden returns and the bits of a hidden return."""
+        observed = random_patterns(len(images), self.sensor.height, self.sensor.width, rng)
+        condition = Condition.of_pixels(images, observed)
+        point = self.completion(hints_of(condition), observed)
+        hidden = ~observed
+        returns = (hidden & images.return_mask).float()
+        count, num_returns = hidden.sum((1, 2)).clamp(min=1), returns.sum((1, 2)).clamp(min=1)
+        nats = self.completion.mask_nats(point, images.return_mask, rng if self.training else None) / count
+        alone = F.binary_cross_entropy_with_logits(point.return_logits, images.return_mask.float(), reduction="none")
+        alone = (alone * hidden).sum((1, 2)) / count
+        log_error = ((point.v - images.range_m.log1p()).abs() * returns).sum((1, 2)) / num_returns
+        error_m = ((point.v.expm1() - images.range_m).abs() * returns).sum((1, 2)) / num_returns
+        of_mask = _MASK_WEIGHT * (nats + _ALONE_WEIGHT * alone)
+        weight = hidden.float().mean((1, 2)).sqrt()
+        loss = (weight * (of_mask + _LOG_WEIGHT * log_error + _METRE_WEIGHT * error_m)).mean()
+        return {"loss": loss, "error_m": error_m.mean().detach(), "mask_bits": nats.mean().detach() / math.log(2)}
+
+
+def random_patterns(count: int, height: int, width: int, rng: torch.Generator) -> Bool[Tensor, "B H W"]:
+    """Return masks of observed pixels for training: every second to eighth row, all but a sector, or single pixels."""
+
+    def uniform() -> float:
+        return float(torch.rand((), generator=rng, device=rng.device))
+
+    masks = []
+    for _ in range(count):
+        kind, first, second = uniform(), uniform(), uniform()
+        mask = torch.zeros(height, width, dtype=torch.bool, device=rng.device)
+        if kind < _KINDS[0]:
+            step = _ROW_STEPS[int(first * len(_ROW_STEPS))]
+            mask[int(second * step) :: step] = True
+        elif kind < _KINDS[1]:
+            hidden = round(width * (_SECTORS[0] + first * (_SECTORS[1] - _SECTORS[0])))
+            mask[:, hidden:] = True
+            mask = mask.roll(int(second * width), 1)
+        else:
+            share = _SHARES[0] * (_SHARES[1] / _SHARES[0]) ** first
+            mask = torch.rand(height, width, generator=rng, device=rng.device) < share
+        masks.append(mask)
+    return torch.stack(masks)
