@@ -193,6 +193,7 @@ def test_sampling_options_reach_the_model(run_folder, tmp_path, typed):
         "mask": "threshold",
         "range_temperature": 0.5,
         "range_noise": 0.7,
+        "completion": "auto",
         "weights": "fp32",
         "decoder": "fp32",
     }

@@ -1,0 +1,122 @@
+"""The network that completes scans: it begins at triangulation, learns, samples its mask by seed, and is a stage."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from lidargrit.conditions import Condition
+from lidargrit.conditions.fills import fill
+from lidargrit.conditions.hints import hints_of
+from lidargrit.errors import ConfigError
+from lidargrit.generators import load
+from lidargrit.generators.lidargrit import LidarGrit, TokenSampling
+from lidargrit.nn.completion_network import CompletionNetwork, CompletionNetworkConfig
+from lidargrit.nn.completion_objective import CompletionObjective, random_patterns
+from lidargrit.sensors import load_sensor
+from lidargrit.structures import RangeImage
+
+SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
+TINY = CompletionNetworkConfig(widths=(8, 8, 8), blocks=1, features=4, mask_width=4, row_channels=1)
+
+
+def scans(count: int) -> RangeImage:
+    """Return smooth walls with drops."""
+    rng = torch.Generator().manual_seed(1)
+    angle = SENSOR.azimuth_rad + 6 * torch.rand(count, 1, 1, generator=rng)
+    range_m = (10 + 5 * angle.cos()).expand(count, 64, 32)
+    return RangeImage.masked(range_m, torch.rand(count, 64, 32, generator=rng) < 0.8, SENSOR)
+
+
+def rows_of(images: RangeImage) -> Condition:
+    observed = torch.zeros_like(images.return_mask)
+    observed[:, 2::4] = True
+    return Condition.of_pixels(images, observed)
+
+
+def made() -> CompletionNetwork:
+    torch.manual_seed(0)
+    return CompletionNetwork(TINY, SENSOR).eval()
+
+
+def test_hints_tell_the_next_return_on_every_side():
+    range_m = torch.zeros(1, 64, 32)
+    range_m[0, 10, 4], range_m[0, 10, 30], range_m[0, 20, 6] = 5.0, 8.0, 11.0
+    image = RangeImage(range_m, range_m > 0, SENSOR)
+    hints = hints_of(Condition.of_pixels(image, torch.ones_like(image.return_mask)))
+    above, below, left, right = hints.candidates[0, 3:, 10, 6].expm1().tolist()
+    assert (below, left, right) == pytest.approx((11.0, 5.0, 8.0))
+    assert above == pytest.approx(float(hints.candidates[0, 0, 10, 6].expm1()))  # nothing above: as triangulated
+    assert hints.maps[0, 9:13, 10, 6].tolist() == pytest.approx([4.0, 10 / 16, 2 / 16, 24 / 16])
+    assert float(hints_of(Condition.nothing(SENSOR, 1)).maps.abs().max()) == 0
+
+
+@torch.no_grad()
+def test_it_begins_near_triangulation_and_a_scan_depends_on_its_seed_alone():
+    network, known = made(), rows_of(scans(3))
+    seeds = [torch.Generator().manual_seed(seed) for seed in (5, 6, 5)]
+    together = network.sample(known, seeds)
+    alone = network.sample(known[1:2], [torch.Generator().manual_seed(6)])
+    assert torch.equal(together.range_m[1], alone.range_m[0])
+    triangles = fill("triangulation", known)
+    both = together.return_mask & triangles.return_mask
+    assert float((together.range_m - triangles.range_m)[both].abs().mean()) < 1.5
+    assert torch.equal(together.return_mask[known.return_observed], known.return_mask[known.return_observed])
+
+
+def test_the_likelihood_of_the_mask_counts_unknown_pixels_alone():
+    network, images = made(), scans(2)
+    known = rows_of(images)
+    point = network(hints_of(known), known.return_observed)
+    nats = network.mask_nats(point, images.return_mask, None)
+    assert nats.shape == (2,)
+    rng = torch.Generator().manual_seed(0)
+    estimates = torch.stack([network.mask_nats(point, images.return_mask, rng) for _ in range(40)])
+    assert torch.allclose(estimates.mean(0), nats, rtol=0.1)
+    whole = Condition.of_pixels(images, torch.ones_like(images.return_mask))
+    point = network(hints_of(whole), whole.return_observed)
+    assert network.mask_nats(point, images.return_mask, None).tolist() == [0, 0]
+
+
+def test_it_learns():
+    objective, images = CompletionObjective(made(), SENSOR).train(), scans(4)
+    optimiser = torch.optim.Adam(objective.parameters(), lr=3e-3)
+    losses = []
+    for _ in range(12):
+        terms = objective(images, torch.Generator().manual_seed(0))
+        optimiser.zero_grad()
+        terms["loss"].backward()
+        optimiser.step()
+        losses.append(float(terms["loss"].detach()))
+    assert losses[-1] < 0.8 * losses[0]
+    assert all(weight.grad is not None for weight in objective.parameters())
+
+
+def test_training_hides_rows_sectors_and_pixels():
+    masks = random_patterns(60, 64, 32, torch.Generator().manual_seed(0))
+    rows = (masks == masks[:, :, :1]).all((1, 2))
+    sectors = (masks == masks[:, :1]).all((1, 2))
+    assert 15 < int(rows.sum()) < 36
+    assert 8 < int(sectors.sum()) < 26
+    assert 8 < int((~rows & ~sectors).sum()) < 26
+    assert bool(masks.flatten(1).any(1).all())
+    assert not bool(masks.flatten(1).all(1).any())
+
+
+def test_a_model_with_the_stage_completes_by_it_and_survives_saving(tmp_path):
+    torch.manual_seed(0)
+    model = LidarGrit(replace(LidarGrit.smallest_config(SENSOR), completion=TINY), SENSOR).eval()
+    assert model.stages == ("tokenizer", "transformer", "completion")
+    known = rows_of(scans(2))
+    done = model.complete(known, [1, 2])
+    observed = known.return_observed
+    assert torch.equal(done.range_m[observed], known.images.range_m[observed])
+    by_tokens = model.complete(known, [1, 2], TokenSampling(completion="tokens"))
+    assert not torch.equal(done.range_m, by_tokens.range_m)
+    model.save(tmp_path)
+    assert torch.equal(load(tmp_path).complete(known[1:], [2]).range_m[0], done.range_m[1])
+    dropped = model.complete(Condition.of_surfaces(scans(1)), [0])  # no task for the network
+    assert not bool((dropped.return_mask & ~scans(1).return_mask).any())
+    plain = LidarGrit(LidarGrit.smallest_config(SENSOR), SENSOR)
+    with pytest.raises(ConfigError, match="completion=network for a model without a network"):
+        plain.complete(known, [1, 2], TokenSampling(completion="network"))
