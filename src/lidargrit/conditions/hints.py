@@ -23,7 +23,7 @@ class Hints(NamedTuple):
     """What is easily told of every pixel of partly observed scans; ranges are ln(1 + range in metres).
 
     Args:
-        maps: what was observed, how the nearest return and its neighbours differ from triangulation, how far they are.
+        maps: observed pixels, differences of the nearest return and its neighbours from triangulation, distances.
         candidates: ranges by triangulation, by interpolation, of the nearest return, and of the next return above,
             below, to the left and to the right.
     """

@@ -54,7 +54,7 @@ class Point(NamedTuple):
     """The network's estimate of every pixel.
 
     Args:
-        guide: what the phases of the mask go by.
+        guide: inputs of the phases of the mask.
         v: ln(1 + range in metres), with its gradient.
         return_logits: logits of the probability of a return by itself, with their gradient.
     """
@@ -101,7 +101,7 @@ class CompletionNetwork(nn.Module):
         """Return the estimate of every pixel.
 
         Args:
-            hints: what classical ways make of the observed pixels.
+            hints: classical fills of the observed pixels.
             known: True where it was observed whether there is a return.
         """
         rows = self.rows[None, :, :, None].expand(len(known), -1, -1, known.shape[-1])

@@ -228,7 +228,7 @@ class MaskNetwork(PhaseNetwork):
         """Return the mask, sampled phase by phase around what is known of it.
 
         Args:
-            guide: what the decoder tells of every pixel.
+            guide: output of the decoder for every pixel.
             uniform: random numbers in [0, 1).
             condition: known part of the scans, whose returns are taken over as they are.
         """
