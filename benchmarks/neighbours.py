@@ -1,6 +1,8 @@
 """Seconds of a command on an idle machine and beside busy processes, by how its threads wait for one another.
 
-    python benchmarks/neighbours.py [--words "sample pretrained" -n 8 32] [--busy 0 1 2] [--repeats 2]
+    python benchmarks/neighbours.py [--words "sample pretrained {out} -n {n}"] [-n 8 32] [--busy 0 1 2] [--repeats 2]
+    python benchmarks/neighbours.py --words "train demo {out} --set training.tokenizer.scans={n}" -n 200 --limit 900
+    python benchmarks/neighbours.py --words "demo --out {out}" -n 1 --limit 3000
 
 Each row is one way of waiting: as the command arranges it, as OpenMP does by itself (threads spin), and with one
 thread. A busy process is a Python loop that never ends. Seconds are of the whole command, its start included, the least
@@ -61,8 +63,9 @@ def timed(python: str, words: list[str], environment: dict[str, str], limit_s: f
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--words", default="sample pretrained", help="a verb that takes a folder and -n")
-    parser.add_argument("-n", type=int, nargs="*", default=[8, 32], help="how many scans")
+    words = "a command, with {out} for a new folder and {n} for the number of scans"
+    parser.add_argument("--words", default="sample pretrained {out} -n {n}", help=words)
+    parser.add_argument("-n", type=int, nargs="*", default=[8, 32], help="numbers of scans")
     parser.add_argument("--busy", type=int, nargs="*", default=[0, 1, 2], help="how many busy processes")
     parser.add_argument("--repeats", type=int, default=2)
     parser.add_argument("--ways", nargs="*", default=list(WAYS), choices=list(WAYS))
@@ -77,7 +80,7 @@ def main() -> None:
                 found = []
                 for _ in range(options.repeats):
                     with tempfile.TemporaryDirectory() as folder, busy(neighbours):
-                        words = [*options.words.split(), f"{folder}/out", "-n", str(count)]
+                        words = options.words.format(out=f"{folder}/out", n=count).split()
                         found.append(timed(options.python, words, WAYS[name], options.limit))
                 seconds, own, others = min(found)
                 bound = ">" if seconds >= options.limit else " "
