@@ -13,7 +13,7 @@ RECIPE = Recipe(
         "adversarial": FitConfig(
             scans=60_000,
             batch_size=16,
-            learning_rate=2e-4,
+            learning_rate=1e-4,
             betas=(0.0, 0.99),
             gradient_clip=0.0,
             augmentations=("flip",),

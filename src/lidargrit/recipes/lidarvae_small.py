@@ -13,7 +13,8 @@ RECIPE = Recipe(
         "autoencoder": FitConfig(
             scans=60_000,
             batch_size=16,
-            learning_rate=1e-3,
+            learning_rate=2e-4,  # 1e-3 from the first step on makes the log-variance overflow
+            warmup_scans=2000,
             schedule="cosine",
             betas=(0.9, 0.999),
             gradient_clip=0.0,
