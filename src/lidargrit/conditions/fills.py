@@ -98,7 +98,7 @@ def triangulation(seen: Observed) -> Float64[np.ndarray, "H W"]:
     near = maximum_filter1d(maximum_filter1d(~seen.known, _ROWS_NEAR, 0), _COLUMNS_NEAR, 1, mode="wrap")
     helpful = seen.returned & near
     # The circle closes if as many columns as the widest gap are copied on either side.
-    beside = min(width, _widest_gap(helpful.any(0)) + _COLUMNS_NEAR)
+    beside = min(width, _widest_gap(np.asarray(helpful.any(0))) + _COLUMNS_NEAR)
     columns = np.arange(-beside, width + beside)
     rows, at = np.nonzero(helpful[:, columns % width])
     azimuth_rad = seen.azimuth_rad[columns % width] - 2 * np.pi * (columns // width)

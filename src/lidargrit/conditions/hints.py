@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Float64
-from scipy.ndimage import uniform_filter
+from jaxtyping import Bool, Float, Float32, Float64
+from scipy.ndimage import uniform_filter1d
 from torch import Tensor
 
 from lidargrit.conditions import Condition
@@ -50,9 +50,7 @@ def _of_one(seen: Observed) -> tuple[Float32[np.ndarray, "15 H W"], Float32[np.n
     )
     sides = [np.where(np.isnan(side), triangles, side) for side in sides]
     drops = seen.known & ~seen.returned
-    share_known, share_dropped = (
-        uniform_filter(part.astype(np.float64), _WINDOW, mode=("constant", "wrap")) for part in (seen.known, drops)
-    )
+    share_known, share_dropped = _share_around(seen.known), _share_around(drops)
     maps = [
         seen.known,
         seen.returned,
@@ -67,6 +65,12 @@ def _of_one(seen: Observed) -> tuple[Float32[np.ndarray, "15 H W"], Float32[np.n
     return np.stack(maps).astype(np.float32), np.stack([triangles, lines, near, *sides]).astype(np.float32)
 
 
+def _share_around(part: Bool[np.ndarray, "H W"]) -> Float64[np.ndarray, "H W"]:
+    """Return for every pixel the share of the pixels around it that belong to a part; the circle closes."""
+    down = uniform_filter1d(part.astype(np.float64), _WINDOW, 0, mode="constant")
+    return uniform_filter1d(down, _WINDOW, 1, mode="wrap")
+
+
 def _next_return(
     seen: Observed, down: int, right: int
 ) -> tuple[Float64[np.ndarray, "H W"], Float64[np.ndarray, "H W"]]:
@@ -79,6 +83,7 @@ def _next_return(
     last = np.concatenate((np.full((len(lines), 1), -1), last[:, :-1]), axis=1)  # not the pixel itself
     range_m = np.where(last >= 0, np.take_along_axis(lines, np.maximum(last, 0), axis=1), np.nan)
     away = np.where(last >= 0, np.minimum((place - last) / _FAR_PIXELS, _FARTHEST), _FARTHEST)
-    found = [part if backwards else part[:, ::-1] for part in (np.log1p(range_m), away)]
     width = seen.range_m.shape[1]
-    return tuple(part[:, width : 2 * width] if right else part.T for part in found)
+    v, away = (part if backwards else part[:, ::-1] for part in (np.log1p(range_m), away))
+    middle = slice(width, 2 * width)
+    return (v[:, middle], away[:, middle]) if right else (v.T, away.T)
