@@ -15,7 +15,7 @@ SEED = 3
 SHOWN = {1: 8, 4: 4, 7: 2, 10: 1}  # number of phases → distance of the pixels that are sampled then
 
 
-def main(run: str, folder: Path) -> None:
+def main(folder: Path, run: str = "pretrained") -> None:
     """Sample one scan with and without the pixel decoder, and show it as it grows."""
     model = lidargrit.load(run)
     if not isinstance(model, LidarGrit) or not isinstance(model.pixels, PixelDecoder):
@@ -33,11 +33,11 @@ def main(run: str, folder: Path) -> None:
         axis.set(xticks=[], yticks=[])
     figure.savefig(folder / "pixel_phases.png", dpi=100, metadata={"Software": None})
     plt.close(figure)
+    print(f"seed {SEED} of {run}: {count} phases in {folder / 'pixel_phases.png'}")
 
 
 if __name__ == "__main__":
     try:
-        given = sys.argv[1:]
-        main(given[0] if given else "pretrained", Path(given[1] if len(given) > 1 else "docs/pictures"))
+        main(Path("docs/pictures"), *sys.argv[1:2])
     except LidarGritError as error:
         raise SystemExit(str(error)) from None

@@ -16,8 +16,7 @@ from lidargrit.cli import build_parser
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([*(ROOT / "docs").rglob("*.md"), *ROOT.glob("*.md")])
 TEXTS = {page: page.read_text(encoding="utf-8") for page in PAGES}
-NEEDS_A_RUN = {"pixel_phases"}  # with a pixel decoder, which takes longer to train than a test may
-EXAMPLES = [path for path in sorted((ROOT / "examples").glob("*.py")) if path.stem not in NEEDS_A_RUN]
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 VERBS = {parser.prog.split()[1]: parser for parser in build_parser().verbs()}
 
 

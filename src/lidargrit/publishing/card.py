@@ -84,7 +84,7 @@ lidargrit view samples
 
 ```python
 from lidargrit import unproject
-from lidargrit.generators import Generator, recipe_settings
+from lidargrit.generators import Generator
 
 model = Generator.from_pretrained("FOLDER")  # or "USER/NAME", with the extra lidargrit[hub]
 scans = model.sample(seeds=[0, 1, 2, 3])  # one for each seed
