@@ -111,7 +111,7 @@ def test_a_scorecard_tells_all_that_is_needed_to_repeat_it(card):
         assert score["interval"]["low"] <= score["value"] <= score["interval"]["high"]
         assert score["floor"]["num_scans"] == 5
         assert score["seconds"] >= 0
-    assert any("10 scans of each set" in warning for warning in card.warnings)
+    assert any("10 scans in each set" in warning for warning in card.warnings)
 
 
 def test_the_same_again_gives_the_same(card, sets):

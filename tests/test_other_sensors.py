@@ -53,9 +53,9 @@ def test_nuscenes_axes_are_turned_rings_counted_from_the_top_and_near_points_lef
         (bytes(32), "32 bytes in .*; if its rows are x, y, z, reflectance, as KITTI writes them, name it .bin"),
         (SWEEP[:, [0, 1, 2, 3, 0]], "laser numbers other than 0 to 31"),
         (SWEEP * np.float32([1, 1, 1, 2, 1]), "reflectance from 0.4 to 2 in"),
-        (SWEEP * np.float32([np.nan, 1, 1, 1, 1]), "3 of 3 points NaN or infinite"),
+        (SWEEP * np.float32([np.nan, 1, 1, 1, 1]), "3 of 3 points with NaN or infinite"),
         (SWEEP[2:], "no point in"),
-        (SWEEP * np.float32([np.inf, 1, 1, 1, 1]), "3 of 3 points NaN or infinite"),
+        (SWEEP * np.float32([np.inf, 1, 1, 1, 1]), "3 of 3 points with NaN or infinite"),
     ],
 )
 def test_nuscenes_files_that_are_refused(tmp_path, content, text):
@@ -252,7 +252,7 @@ def test_argoverse_files_that_are_refused(tmp_path, sweep):
         ({"z": None}, "no column z"),
         ({"x": np.array(["a"] * count)}, "string in the column x|large_string in the column x"),
         ({"laser_number": np.full(count, 64, "u1")}, "no point of up_lidar"),
-        ({"x": np.full(count, np.nan, "f2")}, "points NaN or infinite"),
+        ({"x": np.full(count, np.nan, "f2")}, "points with NaN or infinite"),
     ]:
         path = sweep(tmp_path / "a.feather", **changed)
         with pytest.raises(ScanError, match=text) as refusal:
@@ -272,7 +272,7 @@ def test_argoverse_points_that_are_none_do_not_move_the_rings_of_others(tmp_path
         values[: 10 * 30 : 2] = bad  # half of the points of ten lasers
         values[31 * 30 : 32 * 30] = bad  # all of one's
     path = sweep(tmp_path / "b.feather", **columns)
-    with pytest.raises(ScanError, match=r"180 of 960 points (NaN or infinite|at the origin)"):
+    with pytest.raises(ScanError, match=r"180 of 960 points (with NaN or infinite coordinates|at the origin)"):
         read_scan(path)
     left, kept = read_scan(path, bad_points="drop"), np.isfinite(columns["x"][:960]) & (columns["x"][:960] != 0)
     assert torch.equal(left.ring, whole.ring[torch.from_numpy(kept)])

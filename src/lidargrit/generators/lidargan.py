@@ -29,6 +29,7 @@ from lidargrit.nn.lidargan import (
 )
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.published import read_checkpoint
+from lidargrit.nn.size import numbers_of_file
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
@@ -155,7 +156,8 @@ class LidarGan(Generator[LidarGanConfig, NoSampling]):
             raise CheckpointError(
                 f"{path}, which generates {image_channels} coordinates", "distance and height", "use another file"
             )
-        generator = cls(LidarGanConfig(latent_dim, channels, config.rows, config.first_row, config.loss), sensor)
+        with numbers_of_file(files[0]):
+            generator = cls(LidarGanConfig(latent_dim, channels, config.rows, config.first_row, config.loss), sensor)
         load_exactly(generator.decoder, without_counters(weights, generator.decoder), path)
         return generator.eval()
 

@@ -23,7 +23,7 @@ from lidargrit.nn.lidargen_checkpoint import read_lidargen_checkpoint
 from lidargrit.nn.ncsn import SIDE_AT_LEAST, Ncsn
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.score_matching import langevin, pull_towards, score_matching_errors, sigma_table
-from lidargrit.nn.size import numbers_at_most
+from lidargrit.nn.size import numbers_of_file
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
@@ -202,8 +202,7 @@ class LidarGen(Generator[LidarGenConfig, LangevinSampling]):
             levels=len(read.sigmas),
             steps_each=config.steps_each,
         )
-        expected = sum(tensor.numel() for tensor in read.weights.values())
-        with numbers_at_most(2 * expected + 2**20, f"{path} with a network", "check which program saved it"):
+        with numbers_of_file(path):
             generator = cls(read_config, sensor)
         load_exactly(generator, {f"network.{name}": tensor for name, tensor in read.weights.items()}, path)
         return generator.eval()

@@ -139,7 +139,7 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
     @property
     def stages(self) -> tuple[str, ...]:
         """Those of every generator of tokens, then the network that completes scans, if there is one."""
-        return super().stages if self.completion is None else (*super().stages, "completion")
+        return super().stages if self.config.completion is None else (*super().stages, "completion")
 
     def objective(self, stage: str) -> Objective:
         """Return the objective of a stage."""

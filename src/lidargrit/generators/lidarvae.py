@@ -30,6 +30,7 @@ from lidargrit.nn.lidargan import (
 )
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.published import read_checkpoint
+from lidargrit.nn.size import numbers_of_file
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
@@ -214,7 +215,8 @@ class LidarVae(Generator[LidarVaeConfig, VaeSampling]):
                 f"{path}, which encodes {image_channels} coordinates", "distance and height", "use another file"
             )
         sizes = (latent_dim, channels, config.rows, config.first_row)
-        generator = cls(LidarVaeConfig(*sizes, config.warmup_scans, config.free_nats), sensor)
+        with numbers_of_file(files[0]):
+            generator = cls(LidarVaeConfig(*sizes, config.warmup_scans, config.free_nats), sensor)
         weights |= {"image.scale_m": generator.image.scale_m}
         load_exactly(generator, without_counters(weights, generator), path)
         return generator.eval()

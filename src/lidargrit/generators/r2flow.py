@@ -22,6 +22,7 @@ from lidargrit.nn.flops import flops_of
 from lidargrit.nn.hdit import Hdit, HditConfig
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.published import read_checkpoint
+from lidargrit.nn.size import numbers_of_file
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
@@ -140,7 +141,8 @@ class R2flow(Generator[R2flowConfig, FlowSampling]):
         """
         weights = read_checkpoint(files[0], ("weights",), _BYTES_AT_MOST)
         hdit, channels = _sizes(weights, files[0])
-        generator = cls(R2flowConfig(hdit, reflectance=channels > 1), sensor)
+        with numbers_of_file(files[0]):
+            generator = cls(R2flowConfig(hdit, reflectance=channels > 1), sensor)
         load_exactly(generator, {f"network.{name}": tensor for name, tensor in weights.items()}, files[0])
         return generator.eval()
 

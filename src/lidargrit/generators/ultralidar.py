@@ -18,7 +18,7 @@ from lidargrit.generators._tokens import sample_tokens
 from lidargrit.nn.codebook_care import CodebookCare
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.objective import Objective
-from lidargrit.nn.size import numbers_at_most
+from lidargrit.nn.size import numbers_of_file
 from lidargrit.nn.swin import SwinConfig
 from lidargrit.nn.ultralidar_checkpoint import read_ultralidar_checkpoint
 from lidargrit.nn.voxel_autoencoder import VoxelAutoencoder, VoxelAutoencoderConfig, reconstruction_loss
@@ -177,8 +177,7 @@ class UltraLidar(Generator[UltraLidarConfig, VoxelSampling]):
         """
         (path,) = files
         read = read_ultralidar_checkpoint(path, config.autoencoder)
-        expected = sum(tensor.numel() for tensor in read.weights.values())
-        with numbers_at_most(2 * expected + 2**20, f"{path} with a network", "check which program saved it"):
+        with numbers_of_file(path):
             generator = cls(UltraLidarConfig(read.autoencoder, read.prior, config.flips), sensor)
         counts = {name: of for name, of in generator.state_dict().items() if name.startswith("autoencoder.quantiser.")}
         load_exactly(generator, counts | read.weights, path)  # how often codes were used is not in the file

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
 
 from torch import Tensor, nn
 from torch.nn.modules.module import (
@@ -14,6 +15,11 @@ from torch.nn.modules.module import (
 from lidargrit.errors import ConfigError
 
 NUMBERS_AT_MOST = 2**30  # 4.3 GB in 32 bits, thirty times the largest network of our recipes
+
+
+def numbers_of_file(path: Path) -> AbstractContextManager[None]:
+    """Refuse to build networks larger than the checkpoint of which their sizes were read; see numbers_at_most."""
+    return numbers_at_most(path.stat().st_size // 2 + 2**20, f"{path} with a network", "check which program saved it")
 
 
 @contextmanager
