@@ -21,7 +21,7 @@ HOOKS = {  # what a generator with a capability overrides
     "encode": "_reconstruct",
     "complete": "_complete",
     "invert": "_invert",
-    "likelihood": "_log_likelihood",
+    "likelihood": "_bits",
 }
 
 
@@ -72,7 +72,7 @@ def calls(images, condition, seeds, sampling):
         "encode": ("reconstruct", images),
         "complete": ("complete", condition, seeds, sampling),
         "invert": ("invert", images, seeds, sampling),
-        "likelihood": ("log_likelihood", images),
+        "likelihood": ("bits", images),
     }
 
 
@@ -204,7 +204,12 @@ def test_what_it_can_do_besides_keeps_to_the_seeds_and_the_sensor(name):
     if "encode" in generator.capabilities:
         assert generator.reconstruct(images).range_m.shape == (2, 64, 32)
     if "likelihood" in generator.capabilities:
-        assert bool((generator.log_likelihood(images) < 0).all())
+        bits = generator.bits(images)
+        assert bits.per_scan().keys() == ({"tokens", "mask", "range"} if bits.is_whole else {"tokens"})
+        assert bool((bits.total() > 0).all())
+        assert float(bits.per_pixel().double().sum()) == pytest.approx(float(bits.total().sum()), rel=1e-5)
+        with pytest.raises(ConfigError, match="got a step of 0 mm; wanted a whole number of millimetres"):
+            generator.bits(images, step_mm=0)
     for capability, given in (("complete", Condition.of_pixels(images, observed)), ("invert", images)):
         if capability in generator.capabilities:
             method = getattr(generator, capability)

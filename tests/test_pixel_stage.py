@@ -7,13 +7,15 @@ import math
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 import pytest
 import torch
 
 from lidargrit.cli import main
 from lidargrit.conditions import Condition
 from lidargrit.errors import ConfigError
-from lidargrit.evaluation.reconstruction import score_likelihood
+from lidargrit.evaluation.estimates import Estimate
+from lidargrit.evaluation.likelihood import score_likelihood
 from lidargrit.generators import load
 from lidargrit.generators._batches import in_batches
 from lidargrit.generators._tokens import fill_from_nearest
@@ -29,6 +31,8 @@ from lidargrit.generators.maskgit import MaskedSampling, MaskGit, MaskGitConfig
 from lidargrit.loading import DataConfig
 from lidargrit.nn.decoding import CachedDecoder
 from lidargrit.nn.pixel_networks import PixelDecoderConfig
+from lidargrit.nn.range_mixture import RangeMixture
+from lidargrit.nn.range_steps import RangeSteps
 from lidargrit.nn.transformer import TransformerConfig
 from lidargrit.sensors import load_sensor
 from lidargrit.sources import load_range_images
@@ -96,8 +100,6 @@ def test_a_seed_gives_the_same_scan_whatever_its_batch():
 def test_a_model_without_a_pixel_decoder_refuses_to_sample_by_one():
     with pytest.raises(ConfigError, match="without a pixel decoder"):
         made(None).sample([0], TokenSampling(mask="pixels"))
-    with pytest.raises(ConfigError, match="without a pixel decoder"):
-        made(None).pixel_nll(scans(1))
     with pytest.raises(ConfigError, match="range_noise=0"):
         TokenSampling(range_noise=0.0)
 
@@ -111,21 +113,43 @@ def test_maskgit_takes_a_pixel_decoder_too():
     assert generator.cost().flops > generator.cost(MaskedSampling(mask="bernoulli")).flops
 
 
-def test_the_likelihood_is_that_of_tokens_mask_and_ranges():
+def test_the_bits_are_those_of_tokens_mask_and_ranges():
     generator, images = made(), scans(3)
-    tokens = made(None).log_likelihood(images)
-    nll = generator.pixel_nll(images)
-    expected = tokens - nll.mask.sum((1, 2)) - nll.range.sum((1, 2))
-    assert torch.allclose(generator.log_likelihood(images), expected, rtol=1e-5)
-    assert bool((nll.range[~images.return_mask] == 0).all())
-    bits = generator.bits_by_stage(images)
-    assert set(bits) == {"token_bits_per_pixel", "mask_bits_per_pixel", "range_bits_per_return"}
-    assert set(made(None).bits_by_stage(images)) == {"token_bits_per_pixel"}
-    nats = nll.range.sum() / images.return_mask.sum()
-    expected_bits = (float(nats) - math.log(0.01)) / math.log(2)
-    weights = images.return_mask.sum((1, 2)).float()
-    found = float((bits["range_bits_per_return"] * weights).sum() / weights.sum())
-    assert found == pytest.approx(expected_bits, rel=1e-4)
+    bits, alone = generator.bits(images), made(None).bits(images)
+    assert bits.is_whole
+    assert not alone.is_whole
+    assert set(alone.per_scan()) == {"tokens"}
+    assert torch.equal(alone.tokens, bits.tokens)
+    assert bits.range is not None
+    assert bits.mask is not None
+    assert bool((bits.range[~images.return_mask] == 0).all())
+    assert torch.allclose(bits.total(), sum(bits.per_scan().values()))
+    assert torch.allclose(bits.per_pixel().double().sum((1, 2)), bits.total(), rtol=1e-5)
+    # A step is nearly as likely as its width times the density, where it is narrower than every component.
+    steps = RangeSteps(SENSOR, 1)
+    rounded = steps.round(images)
+    density = generator.pixels(generator.tokenizer.decode(generator.tokenizer.encode(rounded)), rounded).range
+    expected = (density.sum() / math.log(2) - math.log2(0.001) * images.return_mask.sum()).item()
+    assert float(generator.bits(images, 1).per_scan()["range"].sum()) == pytest.approx(expected, rel=2e-3)
+
+
+def test_all_steps_of_a_range_are_sure_to_hold_it():
+    steps = RangeSteps(SENSOR, 500)
+    every = torch.arange(steps.first, steps.last + 1).expand(4, -1)
+    rng = torch.Generator().manual_seed(0)
+    logits, centres, scales = (torch.randn(4, 1, 3, generator=rng).expand(*every.shape, 3) for _ in range(3))
+    limits_m = (SENSOR.range_min_m, SENSOR.range_max_m)
+    mixture = RangeMixture(logits, 2.5 + centres, scales - 3, limits_m)
+    mass = mixture.log_mass(*steps.edges_m(every)).exp()
+    assert torch.allclose(mass.sum(-1), torch.ones(4, dtype=mass.dtype), atol=1e-5)
+    assert torch.equal(steps.indices(steps.range_m(every)), every)
+
+
+def test_maskgit_counts_every_token_alike():
+    generator = MaskGit(MaskGitConfig(TOKENIZER, TRANSFORMER, PIXELS), SENSOR).eval()
+    bits = generator.bits(scans(1))
+    assert bits.is_whole
+    assert float(bits.tokens.sum()) == 64 * 3  # 8 codes
 
 
 def test_a_scan_is_completed_from_the_tokens_and_pixels_that_were_observed():
@@ -238,19 +262,51 @@ def test_evaluate_tells_bits_by_stage(tmp_path, capsys):
     made().save(tmp_path / "run")
     config = DataConfig(train=("simulated:2:test",), val=("simulated:2:test",), columns=512, column_stride=8)
     images = load_range_images(config.train, config)
-    expected = score_likelihood(made(), images)
-    single = made().bits_by_stage(images.batch([0, 1]))
-    assert expected["mask_bits_per_pixel"] == pytest.approx(float(single["mask_bits_per_pixel"].mean()), rel=1e-5)
+    expected = score_likelihood(made(), images).by_natural_unit()
+    single = made().bits(images.batch([0, 1])).per_scan()["mask"] / (64 * 64)
+    assert expected["mask_bits_per_pixel"] == pytest.approx(float(single.mean()), rel=1e-5)
     assert main(["evaluate", str(tmp_path / "run"), "simulated:2:test", "--json"]) == 0
     errors = json.loads(capsys.readouterr().out)["reconstruction"]
     assert errors["range_bits_per_return"] == pytest.approx(expected["range_bits_per_return"], rel=1e-3)
     assert errors["range_mae_m"] > 0
 
 
+def test_the_likelihood_of_a_source_is_told_and_its_map_written(tmp_path, capsys):
+    made().save(tmp_path / "run")
+    words = ["likelihood", "simulated:2:test", "--model", str(tmp_path / "run"), "--map", str(tmp_path / "bits.npy")]
+    assert main([*words, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["whole_scan"]
+    assert told["num_scans"] == 2
+    of_scans = [sum(scan[part] for part in ("tokens", "mask", "range")) for scan in told["scans"]]
+    assert told["bits"]["all"]["scan"]["value"] == pytest.approx(sum(of_scans) / 2)
+    returns = sum(scan["returns"] for scan in told["scans"])
+    assert told["bits"]["range"]["return"]["value"] == pytest.approx(
+        sum(scan["range"] for scan in told["scans"]) / returns
+    )
+    pixels = np.load(tmp_path / "bits.npy")
+    assert pixels.shape == (2, 64, 64)
+    assert pixels.sum((1, 2)) == pytest.approx(of_scans, rel=1e-5)
+    assert main(words) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert main([*words[:4], "--step-mm", "0"]) == 2
+    assert "got a step of 0 mm; wanted a whole number of millimetres" in capsys.readouterr().err
+
+
+def test_the_interval_of_a_ratio_holds_what_other_scans_would_give():
+    rng = np.random.default_rng(0)
+    inside = 0
+    for _ in range(200):
+        returns = rng.integers(50, 150, 64)
+        found = Estimate.of_ratio(5 * returns + rng.normal(0, 40, 64), returns)
+        inside += found.low < 5 < found.high
+    assert 180 <= inside <= 199  # of 200 intervals of 95 %
+
+
 def test_simulated_scans_have_a_finite_likelihood():
     config = DataConfig(train=("simulated:1:test",), val=("simulated:1:test",), columns=512, column_stride=8)
     images = load_range_images(config.train, config).batch([0])
-    assert bool(made().log_likelihood(images).isfinite().all())
+    assert bool(made().bits(images).total().isfinite().all())
 
 
 def test_the_last_batch_is_filled_up_with_copies():

@@ -68,10 +68,12 @@ def test_its_networks_compute_what_they_did_when_they_were_scored(model, tmp_pat
     assert errors["range_mae_m"] == pytest.approx(1.128, rel=0.02)
     assert errors["mask_accuracy"] == pytest.approx(0.934, abs=0.004)
     one = RangeImage.stack([project(simulate(seed=0), model.sensor)])
-    bits = {name: value.item() for name, value in model.bits_by_stage(one).items()}
-    assert bits["token_bits_per_pixel"] == pytest.approx(0.102, abs=0.001)  # 4.54 nats a token; untrained 6.9
-    assert bits["mask_bits_per_pixel"] == pytest.approx(0.272, abs=0.003)
-    assert bits["range_bits_per_return"] == pytest.approx(4.85, abs=0.02)
+    bits = model.bits(one)
+    found = {name: value.item() for name, value in bits.per_scan().items()}
+    pixels, returns = 64 * 256, int(one.return_mask.sum())
+    assert found["tokens"] / pixels == pytest.approx(0.102, abs=0.001)  # 4.54 nats a token; untrained 6.9
+    assert found["mask"] / pixels == pytest.approx(0.272, abs=0.003)
+    assert found["range"] / returns == pytest.approx(4.85, abs=0.02)
 
 
 def test_what_a_user_calls_so_goes_first(model, tmp_path, monkeypatch):

@@ -246,6 +246,48 @@ class Decoded:
         return RangeImage.masked(self.range_m, return_mask, self.sensor, self.reflectance)
 
 
+@dataclass(frozen=True, eq=False)
+class ScanBits:
+    """How many bits name each scan of a batch, by a model's probabilities: -log2 of the likelihood, in its parts.
+
+    Args:
+        step_mm: step in millimetres that ranges are rounded to.
+        return_mask: returns of the scans.
+        tokens: bits of each token, given those before it.
+        mask: bits of the return or ray drop of each pixel, given the tokens; None from a model without its probability.
+        range: bits of the range of each pixel, 0 where there is no return, given tokens and mask; None likewise.
+    """
+
+    step_mm: int
+    return_mask: Bool[Tensor, "B H W"]
+    tokens: Float[Tensor, "B h w"]
+    mask: Float[Tensor, "B H W"] | None = None
+    range: Float[Tensor, "B H W"] | None = None
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the bits name the whole scan; tokens alone leave open what is lost in encoding."""
+        return self.mask is not None and self.range is not None
+
+    def per_scan(self) -> dict[str, Float[Tensor, "B"]]:
+        """Return the bits of each part of each scan, by the part's name, in 64 bits."""
+        parts = {"tokens": self.tokens, "mask": self.mask, "range": self.range}
+        return {name: bits.double().sum((1, 2)) for name, bits in parts.items() if bits is not None}
+
+    def total(self) -> Float[Tensor, "B"]:
+        """Return the bits of each scan, all parts together, in 64 bits."""
+        return torch.stack([*self.per_scan().values()]).sum(0)
+
+    def per_pixel(self) -> Float[Tensor, "B H W"]:
+        """Return the bits of each pixel: of its mask, its range, and an even share of its token's."""
+        height, width = self.return_mask.shape[1:]
+        rows, columns = height // self.tokens.shape[1], width // self.tokens.shape[2]
+        bits = self.tokens.repeat_interleave(rows, 1).repeat_interleave(columns, 2) / (rows * columns)
+        for part in (self.mask, self.range):
+            bits = bits if part is None else bits + part
+        return bits
+
+
 @dataclass(frozen=True)
 class MetricResult:
     """A number with everything needed to read it.

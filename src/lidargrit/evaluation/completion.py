@@ -9,10 +9,8 @@ from dataclasses import asdict, dataclass
 from itertools import combinations
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from scipy.stats import t as student
 from torch import Tensor
 
 from lidargrit.completion import Completer
@@ -20,7 +18,7 @@ from lidargrit.conditions import Condition
 from lidargrit.conditions.patterns import Pattern
 from lidargrit.determinism import derive_seed
 from lidargrit.errors import ConfigError, DataError
-from lidargrit.evaluation.intervals import blocks
+from lidargrit.evaluation.estimates import Estimate
 from lidargrit.loading import RangeImages
 from lidargrit.metrics import load_metric
 from lidargrit.projection import points_of_pixels
@@ -31,34 +29,6 @@ PATTERNS = ("rows:4", "sector:45,315", "pixels:0.1")
 """Patterns that are compared unless others are named: every fourth row, all but 90 degrees ahead, a tenth."""
 BASELINE = "triangulation"
 VOXEL_M = 0.1
-_GROUPS = 16
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A mean over scans.
-
-    Args:
-        value: mean; NaN where no scan has it.
-        low: lower end of its 95 % interval, from groups of neighbouring scans; NaN with fewer than two groups.
-        high: upper end of the interval.
-    """
-
-    value: float
-    low: float
-    high: float
-
-    @classmethod
-    def of(cls, values: Sequence[float]) -> Estimate:
-        """Return the mean of one value a scan, without those that are NaN, with Student's interval over groups."""
-        groups = [np.asarray([values[index] for index in group]) for group in blocks(len(values), _GROUPS)]
-        means = np.asarray([group[~np.isnan(group)].mean() for group in groups if not np.isnan(group).all()])
-        every = np.asarray(values)[~np.isnan(values)]
-        mean = float(every.mean()) if len(every) else math.nan
-        if len(means) < 2:
-            return cls(mean, math.nan, math.nan)
-        reach = float(student.ppf(0.975, len(means) - 1) * means.std(ddof=1) / math.sqrt(len(means)))
-        return cls(mean, mean - reach, mean + reach)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from lidargrit.errors import ConfigError, DataError, ScanError
-from lidargrit.generators import Generator
+from lidargrit.evaluation.likelihood import score_likelihood
 from lidargrit.loading import DataConfig, RangeImages
 from lidargrit.reporting import Reporter
 from lidargrit.sources import RunSource, Source, overlap
@@ -152,25 +152,10 @@ def score_run(run: RunSource, source: Source, config: DataConfig, reporter: Repo
     images = source.images(run.sensor, config, reporter)
     if shared := overlap(run, None, images):
         reporter.message(f"WARNING: {run.text} and the reference overlap ({shared}): the scores flatter it")
-    return {**asdict(score_reconstruction(tokenizer, images)), **score_likelihood(run.generator, images)}
-
-
-@torch.no_grad()
-def score_likelihood(generator: Generator, images: RangeImages) -> dict[str, float]:
-    """Return the mean bits that each part of the scans of a set takes; none from a model without a likelihood.
-
-    Every pixel of the set counts the same, and every return.
-    """
-    sums: dict[str, float] = {}
-    counts: dict[str, float] = {}
-    for first in range(0, len(images), _BATCH):
-        batch = images.batch(range(first, min(first + _BATCH, len(images))))
-        returns = batch.return_mask.sum((1, 2)).double()
-        for name, bits in generator.bits_by_stage(batch).items():
-            weight = returns if name.endswith("_per_return") else torch.full_like(returns, batch.range_m[0].numel())
-            sums[name] = sums.get(name, 0.0) + float((bits.double() * weight).sum())
-            counts[name] = counts.get(name, 0.0) + float(weight.sum())
-    return {name: total / counts[name] for name, total in sums.items()}
+    errors = asdict(score_reconstruction(tokenizer, images))
+    if "likelihood" not in run.generator.capabilities:
+        return errors
+    return {**errors, **score_likelihood(run.generator, images).by_natural_unit()}
 
 
 # The measures of monocular depth estimation (Eigen et al., Depth map prediction from a single image, NeurIPS 2014,

@@ -10,8 +10,6 @@ from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar, final
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from lidargrit import _discovery, configuration
 from lidargrit.conditions import Condition, ConditionKind
@@ -25,9 +23,10 @@ from lidargrit.generators._saved import CARD_FILE as CARD_FILE
 from lidargrit.generators._saved import CONFIG_FILE, WEIGHTS_FILE, ConfigT, SavedModel
 from lidargrit.loading import RangeImages
 from lidargrit.nn.objective import Objective
+from lidargrit.nn.range_steps import RangeSteps
 from lidargrit.nn.size import numbers_at_most
 from lidargrit.sensors import SensorModel
-from lidargrit.structures import RangeImage
+from lidargrit.structures import RangeImage, ScanBits
 from lidargrit.tokenizers import Tokenizer
 
 RUN_FILE = "run.json"  # ``origin`` in it says that the weights beside it were not trained in this folder
@@ -64,7 +63,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     ``capabilities``; asked for more, it answers which generators can.
 
     The public methods check their arguments and form batches, the same for all. A subclass writes ``_sample``, and for
-    its capabilities ``_complete``, ``_invert``, ``_reconstruct``, ``_log_likelihood`` and ``get_tokenizer``; these get
+    its capabilities ``_complete``, ``_invert``, ``_reconstruct``, ``_bits`` and ``get_tokenizer``; these get
     valid arguments on the generator's device, in evaluation mode and without gradients.
     """
 
@@ -237,21 +236,23 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
 
     @final
     @torch.no_grad()
-    def log_likelihood(self, images: RangeImage) -> Float[Tensor, "B"]:
-        """Return the log-likelihood of each scan in nats (capability ``likelihood``).
+    def bits(self, images: RangeImage, step_mm: int = 10) -> ScanBits:
+        """Return how many bits name each scan by the generator's exact probabilities (capability ``likelihood``).
 
-        It is that of the generator's own representation of a scan, such as its tokens: systems do not compare by it.
+        Ranges are rounded to a step first: without one, no number of bits would be enough. Systems compare by their
+        bits at one step if they tell those of the whole scan (:attr:`ScanBits.is_whole`).
+
+        Args:
+            images: batch of range images (B, H, W).
+            step_mm: step of the ranges in whole millimetres.
 
         Raises:
-            ConfigError: images of other rays, or a generator without the capability.
+            ConfigError: images of other rays, another step, or a generator without the capability.
         """
         self._require("likelihood")
         check_images(images, self.sensor)
-        return self.eval()._log_likelihood(images.to(self.device))
-
-    def bits_by_stage(self, images: RangeImage) -> dict[str, Float[Tensor, "B"]]:
-        """Return the bits of each part of a scan, by a name that ends in their unit; empty where none are known."""
-        return {}
+        steps = RangeSteps(self.sensor, step_mm)
+        return self.eval()._bits(steps.round(images.to(self.device)), steps)
 
     @abstractmethod
     def _sample(self, seeds: BatchSeeds, sampling: SamplingT) -> RangeImage:
@@ -267,7 +268,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     def _reconstruct(self, images: RangeImage) -> RangeImage:
         raise NotImplementedError
 
-    def _log_likelihood(self, images: RangeImage) -> Float[Tensor, "B"]:
+    def _bits(self, images: RangeImage, steps: RangeSteps) -> ScanBits:
         raise NotImplementedError
 
     def _settings(self, given: SamplingT | None, default: Callable[[], SamplingT]) -> SamplingT:

@@ -18,12 +18,13 @@ from lidargrit.conditions import Condition
 from lidargrit.errors import ConfigError
 from lidargrit.generators import Cost, Generator
 from lidargrit.nn.objective import Objective
-from lidargrit.nn.pixel_decoder import PixelDecoder, PixelNll, PixelSampling, nats_to_range_bits
+from lidargrit.nn.pixel_decoder import PixelDecoder, PixelSampling, nats_to_range_bits
 from lidargrit.nn.pixel_networks import PixelDecoderConfig
 from lidargrit.nn.processes import sum_over_processes
+from lidargrit.nn.range_steps import RangeSteps
 from lidargrit.nn.transformer import Transformer, TransformerConfig
 from lidargrit.sensors import SensorModel
-from lidargrit.structures import RangeImage, TokenGrid
+from lidargrit.structures import RangeImage, ScanBits, TokenGrid
 from lidargrit.tokenizers import Tokenizer, TokenizerConfig, make_tokenizer
 from lidargrit.tokenizers.vqvae import VqvaeConfig
 
@@ -60,7 +61,7 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
     """
 
     Config = TokenGeneratorConfig
-    capabilities = frozenset({"tokens", "encode"})
+    capabilities = frozenset({"tokens", "encode", "likelihood"})
 
     def __init__(self, config: TokenConfigT, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
@@ -161,31 +162,21 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
         seen = F.max_pool2d(observed[:, None].float(), cell)[:, 0] > 0
         return torch.where(seen, self.tokenizer.encode(filled).tokens, -1).flatten(1)
 
-    @torch.no_grad()
-    def pixel_nll(self, images: RangeImage) -> PixelNll:
-        """Return the exact negative log-likelihood of the pixels of a batch of scans in nats, given their tokens.
+    def _bits(self, images: RangeImage, steps: RangeSteps) -> ScanBits:
+        """Return the bits of the tokens, and those of mask and ranges given the tokens, if there is a pixel decoder."""
+        grid = self.tokenizer.encode(images)
+        tokens = self.token_bits(grid)
+        if self.pixels is None:
+            return ScanBits(steps.step_mm, images.return_mask, tokens)
+        mask, range_ = (nats / math.log(2) for nats in self.pixels(self.tokenizer.decode(grid), images, steps))
+        return ScanBits(steps.step_mm, images.return_mask, tokens, mask, range_)
 
-        Raises:
-            ConfigError: the model has no pixel decoder.
+    def token_bits(self, grid: TokenGrid) -> Float[Tensor, "B h w"]:
+        """Return the bits of each token, as many for one as for another.
+
+        A generator whose transformer gives exact probabilities of tokens returns their bits instead.
         """
-        if self.pixels is None:
-            raise ConfigError(
-                "a model without a pixel decoder",
-                "one whose pixels have a likelihood",
-                "train a recipe with the stage pixels, such as compact_pixels",
-            )
-        self.eval()
-        return self.pixels(self.tokenizer.decode(self.tokenizer.encode(images)), images)
-
-    def bits_by_stage(self, images: RangeImage) -> dict[str, Float[Tensor, "B"]]:
-        """Return the bits of mask and ranges (to a centimetre), given the tokens; none without a pixel decoder."""
-        if self.pixels is None:
-            return {}
-        nll, returns = self.pixel_nll(images), images.return_mask.sum((1, 2)).clamp(min=1)
-        return {
-            "mask_bits_per_pixel": nll.mask.mean((1, 2)) / math.log(2),
-            "range_bits_per_return": nats_to_range_bits(nll.range.sum((1, 2)) / returns),
-        }
+        return torch.full(grid.tokens.shape, math.log2(grid.num_codes), device=grid.tokens.device)
 
     def decoding_cost(self, mask: PixelChoice) -> Cost:
         """Return the cost of decoding the tokens of one scan, and of its pixel decoder if that samples them."""

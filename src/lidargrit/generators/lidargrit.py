@@ -35,7 +35,7 @@ from lidargrit.nn.precision import Precision
 from lidargrit.nn.published import read_checkpoint
 from lidargrit.nn.transformer import CausalTransformer
 from lidargrit.sensors import SensorModel
-from lidargrit.structures import RangeImage
+from lidargrit.structures import RangeImage, TokenGrid
 from lidargrit.tokenizers import Tokenizer
 
 START_TOKEN = 0  # the reference prepends an ordinary token, shared with the first code, not one of its own
@@ -125,7 +125,7 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
     )
     Sampling = TokenSampling
     published_files = tuple(_PUBLISHED_NETWORKS)
-    capabilities = TokenGenerator.capabilities | {"likelihood", "complete"}
+    capabilities = TokenGenerator.capabilities | {"complete"}
 
     def __init__(self, config: LidarGritConfig, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
@@ -194,33 +194,12 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
             )
         return sampling.completion != "tokens" and self.completion is not None and condition.kinds == {"pixels"}
 
-    @torch.no_grad()
-    def token_nll_bits(self, images: RangeImage) -> Float[Tensor, "B h w"]:
-        """Return the negative log-likelihood of each token given those before it, in bits."""
-        self.eval()
-        tokens = self.tokenizer.encode(images).tokens
-        logits = self.transformer(after_start(tokens.flatten(1)[:, :-1]))
-        nats = F.cross_entropy(logits.double().movedim(-1, 1), tokens.flatten(1), reduction="none")
-        return (nats / math.log(2)).float().view(tokens.shape)
-
-    def _log_likelihood(self, images: RangeImage) -> Float[Tensor, "B"]:
-        """Return the log-likelihood of each scan in nats.
-
-        With a pixel decoder it is that of the scan: of its tokens, and of its mask and ranges given those, ranges as a
-        density per metre. Without one it is that of the tokens alone; what is lost in encoding is not counted.
-        """
-        nats = self.token_nll_bits(images).double().sum(dim=(1, 2)) * math.log(2)
-        if self.pixels is not None:
-            nats = nats + sum(part.double().sum(dim=(1, 2)) for part in self.pixel_nll(images))
-        return -nats.float()
-
-    def bits_by_stage(self, images: RangeImage) -> dict[str, Float[Tensor, "B"]]:
-        """Return the bits of the tokens, and of mask and ranges given those, if there is a pixel decoder."""
-        pixels = images.range_m[0].numel()
-        return {
-            "token_bits_per_pixel": self.token_nll_bits(images).sum((1, 2)) / pixels,
-            **super().bits_by_stage(images),
-        }
+    def token_bits(self, grid: TokenGrid) -> Float[Tensor, "B h w"]:
+        """Return the bits of each token given those before it."""
+        tokens = grid.tokens.flatten(1)
+        logits = self.transformer(after_start(tokens[:, :-1]))
+        nats = F.cross_entropy(logits.double().movedim(-1, 1), tokens, reduction="none")
+        return (nats / math.log(2)).float().view(grid.tokens.shape)
 
     def cost(self, sampling: TokenSampling | None = None) -> Cost:
         """Return the cost of one step of the transformer for each token, with a cache, and of one decoding."""

@@ -16,6 +16,7 @@ from lidargrit.conditions import Condition
 from lidargrit.errors import ConfigError
 from lidargrit.nn.pixel_networks import Guide, MaskNetwork, PixelDecoderConfig, RangeNetwork
 from lidargrit.nn.pixel_phases import Phase, at_phases, join_phases
+from lidargrit.nn.range_steps import RangeSteps
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import Decoded, RangeImage
 
@@ -54,8 +55,8 @@ class PixelNll(NamedTuple):
 
     Args:
         mask: negative log-likelihood of the mask (a return or none), given the earlier pixels.
-        range: negative log-likelihood of the range, a density per metre, given the whole mask and the earlier ranges;
-            0 without a return.
+        range: negative log-likelihood of the range, given the whole mask and the earlier ranges; 0 without a return.
+            The likelihood is the probability of a step where ranges have steps, else a density per metre.
     """
 
     mask: Float[Tensor, "B H W"]
@@ -89,13 +90,19 @@ class PixelDecoder(nn.Module):
         self.config, self.sensor = config, sensor
         self.mask, self.range = MaskNetwork(config, sensor, features), RangeNetwork(config, sensor, features)
 
-    def forward(self, decoded: Decoded, images: RangeImage) -> PixelNll:
-        """Return the exact negative log-likelihood of every pixel, given what was decoded from the tokens."""
+    def forward(self, decoded: Decoded, images: RangeImage, steps: RangeSteps | None = None) -> PixelNll:
+        """Return the exact negative log-likelihood of every pixel, given what was decoded from the tokens.
+
+        Args:
+            decoded: output of the tokenizer's decoder.
+            images: range images, rounded to the steps if there are any.
+            steps: steps whose probability is the likelihood of a range; without them it is a density per metre.
+        """
         guide = Guide.of(decoded)
         guided = self.mask.guided(guide), self.range.guided(guide)
         mask_nll, range_nll = None, None  # of the pixels of a lattice, from the coarsest to the whole image
         for phases in self.mask.by_spacing():
-            of_mask, of_range = self._nll(phases, guided, guide, images)
+            of_mask, of_range = self._nll(phases, guided, guide, images, steps)
             mask_nll, range_nll = join_phases(mask_nll, of_mask), join_phases(range_nll, of_range)
         assert mask_nll is not None
         assert range_nll is not None
@@ -130,7 +137,7 @@ class PixelDecoder(nn.Module):
         return self.mask.flops() + self.range.flops()
 
     def _nll(
-        self, phases: list[Phase], guided: _Guided, guide: Guide, images: RangeImage
+        self, phases: list[Phase], guided: _Guided, guide: Guide, images: RangeImage, steps: RangeSteps | None = None
     ) -> tuple[Float[Tensor, "P B h w"], Float[Tensor, "P B h w"]]:
         """Return the negative log-likelihood of mask and range at phases of one spacing."""
         mask, v = images.return_mask, images.range_m.log1p()
@@ -139,10 +146,14 @@ class PixelDecoder(nn.Module):
         of_mask = F.binary_cross_entropy_with_logits(logits, returned.float(), reduction="none")
         candidates = self.range.candidates(phases, guide, mask, v)
         output = self.range.outputs(phases, guided[1], guide, mask, v)
-        # Where nothing returned, any range within the limits stands in: its density is not used.
+        # Where nothing returned, any range within the limits stands in: its likelihood is not used.
         range_m = torch.where(returned, at_phases(images.range_m, phases), self.sensor.range_min_m)
-        density = self.range.mixture(phases, output, candidates, guide).log_density(range_m)
-        return of_mask, torch.where(returned, -density, 0.0)
+        mixture = self.range.mixture(phases, output, candidates, guide)
+        if steps is None:
+            likelihood = mixture.log_density(range_m)
+        else:
+            likelihood = mixture.log_mass(*steps.edges_m(steps.indices(range_m))).float()
+        return of_mask, torch.where(returned, -likelihood, 0.0)
 
     def sample(
         self,

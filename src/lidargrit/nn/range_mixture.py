@@ -42,6 +42,19 @@ class RangeMixture:
         weighted = self.logits.log_softmax(-1) + component
         return weighted.logsumexp(-1) - v[..., 0]  # dv / d range = 1 / (1 + range) = exp(-v)
 
+    def log_mass(self, low_m: Float[Tensor, "*P"], high_m: Float[Tensor, "*P"]) -> Float[Tensor, "*P"]:
+        """Return the natural logarithm of the probability of a range between two ranges within the limits.
+
+        It is computed from the width of the interval, so that it is exact where the interval holds next to nothing.
+        """
+        inverse = (-self.log_scales).exp()
+        below = (low_m.log1p()[..., None] - self.centres) * inverse
+        width = ((high_m - low_m) / (1 + low_m)).log1p()[..., None] * inverse  # dv = ln((1 + high) / (1 + low))
+        # s(b) - s(a) = s(b) s(-a) (1 - exp(a - b)) of the logistic function s.
+        component = F.logsigmoid(below + width) + F.logsigmoid(-below) + (-(-width).expm1()).log()
+        weighted = self.logits.log_softmax(-1) + component - self._mass().clamp(min=_LEAST_MASS).log()
+        return weighted.logsumexp(-1)
+
     def cdf(self, range_m: Float[Tensor, "*P"]) -> Float[Tensor, "*P"]:
         """Return the probability of a range of at most ``range_m``, which lies within the limits."""
         low, mass = self._bounds()[0], self._mass().clamp(min=_LEAST_MASS)

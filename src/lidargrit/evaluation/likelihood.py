@@ -1,0 +1,178 @@
+"""How many bits name the scans of a set by a model's probabilities: range images → bits with intervals, maps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from lidargrit.evaluation.estimates import Estimate
+from lidargrit.files import atomic_path
+from lidargrit.generators import Generator, locate
+from lidargrit.loading import DataConfig, RangeImages
+from lidargrit.nn.devices import usable_device
+from lidargrit.reporting import Reporter
+from lidargrit.sources import RunSource, open_source, overlap
+
+_BATCH = 4
+_ALL = "all"
+_UNITS = {"scan": "a scan", "return": "a return", "pixel": "a pixel"}
+
+
+@dataclass(frozen=True)
+class Likelihood:
+    """Bits of the scans of a set at one step of range.
+
+    Args:
+        step_mm: step in millimetres that ranges are rounded to.
+        is_whole: whether the bits name the whole scan, or only its tokens.
+        names: name of each scan.
+        parts: bits of each scan, by the name of the part: ``tokens``, ``mask``, ``range``.
+        returns: number of returns of each scan.
+        pixels: number of pixels of each scan, which is the same for all.
+    """
+
+    step_mm: int
+    is_whole: bool
+    names: Sequence[str]
+    parts: dict[str, list[float]]
+    returns: list[int]
+    pixels: int
+
+    def estimates(self) -> dict[str, dict[str, Estimate]]:
+        """Return the bits a scan, a return and a pixel, by part and then by unit; ``all`` sums a scan's parts up."""
+        parts = dict(self.parts)
+        if self.is_whole:
+            parts[_ALL] = [sum(bits) for bits in zip(*self.parts.values(), strict=True)]
+        counts = {"scan": [1] * len(self.returns), "return": self.returns, "pixel": [self.pixels] * len(self.returns)}
+        return {
+            part: {unit: Estimate.of_ratio(bits, count) for unit, count in counts.items()}
+            for part, bits in parts.items()
+        }
+
+    def by_natural_unit(self) -> dict[str, float]:
+        """Return the bits of tokens and mask a pixel, and of ranges a return, by names that end in the unit."""
+        found = self.estimates()
+        units = {"tokens": ("token", "pixel"), "mask": ("mask", "pixel"), "range": ("range", "return")}
+        return {
+            f"{name}_bits_per_{unit}": found[part][unit].value
+            for part, (name, unit) in units.items()
+            if part in self.parts
+        }
+
+    def as_json(self) -> dict[str, Any]:
+        """Return everything as plain numbers and words."""
+        bits = {part: {unit: asdict(each) for unit, each in units.items()} for part, units in self.estimates().items()}
+        scans = [
+            {"name": name, "returns": count, **{part: self.parts[part][index] for part in self.parts}}
+            for index, (name, count) in enumerate(zip(self.names, self.returns, strict=True))
+        ]
+        facts = {"step_mm": self.step_mm, "whole_scan": self.is_whole, "num_scans": len(self.names)}
+        return {**facts, "pixels": self.pixels, "bits": bits, "scans": scans}
+
+    def as_table(self) -> str:
+        """Return a table for people."""
+        lines = [f"{'bits':8}" + "".join(f"{unit:>26}" for unit in _UNITS.values())]
+        for part, estimates in self.estimates().items():
+            lines.append(f"{part:8}" + "".join(f"{_told(estimates[unit]):>26}" for unit in _UNITS))
+        told = f"{len(self.names)} scans, {sum(self.returns) / len(self.returns):,.0f} returns a scan, ranges in steps"
+        lines.append(f"{told} of {self.step_mm} mm; 95 % intervals over scans")
+        if not self.is_whole:
+            lines.append("tokens alone: this model has no probabilities of returns and ranges (no pixel decoder)")
+        return "\n".join(lines)
+
+
+def _told(estimate: Estimate) -> str:
+    digits = 0 if abs(estimate.value) >= 1000 else 3
+    value = f"{estimate.value:,.{digits}f}"
+    if np.isnan(estimate.low):
+        return value
+    return f"{value} [{estimate.low:,.{digits}f}, {estimate.high:,.{digits}f}]"
+
+
+def score_likelihood(
+    generator: Generator,
+    images: RangeImages,
+    step_mm: int = 10,
+    reporter: Reporter | None = None,
+    maps: Path | None = None,
+) -> Likelihood:
+    """Return the bits of all images of a set; every scan is coded by itself.
+
+    Args:
+        generator: model with the capability ``likelihood``.
+        images: range images of its sensor.
+        step_mm: step in millimetres that ranges are rounded to.
+        reporter: receiver of progress.
+        maps: file to write the bits of every pixel to, float32 (N, H, W) as ``.npy``; none if not given.
+
+    Raises:
+        ConfigError: a model without probabilities, images of another sensor, or a step that is not one.
+        OutputError: the file cannot be written.
+    """
+    parts: dict[str, list[float]] = {}
+    sensor, returns, whole = images.sensor, [], False
+    size = (len(images), sensor.height, sensor.width)
+    with _maps(maps, size) as pixels, (reporter or Reporter()).progress("scans", len(images)) as progress:
+        for first in range(0, len(images), _BATCH):
+            some = range(first, min(first + _BATCH, len(images)))
+            bits = generator.bits(images.batch(some), step_mm)
+            for name, values in bits.per_scan().items():
+                parts.setdefault(name, []).extend(values.tolist())
+            returns += bits.return_mask.sum((1, 2)).tolist()
+            whole = bits.is_whole
+            if pixels is not None:
+                pixels[some.start : some.stop] = bits.per_pixel().cpu().numpy()
+            progress.advance(len(some))
+    return Likelihood(step_mm, whole, images.provenance.names, parts, returns, sensor.height * sensor.width)
+
+
+@contextmanager
+def _maps(path: Path | None, size: tuple[int, int, int]) -> Iterator[np.memmap | None]:
+    """Give an array that is the file, so that no number of scans fills the memory."""
+    if path is None:
+        yield None
+        return
+    with atomic_path(path) as unfinished:
+        maps = np.lib.format.open_memmap(unfinished, mode="w+", dtype=np.float32, shape=size)
+        yield maps
+        maps.flush()
+
+
+def likelihood_of_source(
+    text: str,
+    model: str,
+    step_mm: int,
+    config: DataConfig,
+    reporter: Reporter,
+    maps: Path | None = None,
+    device: str = "",
+) -> Likelihood:
+    """Return the bits of the scans of a source by a finished run.
+
+    Args:
+        text: source of scans.
+        model: finished run; scans are projected with its sensor, in the way of its training.
+        step_mm: step in millimetres that ranges are rounded to.
+        config: settings of reading and projecting scans.
+        reporter: receiver of progress, and of a warning if the model has learned from these scans.
+        maps: file to write the bits of every pixel to; none if not given.
+        device: device to compute on; a GPU if there is one and none is named.
+
+    Raises:
+        ConfigError: a model without probabilities, or a step that is not one.
+        DataError: no usable scan, or scans of another sensor.
+    """
+    run = RunSource(model, locate(model))
+    variant = run.projection_variant(config) or config.projection_variant
+    config = replace(config, projection_variant=variant)
+    generator = run.generator.to(usable_device(device or ("cuda" if torch.cuda.is_available() else "cpu")))
+    images = open_source(text, config.bad_points).images(run.sensor, config, reporter)
+    if shared := overlap(run, None, images):
+        reporter.message(f"WARNING: {run.text} has learned from some of these scans ({shared}): they take fewer bits")
+    return score_likelihood(generator, images, step_mm, reporter, maps)
