@@ -298,7 +298,7 @@ def test_the_interval_of_a_ratio_holds_what_other_scans_would_give():
     inside = 0
     for _ in range(200):
         returns = rng.integers(50, 150, 64)
-        found = Estimate.of_ratio(5 * returns + rng.normal(0, 40, 64), returns)
+        found = Estimate.of_ratio((5 * returns + rng.normal(0, 40, 64)).tolist(), returns.astype(float).tolist())
         inside += found.low < 5 < found.high
     assert 180 <= inside <= 199  # of 200 intervals of 95 %
 

@@ -49,7 +49,8 @@ class Likelihood:
         parts = dict(self.parts)
         if self.is_whole:
             parts[_ALL] = [sum(bits) for bits in zip(*self.parts.values(), strict=True)]
-        counts = {"scan": [1] * len(self.returns), "return": self.returns, "pixel": [self.pixels] * len(self.returns)}
+        returns = [float(count) for count in self.returns]
+        counts = {"scan": [1.0] * len(returns), "return": returns, "pixel": [float(self.pixels)] * len(returns)}
         return {
             part: {unit: Estimate.of_ratio(bits, count) for unit, count in counts.items()}
             for part, bits in parts.items()
