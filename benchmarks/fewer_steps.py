@@ -48,7 +48,7 @@ def plot(rows: list[dict], path: Path, title: str) -> None:
     for index, metric in enumerate(METRICS):
         axes = figure.add_subplot(1, len(METRICS), index + 1)
         for row in rows:
-            value, low, high, floor = row[metric]
+            value, low, high, real = row[metric]
             exact = row["steps"] is None
             label = "one by one" if exact else f"{row['steps']}"
             axes.errorbar(
@@ -67,7 +67,7 @@ def plot(rows: list[dict], path: Path, title: str) -> None:
                 textcoords="offset points",
                 fontsize=9,
             )
-        axes.axhline(floor, color="#2a8fbd", linestyle=":", label="held-out scans against themselves")
+        axes.axhline(real, color="#2a8fbd", linestyle=":", label="real against real")
         axes.set_xscale("log")
         axes.margins(x=0.15)
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))

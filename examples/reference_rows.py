@@ -23,11 +23,11 @@ def main(folder: Path) -> None:
     lossy = RangeImage.masked(others.range_m, others.return_mask & coin, others.sensor)
     far = RangeImage.masked(others.range_m * 1.05, others.return_mask, others.sensor)
     sets = {
-        "other real scans: the floor": others,
-        "training scans, given back: memorised": train,
+        "other real scans: real against real": others,
+        "memorised training scans": train,
         "every fifth return lost by a coin": lossy,
         "everything 5 % too far": far,
-        "each pixel from another scan: marginal": shuffled(train, pixel),
+        "each pixel from another scan: pixel statistics": shuffled(train, pixel),
     }
     values = {name: [score(metric, images, reference) for metric in METRICS] for name, images in sets.items()}
     for name, row in values.items():

@@ -1,4 +1,4 @@
-"""A folder of .pth files as R2DM's program writes them → scores with intervals and floors."""
+"""A folder of .pth files as R2DM's program writes them → scores with intervals and reference rows."""
 
 import sys
 import tempfile

@@ -214,7 +214,10 @@ def test_samples_tell_what_they_cost_and_those_from_before_go_on(run_folder, tmp
 
 
 def test_evaluate_prints_a_table_and_writes_json(samples, tmp_path, typed):
-    told = typed("evaluate", samples, "simulated:3:test", "--json", tmp_path / "deep" / "scores.json").splitlines()
+    told = typed("evaluate", samples, "simulated:3:test", "--json", tmp_path / "deep" / "scores.json")
+    words, numbers = told.split("\n\n")
+    assert words.startswith("Within noise of real against real in ") or "below 0" in words
+    told = numbers.splitlines()
     assert " ".join(told[0].split()) == "metric variant score 95 % interval real against real better scans"
     scores = json.loads((tmp_path / "deep" / "scores.json").read_text())
     assert scores["reference"] == "simulated:3:test"
@@ -228,7 +231,7 @@ def test_evaluate_prints_a_table_and_writes_json(samples, tmp_path, typed):
 def test_evaluate_one_variant_of_some_scans_twice_gives_the_same(samples, typed):
     words = ("evaluate", samples, "simulated:3:test", "--variant", "textbook", "-n", 2, "--seed", 5)
     told = typed(*words)
-    assert told.splitlines()[1].split()[-3:] == ["2", "v", "2"]
+    assert any(line.split()[-3:] == ["2", "v", "2"] for line in told.splitlines())
     assert typed(*words) == told
 
 

@@ -10,7 +10,9 @@ import pytest
 
 from browser import CHROMIUM, Browser
 from lidargrit import demo
+from lidargrit.evaluation.intervals import RealAgainstReal
 from lidargrit.evaluation.reconstruction import score_reconstruction
+from lidargrit.evaluation.reference_rows import ImagesInMemory
 from lidargrit.generators.lidargrit import LidarGrit
 from lidargrit.loading import Provenance, RangeImages
 from lidargrit.nn.pixel_networks import PixelDecoderConfig
@@ -28,62 +30,65 @@ class Named(Store):
 
 
 @pytest.fixture(scope="module")
-def cards():
+def scored():
     images = RangeImages(SENSOR, [Store()])
     generator = made("lidargrit")[0]
-    sampled = RangeImages(SENSOR, [demo._ImagesInMemory(generator.sample(range(12)))])
-    return sampled, demo._cards(sampled, images, images, Reporter())
+    sampled = RangeImages(SENSOR, [ImagesInMemory(generator.sample(range(12)))])
+    return sampled, demo._score(sampled, images, images, Reporter())
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory, cards) -> Path:
+def written(tmp_path_factory, scored) -> Path:
     folder = tmp_path_factory.mktemp("run")
     generator, val = made("lidargrit")[0], RangeImages(SENSOR, [Named()])
     errors = score_reconstruction(generator.get_tokenizer(), val)
-    demo.write_results_page(generator, "simulated", val, *cards[:1], errors, cards[1], SECONDS, ("a <fact>",), folder)
+    demo.write_results_page(generator, "simulated", val, scored[0], errors, scored[1], SECONDS, ("a <fact>",), folder)
     return folder / "demo.html"
 
 
 @pytest.fixture(scope="module")
-def with_pixel_decoder(tmp_path_factory, cards) -> Path:
+def with_pixel_decoder(tmp_path_factory, scored) -> Path:
     """Return the page of a model that has a pixel decoder."""
     folder, plain = tmp_path_factory.mktemp("run"), made("lidargrit")[0]
     sizes = PixelDecoderConfig(mask_width=4, range_width=4, blocks=1)
     generator = LidarGrit(replace(plain.config, pixels=sizes), SENSOR).eval()
     val = RangeImages(SENSOR, [Named()])
     errors = score_reconstruction(generator.get_tokenizer(), val)
-    demo.write_results_page(generator, "simulated", val, *cards[:1], errors, cards[1], SECONDS, (), folder)
+    demo.write_results_page(generator, "simulated", val, scored[0], errors, scored[1], SECONDS, (), folder)
     return folder / "demo.html"
 
 
-def test_scores_stand_between_real_against_real_and_pixel_statistics(cards):
-    sampled, (card, real, pixels) = cards
-    assert [one.samples.source for one in (card, real, pixels)] == ["samples", "val", "marginal"]
-    assert {one.reference.sha256 for one in (card, real, pixels)} == {card.reference.sha256}, "one reference for all"
-    for score, low in zip(card.scores, real.scores, strict=True):
-        assert low.result.value <= max(score.result.value, 1e-9), "the reference itself, which nothing can beat"
-    drawing = score_chart(card.scores[0], 0.25, 9.0)
-    assert "real against real 0.2500, pixel statistics 9.0000" in drawing
-    assert 'class="pixels"' not in score_chart(card.scores[0])
-    assert 'class="real"' in score_chart(card.scores[0])
-    assert 'class="real"' not in score_chart(replace(card.scores[0], real_against_real=None))
+def test_scores_stand_between_real_against_real_and_pixel_statistics(scored):
+    sampled, card = scored
+    for score in card.scores:
+        real = score.real_against_real
+        assert real.value <= max(score.result.value, 1e-9), "the reference itself, which nothing can beat"
+        assert (real.num_scans, real.halvings) == (12, 0), "held-out scans, not halves"
+        assert score.pixel_statistics is not None
+    score = replace(card.scores[0], real_against_real=RealAgainstReal(0.25, 12, 0), pixel_statistics=9.0)
+    assert "real against real 0.2500, pixel statistics 9.0000" in score_chart(score)
+    plain = score_chart(replace(score, real_against_real=None, pixel_statistics=None))
+    assert 'class="pixels"' not in plain
+    assert 'class="real"' not in plain
     assert len(sampled) == 12
 
 
-def test_the_page_tells_all_of_it_and_fetches_nothing(written, cards):
+def test_the_page_tells_all_of_it_and_fetches_nothing(written, scored):
     text = written.read_text(encoding="utf-8")
     titles = re.findall(r"<h2>(.*?)</h2>", text)
     assert [title[:2] for title in titles] == ["1.", "2.", "3.", "4.", "5.", "6.", "7.", "Wh"]
     assert not re.search(r"https?://|src=\"(?!data:)|@import|url\(", text)
     assert text.count("</script>") == 2, "names cannot end a script"
     assert "<b>0</b>" not in text
+    assert text.count('class="verdict"') == 1
+    assert text.index('class="verdict"') < text.index("pixel statistics</th>"), "words come before numbers"
     assert "a &lt;fact&gt;" in text
     assert "154.1 s" in text
     generator = made("lidargrit")[0]
     tokens = generator.get_tokenizer().encode(RangeImages(SENSOR, [Store()]).batch([0])).tokens[0]
     shown = [int(number) for number in re.findall(r'text-anchor="middle" style="fill:#\w+">(\d+)</text>', text)]
     assert shown == tokens[1:7].flatten().tolist(), "the middle six of eight rows, as numbers"
-    assert text.count('<th scope="row">') == len(cards[1][0].scores) + len(SECONDS)
+    assert text.count('<th scope="row">') == len(scored[1].scores) + len(SECONDS)
 
 
 def test_a_pixel_decoder_is_shown_phase_by_phase(written, with_pixel_decoder):

@@ -109,7 +109,7 @@ def test_a_scorecard_tells_all_that_is_needed_to_repeat_it(card):
     for score in data["scores"]:
         assert score["num_generated"] == score["num_reference"] == 10
         assert score["interval"]["low"] <= score["value"] <= score["interval"]["high"]
-        assert score["floor"]["num_scans"] == 5
+        assert score["real_against_real"]["num_scans"] == 5
         assert score["seconds"] >= 0
     assert any("10 scans in each set" in warning for warning in card.warnings)
 
@@ -217,7 +217,7 @@ def test_a_scorecard_is_read_back_and_nothing_else_is(card, tmp_path):
     write_json(path, data)
     with pytest.raises(DataError, match="evaluate again"):
         Scorecard.read(path)
-    for name, bad in itertools.product(("interval", "floor"), (0, "", [], False)):
+    for name, bad in itertools.product(("interval", "real_against_real"), (0, "", [], False)):
         data = card.to_json()
         data["scores"][0][name] = bad
         write_json(path, data)
@@ -292,7 +292,8 @@ def test_the_command_line_writes_scores_page_and_table(tmp_path, capsys, sets):
     words = ["evaluate", *sets, "--metrics", *CHEAP, "--intervals", "4"]
     files = ["--json", str(tmp_path / "s.json"), "--report", str(tmp_path / "s.html")]
     assert main([*words, *files]) == 0
-    head, *rows = capsys.readouterr().out.splitlines()
+    first, blank, head, *rows = capsys.readouterr().out.splitlines()
+    assert (first, blank) == ("Within noise of real against real in 2 of 2 scores.", "")
     assert " ".join(head.split()) == "metric variant score 95 % interval real against real better scans"
     assert len(rows) == 2
     assert (tmp_path / "s.html").read_text(encoding="utf-8").startswith("<!DOCTYPE html>")

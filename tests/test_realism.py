@@ -125,7 +125,7 @@ def test_the_verb(tmp_path, capsys):
     assert "drop_run_lengths" in capsys.readouterr().out
     told = json.loads(file.read_text())
     assert told["real"] == "simulated:2:val"
-    assert {"simulated", "bernoulli", "floor", "ratio"} == set(told["curves"][0])
+    assert {"simulated", "bernoulli", "real_against_real", "ratio"} == set(told["curves"][0])
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert main(words) == 2  # it is there already
     assert "add --overwrite" in capsys.readouterr().err

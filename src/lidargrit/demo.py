@@ -14,20 +14,19 @@ from lidargrit.configuration import override
 from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import CheckpointError, DataError
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair
-from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
 from lidargrit.evaluation.reconstruction import ReconstructionErrors, score_reconstruction
+from lidargrit.evaluation.reference_rows import with_held_out, with_pixel_statistics
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.files import read_json, write_json
-from lidargrit.generators import Generator, load_class
+from lidargrit.generators import Generator
 from lidargrit.generators.lidargrit import LidarGrit
-from lidargrit.loading import DataConfig, Pixels, Provenance, RangeImages
+from lidargrit.loading import DataConfig, RangeImages
 from lidargrit.nn.pixel_decoder import PixelSampling
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
 from lidargrit.sources import load_range_images, open_source
 from lidargrit.sources.samples import read_samples, write_samples
-from lidargrit.structures import RangeImage
 from lidargrit.training import check_folder, train
 from lidargrit.training.log import LOG_FILE, read_log
 from lidargrit.viewer import plot_comparison
@@ -68,18 +67,18 @@ def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter
     samples = read_samples(folder / "samples", _NUM_SAMPLES)
     with clock.stage("score reconstruction and new scans"):
         reconstruction = score_reconstruction(generator.get_tokenizer(), val)
-        cards = _cards(samples, val, real, reporter)
+        card = _score(samples, val, real, reporter)
     clock.keep()
     write_json(
         folder / "evaluation.json",
-        {"reconstruction_on_val": asdict(reconstruction), "generated_against_train": cards[0].to_json()},
+        {"reconstruction_on_val": asdict(reconstruction), "generated_against_train": card.to_json()},
     )
     reporter.message(
         f"reconstruction of {reconstruction.num_scans} scans never trained on: range error "
         f"{reconstruction.range_mae_m:.2f} m, mask accuracy {reconstruction.mask_accuracy:.3f}, dropped rays found "
         f"{reconstruction.drop_recall:.2f} with precision {reconstruction.drop_precision:.2f}"
     )
-    reporter.message(cards[0].as_table())
+    reporter.message(card.as_table())
     reporter.message(
         "(scores after a few minutes of training on little data; they cannot be compared with published tables)"
     )
@@ -90,7 +89,7 @@ def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter
         f"LidarGRIT at a small size: {weights:.1f} million weights",
         f"{len(real):,} {kind} scans to learn from and {len(val):,} held out, of the sensor {generator.sensor.name}",
     )
-    write_results_page(generator, kind, val, samples, reconstruction, cards, clock.seconds, facts, folder)
+    write_results_page(generator, kind, val, samples, reconstruction, card, clock.seconds, facts, folder)
     return folder
 
 
@@ -100,7 +99,7 @@ def write_results_page(
     val: RangeImages,
     samples: RangeImages,
     errors: ReconstructionErrors,
-    cards: tuple[Scorecard, Scorecard, Scorecard],
+    card: Scorecard,
     seconds: dict[str, float],
     facts: tuple[str, ...],
     folder: Path,
@@ -113,7 +112,7 @@ def write_results_page(
         val: held-out scans; the page follows the first of them.
         samples: scans that the generator sampled.
         errors: errors of reconstruction.
-        cards: scores of the samples, of held-out scans, and of pixel statistics, all against training scans.
+        card: scores of the samples against training scans, with those of held-out scans and of pixel statistics.
         seconds: time that each stage took, in seconds, by its name.
         facts: short sentences about the model and its training.
         folder: folder of the run.
@@ -136,7 +135,7 @@ def write_results_page(
         ScanSet("reconstructed", reconstructed, names),
         ScanSet("new", new, seeds),
     )
-    results = errors, *cards, seconds, facts, folder
+    results = errors, card, seconds, facts, folder
     write_demo_page(
         DemoPage(kind, names[0], held_out[:1], tokens, decoded, sampled, by_phases, coarsest_cell, sets, *results),
         folder / PAGE,
@@ -171,38 +170,16 @@ def divided(data: str, reporter: Reporter) -> DataConfig:
     return DataConfig(train=(train,), val=(val,), sensor=dataset.sensor, max_scans=_MAX_SCANS)
 
 
-def _cards(
-    samples: RangeImages, val: RangeImages, real: RangeImages, reporter: Reporter
-) -> tuple[Scorecard, Scorecard, Scorecard]:
-    """Score new scans, held-out scans and pixel statistics, equally many of each, against training scans."""
-    marginal = load_class("marginal")
-    single = marginal(marginal.Config(), real.sensor)
-    single.fit_statistics(real)
-    count = min(len(samples), len(real))
-    pixels = RangeImages(real.sensor, [_ImagesInMemory(single.sample(range(count)))])
-    plain = EvalConfig(resampling=Resampling(halves=0))
-    cards = []
-    for name, images, config in (("samples", samples, EvalConfig()), ("val", val, plain), ("marginal", pixels, plain)):
-        some = min(count, len(images))
-        reference = EvalSet("train", real, evenly_spaced(some, len(real)))
-        pair = EvalPair(EvalSet(name, images, evenly_spaced(some, len(images))), reference)
-        cards.append(compare_pair(pair, config, reporter if name == "samples" else None))
-    return cards[0], cards[1], cards[2]
-
-
-class _ImagesInMemory:
-    """A store of range images that lie in memory."""
-
-    provenance = Provenance()
-
-    def __init__(self, images: RangeImage) -> None:
-        self._range_m = images.range_m.numpy()
-
-    def __len__(self) -> int:
-        return len(self._range_m)
-
-    def read(self, index: int) -> Pixels:
-        return self._range_m[index], None
+def _score(samples: RangeImages, val: RangeImages, real: RangeImages, reporter: Reporter) -> Scorecard:
+    """Score new scans against training scans, with held-out scans and pixel statistics beside them, as many of each."""
+    count = min(len(samples), len(real), len(val))
+    sets = {"samples": samples, "val": val, "train": real}
+    new, held_out, reference = (
+        EvalSet(name, images, evenly_spaced(count, len(images))) for name, images in sets.items()
+    )
+    pair, settings = EvalPair(new, reference), EvalConfig()
+    card = compare_pair(pair, settings, reporter)
+    return with_pixel_statistics(with_held_out(card, held_out, reference, settings), pair, real, settings)
 
 
 class _Clock:

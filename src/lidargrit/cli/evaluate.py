@@ -34,6 +34,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--weights", nargs="+", default=[], metavar="NAME=FILE", help="weights of pointnet and rangenet53")
     add("-n", "--max-scans", type=int, default=0, help="largest number of scans of each; 0 for the protocol's")
     add("--intervals", type=int, default=20, metavar="B", help="number of half-samples for 95 %% intervals; 0 for none")
+    pixels = "also score pixel statistics of the reference, which any model has to beat; takes a little longer"
+    add("--pixel-statistics", action="store_true", help=pixels)
     add("--groups", type=int, default=16, metavar="G", help="number of groups of neighbours kept together in them")
     add("--seed", type=seed_number, default=0, help="seed of all random choices")
     add("--device", default="cpu", help="device for feature networks: cpu or cuda")
@@ -55,6 +57,7 @@ def run(options: argparse.Namespace) -> None:
     if options.tables:
         return tell(options, *read_tables(options.tables, options.format))
     names = "protocol metrics variant projection_variant max_scans seed samples_format device weights groups intervals"
-    config = read_config(**{name: vars(options)[name] for name in (*names.split(), "bad_points", "bad_scans")})
+    others = ("pixel_statistics", "bad_points", "bad_scans")
+    config = read_config(**{name: vars(options)[name] for name in (*names.split(), *others)})
     sets, report = (options.samples, options.reference), (options.report, write_report, options.overwrite)
     tell(options, *evaluate(*sets, config, TerminalReporter(), *report))

@@ -13,6 +13,7 @@ from lidargrit.evaluation.comparison import EvalConfig, compare_pair, open_pair
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.pairs import EvalPair
 from lidargrit.evaluation.reconstruction import score_run
+from lidargrit.evaluation.reference_rows import with_pixel_statistics
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.files import refuse_to_overwrite
 from lidargrit.formats import BadPoints
@@ -58,6 +59,8 @@ def evaluate(
         return _reconstruction(first, second, config, reporter)
     pair = open_pair(first, second, config, reporter)
     card = compare_pair(pair, config, reporter)
+    if config.pixel_statistics:
+        card = with_pixel_statistics(card, pair, pair.reference.images, config)
     for warning in card.warnings[len(pair.warnings) :]:
         reporter.message(f"WARNING: {warning}")
     if report and write_report:

@@ -39,6 +39,7 @@ class EvalConfig:
         seed: seed of the random numbers that metrics use.
         resampling: settings of the intervals and of real against real.
         weights: files of published weights, by the name of their network.
+        pixel_statistics: whether every score gets that of pixel statistics of the reference beside it.
         samples_format: name of the program that wrote a folder of tensors; recognised from the first file if empty.
         device: name of the device that networks compute on.
         data: settings of reading scans.
@@ -52,6 +53,7 @@ class EvalConfig:
     seed: int = 0
     resampling: Resampling = field(default_factory=Resampling)
     weights: Mapping[str, Path] = field(default_factory=dict)
+    pixel_statistics: bool = False
     samples_format: str = ""
     device: str = "cpu"
     data: DataConfig = field(default_factory=DataConfig)

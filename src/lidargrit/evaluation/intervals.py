@@ -77,13 +77,13 @@ class Interval:
 
 @dataclass(frozen=True)
 class RealAgainstReal:
-    """What a perfect generator would score: one half of the reference against the other.
+    """What real scans score in place of the samples: no generator can be expected to do better.
 
     Args:
-        value: mean over halvings.
-        num_scans: number of scans in each half. Most metrics fall as sets grow, so the whole sets would score a little
-            lower.
-        halvings: number of halvings.
+        value: mean over halvings of the reference, one half against the other; or score of held-out scans.
+        num_scans: number of scans in each set. Most metrics fall as sets grow, so whole sets would score a little lower
+            than halves.
+        halvings: number of halvings; 0 for held-out scans.
     """
 
     value: float

@@ -193,8 +193,7 @@ def _distance(
 
 def as_json(scores: Sequence[CurveScore]) -> list[dict[str, Any]]:
     """Return scores with their curves for a file."""
-    facts = [{**asdict(score), "ratio": score.ratio} for score in scores]
-    return [{"floor" if name == "real_against_real" else name: of for name, of in each.items()} for each in facts]
+    return [{**asdict(score), "ratio": score.ratio} for score in scores]
 
 
 def as_table(scores: Sequence[CurveScore]) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 
 from lidargrit.errors import DataError
 from lidargrit.evaluation.intervals import Interval, RealAgainstReal
+from lidargrit.evaluation.verdict import counted_first, verdict
 from lidargrit.files import read_json
 from lidargrit.structures import MetricResult
 
@@ -22,9 +23,10 @@ class Score:
     Args:
         result: value of the metric.
         interval: 95 %, if wanted and possible.
-        real_against_real: score of one half of the reference against the other half; None if it was not computed.
+        real_against_real: score of real scans in place of the samples; None if it was not computed.
         options: options of the metric, besides variant and seed.
-        seconds: time that the metric, its interval and the reference row took.
+        seconds: time that the metric, its interval and real against real took.
+        pixel_statistics: score of the generator ``marginal`` in place of the samples; None if it was not computed.
     """
 
     result: MetricResult
@@ -32,6 +34,7 @@ class Score:
     real_against_real: RealAgainstReal | None = None
     options: dict[str, Any] = field(default_factory=dict)
     seconds: float = 0.0
+    pixel_statistics: float | None = None
 
 
 @dataclass(frozen=True)
@@ -116,6 +119,7 @@ class Scorecard:
             "inputs": {"samples": asdict(self.samples), "reference": asdict(self.reference)},
             "deviations": list(self.deviations),
             "warnings": list(self.warnings),
+            "verdict": list(verdict(self.scores)),
             "settings": self.settings,
             "versions": self.versions,
             "scores": [
@@ -123,7 +127,8 @@ class Scorecard:
                     **asdict(score.result),
                     "options": score.options,
                     "interval": score.interval and asdict(score.interval),
-                    "floor": score.real_against_real and asdict(score.real_against_real),
+                    "real_against_real": score.real_against_real and asdict(score.real_against_real),
+                    "pixel_statistics": score.pixel_statistics,
                     "seconds": round(score.seconds, 3),
                 }
                 for score in self.scores
@@ -160,18 +165,25 @@ class Scorecard:
             raise DataError(f"{path}, which cannot be used ({type(error).__name__}: {error})", wanted, cure) from None
 
     def as_table(self) -> str:
-        """Return the scores as lines for a terminal."""
-        cells = [("metric", "variant", "score", "95 % interval", "real against real", "better", "scans")]
-        cells += [_row(score) for score in self.scores]
-        cells += [(each.metric, each.variant or "-", each.verdict, *[""] * 4) for each in self.left_out]
-        widths = [max(len(row[column]) for row in cells) for column in range(len(cells[0]))]
-        lines = [
+        """Return the scores as lines for a terminal: the verdict in words, then the numbers."""
+        counted, apart = counted_first(self.scores)
+        with_pixels = any(score.pixel_statistics is not None for score in self.scores)
+        pixels = ("pixel statistics",) if with_pixels else ()
+        head = ("metric", "variant", "score", "95 % interval", "real against real", *pixels, "better", "scans")
+        cells = [head, *(_row(score, with_pixels) for score in (*counted, *apart))]
+        cells += [(each.metric, each.variant or "-", each.verdict, *[""] * (len(head) - 3)) for each in self.left_out]
+        widths = [max(len(row[column]) for row in cells) for column in range(len(head))]
+        rows = [
             "  ".join(
-                text.rjust(width) if 2 <= column <= 4 else text.ljust(width)
+                text.rjust(width) if 2 <= column < len(head) - 2 else text.ljust(width)
                 for column, (text, width) in enumerate(zip(row, widths, strict=True))
             ).rstrip()
             for row in cells
         ]
+        if apart:
+            rows.insert(1 + len(counted), "set apart: no different for pixel statistics and real scans")
+        sentences = verdict(self.scores)
+        lines = [*sentences, *([""] if sentences else []), *rows]
         lines += [f"{each.verdict}: {each.metric}: {each.why}" for each in self.left_out]
         lines += [f"not the protocol {self.protocol}: {each}" for each in self.deviations]
         return "\n".join(lines)
@@ -184,14 +196,16 @@ def format_value(value: float) -> str:
     return f"{value:.4f}" if 1e-2 <= abs(value) < 1e3 else f"{value:.4g}"
 
 
-def _row(score: Score) -> tuple[str, ...]:
+def _row(score: Score, with_pixels: bool) -> tuple[str, ...]:
     result, interval, real = score.result, score.interval, score.real_against_real
+    pixels = score.pixel_statistics
     return (
         result.metric,
         result.variant,
         format_value(result.value),
         f"{format_value(interval.low)} .. {format_value(interval.high)}" if interval else "-",
         f"{format_value(real.value)} (n={real.num_scans})" if real else "-",
+        *(("-" if pixels is None else format_value(pixels),) if with_pixels else ()),
         "higher" if result.higher_is_better else "lower",
         f"{result.num_generated} v {result.num_reference}",
     )
@@ -217,7 +231,9 @@ def _score(data: dict[str, Any]) -> Score:
         str(data["variant"]),
         dict(data["details"]),
     )
-    interval, real = data["interval"], data["floor"]
+    # Files of before the reference rows had one name everywhere.
+    interval, real = data["interval"], data["real_against_real"] if "real_against_real" in data else data["floor"]
+    pixels = data.get("pixel_statistics")
     return Score(
         result,
         None
@@ -231,4 +247,5 @@ def _score(data: dict[str, Any]) -> Score:
         None if real is None else RealAgainstReal(float(real["value"]), int(real["num_scans"]), int(real["halvings"])),
         dict(data["options"]),
         float(data["seconds"]),
+        None if pixels is None else float(pixels),
     )

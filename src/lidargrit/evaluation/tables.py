@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from itertools import chain
 from pathlib import Path
@@ -12,10 +12,12 @@ from typing import Any, Literal
 
 from lidargrit.errors import DataError
 from lidargrit.evaluation.scorecard import NOT_APPLICABLE, LeftOut, Score, Scorecard, format_value
+from lidargrit.evaluation.verdict import MEMORISED, PIXEL_STATISTICS, verdict
 from lidargrit.files import read_json
 
 Format = Literal["text", "markdown", "latex"]
 Column = tuple[str, str]  # metric, variant
+_BOUNDS = {PIXEL_STATISTICS: " (pixel statistics)", MEMORISED: " (memorised training scans)"}
 
 
 @dataclass(frozen=True)
@@ -27,12 +29,14 @@ class Block:
         columns: metrics and variants.
         rows: a system and its figures, "" where there is none.
         notes: lines below.
+        verdicts: lines above the rows, one for each system.
     """
 
     title: str
     columns: tuple[Column, ...]
     rows: tuple[tuple[str, tuple[str, ...]], ...]
     notes: tuple[str, ...] = ()
+    verdicts: tuple[str, ...] = ()
 
 
 def side_by_side(paths: Sequence[Path], form: Format = "text") -> str:
@@ -40,7 +44,8 @@ def side_by_side(paths: Sequence[Path], form: Format = "text") -> str:
 
     Rows share a block only if they were measured by one protocol against the very same reference. Published figures
     never stand among measured ones: they get blocks of their own, and only where the measured rows are what the
-    protocol wants; else a line says why they do not compare.
+    protocol wants; else a line says why they do not compare. A file called ``marginal`` is the row of pixel statistics,
+    and one called ``memorised`` that of memorised training scans.
 
     Args:
         paths: files that ``lidargrit evaluate --json`` wrote.
@@ -66,13 +71,14 @@ def read_tables(paths: Sequence[Path], form: Format = "text") -> tuple[str, dict
 
 
 def _measured(cards: Sequence[tuple[str, Scorecard]]) -> Block:
+    cards = _with_pixel_statistics(cards)
     words = [{(each.metric, each.variant): each.verdict for each in _not_applicable(card)} for _, card in cards]
     scored = (_column(score) for _, card in cards for score in card.scores)
     columns = list(dict.fromkeys([*scored, *chain.from_iterable(words)]))
     rows, notes = [], []
-    for (name, card), told in zip(cards, words, strict=True):
-        cells = told | {_column(score): _cell(score) for score in card.scores}
-        rows.append((name, tuple(cells.get(column, "") for column in columns)))
+    for (name, card), not_applicable in zip(cards, words, strict=True):
+        cells = not_applicable | {_column(score): _cell(score) for score in card.scores}
+        rows.append((f"{name}{_BOUNDS.get(name, '')}", tuple(cells.get(column, "") for column in columns)))
         notes += [f"{name}: {text}" for text in (*card.deviations, *card.warnings)]
     card = cards[0][1]
     reference_row = {_column(score): score.real_against_real for score in card.scores if score.real_against_real}
@@ -86,7 +92,27 @@ def _measured(cards: Sequence[tuple[str, Scorecard]]) -> Block:
         f"Measured, protocol {card.protocol}, {card.reference.scans_used:,} scans each, "
         f"against {card.reference.source} (sha256 {card.reference.sha256[:8]})"
     )
-    return Block(title, tuple(columns), tuple(rows), tuple(notes))
+    verdicts = tuple(
+        f"{name}: {' '.join(sentences)}"
+        for name, card in cards
+        if name not in _BOUNDS and (sentences := verdict(card.scores))
+    )
+    return Block(title, tuple(columns), tuple(rows), tuple(notes), verdicts)
+
+
+def _with_pixel_statistics(cards: Sequence[tuple[str, Scorecard]]) -> list[tuple[str, Scorecard]]:
+    """Give every score that of the row of pixel statistics, if there is such a row."""
+    rows = [card for name, card in cards if name == PIXEL_STATISTICS]
+    if not rows:
+        return list(cards)
+    values = {_column(score): score.result.value for score in rows[0].scores}
+    return [
+        (
+            name,
+            replace(card, scores=tuple(replace(s, pixel_statistics=values.get(_column(s))) for s in card.scores)),
+        )
+        for name, card in cards
+    ]
 
 
 def _not_applicable(card: Scorecard) -> list[LeftOut]:
@@ -145,7 +171,7 @@ def _grid(block: Block) -> list[list[str]]:
 
 
 def _as_text(block: Block) -> str:
-    lines = [block.title]
+    lines = [block.title, *block.verdicts]
     if block.columns:
         grid = _grid(block)
         widths = [max(len(row[column]) for row in grid) for column in range(len(grid[0]))]
@@ -154,7 +180,8 @@ def _as_text(block: Block) -> str:
 
 
 def _as_markdown(block: Block) -> str:
-    lines = [f"**{_marked(block.title)}**", ""]
+    lines = [f"**{_marked(block.title)}**", "", *(f"- {_marked(each)}" for each in block.verdicts)]
+    lines += [""] if block.verdicts else []
     if block.columns:
         head, *rows = [[_marked(text) for text in row] for row in _grid(block)]
         lines += [f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows)] + [""]
@@ -168,7 +195,7 @@ def _marked(text: str) -> str:
 
 
 def _as_latex(block: Block) -> str:
-    lines = [f"% {' '.join(block.title.split())}"]
+    lines = [f"% {' '.join(text.split())}" for text in (block.title, *block.verdicts)]
     if block.columns:
         head, *rows = [" & ".join(_typeset(text) for text in row) + r" \\" for row in _grid(block)]
         layout = "l" + "r" * len(block.columns)

@@ -12,6 +12,7 @@ from lidargrit import _discovery
 from lidargrit.datasets import load as load_dataset
 from lidargrit.errors import one_line
 from lidargrit.evaluation.scorecard import NOT_APPLICABLE, Scorecard, format_value
+from lidargrit.evaluation.verdict import verdict
 from lidargrit.generators import Generator, recipe_settings
 from lidargrit.loading import Provenance
 from lidargrit.sources import data_set_of
@@ -162,6 +163,7 @@ def _training(about: dict[str, Any]) -> str:
 
 def _scores(card: Scorecard) -> str:
     reference = " ".join(filter(None, (card.reference.data_set, card.reference.split))) or "an unnamed data set"
+    sentences = verdict(card.scores)
     lines = [
         "## Scores",
         "",
@@ -170,6 +172,8 @@ def _scores(card: Scorecard) -> str:
         "Real against real is the score of one half of the real scans against the other half: no model can be expected "
         "to be better.",
         "",
+        *(f"- {_text(sentence)}" for sentence in sentences),
+        *([""] if sentences else []),
         "| metric | variant | score | 95 % interval | real against real | better |",
         "|---|---|---|---|---|---|",
     ]

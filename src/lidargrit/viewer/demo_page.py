@@ -17,16 +17,16 @@ from matplotlib import colormaps
 
 from lidargrit import __version__
 from lidargrit.evaluation.reconstruction import ReconstructionErrors
-from lidargrit.evaluation.scorecard import Scorecard, format_value
+from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.files import write_text
-from lidargrit.metrics import load_metric
 from lidargrit.structures import Decoded, RangeImage, TokenGrid
 from lidargrit.viewer import interactive
 from lidargrit.viewer.interactive import button
-from lidargrit.viewer.report_charts import bar_chart, score_chart
+from lidargrit.viewer.report_charts import bar_chart
 from lidargrit.viewer.report_pictures import colour_picture, range_picture, rate_picture
 from lidargrit.viewer.report_style import STYLE
 from lidargrit.viewer.scan_sets import ScanSet
+from lidargrit.viewer.score_table import score_table
 
 _PIECE = 6, 16  # rows and columns of tokens that are shown as numbers: as many as can be read
 _CELL = 44, 24  # width and height of the cell of a token on the page, in pixels
@@ -41,7 +41,6 @@ main{display:block;max-width:1240px}
 .phases{display:grid;grid-template-columns:repeat(4,1fr);gap:4px 14px;margin-bottom:1em}
 .points{min-height:380px}
 @media (min-width:1000px){#panes{grid-template-columns:repeat(3,1fr)}}
-.pixels{fill:var(--soft);stroke:var(--paper);stroke-width:1.5}
 .bar rect,rect.bar{fill:var(--b)}
 .tokens{width:100%;max-width:760px;font-family:ui-monospace,monospace}
 .grid{display:block;width:100%;height:170px;border-radius:3px}
@@ -69,9 +68,7 @@ class DemoPage:
         coarsest_cell: distance between the pixels of the pixel decoder's first phase.
         sets: sets of scans to turn side by side.
         errors: errors of reconstruction over all held-out scans.
-        card: scores of new scans against training scans.
-        real_against_real: scores of held-out scans against training scans.
-        pixel_statistics: scores of a generator that knows only the statistics of single pixels.
+        card: scores of new scans against training scans, with those of held-out scans and of pixel statistics.
         seconds: time that each stage took, in seconds, by its name.
         facts: short sentences about the model and its training.
         run: folder of the run.
@@ -88,8 +85,6 @@ class DemoPage:
     sets: Sequence[ScanSet]
     errors: ReconstructionErrors
     card: Scorecard
-    real_against_real: Scorecard
-    pixel_statistics: Scorecard
     seconds: Mapping[str, float]
     facts: Sequence[str]
     run: Path
@@ -321,40 +316,15 @@ def _new_scans(demo: DemoPage) -> _Step:
 
 
 def _scores(demo: DemoPage) -> _Step:
-    real_scores, pixel_scores = (
-        {(score.result.metric, score.result.variant): score.result.value for score in card.scores}
-        for card in (demo.real_against_real, demo.pixel_statistics)
-    )
-    rows = []
-    for score in demo.card.scores:
-        name = score.result.metric, score.result.variant
-        real, pixels, interval = real_scores.get(name), pixel_scores.get(name), score.interval
-        between = (
-            f"<br><small>{format_value(interval.low)} to {format_value(interval.high)}</small>" if interval else ""
-        )
-        rows.append(
-            f'<tr><th scope="row">{escape(load_metric(name[0]).title)}</th>'
-            f'<td class="number">{"" if real is None else format_value(real)}</td>'
-            f'<td class="number">{format_value(score.result.value)}{between}</td>'
-            f'<td class="number">{"" if pixels is None else format_value(pixels)}</td>'
-            f"<td>{score_chart(score, real, pixels)}</td></tr>"
-        )
     text = (
         f"Each metric measures how far {demo.card.samples.scans_used} new scans are from as many training scans; lower "
-        f"is better. <i>Real against real</i> (dashed line) is the score of held-out {demo.kind} scans: no model can "
-        "be expected to do better. <i>Pixel statistics</i> (square) is the score of the generator "
-        "<code>marginal</code>, which samples each pixel by itself and knows nothing of shapes. Where it does as well "
-        "as real against real, the metric looks at single pixels only, and a good score says little. With so few scans "
-        "all scores are rough; the line through the dot is the 95 % interval."
+        f"is better. Two bounds stand beside every score. <i>Real against real</i> (dashed line) is the score of "
+        f"held-out {demo.kind} scans: no model can be expected to do better. <i>Pixel statistics</i> (square) is the "
+        "score of the generator <code>marginal</code>, which samples each pixel by itself and knows nothing of shapes: "
+        "any model should do better. With so few scans all scores are rough; the bar behind the dot is the 95 % "
+        "interval."
     )
-    heads = ("metric", "real against real", "this model", "pixel statistics", "chart, from 0")
-    head = "".join(f'<th scope="col">{name}</th>' for name in heads)
-    return _Step(
-        "Scores of the new scans",
-        text,
-        '<div class="wide" tabindex="0" role="region" aria-label="scores"><table><thead><tr>'
-        f"{head}</tr></thead><tbody>{''.join(rows)}</tbody></table></div>",
-    )
+    return _Step("Scores of the new scans", text, score_table(demo.card.scores))
 
 
 def _timings(demo: DemoPage) -> _Step:

@@ -13,10 +13,9 @@ from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import without_folders
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
 from lidargrit.evaluation.profiles import HALF_VIEW_M, Match, Profile, matches, profile
-from lidargrit.evaluation.scorecard import NOT_APPLICABLE, Score, Scorecard, SetFacts, format_value
+from lidargrit.evaluation.scorecard import NOT_APPLICABLE, Scorecard, SetFacts
 from lidargrit.files import write_text
-from lidargrit.metrics import load_metric
-from lidargrit.viewer.report_charts import line_chart, score_chart
+from lidargrit.viewer.report_charts import line_chart
 from lidargrit.viewer.report_pictures import (
     NO_RETURN,
     density_picture,
@@ -25,6 +24,7 @@ from lidargrit.viewer.report_pictures import (
     rate_picture,
 )
 from lidargrit.viewer.report_style import STYLE
+from lidargrit.viewer.score_table import metric_title, score_table
 
 _MATCHES = 3  # best, and as many worst
 _SHEET = 12  # samples on the sheet
@@ -109,58 +109,22 @@ def _notes(title: str, lines: Sequence[str], kind: str) -> str:
 
 
 def _scores(card: Scorecard) -> str:
-    rows = "".join(_score_row(score) for score in card.scores)
-    rows += "".join(
-        f'<tr><th scope="row">{_metric(each.metric, each.variant)}</th><td colspan="5">{NOT_APPLICABLE}</td></tr>'
+    not_applicable = "".join(
+        f'<tr><th scope="row">{metric_title(each.metric, each.variant)}</th><td colspan="6">{NOT_APPLICABLE}</td></tr>'
         for each in card.left_out
         if each.verdict == NOT_APPLICABLE
     )
     left_out = "".join(f"<li><b>{escape(each.metric)}</b>: {_escaped(each.why)}</li>" for each in card.left_out)
     return (
-        "<section><h2>Scores</h2><p>The dot is the score and the bar its 95 % interval. The upright dashed line is "
-        "<i>real against real</i>: the score of one half of the reference against its other half. No generator can be "
-        "expected to do better. The halves are smaller than the sets, and most metrics fall as sets grow, so a good "
-        "score may still lie below this line. Every chart begins at 0 and has its own scale.</p>"
-        '<div class="wide" tabindex="0" role="region" aria-label="scores"><table><thead><tr><th scope="col">metric</th>'
-        '<th scope="col">score</th><th scope="col">95 % interval</th><th scope="col">real against real</th>'
-        '<th scope="col">chart</th><th scope="col">better</th></tr></thead>'
-        f"<tbody>{rows}</tbody></table></div>"
-        + _verdict(card)
+        f"<section><h2>Scores</h2>{score_table(card.scores, not_applicable)}<p>The dot is the score and the bar its "
+        "95 % interval. The upright dashed line is <i>real against real</i>: the score of one half of the reference "
+        "against its other half. No generator can be expected to do better. The halves are smaller than the sets, and "
+        "most metrics fall as sets grow, so a good score may still lie below this line. The square, where there is "
+        "one, is <i>pixel statistics</i>: scans whose pixels are sampled one by one, which any model has to beat. "
+        "Every chart begins at 0 and has its own scale.</p>"
         + (f"<h3>Left out</h3><ul>{left_out}</ul>" if left_out else "")
         + "</section>"
     )
-
-
-def _verdict(card: Scorecard) -> str:
-    """Name the scores whose whole interval is worse than real against real."""
-    known, worse = 0, []
-    for score in card.scores:
-        if score.interval and (real := score.real_against_real):
-            known += 1
-            higher = score.result.higher_is_better
-            if score.interval.high < real.value if higher else score.interval.low > real.value:
-                worse.append(f"{score.result.metric} ({score.result.variant})")
-    if not known:
-        return ""
-    caption = f"The whole interval of {len(worse)} of {known} scores is worse than real against real"
-    return f"<p>{escape(caption + (': ' + ', '.join(worse) if worse else ''))}.</p>"
-
-
-def _score_row(score: Score) -> str:
-    result, interval, real = score.result, score.interval, score.real_against_real
-    caption = f"{format_value(interval.low)} to {format_value(interval.high)}" if interval else "not known"
-    baseline = f"{format_value(real.value)} <small>(n = {real.num_scans:,})</small>" if real else "not known"
-    return (
-        f'<tr><th scope="row">{_metric(result.metric, result.variant)}</th>'
-        f'<td class="number">{format_value(result.value)}</td><td class="number">{caption}</td>'
-        f'<td class="number">{baseline}</td>'
-        f"<td>{score_chart(score)}</td><td>{'higher' if result.higher_is_better else 'lower'}</td></tr>"
-    )
-
-
-def _metric(name: str, variant: str) -> str:
-    """Return a metric's title with its name and variant below, for the head of a row."""
-    return f"{escape(load_metric(name).title)}<br><small>{escape(name)}, {escape(variant)}</small>"
 
 
 def _limits_m(pair: EvalPair) -> tuple[float, float]:

@@ -15,17 +15,13 @@ _CHART_WIDE, _CHART_TALL = 720, 260
 _LEFT, _RIGHT, _TOP, _BOTTOM = 48, 12, 12, 40
 
 
-def score_chart(score: Score, real: float | None = None, pixels: float | None = None) -> str:
-    """Plot a score as a dot on its interval, from 0, with an upright line for real against real.
+def score_chart(score: Score) -> str:
+    """Plot a score as a dot on its interval, from 0, with real against real as an upright line.
 
-    Args:
-        score: score with its interval, and real against real, if the evaluation found them.
-        real: value of real against real to plot in place of the score's own.
-        pixels: value of the pixel statistics, plotted as a square.
+    Pixel statistics, where their score is known, are a square.
     """
-    value, interval = score.result.value, score.interval
-    if real is None and score.real_against_real is not None:
-        real = score.real_against_real.value
+    value, interval, pixels = score.result.value, score.interval, score.pixel_statistics
+    real = None if score.real_against_real is None else score.real_against_real.value
     low, high = (interval.low, interval.high) if interval else (value, value)
     marks = [low, high, value, *(mark for mark in (real, pixels) if mark is not None)]
     if not np.isfinite(marks).all():

@@ -1,0 +1,115 @@
+"""Scores between their two reference rows → a verdict in words: what beats pixel statistics, what is like real scans.
+
+Every score table of this program knows three bounds, by these names alone:
+
+- *real against real*: real scans, scored as if they had been generated. No generator can be expected to do better.
+- *pixel statistics*: scans of the generator ``marginal``, which samples every pixel by itself. A model has to do better.
+- *memorised training scans*: scans of the generator ``memorised``. They score like real scans, and nothing is new.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:  # the scorecard shows a verdict of its own scores
+    from lidargrit.evaluation.scorecard import Score
+
+PIXEL_STATISTICS, MEMORISED = "marginal", "memorised"
+"""The generators whose scans are the second and the third bound."""
+
+
+def noise(score: Score) -> float:
+    """Return half the width of a score's interval, 0 without one: how far chance alone may move it."""
+    if score.interval is None:
+        return 0.0
+    return max(score.interval.high - score.result.value, score.result.value - score.interval.low)
+
+
+def beats_pixel_statistics(score: Score) -> bool | None:
+    """Say whether a score is better than that of pixel statistics by more than chance; None where that is not known."""
+    if score.pixel_statistics is None:
+        return None
+    return _worse_by(score, score.pixel_statistics, score.result.value) > noise(score)
+
+
+def is_like_real(score: Score) -> bool | None:
+    """Say whether a score is not worse than real against real by more than chance; None where that is not known."""
+    if score.real_against_real is None:
+        return None
+    return _worse_by(score, score.result.value, score.real_against_real.value) <= noise(score)
+
+
+def tells_apart(score: Score) -> bool | None:
+    """Say whether the metric tells pixel statistics from real scans by more than chance; None where not known."""
+    if score.pixel_statistics is None or score.real_against_real is None:
+        return None
+    return _worse_by(score, score.pixel_statistics, score.real_against_real.value) > noise(score)
+
+
+def counted_first(scores: Sequence[Score]) -> tuple[list[Score], list[Score]]:
+    """Divide scores into those that count and those set apart, whose metric does not see that pixels are unrelated."""
+    apart = [score for score in scores if tells_apart(score) is False]
+    return [score for score in scores if tells_apart(score) is not False], apart
+
+
+def verdict(scores: Sequence[Score]) -> tuple[str, ...]:
+    """Return in a few sentences how scores stand to real against real and to pixel statistics.
+
+    Args:
+        scores: scores of one set of samples, with their reference rows where these are known.
+
+    Returns:
+        no sentence if there is neither reference row; else the count, then which metrics were set apart and why, then
+        what a value below 0 or better than real against real means.
+    """
+    counted, apart = counted_first(scores)
+    sentences = [sentence] if (sentence := _count(counted)) else []
+    if apart:
+        sentences.append(
+            f"Set apart, and not counted: {_names(apart)}. Here "
+            f"{'they do' if len(apart) > 1 else 'it does'} not tell pixel statistics from real scans."
+        )
+    if below := [score for score in scores if score.result.value < 0]:
+        sentences.append(
+            f"{_names(below)} below 0: the unbiased estimate of a squared distance scatters around 0 for sets that do "
+            "not differ; read it as 0."
+        )
+    if beyond := [score for score in counted if _is_beyond_real(score)]:
+        sentences.append(
+            f"Better than real against real: {_names(beyond)}. Either the two sets of that row are smaller, which "
+            "raises most scores, or the samples repeat scans of the reference."
+        )
+    return tuple(sentences)
+
+
+def _count(scores: Sequence[Score]) -> str:
+    """Return the sentence that counts, or "" if neither reference row is known."""
+    beaten = [known for score in scores if (known := beats_pixel_statistics(score)) is not None]
+    real = [known for score in scores if (known := is_like_real(score)) is not None]
+    words = []
+    if beaten:
+        words.append(f"better than pixel statistics in {sum(beaten)} of {len(beaten)} scores")
+    if real:
+        words.append(f"within noise of real against real in {sum(real)}{'' if beaten else f' of {len(real)} scores'}")
+    sentence = "; ".join(words)
+    return f"{sentence[0].upper()}{sentence[1:]}." if sentence else ""
+
+
+def _is_beyond_real(score: Score) -> bool:
+    real = score.real_against_real
+    return real is not None and _worse_by(score, real.value, score.result.value) > noise(score)
+
+
+def _worse_by(score: Score, value: float, other: float) -> float:
+    """Return by how much one value of a metric is worse than another one of the same metric."""
+    return other - value if score.result.higher_is_better else value - other
+
+
+def _names(scores: Sequence[Score]) -> str:
+    """Return the names of metrics, each with its variant where several variants of it were scored."""
+    metrics = [score.result.metric for score in scores]
+    return ", ".join(
+        name if metrics.count(name) == 1 else f"{name} ({score.result.variant})"
+        for name, score in zip(metrics, scores, strict=True)
+    )

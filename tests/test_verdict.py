@@ -1,0 +1,99 @@
+"""The verdict on scores: what it counts, which metrics it sets apart, and what it says of odd values."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from lidargrit.cli import main
+from lidargrit.evaluation.intervals import Interval, RealAgainstReal
+from lidargrit.evaluation.scorecard import Score, Scorecard, SetFacts
+from lidargrit.evaluation.tables import side_by_side
+from lidargrit.evaluation.verdict import counted_first, verdict
+from lidargrit.files import read_json, write_json
+from lidargrit.structures import MetricResult
+
+FACTS = SetFacts("a", "samples", "", 9, 9, "s 8x8", "spherical, exact", "ab" * 32)
+
+
+def score(value, real=None, pixels=None, *, noise=0.1, metric="bev_jsd", higher=False, variant="exact"):
+    result = MetricResult(metric, value, higher, 9, 9, variant)
+    interval = Interval(value - noise, value + noise, noise / 2, 20) if noise else None
+    return Score(result, interval, None if real is None else RealAgainstReal(real, 9, 5), pixel_statistics=pixels)
+
+
+def card(*scores):
+    return Scorecard("exact", {}, FACTS, FACTS, scores)
+
+
+def test_it_counts_scores_between_their_bounds():
+    scores = [score(0.5, 0.1, 0.9), score(0.15, 0.1, 0.9, metric="bev_mmd"), score(0.85, 0.1, 0.9, metric="coverage")]
+    assert verdict(scores) == ("Better than pixel statistics in 2 of 3 scores; within noise of real against real in 1.",)
+    assert verdict([score(0.5, 0.9, 0.1, higher=True)])[0].startswith("Better than pixel statistics in 1 of 1 scores")
+
+
+def test_one_bound_alone_is_counted_and_without_any_nothing_is_said():
+    assert verdict([score(0.15, 0.1)]) == ("Within noise of real against real in 1 of 1 scores.",)
+    assert verdict([score(0.15, None, 0.9)]) == ("Better than pixel statistics in 1 of 1 scores.",)
+    assert verdict([score(0.15)]) == ()
+    assert verdict([score(0.15, 0.1, 0.9, noise=0)])[0].endswith("within noise of real against real in 0.")
+
+
+def test_metrics_that_do_not_see_pixel_statistics_are_set_apart_last_in_the_table():
+    blind, sees = score(0.3, 0.1, 0.15), score(0.5, 0.1, 0.9, metric="bev_mmd")
+    assert counted_first([blind, sees]) == ([sees], [blind])
+    words = verdict([blind, sees])
+    assert words[0].startswith("Better than pixel statistics in 1 of 1 scores")
+    assert words[1] == (
+        "Set apart, and not counted: bev_jsd. Here it does not tell pixel statistics from real scans."
+    )
+    lines = card(blind, sees).as_table().splitlines()
+    assert lines[:2] == list(words)
+    assert [line.split()[0] for line in lines[4:]] == ["bev_mmd", "set", "bev_jsd"]
+    assert lines[4].split()[-6:] == ["(n=9)", "0.9000", "lower", "9", "v", "9"]
+
+
+def test_values_below_zero_and_better_than_real_are_explained():
+    words = " ".join(verdict([score(-0.01, 0.0, 0.9, metric="bev_mmd"), score(0.1, 0.5, 0.9)]))
+    assert "bev_mmd below 0: the unbiased estimate" in words
+    assert "Better than real against real: bev_jsd." in words
+    both = [score(-0.01, 0.0, variant="exact"), score(-0.01, 0.0, variant="r2dm")]
+    assert "bev_jsd (exact), bev_jsd (r2dm) below 0" in " ".join(verdict(both))
+
+
+def test_a_table_takes_pixel_statistics_from_their_own_row(tmp_path):
+    files = {"marginal": card(score(0.9, 0.1)), "memorised": card(score(0.1, 0.1)), "mine": card(score(0.5, 0.1))}
+    paths = []
+    for name, one in files.items():
+        paths.append(tmp_path / f"{name}.json")
+        write_json(paths[-1], one.to_json())
+    table = side_by_side(paths)
+    assert table.splitlines()[1] == (
+        "mine: Better than pixel statistics in 1 of 1 scores; within noise of real against real in 0."
+    )
+    assert "marginal (pixel statistics)" in table
+    assert "memorised (memorised training scans)" in table
+    assert "mine: Better" in side_by_side(paths, "markdown")
+    assert side_by_side(paths, "latex").splitlines()[1].startswith("% mine: Better")
+
+
+def test_files_of_before_one_name_are_read(tmp_path):
+    data = card(score(0.5, 0.1, 0.9)).to_json()
+    for each in data["scores"]:
+        each["floor"] = each.pop("real_against_real")
+        del each["pixel_statistics"]
+    write_json(tmp_path / "old.json", data)
+    found = Scorecard.read(tmp_path / "old.json").scores[0]
+    assert (found.real_against_real, found.pixel_statistics) == (RealAgainstReal(0.1, 9, 5), None)
+    write_json(tmp_path / "new.json", card(replace(found, pixel_statistics=0.9)).to_json())
+    assert Scorecard.read(tmp_path / "new.json").scores[0].pixel_statistics == 0.9
+
+
+@pytest.mark.parametrize("metric", ["bev_jsd"])
+def test_the_command_scores_pixel_statistics_where_they_are_wanted(tmp_path: Path, capsys, metric):
+    words = ["evaluate", "simulated:4:val", "simulated:4:test", "--metrics", metric, "--variant", "exact"]
+    assert main([*words, "--pixel-statistics", "--json", str(tmp_path / "s.json")]) == 0
+    assert "pixel statistics" in capsys.readouterr().out.splitlines()[0].lower()
+    found = read_json(tmp_path / "s.json")
+    assert found["scores"][0]["pixel_statistics"] > 0
+    assert found["verdict"]
