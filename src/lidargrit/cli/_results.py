@@ -34,7 +34,7 @@ def refuse_taken(options: argparse.Namespace) -> None:
     refuse_to_overwrite(options.json, options.overwrite, ".json")
 
 
-def tell(options: argparse.Namespace, text: str, result: Any, done: str = "") -> None:
+def print_result(options: argparse.Namespace, text: str, result: Any, done: str = "") -> None:
     """Print what was found as the user wants it, and write it where the user wants it.
 
     Args:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from lidargrit.cli._options import add_settings
-from lidargrit.cli._results import add_json, refuse_taken, tell
+from lidargrit.cli._results import add_json, print_result, refuse_taken
 
 EXAMPLES = """\
   lidargrit compare table marginal memorised small dusty_small r2dm_small:steps=32
@@ -51,4 +51,4 @@ def run(options: argparse.Namespace) -> None:
         flops=options.flops,
     )
     scores = run_benchmark(options.systems, options.out, benchmark, TerminalReporter())
-    tell(options, as_table(scores, options.format), as_json(scores))
+    print_result(options, as_table(scores, options.format), as_json(scores))

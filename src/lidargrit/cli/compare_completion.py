@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from lidargrit.cli._options import add_bad_scans, add_device
-from lidargrit.cli._results import add_json, refuse_taken, tell
+from lidargrit.cli._results import add_json, print_result, refuse_taken
 from lidargrit.untrusted import seed_number
 
 EXAMPLES = """\
@@ -52,4 +52,4 @@ def run(options: argparse.Namespace) -> None:
     config = DataConfig(max_scans=options.count, bad_points=options.bad_points, bad_scans=options.bad_scans)
     images = open_images(options.scans, completers[0].sensor, config, TerminalReporter())
     scores = compare_completion(images, completers, patterns, options.completions, options.seed, TerminalReporter())
-    tell(options, as_table(scores), {"scans": options.scans, "scores": as_json(scores)})
+    print_result(options, as_table(scores), {"scans": options.scans, "scores": as_json(scores)})

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from lidargrit.cli._options import add_bad_scans
-from lidargrit.cli._results import add_json, refuse_taken, tell
+from lidargrit.cli._results import add_json, print_result, refuse_taken
 from lidargrit.untrusted import seed_number
 
 EXAMPLES = """\
@@ -50,4 +50,4 @@ def run(options: argparse.Namespace) -> None:
     )
     plot_curves(scores, options.out, f"real: {options.real}")
     result = {**about, "seed": options.seed, "curves": as_json(scores)}
-    tell(options, as_table(scores), result, f"done: look at {options.out}")
+    print_result(options, as_table(scores), result, f"done: look at {options.out}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from lidargrit.cli._results import add_json, refuse_taken, tell
+from lidargrit.cli._results import add_json, print_result, refuse_taken
 
 EXAMPLES = """\
   lidargrit doctor
@@ -50,4 +50,4 @@ def run(options: argparse.Namespace) -> None:
     told["bfloat16"] = "yes" if has_bf16() else "no: training takes two to three times as long in 32 bits"
     none = "none that torch can use; the recipes small and demo are made for CPUs"
     told["gpus"] = ", ".join(f"{card['name']}, {card['memory_gib']} GiB" for card in facts["gpus"]) or none
-    tell(options, "\n".join(f"{name:<18}{fact}" for name, fact in told.items()), facts)
+    print_result(options, "\n".join(f"{name:<18}{fact}" for name, fact in told.items()), facts)

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from lidargrit.cli._options import add_bad_scans, add_projection_variant
-from lidargrit.cli._results import add_json, refuse_taken, tell
+from lidargrit.cli._results import add_json, print_result, refuse_taken
 from lidargrit.untrusted import seed_number
 
 EXAMPLES = """\
@@ -23,19 +23,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     samples = "samples of lidargrit or of another program (.pth), a source of scans, or a run"
     add("samples", nargs="?", default="", help=samples)
-    reference = "scans to compare with, also any of these; projected with the sensor of the samples"
-    add("reference", nargs="?", default="", help=reference)
+    add("reference", nargs="?", default="", help="scans to compare with; projected with the sensor of the samples")
     add("--protocol", default="exact", help="metrics and their definitions, see: lidargrit list protocols")
     add("--metrics", nargs="+", default=[], help="metrics instead of the protocol's, see: lidargrit list metrics")
-    variant = "published definition of every metric, instead of the protocol's; see: lidargrit list metrics"
-    add("--variant", default="", help=variant)
+    add("--variant", default="", help="published definition of every metric; see: lidargrit list metrics")
     add_projection_variant(parser, default=None)
     add("--samples-format", default="", help="program that wrote .pth files: r2dm, lidargen or lidargrit")
     add("--weights", nargs="+", default=[], metavar="NAME=FILE", help="weights of pointnet and rangenet53")
     add("-n", "--max-scans", type=int, default=0, help="largest number of scans of each; 0 for the protocol's")
     add("--intervals", type=int, default=20, metavar="B", help="number of half-samples for 95 %% intervals; 0 for none")
-    pixels = "also score pixel statistics of the reference, which any model has to beat; takes a little longer"
-    add("--pixel-statistics", action="store_true", help=pixels)
+    add("--pixel-statistics", action="store_true", help="also score pixel statistics, which any model has to beat")
     add("--groups", type=int, default=16, metavar="G", help="number of groups of neighbours kept together in them")
     add("--seed", type=seed_number, default=0, help="seed of all random choices")
     add("--device", default="cpu", help="device for feature networks: cpu or cuda")
@@ -55,9 +52,9 @@ def run(options: argparse.Namespace) -> None:
 
     refuse_taken(options)
     if options.tables:
-        return tell(options, *read_tables(options.tables, options.format))
+        return print_result(options, *read_tables(options.tables, options.format))
     names = "protocol metrics variant projection_variant max_scans seed samples_format device weights groups intervals"
-    others = ("pixel_statistics", "bad_points", "bad_scans")
-    config = read_config(**{name: vars(options)[name] for name in (*names.split(), *others)})
+    names += " pixel_statistics bad_points bad_scans"
+    config = read_config(**{name: vars(options)[name] for name in names.split()})
     sets, report = (options.samples, options.reference), (options.report, write_report, options.overwrite)
-    tell(options, *evaluate(*sets, config, TerminalReporter(), *report))
+    print_result(options, *evaluate(*sets, config, TerminalReporter(), *report))

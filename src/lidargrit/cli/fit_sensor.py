@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from lidargrit.cli._options import add_bad_points
-from lidargrit.cli._results import add_json, refuse_taken, tell
+from lidargrit.cli._results import add_json, print_result, refuse_taken
 
 EXAMPLES = """\
   lidargrit fit-sensor /data/scans -o my_sensor.json --picture fit.png
@@ -42,4 +42,4 @@ def run(options: argparse.Namespace) -> None:
         plot_sensor_fit(fit, options.picture)
     write_json(options.out, fit.sensor.to_json())
     done = f"done: {options.out}; use it with data.sensor={options.out} (train), or wherever a sensor is named"
-    tell(options, as_table(fit), {"sensor_file": str(options.out), **as_json(fit)}, done)
+    print_result(options, as_table(fit), {"sensor_file": str(options.out), **as_json(fit)}, done)

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from lidargrit.cli._options import add_bad_points, add_projection_variant
-from lidargrit.cli._results import add_json, refuse_taken, tell
+from lidargrit.cli._results import add_json, print_result, refuse_taken
 
 EXAMPLES = """\
   lidargrit inspect scan.bin                                     with the sensor of ours that looks closest
@@ -54,4 +54,4 @@ def run(options: argparse.Namespace) -> None:
     found = inspect(scan, sensor, options.projection, options.projection_variant)
     if options.out:
         plot_inspection(found, options.out)
-    tell(options, as_table(found), as_json(found), f"\ndone: look at {options.out}" if options.out else "")
+    print_result(options, as_table(found), as_json(found), f"\ndone: look at {options.out}" if options.out else "")

@@ -6,7 +6,7 @@ import argparse
 import textwrap
 
 from lidargrit.catalogue import FORMER_KINDS, KINDS
-from lidargrit.cli._results import add_json, refuse_taken, tell
+from lidargrit.cli._results import add_json, print_result, refuse_taken
 
 EXAMPLES = """\
   lidargrit list
@@ -37,4 +37,4 @@ def run(options: argparse.Namespace) -> None:
         for entry in of_kind:
             told.append(f"  {entry['name']:<36}{entry['summary']}")
             told += [wrapper.fill(line) for line in (lines(kind, entry) if options.kind else [])]
-    tell(options, "\n".join(told), found)
+    print_result(options, "\n".join(told), found)

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from lidargrit.cli._options import add_bad_scans, add_projection_variant, add_rank
-from lidargrit.cli._results import add_json, refuse_taken, tell
+from lidargrit.cli._results import add_json, print_result, refuse_taken
 
 EXAMPLES = """\
   lidargrit prepare kitti_360:/data/KITTI-360:train -o /fast/kitti_360_train --workers 16
@@ -57,4 +57,4 @@ def run(options: argparse.Namespace) -> None:
     )
     reporter, machines = TerminalReporter(), (options.rank, options.world_size)
     made = prepare_and_describe(options.source, dataset, config, options.out, reporter, *machines, options.verify)
-    tell(options, made.as_text(), made.to_json())
+    print_result(options, made.as_text(), made.to_json())

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from lidargrit.cli._options import add_settings
-from lidargrit.cli._results import add_json, refuse_taken, tell
+from lidargrit.cli._results import add_json, print_result, refuse_taken
 
 EXAMPLES = """\
   lidargrit reproduce 3 simulated ablation --small                 a small counterpart, a quarter of an hour
@@ -53,7 +53,7 @@ def run(options: argparse.Namespace) -> None:
     )
     if options.dry_run:
         facts = plan(wanted, options.out)
-        tell(options, plan_as_text(wanted, facts), facts)
+        print_result(options, plan_as_text(wanted, facts), facts)
         return
     scores = reproduce(wanted, options.out, TerminalReporter())
-    tell(options, table_of(wanted, scores, options.format), as_json(scores))
+    print_result(options, table_of(wanted, scores, options.format), as_json(scores))

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from lidargrit.cli._options import add_settings
-from lidargrit.cli._results import add_json, refuse_taken, tell
+from lidargrit.cli._results import add_json, print_result, refuse_taken
 
 EXAMPLES = """\
   lidargrit train small runs/mine
@@ -43,7 +43,7 @@ def run(options: argparse.Namespace) -> None:
         refuse_taken(options)
         planned, measured = plan_training(recipe), measure(recipe) if options.measure else []
         text = "\n".join([planned.as_text(), *(stage.as_text() for stage in measured)])
-        tell(options, text, {**planned.to_json(), "measured": [vars(stage) for stage in measured]})
+        print_result(options, text, {**planned.to_json(), "measured": [vars(stage) for stage in measured]})
         check_data(recipe)  # last: the plan of a recipe is worth reading on a machine without its data too
         return
     if options.json:

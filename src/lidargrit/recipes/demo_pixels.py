@@ -9,7 +9,13 @@ _DATA = ("data.train=simulated:192:train", "data.val=simulated:16:val")
 _SMALLER = ("model.transformer.layers=3", "model.transformer.width=192")
 # So few scans that each stage takes about a quarter to a half of the time: measured step by step, in 32 bits.
 _TOKENIZER = ("scans=640", "warmup_scans=40", "average_over_scans=60", "validate_every=320", "checkpoint_every=160")
-_TRANSFORMER = ("scans=2400", "warmup_scans=160", "average_over_scans=160", "validate_every=1200", "checkpoint_every=480")
+_TRANSFORMER = (
+    "scans=2400",
+    "warmup_scans=160",
+    "average_over_scans=160",
+    "validate_every=1200",
+    "checkpoint_every=480",
+)
 _PIXELS = ("scans=320", "warmup_scans=32", "average_over_scans=32", "validate_every=160", "checkpoint_every=80")
 _TRAINING = [
     f"training.{stage}.{each}"
