@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from lidargrit.cli._options import add_bad_scans, add_device
-from lidargrit.cli._results import add_json, refuse_taken, tell
+from lidargrit.cli._results import add_json, print_result, refuse_taken
 
 EXAMPLES = """\
   lidargrit likelihood simulated:64:test
@@ -47,4 +47,4 @@ def run(options: argparse.Namespace) -> None:
     named = (options.scans, options.model, options.step_mm)
     found = likelihood_of_source(*named, config, TerminalReporter(), options.map, options.device)
     result = {"model": options.model, "source": options.scans, **found.as_json()}
-    tell(options, found.as_table(), result)
+    print_result(options, found.as_table(), result)
