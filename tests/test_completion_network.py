@@ -17,7 +17,9 @@ from lidargrit.sensors import load_sensor
 from lidargrit.structures import RangeImage
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
-TINY = CompletionNetworkConfig(widths=(8, 8, 8), blocks=1, features=4, mask_width=4, row_channels=1)
+TINY = CompletionNetworkConfig(
+    widths=(8, 8, 8), blocks=1, attention_layers=1, heads=2, features=4, mask_width=4, row_channels=1
+)
 
 
 def scans(count: int) -> RangeImage:
@@ -44,11 +46,27 @@ def test_hints_tell_the_next_return_on_every_side():
     range_m[0, 10, 4], range_m[0, 10, 30], range_m[0, 20, 6] = 5.0, 8.0, 11.0
     image = RangeImage(range_m, range_m > 0, SENSOR)
     hints = hints_of(Condition.of_pixels(image, torch.ones_like(image.return_mask)))
-    above, below, left, right = hints.candidates[0, 3:, 10, 6].expm1().tolist()
+    above, below, left, right = hints.candidates[0, 3:7, 10, 6].expm1().tolist()
     assert (below, left, right) == pytest.approx((11.0, 5.0, 8.0))
     assert above == pytest.approx(float(hints.candidates[0, 0, 10, 6].expm1()))  # nothing above: as triangulated
     assert hints.maps[0, 9:13, 10, 6].tolist() == pytest.approx([4.0, 10 / 16, 2 / 16, 24 / 16])
     assert float(hints_of(Condition.nothing(SENSOR, 1)).maps.abs().max()) == 0
+
+
+def test_hints_of_the_mirror_image_are_those_of_mirrored_scans():
+    images = scans(1)
+    known = Condition.of_pixels(images, torch.rand(1, 64, 32, generator=torch.Generator().manual_seed(0)) < 0.2)
+    there = RangeImage(known.range_m.flip(-1), known.return_mask.flip(-1), SENSOR)
+    mirrored, wanted = hints_of(known).mirrored(), hints_of(Condition.of_pixels(there, known.return_observed.flip(-1)))
+    exact = [
+        0,
+        1,
+        2,
+        *range(9, 15),
+    ]  # the others depend on which of two equally near returns, or of two tilings, counts
+    assert torch.allclose(mirrored.maps[:, exact], wanted.maps[:, exact], atol=1e-6)
+    for one, other in zip((mirrored.maps, mirrored.candidates), (wanted.maps, wanted.candidates), strict=True):
+        assert float(((one - other).abs() > 1e-3).float().mean()) < 0.1
 
 
 @torch.no_grad()
@@ -92,6 +110,11 @@ def test_it_learns():
         losses.append(float(terms["loss"].detach()))
     assert losses[-1] < 0.8 * losses[0]
     assert all(weight.grad is not None for weight in objective.completion.unet.parameters())
+
+
+def test_more_attention_than_blocks_is_refused():
+    with pytest.raises(ConfigError, match="3 layers of attention of 4 heads, 128 channels; wanted at most 2 layers"):
+        CompletionNetworkConfig(blocks=2, attention_layers=3)
 
 
 def test_training_hides_rows_sectors_and_pixels():

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from lidargrit.conditions import Condition
+from lidargrit.conditions.fills import fill_from_nearest
 from lidargrit.conditions.patterns import Pattern
 from lidargrit.errors import ConfigError, ScanError, UsageError
 from lidargrit.sensors import load_sensor
@@ -90,3 +91,18 @@ def test_observed_words_that_cannot_be_are_refused_in_one_line(text, told, tmp_p
     text = f"{tmp_path}/{text}" if text.endswith(".npy") and text != "nowhere.npy" else text
     with pytest.raises(UsageError, match=f"^got {told}"):
         Pattern(text).mask(scans(1)[0])
+
+
+def test_the_nearest_observed_pixel_is_that_of_the_smallest_angle_around_the_circle():
+    images = RangeImage.masked(torch.zeros(1, 64, 32) + 9, torch.ones(1, 64, 32, dtype=torch.bool), SENSOR)
+    observed = torch.zeros_like(images.return_mask)
+    observed[:, :, 30] = True
+    filled = fill_from_nearest(images, observed)
+    assert bool((filled.range_m == 9).all())
+    images.range_m[0, 20, 4], images.range_m[0, 32, 5] = 5.0, 7.0
+    observed[:] = False
+    observed[0, 20, 4], observed[0, 32, 5] = True, True
+    filled = fill_from_nearest(images, observed)
+    assert float(filled.range_m[0, 32, 3]) == 5.0  # 12 rows are 4 degrees, and one column is 11
+    assert float(filled.range_m[0, 26, 31]) == 5.0
+    assert not fill_from_nearest(images, torch.zeros_like(observed)).return_mask.any()

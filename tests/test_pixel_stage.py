@@ -18,7 +18,6 @@ from lidargrit.evaluation.estimates import Estimate
 from lidargrit.evaluation.likelihood import score_likelihood
 from lidargrit.generators import load
 from lidargrit.generators._batches import in_batches
-from lidargrit.generators._tokens import fill_from_nearest
 from lidargrit.generators.lidargrit import (
     START_TOKEN,
     LidarGrit,
@@ -208,16 +207,6 @@ def test_observed_tokens_stand_and_later_ones_know_of_them(static):
     after = generator.transformer(after_start(held[:, :-1]))[:, 20]
     assert torch.equal(held[:, 20], sample_token(after, uniform[:, 20], TokenSampling()))
     assert torch.equal(decoder.generate(uniform), free)
-
-
-def test_unobserved_pixels_are_filled_from_the_nearest_around_the_circle():
-    images = scans(1)
-    observed = torch.zeros_like(images.return_mask)
-    observed[:, :, 60] = True
-    filled = fill_from_nearest(images, observed)
-    assert torch.equal(filled.range_m[0, :, 2], images.range_m[0, :, 60])
-    assert torch.equal(filled.range_m[0, :, 40], images.range_m[0, :, 60])
-    assert not fill_from_nearest(images, torch.zeros_like(observed)).return_mask.any()
 
 
 def test_its_cost_counts_every_phase():

@@ -59,6 +59,23 @@ def uninterrupted(tmp_path_factory) -> bytes:
     return (folder / "model.safetensors").read_bytes()
 
 
+@pytest.mark.parametrize(
+    ("words", "follows"),
+    [
+        (["compare-completion", "scans"], "the same command begins anew"),
+        (["evaluate", "one", "other"], "the same command begins anew"),
+        (["complete", "scans", "out"], "the same command goes on"),
+    ],
+)
+def test_only_verbs_that_keep_their_work_say_that_they_go_on(words, follows, monkeypatch, capsys):
+    def interrupted(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(f"lidargrit.cli.{words[0].replace('-', '_')}.run", interrupted)
+    assert main(words) == 130
+    assert capsys.readouterr().err == f"\nlidargrit {words[0]}: interrupted; {follows}\n"
+
+
 def hidden(folder: Path) -> list[Path]:
     return [path for path in folder.rglob(".*") if path.is_file()]
 

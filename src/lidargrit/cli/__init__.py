@@ -27,6 +27,24 @@ examples:
 a verb's own examples: lidargrit VERB --help
 """
 
+_CONTINUED = frozenset(
+    {
+        "compare",
+        "complete",
+        "demo",
+        "export",
+        "prepare",
+        "publish",
+        "raydrop",
+        "reproduce",
+        "sample",
+        "simulate",
+        "train",
+        "upsample",
+    }
+)
+"""Verbs that keep what they have done in a folder, and go on there."""
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb; 0 = done, 2 = the user's mistake, told in one line, 130 = interrupted, 143 = terminated."""
@@ -52,14 +70,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"lidargrit {options.verb}: {error}", file=sys.stderr)
         return 2
     except Terminated:
-        print(f"\nlidargrit {options.verb}: terminated; the same command goes on", file=sys.stderr)
+        print(f"\nlidargrit {options.verb}: terminated; {_what_follows(options.verb)}", file=sys.stderr)
         return 143
     except KeyboardInterrupt:
-        print(f"\nlidargrit {options.verb}: interrupted; the same command goes on", file=sys.stderr)
+        print(f"\nlidargrit {options.verb}: interrupted; {_what_follows(options.verb)}", file=sys.stderr)
         return 130
     except BrokenPipeError:  # the reader of our output, such as head, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return 0
+
+
+def _what_follows(verb: str) -> str:
+    """Return what the same command does after it was stopped."""
+    return "the same command goes on" if verb in _CONTINUED else "the same command begins anew"
 
 
 def _let_threads_sleep() -> None:

@@ -11,12 +11,14 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from scipy.ndimage import distance_transform_edt, maximum_filter1d
 from scipy.spatial import Delaunay, QhullError
+from torch import Tensor
 
 from lidargrit.conditions import Condition
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
 EDGE = 0.8  # of ln(1 + range in metres): two observed returns further apart lie on two surfaces
+_JITTER_RAD = 1e-6  # a twentieth of a millimetre at 50 m
 _ROWS_NEAR, _COLUMNS_NEAR = 9, 17  # window in which a return helps to fill an unknown pixel in; farther are others
 
 
@@ -48,16 +50,7 @@ class Observed:
 
     def nearest(self, wanted: Bool[np.ndarray, "H W"]) -> tuple[Int64[np.ndarray, "H W"], Int64[np.ndarray, "H W"]]:
         """Return for every pixel row and column of the nearest wanted one by angle; of itself if none is wanted."""
-        height, width = wanted.shape
-        if not wanted.any():
-            rows, columns = np.indices((height, width))
-            return rows, columns
-        thrice = np.tile(~wanted, (1, 3))  # so that the circle closes
-        steps = (np.abs(np.diff(self.elevation_rad)).mean() if height > 1 else 1.0, 2 * np.pi / width)
-        nearest = np.empty((2, height, 3 * width), dtype=np.int32)
-        distance_transform_edt(thrice, steps, return_distances=False, return_indices=True, indices=nearest)
-        rows, columns = nearest[:, :, width : 2 * width].astype(np.int64)
-        return rows, columns % width
+        return _nearest(wanted, self.elevation_rad)
 
     @cached_property
     def nearest_return(self) -> tuple[Int64[np.ndarray, "H W"], Int64[np.ndarray, "H W"]]:
@@ -88,13 +81,31 @@ def linear(seen: Observed) -> Float64[np.ndarray, "H W"]:
     return np.where(np.isfinite(found), found, seen.nearest_range_m)
 
 
-def triangulation(seen: Observed) -> Float64[np.ndarray, "H W"]:
-    """Interpolate 1 / range linearly in the triangles of Delaunay between observed returns.
+@dataclass(frozen=True)
+class Triangles:
+    """What the triangles of Delaunay between observed returns tell of every pixel.
 
-    Where a triangle spans an edge, and outside of all, the nearest return counts. Of a plane 1 / range is nearly
-    linear in the angles.
+    Args:
+        range_m: 1 / range interpolated linearly; the nearest return where a triangle spans an edge, and outside of all.
+        corners_m: ranges of the three corners, that of the largest weight first; the filled range without a triangle.
+        weights: barycentric weights of the corners; 1, 0 and 0 without a triangle.
     """
-    width, found = len(seen.azimuth_rad), seen.nearest_range_m.copy()
+
+    range_m: Float64[np.ndarray, "H W"]
+    corners_m: Float64[np.ndarray, "3 H W"]
+    weights: Float64[np.ndarray, "3 H W"]
+
+    @classmethod
+    def none(cls, range_m: Float64[np.ndarray, "H W"]) -> Triangles:
+        """Return what there is without a triangle: ranges that were filled in another way."""
+        weights = np.zeros((3, *range_m.shape))
+        weights[0] = 1
+        return cls(range_m.copy(), np.stack([range_m] * 3), weights)
+
+
+def triangles(seen: Observed) -> Triangles:
+    """Triangulate the observed returns by the angles of their rays; of a plane 1 / range is nearly linear in these."""
+    width = len(seen.azimuth_rad)
     near = maximum_filter1d(maximum_filter1d(~seen.known, _ROWS_NEAR, 0), _COLUMNS_NEAR, 1, mode="wrap")
     helpful = seen.returned & near
     # The circle closes if as many columns as the widest gap are copied on either side.
@@ -105,23 +116,34 @@ def triangulation(seen: Observed) -> Float64[np.ndarray, "H W"]:
     corners = np.stack((seen.elevation_rad[rows], azimuth_rad[at]), axis=1)
     range_m = seen.range_m[rows, columns[at] % width]
     try:
-        triangles = Delaunay(corners)
+        # The corners of a grid's cell lie on one circle, a tie that Qhull breaks slowly; moved a little, they do not.
+        tiling = Delaunay(corners + np.random.default_rng(0).normal(scale=_JITTER_RAD, size=corners.shape))
     except (QhullError, ValueError):  # too few returns, or all on one line
-        return linear(seen)
+        return Triangles.none(linear(seen))
     missing = np.nonzero(~seen.known)
     points = np.stack((seen.elevation_rad[missing[0]], seen.azimuth_rad[missing[1]]), axis=1)
-    triangle = triangles.find_simplex(points)
-    transform = triangles.transform[triangle]
+    triangle = tiling.find_simplex(points)
+    transform = tiling.transform[triangle]
     first_two = np.einsum("nij,nj->ni", transform[:, :2], points - transform[:, 2])
     weights = np.concatenate((first_two, 1 - first_two.sum(1, keepdims=True)), axis=1)
-    of_corners_m = range_m[triangles.simplices[triangle]]
+    of_corners_m = range_m[tiling.simplices[triangle]]
+    inside = (triangle >= 0) & np.isfinite(weights).all(1)  # triangles without an area have no weights
     log_m = np.log1p(of_corners_m)
-    with np.errstate(invalid="ignore"):  # triangles without an area have no weights
-        inverse = (weights / of_corners_m).sum(1)
-        one_surface = (triangle >= 0) & (np.ptp(log_m, axis=1) <= EDGE) & (inverse > 0)
-    chosen = tuple(part[one_surface] for part in missing)
-    found[chosen] = 1 / inverse[one_surface]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        filled_m = 1 / (weights / of_corners_m).sum(1)
+        one_surface = inside & (np.ptp(log_m, axis=1) <= EDGE) & (filled_m > 0)
+    found = Triangles.none(seen.nearest_range_m)
+    found.range_m[_part(missing, one_surface)] = filled_m[one_surface]
+    order = np.argsort(-weights[inside], axis=1)
+    chosen = (slice(None), *_part(missing, inside))
+    found.corners_m[chosen] = np.take_along_axis(of_corners_m[inside], order, axis=1).T
+    found.weights[chosen] = np.take_along_axis(weights[inside], order, axis=1).T
     return found
+
+
+def triangulation(seen: Observed) -> Float64[np.ndarray, "H W"]:
+    """Interpolate 1 / range linearly in the triangles of Delaunay between observed returns, within surfaces."""
+    return triangles(seen).range_m
 
 
 FILLS: dict[str, Callable[[Observed], Float64[np.ndarray, "H W"]]] = {
@@ -155,6 +177,37 @@ def fill(method: str, condition: Condition) -> RangeImage:
     return condition.to("cpu").put_into(filled)
 
 
+def fill_from_nearest(images: RangeImage, observed: Bool[Tensor, "B H W"]) -> RangeImage:
+    """Return scans in which every pixel that was not observed is as the nearest one by angle that was; none, if none.
+
+    Args:
+        images: batch of range images; what was observed without a return has a range of 0.
+        observed: True for pixels that were observed.
+    """
+    elevation_rad, _ = _angles(images.sensor)
+    filled = []
+    for range_m, known in zip(images.range_m.cpu(), observed.cpu(), strict=True):
+        rows, columns = (torch.from_numpy(part) for part in _nearest(known.numpy(), elevation_rad))
+        filled.append(range_m[rows, columns] if bool(known.any()) else torch.zeros_like(range_m))
+    range_m = torch.stack(filled).to(images.range_m.device)
+    return RangeImage(range_m, range_m > 0, images.sensor)
+
+
+def _nearest(
+    wanted: Bool[np.ndarray, "H W"], elevation_rad: Float64[np.ndarray, " H"]
+) -> tuple[Int64[np.ndarray, "H W"], Int64[np.ndarray, "H W"]]:
+    height, width = wanted.shape
+    if not wanted.any():
+        rows, columns = np.indices((height, width))
+        return rows, columns
+    thrice = np.tile(~wanted, (1, 3))  # so that the circle closes
+    steps = (np.abs(np.diff(elevation_rad)).mean() if height > 1 else 1.0, 2 * np.pi / width)
+    nearest = np.empty((2, height, 3 * width), dtype=np.int32)
+    distance_transform_edt(thrice, steps, return_distances=False, return_indices=True, indices=nearest)
+    rows, columns = nearest[:, :, width : 2 * width].astype(np.int64)
+    return rows, columns % width
+
+
 def _angles(sensor: SensorModel) -> tuple[Float64[np.ndarray, " H"], Float64[np.ndarray, " W"]]:
     elevation_rad = sensor.elevation_rad.double().mean(1).cpu().numpy()
     return elevation_rad, sensor.azimuth_rad.double().mean(0).cpu().numpy()
@@ -162,6 +215,11 @@ def _angles(sensor: SensorModel) -> tuple[Float64[np.ndarray, " H"], Float64[np.
 
 def _thrice(azimuth_rad: Float64[np.ndarray, " W"]) -> Float64[np.ndarray, " W*3"]:
     return np.concatenate([azimuth_rad - turn * 2 * np.pi for turn in (-1, 0, 1)])
+
+
+def _part(pixels: tuple[np.ndarray, ...], chosen: Bool[np.ndarray, " n"]) -> tuple[np.ndarray, ...]:
+    """Return the rows and the columns of some of the pixels."""
+    return tuple(axis[chosen] for axis in pixels)
 
 
 def _widest_gap(some: Bool[np.ndarray, " W"]) -> int:

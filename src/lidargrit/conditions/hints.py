@@ -11,9 +11,11 @@ from scipy.ndimage import uniform_filter1d
 from torch import Tensor
 
 from lidargrit.conditions import Condition
-from lidargrit.conditions.fills import Observed, linear, triangulation
+from lidargrit.conditions.fills import Observed, linear, triangles
 
-NUM_MAPS, NUM_CANDIDATES = 15, 7
+NUM_MAPS, NUM_CANDIDATES = 19, 9
+_LEFT_RIGHT = {7: 8, 8: 7, 11: 12, 12: 11}  # maps that change places in the mirror, and so do candidates:
+_LEFT_RIGHT_CANDIDATES = {5: 6, 6: 5}
 _TYPICAL_V = 2.5  # ln(1 + 11 m), the middle of what scans hold, so that maps are near 0
 _FAR_PIXELS, _FARTHEST = 16.0, 4.0  # a distance is told in units of 16 pixels, up to 64 of them
 _WINDOW = 9  # rows and columns in which shares are counted
@@ -23,13 +25,20 @@ class Hints(NamedTuple):
     """What is easily told of every pixel of partly observed scans; ranges are ln(1 + range in metres).
 
     Args:
-        maps: observed pixels, differences of the nearest return and its neighbours from triangulation, distances.
-        candidates: ranges by triangulation, by interpolation, of the nearest return, and of the next return above,
-            below, to the left and to the right.
+        maps: observed pixels, differences of the nearest return and its neighbours from triangulation, distances, and
+            of the triangle's second and third corner the same differences and the weights.
+        candidates: ranges by triangulation, by interpolation, of the nearest return, of the next return above, below,
+            to the left and to the right, and of the triangle's second and third corner.
     """
 
-    maps: Float[Tensor, "B 15 H W"]
-    candidates: Float[Tensor, "B 7 H W"]
+    maps: Float[Tensor, "B 19 H W"]
+    candidates: Float[Tensor, "B 9 H W"]
+
+    def mirrored(self) -> Hints:
+        """Return the hints of the scans' mirror images, left and right exchanged."""
+        maps = [_LEFT_RIGHT.get(index, index) for index in range(NUM_MAPS)]
+        candidates = [_LEFT_RIGHT_CANDIDATES.get(index, index) for index in range(NUM_CANDIDATES)]
+        return Hints(self.maps[:, maps].flip(-1), self.candidates[:, candidates].flip(-1))
 
 
 def hints_of(condition: Condition) -> Hints:
@@ -39,30 +48,34 @@ def hints_of(condition: Condition) -> Hints:
     return Hints(maps, candidates)
 
 
-def _of_one(seen: Observed) -> tuple[Float32[np.ndarray, "15 H W"], Float32[np.ndarray, "7 H W"]]:
+def _of_one(seen: Observed) -> tuple[Float32[np.ndarray, "19 H W"], Float32[np.ndarray, "9 H W"]]:
     if not seen.returned.any():
         empty = np.zeros((NUM_MAPS, *seen.returned.shape), dtype=np.float32)
         empty[0] = seen.known
         return empty, np.full((NUM_CANDIDATES, *seen.returned.shape), _TYPICAL_V, dtype=np.float32)
-    triangles, lines, near = (np.log1p(part) for part in (triangulation(seen), linear(seen), seen.nearest_range_m))
+    tiling = triangles(seen)
+    filled, lines, near = (np.log1p(part) for part in (tiling.range_m, linear(seen), seen.nearest_range_m))
+    corners = np.log1p(tiling.corners_m[1:])
     sides, distances = zip(
         *(_next_return(seen, down, right) for down, right in ((-1, 0), (1, 0), (0, -1), (0, 1))), strict=True
     )
-    sides = [np.where(np.isnan(side), triangles, side) for side in sides]
+    sides = [np.where(np.isnan(side), filled, side) for side in sides]
     drops = seen.known & ~seen.returned
     share_known, share_dropped = _share_around(seen.known), _share_around(drops)
     maps = [
         seen.known,
         seen.returned,
         drops,
-        near - triangles,
-        triangles - _TYPICAL_V,
-        *(side - triangles for side in sides),
+        near - filled,
+        filled - _TYPICAL_V,
+        *(side - filled for side in sides),
         *distances,
         share_dropped / np.maximum(share_known, 1e-6),
         share_known,
+        *(corners - filled),
+        *tiling.weights[1:],
     ]
-    return np.stack(maps).astype(np.float32), np.stack([triangles, lines, near, *sides]).astype(np.float32)
+    return np.stack(maps).astype(np.float32), np.stack([filled, lines, near, *sides, *corners]).astype(np.float32)
 
 
 def _share_around(part: Bool[np.ndarray, "H W"]) -> Float64[np.ndarray, "H W"]:

@@ -7,14 +7,13 @@ from abc import abstractmethod
 from dataclasses import dataclass, field
 from typing import Literal, TypeVar
 
-import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int
-from scipy.ndimage import distance_transform_edt
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from lidargrit.conditions import Condition
+from lidargrit.conditions.fills import fill_from_nearest
 from lidargrit.errors import ConfigError
 from lidargrit.generators import Cost, Generator
 from lidargrit.nn.objective import Objective
@@ -153,7 +152,7 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
     def observed_tokens(self, condition: Condition) -> Int[Tensor, "B T"]:
         """Return the tokens of the cells of which a pixel was observed, and -1 for the others.
 
-        They are those of scans in which every other pixel is as the nearest observed one, around the circle.
+        They are those of scans in which every other pixel is as the nearest observed one by angle, around the circle.
         """
         observed = condition.return_observed | condition.range_observed
         filled = fill_from_nearest(condition.surfaces, observed)
@@ -233,23 +232,6 @@ class PixelObjective(Objective):
             mask_nats, range_nats = nll.mask.mean(), nll.range.sum() / images.return_mask.sum().clamp(min=1)
         bits = {"mask_bits": mask_nats / math.log(2), "range_bits": nats_to_range_bits(range_nats)}
         return {"loss": mask_nats + range_nats, **{name: value.detach() for name, value in bits.items()}}
-
-
-def fill_from_nearest(images: RangeImage, observed: Bool[Tensor, "B H W"]) -> RangeImage:
-    """Return scans in which every pixel that was not observed is as the nearest one that was; none, where none was."""
-    width = images.range_m.shape[-1]
-    filled = []
-    for range_m, known in zip(images.range_m.cpu(), observed.cpu(), strict=True):
-        if not bool(known.any()):
-            filled.append(torch.zeros_like(range_m))
-            continue
-        thrice = np.tile(~known.numpy(), (1, 3))  # so that the circle closes
-        nearest = np.zeros((2, *thrice.shape), dtype=np.int32)  # row and column of the nearest observed pixel
-        distance_transform_edt(thrice, return_distances=False, return_indices=True, indices=nearest)
-        row, column = torch.from_numpy(nearest[:, :, width : 2 * width]).long()
-        filled.append(range_m[row, column % width])
-    range_m = torch.stack(filled).to(images.range_m.device)
-    return RangeImage(range_m, range_m > 0, images.sensor)
 
 
 def sample_tokens(logits: Float[Tensor, "*B K"], uniform: Float[Tensor, "*B"]) -> Int[Tensor, "*B"]:

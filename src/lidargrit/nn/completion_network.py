@@ -19,6 +19,7 @@ from lidargrit.nn.blocks import Network
 from lidargrit.nn.convolution import Convolution
 from lidargrit.nn.pixel_networks import Guide, MaskNetwork, PixelDecoderConfig, Residual
 from lidargrit.nn.pixel_phases import at_phases
+from lidargrit.nn.transformer import TransformerBlock, TransformerConfig
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
@@ -34,20 +35,32 @@ class CompletionNetworkConfig:
     Args:
         widths: channels at a half, a quarter and an eighth of the image's rows and columns.
         blocks: residual blocks at an eighth.
+        attention_layers: layers of attention between all pixels at an eighth, among the residual blocks; what stands in
+            a wide gap follows from the other side of the street, too.
+        heads: attention heads of each layer.
         features: channels that the phases of the mask see.
         mask_width: channels of the layers of the mask's phases.
         row_channels: learned numbers of every row.
     """
 
-    widths: tuple[int, int, int] = (48, 64, 96)
+    widths: tuple[int, int, int] = (48, 64, 128)
     blocks: int = 4
+    attention_layers: int = 2
+    heads: int = 4
     features: int = 32
     mask_width: int = 24
     row_channels: int = 2
 
     def __post_init__(self) -> None:
-        if min(*self.widths, self.blocks, self.features, self.mask_width, self.row_channels) < 1:
+        sizes = (*self.widths, self.blocks, self.heads, self.features, self.mask_width, self.row_channels)
+        if min(sizes) < 1 or self.attention_layers < 0:
             raise ConfigError(f"{self}", "sizes of at least 1", "raise the one that is lower")
+        if self.attention_layers > self.blocks or self.widths[-1] % self.heads:
+            raise ConfigError(
+                f"{self.attention_layers} layers of attention of {self.heads} heads, {self.widths[-1]} channels",
+                f"at most {self.blocks} layers, one after each residual block, and heads that divide the channels",
+                "change model.completion.attention_layers or .heads",
+            )
 
 
 class Point(NamedTuple):
@@ -85,7 +98,9 @@ class CompletionNetwork(nn.Module):
             )
         self.limits_v = (math.log1p(sensor.range_min_m), math.log1p(sensor.range_max_m))
         self.rows = nn.Parameter(torch.zeros(config.row_channels, sensor.height))
-        self.unet = _Unet(config, NUM_MAPS + config.row_channels, config.features + NUM_CANDIDATES + 2)
+        azimuth_rad = sensor.azimuth_rad.double().mean(0).float()
+        self.register_buffer("azimuth", torch.stack((azimuth_rad.sin(), azimuth_rad.cos())), persistent=False)
+        self.unet = _Unet(config, NUM_MAPS + config.row_channels + 2, config.features + NUM_CANDIDATES + 2)
         sizes = PixelDecoderConfig(
             coarsest_cell=_CELL, mask_features=config.features, mask_width=config.mask_width, blocks=2
         )
@@ -96,6 +111,7 @@ class CompletionNetwork(nn.Module):
         self.num_features = config.features
 
     preferred: Tensor
+    azimuth: Tensor
 
     def forward(self, hints: Hints, known: Bool[Tensor, "B H W"]) -> Point:
         """Return the estimate of every pixel.
@@ -105,7 +121,8 @@ class CompletionNetwork(nn.Module):
             known: True where it was observed whether there is a return.
         """
         rows = self.rows[None, :, :, None].expand(len(known), -1, -1, known.shape[-1])
-        output = self.unet(torch.cat((hints.maps, rows), 1)).float()
+        columns = self.azimuth[None, :, None].expand(len(known), -1, known.shape[-2], -1)
+        output = self.unet(torch.cat((hints.maps, rows, columns), 1)).float()
         features, weights, moved, logits = output.split((self.num_features, NUM_CANDIDATES, 1, 1), 1)
         shares = (4 * weights + self.preferred).softmax(1)
         v = (shares * hints.candidates).sum(1) + 0.3 * moved[:, 0]
@@ -116,6 +133,8 @@ class CompletionNetwork(nn.Module):
     def sample(self, condition: Condition, rngs: Sequence[torch.Generator]) -> RangeImage:
         """Return completed scans: the range estimated, the mask sampled; a scan does not depend on the others.
 
+        The range is the mean of two estimates, of the scan and of its mirror image.
+
         Args:
             condition: known pixels of as many scans.
             rngs: random generators on the CPU, one for each scan.
@@ -123,11 +142,13 @@ class CompletionNetwork(nn.Module):
         images = []
         for index, rng in enumerate(rngs):
             one = condition[index : index + 1]
-            point = self(hints_of(one), one.return_observed)
+            hints = hints_of(one)
+            point, mirrored = self(hints, one.return_observed), self(hints.mirrored(), one.return_observed.flip(-1))
+            v = (point.v + mirrored.v.flip(-1)) / 2
             uniform = torch.rand(one.range_m.shape, generator=rng).to(one.range_m.device)
             mask = self.mask.sample(point.guide, uniform, one)
             low_m, high_m = condition.sensor.range_min_m, condition.sensor.range_max_m
-            images.append(RangeImage.masked(point.v.expm1().clamp(low_m, high_m), mask, condition.sensor))
+            images.append(RangeImage.masked(v.expm1().clamp(low_m, high_m), mask, condition.sensor))
         return RangeImage.cat(images)
 
     def mask_nats(
@@ -163,7 +184,11 @@ class _Unet(Network):
         self.enter, self.level1 = Convolution(4 * inputs, first, "wrap"), Residual(first)
         self.down1, self.level2 = nn.Conv2d(4 * first, second, 1), Residual(second)
         self.down2 = nn.Conv2d(4 * second, third, 1)
-        self.level3 = nn.Sequential(*(Residual(third) for _ in range(config.blocks)))
+        self.level3 = nn.Sequential()
+        for index in range(config.blocks):
+            self.level3.append(Residual(third))
+            if index < config.attention_layers:
+                self.level3.append(_Attention(TransformerConfig(1, config.heads, third, embedding_dropout=0.0)))
         self.up2, self.after2 = nn.Conv2d(third, 4 * second, 1), Residual(second)
         self.up1, self.after1 = nn.Conv2d(second, 4 * first, 1), Residual(first)
         self.out = nn.Conv2d(first, 4 * outputs, 1)
@@ -178,3 +203,15 @@ class _Unet(Network):
         two = self.after2(two + F.pixel_shuffle(self.up2(three), 2))
         one = self.after1(one + F.pixel_shuffle(self.up1(two), 2))
         return F.pixel_shuffle(self.out(F.silu(one)), 2)
+
+
+class _Attention(nn.Module):
+    """A layer of a transformer whose tokens are pixels; convolutions tell them where they are."""
+
+    def __init__(self, config: TransformerConfig) -> None:
+        super().__init__()
+        self.layer = TransformerBlock(config, causal=False)
+
+    def forward(self, x: Float[Tensor, "B C h w"]) -> Float[Tensor, "B C h w"]:
+        size = x.shape[-2:]
+        return self.layer(x.flatten(2).transpose(1, 2)).transpose(1, 2).unflatten(2, size)

@@ -17,10 +17,10 @@ from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
 _ROW_STEPS = (2, 4, 4, 8)  # one of so many rows is observed; four as often as the others together
-_KINDS = (0.42, 0.7)  # up to these: rows, then sectors, then pixels
+_KINDS = (0.38, 0.72)  # up to these: rows, then sectors, then pixels
 _SECTORS = (24 / 256, 128 / 256)  # of the columns, hidden
 _SHARES = (0.03, 0.5)  # of the pixels, observed
-_MASK_WEIGHT, _ALONE_WEIGHT, _LOG_WEIGHT, _METRE_WEIGHT = 3.0, 0.5, 3.0, 0.15
+_MASK_WEIGHT, _ALONE_WEIGHT, _LOG_WEIGHT, _METRE_WEIGHT = 3.0, 0.5, 1.5, 0.3
 
 
 class CompletionObjective(Objective):

@@ -75,7 +75,7 @@ class Transformer(Network):
         self.tok_emb = nn.Embedding(num_inputs, config.width)
         self.pos_emb = nn.Parameter(torch.zeros(1, context_length, config.width))
         self.drop = nn.Dropout(config.embedding_dropout)
-        self.blocks = nn.ModuleList(_Block(config, causal) for _ in range(config.layers))
+        self.blocks = nn.ModuleList(TransformerBlock(config, causal) for _ in range(config.layers))
         self.ln_f = nn.LayerNorm(config.width)
         self.head = nn.Linear(config.width, num_tokens, bias=False)
         self.apply(_initialise)
@@ -121,7 +121,9 @@ class _Attention(nn.Module):
         return self.proj(mixed.transpose(1, 2).flatten(-2))
 
 
-class _Block(Block):
+class TransformerBlock(Block):
+    """Attention, then a perceptron, each added to what comes in, over tokens of :attr:`TransformerConfig.width`."""
+
     def __init__(self, config: TransformerConfig, causal: bool) -> None:
         super().__init__()
         self.ln1, self.ln2 = nn.LayerNorm(config.width), nn.LayerNorm(config.width)
@@ -131,7 +133,8 @@ class _Block(Block):
         )
         self.drop = nn.Dropout(config.residual_dropout)
 
-    def forward(self, x: Tensor) -> Tensor:
+    def forward(self, x: Float[Tensor, "B T C"]) -> Float[Tensor, "B T C"]:
+        """Add what the two layers find."""
         x = x + self.drop(self.attn(self.ln1(x)))
         return x + self.drop(self.mlp(self.ln2(x)))
 
