@@ -166,11 +166,14 @@ def test_max_scans_are_spread_evenly(tree):
     assert [name[-10:] for name in images.provenance.names] == ["000000.bin", KittiOdometry(tree).path(2).name]
 
 
-def test_a_sensor_of_another_data_set_is_warned_of(tree):
+def test_a_sensor_with_fewer_lasers_than_the_scans_show_is_warned_of(tree):
     listener = Listener()
-    config = DataConfig(train=(str(tree),), val=(), sensor="hdl64e_kitti_360")
+    config = DataConfig(train=(str(tree),), val=(), sensor="hdl32e", max_scans=1)
     load_range_images(config.train, config, listener)
-    assert any("WARNING" in line and "imaged as hdl64e_kitti_360" in line for line in listener.lines)
+    (warning,) = (line for line in listener.lines if "WARNING" in line)
+    assert "imaged as hdl32e" in warning
+    assert "points of two lasers" in warning
+    assert "lidargrit fit-sensor" in warning
     with pytest.raises(DataError, match="no source of scans"):
         load_range_images((), config)
 

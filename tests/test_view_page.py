@@ -16,6 +16,7 @@ from lidargrit.cli import main
 from lidargrit.errors import ConfigError, ScanError
 from lidargrit.formats import read_scan
 from lidargrit.loading import DataConfig
+from lidargrit.loading.config import ScanSettings
 from lidargrit.projection import unproject
 from lidargrit.sensors import load_sensor
 from lidargrit.structures import RangeImage
@@ -131,7 +132,7 @@ def test_scans_that_cannot_be_used_are_refused_or_left_out(tmp_path):
     (tmp_path / "1.bin").write_bytes(b"no scan at all")
     with pytest.raises(ScanError, match=r"1\.bin"):
         load_scan_sets([str(tmp_path)], 2)
-    (one,) = load_scan_sets([str(tmp_path)], 2, config=DataConfig(bad_scans="skip"))
+    (one,) = load_scan_sets([str(tmp_path)], 2, settings=ScanSettings(DataConfig(bad_scans="skip")))
     assert one.scan_names == ("0",)
     assert one.label is None
     assert scan_sets._short("x" * 99) == "..." + "x" * 37

@@ -4,29 +4,63 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from lidargrit.untrusted import seed_number
 
+if TYPE_CHECKING:
+    from lidargrit.loading.config import ScanSettings
 
-def add_bad_points(parser: argparse.ArgumentParser) -> None:
+
+def add_bad_points(parser: argparse.ArgumentParser, default: str | None = "refuse") -> None:
     """Add ``--bad-points``."""
     parser.add_argument(
         "--bad-points",
         choices=["refuse", "drop"],
-        default="refuse",
+        default=default,
         help="how to treat points that are NaN, infinite or at the origin: refuse the scan, or drop the points",
     )
 
 
-def add_bad_scans(parser: argparse.ArgumentParser) -> None:
+def add_bad_scans(parser: argparse.ArgumentParser, default: str | None = "refuse") -> None:
     """Add ``--bad-points`` and ``--bad-scans``."""
-    add_bad_points(parser)
+    add_bad_points(parser, default)
     parser.add_argument(
         "--bad-scans",
         choices=["refuse", "skip"],
-        default="refuse",
+        default=default,
         help="how to treat a scan that cannot be used: stop, or skip the scan with a warning",
     )
+
+
+def add_scans(parser: argparse.ArgumentParser, *variant_aliases: str) -> None:
+    """Add what all verbs that read and project scans share; :func:`scan_settings` reads it.
+
+    Args:
+        parser: parser of the verb.
+        variant_aliases: older words for ``--projection-variant``.
+    """
+    sensor = "name or .json file of the sensor (default: that of the data set, the samples, the run or the protocol)"
+    parser.add_argument("--sensor", default="", help=sensor)
+    rows = "rows by elevation (spherical), by ring (unfolding), or the sensor's own (default), by elevation where "
+    rows += "points are not in firing order"
+    parser.add_argument("--projection", choices=["sensor", "spherical", "unfolding"], help=rows)
+    add_projection_variant(parser, *variant_aliases, default=None)
+    add_bad_scans(parser, default=None)
+    add_settings(parser, "settings of reading scans, the same for all verbs, such as data.columns=1024")
+
+
+def scan_settings(options: argparse.Namespace, **more: int | None) -> ScanSettings:
+    """Return what the user said of reading scans.
+
+    Args:
+        options: words of the user, as :func:`add_scans` has them.
+        more: further settings of :class:`DataConfig` that are options of the verb; None for those not given.
+    """
+    from lidargrit.loading.config import ScanSettings
+
+    names = ("sensor", "projection", "projection_variant", "bad_points", "bad_scans")
+    return ScanSettings.read(options.set, **{name: vars(options)[name] for name in names}, **more)
 
 
 def add_settings(parser: argparse.ArgumentParser, what: str) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from lidargrit.cli._options import add_bad_scans
+from lidargrit.cli._options import add_scans, scan_settings
 from lidargrit.cli._results import add_json, print_result, refuse_taken
 from lidargrit.untrusted import seed_number
 
@@ -19,7 +19,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
     parser.add_argument("real", metavar="REAL", help="source of real scans")
     parser.add_argument("-n", "--count", type=int, default=32, help="number of simulated scans, and the most real ones")
-    parser.add_argument("--sensor", default="", help="name or .json file of a sensor (default: the data set's)")
     parser.add_argument(
         "--fine",
         action="store_true",
@@ -29,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-o", "--out", type=Path, default=Path("compare_sim.png"), metavar="PNG", help="picture of the curves"
     )
-    add_bad_scans(parser)
+    add_scans(parser)
     add_json(parser, "the files of --out and --json")
 
 
@@ -37,16 +36,15 @@ def run(options: argparse.Namespace) -> None:
     """Simulate, compare, print a table and plot the curves."""
     from lidargrit.evaluation.realism import as_json, as_table, compare_source
     from lidargrit.files import refuse_to_overwrite
-    from lidargrit.loading import DataConfig
     from lidargrit.reporting import TerminalReporter
     from lidargrit.viewer.curves import plot_curves
 
     refuse_to_overwrite(options.out, options.overwrite, ".png")
     refuse_taken(options)
-    config = DataConfig(bad_points=options.bad_points, bad_scans=options.bad_scans)
-    about = {"real": options.real, "count": options.count, "sensor": options.sensor, "fine": options.fine}
+    settings = scan_settings(options)
+    about = {"real": options.real, "count": options.count, "sensor": settings.sensor, "fine": options.fine}
     scores = compare_source(
-        options.real, options.count, options.sensor, options.fine, options.seed, config, TerminalReporter()
+        options.real, options.count, settings.sensor, options.fine, options.seed, settings.data, TerminalReporter()
     )
     plot_curves(scores, options.out, f"real: {options.real}")
     result = {**about, "seed": options.seed, "curves": as_json(scores)}

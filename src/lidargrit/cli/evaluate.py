@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from lidargrit.cli._options import add_bad_scans, add_projection_variant
+from lidargrit.cli._options import add_scans, scan_settings
 from lidargrit.cli._results import add_json, print_result, refuse_taken
 from lidargrit.untrusted import seed_number
 
@@ -27,7 +27,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--protocol", default="exact", help="metrics and their definitions, see: lidargrit list protocols")
     add("--metrics", nargs="+", default=[], help="metrics instead of the protocol's, see: lidargrit list metrics")
     add("--variant", default="", help="published definition of every metric; see: lidargrit list metrics")
-    add_projection_variant(parser, default=None)
     add("--samples-format", default="", help="program that wrote .pth files: r2dm, lidargen or lidargrit")
     add("--weights", nargs="+", default=[], metavar="NAME=FILE", help="weights of pointnet and rangenet53")
     add("-n", "--max-scans", type=int, default=0, help="largest number of scans of each; 0 for the protocol's")
@@ -36,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--groups", type=int, default=16, metavar="G", help="number of groups of neighbours kept together in them")
     add("--seed", type=seed_number, default=0, help="seed of all random choices")
     add("--device", default="cpu", help="device for feature networks: cpu or cuda")
-    add_bad_scans(parser)
+    add_scans(parser)
     add("--report", type=Path, metavar="FILE.html", help="also write a page with scores and pictures")
     add_json(parser, "the files of --json and --report")
     add("--tables", nargs="+", type=Path, metavar="JSON", help="only print these files of --json side by side")
@@ -53,8 +52,7 @@ def run(options: argparse.Namespace) -> None:
     refuse_taken(options)
     if options.tables:
         return print_result(options, *read_tables(options.tables, options.format))
-    names = "protocol metrics variant projection_variant max_scans seed samples_format device weights groups intervals"
-    names += " pixel_statistics bad_points bad_scans"
-    config = read_config(**{name: vars(options)[name] for name in names.split()})
+    names = "protocol metrics variant max_scans seed samples_format device weights groups intervals pixel_statistics"
+    config = read_config(scan_settings(options), **{name: vars(options)[name] for name in names.split()})
     sets, report = (options.samples, options.reference), (options.report, write_report, options.overwrite)
     print_result(options, *evaluate(*sets, config, TerminalReporter(), *report))

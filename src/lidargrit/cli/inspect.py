@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from lidargrit.cli._options import add_bad_points, add_projection_variant
+from lidargrit.cli._options import add_scans, scan_settings
 from lidargrit.cli._results import add_json, print_result, refuse_taken
 
 EXAMPLES = """\
@@ -18,13 +18,8 @@ EXAMPLES = """\
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
     parser.add_argument("scan", help="file of a scan, or a source of scans whose first scan is inspected")
-    sensor = "name or .json file of the sensor (default: the data set's, or the known sensor that fits best)"
-    parser.add_argument("--sensor", help=sensor)
     parser.add_argument("--columns", type=int, help="number of columns of the full circle (default: the sensor's)")
-    rows = "rows by elevation (spherical) or by ring (unfolding) (default: the sensor's own)"
-    parser.add_argument("--projection", choices=["spherical", "unfolding"], help=rows)
-    add_projection_variant(parser, "--variant")
-    add_bad_points(parser)
+    add_scans(parser, "--variant")
     parser.add_argument("-o", "--out", type=Path, metavar="PNG", help="also plot the range image and what is lost")
     add_json(parser, "the files of --out and --json")
 
@@ -33,25 +28,27 @@ def run(options: argparse.Namespace) -> None:
     """Project one scan and print what became of it."""
     from lidargrit.api import load_scan
     from lidargrit.files import refuse_to_overwrite
-    from lidargrit.projection.fit import closest_sensor
+    from lidargrit.projection.fit import closest_sensor, projection_that_fits
     from lidargrit.projection.inspection import as_json, as_table, inspect
+    from lidargrit.reporting import TerminalReporter
     from lidargrit.sensors import load_sensor
     from lidargrit.sources import open_source
     from lidargrit.viewer.inspection import plot_inspection
 
     refuse_to_overwrite(options.out, options.overwrite, ".png")
     refuse_taken(options)
-    name = options.sensor
+    settings = scan_settings(options, columns=options.columns)
+    name, bad_points = settings.sensor, settings.data.bad_points
     if Path(options.scan).is_file():
-        scan = load_scan(options.scan, bad_points=options.bad_points)
+        scan = load_scan(options.scan, bad_points=bad_points)
     else:
-        dataset = open_source(options.scan, options.bad_points).scans()
+        dataset = open_source(options.scan, bad_points).scans()
         scan = dataset.scan(0)
         name = name or dataset.sensor
-    sensor = load_sensor(name or closest_sensor(scan))
-    if options.columns is not None:
-        sensor = sensor.with_columns(options.columns)
-    found = inspect(scan, sensor, options.projection, options.projection_variant)
+    sensor, method = settings.data.imaged(load_sensor(name or closest_sensor(scan))), None
+    if settings.data.projection == "sensor" and (method := projection_that_fits(scan, sensor)) != sensor.projection:
+        TerminalReporter().message("points that are not in firing order, so rows go by elevation")
+    found = inspect(scan, sensor, method, settings.data.projection_variant)
     if options.out:
         plot_inspection(found, options.out)
     print_result(options, as_table(found), as_json(found), f"\ndone: look at {options.out}" if options.out else "")

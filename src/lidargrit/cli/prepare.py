@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
-from lidargrit.cli._options import add_bad_scans, add_projection_variant, add_rank
+from lidargrit.cli._options import add_rank, add_scans, scan_settings
 from lidargrit.cli._results import add_json, print_result, refuse_taken
 
 EXAMPLES = """\
@@ -21,16 +22,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("source", help="scans: a folder, NAME:ROOT:SPLIT or simulated:COUNT")
     out = "folder for the range images, a source for train and evaluate (default: in the cache)"
     parser.add_argument("-o", "--out", type=Path, help=out)
-    parser.add_argument("--sensor", help="name or .json file of the sensor (default: the data set's)")
     columns = "number of columns of the full circle (default: the sensor's)"
-    parser.add_argument("--columns", type=int, default=0, help=columns)
-    parser.add_argument("--column-stride", type=int, default=1, help="keep every n-th of the columns")
-    rows = "rows by elevation (spherical) or by ring (unfolding) (default: the sensor's own)"
-    parser.add_argument("--projection", choices=["sensor", "spherical", "unfolding"], default="sensor", help=rows)
-    add_projection_variant(parser)
-    parser.add_argument("-n", "--max-scans", type=int, default=0, help="number of scans, evenly spaced; 0 for all")
-    add_bad_scans(parser)
-    parser.add_argument("--workers", type=int, default=2, help="number of processes on this machine")
+    parser.add_argument("--columns", type=int, help=columns)
+    parser.add_argument("--column-stride", type=int, help="keep every n-th of the columns")
+    parser.add_argument("-n", "--max-scans", type=int, help="number of scans, evenly spaced; 0 for all (default)")
+    add_scans(parser)
+    parser.add_argument("--workers", type=int, help="number of processes on this machine (default: 2)")
     add_rank(parser, "machine")
     parser.add_argument("--verify", action="store_true", help="also read all back, and prepare damaged parts anew")
     add_json(parser)
@@ -38,23 +35,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Prepare, and say what was made."""
-    from lidargrit.loading import DataConfig, prepare_and_describe
+    from lidargrit.loading import prepare_and_describe
     from lidargrit.reporting import TerminalReporter
     from lidargrit.sources import open_source
 
     refuse_taken(options)
-    dataset = open_source(options.source, options.bad_points).scans()
-    config = DataConfig(
-        sensor=options.sensor or dataset.sensor,
-        columns=options.columns,
-        column_stride=options.column_stride,
-        projection=options.projection,
-        projection_variant=options.projection_variant,
-        max_scans=options.max_scans,
-        bad_points=options.bad_points,
-        bad_scans=options.bad_scans,
-        workers=options.workers,
-    )
+    names = ("columns", "column_stride", "max_scans", "workers")
+    settings = scan_settings(options, **{name: vars(options)[name] for name in names})
+    dataset = open_source(options.source, settings.data.bad_points).scans()
+    config = replace(settings.data, sensor=settings.sensor or dataset.sensor)
     reporter, machines = TerminalReporter(), (options.rank, options.world_size)
     made = prepare_and_describe(options.source, dataset, config, options.out, reporter, *machines, options.verify)
     print_result(options, made.as_text(), made.to_json())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from lidargrit.cli._options import add_bad_scans
+from lidargrit.cli._options import add_scans, scan_settings
 from lidargrit.untrusted import seed_number
 
 EXAMPLES = """\
@@ -25,19 +25,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("-n", "--count", type=int, default=3, help="number of scans of each")
     parser.add_argument("--seed", type=seed_number, default=0, help="seed of the first generated scan")
-    add_bad_scans(parser)
+    add_scans(parser)
     parser.add_argument("--overwrite", action="store_true", help="replace the file if it exists")
 
 
 def run(options: argparse.Namespace) -> None:
     """Render the picture, or write the page."""
     from lidargrit.files import refuse_to_overwrite
-    from lidargrit.loading import DataConfig
     from lidargrit.reporting import TerminalReporter
     from lidargrit.viewer import view
 
     ending = ".html" if options.out.suffix.lower() == ".html" else ".png"
     refuse_to_overwrite(options.out, options.overwrite, ending)
-    config = DataConfig(bad_points=options.bad_points, bad_scans=options.bad_scans)
-    view(options.places, options.out, options.count, options.seed, config, TerminalReporter())
+    view(options.places, options.out, options.count, options.seed, scan_settings(options), TerminalReporter())
     print(f"done: look at {options.out}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from lidargrit import _discovery
 from lidargrit.errors import ConfigError, nearest_names
@@ -16,8 +16,7 @@ from lidargrit.evaluation.reconstruction import score_run
 from lidargrit.evaluation.reference_rows import with_pixel_statistics
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.files import refuse_to_overwrite
-from lidargrit.formats import BadPoints
-from lidargrit.loading import DataConfig
+from lidargrit.loading.config import ScanSettings
 from lidargrit.metrics import load_metric
 from lidargrit.nn.devices import usable_device
 from lidargrit.reporting import Reporter
@@ -69,34 +68,35 @@ def evaluate(
 
 
 def read_config(
+    scans: ScanSettings | None = None,
     *,
     metrics: Sequence[str] = (),
     weights: Sequence[str] = (),
     groups: int = 16,
     intervals: int = 20,
-    bad_points: BadPoints = "refuse",
-    bad_scans: Literal["refuse", "skip"] = "refuse",
     **settings: Any,
 ) -> EvalConfig:
     """Turn words and numbers, as a user types them, into a configuration.
 
     Args:
+        scans: settings of reading scans.
         metrics: names of metrics, in place of the protocol's.
         weights: words such as ``pointnet=FILE``.
         groups: number of groups that each set is cut into.
         intervals: number of half-samples; 0 for no intervals.
-        bad_points: treatment of NaN, infinite and origin points.
-        bad_scans: treatment of scans that cannot be used.
         settings: further settings of :class:`EvalConfig`, by name.
 
     Raises:
         ConfigError: a setting out of its bounds, or weights of a network that no metric uses.
     """
+    scans = scans or ScanSettings()
     return EvalConfig(
         metrics=tuple(metrics),
         resampling=Resampling(groups, intervals, max(settings.get("seed", 0), 0)),
         weights=_weights(weights),
-        data=DataConfig(bad_points=bad_points, bad_scans=bad_scans),
+        sensor=scans.sensor,
+        projection_variant=scans.projection_variant,
+        data=scans.data,
         **settings,
     )
 

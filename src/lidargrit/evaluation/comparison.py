@@ -20,6 +20,7 @@ from lidargrit.loading import DataConfig
 from lidargrit.metrics import load_metric
 from lidargrit.projection import ProjectionVariant
 from lidargrit.reporting import Reporter
+from lidargrit.sensors import load_sensor
 from lidargrit.sources import Source, open_source
 from lidargrit.untrusted import SEED_AT_MOST
 
@@ -34,6 +35,7 @@ class EvalConfig:
         protocol: name of the protocol.
         metrics: names of metrics, in place of the protocol's; metrics of the protocol keep its definitions.
         variant: one definition for all metrics, in place of the protocol's.
+        sensor: name or ``.json`` file of the sensor that scans are imaged with, in place of the protocol's.
         projection_variant: variant by which real scans become images, in place of the protocol's.
         max_scans: largest number of scans of each set; 0 for the protocol's.
         seed: seed of the random numbers that metrics use.
@@ -48,6 +50,7 @@ class EvalConfig:
     protocol: str = DEFAULT
     metrics: tuple[str, ...] = ()
     variant: str = ""
+    sensor: str = ""
     projection_variant: ProjectionVariant | None = None
     max_scans: int = 0
     seed: int = 0
@@ -97,6 +100,8 @@ class EvalConfig:
             "metrics": list(self.metrics),
             "variant": self.variant,
             "projection_variant": self.projection_variant or load_protocol(self.protocol).variant,
+            **({"sensor": self.sensor} if self.sensor else {}),
+            **({"projection": self.data.projection} if self.data.projection != "sensor" else {}),
             "max_scans": self.max_scans,
             "seed": self.seed,
             "resampling": asdict(self.resampling),
@@ -134,9 +139,11 @@ def open_pair(samples: Source, reference: Source, settings: EvalConfig, reporter
     protocol = load_protocol(settings.protocol)
     variant = settings.projection_variant or protocol.variant
     config = replace(settings.data, projection_variant=variant, max_scans=settings.max_scans)
-    pair = pair_for_protocol(samples, reference, protocol, config, reporter)
+    sensor = config.imaged(load_sensor(settings.sensor)) if settings.sensor else protocol.load_sensor()
+    pair = pair_for_protocol(samples, reference, protocol, config, reporter, sensor)
     for warning in pair.warnings:
-        reporter.message(f"WARNING: {warning}")
+        if warning not in (*samples.doubts, *reference.doubts):  # which were told when the scans were opened
+            reporter.message(f"WARNING: {warning}")
     return pair
 
 

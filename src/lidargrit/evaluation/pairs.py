@@ -14,7 +14,8 @@ from lidargrit.evaluation.protocols import Protocol
 from lidargrit.evaluation.scorecard import SetFacts
 from lidargrit.loading import DataConfig, RangeImages
 from lidargrit.reporting import Reporter
-from lidargrit.sources import SampleSource, Source, overlap
+from lidargrit.sensors import SensorModel
+from lidargrit.sources import DatasetSource, SampleSource, Source, overlap
 from lidargrit.sources.samples import full_rows_of
 from lidargrit.structures import RangeImage
 
@@ -119,7 +120,12 @@ class EvalPair:
 
 
 def pair_for_protocol(
-    samples: Source, reference: Source, protocol: Protocol, config: DataConfig, reporter: Reporter | None = None
+    samples: Source,
+    reference: Source,
+    protocol: Protocol,
+    config: DataConfig,
+    reporter: Reporter | None = None,
+    sensor: SensorModel | None = None,
 ) -> EvalPair:
     """Read two sets as a protocol wants them.
 
@@ -129,15 +135,21 @@ def pair_for_protocol(
         protocol: definition of the sensor, range window, data set and number of scans that are wanted.
         config: settings of reading and projecting scans; ``max_scans`` further limits their number.
         reporter: receiver of the progress of the projection.
+        sensor: sensor that scans are imaged with, in place of the protocol's; samples that are images keep theirs.
 
     Raises:
         ConfigError: the two sets look along different rays.
     """
-    reporter = reporter or Reporter()
+    reporter, sensor = reporter or Reporter(), sensor or protocol.load_sensor()
     at_most = min((n for n in (config.max_scans, protocol.num_scans) if n), default=0)
     config = replace(config, max_scans=at_most)
-    first = samples.images(protocol.load_sensor(), config, reporter)
+    first = samples.images(sensor, config, reporter)
+    if isinstance(samples, DatasetSource):  # whose points may have had to go by elevation: then so do the reference's
+        config = replace(config, projection_variant=samples.projection_variant(config))
     second = reference.images(first.sensor, config, reporter)
+    if isinstance(samples, DatasetSource) and second.sensor.projection != first.sensor.projection:
+        config = replace(config, projection_variant=reference.projection_variant(config))
+        first = samples.images(second.sensor, config, reporter)
     _require_same_rays(first, second)
     count = min(len(first), len(second), at_most or len(first))
     both = [
@@ -155,8 +167,8 @@ def pair_for_protocol(
         for source, images in ((samples, first), (reference, second))
     ]
     pair = EvalPair(both[0], both[1])
-    shared = overlap(samples, first, second)
-    return replace(pair, deviations=deviations(pair, protocol), warnings=_warnings(pair, shared))
+    warnings = (*_warnings(pair, overlap(samples, first, second)), *samples.doubts, *reference.doubts)
+    return replace(pair, deviations=deviations(pair, protocol), warnings=warnings)
 
 
 def deviations(pair: EvalPair, protocol: Protocol) -> tuple[str, ...]:
@@ -188,7 +200,10 @@ def _warnings(pair: EvalPair, shared: str) -> tuple[str, ...]:
     if shared:
         found.append(f"{first.source} and the reference overlap ({shared}): the scores flatter it")
     theirs, ours = first.projection_variant, second.projection_variant
-    if theirs and ours and theirs != ours:
+    rows = [each.images.sensor.projection for each in (first, second)]
+    if theirs and ours and (theirs != ours or rows[0] != rows[1]):
+        if rows[0] != rows[1]:
+            theirs, ours = (f"{variant} {row}" for variant, row in ((theirs, rows[0]), (ours, rows[1])))
         found.append(
             f"the two sets took different roads: the samples' scans were projected by {theirs!r}, those of the "
             f"reference by {ours!r}; scores mix this with what the model does"

@@ -142,9 +142,10 @@ def compare_source(
         raise ConfigError(f"{count} scans from seed {seed}", "at least 2, and no negative seed", "correct the number")
     config, reporter = config or DataConfig(), reporter or Reporter()
     scans = open_source(source, config.bad_points)
-    rays = load_sensor(sensor) if sensor else scans.sensor
+    rays = config.imaged(load_sensor(sensor) if sensor else scans.sensor)
     rays = rays.fine() if fine else rays
     real = scans.images(rays, replace(config, max_scans=count), reporter)
+    rays = real.sensor
     pairs = []
     with reporter.progress("simulating", count) as progress:
         for each in range(seed, seed + count):

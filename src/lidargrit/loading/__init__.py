@@ -3,6 +3,7 @@
 from lidargrit.loading.batches import Batches
 from lidargrit.loading.config import DataConfig
 from lidargrit.loading.images import ImageStore, Pixels, Provenance, RangeImages
+from lidargrit.loading.imaging import Imaging, choose_imaging
 from lidargrit.loading.prepare import (
     damaged_shards,
     prepare,
@@ -14,11 +15,13 @@ __all__ = [
     "Batches",
     "DataConfig",
     "ImageStore",
+    "Imaging",
     "Pixels",
     "Provenance",
     "PreparedFolder",
     "PreparedImages",
     "RangeImages",
+    "choose_imaging",
     "damaged_shards",
     "is_prepared",
     "prepare",

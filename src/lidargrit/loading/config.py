@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
+from lidargrit.configuration import override
 from lidargrit.errors import ConfigError
 from lidargrit.formats import BadPoints
 from lidargrit.projection import ProjectionVariant
@@ -52,7 +54,50 @@ class DataConfig:
 
     def load_sensor(self) -> SensorModel:
         """Return the sensor with these columns and this projection."""
-        sensor = load_sensor(self.sensor)
+        return self.imaged(load_sensor(self.sensor))
+
+    def imaged(self, sensor: SensorModel) -> SensorModel:
+        """Return another sensor with these columns and this projection."""
         if self.columns:
             sensor = sensor.with_columns(self.columns, self.column_stride)
         return sensor if self.projection == "sensor" else replace(sensor, projection=self.projection)
+
+
+@dataclass(frozen=True)
+class ScanSettings:
+    """What a command line says of reading scans, in one way for all commands.
+
+    Args:
+        data: settings of reading and projecting scans.
+        sensor: name or ``.json`` file of the sensor; "" if none is named.
+        projection_variant: variant of the projection; None if none is named.
+    """
+
+    data: DataConfig = field(default_factory=DataConfig)
+    sensor: str = ""
+    projection_variant: ProjectionVariant | None = None
+
+    @classmethod
+    def read(cls, settings: Sequence[str] = (), **options: str | int | None) -> ScanSettings:
+        """Read words such as ``data.projection=spherical``, and options that have a name of their own.
+
+        Args:
+            settings: words of the form data.NAME=VALUE.
+            options: values by the names of :class:`DataConfig`; None or "" for those that the user did not give. They
+                come after the words.
+
+        Raises:
+            ConfigError: no such setting, or a value out of its bounds.
+        """
+        words = [*settings, *(f"data.{name}={value}" for name, value in options.items() if value not in (None, ""))]
+        owner, cure = "reading scans", "name one with data. before it, as data.projection=spherical"
+        data = override(cls(), words, owner, cure).data
+        named = {word.partition("=")[0].strip() for word in words}
+        if taken := {"data.train", "data.val", "sensor", "projection_variant"} & named:
+            raise ConfigError(f"the setting {min(taken)}", "a setting of reading scans", cure)
+        variant = data.projection_variant if "data.projection_variant" in named else None
+        return cls(data, data.sensor if "data.sensor" in named else "", variant)
+
+    def load_sensor(self) -> SensorModel | None:
+        """Return the sensor that is named, with the wanted columns and projection; None if none is named."""
+        return self.data.load_sensor() if self.sensor else None

@@ -17,6 +17,7 @@ from lidargrit.environment import cache_folder
 from lidargrit.errors import DataError, OutputError
 from lidargrit.files import claim_folder, is_taken, remove_partials, write_json, write_text
 from lidargrit.loading.config import DataConfig
+from lidargrit.loading.imaging import choose_imaging
 from lidargrit.loading.prepared import (
     FORMAT,
     PLAN_FILE,
@@ -69,8 +70,6 @@ def prepare(
     reporter, sensor = reporter or Reporter(), sensor or config.load_sensor()
     rank, world_size = rank_and_world_size(rank, world_size)
     dataset = open_dataset(source, config.bad_points) if dataset is None else dataset
-    if dataset.sensor != sensor.name and not config.sensor.endswith(".json"):
-        reporter.message(f"WARNING: {source} was made by {dataset.sensor}, and is imaged as {sensor.name}")
     spec, scans = _spec(source, dataset, sensor, config)
     facts = json.dumps(asdict(spec), sort_keys=True).encode()
     folder = folder or cache_folder() / hashlib.sha256(facts).hexdigest()[:24]
@@ -143,12 +142,15 @@ def prepare_and_describe(
         OutputError, ScanError: as for :func:`prepare`.
     """
     begun = time.monotonic()
-    folder = prepare(source, config, folder, reporter, None, rank, world_size, dataset)
+    imaging = choose_imaging(source, dataset, config.load_sensor(), config)
+    imaging.tell(reporter)
+    config, sensor = imaging.config, imaging.sensor
+    folder = prepare(source, config, folder, reporter, sensor, rank, world_size, dataset)
     if verify and (damaged := damaged_shards(folder, reporter)):
         reporter.message(f"damaged and made again: {', '.join(map(shard_name, damaged))}")
         for shard in damaged:
             (folder / shard_name(shard)).unlink()
-        prepare(source, config, folder, reporter, None, rank, world_size, dataset)
+        prepare(source, config, folder, reporter, sensor, rank, world_size, dataset)
     images, seconds = PreparedImages(str(folder)), time.monotonic() - begun
     for why in images.left_out.values():
         reporter.message(f"left out: {why}")

@@ -217,6 +217,31 @@ class PreparedImages:
         chosen.provenance = Provenance(names, recordings, fingerprints)
         return chosen
 
+    def require_projection(self, sensor: SensorModel, variant: str) -> None:
+        """Refuse images that were prepared for other rays than a sensor's, or projected in another way than is wanted.
+
+        Raises:
+            DataError: says what they were prepared for.
+        """
+        location, prepared, wanted = self._folder.location, self.sensor, sensor.fine()
+        if not prepared.same_rays(wanted):
+            raise DataError(
+                f"{location}, prepared for {prepared.name!r} ({prepared.height}x{prepared.width})",
+                f"the rays of {sensor.name!r} ({wanted.height}x{wanted.width} with every fine column)",
+                "name the sensor that it was prepared for, or prepare it for this one",
+            )
+        theirs = (self.spec.variant, prepared.projection, prepared.range_min_m, prepared.range_max_m)
+        ours = (variant, wanted.projection, wanted.range_min_m, wanted.range_max_m)
+        if theirs != ours:
+            told = [
+                f"{variant}, {projection}, {near:g} to {far:g} m" for variant, projection, near, far in (theirs, ours)
+            ]
+            raise DataError(
+                f"{location}, prepared by the projection {told[0]}",
+                told[1],
+                "choose that projection with --set data.projection=... data.projection_variant=..., or prepare anew",
+            )
+
     def read(self, index: int, verify: bool = False) -> Pixels:
         """Return the pixels of one image.
 

@@ -1,16 +1,23 @@
-"""Does a scan fit a sensor? Scan, sensor → the problems, and the bundled sensors that would fit."""
+"""Does a scan fit a sensor? Scan, sensor → the problems, the projection that fits, and the sensors that would fit."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
 import numpy as np
+from jaxtyping import Int
 from torch import Tensor
 
 from lidargrit import _discovery
 from lidargrit.errors import ScanError
 from lidargrit.projection import spherical, unfolding
-from lidargrit.projection.pixel_coordinates import PixelCoordinates, row_elevation_rad
+from lidargrit.projection.pixel_coordinates import (
+    PixelCoordinates,
+    ProjectionVariant,
+    pixel_coordinates,
+    row_elevation_rad,
+    within_limits,
+)
 from lidargrit.sensors import ProjectionName, SensorModel, load_sensor
 from lidargrit.structures import Scan
 
@@ -18,14 +25,89 @@ _OUTSIDE_AT_MOST = 0.25  # KITTI leaves up to 8 % of its points above +3 degrees
 _SECTORS = 36  # of 10 degrees: the coarsest sensor has several columns in each
 _SECTORS_AT_LEAST = 27  # with a return: KITTI's scans have all, a crop to the camera's view a quarter
 
+# How far points lie from the elevation of the row that they are put into, in the median, as a share of all rows' span.
+# Real scans in their own sensor's rows: up to 0.02; images without elevations (Karlsruhe): 0.08; rows by a firing
+# order that is none, or upside down, or by rings of another sensor: 0.24 and more.
+_MISPLACED_AT_MOST = 0.125
+_POINTS_TO_TELL = 100  # fewer tell nothing of an order
+_POINTS_MEASURED = 8192
+_WITHIN_RINGS_AT_MOST = (
+    0.1  # share of the elevations' variance; 0.01 in files stored ring by ring, 0.9 in shuffled ones
+)
+_TWO_RINGS = 0.4  # of a row's height, between two points of one pixel: they are of two lasers
+# Real scans in their own sensor's rows: up to 0.07 of the pixels, 0.17 in the 64 equal rows of KITTI-360's literature;
+# scans of 64 or 128 lasers in half as many rows: 0.5 and more.
+_CROWDED_AT_MOST = 0.35
+_EMPTY_ROWS_AT_MOST = 0.4  # 0 to 0.1 in the rows of the scan's own sensor; scans of 16 lasers in 64 rows: 0.6 and more
+_FEW_POINTS = 0.02  # of what a row has in the median: a stray point does not fill a row
+
+_BY_ELEVATION = "project by elevation: --set data.projection=spherical (in Python: method='spherical')"
+FIT_SENSOR = "or find yours with lidargrit fit-sensor, and name its file with --set data.sensor=FILE.json"
+
 
 def fit_problems(
-    scan: Scan, sensor: SensorModel, method: ProjectionName, pixels: PixelCoordinates, partial: bool = False
+    scan: Scan,
+    sensor: SensorModel,
+    method: ProjectionName,
+    pixels: PixelCoordinates,
+    partial: bool = False,
+    variant: ProjectionVariant = "exact",
 ) -> Iterator[ScanError]:
-    """Yield each problem that would make an exact projection of the scan wrong; none for a scan that fits."""
-    for check in (None if partial else _part_of_a_circle(scan), _wrong_rows(scan, sensor, method, pixels)):
+    """Yield each problem that makes the image of the scan wrong; none for a scan that fits.
+
+    The reference program takes every scan. In its variant only that is a problem which puts most points into rows where
+    the sensor does not look.
+    """
+    rows = _misplaced(scan, sensor, method, pixels, variant)
+    if variant == "exact":
+        rows = _wrong_rows(scan, sensor, method, pixels) or rows
+    for check in (None if partial or variant != "exact" else _part_of_a_circle(scan), rows):
         if check is not None:
             yield check
+
+
+def projection_that_fits(scan: Scan, sensor: SensorModel) -> ProjectionName:
+    """Return the sensor's own projection, or ``spherical`` where that needs a firing order and the scan has none.
+
+    Points have none where they name no ring and are stored neither ring by ring nor from the highest ring down:
+    generated, simulated and shuffled clouds. A file whose rings are in order but too many or too few keeps the sensor's
+    projection, which refuses it: it was cut, or is of another sensor.
+    """
+    if sensor.projection == "spherical" or scan.ring is not None or len(scan) < _POINTS_TO_TELL:
+        return sensor.projection
+    ring = unfolding.rings_from_firing_order(np.ascontiguousarray(scan.points_xyz_m.numpy().T))
+    if not _is_ring_by_ring(scan, ring):
+        return "spherical"
+    other_count = int(ring[-1]) + 1 != sensor.height
+    return sensor.projection if other_count or not _is_misplaced(scan, sensor, ring) else "spherical"
+
+
+def doubts_about_rays(scan: Scan, sensor: SensorModel, method: ProjectionName) -> str:
+    """Say in a few words what tells that another sensor than the named one made a scan; "" if nothing does.
+
+    The image of such a scan is not wrong, point by point, but its rows are not those of the lasers.
+    """
+    pixels = pixel_coordinates(scan, sensor, method, "exact")
+    kept = np.flatnonzero(pixels.in_rows() & within_limits(pixels.range_m, sensor))
+    if len(kept) < _POINTS_TO_TELL:
+        return ""
+    row = pixels.row[kept].astype(np.int64)
+    count = np.bincount(row, minlength=sensor.height)
+    used = np.flatnonzero(count > _FEW_POINTS * np.median(count[count > 0]))
+    empty = 1 - len(used) / (used[-1] - used[0] + 1)
+    if empty > _EMPTY_ROWS_AT_MOST:
+        return f"{empty:.0%} of its rows get no points: the sensor that made the scans has fewer lasers"
+    elevation_deg = elevations_deg(scan.points_xyz_m[kept])
+    pixel = row * pixels.width + pixels.column[kept]
+    order = np.lexsort((elevation_deg, pixel))
+    first = np.flatnonzero(np.diff(pixel[order], prepend=-1))
+    last = np.append(first[1:], len(order)) - 1
+    height_deg = -np.diff(np.degrees(spherical.row_edges_rad(row_elevation_rad(sensor))))[row[order[first]]]
+    apart_deg = elevation_deg[order[last]] - elevation_deg[order[first]]
+    crowded = float((apart_deg > _TWO_RINGS * height_deg).mean())
+    if crowded > _CROWDED_AT_MOST:
+        return f"{crowded:.0%} of its pixels get points of two lasers: the sensor that made the scans has more of them"
+    return ""
 
 
 def sensors_that_fit(scan: Scan) -> list[str]:
@@ -99,22 +181,72 @@ def _wrong_rows(scan: Scan, sensor: SensorModel, method: ProjectionName, pixels:
         return None
     if scan.ring is not None and int(pixels.row.min()) >= 0 and rings <= sensor.height:  # a ring may lack any return
         return None
+    if scan.ring is None and not _is_ring_by_ring(scan, pixels.row):
+        return _no_firing_order(scan)
     return ScanError(
         f"{rings} rings in {scan.source}",
         f"the {sensor.height} rings of the sensor {sensor.name!r}, in firing order",
-        "remove the file if the sweep was cut, or project by elevation with --set data.projection=spherical",
+        f"remove the file if the sweep was cut; {_BY_ELEVATION}; {FIT_SENSOR}",
     )
+
+
+def _misplaced(
+    scan: Scan, sensor: SensorModel, method: ProjectionName, pixels: PixelCoordinates, variant: ProjectionVariant
+) -> ScanError | None:
+    """Return what to say of an image whose rows are not where its points lie."""
+    if (method == "spherical" and variant == "exact") or not _is_misplaced(scan, sensor, pixels.row):
+        return None  # rows by elevation are right by themselves
+    if method == "unfolding" and scan.ring is None:
+        return _no_firing_order(scan)
+    fitting = " or ".join(sensors_that_fit(scan)) or "none of ours fits"
+    what = "rings" if method == "unfolding" else "rows of LidarGRIT's fixed field of view"
+    return ScanError(
+        f"{what} that lie elsewhere than those of {sensor.name!r}, in {scan.source}",
+        "a scan of this sensor",
+        f"name the sensor that made it ({fitting}), {FIT_SENSOR}"
+        if method == "unfolding"
+        else "project with --set data.projection_variant=exact (in Python: variant='exact')",
+    )
+
+
+def _no_firing_order(scan: Scan) -> ScanError:
+    return ScanError(
+        f"points that are not stored as they were fired, ring by ring from the highest, in {scan.source}",
+        "points in firing order, or the ring of each, to put them into rows by ring",
+        _BY_ELEVATION,
+    )
+
+
+def _is_misplaced(scan: Scan, sensor: SensorModel, row: Int[np.ndarray, "n"]) -> bool:
+    """Tell whether most points lie far from the elevation of the row that they are put into."""
+    if len(scan) < _POINTS_TO_TELL:
+        return False
+    step = max(1, len(scan) // _POINTS_MEASURED)
+    rays_deg = np.degrees(row_elevation_rad(sensor))
+    some = row[::step]
+    off_deg = np.abs(elevations_deg(scan.points_xyz_m[::step]) - rays_deg[np.clip(some, 0, sensor.height - 1)])
+    off_deg[(some < 0) | (some >= sensor.height)] = np.inf
+    return bool(np.median(off_deg) > _MISPLACED_AT_MOST * (rays_deg[0] - rays_deg[-1]))
+
+
+def _is_ring_by_ring(scan: Scan, ring: Int[np.ndarray, "n"]) -> bool:
+    """Tell whether rings that were found in the order of the points each keep to one elevation."""
+    elevation_deg = elevations_deg(scan.points_xyz_m).astype(np.float64)
+    points = np.maximum(np.bincount(ring), 1)
+    mean_deg = np.bincount(ring, elevation_deg) / points
+    within = np.square(elevation_deg - mean_deg[ring]).mean()
+    return bool(within <= _WITHIN_RINGS_AT_MOST * elevation_deg.var())
 
 
 def _wrong_elevations(scan: Scan, sensor: SensorModel, outside: float) -> ScanError:
     low_deg, high_deg = elevation_span_deg(scan)
     bottom_deg, top_deg = _span_of_rows_deg(sensor)
-    fitting = " or ".join(sensors_that_fit(scan)) or "none of ours does; describe it in a sensor file"
+    fitting = " or ".join(sensors_that_fit(scan)) or "none of ours fits"
     return ScanError(
         f"{outside:.0%} of the points of {scan.source} outside the sensor's elevations (the scan spans "
         f"{low_deg:.1f} to {high_deg:.1f} degrees)",
         f"{bottom_deg:.1f} to {top_deg:.1f} degrees for {sensor.name!r}",
-        f"choose the sensor that made the scan: {fitting}",
+        f"name the sensor that made the scan: {fitting}, {FIT_SENSOR}",
     )
 
 

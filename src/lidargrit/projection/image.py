@@ -32,7 +32,8 @@ def project(
             if not given.
         variant: ``exact`` floors, leaves out points beyond the sensor's span or limits before the nearest one wins, and
             refuses a scan that does not fit. ``reference`` repeats LidarGRIT's program: it rounds, clips points outside
-            into the border pixels, and loses a pixel whose nearest point is beyond the limits.
+            into the border pixels, and loses a pixel whose nearest point is beyond the limits; of scans that do not fit
+            only those are refused of which most points would lie in rows where the sensor does not look.
         partial: whether a scan of a part of the circle is accepted. A pixel without a point is then unknown; it does
             not mean a beam that did not return.
 
@@ -40,12 +41,13 @@ def project(
         range_m (H, W) in metres and return_mask (H, W), with the reflectance if the scan has it.
 
     Raises:
-        ScanError: the scan does not fit the sensor; names the sensors that would.
+        ScanError: the scan does not fit the sensor, or its points are not in firing order; names the sensors that
+            would fit, or the projection.
 
     Source:
         Haghighi et al., LidarGRIT, 2024, section 3.1; program hamedhaghighi/LidarGRIT@a3f86e7.
     """
-    nearest = _nearest(scan, sensor, method, variant, partial)
+    nearest = _nearest(scan, sensor, method, variant, partial, refuse=True)
     point_of_pixel, range_m = (array[:, :: sensor.column_stride] for array in nearest)
     filled = point_of_pixel >= 0
     if not filled.any():
@@ -74,18 +76,23 @@ def index_map(
 ) -> Int32[np.ndarray, "H fine_W"]:
     """Return the index of the point that fills each pixel, -1 for none, before any column is left out.
 
-    Args, Raises: as for :func:`project`.
+    Args, Raises: as for :func:`project`; the ``reference`` variant takes every scan here, as its program does.
     """
-    return _nearest(scan, sensor, method, variant, partial)[0]
+    return _nearest(scan, sensor, method, variant, partial, refuse=variant == "exact")[0]
 
 
 def _nearest(
-    scan: Scan, sensor: SensorModel, method: ProjectionName | None, variant: ProjectionVariant, partial: bool = False
+    scan: Scan,
+    sensor: SensorModel,
+    method: ProjectionName | None,
+    variant: ProjectionVariant,
+    partial: bool,
+    refuse: bool,
 ) -> tuple[Int32[np.ndarray, "H fine_W"], Float32[np.ndarray, "H fine_W"]]:
     method = method or sensor.projection
     pixels = pixel_coordinates(scan, sensor, method, variant)
+    for problem in fit_problems(scan, sensor, method, pixels, partial, variant) if refuse else ():
+        raise problem
     if variant == "reference":
         return pixels.nearest(np.ones(len(scan), dtype=bool))
-    for problem in fit_problems(scan, sensor, method, pixels, partial):
-        raise problem
     return pixels.nearest(pixels.in_rows() & within_limits(pixels.range_m, sensor))

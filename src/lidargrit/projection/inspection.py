@@ -88,7 +88,7 @@ def inspect(
     """
     method = method or sensor.projection
     pixels = pixel_coordinates(scan, sensor, method, variant)
-    problems = [str(problem) for problem in fit_problems(scan, sensor, method, pixels)] if variant == "exact" else []
+    problems = [str(problem) for problem in fit_problems(scan, sensor, method, pixels, variant=variant)]
     fate, wanted = _fates(pixels, sensor, variant)
     kept = np.flatnonzero(fate == _KEPT)
     if not len(kept):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import ClassVar
@@ -13,7 +12,17 @@ from lidargrit.datasets import ScanDataset, data_set_and_split, open_dataset
 from lidargrit.errors import DataError, LidarGritError
 from lidargrit.formats import BadPoints
 from lidargrit.generators import Generator, is_run, load, locate
-from lidargrit.loading import DataConfig, PreparedFolder, PreparedImages, Provenance, RangeImages, is_prepared, prepare
+from lidargrit.loading import (
+    DataConfig,
+    Imaging,
+    PreparedFolder,
+    PreparedImages,
+    Provenance,
+    RangeImages,
+    choose_imaging,
+    is_prepared,
+    prepare,
+)
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel, load_sensor
 from lidargrit.sources.sample_formats import is_tensor_folder, load_sample_format, read_tensor_folder, recognise
@@ -33,6 +42,8 @@ class Source(ABC):
     """Name of the data set; ``samples`` for what a generator made; "" where it is not known."""
     split: str = ""
     """Part of the data set, or the sample format of tensors; "" where there is none."""
+    doubts: tuple[str, ...] = ()
+    """Reasons to doubt that the sensor of the images that were opened last made the scans, one sentence each."""
 
     def __init__(self, text: str) -> None:
         self.text = text
@@ -93,6 +104,7 @@ class DatasetSource(Source):
         super().__init__(text)
         self._dataset = open_dataset(text, bad_points)
         self.data_set, self.split = self._dataset.public_name(), self._dataset.split
+        self._imaged_by = ""
 
     @property
     def sensor(self) -> SensorModel:
@@ -100,8 +112,8 @@ class DatasetSource(Source):
         return load_sensor(self._dataset.sensor)
 
     def projection_variant(self, config: DataConfig) -> str:
-        """Return the variant that the configuration names."""
-        return config.projection_variant
+        """Return the variant of the images that were opened last, else the one that the configuration names."""
+        return self._imaged_by or config.projection_variant
 
     def scans(self) -> ScanDataset:
         """Return the data set, as it was opened."""
@@ -112,11 +124,21 @@ class DatasetSource(Source):
     ) -> RangeImages:
         """Project the scans once, and find them in the cache from then on."""
         config, reporter = config or DataConfig(), reporter or Reporter()
-        if sensor is None:
-            config = replace(config, sensor=self._dataset.sensor)
-            sensor = config.load_sensor()
+        imaging = self.imaging(sensor, config)
+        imaging.tell(reporter)
+        sensor, config = imaging.sensor, imaging.config
         folder = prepare(self.text, config, reporter=reporter, sensor=sensor, dataset=self._dataset)
+        self.doubts, self._imaged_by = imaging.doubts, config.projection_variant
         return _read_prepared(self.text, PreparedImages(str(folder)), sensor, reporter)
+
+    def imaging(self, sensor: SensorModel | None, config: DataConfig) -> Imaging:
+        """Choose how the scans become images: see :func:`lidargrit.loading.choose_imaging`.
+
+        Args:
+            sensor: sensor of the images; the data set's own, with the configuration's columns, if not given.
+            config: settings of the projection.
+        """
+        return choose_imaging(self.text, self._dataset, sensor or config.imaged(self.sensor), config)
 
 
 class PreparedSource(Source):
@@ -143,7 +165,7 @@ class PreparedSource(Source):
     ) -> RangeImages:
         """Read the images as they are."""
         config, sensor = config or DataConfig(), sensor or self.sensor
-        _require_same_projection(self.text, self._prepared, sensor, config)
+        self._prepared.require_projection(sensor, config.projection_variant)
         chosen = self._prepared.evenly_spaced(config.max_scans) if config.max_scans else self._prepared
         return _read_prepared(self.text, chosen, sensor, reporter or Reporter())
 
@@ -376,23 +398,3 @@ def _read_prepared(text: str, prepared: PreparedImages, sensor: SensorModel, rep
     if not len(prepared):
         raise DataError(f"no usable scan in {text}", "at least one", "see the messages above")
     return RangeImages(sensor, [prepared])
-
-
-def _require_same_projection(text: str, images: PreparedImages, sensor: SensorModel, config: DataConfig) -> None:
-    """Refuse images that were prepared for other rays, or projected in another way than is wanted."""
-    prepared, wanted = images.sensor, sensor.fine()
-    if not prepared.same_rays(wanted):
-        raise DataError(
-            f"{text}, prepared for {prepared.name!r} ({prepared.height}x{prepared.width})",
-            f"the rays of {sensor.name!r} ({wanted.height}x{wanted.width} with every fine column)",
-            "name the sensor that it was prepared for, or prepare it for this one",
-        )
-    theirs = (images.spec.variant, prepared.projection, prepared.range_min_m, prepared.range_max_m)
-    ours = (config.projection_variant, wanted.projection, wanted.range_min_m, wanted.range_max_m)
-    if theirs != ours:
-        told = [f"{variant}, {projection}, {near:g} to {far:g} m" for variant, projection, near, far in (theirs, ours)]
-        raise DataError(
-            f"{text}, prepared by the projection {told[0]}",
-            told[1],
-            "choose that projection, or prepare the scans anew",
-        )

@@ -12,6 +12,7 @@ from torch import Tensor
 from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import ConfigError, DataError, ScanError
 from lidargrit.loading import DataConfig
+from lidargrit.loading.config import ScanSettings
 from lidargrit.projection import index_map, project
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel
@@ -44,19 +45,20 @@ def load_scan_sets(
     sources: Sequence[str],
     count: int,
     seed: int = 0,
-    config: DataConfig | None = None,
+    settings: ScanSettings | None = None,
     reporter: Reporter | None = None,
 ) -> list[ScanSet]:
     """Read scans and samples, and sample from runs.
 
-    Scans are projected to the sensor of the first run, if there is a run. A run gives a set of generated scans and, if
+    Scans are projected to the sensor that is named, else that of the first run, else that of the first samples or
+    prepared scans; where there is none of these, each set to its own. A run gives a set of generated scans and, if
     its generator has tokens, a set of reconstructions of the first source of scans.
 
     Args:
         sources: sources of scans, folders of samples, prepared folders, and folders of runs.
         count: number of scans of each set, evenly spaced over its source.
         seed: seed of the first generated scan.
-        config: settings by which scans are read and projected.
+        settings: sensor that scans are imaged with, and settings of reading them.
         reporter: receiver of messages about scans that are left out.
 
     Raises:
@@ -64,15 +66,20 @@ def load_scan_sets(
         DataError: no usable scan in a source.
         ScanError: a scan that cannot be used, unless such scans are skipped.
     """
-    config, reporter = config or DataConfig(), reporter or Reporter()
+    settings, reporter = settings or ScanSettings(), reporter or Reporter()
+    config = settings.data
     opened = [open_source(source, config.bad_points) for source in sources]
     generators = {source.text: source.generator for source in opened if isinstance(source, RunSource)}
-    sensor = next((generator.sensor for generator in generators.values()), None)
+    sensor = settings.load_sensor() or next((generator.sensor for generator in generators.values()), None)
+    if sensor is None:
+        imaged = (source for source in opened if not isinstance(source, (DatasetSource, RunSource)))
+        sensor = next((source.sensor for source in imaged), None)
     sets: list[ScanSet] = []
     for source in opened:
         if not isinstance(source, RunSource):
-            read = _of_scans if isinstance(source, DatasetSource) else _of_images
-            sets.append(replace(read(source, count, sensor, config, reporter), name=_short(source.text)))
+            how = (count, sensor, config, reporter)
+            read = _of_scans(source, *how) if isinstance(source, DatasetSource) else _of_images(source, *how)
+            sets.append(replace(read, name=_short(source.text)))
     scans = sets[0] if sets else None
     for name, generator in generators.items():
         if scans is not None and "encode" in generator.capabilities:
@@ -106,10 +113,11 @@ def _of_images(
 
 
 def _of_scans(
-    source: Source, count: int, sensor: SensorModel | None, config: DataConfig, reporter: Reporter
+    source: DatasetSource, count: int, sensor: SensorModel | None, config: DataConfig, reporter: Reporter
 ) -> ScanSet:
-    dataset = source.scans()
-    sensor = sensor or source.sensor
+    dataset, imaging = source.scans(), source.imaging(sensor, config)
+    imaging.tell(reporter)
+    sensor, config = imaging.sensor, imaging.config
     images, names, labels = [], [], []
     for index in evenly_spaced(count, len(dataset)):
         try:

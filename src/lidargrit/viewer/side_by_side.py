@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lidargrit.errors import ConfigError
-from lidargrit.loading import DataConfig
+from lidargrit.loading.config import ScanSettings
 from lidargrit.reporting import Reporter
 from lidargrit.viewer.interactive import PAGE_SCANS_AT_MOST, write_page
 from lidargrit.viewer.pictures import SCANS_AT_MOST, plot_comparison
@@ -18,7 +18,7 @@ def view(
     out: Path,
     count: int = 3,
     seed: int = 0,
-    config: DataConfig | None = None,
+    settings: ScanSettings | None = None,
     reporter: Reporter | None = None,
 ) -> None:
     """Plot scans, samples, and what runs generate and reconstruct.
@@ -28,7 +28,7 @@ def view(
         out: path of the PNG, or of the page if it ends in ``.html``.
         count: number of scans of each set, evenly spaced over its source.
         seed: seed of the first generated scan.
-        config: settings by which scans are read and projected.
+        settings: sensor that scans are imaged with, and settings of reading them.
         reporter: receiver of messages about scans that are left out.
 
     Raises:
@@ -40,7 +40,7 @@ def view(
     at_most = PAGE_SCANS_AT_MOST if is_page else SCANS_AT_MOST
     if not 1 <= count <= at_most:
         raise ConfigError(f"{count} scans of each set", f"1 to {at_most}", "correct the number")
-    sets = load_scan_sets(sources, count, seed, config, reporter)
+    sets = load_scan_sets(sources, count, seed, settings, reporter)
     if is_page:
         write_page(sets, out)
     else:

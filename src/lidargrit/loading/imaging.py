@@ -1,0 +1,78 @@
+"""A few scans of a set → how all of them become images, and what tells that they are of another sensor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from lidargrit.datasets import ScanDataset
+from lidargrit.determinism import evenly_spaced
+from lidargrit.errors import ScanError
+from lidargrit.loading.config import DataConfig
+from lidargrit.projection import FIT_SENSOR, doubts_about_rays, projection_that_fits
+from lidargrit.reporting import Reporter
+from lidargrit.sensors import SensorModel
+from lidargrit.structures import Scan
+
+_PROBES = 3  # scans that are looked at: the first would do, were a folder not sometimes a mixture
+
+
+@dataclass(frozen=True, eq=False)
+class Imaging:
+    """How the scans of one set become images.
+
+    Args:
+        sensor: sensor of the images, with the projection that fits the scans.
+        config: settings of the projection, with the variant that fits the scans.
+        notes: sentences on what was chosen in place of what the sensor and the settings say.
+        doubts: sentences that tell why another sensor than this one may have made the scans.
+    """
+
+    sensor: SensorModel
+    config: DataConfig
+    notes: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
+
+    def tell(self, reporter: Reporter) -> None:
+        """Tell what was chosen, and warn of what is in doubt."""
+        for line in (*self.notes, *(f"WARNING: {doubt}" for doubt in self.doubts)):
+            reporter.message(line)
+
+
+def choose_imaging(source: str, dataset: ScanDataset, sensor: SensorModel, config: DataConfig) -> Imaging:
+    """Look at a few scans of a set, and choose how all of them become images.
+
+    Points that are not in firing order go by elevation, in the exact variant: no row of theirs can be told by order.
+    ``projection=unfolding`` keeps the order nevertheless, and such scans are then refused one by one.
+
+    Args:
+        source: name of the set, for the sentences.
+        dataset: scans of the set. Simulated ones are looked at only if they are of another sensor.
+        sensor: sensor of the images.
+        config: settings of the projection; one that is named there comes before the sensor's own.
+    """
+    if config.projection != "sensor":
+        sensor = replace(sensor, projection=config.projection)
+    probes = _probes(dataset, sensor)
+    notes: list[str] = []
+    fitting = {projection_that_fits(scan, sensor) for scan in probes} if config.projection == "sensor" else set()
+    if fitting - {sensor.projection}:
+        sensor, config = replace(sensor, projection="spherical"), replace(config, projection_variant="exact")
+        notes.append(f"{source}: points that are not in firing order, so rows go by elevation (projection=spherical)")
+    told = (doubts_about_rays(scan, sensor, sensor.projection) for scan in probes)
+    doubt = next((each for each in told if each), "")
+    doubts = (f"{source}, imaged as {sensor.name}: {doubt}; name that sensor, {FIT_SENSOR}",) if doubt else ()
+    return Imaging(sensor, config, tuple(notes), doubts)
+
+
+def _probes(dataset: ScanDataset, sensor: SensorModel) -> list[Scan]:
+    """Read a few scans, without those that cannot be used, which are refused or left out later."""
+    files = {dataset.path(index): index for index in reversed(evenly_spaced(_PROBES, len(dataset)))}
+    if None in files and dataset.sensor == sensor.name:
+        return []
+    found = []
+    for index in files.values():
+        try:
+            found.append(dataset.scan(index))
+        except ScanError:
+            continue
+    return found
