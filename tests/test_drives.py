@@ -46,6 +46,7 @@ def test_it_reads_as_kitti_odometry_with_labels(drive):
 def test_poses_carry_points_to_where_they_were_in_the_first_frame(drive):
     sequence = drive / "sequences" / "01"
     rows = np.loadtxt(sequence / "poses.txt").reshape(-1, 3, 4)
+    assert (drive / "poses" / "01.txt").read_bytes() == (sequence / "poses.txt").read_bytes()
     lines = dict(line.split(": ", 1) for line in (sequence / "calib.txt").read_text().splitlines())
     camera_from_sensor = np.vstack((np.array(lines["Tr"].split(), float).reshape(3, 4), [0, 0, 0, 1]))
     poses = [np.vstack((row, [0, 0, 0, 1])) for row in rows]

@@ -168,7 +168,7 @@ def test_max_scans_are_spread_evenly(tree):
 
 def test_a_sensor_with_fewer_lasers_than_the_scans_show_is_warned_of(tree):
     listener = Listener()
-    config = DataConfig(train=(str(tree),), val=(), sensor="hdl32e", max_scans=1)
+    config = DataConfig(train=(str(tree),), val=(), sensor="hdl32e", projection="spherical", max_scans=1)
     load_range_images(config.train, config, listener)
     (warning,) = (line for line in listener.lines if "WARNING" in line)
     assert "imaged as hdl32e" in warning

@@ -73,7 +73,8 @@ def write_drives(
 ) -> None:
     """Write scans, labels and poses; scans that are there already are not simulated again.
 
-    The tree is ``sequences/SS/{velodyne/NNNNNN.bin, labels/NNNNNN.label, poses.txt, times.txt, calib.txt}``.
+    The tree is ``sequences/SS/{velodyne/NNNNNN.bin, labels/NNNNNN.label, poses.txt, times.txt, calib.txt}``. The poses
+    lie in ``poses/SS.txt``, too: SemanticKITTI has them in the sequence, KITTI's own tools look there.
 
     Args:
         out: an empty folder, or a folder that the same simulation began; scans can be added to it.
@@ -163,7 +164,9 @@ def _write_sequence_files(out: Path, config: DriveConfig, num_scans: int) -> Non
     calibration = [f"P{camera}: {projection}" for camera in range(4)] + [f"Tr: {_numbers(_CAMERA_FROM_SENSOR[:3])}"]
     for sequence, relative in poses.items():
         folder = out / "sequences" / sequence
-        write_text(folder / "poses.txt", "".join(f"{_numbers(pose[:3])}\n" for pose in relative))
+        lines = "".join(f"{_numbers(pose[:3])}\n" for pose in relative)
+        write_text(out / "poses" / f"{sequence}.txt", lines)
+        write_text(folder / "poses.txt", lines)
         write_text(folder / "times.txt", "".join(f"{number * _FRAME_S:e}\n" for number in range(len(relative))))
         write_text(folder / "calib.txt", "".join(f"{line}\n" for line in calibration))
 
