@@ -17,6 +17,7 @@ from lidargrit.errors import ConfigError
 from lidargrit.nn.blocks import Block, Network
 from lidargrit.nn.convolution import Convolution
 from lidargrit.nn.pixel_phases import Phase, at_phases, cells_of, generated_before, neighbours_of, phases_of
+from lidargrit.nn.precision import at_least_32_bits
 from lidargrit.nn.range_mixture import RangeMixture
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import Decoded
@@ -93,8 +94,8 @@ class Guide(NamedTuple):
                 "one that gives them (Decoded.features)",
                 "leave the pixel decoder out, or choose the tokenizer vqvae",
             )
-        logits = decoded.return_logits.float().clamp(-_LOGIT_BOUND, _LOGIT_BOUND)
-        return cls(decoded.features.float(), decoded.range_m.float().log1p(), logits)
+        logits = at_least_32_bits(decoded.return_logits).clamp(-_LOGIT_BOUND, _LOGIT_BOUND)
+        return cls(at_least_32_bits(decoded.features), at_least_32_bits(decoded.range_m).log1p(), logits)
 
 
 class Residual(Block):
@@ -136,7 +137,8 @@ class _SpacingNetwork(Network):
         x = self.context(contexts.flatten(0, 1)).unflatten(0, size)
         x = x + guided + self.phase_bias[first : first + size[0], None, :, None, None]
         x = F.silu(self.blocks(x.flatten(0, 1))).unflatten(0, size)
-        return torch.stack([layer(part) for layer, part in zip(self.out[first:], x, strict=False)]).float()
+        outputs = [layer(part) for layer, part in zip(self.out[first:], x, strict=False)]
+        return at_least_32_bits(torch.stack(outputs))
 
 
 class PhaseNetwork(nn.Module, ABC):
@@ -218,10 +220,10 @@ class MaskNetwork(PhaseNetwork):
         self, phase: Phase, guide: Guide, return_mask: Bool[Tensor, "B H W"], v: Float[Tensor, "B H W"]
     ) -> Float[Tensor, "B D h w"]:
         """Return for each pixel of a cell whether it is known to have returned, and whether it is known not to."""
-        returned = cells_of(return_mask[:, None].float(), phase.spacing)
+        returned = cells_of(return_mask[:, None].to(v.dtype), phase.spacing)
         known = generated_before(phase).to(returned)[:, None, None]
         if guide.known is not None:
-            known = torch.maximum(known, cells_of(guide.known[:, None].float(), phase.spacing))
+            known = torch.maximum(known, cells_of(guide.known[:, None].to(v.dtype), phase.spacing))
         return torch.cat((known * returned, known * (1 - returned)), 1)
 
     def sample(self, guide: Guide, uniform: Float[Tensor, "B H W"], condition: Condition) -> Bool[Tensor, "B H W"]:
@@ -275,7 +277,7 @@ class RangeNetwork(PhaseNetwork):
         self, phase: Phase, guide: Guide, return_mask: Bool[Tensor, "B H W"], v: Float[Tensor, "B H W"]
     ) -> Float[Tensor, "B D h w"]:
         """Return the mask, the known ranges beside the decoded ones, and how far the candidates are apart."""
-        returned, beside = cells_of(torch.stack((return_mask.float(), v - guide.v), 1), phase.spacing).chunk(2, 1)
+        returned, beside = cells_of(torch.stack((return_mask.to(v.dtype), v - guide.v), 1), phase.spacing).chunk(2, 1)
         known = generated_before(phase).to(returned)[:, None, None] * returned
         candidates = self.candidates([phase], guide, return_mask, v)[0]
         decoded = guide.v[(..., *phase.pixels)][:, None]

@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import Literal
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 Precision = Literal["fp32", "bf16", "auto"]
 
@@ -15,6 +17,11 @@ def has_bf16() -> bool:
         return torch.cuda.is_bf16_supported(including_emulation=False)
     # Torch has no public question for this yet; a torch without this one is taken for a machine without bfloat16.
     return bool(getattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)())
+
+
+def at_least_32_bits(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """Return numbers in 32 bits, or in 64 if they have as many: for what 16 bits cannot tell."""
+    return x.to(torch.promote_types(x.dtype, torch.float32))
 
 
 def dtype_of(precision: Precision) -> torch.dtype:

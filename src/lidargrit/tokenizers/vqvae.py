@@ -26,7 +26,7 @@ from lidargrit.nn.convolution import (
     group_norm,
 )
 from lidargrit.nn.flops import flops_of
-from lidargrit.nn.precision import Precision, dtype_of
+from lidargrit.nn.precision import Precision, at_least_32_bits, dtype_of
 from lidargrit.nn.quantiser import CodebookLoss, VectorQuantiser
 from lidargrit.projection import RangeEncoding
 from lidargrit.sensors import SensorModel
@@ -297,7 +297,7 @@ class Vqvae(CodebookTokenizer[VqvaeConfig]):
 
     def _heads(self, raw: Float[Tensor, "B heads H W"]) -> tuple[Float[Tensor, "B H W"], Float[Tensor, "B H W"]]:
         """Return encoded range and return logits of what the decoder's last layer gives."""
-        raw = raw.float()
+        raw = at_least_32_bits(raw)
         encoded = raw[:, 0].tanh()
         if self.config.raydrop_loss:
             return encoded, raw[:, 1]

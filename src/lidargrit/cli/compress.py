@@ -1,0 +1,41 @@
+"""Compress range images of scans to a few bits a return, lossless at a step of range, by a model's probabilities."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from lidargrit.cli._options import add_bad_scans
+
+EXAMPLES = """\
+  lidargrit compress /data/kitti_odometry scans.lgz
+  lidargrit compress /data/drive drive.lgz --step-mm 2 --model runs/mine
+  lidargrit decompress drive.lgz restored --model runs/mine
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Name the options."""
+    add = parser.add_argument
+    add("scans", help="scans: a file, a folder, NAME:ROOT:SPLIT, samples, prepared scans, or range images as .npy")
+    add("out", type=Path, metavar="OUT.lgz", help="file to write")
+    add("--model", default="pretrained", help="run with a pixel decoder (default: the one in the package)")
+    add("--step-mm", type=int, default=10, metavar="MM", help="step in millimetres that ranges are rounded to first")
+    add("-n", "--max-scans", type=int, default=0, help="largest number of scans, evenly spaced; 0 for all")
+    add_bad_scans(parser)
+    add("--overwrite", action="store_true", help="replace the file if it exists")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Compress the scans, and say how small they are."""
+    from lidargrit.compression.command import compress_scans
+    from lidargrit.files import refuse_to_overwrite
+    from lidargrit.loading import DataConfig
+    from lidargrit.reporting import TerminalReporter
+
+    refuse_to_overwrite(options.out, options.overwrite, ".lgz")
+    config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)
+    named = (options.scans, options.out, options.model, options.step_mm)
+    found = compress_scans(*named, config, TerminalReporter())
+    told = f"{found.num_bytes:,} bytes, {found.bits_per_return:.2f} bits a return in steps of {options.step_mm} mm"
+    print(f"done: {found.num_scans} scans in {options.out}: {told}")

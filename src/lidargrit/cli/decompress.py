@@ -1,0 +1,36 @@
+"""Restore the range images that lidargrit compress wrote, as images or as points; a damaged file is refused."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from lidargrit.untrusted import whole_number
+
+EXAMPLES = """\
+  lidargrit decompress scans.lgz restored                    range images in metres as .npy
+  lidargrit decompress scans.lgz clouds --format pcd         points on the rays of the pixels
+  lidargrit decompress scans.lgz two --only 0 17 --model runs/mine
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Name the options."""
+    add = parser.add_argument
+    add("file", type=Path, metavar="FILE.lgz", help="file that lidargrit compress wrote")
+    add("out", type=Path, help="folder for the scans: empty, or begun by the same command")
+    add("--model", default="pretrained", help="run by which it was compressed (default: the one in the package)")
+    kind = "image for range images (H, W) in metres as .npy (default), or bin, pcd, ply, npz, or a name from: "
+    add("--format", default="image", help=kind + "lidargrit list formats")
+    only = "indices of the scans that are wanted, from 0; all if not given"
+    add("--only", nargs="+", type=whole_number, default=[], metavar="INDEX", help=only)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Restore the scans."""
+    from lidargrit.compression.command import decompress_scans
+    from lidargrit.reporting import TerminalReporter
+
+    named = (options.file, options.out, options.model, options.format, options.only)
+    count = decompress_scans(*named, TerminalReporter())
+    print(f"done: {count} scans in {options.out}; decompressed.json says where they come from")

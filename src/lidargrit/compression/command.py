@@ -1,0 +1,160 @@
+"""A source of scans → one file of compressed range images, and back into a file for each scan."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from lidargrit import __version__
+from lidargrit.completion.inputs import ScanReader, open_inputs
+from lidargrit.compression.archive import Archive, ArchiveWriter
+from lidargrit.compression.coder import not_reproduced
+from lidargrit.compression.scan_codec import ScanCodec
+from lidargrit.errors import CheckpointError, DataError, ScanError, UsageError
+from lidargrit.export import claim_scans, writable_format
+from lidargrit.files import atomic_path, claim_folder
+from lidargrit.generators import load, locate
+from lidargrit.loading import DataConfig
+from lidargrit.projection import unproject
+from lidargrit.reporting import Reporter
+from lidargrit.sources.samples import projection_of
+from lidargrit.structures import RangeImage
+
+IMAGE = "image"  # the word for range images as .npy
+
+
+@dataclass(frozen=True)
+class Compressed:
+    """What a file of compressed scans holds.
+
+    Args:
+        num_scans: number of scans.
+        num_returns: number of returns of all scans.
+        num_bytes: size of the whole file in bytes.
+    """
+
+    num_scans: int
+    num_returns: int
+    num_bytes: int
+
+    @property
+    def bits_per_return(self) -> float:
+        """Bits of the whole file by returns."""
+        return 8 * self.num_bytes / max(self.num_returns, 1)
+
+
+def compress_scans(
+    source: str, out: Path, model: str, step_mm: int, config: DataConfig, reporter: Reporter
+) -> Compressed:
+    """Write the range images of a source into one file, each compressed by itself and read again before it is kept.
+
+    Args:
+        source: a file, a folder or another source of scans, samples, prepared scans, or range images as ``.npy``.
+        out: file to write, which appears when it is whole.
+        model: run with a pixel decoder; scans are projected with its sensor, in the way of its training.
+        step_mm: step in millimetres that ranges are rounded to.
+        config: number of scans, and what to do with unusable points and scans.
+        reporter: receiver of progress and messages.
+
+    Raises:
+        ConfigError: a model without a pixel decoder, a step that is not one, or no range coder.
+        DataError: no usable scan.
+        ScanError: a scan that cannot be used.
+    """
+    codec = ScanCodec(load(model), step_mm)
+    inputs = open_inputs(source, ScanReader(codec.sensor, projection_of(locate(model)) or "exact"), config)
+    scans = returns = 0
+    with atomic_path(out) as unfinished, unfinished.open("wb") as file:
+        writer = ArchiveWriter(file, _header(codec, model))
+        with reporter.progress("compressing", len(inputs)) as progress:
+            for index in range(len(inputs)):
+                try:
+                    image = inputs.read(index).image
+                except ScanError as error:
+                    if config.bad_scans == "refuse":
+                        raise
+                    reporter.message(f"left out: {error}")
+                else:
+                    writer.add(inputs.name(index), codec.compress(image))
+                    scans, returns = scans + 1, returns + int(image.return_mask.sum())
+                progress.advance(1)
+        if not scans:
+            raise DataError(f"no usable scan in {source}", "at least one", "see the messages above")
+        return Compressed(scans, returns, writer.close())
+
+
+def decompress_scans(path: Path, out: Path, model: str, kind: str, chosen: Sequence[int], reporter: Reporter) -> int:
+    """Write the scans of a compressed file as they were, and return their number.
+
+    The whole file is checked before anything is written, and each scan's pixels before its own file.
+
+    Args:
+        path: file that :func:`compress_scans` wrote.
+        out: an empty folder, or one that the same command began: files that are there are not written again.
+        model: run by which it was compressed.
+        kind: ``image`` for range images (H, W) in metres as ``.npy``, or name or ending of a format for points.
+        chosen: indices of the scans that are wanted; all if there is none.
+        reporter: receiver of progress.
+
+    Raises:
+        ScanError: a file that was cut off or altered, or that this machine cannot reproduce.
+        CheckpointError: another model than the file's.
+        UsageError: an index that the file does not have.
+    """
+    archive = Archive(path)
+    wrong = [index for index in chosen if not 0 <= index < len(archive)]
+    if wrong:
+        raise UsageError(f"--only {wrong[0]}", f"indices from 0 to {len(archive) - 1}", "correct it")
+    archive.check()
+    codec = _codec_of(archive, model)
+    form, suffix = (None, ".npy") if kind == IMAGE else writable_format(kind)
+    files = {index: archive.entries[index].name + suffix for index in chosen or range(len(archive))}
+    scans = {file: archive.entries[index].name for index, file in files.items()}
+    missing = [index for index, file in files.items() if not (out / file).exists()]
+    with claim_folder(out):
+        facts = {"source": path.name, "step_mm": codec.steps.step_mm, "format": kind}
+        claim_scans(out / "decompressed.json", {**facts, "scans": scans})
+        with reporter.progress("decompressing", len(files), len(files) - len(missing)) as progress:
+            for index in missing:
+                image = codec.decompress(archive.read(index))
+                if form is None:
+                    _write_array(out / files[index], image)
+                else:
+                    form.write(out / files[index], unproject(image))
+                progress.advance(1)
+    return len(files)
+
+
+def _write_array(path: Path, image: RangeImage) -> None:
+    with atomic_path(path) as unfinished, unfinished.open("wb") as file:
+        np.save(file, image.range_m.numpy())
+
+
+def _header(codec: ScanCodec, model: str) -> dict[str, Any]:
+    sensor = codec.sensor
+    return {
+        "model": Path(model).name,
+        "model_sha256": codec.digest(),
+        "step_mm": codec.steps.step_mm,
+        "sensor": sensor.name,
+        "size": [sensor.height, sensor.width],
+        "lidargrit": __version__,
+        "torch": torch.__version__,
+    }
+
+
+def _codec_of(archive: Archive, model: str) -> ScanCodec:
+    step_mm, digest = archive.header.get("step_mm"), archive.header.get("model_sha256")
+    if not (isinstance(step_mm, int) and isinstance(digest, str)):
+        raise not_reproduced()
+    codec = ScanCodec(load(model), step_mm)
+    if codec.digest() != digest:
+        told = f"{archive.path}, compressed by the model {archive.header.get('model')!r} of hash {digest[:12]}"
+        cure = f"name that run with --model: {model} has the hash {codec.digest()[:12]}"
+        raise CheckpointError(told, "the same model to decompress it", cure)
+    return codec

@@ -1,0 +1,187 @@
+"""Range images come back from a compressed file to the last bit, or not at all."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from lidargrit.cli import main
+from lidargrit.compression import rounding
+from lidargrit.compression.archive import Archive, ArchiveWriter
+from lidargrit.compression.arithmetic import exp, ln, sigmoid
+from lidargrit.compression.scan_codec import ScanCodec
+from lidargrit.errors import ConfigError, ScanError
+from lidargrit.generators.lidargrit import LidarGrit, LidarGritConfig, TokenSampling
+from lidargrit.nn.pixel_networks import PixelDecoderConfig
+from lidargrit.nn.transformer import TransformerConfig
+from lidargrit.sensors import load_sensor
+from lidargrit.structures import RangeImage
+from lidargrit.tokenizers.vqvae import VqvaeConfig
+
+pytest.importorskip("constriction")
+SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
+TOKENIZER = VqvaeConfig(
+    channels=32, channel_multipliers=(1, 1, 1, 1), code_dim=4, num_codes=8, dropout=0.0, padding="wrap"
+)
+PIXELS = PixelDecoderConfig(mask_features=2, range_features=2, mask_width=4, range_width=4, blocks=1)
+
+
+def made(pixels: PixelDecoderConfig | None = PIXELS, seed: int = 3) -> LidarGrit:
+    """Return a generator of random weights, whose probabilities differ from pixel to pixel."""
+    generator = LidarGrit(LidarGritConfig(TOKENIZER, TransformerConfig(layers=1, heads=2, width=16), pixels), SENSOR)
+    rng = torch.Generator().manual_seed(seed)
+    for weight in generator.parameters():
+        weight.data = torch.empty_like(weight).normal_(std=0.1, generator=rng)
+    return generator.eval()
+
+
+def scans(count: int) -> RangeImage:
+    """Return walls at one range with a few others, and holes."""
+    rng = torch.Generator().manual_seed(1)
+    size = (count, SENSOR.height, SENSOR.width)
+    wall = 12 + 5 * torch.rand((count, 1, SENSOR.width), generator=rng).expand(size)
+    range_m = torch.where(torch.rand(size, generator=rng) < 0.9, wall, SENSOR.range_max_m)
+    return RangeImage.masked(range_m, torch.rand(size, generator=rng) < 0.8, SENSOR)
+
+
+@pytest.fixture(scope="module")
+def codec() -> ScanCodec:
+    return ScanCodec(made(), 20)
+
+
+@pytest.fixture(scope="module")
+def compressed(codec) -> bytes:
+    return codec.compress(scans(1)[0])
+
+
+def test_pixels_come_back_rounded_to_the_step(codec, compressed):
+    image = scans(1)
+    back = codec.decompress(compressed)
+    assert torch.equal(back.range_m, codec.steps.round(image).range_m[0])
+    assert float((back.range_m - image.range_m[0]).abs().max()) <= 0.01 + 1e-6
+
+
+def test_a_scan_takes_as_many_bits_as_the_model_tells(codec):
+    image = made().sample([0], TokenSampling(range_temperature=1.0, range_noise=1.0))
+    compressed, bits = codec.compress(image[0]), made().bits(image, 20)
+    expected = float(bits.total()) - float(bits.tokens.sum()) + 8 * 4 * math.log2(8)  # 32 tokens, all as likely
+    assert 0.99 * expected < 8 * len(compressed) < 1.01 * expected + 72 + 64  # a head of 72 bits, two words
+
+
+@pytest.mark.parametrize("kind", ["no return", "every return, nearest", "every return, farthest"])
+def test_scans_at_the_limits_come_back(codec, kind):
+    mask = torch.full((SENSOR.height, SENSOR.width), kind != "no return")
+    limit = SENSOR.range_min_m if kind.endswith("nearest") else SENSOR.range_max_m
+    image = RangeImage.masked(torch.full(mask.shape, limit), mask, SENSOR)
+    back = codec.decompress(codec.compress(image))
+    assert torch.equal(back.return_mask, mask)
+    assert float((back.range_m - image.range_m).abs().max()) <= 0.01
+
+
+def test_another_machine_within_the_margins_decodes_the_same(codec, compressed, monkeypatch):
+    right, rng = rounding.Rounding.indices, np.random.default_rng(0)
+
+    def elsewhere(self, values, grid, matters=None):
+        return right(self, values + grid.margin * rng.uniform(-0.99, 0.99, values.shape), grid, matters)
+
+    expected = codec.decompress(compressed).range_m
+    monkeypatch.setattr(rounding.Rounding, "indices", elsewhere)
+    assert torch.equal(codec.decompress(compressed).range_m, expected)
+
+
+def test_a_number_near_a_border_is_rounded_by_other_borders():
+    grid = rounding.Grid(0.25, 1e-3)
+    values = np.array([0.0, 0.1249999, 0.7])
+    with pytest.raises(rounding.TooNearABorderError):
+        rounding.Rounding(0, checked=True).indices(values, grid)
+    assert rounding.Rounding(0, checked=False).indices(values, grid).tolist() == [0, 0, 3]
+    assert rounding.Rounding(0, checked=True).indices(values, grid, values != values[1]).tolist() == [0, 0, 3]
+    found = {tuple(rounding.Rounding(attempt, checked=True).indices(values, grid)) for attempt in (1, 2)}
+    assert found == {(0, 1, 3), (0, 0, 3)}
+
+
+def test_one_that_does_not_reproduce_the_probabilities_says_so(codec, compressed):
+    told = "probabilities that are not those of the machine"
+    with pytest.raises(ScanError, match=told):
+        ScanCodec(made(seed=4), 20).decompress(compressed)
+    rng = np.random.default_rng(0)
+    for _ in range(4):
+        altered = bytearray(compressed)
+        altered[rng.integers(1, len(altered))] ^= 1 << rng.integers(8)
+        with pytest.raises(ScanError, match=told):
+            codec.decompress(bytes(altered))
+    with pytest.raises(ScanError, match=told):
+        codec.decompress(compressed[:7])
+
+
+def test_damaged_files_are_refused(tmp_path):
+    path, rng = tmp_path / "scans.lgz", np.random.default_rng(0)
+    with path.open("wb") as file:
+        writer = ArchiveWriter(file, {"step_mm": 20})
+        for name in ("one", "two"):
+            writer.add(name, rng.bytes(300))
+        assert writer.close() == file.tell()
+    whole = path.read_bytes()
+    archive = Archive(path)
+    archive.check()
+    assert [entry.name for entry in archive.entries] == ["one", "two"]
+    damaged = [whole[:length] for length in range(0, len(whole), 7)] + [whole + b"\0", whole[1:]]
+    for bit in rng.choice(8 * len(whole), 500, replace=False):
+        altered = bytearray(whole)
+        altered[bit // 8] ^= 1 << (bit % 8)
+        damaged.append(bytes(altered))
+    for content in damaged:
+        path.write_bytes(content)
+        with pytest.raises(ScanError, match=r"cut off or altered|does not begin as a file of compressed scans"):
+            Archive(path).check()
+
+
+def test_models_and_images_that_cannot_be_compressed_are_refused(codec):
+    with pytest.raises(ConfigError, match="without a pixel decoder"):
+        ScanCodec(made(None), 20)
+    with pytest.raises(ConfigError, match=r"got a range image .*; wanted one image"):
+        codec.compress(scans(1))
+
+
+def test_the_commands_restore_what_was_compressed(tmp_path, capsys):
+    made().save(tmp_path / "run")
+    made(seed=4).save(tmp_path / "other")
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for index, range_m in enumerate(scans(2).range_m):
+        np.save(folder / f"{index}.npy", range_m.numpy())
+    run, file, out = (str(tmp_path / name) for name in ("run", "scans.lgz", "out"))
+    assert main(["compress", str(folder), file, "--model", run, "--step-mm", "20"]) == 0
+    size = Path(file).stat().st_size
+    assert f"done: 2 scans in {file}: {size:,} bytes" in capsys.readouterr().out
+    assert main(["decompress", file, out, "--model", run, "--only", "1"]) == 0
+    assert [one.name for one in Path(out).iterdir() if one.suffix == ".npy"] == ["1.npy"]
+    assert main(["decompress", file, out, "--model", run]) == 0
+    for index, range_m in enumerate(scans(2).range_m):
+        assert np.abs(np.load(Path(out) / f"{index}.npy") - range_m.numpy()).max() <= 0.01 + 1e-6
+    capsys.readouterr()
+    for words, told in (
+        (["--model", str(tmp_path / "other")], "compressed by the model 'run' of hash"),
+        (["--model", run, "--only", "2"], "got --only 2; wanted indices from 0 to 1"),
+    ):
+        assert main(["decompress", file, str(tmp_path / "nothing"), *words]) == 2
+        assert told in capsys.readouterr().err
+    Path(file).write_bytes(Path(file).read_bytes()[:-40])
+    assert main(["decompress", file, str(tmp_path / "nothing"), "--model", run]) == 2
+    error = capsys.readouterr().err
+    assert "cut off or altered" in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "nothing").exists()
+
+
+def test_functions_that_every_machine_computes_alike_are_right():
+    x = np.linspace(-60, 60, 4001)
+    assert exp(x) == pytest.approx(np.exp(x), rel=2e-15)
+    assert sigmoid(x) == pytest.approx(1 / (1 + np.exp(-x)), rel=2e-15)
+    assert bool((np.diff(sigmoid(x)) >= 0).all())
+    y = np.exp(x / 5)
+    assert ln(y) == pytest.approx(np.log(y), rel=1e-15, abs=2e-16)
