@@ -1,7 +1,7 @@
 """Compressed scans in one file: a header, the scans one after the other, and an index that finds each of them.
 
-The file begins with ``LGZ1``, the length of the header and its CRC-32, and ends with where the index begins, its CRC-32
-and ``1ZGL``; numbers are of 32 bits, the place of the index of 64, the lowest byte first. Header and index are JSON,
+The file begins with ``LGZ1``, the length of the header and its CRC-32, and ends with the offset of the index, its CRC-32
+and ``1ZGL``; numbers are of 32 bits, the offset of 64, the lowest byte first. Header and index are JSON,
 the index compressed by zlib. Each scan has a CRC-32 in the index, and the scans lie without gaps: a file that was cut
 off, or of which one byte was altered, is refused.
 """
@@ -24,11 +24,11 @@ _TAIL = struct.Struct("<QI4s")
 
 
 class Entry(NamedTuple):
-    """Where a scan lies in the file.
+    """The part of the file that holds one scan.
 
     Args:
         name: name of the scan.
-        offset: index of its first byte.
+        offset: index of its first byte in the file.
         length: number of its bytes.
         crc32: checksum of its bytes.
     """
@@ -44,7 +44,7 @@ class ArchiveWriter:
 
     Args:
         file: file that is open to be written.
-        header: what all scans have in common, as JSON.
+        header: facts that all scans have in common, as JSON.
     """
 
     def __init__(self, file: BinaryIO, header: dict[str, Any]) -> None:

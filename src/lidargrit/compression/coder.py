@@ -59,7 +59,7 @@ class Coder(ABC):
         """Code or decode integers from ``first`` to ``last`` by halving the interval again and again.
 
         Args:
-            mixture: their distributions.
+            mixture: distribution of each integer.
             first: least of the integers.
             last: greatest of the integers.
             values: integers, to code them; None to decode.

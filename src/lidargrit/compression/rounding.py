@@ -52,7 +52,7 @@ class Rounding:
         """Return the multiple that each number is rounded to.
 
         Args:
-            values: numbers.
+            values: numbers of one kind.
             grid: grid of their kind.
             matters: True where the number has an effect; everywhere if not given.
 
