@@ -1,9 +1,9 @@
 """Compressed scans in one file: a header, the scans one after the other, and an index that finds each of them.
 
-The file begins with ``LGZ1``, the length of the header and its CRC-32, and ends with the offset of the index, its CRC-32
-and ``1ZGL``; numbers are of 32 bits, the offset of 64, the lowest byte first. Header and index are JSON,
-the index compressed by zlib. Each scan has a CRC-32 in the index, and the scans lie without gaps: a file that was cut
-off, or of which one byte was altered, is refused.
+The file begins with ``LGZ1``, the length of the header and its CRC-32. It ends with the offset of the index, the CRC-32
+of the index, and ``1ZGL``. Numbers have 32 bits, the offset 64, the lowest byte first. Header and index are JSON, the
+index compressed by zlib. Each scan has a CRC-32 in the index, and the scans lie without gaps: a file that was cut off,
+or of which one byte was altered, is refused.
 """
 
 from __future__ import annotations
