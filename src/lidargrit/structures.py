@@ -127,7 +127,7 @@ class RangeImage:
             )
 
     def _is_valid(self) -> bool:
-        if not self.range_m.numel():
+        if not self.range_m.numel() or self.range_m.is_meta:  # without values, where operations are only counted
             return True
         nearest, farthest = self.range_m.aminmax()  # NaN where any is: no comparison holds
         positive = self.range_m > 0
@@ -203,7 +203,9 @@ class TokenGrid:
     num_codes: int
 
     def __post_init__(self) -> None:
-        if self.tokens.numel() and not (int(self.tokens.min()) >= 0 and int(self.tokens.max()) < self.num_codes):
+        if self.tokens.is_meta or not self.tokens.numel():  # without values, where operations are only counted
+            return
+        if not (int(self.tokens.min()) >= 0 and int(self.tokens.max()) < self.num_codes):
             raise ConfigError(
                 f"tokens from {int(self.tokens.min())} to {int(self.tokens.max())}",
                 f"tokens of a codebook of {self.num_codes} codes",

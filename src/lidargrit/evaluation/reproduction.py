@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from lidargrit.metrics import load_metric
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
 from lidargrit.sources import load_range_images, open_source
-from lidargrit.training import Recipe, gpu_time, plan_training, with_budget
+from lidargrit.training import Recipe, computing_time, plan_training, with_budget
 
 SIMULATED = "simulated"  # in place of a root
 _SIMULATED_SCANS = {"train": 300, "val": 16}  # the demo's: a few minutes of simulating
@@ -37,8 +37,7 @@ class PaperTable:
         train: split to train on; ``val`` and ``test`` are called so, and share no drive with it or with each other.
         images: settings that make the protocol's images of the data set's scans.
         small_images: settings that make images with fewer columns.
-        rows: the paper's name of each row that there are recipes for: of its size, and a small one.
-        missing: the others, and why.
+        rows: recipes of each row of the paper, by its name there: one of its size, and a small one.
         remarks: sentences that a reader of the measured rows must know.
     """
 
@@ -49,7 +48,6 @@ class PaperTable:
     rows: Mapping[str, tuple[str, str]]
     images: tuple[str, ...] = ()
     small_images: tuple[str, ...] = ()
-    missing: Mapping[str, str] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
 
 
@@ -163,7 +161,7 @@ class Reproduction:
 
 
 def reproduce(wanted: Reproduction, folder: Path, reporter: Reporter | None = None) -> list[Path]:
-    """Prepare, train, sample and score every row that has a recipe, and return the files of scores.
+    """Prepare, train, sample and score every row, and return the files of scores.
 
     Args:
         wanted: the table and its data.
@@ -211,7 +209,9 @@ def plan_as_text(wanted: Reproduction, facts: dict[str, Any]) -> str:
     for system, of in facts["systems"].items():
         lines += ["", f"train {system} ({of['state']}), {of['plan']['published'] or 'no published figure'}"]
         for stage in of["plan"]["stages"]:
-            lines.append(f"  {stage['name']}: {stage['scans']:,} scans, {gpu_time(stage['flops'], stage['precision'])}")
+            lines.append(
+                f"  {stage['name']}: {stage['scans']:,} scans, {computing_time(stage['flops'], stage['precision'])}"
+            )
         lines.append(f"  sample {facts['samples']:,} scans: {of['sampling_flops']:.2g} floating-point operations")
     return "\n".join([*lines, "", _words(wanted)])
 
@@ -235,7 +235,6 @@ def _prepare(benchmark: Benchmark, systems: list[str], reporter: Reporter) -> No
 
 
 def _words(wanted: Reproduction) -> str:
-    """Return which row is which, and which of the paper's are not here."""
+    """Return which row is which, and what a reader must know of them."""
     lines = [f"the paper's row {row!r} is measured by {system}" for row, system in wanted.systems().items()]
-    lines += [f"not available: {row}: {why}" for row, why in wanted.table.missing.items()]
     return "\n".join([*lines, *wanted.table.remarks])

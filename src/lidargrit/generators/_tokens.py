@@ -19,6 +19,7 @@ from lidargrit.generators import Cost, Generator
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.pixel_decoder import PixelDecoder, PixelSampling, nats_to_range_bits
 from lidargrit.nn.pixel_networks import PixelDecoderConfig
+from lidargrit.nn.precision import without_autocast
 from lidargrit.nn.processes import sum_over_processes
 from lidargrit.nn.range_steps import RangeSteps
 from lidargrit.nn.transformer import Transformer, TransformerConfig
@@ -200,12 +201,14 @@ class TokenObjective(Objective):
     def encode(self, images: RangeImage) -> tuple[Int[Tensor, "B T"], Float[Tensor, "B T"]]:
         """Return the tokens, and their negative log-likelihood in nats by a model that knows only token frequencies."""
         # Tokens are computed in full precision, as when a scan is encoded outside of training.
-        with torch.autocast(images.range_m.device.type, enabled=False):
+        with without_autocast(images.range_m.device):
             self._frozen[0].to(images.range_m.device)
             tokens = self._frozen[0].encode(images).tokens.flatten(1)
         if self.training:
-            counted = torch.bincount(tokens.flatten(), minlength=len(self.token_counts))
-            self.token_counts += sum_over_processes(counted)
+            ones = torch.ones_like(tokens, dtype=self.token_counts.dtype).flatten()
+            self.token_counts += sum_over_processes(
+                torch.zeros_like(self.token_counts).index_add_(0, tokens.flatten(), ones)
+            )
         return tokens, -(self.token_counts / self.token_counts.sum()).log()[tokens]
 
 

@@ -19,6 +19,7 @@ from lidargrit.nn.diffusion import SeededNoise
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.latent_unet import LatentUnet, LatentUnetConfig
 from lidargrit.nn.objective import Objective
+from lidargrit.nn.precision import without_autocast
 from lidargrit.nn.published import read_checkpoint
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import MaskDecoding, RangeImage
@@ -133,7 +134,7 @@ class Lidm(Generator[LidmConfig, LidmSampling]):
         if stage == "tokenizer":
             return self.tokenizer
         if self.config.scale_latents:
-            self.latent_scale.fill_(self.tokenizer.quantize.spread())
+            self.latent_scale.copy_(self.tokenizer.quantize.spread())
         return LatentDenoising(self.tokenizer, self.denoiser, self.latent_scale, self._shares())
 
     def load_stage(self, stage: str, objective: Objective) -> None:
@@ -243,6 +244,8 @@ class LatentCache:
     @torch.no_grad()
     def __call__(self, images: RangeImage) -> Float[Tensor, "B D h w"]:
         """Return the latents of a batch, on its device."""
+        if images.range_m.is_meta:  # without values, where operations are only counted
+            return self._encoded(images)
         device, pixels = images.range_m.device, images.range_m.cpu().numpy()
         keys = [hashlib.blake2b(one.tobytes(), digest_size=16).digest() for one in pixels]
         latents = [self._kept.get(key) for key in keys]
@@ -256,7 +259,7 @@ class LatentCache:
 
     def _encoded(self, image: RangeImage) -> Float[Tensor, "1 D h w"]:
         # In full precision, as when a scan is encoded outside of training.
-        with torch.autocast(image.range_m.device.type, enabled=False):
+        with without_autocast(image.range_m.device):
             return self._tokenizer.to(image.range_m.device).latents(image).float()
 
 

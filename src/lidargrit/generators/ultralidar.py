@@ -18,6 +18,7 @@ from lidargrit.generators._tokens import sample_tokens
 from lidargrit.nn.codebook_care import CodebookCare
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.objective import Objective
+from lidargrit.nn.precision import without_autocast
 from lidargrit.nn.size import numbers_of_file
 from lidargrit.nn.swin import SwinConfig
 from lidargrit.nn.ultralidar_checkpoint import read_ultralidar_checkpoint
@@ -256,12 +257,12 @@ class HiddenVoxelTokens(Objective):
         """Return the error in nats for each hidden token, of which a batch hides one share, and how many are right."""
         autoencoder = self._frozen[0].to(images.range_m.device)
         voxels = _training_voxels(images, autoencoder.config.grid, self._flips, rng)
-        with torch.no_grad(), torch.autocast(voxels.device.type, enabled=False):  # tokens as outside of training
+        with torch.no_grad(), without_autocast(voxels.device):  # tokens as outside of training
             tokens = autoencoder.tokens(voxels)
             codes = autoencoder.codes(tokens)
         progress = torch.rand((), generator=rng, device=rng.device, dtype=torch.float64)
         noise = torch.rand(tokens.shape, generator=rng, device=rng.device)
-        hidden = hidden_at_random(noise, float((progress * (torch.pi / 2)).cos()))
+        hidden = hidden_at_random(noise, (progress * (torch.pi / 2)).cos())
         logits = self.prior(self.prior.hide(codes, hidden))
         right = ((logits.detach().argmax(dim=-1) == tokens) & hidden).sum() / hidden.sum()
         return {"loss": hidden_token_loss(logits, tokens, hidden), "accuracy": right}

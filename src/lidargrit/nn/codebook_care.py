@@ -67,6 +67,8 @@ class CodebookCare(nn.Module):
         self.filled.copy_((self.filled + len(new)).clamp(max=len(self.reservoir)))
         self.rest_steps.copy_((self.rest_steps - 1).clamp(min=0))
         idle = self.idle_steps >= _IDLE_STEPS
+        if idle.is_meta:  # without values, where operations are only counted: k-means is rare
+            return
         if int(self.rest_steps) == 0 and float(idle.float().mean()) > _IDLE_SHARE:
             codes.copy_(self._moved(codes, idle, rng))
             self.idle_steps.zero_()

@@ -12,6 +12,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from lidargrit.nn.precision import without_autocast
+
 LEVELS = 4  # times that rows and columns double, or halve
 
 _SLOPE = 0.2  # of the leaky rectifier below 0
@@ -94,7 +96,7 @@ class Discriminator(nn.Module):
     def forward(self, images: Float[Tensor, "B 1 H W"]) -> Float[Tensor, "B"]:
         """Return the logit of each image."""
         # In 16 bits all that is farther than some 60 m would be next to the same value.
-        with torch.autocast("cuda" if images.is_cuda else "cpu", enabled=False):
+        with without_autocast(images.device):
             features = self.down[0](_pad(_blurred_both_ways(images)))
         for layer in self.down[1:]:
             features = layer(_pad(_rectify(features)))

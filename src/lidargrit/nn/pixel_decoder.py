@@ -120,7 +120,8 @@ class PixelDecoder(nn.Module):
         mask_nats, range_nats = guide.v.new_zeros(()), guide.v.new_zeros(())
         returns = guide.v.new_zeros(())
         for phases in self.mask.by_spacing():
-            chosen = [phases[int(torch.randint(len(phases), (), generator=rng, device=rng.device))]]
+            index = torch.randint(len(phases), (), generator=rng, device=rng.device)
+            chosen = [phases[0 if index.is_meta else int(index)]]  # all take as many operations, if these are counted
             of_mask, of_range = self._nll(chosen, guided, guide, images)
             mask_nats = mask_nats + len(phases) * of_mask.sum()
             range_nats = range_nats + len(phases) * of_range.sum()

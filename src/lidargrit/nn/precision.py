@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from typing import Literal
 
 import torch
@@ -22,6 +23,11 @@ def has_bf16() -> bool:
 def at_least_32_bits(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """Return numbers in 32 bits, or in 64 if they have as many: for what 16 bits cannot tell."""
     return x.to(torch.promote_types(x.dtype, torch.float32))
+
+
+def without_autocast(device: torch.device) -> AbstractContextManager[object]:
+    """Compute in the numbers' own precision within the ``with`` block, whatever the training has chosen around it."""
+    return torch.autocast("cpu" if device.type == "meta" else device.type, enabled=False)
 
 
 def dtype_of(precision: Precision) -> torch.dtype:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Literal, NamedTuple
 
 import torch
@@ -10,6 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from lidargrit.nn.precision import without_autocast
 from lidargrit.nn.processes import sample_from_all, sum_over_processes
 
 CodebookLoss = Literal["paper", "reference", "vqvae", "ema"]
@@ -61,7 +61,7 @@ class VectorQuantiser(nn.Module):
 
     def forward(self, z: Float[Tensor, "B D h w"], rng: torch.Generator | None = None) -> Quantised:
         """Replace every latent by its nearest code; ``rng`` chooses the latents that dead codes restart from."""
-        with torch.autocast(z.device.type, enabled=False):  # codes lie too close together for 16 bits
+        with without_autocast(z.device):  # codes lie too close together for 16 bits
             return self._quantise(z.float(), rng)
 
     def _quantise(self, z: Tensor, rng: torch.Generator | None) -> Quantised:
@@ -93,16 +93,15 @@ class VectorQuantiser(nn.Module):
         return float((self.usage > self._dead_below()).float().mean())
 
     @torch.no_grad()
-    def spread(self) -> float:
+    def spread(self) -> Float[Tensor, ""]:
         """Return the standard deviation of the numbers in codes, each as often as its code is used.
 
         Before any training, all codes count alike.
         """
         codes, share = self.embedding.weight, self.usage / self.usage.sum().clamp(min=1e-9)
-        if not bool(share.any()):
-            share = torch.full_like(share, 1 / len(codes))
+        share = torch.where(share.any(), share, 1 / len(codes))
         means = [(share[:, None] * power).sum() / codes.shape[1] for power in (codes, codes.square())]
-        return math.sqrt(float(means[1] - means[0].square()))
+        return (means[1] - means[0].square()).sqrt()
 
     @torch.no_grad()
     def _update_codes(self, flat: Tensor, tokens: Tensor, rng: torch.Generator | None) -> None:

@@ -93,9 +93,9 @@ class VoxelPrior(Network):
         return torch.where(hidden[..., None], self.mask_token, codes)
 
 
-def hidden_at_random(noise: Float[Tensor, "B T"], share: float) -> Bool[Tensor, "B T"]:
+def hidden_at_random(noise: Float[Tensor, "B T"], share: float | Float[Tensor, ""]) -> Bool[Tensor, "B T"]:
     """Return which tokens are hidden: a share of those of each scan, rounded up, where the noise is largest."""
-    shown = min(int(noise.shape[1] * (1 - share)), noise.shape[1] - 1)
+    shown = torch.as_tensor(noise.shape[1] * (1 - share), dtype=torch.float64).long().clamp(max=noise.shape[1] - 1)
     return noise.argsort(dim=1).argsort(dim=1) >= shown
 
 

@@ -80,10 +80,11 @@ def occupied_voxels(
     low, side = (torch.tensor(of, dtype=torch.float32, device=points_xyz_m.device) for of in (grid.low_m, grid.cell_m))
     index = ((points_xyz_m.float() - low) / side).floor()  # in 32 bits, as the program: rounding decides at borders
     inside = eligible & ((index >= 0) & (index < index.new_tensor(grid.cells))).all(dim=-1)
-    occupied = torch.zeros(len(points_xyz_m), *grid.shape, dtype=torch.bool, device=points_xyz_m.device)
-    x, y, z = index[inside].long().unbind(dim=-1)
-    occupied[inside.nonzero()[:, 0], z, y, x] = True
-    return occupied
+    x, y, z = index.long().unbind(dim=-1)
+    outside = math.prod(grid.cells)  # a further cell, for all points that count nowhere
+    cell = torch.where(inside, (z * grid.cells[1] + y) * grid.cells[0] + x, outside)
+    occupied = torch.zeros(len(cell), outside + 1, dtype=torch.bool, device=cell.device).scatter_(1, cell, True)
+    return occupied[:, :outside].unflatten(1, grid.shape)
 
 
 def voxels_of_images(images: RangeImage, grid: VoxelGrid) -> Bool[Tensor, "B z y x"]:

@@ -1,6 +1,6 @@
 """Recipe → run folder, by one training loop for every generator."""
 
-from lidargrit.training.compute import gpu_time, training_flops, with_budget
+from lidargrit.training.compute import computing_time, training_flops, with_budget
 from lidargrit.training.config import FitConfig, Recipe
 from lidargrit.training.measure import Measured, measure
 from lidargrit.training.plan import TrainingPlan, check_data, plan_training
@@ -14,7 +14,7 @@ __all__ = [
     "TrainingPlan",
     "check_data",
     "check_folder",
-    "gpu_time",
+    "computing_time",
     "measure",
     "plan_training",
     "tracked",

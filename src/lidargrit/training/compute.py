@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+import time
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
-from itertools import chain, product
+from functools import cache
+from itertools import product
 
 import torch
-from torch import Tensor
-from torch.func import functional_call
-from torch.nn.attention import SDPBackend, sdpa_kernel
-from torch.utils.flop_counter import FlopCounterMode
-from torch.utils.module_tracker import ModuleTracker
 
 from lidargrit.errors import ConfigError
+from lidargrit.generators import Generator
+from lidargrit.nn.flops import FlopCounter
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.precision import Precision
 from lidargrit.sensors import SensorModel
@@ -23,7 +23,8 @@ from lidargrit.training.config import FitConfig, Recipe
 _SCANS = 2  # in a counted batch: some objectives compare the scans of a batch
 _STEPS_AT_MOST = 64  # that are counted; rarer terms hardly cost
 _A100_FP32_FLOPS_PER_S, _A100_BF16_FLOPS_PER_S = 19.5e12, 312e12
-_SHARE = 0.25  # of a card's peak: a guess for networks as small as these; small batches reach less
+_SHARE = 0.25  # of a peak: a guess for networks as small as these; small batches reach less
+_MATRIX, _REPETITIONS = 512, 8  # the first repetition chooses a kernel
 
 
 def training_flops(recipe: Recipe) -> dict[str, int]:
@@ -32,8 +33,8 @@ def training_flops(recipe: Recipe) -> dict[str, int]:
     Matrix products and convolutions are counted while a few steps run, on scans whose every pixel returns at 10 m. A
     multiplication with its addition counts as two operations. Validation and the optimiser are not counted.
 
-    The steps run on weights that have a shape and no values, so that nothing is computed. Only where the operations of
-    an objective depend on values, as MaskGIT's do, are the steps computed.
+    The steps run on tensors that have a shape and no values, so that nothing is computed, and networks of any width are
+    counted alike. Only where the operations of an objective depend on values, as MaskGIT's do, are the steps computed.
 
     Returns:
         number of operations, by the name of the stage.
@@ -41,28 +42,45 @@ def training_flops(recipe: Recipe) -> dict[str, int]:
     with torch.random.fork_rng(range(torch.cuda.device_count())):
         torch.manual_seed(0)
         sensor = recipe.data.load_sensor()
-        generator = recipe.build_generator(sensor)
-        return {
-            stage: round(_flops_per_scan(generator.objective(stage), sensor) * recipe.training[stage].scans)
-            for stage in generator.stages
-        }
+        with torch.device("meta"):
+            generator = recipe.build_generator(sensor).to("meta")
+        per_scan = {}
+        for stage in generator.stages:
+            try:
+                per_scan[stage] = _flops_without_values(generator, stage, sensor)
+            except (RuntimeError, NotImplementedError):  # torch's for a value that was asked for, and for two devices
+                per_scan[stage] = _flops_with_values(recipe.build_generator(sensor), stage, sensor)
+    return {stage: round(flops * recipe.training[stage].scans) for stage, flops in per_scan.items()}
 
 
-def gpu_time(flops: int, precision: Precision) -> str:
-    """Return a line for a person: the operations, and the estimated time of an NVIDIA A100 for them.
+def computing_time(flops: int, precision: Precision) -> str:
+    """Return a line for a person: the operations, and estimated times for them on this machine's CPU and on a GPU.
 
     Args:
         flops: number of floating-point operations.
         precision: precision of the operations.
 
     Source:
-        Peaks of the card without sparsity: NVIDIA A100 datasheet, 2021.
+        Peaks of an NVIDIA A100 without sparsity: its datasheet, 2021.
     """
     kind, peak = ("fp32", _A100_FP32_FLOPS_PER_S) if precision == "fp32" else ("bf16", _A100_BF16_FLOPS_PER_S)
+    here = _cpu_flops_per_s()
     return (
-        f"{flops:.2e} floating-point operations, by estimate {duration(flops / (_SHARE * peak))} on one A100 "
-        f"at {_SHARE:.0%} of its {peak / 1e12:g} TFLOP/s in {kind}"
+        f"{flops:.2e} floating-point operations, by estimate {duration(flops / (_SHARE * here))} on this machine's CPU "
+        f"at {_SHARE:.0%} of its {here / 1e9:.0f} GFLOP/s in matrix products, "
+        f"{duration(flops / (_SHARE * peak))} on one A100 at {_SHARE:.0%} of its {peak / 1e12:g} TFLOP/s in {kind}"
     )
+
+
+@cache
+def _cpu_flops_per_s() -> float:
+    """Measure how fast this machine multiplies matrices, with the threads that torch uses now; takes some ms."""
+    matrix, seconds = torch.ones(_MATRIX, _MATRIX), []
+    for _ in range(_REPETITIONS):
+        begun = time.perf_counter()
+        matrix @ matrix
+        seconds.append(time.perf_counter() - begun)
+    return 2 * _MATRIX**3 / min(seconds)
 
 
 def duration(seconds: float) -> str:
@@ -114,48 +132,36 @@ def uniform_images(sensor: SensorModel, count: int) -> RangeImage:
     return RangeImage(range_m, torch.ones_like(range_m, dtype=torch.bool), sensor, torch.full_like(range_m, 0.3))
 
 
-def _flops_per_scan(objective: Objective, sensor: SensorModel) -> float:
-    from torch._subclasses import fake_tensor  # noqa: PLC0415  takes two seconds, and only counting needs it
+class _SeedOfNoValues(torch.Generator):
+    """Random numbers for objectives that make them on the device of their source."""
 
-    images, steps = uniform_images(sensor, _SCANS), min(objective.period, _STEPS_AT_MOST)
+    device = torch.device("meta")
+
+
+def _flops_without_values(generator: Generator, stage: str, sensor: SensorModel) -> float:
+    """Count the operations of a stage for one scan, of a generator whose weights have no values."""
+    with torch.device("meta"):
+        objective = generator.objective(stage)
+    objective.to("meta")
+    for module in objective.modules():
+        for name, buffer in module.named_buffers(recurse=False):
+            if buffer.ndim == 0 and not buffer.is_floating_point():  # a counter, by which steps differ
+                module.register_buffer(name, torch.zeros_like(buffer, device="cpu"))
+    return _flops_per_scan(objective, uniform_images(sensor, _SCANS).to("meta"), _SeedOfNoValues)
+
+
+def _flops_with_values(generator: Generator, stage: str, sensor: SensorModel) -> float:
+    """Count the operations of a stage for one scan by computing them."""
+    return _flops_per_scan(generator.objective(stage), uniform_images(sensor, _SCANS), torch.Generator)
+
+
+def _flops_per_scan(objective: Objective, images: RangeImage, make_rng: Callable[[], torch.Generator]) -> float:
+    """Count the operations of some steps of all players, and return those for one scan of one step."""
+    steps = min(objective.period, _STEPS_AT_MOST)
     objective.train()
-    mode = fake_tensor.FakeTensorMode(allow_non_fake_inputs=True)
-    own = chain(objective.named_parameters(), objective.named_buffers())
-    # Counters, by which steps differ, keep their values.
-    without_values: dict[str, Tensor] = {
-        name: mode.from_tensor(tensor) for name, tensor in own if tensor.is_floating_point()
-    }
-    try:
-        total = _total_flops(objective, without_values, images, steps)
-    except (
-        fake_tensor.DataDependentOutputException,
-        fake_tensor.DynamicOutputShapeException,
-        fake_tensor.UnsupportedOperatorException,
-    ):
-        total = _total_flops(objective, {}, images, steps)
-    return total / (steps * _SCANS)
-
-
-def _total_flops(objective: Objective, tensors: dict[str, Tensor], images: RangeImage, steps: int) -> int:
-    """Count the operations of some steps of all players, with other tensors in place of the objective's own."""
-    counter = FlopCounterMode(display=False)
-    # The counter's tracker of modules fails on gradient penalties, and counts by module are not needed.
-    counter.mod_tracker = _NoModules()
-    # The counter does not see the matrix products within the fused attention of a CPU.
-    with counter, sdpa_kernel(SDPBackend.MATH), warnings.catch_warnings():
+    with FlopCounter() as counter, warnings.catch_warnings():
         # Torch asks an image of which a penalty takes the gradient for one that was not kept, and warns itself of it.
         warnings.filterwarnings("ignore", "The .grad attribute of a Tensor")
         for step, player in product(range(steps), objective.players or ("",)):
-            rng = torch.Generator().manual_seed(step)
-            functional_call(objective, tensors, (images, rng, player))["loss"].backward()
-    return counter.get_total_flops()
-
-
-class _NoModules(ModuleTracker):
-    """Tracks no modules, so that every operation is counted once, in the total."""
-
-    def __enter__(self) -> ModuleTracker:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
+            objective(images, make_rng().manual_seed(step), player)["loss"].backward()
+    return counter.total / (steps * len(images))

@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import torch
+
 from lidargrit import configuration
 from lidargrit.nn.precision import Precision
 from lidargrit.sources import PreparedSource, open_to_train
-from lidargrit.training.compute import gpu_time, training_flops
+from lidargrit.training.compute import computing_time, training_flops
 from lidargrit.training.config import Recipe
 from lidargrit.training.optimiser import memory_of_weights
 
@@ -69,7 +71,7 @@ class TrainingPlan:
             f"{stage.memory / 2**20:,.0f} MiB of memory besides activations"
             for stage in self.stages
         ]
-        lines += [f"{stage.name}: {gpu_time(stage.flops, stage.precision)}" for stage in self.stages]
+        lines += [f"{stage.name}: {computing_time(stage.flops, stage.precision)}" for stage in self.stages]
         return "\n".join(lines)
 
     def to_json(self) -> dict[str, Any]:
@@ -92,10 +94,12 @@ def check_data(recipe: Recipe) -> None:
 def plan_training(recipe: Recipe) -> TrainingPlan:
     """Return what the training of a recipe would do; nothing is read or written."""
     sensor = recipe.data.load_sensor()
-    generator = recipe.build_generator(sensor)
     stages, flops = [], training_flops(recipe)
-    for name in generator.stages:
-        objective, budget = generator.objective(name), recipe.training[name]
+    with torch.device("meta"):  # sizes alone, without values, so that wide networks take no time
+        generator = recipe.build_generator(sensor).to("meta")
+        objectives = {name: generator.objective(name) for name in generator.stages}
+    for name, objective in objectives.items():
+        budget = recipe.training[name]
         parameters = sum(weight.numel() for weight in objective.parameters())
         size = (parameters, budget.scans, budget.batch_size, memory_of_weights(objective))
         stages.append(StagePlan(name, *size, flops[name], budget.precision))
