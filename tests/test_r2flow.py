@@ -9,6 +9,7 @@ import torch
 import lidargrit
 from lidargrit.cli import main
 from lidargrit.errors import CheckpointError, ConfigError
+from lidargrit.generators._flow import FlowPairs, ReflowConfig, as_kept
 from lidargrit.generators._log_range import decode, encode
 from lidargrit.generators.r2flow import FlowSampling, R2flow, R2flowConfig
 from lidargrit.nn import flow
@@ -16,6 +17,7 @@ from lidargrit.nn.hdit import Hdit, HditConfig
 from lidargrit.recipes import load_recipe
 from lidargrit.sensors import load_sensor
 from lidargrit.structures import RangeImage
+from lidargrit.training import compute
 from test_hdit import reference_network
 from tiny_runs import the_one_line
 
@@ -116,6 +118,85 @@ def test_an_adaptive_solver_takes_more_steps_for_less_error():
     assert steps[1] < 0.2 * steps[0]
 
 
+@pytest.mark.shared
+def test_the_later_trainings_compute_as_the_references(golden):
+    data = golden("rivals/r2flow")
+    times = flow.u_shaped(torch.from_numpy(data["u_shaped_u"]), torch.from_numpy(data["u_shaped_perm"]))
+    assert np.allclose(times.numpy(), data["u_shaped_t"], atol=1e-6)
+    error = torch.from_numpy(data["fm_v"] - data["fm_u_t"])
+    loss = flow.pseudo_huber(error, 0.00054 * np.sqrt(error[0].numel()))
+    assert float(loss) == pytest.approx(float(data["loss_pseudo_huber"]), rel=1e-6)
+
+
+@pytest.mark.shared
+def test_a_pair_ends_at_what_a_file_keeps_of_the_generated_scan(golden):
+    data, sensor = golden("rivals/r2flow"), load_sensor("hdl64e_kitti_360").with_columns(64)
+    end, wanted = (torch.from_numpy(data[name]).repeat(1, 1, 4, 1) for name in ("ode_dopri5", "reflow_target"))
+    assert torch.allclose(as_kept(end, sensor), wanted, atol=1e-5)
+
+
+def test_later_trainings_straighten_and_distil_the_flow():
+    pairs = ReflowConfig(pairs=4, distilled_steps=2, distilled_pairs=4, solving=FlowSampling(steps=4))
+    generator, images = stirred(made(reflectance=False, reflow=pairs)), walls(2, reflectance=False)
+    assert generator.stages == ("flow", "reflow", "distillation")
+    for stage in generator.stages[1:]:
+        objective = generator.objective(stage).train()
+        optimiser = torch.optim.Adam(objective.parameters(), lr=3e-3)
+        found = []
+        for step in range(24):
+            loss = objective(images, torch.Generator().manual_seed(step % 2))["loss"]  # the same pairs and times
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+            found.append(float(loss.detach()))
+        assert sum(found[-2:]) < 0.8 * sum(found[:2]), stage
+        kept = objective._pairs._kept
+        assert set(kept) <= set(range(4)), "a pair is made once, and none is for validation"
+        objective.eval()
+        held_out = float(objective(images, torch.Generator().manual_seed(0))["loss"].detach())
+        assert 0 < held_out < 1
+        assert max(kept) >= 4
+        generator.load_stage(stage, objective)
+    assert generator.cost().network_evaluations == 2
+    assert generator.cost(FlowSampling(steps=1)).network_evaluations == 1
+
+
+def test_pairs_depend_on_their_number_alone():
+    network, solving = stirred(made()).network, FlowSampling(steps=2)
+    kept, anew = (FlowPairs(network, SENSOR, solving, bytes_at_most) for bytes_at_most in (1 << 20, 0))
+    together = kept(torch.tensor([5, 2]))
+    assert all(torch.equal(one[1:], other) for one, other in zip(together, anew(torch.tensor([2])), strict=True))
+    assert set(kept._kept) == {2, 5}
+    assert not anew._kept
+    network.tokenizer[0].weight.data.zero_()  # training goes on, pairs are those of the network as it was
+    assert all(torch.equal(one[1:], other) for one, other in zip(together, anew(torch.tensor([2])), strict=True))
+
+
+def test_a_distilled_model_takes_the_steps_that_it_has_learned():
+    generator = made(reflow=ReflowConfig(distilled_steps=4))
+    for sampling, got in (
+        (FlowSampling(steps=3), "steps=3"),
+        (FlowSampling(steps=256), "steps=256"),
+        (FlowSampling(solver="dopri5"), "solver=dopri5"),
+    ):
+        with pytest.raises(ConfigError, match=f"got {got} for a model that was distilled to 4 equal steps; wanted "):
+            generator.sample([0], sampling)
+    with pytest.raises(ConfigError, match="got pairs=0, "):
+        ReflowConfig(pairs=0)
+    with pytest.raises(ConfigError, match="got distilled_steps=-1; wanted 0 to 256"):
+        ReflowConfig(distilled_steps=-1)
+
+
+def test_operations_of_the_pairs_are_counted_once():
+    recipe = load_recipe("r2flow_reflow_small", ("training.reflow.scans=400", "model.reflow.pairs=100"))
+    counted = compute.training_flops(recipe)
+    with torch.device("meta"):
+        generator = load_recipe("r2flow_small").build_generator(SENSOR.with_columns(256)).to("meta")
+    a_pair = generator.cost(FlowSampling(steps=16)).flops
+    flow_scan = counted["flow"] / recipe.training["flow"].scans
+    assert counted["reflow"] == pytest.approx(400 * flow_scan + 100 * a_pair, rel=1e-6)
+
+
 def test_cost_counts_the_passes_of_either_solver():
     generator = stirred(made())
     two, four = (generator.cost(FlowSampling(steps=steps)) for steps in (2, 4))
@@ -132,7 +213,7 @@ def test_cost_counts_the_passes_of_either_solver():
 def test_a_flow_that_explodes_is_told_in_one_line():
     with pytest.raises(ConfigError, match=r"cannot be followed with tolerance=0\.001 .*; wanted a larger tolerance"):
         flow.dopri5(lambda image, _: torch.full_like(image, torch.nan), torch.zeros(1, 1, 4, 8), 1e-3)
-    for settings in ({"steps": 0}, {"tolerance": 0.0}, {"tolerance": float("nan")}):
+    for settings in ({"steps": -1}, {"tolerance": 0.0}, {"tolerance": float("nan")}):
         with pytest.raises(ConfigError, match=f"got {next(iter(settings))}="):
             FlowSampling(**settings)
 

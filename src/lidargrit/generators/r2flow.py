@@ -6,16 +6,15 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from lidargrit.errors import CheckpointError, ConfigError
 from lidargrit.files import load_exactly
 from lidargrit.generators import Cost, Generator, SystemFacts
-from lidargrit.generators._log_range import decode, encode
+from lidargrit.generators._flow import FlowMatching, FlowSampling, PairMatching, ReflowConfig, solve, steps_of
+from lidargrit.generators._log_range import decode
 from lidargrit.nn import flow
 from lidargrit.nn.diffusion import SeededNoise
 from lidargrit.nn.flops import flops_of
@@ -37,39 +36,19 @@ class R2flowConfig:
     Args:
         hdit: sizes of the network.
         reflectance: whether to learn the reflectance beside the range, as published; false where scans have none.
+        reflow: settings of the trainings after the first, which straighten the flow; None for the first alone (1-RF).
     """
 
     hdit: HditConfig = field(default_factory=HditConfig)
     reflectance: bool = True
-
-
-@dataclass(frozen=True)
-class FlowSampling:
-    """How the flow is followed from noise to a scan.
-
-    Args:
-        solver: ``euler`` takes equal steps (published for sampling); ``dopri5`` chooses its own by ``tolerance``, and
-            evaluates the network as often as a scan needs it (published for the pairs of the second training).
-        steps: number of steps of ``euler``, with one evaluation of the network each; 256 are published.
-        tolerance: largest error of a step of ``dopri5``, absolute and relative; 1e-5 is published.
-    """
-
-    solver: Literal["euler", "dopri5"] = "euler"
-    steps: int = 256
-    tolerance: float = 1e-5
-
-    def __post_init__(self) -> None:
-        if self.steps < 1:
-            raise ConfigError(f"steps={self.steps}", "at least 1", "raise it")
-        if not 1e-7 <= self.tolerance <= 1:  # below, 32 bits of the network are the larger error
-            raise ConfigError(f"tolerance={self.tolerance:g}", "a number from 1e-7 to 1", "change it")
+    reflow: ReflowConfig | None = None
 
 
 class R2flow(Generator[R2flowConfig, FlowSampling]):
     """Generates the image of log ranges, in which a missing return is a range that no return has.
 
-    This is the first training of the paper (1-RF). Its second, from pairs of noise and generated scan, and the
-    distillation to few steps are not here.
+    It is trained in up to three stages: ``flow`` from noise to scans (1-RF), ``reflow`` on pairs of noise and the scan
+    that it leads to (2-RF), and ``distillation`` to few equal steps (k-TD).
 
     Source:
         Nakashima et al., Fast LiDAR Data Generation with Rectified Flows, ICRA 2025; numbers from
@@ -94,8 +73,9 @@ class R2flow(Generator[R2flowConfig, FlowSampling]):
 
     @classmethod
     def smallest_config(cls, sensor: SensorModel) -> R2flowConfig:
-        """Return a transformer of two levels and 8 channels."""
-        return R2flowConfig(HditConfig(8, 8, (1, 1), (1, 2)))
+        """Return a transformer of two levels and 8 channels, and every training with 4 pairs."""
+        reflow = ReflowConfig(pairs=4, distilled_steps=2, distilled_pairs=4, solving=FlowSampling(steps=2))
+        return R2flowConfig(HditConfig(8, 8, (1, 1), (1, 2)), reflow=reflow)
 
     @classmethod
     def quickest_sampling(cls) -> FlowSampling:
@@ -104,16 +84,22 @@ class R2flow(Generator[R2flowConfig, FlowSampling]):
 
     @property
     def stages(self) -> tuple[str, ...]:
-        """One stage."""
-        return ("flow",)
+        """The flow, its straightening, its distillation to few steps; the latter two if so configured."""
+        if self.config.reflow is None:
+            return ("flow",)
+        return ("flow", "reflow", "distillation") if self.config.reflow.distilled_steps else ("flow", "reflow")
 
     def objective(self, stage: str) -> Objective:
-        """Return the matching of the flow."""
-        return FlowMatching(self.network, self.sensor)
+        """Return the matching of velocities between noise and scans, or between pairs that the flow so far gives."""
+        reflow = self.config.reflow
+        if stage == "flow" or reflow is None:
+            return FlowMatching(self.network, self.sensor)
+        pairs, steps = (reflow.pairs, 0) if stage == "reflow" else (reflow.distilled_pairs, reflow.distilled_steps)
+        return PairMatching(self.network, self.sensor, pairs, reflow.solving, steps)
 
     def load_stage(self, stage: str, objective: Objective) -> None:
         """Take over the trained network."""
-        assert isinstance(objective, FlowMatching)
+        assert isinstance(objective, FlowMatching | PairMatching)
         self.network.load_state_dict(objective.network.state_dict())
 
     def _sample(self, seeds: Sequence[int], sampling: FlowSampling) -> RangeImage:
@@ -127,7 +113,7 @@ class R2flow(Generator[R2flowConfig, FlowSampling]):
         sampling it.
         """
         sampling = sampling or FlowSampling()
-        passes = sampling.steps
+        passes = steps_of(sampling, self._distilled_steps)
         if sampling.solver == "dopri5":
             passes = self.eval()._solved([_COST_SEED], sampling).evaluations
         return Cost(passes, passes * flops_of(self.network, (1, *self.shape), (1,)))
@@ -148,25 +134,11 @@ class R2flow(Generator[R2flowConfig, FlowSampling]):
 
     def _solved(self, seeds: Sequence[int], sampling: FlowSampling) -> flow.Solved:
         noise = SeededNoise(seeds, self.shape, self.device)()
-        if sampling.solver == "euler":
-            return flow.euler(self.network, noise, sampling.steps)
-        return flow.dopri5(self.network, noise, sampling.tolerance)
+        return solve(self.network, noise, sampling, self._distilled_steps)
 
-
-class FlowMatching(Objective):
-    """The objective: the squared error of the predicted velocity at a random time between noise and image."""
-
-    def __init__(self, network: Hdit, sensor: SensorModel) -> None:
-        super().__init__(sensor)
-        self.network = network
-
-    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
-        """Return the mean squared error as ``loss``."""
-        clean = encode(images, with_reflectance=self.network.images > 1)
-        time = torch.rand(len(clean), generator=rng, device=clean.device)
-        noise = torch.randn(clean.shape, generator=rng, device=clean.device)
-        predicted: Float[Tensor, "B C H W"] = self.network(flow.interpolated(noise, clean, time), time).float()
-        return {"loss": (predicted - (clean - noise)).square().mean()}
+    @property
+    def _distilled_steps(self) -> int:
+        return 0 if self.config.reflow is None else self.config.reflow.distilled_steps
 
 
 def _sizes(weights: dict[str, Tensor], path: Path) -> tuple[HditConfig, int]:

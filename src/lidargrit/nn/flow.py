@@ -8,17 +8,20 @@ Source:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.integrate import solve_ivp
 from torch import Tensor
 
 from lidargrit.errors import ConfigError
+
+_U_SHAPE = 4.0  # how much likelier the ends are than the middle
 
 Velocity = Callable[[Tensor, Tensor], Tensor]
 """(images (B, C, H, W), their times (B,)) → their velocities."""
@@ -41,6 +44,35 @@ def interpolated(
 ) -> Float[Tensor, "B C H W"]:
     """Return the images at these times on the straight way from noise to clean images."""
     return torch.lerp(noise, clean, time[:, None, None, None])
+
+
+def u_shaped(uniform: Float[Tensor, "B"], order: Int[Tensor, "2*B"]) -> Float[Tensor, "B"]:
+    """Return times that lie near 0 and near 1 more often than between them, with a density like exp(4t) + exp(4 - 4t).
+
+    Args:
+        uniform: random numbers, uniform in [0, 1).
+        order: random order of the times that these give and of their mirror images, of which the first B are taken.
+
+    Source:
+        Lee et al., Improving the Training of Rectified Flows, NeurIPS 2024, section 4.1; as in
+        kazuto1011/r2flow@3f5afeb (MIT).
+    """
+    late = (uniform * math.expm1(_U_SHAPE) + 1).log() / _U_SHAPE
+    return torch.cat((late, 1 - late))[order[: len(uniform)]]
+
+
+def pseudo_huber(error: Float[Tensor, "B C H W"], scale: float) -> Float[Tensor, ""]:
+    """Return the mean over all values of an error that is squared where it is small, and absolute where it is large.
+
+    Args:
+        error: difference of prediction and target.
+        scale: size of an error between small and large.
+
+    Source:
+        Lee et al., Improving the Training of Rectified Flows, NeurIPS 2024, section 4.2, whose norm is that of a whole
+        image; of single values in kazuto1011/r2flow@3f5afeb (MIT), as here.
+    """
+    return ((error.square() + scale**2).sqrt() - scale).mean()
 
 
 def euler(velocity: Velocity, noise: Float[Tensor, "B C H W"], steps: int) -> Solved:

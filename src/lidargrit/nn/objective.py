@@ -42,6 +42,14 @@ class Objective(nn.Module, ABC):
             player: one of ``players``; "" where there are none.
         """
 
+    def preparation_flops(self, scans: int) -> int:
+        """Return the floating-point operations of what is computed once, before steps learn from it.
+
+        Args:
+            scans: number of scans seen over the whole training.
+        """
+        return 0
+
     def warnings(self) -> list[str]:
         """Return lines that a person should read after a validation, such as that a codebook has collapsed."""
         return []

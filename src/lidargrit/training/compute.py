@@ -44,13 +44,14 @@ def training_flops(recipe: Recipe) -> dict[str, int]:
         sensor = recipe.data.load_sensor()
         with torch.device("meta"):
             generator = recipe.build_generator(sensor).to("meta")
-        per_scan = {}
+        total = {}
         for stage in generator.stages:
+            scans = recipe.training[stage].scans
             try:
-                per_scan[stage] = _flops_without_values(generator, stage, sensor)
+                total[stage] = _flops_without_values(generator, stage, sensor, scans)
             except (RuntimeError, NotImplementedError):  # torch's for a value that was asked for, and for two devices
-                per_scan[stage] = _flops_with_values(recipe.build_generator(sensor), stage, sensor)
-    return {stage: round(flops * recipe.training[stage].scans) for stage, flops in per_scan.items()}
+                total[stage] = _flops_with_values(recipe.build_generator(sensor), stage, sensor, scans)
+    return total
 
 
 def computing_time(flops: int, precision: Precision) -> str:
@@ -138,8 +139,8 @@ class _SeedOfNoValues(torch.Generator):
     device = torch.device("meta")
 
 
-def _flops_without_values(generator: Generator, stage: str, sensor: SensorModel) -> float:
-    """Count the operations of a stage for one scan, of a generator whose weights have no values."""
+def _flops_without_values(generator: Generator, stage: str, sensor: SensorModel, scans: int) -> int:
+    """Count the operations of a stage's training, of a generator whose weights have no values."""
     with torch.device("meta"):
         objective = generator.objective(stage)
     objective.to("meta")
@@ -147,16 +148,16 @@ def _flops_without_values(generator: Generator, stage: str, sensor: SensorModel)
         for name, buffer in module.named_buffers(recurse=False):
             if buffer.ndim == 0 and not buffer.is_floating_point():  # a counter, by which steps differ
                 module.register_buffer(name, torch.zeros_like(buffer, device="cpu"))
-    return _flops_per_scan(objective, uniform_images(sensor, _SCANS).to("meta"), _SeedOfNoValues)
+    return _total(objective, uniform_images(sensor, _SCANS).to("meta"), _SeedOfNoValues, scans)
 
 
-def _flops_with_values(generator: Generator, stage: str, sensor: SensorModel) -> float:
-    """Count the operations of a stage for one scan by computing them."""
-    return _flops_per_scan(generator.objective(stage), uniform_images(sensor, _SCANS), torch.Generator)
+def _flops_with_values(generator: Generator, stage: str, sensor: SensorModel, scans: int) -> int:
+    """Count the operations of a stage's training by computing some of its steps."""
+    return _total(generator.objective(stage), uniform_images(sensor, _SCANS), torch.Generator, scans)
 
 
-def _flops_per_scan(objective: Objective, images: RangeImage, make_rng: Callable[[], torch.Generator]) -> float:
-    """Count the operations of some steps of all players, and return those for one scan of one step."""
+def _total(objective: Objective, images: RangeImage, make_rng: Callable[[], torch.Generator], scans: int) -> int:
+    """Count the operations of some steps of all players, and return those of a training of so many scans."""
     steps = min(objective.period, _STEPS_AT_MOST)
     objective.train()
     with FlopCounter() as counter, warnings.catch_warnings():
@@ -164,4 +165,4 @@ def _flops_per_scan(objective: Objective, images: RangeImage, make_rng: Callable
         warnings.filterwarnings("ignore", "The .grad attribute of a Tensor")
         for step, player in product(range(steps), objective.players or ("",)):
             objective(images, make_rng().manual_seed(step), player)["loss"].backward()
-    return counter.total / (steps * len(images))
+    return round(counter.total / (steps * len(images)) * scans) + objective.preparation_flops(scans)

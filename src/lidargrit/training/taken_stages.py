@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from lidargrit import configuration
 from lidargrit.errors import ConfigError
 from lidargrit.generators import Generator, load
@@ -42,6 +44,12 @@ def _check(setting: str, generator: Generator, donor: Generator, stage: str) -> 
     """Refuse a stage whose sizes or sensor are not the generator's."""
     ours, theirs = _settings(generator, stage), _settings(donor, stage)
     differing = [name for name in ours if ours[name] != theirs.get(name)]
+    if not ours and _shapes(generator, stage) != _shapes(donor, stage):  # its settings have no stage's name
+        raise ConfigError(
+            f"{setting}, whose {stage} has weights of other sizes",
+            "one of this recipe's model and sensor",
+            "set them as there, or choose another run",
+        )
     if differing or not generator.sensor.same_rays(donor.sensor):
         other = f"model.{stage}.{differing[0]}={theirs.get(differing[0])}" if differing else "data.sensor"
         raise ConfigError(
@@ -49,6 +57,10 @@ def _check(setting: str, generator: Generator, donor: Generator, stage: str) -> 
             f"one of this recipe's model.{stage} and sensor",
             "set them as there, or choose another run",
         )
+
+
+def _shapes(generator: Generator, stage: str) -> dict[str, torch.Size]:
+    return {name: weight.shape for name, weight in generator.objective(stage).state_dict().items()}
 
 
 def _settings(generator: Generator, stage: str) -> dict[str, Any]:
