@@ -19,7 +19,8 @@ from lidargrit.nn.flops import flops_of
 from lidargrit.recipes import load_recipe
 from lidargrit.training import compute, computing_time, training_flops, with_budget
 from lidargrit.training.compute import uniform_images
-from tiny_runs import MODEL
+from lidargrit.viewer.table_page import table_page
+from tiny_runs import MODEL, the_one_line
 
 FEW = ("data.train=simulated:6:train", "data.val=simulated:2:val", "data.columns=512", "data.column_stride=8")
 QUICK = EvalConfig(metrics=("bev_jsd",), resampling=Resampling(groups=4, halves=2))
@@ -162,3 +163,36 @@ def test_a_penalty_that_comes_rarely_is_counted_as_rarely():
 def test_an_a100_takes_days_or_seconds():
     assert "3.9 days on one A100 at 25%" in computing_time(1643 * 10**15, "fp32")
     assert "13 s on one A100" in computing_time(10**15, "auto")
+
+
+def test_processes_make_a_table_that_can_be_extended(tmp_path, capfd):
+    words = ["--against", "simulated:4:test", "-n", "4", "--metrics", "bev_jsd", "--set", *FEW]
+    assert main(["compare", str(tmp_path), "marginal", "memorised", "--processes", "2", *words]) == 0
+    told = capfd.readouterr().err
+    assert "1 of 2 systems are done; left, for about" in told
+    assert "marginal: marginal:" in told, "lines of processes begin with the run"
+    run = str(tmp_path / "runs" / "marginal")
+    assert main(["compare", str(tmp_path), "--add", run]) == 0
+    table = json.loads((tmp_path / "table.json").read_text())
+    assert table["systems"] == ["marginal", "memorised", run]
+    first, _, again = ([score["value"] for score in cell["scores"]["scores"]] for cell in table["cells"])
+    assert first == again
+    assert (tmp_path / "table.html").read_text().count("<tr>") == 1 + 3 + 1
+    for wrong, got in (
+        (["--add", "small", "-n", "5"], "--add with settings of its own (count)"),
+        (["small", "--add", "demo"], "--add with systems before it"),
+    ):
+        capfd.readouterr()
+        assert main(["compare", str(tmp_path), *wrong]) == 2
+        assert f"got {got}; " in the_one_line(capfd.readouterr().err, "compare")
+    assert main(["compare", str(tmp_path / "none"), "--add", "marginal"]) == 2
+    assert "none, which holds no table.json" in the_one_line(capfd.readouterr().err, "compare")
+
+
+def test_a_page_of_foreign_names_holds_no_code_of_theirs():
+    score = {"metric": "<b>", "variant": "x", "higher_is_better": False, "value": 0.5, "interval": None, "floor": None}
+    scores = {"scores": [score], "inputs": {"reference": {"scans_used": 4}}}
+    page = table_page([{"system": "<script>alert(1)</script>", "costs": {"parameters": 3}, "scores": scores}], 0.0)
+    assert "<script>alert" not in page
+    assert "&lt;script&gt;alert" in page
+    assert page.count("<script>") == 1

@@ -26,6 +26,10 @@ class Reporter:
         """Show how far a piece of work is and how long it will still take."""
         yield Progress()
 
+    def of_process(self, name: str) -> Reporter:
+        """Return the reporter of one of several processes that work at the same time; its lines begin with a name."""
+        return self
+
 
 class TerminalReporter(Reporter):
     """Speaks on standard error: bars on a terminal, a line now and then in a log file."""
@@ -60,6 +64,22 @@ class TerminalReporter(Reporter):
         with bars.Progress(*columns, console=self._console, speed_estimate_period=60) as display:
             task = display.add_task(what, total=total, completed=done, note="", rate="")
             yield _Bar(display, task)
+
+    def of_process(self, name: str) -> Reporter:
+        """Return a reporter without bars, which would overwrite those of other processes."""
+        return _LineReporter(name)
+
+
+class _LineReporter(Reporter):
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def message(self, text: str) -> None:
+        print(f"{self._name}: {text}", file=sys.stderr, flush=True)
+
+    @contextmanager
+    def progress(self, what: str, total: int, done: int = 0) -> Iterator[Progress]:
+        yield _LoggedProgress(self, what, total, done)
 
 
 class _Bar(Progress):

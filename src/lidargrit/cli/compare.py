@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from lidargrit.cli._comparison import DEFAULTS, wanted
 from lidargrit.cli._options import add_settings
 from lidargrit.cli._results import add_json, print_result, refuse_taken
 
@@ -12,6 +13,7 @@ EXAMPLES = """\
   lidargrit compare table marginal memorised small dusty_small r2dm_small:steps=32
   lidargrit compare table small r2dm_small --flops 2e14 -n 1000      equal compute for all
   lidargrit compare table runs/mine runs/theirs --against /data/held_out
+  lidargrit compare table --add runs/another                          as the others of the table were compared
 """
 
 
@@ -19,36 +21,38 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
     parser.add_argument("out", type=Path, help="folder for runs, samples and scores; the same command continues there")
     what = "name of a recipe or folder of a finished run; SYSTEM:NAME=VALUE,... also sets how it is sampled"
-    parser.add_argument("systems", nargs="+", metavar="SYSTEM", help=what)
-    parser.add_argument("--against", default="simulated:256:test", metavar="SOURCE", help="real scans to compare with")
-    parser.add_argument("-n", "--count", type=int, default=256, help="number of samples of each system")
-    parser.add_argument("--protocol", default="exact", help="name of a protocol, see: lidargrit list protocols")
-    parser.add_argument(
-        "--metrics", nargs="+", default=[], help="metrics instead of the protocol's, see: lidargrit list metrics"
-    )
+    parser.add_argument("systems", nargs="*", metavar="SYSTEM", help=what)
+    added = "systems to compare as those of the table in OUT were, with the settings that it was made with"
+    parser.add_argument("--add", nargs="+", default=[], metavar="SYSTEM", help=added)
+    at_once = "number of systems to make at the same time, each in a process of its own"
+    parser.add_argument("--processes", type=int, default=1, help=at_once)
+    parser.add_argument("--against", default=DEFAULTS["against"], metavar="SOURCE", help="real scans to compare with")
+    parser.add_argument("-n", "--count", type=int, default=DEFAULTS["count"], help="number of samples of each system")
+    protocol, metrics = DEFAULTS["protocol"], "metrics instead of the protocol's, see: lidargrit list metrics"
+    parser.add_argument("--protocol", default=protocol, help="name of a protocol, see: lidargrit list protocols")
+    parser.add_argument("--metrics", nargs="+", default=DEFAULTS["metrics"], help=metrics)
     settings = "settings to change in every recipe, such as data.train=/data/scans"
     add_settings(parser, settings)
     budget = "training budget of each system in floating-point operations (default: each recipe's own)"
-    parser.add_argument("--flops", type=float, default=0.0, help=budget)
+    parser.add_argument("--flops", type=float, default=DEFAULTS["flops"], help=budget)
     parser.add_argument("--batch-size", type=int, help="no effect any more: each generator has a batch size of its own")
     parser.add_argument("--format", choices=["text", "markdown", "latex"], default="text", help="format of the table")
     add_json(parser)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the benchmark and print the table."""
-    from lidargrit.evaluation.benchmark import Benchmark, as_json, as_table
+    """Run the benchmark, write the table and its page, and print it."""
+    from lidargrit.evaluation.benchmark import as_json, as_table
     from lidargrit.evaluation.benchmark import run as run_benchmark
-    from lidargrit.evaluation.comparison import EvalConfig
+    from lidargrit.evaluation.table_folder import write_table
+    from lidargrit.files import write_text
     from lidargrit.reporting import TerminalReporter
+    from lidargrit.viewer.table_page import table_page
 
     refuse_taken(options)
-    benchmark = Benchmark(
-        reference=options.against,
-        num_samples=options.count,
-        settings=EvalConfig(protocol=options.protocol, metrics=tuple(options.metrics)),
-        recipe_settings=tuple(options.set),
-        flops=options.flops,
-    )
-    scores = run_benchmark(options.systems, options.out, benchmark, TerminalReporter())
-    print_result(options, as_table(scores, options.format), as_json(scores))
+    systems, benchmark = wanted(options)
+    scores = run_benchmark(systems, options.out, benchmark, TerminalReporter(), options.processes)
+    write_table(options.out, systems, benchmark, scores)
+    write_text(options.out / "table.html", table_page(as_json(scores), benchmark.flops))
+    done = f"done: {options.out / 'table.html'} sorts the table in a browser"
+    print_result(options, as_table(scores, options.format), as_json(scores), done)

@@ -5,7 +5,10 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
+from itertools import chain
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +23,17 @@ from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.evaluation.tables import Format, side_by_side
 from lidargrit.files import read_json, write_json
 from lidargrit.generators import Generator, is_run, load, load_class, locate
+from lidargrit.processes import safe_multiprocessing
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
 from lidargrit.sources import Source, open_source
 from lidargrit.sources.samples import write_samples
 from lidargrit.training import Recipe, check_folder, train, training_flops, with_budget
+from lidargrit.training.compute import duration
 
 COSTS = "costs.json"
 _SAMPLES_AT_MOST = 10**8  # names of files have eight digits
+_PROCESSES_AT_MOST = 256
 
 
 @dataclass(frozen=True)
@@ -57,7 +63,13 @@ class Benchmark:
             )
 
 
-def run(systems: Sequence[str], folder: Path, benchmark: Benchmark, reporter: Reporter | None = None) -> list[Path]:
+def run(
+    systems: Sequence[str],
+    folder: Path,
+    benchmark: Benchmark,
+    reporter: Reporter | None = None,
+    processes: int = 1,
+) -> list[Path]:
     """Train or load each system, sample from it and score the samples, and return the files of scores.
 
     Args:
@@ -67,24 +79,53 @@ def run(systems: Sequence[str], folder: Path, benchmark: Benchmark, reporter: Re
             ``SYSTEM/SYSTEM.json`` with its scores and ``SYSTEM/costs.json``. Existing results are kept.
         benchmark: settings that all systems share.
         reporter: receiver of the progress.
+        processes: number of systems that are made at the same time, each in a process with its share of the cores.
 
     Raises:
         ConfigError: a system that occurs twice, or a recipe that does not take a setting.
     """
     reporter = reporter or Reporter()
-    names = [system.replace("/", "_") for system in systems]
+    names = [_folder_name(system) for system in systems]
     if len(set(names)) < len(names) or not names:
         raise ConfigError(
             f"the systems {', '.join(systems) or '(none)'}", "each once, and at least one", "correct them"
         )
     # Wrong words and runs of other recipes are refused before anything is trained.
     plans = [_Plan.of(system, folder, benchmark) for system in systems]
-    settings = replace(benchmark.settings, max_scans=benchmark.num_samples)
-    reference = open_source(benchmark.reference, settings.data.bad_points)
+    open_source(benchmark.reference, benchmark.settings.data.bad_points)
+    if not 1 <= processes <= _PROCESSES_AT_MOST:
+        raise ConfigError(f"{processes} processes", f"1 to {_PROCESSES_AT_MOST}", "one for a core or two is enough")
     if (benchmark.recipe_settings or benchmark.flops) and not any(plan.recipe for plan in plans):
         raise ConfigError("settings or a budget, and no recipe", "a recipe that they are for", "leave them out")
-    scores = []
-    for name, plan in zip(names, plans, strict=True):
+    by_run: dict[Path, list[str]] = {}  # systems of one run one after the other: it is trained once
+    for system, plan in zip(systems, plans, strict=True):
+        by_run.setdefault(plan.run, []).append(system)
+    remaining = _Remaining(list(systems), reporter)
+    if processes == 1:
+        for system in chain.from_iterable(by_run.values()):
+            _finish([system], folder, benchmark, reporter)
+            remaining.without([system])
+    else:
+        with safe_multiprocessing(), ProcessPoolExecutor(processes, get_context("spawn"), _share, (processes,)) as pool:
+            begun = {
+                pool.submit(_finish, some, folder, benchmark, reporter.of_process(run.name)): some
+                for run, some in by_run.items()
+            }
+            try:
+                for done in as_completed(begun):
+                    done.result()
+                    remaining.without(begun[done])
+            finally:
+                pool.shutdown(wait=True, cancel_futures=True)
+    return [folder / name / f"{name}.json" for name in names]
+
+
+def _finish(systems: Sequence[str], folder: Path, benchmark: Benchmark, reporter: Reporter) -> None:
+    """Train or load systems of one run, sample from each, and score the samples."""
+    settings = replace(benchmark.settings, max_scans=benchmark.num_samples)
+    reference = open_source(benchmark.reference, settings.data.bad_points)
+    for system in systems:
+        name, plan = _folder_name(system), _Plan.of(system, folder, benchmark)
         reporter.message(f"{name}:")
         generator = (
             load(plan.run) if plan.recipe is None or is_run(plan.run) else train(plan.recipe, plan.run, reporter)
@@ -92,11 +133,37 @@ def run(systems: Sequence[str], folder: Path, benchmark: Benchmark, reporter: Re
         generator.to("cuda" if torch.cuda.is_available() else "cpu")
         seconds = _sample(generator, plan.run, folder / name / "samples", plan.sampling, benchmark, reporter)
         _write_costs(folder / name / COSTS, plan.recipe, generator, plan.sampling, seconds, benchmark.num_samples)
-        scores.append(folder / name / f"{name}.json")
-        card = _score(str(folder / name / "samples"), reference, settings, scores[-1], reporter)
+        scores = folder / name / f"{name}.json"
+        card = _score(str(folder / name / "samples"), reference, settings, scores, reporter)
         if card.samples.scans_used < benchmark.num_samples:
             reporter.message(f"WARNING: {benchmark.reference} has but {card.samples.scans_used} scans to compare with")
-    return scores
+
+
+def _folder_name(system: str) -> str:
+    return system.replace("/", "_")
+
+
+def _share(processes: int) -> None:
+    """Give this process its share of the machine's cores."""
+    torch.set_num_threads(max(1, torch.get_num_threads() // processes))
+
+
+class _Remaining:
+    """Tells which systems are left, and about how long they will take if each takes as long as those before."""
+
+    def __init__(self, systems: list[str], reporter: Reporter) -> None:
+        self._left, self._count, self._reporter = systems, len(systems), reporter
+        self._begun = time.monotonic()
+
+    def without(self, done: Sequence[str]) -> None:
+        """Tell what is left now that these are done."""
+        self._left = [system for system in self._left if system not in done]
+        if self._left:
+            each_s = (time.monotonic() - self._begun) / (self._count - len(self._left))
+            self._reporter.message(
+                f"{self._count - len(self._left)} of {self._count} systems are done; left, for about "
+                f"{duration(each_s * len(self._left))}: {', '.join(self._left)}"
+            )
 
 
 def as_table(scores: Sequence[Path], form: Format = "text") -> str:

@@ -257,7 +257,7 @@ class LatentCache:
                     self._kept[key] = encoded.cpu()
         return torch.cat([one.to(device) for one in latents if one is not None])
 
-    def _encoded(self, image: RangeImage) -> Float[Tensor, "1 D h w"]:
+    def _encoded(self, image: RangeImage) -> Float[Tensor, "B D h w"]:
         # In full precision, as when a scan is encoded outside of training.
         with without_autocast(image.range_m.device):
             return self._tokenizer.to(image.range_m.device).latents(image).float()

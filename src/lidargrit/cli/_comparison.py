@@ -1,0 +1,45 @@
+"""Options of ``compare`` → the systems to compare, and what they have in common."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from lidargrit.evaluation.benchmark import Benchmark
+
+DEFAULTS: dict[str, Any] = {
+    "against": "simulated:256:test",
+    "count": 256,
+    "protocol": "exact",
+    "metrics": [],
+    "flops": 0.0,
+    "set": [],
+}
+"""Settings that all systems share; a table that is extended keeps its own."""
+
+
+def wanted(options: argparse.Namespace) -> tuple[list[str], Benchmark]:
+    """Return the systems to compare, and what they have in common."""
+    from lidargrit.errors import ConfigError
+    from lidargrit.evaluation.benchmark import Benchmark
+    from lidargrit.evaluation.comparison import EvalConfig
+    from lidargrit.evaluation.table_folder import read_table
+
+    if options.add:
+        given = [name for name, default in DEFAULTS.items() if getattr(options, name) != default]
+        if options.systems or given:
+            raise ConfigError(
+                f"--add with {'systems before it' if options.systems else f'settings of its own ({given[0]})'}",
+                "--add SYSTEM ... alone: all else is as in the table",
+                "leave them out, or begin a table in another folder",
+            )
+        systems, benchmark = read_table(options.out)
+        return [*systems, *(system for system in options.add if system not in systems)], benchmark
+    return options.systems, Benchmark(
+        reference=options.against,
+        num_samples=options.count,
+        settings=EvalConfig(protocol=options.protocol, metrics=tuple(options.metrics)),
+        recipe_settings=tuple(options.set),
+        flops=options.flops,
+    )

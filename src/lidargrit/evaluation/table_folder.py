@@ -1,0 +1,65 @@
+"""A folder of systems that were compared alike → how, and the costs and scores of each; it can be extended."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from lidargrit.errors import ConfigError
+from lidargrit.evaluation.benchmark import Benchmark, as_json
+from lidargrit.evaluation.comparison import EvalConfig
+from lidargrit.files import read_json, write_json
+
+TABLE = "table.json"
+_CURE = "name the systems and settings once more: lidargrit compare OUT SYSTEM ..."
+
+
+def write_table(folder: Path, systems: Sequence[str], benchmark: Benchmark, scores: Sequence[Path]) -> None:
+    """Write what :func:`read_table` reads, with every cell of the table.
+
+    Args:
+        folder: output folder of the comparison.
+        systems: names of the systems, as the user gave them.
+        benchmark: settings that they share.
+        scores: file of scores of each system.
+    """
+    settings = _settings(benchmark)
+    write_json(folder / TABLE, {"systems": list(systems), "settings": settings, "cells": as_json(scores)})
+
+
+def read_table(folder: Path) -> tuple[list[str], Benchmark]:
+    """Return the systems of a folder and the settings under which they were compared.
+
+    Raises:
+        ConfigError: no table in the folder, or one of settings that the command cannot repeat.
+    """
+    if not (folder / TABLE).is_file():
+        raise ConfigError(f"{folder}, which holds no {TABLE}", "the folder of a finished comparison", _CURE)
+    try:
+        data = read_json(folder / TABLE)
+        systems, told = [str(system) for system in data["systems"]], data["settings"]
+        benchmark = Benchmark(
+            str(told["reference"]),
+            int(told["num_samples"]),
+            EvalConfig(protocol=str(told["protocol"]), metrics=tuple(map(str, told["metrics"]))),
+            tuple(map(str, told["recipe_settings"])),
+            float(told["flops"]),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise ConfigError(f"{folder / TABLE}, which cannot be used ({error})", "what compare wrote", _CURE) from None
+    if _settings(benchmark) != told:
+        raise ConfigError(f"{folder / TABLE}, made with settings that no option names", "those of the command", _CURE)
+    return systems, benchmark
+
+
+def _settings(benchmark: Benchmark) -> dict[str, Any]:
+    return {
+        "reference": benchmark.reference,
+        "num_samples": benchmark.num_samples,
+        "protocol": benchmark.settings.protocol,
+        "metrics": list(benchmark.settings.metrics),
+        "recipe_settings": list(benchmark.recipe_settings),
+        "flops": benchmark.flops,
+        "evaluation": benchmark.settings.facts(),
+    }

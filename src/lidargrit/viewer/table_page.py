@@ -1,0 +1,118 @@
+"""Costs and scores of several systems → one page with a table that a reader can sort."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import math
+from collections.abc import Sequence
+from html import escape
+from typing import Any
+
+from lidargrit.evaluation.scorecard import format_value
+from lidargrit.viewer.report_style import STYLE
+
+_COSTS = {
+    "parameters": "parameters",
+    "training_flops": "operations of training",
+    "flops_per_scan": "operations a scan",
+    "network_evaluations": "network evaluations a scan",
+    "seconds_per_scan": "seconds a scan",
+}
+_SCRIPT = """
+for (const button of document.querySelectorAll("th button")) button.addEventListener("click", () => {
+  const head = button.parentElement, body = document.querySelector("tbody"), index = head.cellIndex;
+  const up = head.getAttribute("aria-sort") !== "ascending";
+  for (const other of head.parentElement.children) other.removeAttribute("aria-sort");
+  head.setAttribute("aria-sort", up ? "ascending" : "descending");
+  const key = (row) => row.cells[index].dataset.value ?? row.cells[index].textContent;
+  const compare = (a, b) => {
+    const [x, y] = [key(a), key(b)];
+    if (x === "" || y === "") return (x === "") - (y === "");  // cells without a number stay at the end
+    const order = isNaN(x) || isNaN(y) ? x.localeCompare(y) : x - y;
+    return up ? order : -order;
+  };
+  body.append(...[...body.rows].sort(compare));
+});
+"""
+_LOOKS = """
+th button{all:unset;cursor:pointer;font-weight:600}
+th button:hover{text-decoration:underline}
+th button:focus-visible{outline:3px solid var(--b);outline-offset:2px}
+th[aria-sort=ascending] button::after{content:" \\25B2"}
+th[aria-sort=descending] button::after{content:" \\25BC"}
+main{max-width:none}
+tbody th{white-space:nowrap}
+tfoot td,tfoot th{color:var(--soft)}
+"""
+
+
+def table_page(cells: Sequence[dict[str, Any]], flops: float) -> str:
+    """Return the page as text; it needs no network and no other file, and names of systems are escaped.
+
+    Args:
+        cells: name, costs and scores of each system, as the comparison wrote them.
+        flops: floating-point operations of the training of each; 0 where each had its own budget.
+    """
+    columns = list(dict.fromkeys(_column(score) for cell in cells for score in cell["scores"]["scores"]))
+    heads = ["system", *(f"{metric}<br><small>{variant}</small>" for metric, variant in columns), *_COSTS.values()]
+    head = "".join(f'<th scope="col"><button type="button">{name}</button></th>' for name in heads)
+    body = "".join(_row(cell, columns) for cell in cells)
+    foot = _real_against_real(cells, columns)
+    reference = cells[0]["scores"]["inputs"]["reference"] if cells else {"scans_used": 0}
+    budget = f"{flops:.2g} floating-point operations to learn with each" if flops else "each with a budget of its own"
+    checked = base64.b64encode(hashlib.sha256(_SCRIPT.encode()).digest()).decode()
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        '<meta name="color-scheme" content="light dark">\n'
+        # Nothing is fetched, and no script runs but the one below, whatever a name may hold.
+        f"<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; script-src 'sha256-{checked}'; "
+        "style-src 'unsafe-inline'\">\n"
+        f"<title>{len(cells)} systems compared</title>\n<style>{STYLE}{_LOOKS}</style>\n</head>\n<body>\n<main>\n"
+        f"<h1>{len(cells)} systems, compared alike</h1>\n"
+        f"<p>{int(reference['scans_used']):,} samples of each against as many real scans; {escape(budget)}. Brackets "
+        "hold 95 % intervals over scans. Click on a head to sort. Lower is better where nothing else is said.</p>\n"
+        '<div class="wide" tabindex="0" role="region" aria-label="scores and costs"><table><thead><tr>'
+        f"{head}</tr></thead><tbody>{body}</tbody><tfoot>{foot}</tfoot></table></div>\n"
+        f"</main>\n<script>{_SCRIPT}</script>\n</body>\n</html>\n"
+    )
+
+
+def _column(score: dict[str, Any]) -> tuple[str, str]:
+    better = ", higher is better" if score["higher_is_better"] else ""
+    return escape(str(score["metric"])), escape(f"{score['variant']}{better}")
+
+
+def _row(cell: dict[str, Any], columns: Sequence[tuple[str, str]]) -> str:
+    scores = {_column(score): score for score in cell["scores"]["scores"]}
+    found = [_score(scores.get(column)) for column in columns]
+    costs = [_number(cell["costs"].get(name)) for name in _COSTS]
+    return f'<tr><th scope="row">{escape(str(cell["system"]))}</th>{"".join([*found, *costs])}</tr>'
+
+
+def _score(score: dict[str, Any] | None) -> str:
+    if score is None or score["value"] is None:
+        return '<td data-value="">-</td>'
+    interval = score["interval"]
+    told = f"[{format_value(interval['low'])}, {format_value(interval['high'])}]" if interval else ""
+    value = float(score["value"])
+    return f'<td class="number" data-value="{value!r}">{format_value(value)} <small>{told}</small></td>'
+
+
+def _number(value: int | float | None) -> str:
+    if value is None or not math.isfinite(value):
+        return '<td data-value="">-</td>'
+    told = f"{value:,}" if isinstance(value, int) and value < 1e9 else f"{value:.3g}"
+    return f'<td class="number" data-value="{value!r}">{told}</td>'
+
+
+def _real_against_real(cells: Sequence[dict[str, Any]], columns: Sequence[tuple[str, str]]) -> str:
+    known = {
+        _column(score): score["floor"]["value"]
+        for cell in cells
+        for score in cell["scores"]["scores"]
+        if score["floor"] is not None
+    }
+    told = [f'<td class="number">{format_value(known[column]) if column in known else ""}</td>' for column in columns]
+    return f'<tr><th scope="row">real against real</th>{"".join(told)}<td colspan="{len(_COSTS)}"></td></tr>'
