@@ -1,11 +1,13 @@
-"""Quality against seconds a scan: a LidarGRIT run, token by token, beside a MaskGIT run in several numbers of passes.
+"""Quality against seconds a scan: a LidarGRIT run, token by token, beside runs that take few steps, in several numbers.
 
-    python benchmarks/fewer_steps.py OUT EXACT_RUN MASKED_RUN [-n 256] [--steps 8 16 32 64]
+    python benchmarks/fewer_steps.py OUT EXACT_RUN RUN [RUN ...] [-n 256] [--steps 8 16 32 64]
+    python benchmarks/fewer_steps.py OUT runs/small runs/maskgit runs/r2dm runs/r2flow runs/r2flow_1:1 --steps 4 16
 
-Every system writes the same number of samples, which are scored against simulated scans that none was trained on, by
-three metrics with their 95 % intervals; OUT keeps samples and scores, and the same command goes on there. Seconds are
-of whole scans, seed to range image, the best of the repeats; with OMP_NUM_THREADS=1 they are the processor's, which do
-not count waiting for neighbours. Prints the table and plots them.
+Runs of MaskGIT, R2DM, R2Flow and the like take the steps of --steps, or those behind their own colon, as a model of
+R2Flow that was distilled to one step does. Every system makes the same number of samples, which are scored against
+simulated scans that none was trained on, by three metrics with their 95 % intervals; OUT keeps samples and scores, and
+the same command goes on there. Seconds are of whole scans, seed to range image, the best of the repeats; with
+OMP_NUM_THREADS=1 they are the processor's, which do not count waiting for neighbours. Prints the table and plots them.
 """
 
 import argparse
@@ -26,6 +28,7 @@ from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.generators import Generator, load
 from lidargrit.reporting import TerminalReporter
 
+COLOURS = ("#d1495b", "#3a7d44", "#8a5fbf", "#c07f1a")
 METRICS = {"sliced_wasserstein": "textbook", "point_cloud_jsd": "exact", "return_rate_per_ring": "exact"}  # → variant
 
 
@@ -45,8 +48,10 @@ def plot(rows: list[dict], path: Path, title: str) -> None:
     """Plot a panel for each metric: its value with the interval over the seconds of one scan at a time."""
     figure = Figure(figsize=(13.0, 4.2), dpi=100)
     FigureCanvasAgg(figure)
+    names = list(dict.fromkeys(row["name"] for row in rows[1:]))
     for index, metric in enumerate(METRICS):
         axes = figure.add_subplot(1, len(METRICS), index + 1)
+        first = {row["name"]: row for row in reversed(rows)}
         for row in rows:
             value, low, high, real = row[metric]
             exact = row["steps"] is None
@@ -56,8 +61,9 @@ def plot(rows: list[dict], path: Path, title: str) -> None:
                 value,
                 [[max(0.0, value - low)], [max(0.0, high - value)]],
                 fmt="s" if exact else "o",
-                color="#26323c" if exact else "#d1495b",
+                color="#26323c" if exact else COLOURS[names.index(row["name"]) % len(COLOURS)],
                 capsize=3,
+                label=row["name"] if exact or row is first[row["name"]] else None,
             )
             axes.annotate(
                 label,
@@ -99,24 +105,31 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("exact_run", type=Path)
-    parser.add_argument("masked_run", type=Path)
+    parser.add_argument("few_step_runs", nargs="+", metavar="RUN[:STEPS,...]")
     parser.add_argument("-n", type=int, default=256)
     parser.add_argument("--steps", type=int, nargs="+", default=[8, 16, 32, 64])
-    parser.add_argument("--masked", nargs="*", default=[], metavar="NAME=VALUE", help="choices of all masked sampling")
+    parser.add_argument("--choices", nargs="*", default=[], metavar="NAME=VALUE", help="further choices of these runs")
     parser.add_argument("--batch", type=int, nargs="+", default=[1, 8], help="scans at once, in the timing")
     parser.add_argument("--picture", type=Path, default=Path("docs/pictures/quality_against_seconds.png"))
     parser.add_argument("--title", default="")
     options = parser.parse_args()
-    choices = [[f"steps={steps}", *options.masked] for steps in options.steps]
-    systems = [str(options.exact_run), *(f"{options.masked_run}:{','.join(chosen)}" for chosen in choices)]
+    few: list[tuple[str, int]] = []
+    for words in options.few_step_runs:
+        run, _, own = words.partition(":")
+        few += [(run, steps) for steps in (map(int, own.split(",")) if own else options.steps)]
+    chosen = [[f"steps={steps}", *options.choices] for _, steps in few]
+    systems = [
+        str(options.exact_run),
+        *(f"{run}:{','.join(words)}" for (run, _), words in zip(few, chosen, strict=True)),
+    ]
     benchmark = Benchmark(f"simulated:{options.n}:test", options.n, EvalConfig(metrics=tuple(METRICS)))
     scores = run_benchmark(systems, options.out, benchmark, TerminalReporter())
-    exact, masked = load(options.exact_run), load(options.masked_run)
-    choices_of = [(exact, exact.Sampling()), *((masked, override(masked.Sampling(), chosen)) for chosen in choices)]
     rows = []
-    for (generator, sampling), steps, path in zip(choices_of, [None, *options.steps], scores, strict=True):
+    for (run, steps), words, path in zip([(options.exact_run, None), *few], [[], *chosen], scores, strict=True):
+        generator = load(run)
+        sampling = override(generator.Sampling(), words)
         seconds = [seconds_per_scan(generator, sampling, batch) for batch in options.batch]
-        rows.append(row_of(generator.public_name(), steps, path, seconds))
+        rows.append(row_of(Path(run).name, steps, path, seconds))
     heads = [*(f"seconds, batch {batch}" for batch in options.batch), *METRICS]
     print(f"| {options.n} scans | passes | {' | '.join(heads)} |\n|---|---|{'---|' * len(heads)}")
     for row in rows:
