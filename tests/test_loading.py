@@ -11,6 +11,7 @@ import fsspec
 import numpy as np
 import pytest
 import torch
+from fsspec.implementations.local import LocalFileSystem
 
 from lidargrit.datasets import open_dataset
 from lidargrit.datasets.kitti_odometry import KittiOdometry
@@ -269,10 +270,41 @@ def test_prepared_images_are_a_source_here_and_by_url(tmp_path):
     assert torch.equal(here.batch([3, 0]).range_m, away.batch([3, 0]).range_m)
     with pytest.raises(DataError, match=r"prepared for 'hdl64e_kitti_odometry' \(64x2048\); wanted the rays of"):
         load_range_images((str(folder),), DataConfig(sensor="hdl64e_kitti_360"))
-    with pytest.raises(DataError, match=r"memory://bucket/nothing/plan.json, which cannot be read"):
+    with pytest.raises(DataError, match=r"memory://bucket/nothing/plan.json, which does not exist"):
         load_range_images(("memory://bucket/nothing",), SIMULATED)
     with pytest.raises(DataError, match="a URL that fsspec can open"):
         load_range_images(("gopher://somewhere",), SIMULATED)
+
+
+class Bucket(LocalFileSystem):
+    """A store as the libraries of stores are: a version comes before the range of bytes, and errors are their own."""
+
+    protocol = "bucket"
+    down = False
+
+    def info(self, path, **options):
+        if Bucket.down:
+            raise RuntimeError("no credentials")
+        return super().info(path, **options)
+
+    def cat_file(self, path, version_id=None, start=None, end=None):
+        if Bucket.down:
+            raise RuntimeError("connection lost")
+        return super().cat_file(path, start, end)
+
+
+def test_prepared_images_are_read_from_a_bucket(tmp_path, monkeypatch):
+    fsspec.register_implementation("bucket", Bucket, clobber=True)
+    folder = prepare("simulated:4", SIMULATED, tmp_path / "out")
+    images = load_range_images((f"bucket://{folder}",), SIMULATED)
+    assert torch.equal(images.batch([3, 0]).range_m, load_range_images((str(folder),), SIMULATED).batch([3, 0]).range_m)
+    monkeypatch.setattr(Bucket, "down", True)
+    with pytest.raises(
+        DataError, match=r"000000.shard, which cannot be read \(RuntimeError: connection lost\); wanted a"
+    ):
+        images.batch([1])
+    with pytest.raises(DataError, match=r"^got \S*plan.json, which cannot be read \(RuntimeError: no credentials\)"):
+        load_range_images((f"bucket://{folder}",), SIMULATED)
 
 
 def test_batches_come_in_one_order_whatever_reads_them():

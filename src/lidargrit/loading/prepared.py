@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import copy
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
@@ -111,10 +113,10 @@ class PreparedFolder:
         Raises:
             DataError: the file cannot be read.
         """
+        if not self._is_local:
+            return _RemoteBytes(self._files, f"{self._root}/{name}", f"{self.location}/{name}")
         try:
-            if self._is_local:
-                return LocalBytes(user_path(self.location) / name)
-            return _RemoteBytes(self._files, f"{self._root}/{name}")
+            return LocalBytes(user_path(self.location) / name)
         except (OSError, ValueError) as error:  # an empty file cannot be mapped
             raise DataError(
                 f"{self.location}/{name}, which cannot be read ({error})", "what lidargrit prepare wrote", "prepare it"
@@ -131,12 +133,9 @@ class PreparedFolder:
         Raises:
             DataError: the file cannot be read, or holds something else.
         """
-        file, what = self.open(name), "what lidargrit prepare wrote"
-        try:
-            data = bytes(file.read(0, min(file.size, at_most + 1)))
-        except (OSError, ValueError) as error:
-            raise DataError(f"{self.location}/{name}, which is damaged ({error})", what, "prepare again") from None
-        return parse_json(data, f"{self.location}/{name}", kind, DataError, what, "prepare again", at_most)
+        file = self.open(name)
+        data, wanted = bytes(file.read(0, min(file.size, at_most + 1))), "what lidargrit prepare wrote"
+        return parse_json(data, f"{self.location}/{name}", kind, DataError, wanted, "prepare again", at_most)
 
     def read_spec(self) -> PreparedSpec:
         """Read what the images were prepared from and how, or raise DataError."""
@@ -162,12 +161,36 @@ def _is_named(scan: Any) -> bool:
 
 
 class _RemoteBytes:
-    def __init__(self, files: Any, path: str) -> None:
-        self._files, self._path = files, path
-        self.size = int(files.info(path)["size"])
+    """A file in a store that fsspec knows, such as an S3 bucket.
+
+    Raises:
+        DataError: there is no such file, or the store does not answer, or not to this user.
+    """
+
+    def __init__(self, files: Any, path: str, url: str) -> None:
+        self._files, self._path, self._url = files, path, url
+        with self._store_errors():
+            self.size = int(files.info(path)["size"])
 
     def read(self, start: int, end: int) -> bytes:
-        return self._files.cat_file(self._path, start, end)
+        """Return the bytes from ``start`` up to ``end``."""
+        with self._store_errors():  # by keyword: some stores have a version of the file before the start
+            return self._files.cat_file(self._path, start=start, end=end)
+
+    @contextmanager
+    def _store_errors(self) -> Iterator[None]:
+        try:
+            yield
+        except FileNotFoundError:
+            raise DataError(
+                f"{self._url}, which does not exist", "what lidargrit prepare wrote", "prepare it, or check the URL"
+            ) from None
+        except Exception as error:  # the library of every store has errors of its own
+            raise DataError(
+                f"{self._url}, which cannot be read ({type(error).__name__}: {error})",
+                "a store that can be reached with your credentials",
+                "check its address and the credentials, then give the same command again",
+            ) from None
 
 
 class PreparedImages:

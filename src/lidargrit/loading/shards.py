@@ -58,7 +58,11 @@ class Bytes(Protocol):
     size: int
 
     def read(self, start: int, end: int) -> bytes | memoryview:
-        """Return the bytes from ``start`` up to ``end``."""
+        """Return the bytes from ``start`` up to ``end``.
+
+        Raises:
+            DataError: they lie on another machine, which does not answer.
+        """
         ...
 
 
@@ -146,13 +150,14 @@ def read_index(file: Bytes, name: str) -> tuple[list[Entry], dict[int, str]]:
     Raises:
         DataError: the file is no whole shard.
     """
+    tail = bytes(file.read(max(0, file.size - _TAIL), file.size))
+    length = int.from_bytes(tail[:8], "little")
+    start = file.size - _TAIL - length
+    if tail[8:] != _MAGIC or not len(_MAGIC) <= start or length > JSON_BYTES_AT_MOST:
+        raise _damaged(name, ValueError("no index at its end"))
+    data = bytes(file.read(start, file.size - _TAIL))
     try:
-        tail = bytes(file.read(max(0, file.size - _TAIL), file.size))
-        length = int.from_bytes(tail[:8], "little")
-        start = file.size - _TAIL - length
-        if tail[8:] != _MAGIC or not len(_MAGIC) <= start or length > JSON_BYTES_AT_MOST:
-            raise ValueError("no index at its end")
-        index = parse_json(bytes(file.read(start, file.size - _TAIL)), "its index")
+        index = parse_json(data, "its index")
         entries = [Entry(**entry) for entry in index["entries"]]
         for entry in entries:
             numbers = entry.scan, entry.offset, entry.range_bytes, entry.reflectance_bytes
@@ -163,7 +168,7 @@ def read_index(file: Bytes, name: str) -> tuple[list[Entry], dict[int, str]]:
             if entry.offset + entry.range_bytes + entry.reflectance_bytes > start:
                 raise ValueError("an image beyond its end")
         return entries, {int(scan): str(why) for scan, why in index["left_out"].items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise _damaged(name, error) from None
 
 
@@ -175,13 +180,11 @@ def read_image(
     Raises:
         DataError: the image is damaged.
     """
-    middle = entry.offset + entry.range_bytes
+    blob = file.read(entry.offset, entry.offset + entry.range_bytes + entry.reflectance_bytes)
     try:
-        steps = _decompress(file.read(entry.offset, middle), shape, np.uint16)
-        levels = None
-        if entry.reflectance_bytes:
-            levels = _decompress(file.read(middle, middle + entry.reflectance_bytes), shape, np.uint8)
-    except (OSError, ValueError, RuntimeError, TypeError) as error:
+        steps = _decompress(blob[: entry.range_bytes], shape, np.uint16)
+        levels = _decompress(blob[entry.range_bytes :], shape, np.uint8) if entry.reflectance_bytes else None
+    except (ValueError, RuntimeError, TypeError) as error:
         raise _damaged(name, error) from None
     if verify and _fingerprint(steps, levels) != entry.fingerprint:
         raise _damaged(name, ValueError("pixels that differ from their fingerprint"))
