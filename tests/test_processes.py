@@ -40,7 +40,7 @@ STEADY = [  # no random numbers of a process, only of a scan; codes that restart
     "training.transformer.validate_every=8",
 ]
 RANK = """
-import sys
+import contextlib, io, os, sys
 from pathlib import Path
 import torch
 from lidargrit.cli import main
@@ -52,6 +52,12 @@ weights, rank = play()
 torch.save(weights, folder / f"game{rank}.pt")
 assert steps_with_a_bad_process() == [False, False]
 assert main([*words, "training.tokenizer.learning_rate=1"]) == 2  # all are told what the first found
+if rank == 1:
+    os._exit(0)  # dies in the middle of the work, as far as the other can see
+with contextlib.redirect_stderr(io.StringIO()) as told:
+    assert main([words[0], words[1], str(folder / "alone"), *words[3:]]) == 2
+assert "got no answer from another of 2 processes; wanted all of them" in told.getvalue(), told.getvalue()
+assert "Traceback" not in told.getvalue()
 """
 
 

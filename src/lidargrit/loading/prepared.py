@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from typing import Any
@@ -18,6 +19,7 @@ from lidargrit.untrusted import JSON_BYTES_AT_MOST, parse_json, user_path
 
 PLAN_FILE, SCANS_FILE = "plan.json", "scans.json"
 FORMAT = 2  # to be raised whenever projection or simulation give other pixels for the same scan
+_OPENED_AT_ONCE = 16  # shards: a store takes some hundredths of a second for each
 _LIST_BYTES_AT_MOST = 2**28  # the list of a million scans takes half of it
 
 
@@ -215,8 +217,9 @@ class PreparedImages:
         scans = self._folder.read_json(SCANS_FILE, list, _LIST_BYTES_AT_MOST)
         if len(scans) != self.spec.num_scans or not all(map(_is_named, scans)):
             raise DataError(f"{location}/{SCANS_FILE}, which is damaged", "the scans of the plan", "prepare again")
-        for shard in range(self.spec.num_shards):
-            entries, left_out = read_index(self._bytes(shard), shard_name(shard))
+        with ThreadPoolExecutor(_OPENED_AT_ONCE) as pool:
+            indices = list(pool.map(self._read_index, range(self.spec.num_shards)))
+        for shard, (entries, left_out) in enumerate(indices):
             if sorted([*(entry.scan for entry in entries), *left_out]) != list(self.spec.scans_of(shard)):
                 raise DataError(f"{shard_name(shard)} with other scans", "those of the plan", "prepare again")
             self._entries += [(shard, entry) for entry in entries]
@@ -283,8 +286,13 @@ class PreparedImages:
         """Return the number of the shard that holds an image."""
         return self._entries[index][0]
 
+    def _read_index(self, shard: int) -> tuple[list[Entry], dict[int, str]]:
+        return read_index(self._bytes(shard), shard_name(shard))
+
     def _bytes(self, shard: int) -> Bytes:
         with self._lock:
-            if shard not in self._open:
-                self._open[shard] = self._folder.open(shard_name(shard))
-            return self._open[shard]
+            if shard in self._open:
+                return self._open[shard]
+        file = self._folder.open(shard_name(shard))  # not under the lock: a store takes a while to answer
+        with self._lock:
+            return self._open.setdefault(shard, file)

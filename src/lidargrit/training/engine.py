@@ -6,15 +6,17 @@ import logging
 import os
 import resource
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.distributed import DistError
 
 from lidargrit.determinism import derive_seed
-from lidargrit.errors import LidarGritError
+from lidargrit.errors import LidarGritError, TrainingError
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.precision import Precision, dtype_of
 from lidargrit.processes import rank_and_world_size
@@ -65,6 +67,24 @@ class Engine:
             error = self._fabric.broadcast(error)
         if error is not None:
             raise error
+
+    @contextmanager
+    def lost_processes_reported(self) -> Iterator[None]:
+        """Say in one line that another process has died, whatever the library of the connection says.
+
+        Raises:
+            TrainingError: another process does not answer any more.
+        """
+        try:
+            yield
+        except RuntimeError as error:  # NCCL has a class of its own for it, gloo has not
+            if self.world_size == 1 or not (isinstance(error, DistError) or "/gloo/" in str(error)):
+                raise
+            raise TrainingError(
+                f"no answer from another of {self.world_size} processes",
+                "all of them to run until the end",
+                "see what the others printed; the same command goes on from the last checkpoint",
+            ) from None
 
     def peak_gib(self) -> float:
         """Return the largest memory that this process has held so far, in GiB, on its GPU or else in the machine."""

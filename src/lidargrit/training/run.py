@@ -57,12 +57,12 @@ def train(
     Raises:
         OutputError: the folder holds something else, another process trains in it, or it cannot be written.
         DataError, ScanError: the data cannot be used.
-        TrainingError: the loss is not finite.
+        TrainingError: the loss is not finite, or another process of a launcher has died.
         ConfigError: a stage to be taken from another run has other settings or another sensor than the recipe.
     """
     engine = Engine("fp32")  # tells which of several processes is the first, the only one that writes
     reporter = reporter if reporter and engine.rank == 0 else Reporter()
-    with ExitStack() as held:
+    with ExitStack() as held, engine.lost_processes_reported():
         engine.by_first(lambda: check_folder(folder, recipe))
         engine.by_first(lambda: held.enter_context(claim_folder(folder)))
         return _train(recipe, folder, reporter, plot, engine)
