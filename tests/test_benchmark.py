@@ -190,9 +190,11 @@ def test_processes_make_a_table_that_can_be_extended(tmp_path, capfd):
 
 
 def test_a_page_of_foreign_names_holds_no_code_of_theirs():
-    score = {"metric": "<b>", "variant": "x", "higher_is_better": False, "value": 0.5, "interval": None, "floor": None}
+    score = {"metric": "<b>", "variant": "x", "higher_is_better": False, "value": 0.5, "interval": None}
+    score["real_against_real"] = {"value": 0.25, "num_scans": 4, "halvings": 2}
     scores = {"scores": [score], "inputs": {"reference": {"scans_used": 4}}}
     page = table_page([{"system": "<script>alert(1)</script>", "costs": {"parameters": 3}, "scores": scores}], 0.0)
     assert "<script>alert" not in page
     assert "&lt;script&gt;alert" in page
     assert page.count("<script>") == 1
+    assert "0.25" in page

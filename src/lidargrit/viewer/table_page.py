@@ -108,11 +108,10 @@ def _number(value: int | float | None) -> str:
 
 
 def _real_against_real(cells: Sequence[dict[str, Any]], columns: Sequence[tuple[str, str]]) -> str:
-    known = {
-        _column(score): score["floor"]["value"]
-        for cell in cells
-        for score in cell["scores"]["scores"]
-        if score["floor"] is not None
-    }
+    known = {}
+    for score in (score for cell in cells for score in cell["scores"]["scores"]):
+        real = score["real_against_real"] if "real_against_real" in score else score["floor"]  # its name before
+        if real is not None:
+            known[_column(score)] = real["value"]
     told = [f'<td class="number">{format_value(known[column]) if column in known else ""}</td>' for column in columns]
     return f'<tr><th scope="row">real against real</th>{"".join(told)}<td colspan="{len(_COSTS)}"></td></tr>'
