@@ -128,7 +128,7 @@ class Archive:
         if end != _END or not offset <= size - _TAIL.size:
             raise self._damaged()
         file.seek(offset)
-        packed = file.read(size - _TAIL.size - offset)
+        packed = file.read(min(size - _TAIL.size - offset, JSON_BYTES_AT_MOST))
         if zlib.crc32(packed) != crc32:
             raise self._damaged()
         opened = zlib.decompressobj()
