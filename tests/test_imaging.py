@@ -114,6 +114,15 @@ def test_a_shuffled_set_is_compared_as_if_it_were_in_order(folders, protocol):
     assert {each.projection_variant for each in (swapped.samples, swapped.reference)} == {"exact"}
 
 
+def test_scans_are_known_again_without_their_reflectance(folders, tmp_path):
+    """As bare coordinates in .npy the same scans were not told to overlap before."""
+    whole = open_source(str(folders / "fired"))
+    for index in range(2):
+        np.save(tmp_path / f"{index}.npy", whole.scans().scan(index).points_xyz_m.numpy())
+    bare = open_source(str(tmp_path)).images(HDL64E)
+    assert whole.images(HDL64E).provenance.overlap(bare.provenance) == "2 scans are in both"
+
+
 def test_an_order_that_is_asked_for_is_not_replaced(folders):
     with pytest.raises(ScanError, match="not stored as they were fired"):
         open_source(str(folders / "shuffled")).images(HDL64E, DataConfig(projection="unfolding"))

@@ -21,6 +21,7 @@ from lidargrit.structures import Scan
 
 __all__ = ["SensorFit", "fit_sensor", "fit_sensor_to_source"]
 
+_HALVED = 8  # networks halve the columns up to three times
 _COLUMNS_UNCLEAR = 1024  # what most range images of the literature have
 _AGREE_AT_LEAST = 0.4  # motion-corrected scans of KITTI reach 0.6, points seen from another place 0.1
 _FEW_SCANS = 5  # a moving car tilts, and its far rings meet little: one scan shows both
@@ -202,7 +203,8 @@ def _model(
     return SensorModel(
         name=name,
         elevation_rad=torch.from_numpy(np.radians(rows.elevation_deg)).float()[:, None],
-        azimuth_rad=column_azimuths_rad(columns or _COLUMNS_UNCLEAR),
+        # The nearest number that networks can halve three times: four columns more or less, of hundreds.
+        azimuth_rad=column_azimuths_rad(_HALVED * max(1, round((columns or _COLUMNS_UNCLEAR) / _HALVED))),
         range_min_m=near_m,
         range_max_m=far_m,
         projection=_projection(rows, rings),

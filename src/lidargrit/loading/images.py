@@ -28,19 +28,27 @@ class Provenance:
         names: one name for each image: the file of its scan, or another identifier.
         recordings: names of the drives that the images were cut from; empty for generated scans.
         fingerprints: one hash of the pixels for each image; empty where it is not known.
+        range_fingerprints: one hash of the ranges for each image, without reflectance; empty or "" where it is not
+            known.
     """
 
     names: tuple[str, ...] = ()
     recordings: tuple[str, ...] = ()
     fingerprints: tuple[str, ...] = ()
+    range_fingerprints: tuple[str, ...] = ()
 
     def overlap(self, other: Provenance) -> str:
         """Return in a few words what two sets share; "" if they share nothing that is known.
 
-        Two scans are the same if their files or their pixels are. Scans of one drive show the same streets; they are
-        recognised by their recording, also where two data sets hold the same recording.
+        Two scans are the same if their files, their pixels or their ranges are. Scans of one drive show the same
+        streets; they are recognised by their recording, also where two data sets hold the same recording.
         """
-        scans = max(len(set(self.names) & set(other.names)), len(set(self.fingerprints) & set(other.fingerprints)))
+        pairs = (
+            (self.names, other.names),
+            (self.fingerprints, other.fingerprints),
+            (self.range_fingerprints, other.range_fingerprints),
+        )
+        scans = max(len((set(mine) & set(theirs)) - {""}) for mine, theirs in pairs)
         if scans:
             return f"{scans} {'scans are' if scans > 1 else 'scan is'} in both"
         drives = sorted(set(self.recordings) & set(other.recordings) - {""})
@@ -91,6 +99,7 @@ class RangeImages:
             tuple(name for part in parts for name in part.names),
             tuple(recording for part in parts for recording in part.recordings),
             tuple(fingerprint for part in parts for fingerprint in part.fingerprints),
+            tuple(fingerprint for part in parts for fingerprint in part.range_fingerprints),
         )
 
     @cached_property

@@ -228,6 +228,11 @@ class PreparedImages:
             tuple(scans[entry.scan][0] for _, entry in self._entries),
             tuple(scans[entry.scan][1] for _, entry in self._entries),
             tuple(entry.fingerprint for _, entry in self._entries),
+            # Without reflectance the ranges are all pixels, in older shards, too.
+            tuple(
+                entry.range_fingerprint or ("" if entry.reflectance_bytes else entry.fingerprint)
+                for _, entry in self._entries
+            ),
         )
 
     def __len__(self) -> int:
@@ -237,10 +242,12 @@ class PreparedImages:
         """Return so many of the images, evenly spaced, without opening the folder again."""
         chosen, known, indices = copy.copy(self), self.provenance, evenly_spaced(count, len(self))
         chosen._entries = [self._entries[index] for index in indices]
-        names, recordings, fingerprints = (
-            tuple(of[index] for index in indices) for of in (known.names, known.recordings, known.fingerprints)
+        chosen.provenance = Provenance(
+            *(
+                tuple(of[index] for index in indices)
+                for of in (known.names, known.recordings, known.fingerprints, known.range_fingerprints)
+            )
         )
-        chosen.provenance = Provenance(names, recordings, fingerprints)
         return chosen
 
     def require_projection(self, sensor: SensorModel, variant: str) -> None:

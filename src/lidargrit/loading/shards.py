@@ -42,6 +42,8 @@ class Entry:
         range_bytes: length of the compressed range.
         reflectance_bytes: length of the compressed reflectance, which follows the range; 0 if there is none.
         fingerprint: hash of the pixels before compression.
+        range_fingerprint: hash of the ranges alone, by which a scan is known without its reflectance; "" in shards of
+            before it was written.
     """
 
     scan: int
@@ -49,6 +51,7 @@ class Entry:
     range_bytes: int
     reflectance_bytes: int
     fingerprint: str
+    range_fingerprint: str = ""
 
 
 @runtime_checkable
@@ -113,7 +116,8 @@ class ShardWriter:
         levels = None if image.reflectance is None else np.rint(image.reflectance.numpy() * 255).astype(np.uint8)
         range_blob, reflectance_blob = _compress(steps), b"" if levels is None else _compress(levels)
         lengths = len(range_blob), len(reflectance_blob)
-        self._append(Entry(scan, self._end, *lengths, _fingerprint(steps, levels)), range_blob + reflectance_blob)
+        hashes = _fingerprint(steps, levels), _fingerprint(steps, None)
+        self._append(Entry(scan, self._end, *lengths, *hashes), range_blob + reflectance_blob)
 
     def add_from(self, file: Bytes, name: str) -> None:
         """Add all that another file of this class holds.
@@ -163,7 +167,7 @@ def read_index(file: Bytes, name: str) -> tuple[list[Entry], dict[int, str]]:
             numbers = entry.scan, entry.offset, entry.range_bytes, entry.reflectance_bytes
             if not all(type(number) is int and number >= 0 for number in numbers):
                 raise ValueError("lengths that are no whole numbers")
-            if not isinstance(entry.fingerprint, str):
+            if not (isinstance(entry.fingerprint, str) and isinstance(entry.range_fingerprint, str)):
                 raise ValueError("a fingerprint that is none")
             if entry.offset + entry.range_bytes + entry.reflectance_bytes > start:
                 raise ValueError("an image beyond its end")

@@ -182,12 +182,17 @@ def _write_trained_on(folder: Path, train_images: RangeImages, donor: str | None
     """Write which scans the model learns from, without names of the user's files, so that samples can carry it on."""
     if not (folder / TRAINED_ON_FILE).exists():
         came_from = train_images.provenance
-        facts = {"recordings": {*came_from.recordings} - {""}, "fingerprints": {*came_from.fingerprints}}
+        facts = {
+            "recordings": {*came_from.recordings} - {""},
+            "fingerprints": {*came_from.fingerprints},
+            "range_fingerprints": {*came_from.range_fingerprints} - {""},
+        }
         if donor is not None:  # the model has learned from the scans of the stages that it takes, too
             theirs = trained_on(locate(donor))
             facts = {
                 "recordings": facts["recordings"] | {*theirs.recordings},
                 "fingerprints": facts["fingerprints"] | {*theirs.fingerprints},
+                "range_fingerprints": facts["range_fingerprints"] | {*theirs.range_fingerprints},
             }
         write_text(folder / TRAINED_ON_FILE, json.dumps({name: sorted(known) for name, known in facts.items()}) + "\n")
 

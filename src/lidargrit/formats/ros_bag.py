@@ -1,0 +1,255 @@
+"""ROS recordings (.bag, .mcap, .db3): messages sensor_msgs/PointCloud2 of one topic → :class:`Scan`."""
+
+from __future__ import annotations
+
+import functools
+import sqlite3
+import warnings
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+from urllib.parse import quote
+
+import numpy as np
+
+from lidargrit.errors import ScanError
+from lidargrit.formats import POINTS_AT_MOST, BadPoints, ScanFormat, damaged, first_bytes, open_file
+from lidargrit.formats._columns import BYTES_AT_MOST, REFLECTANCE_RULE, scan_of_columns
+from lidargrit.structures import Scan
+
+_FORMAT = "a recording of ROS with messages sensor_msgs/PointCloud2"
+_INSTALL = "pip install 'lidargrit[ros]'"
+_MAGIC = {".bag": b"#ROSBAG V2.0", ".mcap": b"\x89MCAP", ".db3": b"SQLite format 3\x00"}
+_TYPES = ("sensor_msgs/msg/PointCloud2", "sensor_msgs/PointCloud2")
+_MESSAGES_AT_MOST = 1_000_000  # a day at ten revolutions a second
+_CHUNK_BYTES_AT_MOST = 64_000_000  # as packed in the file: recorders write below 10 MB
+_SQLITE_STEPS_AT_MOST = 100_000_000  # of its machine, for one question: a second or two
+_NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # PointField's datatype
+
+
+class RosBag(ScanFormat):
+    """Recordings of ROS 1 (``.bag``) and ROS 2 (``.mcap``, ``.db3``): one scan for each message with a point cloud.
+
+    Of several topics with point clouds the one with the most messages counts, of equally many the first by name. A file
+    needs no ``metadata.yaml`` beside it; each file of a split recording is read by itself.
+
+    Source:
+        sensor_msgs/PointCloud2 and PointField of ROS; unpacked by the libraries rosbags and mcap.
+    """
+
+    title = "ROS recording (.bag, .mcap, .db3)"
+    suffixes = (".bag", ".mcap", ".db3")
+    reflectance = REFLECTANCE_RULE
+    several = True
+    extra = "ros"
+
+    @staticmethod
+    def recognises(path: Path) -> bool:
+        """Tell whether a file begins as a recording."""
+        return first_bytes(path, 16).startswith(tuple(_MAGIC.values()))
+
+    @staticmethod
+    def count(path: Path) -> int:
+        """Count the point clouds of the topic."""
+        return len(_open(path).times)
+
+    @staticmethod
+    def read(path: Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
+        """Read one point cloud."""
+        recording = _open(path)
+        if not 0 <= index < len(recording.times):
+            what = f"scan number {index} of {path}"
+            raise ScanError(what, f"one of its {len(recording.times)}, counted from 0", "take another")
+        try:
+            columns = _columns(recording.message(index))
+        except Exception as error:  # the libraries meet damaged bytes with whatever they stumble over
+            raise damaged(path, _FORMAT, error) from None
+        return scan_of_columns(columns, path, bad_points)
+
+
+@runtime_checkable
+class _Recording(Protocol):
+    """The messages of one topic, in the order of time."""
+
+    times: list[int]
+    """Time of each message, or another number that orders and finds them."""
+
+    def message(self, index: int) -> Any:
+        """Return one PointCloud2, by its number."""
+        ...
+
+
+def _open(path: Path) -> _Recording:
+    with open_file(path, _FORMAT) as file:
+        start = file.read(16)
+    kind = next((kind for kind, magic in _MAGIC.items() if start.startswith(magic)), None)
+    if kind is None:
+        raise ScanError(f"{path}, which is no recording", _FORMAT, "check what wrote it")
+    try:
+        status = path.stat()
+        with warnings.catch_warnings(action="ignore"):  # of what a library will drop
+            recording = _opened(kind, path, (status.st_size, status.st_mtime_ns))
+    except ImportError as error:
+        raise ScanError(f"{path}, which takes {error.name or 'rosbags'} to read", "it installed", _INSTALL) from None
+    except Exception as error:
+        raise damaged(path, _FORMAT, error) from None
+    if not 1 <= len(recording.times) <= _MESSAGES_AT_MOST:
+        raise ScanError(f"{len(recording.times)} point clouds in {path}", _FORMAT, "record the lidar's topic")
+    return recording
+
+
+@functools.lru_cache(maxsize=4)
+def _opened(kind: str, path: Path, _version: tuple[int, int]) -> _Recording:
+    return {".bag": _Ros1, ".mcap": _Mcap, ".db3": _Sqlite}[kind](path)
+
+
+def _busiest(topics: Counter[str]) -> str:
+    """Return the topic with the most point clouds."""
+    if not topics:
+        raise ValueError("no topic with PointCloud2")
+    return min(topics, key=lambda topic: (-topics[topic], topic))
+
+
+class _Ros1:
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        with _bag(path) as reader:
+            clouds = [each for each in reader.connections if each.msgtype in _TYPES]
+            topic = _busiest(
+                Counter({each.topic: sum(c.msgcount for c in clouds if c.topic == each.topic) for each in clouds})
+            )
+            self._ids = {each.id for each in clouds if each.topic == topic}
+            if sum(each.msgcount for each in clouds if each.id in self._ids) > _MESSAGES_AT_MOST:
+                raise ValueError("more messages than a recording can have")
+            self.times = sorted(entry.time for each in self._ids for entry in reader.indexes[each])
+
+    def message(self, index: int) -> Any:
+        from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415  an optional part
+
+        with _bag(self._path) as reader:
+            for chunk in reader.chunks.values():
+                if chunk.datasize > _CHUNK_BYTES_AT_MOST or chunk.decompressor.__module__ == "bz2":
+                    raise ValueError("chunks of bzip2 or of more than 64 MB: unpack it with rosbag decompress")
+            clouds = [each for each in reader.connections if each.id in self._ids]
+            same = self.times[:index].count(self.times[index])
+            found = reader.messages(clouds, self.times[index], self.times[index] + 1)
+            raw = [data for _, _, data in found][same]
+        return get_typestore(Stores.ROS1_NOETIC).deserialize_ros1(raw, _TYPES[0])
+
+
+@contextmanager
+def _bag(path: Path) -> Iterator[Any]:
+    """Open a recording of ROS 1; the library leaves the file open where it meets a damaged one."""
+    from rosbags.rosbag1 import Reader  # noqa: PLC0415  an optional part
+
+    reader = Reader(path)
+    try:
+        reader.open()
+        yield reader
+    finally:
+        if reader.bio is not None:
+            reader.bio.close()
+
+
+class _Mcap:
+    def __init__(self, path: Path) -> None:
+        from mcap.reader import SeekingReader  # noqa: PLC0415  an optional part
+
+        self._path = path
+        with path.open("rb") as file:
+            reader = SeekingReader(file, record_size_limit=BYTES_AT_MOST)
+            summary = reader.get_summary()
+            if summary is None or summary.statistics is None or not summary.chunk_indexes:
+                raise ValueError("no summary at its end: repair it with mcap recover")
+            for chunk in summary.chunk_indexes:
+                if chunk.uncompressed_size > BYTES_AT_MOST or chunk.compressed_size > _CHUNK_BYTES_AT_MOST:
+                    raise ValueError("a chunk larger than any recorder's")
+            types = {key: schema.name for key, schema in summary.schemas.items()}
+            counts = summary.statistics.channel_message_counts
+            clouds = [each for each in summary.channels.values() if types.get(each.schema_id) in _TYPES]
+            topics: Counter[str] = Counter()
+            for each in clouds:
+                topics[each.topic] += counts.get(each.id, 0)
+            self._topic = _busiest(topics)
+            if topics[self._topic] > _MESSAGES_AT_MOST:
+                raise ValueError("more messages than a recording can have")
+            self._encoding = next(each.message_encoding for each in clouds if each.topic == self._topic)
+            self.times = [message.log_time for _, _, message in reader.iter_messages(topics=[self._topic])]
+
+    def message(self, index: int) -> Any:
+        from mcap.reader import SeekingReader  # noqa: PLC0415  an optional part
+
+        time, same = self.times[index], self.times[:index].count(self.times[index])
+        with self._path.open("rb") as file, warnings.catch_warnings(action="ignore"):
+            reader = SeekingReader(file, record_size_limit=BYTES_AT_MOST)
+            found = reader.iter_messages(topics=[self._topic], start_time=time, end_time=time + 1)
+            raw = [message.data for _, _, message in found][same]
+        return _decoded(raw, self._encoding)
+
+
+class _Sqlite:
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        topics: Counter[str] = Counter()
+        with closing(self._connected()) as database:
+            kinds = dict(database.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'"))
+            for table in ("topics", "messages"):  # and no view or virtual table, which could be anything
+                if not str(kinds.get(table, "")).upper().startswith("CREATE TABLE"):
+                    raise ValueError(f"no table {table}")
+            numbers = {}
+            for number, name, kind in database.execute("SELECT id, name, type FROM topics LIMIT 10000"):
+                if kind in _TYPES:
+                    numbers[str(name)] = int(number)
+                    (count,) = database.execute(
+                        "SELECT COUNT(*) FROM messages WHERE topic_id = ?", (number,)
+                    ).fetchone()
+                    topics[str(name)] = count
+            number = numbers[_busiest(topics)]
+            query = "SELECT rowid FROM messages WHERE topic_id = ? ORDER BY timestamp, rowid LIMIT ?"
+            self.times = [row for (row,) in database.execute(query, (number, _MESSAGES_AT_MOST + 1))]
+
+    def message(self, index: int) -> Any:
+        with closing(self._connected()) as database:
+            query = "SELECT data FROM messages WHERE rowid = ? AND length(data) <= ?"
+            (raw,) = database.execute(query, (self.times[index], BYTES_AT_MOST)).fetchone()
+        return _decoded(raw, "cdr")
+
+    def _connected(self) -> sqlite3.Connection:
+        """Open the file to read only, without files beside it, and with an end to every question."""
+        database = sqlite3.connect(f"file:{quote(str(self._path.resolve()))}?mode=ro&immutable=1", uri=True)
+        database.execute("PRAGMA trusted_schema = OFF")
+        database.set_progress_handler(lambda: 1, _SQLITE_STEPS_AT_MOST)
+        return database
+
+
+def _decoded(raw: bytes, encoding: str) -> Any:
+    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415  an optional part
+
+    if encoding == "ros1":
+        return get_typestore(Stores.ROS1_NOETIC).deserialize_ros1(raw, _TYPES[0])
+    if encoding != "cdr":
+        raise ValueError(f"messages in {encoding[:20]}, not in cdr")
+    return get_typestore(Stores.ROS2_FOXY).deserialize_cdr(raw, _TYPES[0])
+
+
+def _columns(cloud: Any) -> dict[str, np.ndarray]:
+    """Return the named columns of a PointCloud2; one of several numbers a point is left alone."""
+    order = ">" if cloud.is_bigendian else "<"
+    fields = [each for each in cloud.fields if each.count <= 1 and each.datatype in _NUMBERS]
+    kind = np.dtype(
+        {
+            "names": [each.name for each in fields],
+            "formats": [order + _NUMBERS[each.datatype] for each in fields],
+            "offsets": [each.offset for each in fields],
+            "itemsize": cloud.point_step,
+        }
+    )
+    data = np.ascontiguousarray(cloud.data, dtype=np.uint8)
+    width, height, row = int(cloud.width), int(cloud.height), int(cloud.row_step)
+    if width * height > POINTS_AT_MOST or width * cloud.point_step > row or row * height > len(data):
+        raise ValueError(f"{width}x{height} points in {len(data)} bytes")
+    rows = data[: row * height].reshape(height, row)[:, : width * cloud.point_step]
+    points = np.ascontiguousarray(rows).view(kind).reshape(-1)
+    return {each.name: points[each.name] for each in fields}
