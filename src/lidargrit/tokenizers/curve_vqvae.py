@@ -13,13 +13,20 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from lidargrit.errors import ConfigError
-from lidargrit.nn.blocks import Block, Network
+from lidargrit.nn.blocks import Block
 from lidargrit.nn.convolution import Convolution, Downsample, ResidualBlock, group_norm
 from lidargrit.nn.flops import flops_of
-from lidargrit.nn.quantiser import CodebookLoss, VectorQuantiser
+from lidargrit.nn.quantiser import CodebookLoss
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import Decoded, RangeImage, TokenGrid
-from lidargrit.tokenizers import CodebookTokenizer, TokenizerConfig
+from lidargrit.tokenizers import TokenizerConfig
+from lidargrit.tokenizers._convolutional import (
+    ConvolutionalDecoder,
+    ConvolutionalEncoder,
+    ConvolutionalTokenizer,
+    Level,
+    check_sizes,
+)
 
 _NOTHING_M = 1e-4  # is added to every range by the logarithmic encoding
 _THRESHOLD_UNIT = 1 / 255  # of the encoded range: nearer values are no return
@@ -62,13 +69,7 @@ class CurveVqvaeConfig(TokenizerConfig):
     restart_dead_codes: bool = False
 
     def __post_init__(self) -> None:
-        if self.channels < 32 or self.channels % 32:
-            raise ConfigError(
-                f"channels={self.channels}", "a positive multiple of 32", "the norms share 32 groups: round it up"
-            )
-        for name, most in (("residual_blocks", 100), ("code_dim", 16_384), ("num_codes", 65_536)):
-            if not 1 <= getattr(self, name) <= most:
-                raise ConfigError(f"{name}={getattr(self, name)}", f"1 to {most}", "correct it")
+        check_sizes(self.channels, self.residual_blocks, self.code_dim, self.num_codes)
         multipliers, strides = self.channel_multipliers, self.row_strides
         if len(strides) > 15 or {*strides} - {1, 2} or len(multipliers) != len(strides) + 1 or min(multipliers) < 1:
             raise ConfigError(
@@ -84,23 +85,10 @@ class CurveVqvaeConfig(TokenizerConfig):
         return [self.channels * multiplier for multiplier in self.channel_multipliers]
 
 
-class CurveLevel(nn.Module):
-    """One resolution of the encoder or the decoder: residual blocks, then perhaps a change of resolution."""
-
-    def __init__(self, inputs: int, width: int, num_blocks: int, kernel: tuple[int, int]) -> None:
-        super().__init__()
-        widths = [inputs, *[width] * num_blocks]
-        self.block = nn.ModuleList(ResidualBlock(*pair, 0.0, "wrap", kernel) for pair in pairwise(widths))
-        self.downsample: Downsample | None = None
-        self.upsample: CurveUpsample | None = None
-
-    def forward(self, x: Float[Tensor, "B C H W"]) -> Float[Tensor, "B D h w"]:
-        """Return the feature maps of the next level."""
-        for block in self.block:
-            x = block(x)
-        if self.downsample is not None:
-            x = self.downsample(x)
-        return x if self.upsample is None else self.upsample(x)
+def _level(inputs: int, width: int, num_blocks: int, kernel: tuple[int, int]) -> Level:
+    """Make residual blocks with one kernel."""
+    widths = [inputs, *[width] * num_blocks]
+    return Level([ResidualBlock(*pair, 0.0, "wrap", kernel) for pair in pairwise(widths)])
 
 
 class CurveUpsample(nn.Module):
@@ -147,14 +135,14 @@ class CurveMiddle(nn.Module):
         return self.block_2(self.attn_1(self.block_1(x)))
 
 
-class CurveEncoder(Network):
+class CurveEncoder(ConvolutionalEncoder):
     """The network from encoded range (B, 1, H, W) to latents (B, code_dim, h, w)."""
 
     def __init__(self, config: CurveVqvaeConfig) -> None:
         super().__init__()
         widths = config.widths()
         self.conv_in = Convolution(1, config.channels, "wrap")
-        levels = [CurveLevel(*pair, config.residual_blocks, _SQUARE) for pair in pairwise([config.channels, *widths])]
+        levels = [_level(*pair, config.residual_blocks, _SQUARE) for pair in pairwise([config.channels, *widths])]
         for level, width, row_stride in zip(levels, widths, config.row_strides, strict=False):  # not the coarsest
             level.downsample = Downsample(width, "wrap", row_stride)
         self.down = nn.ModuleList(levels)
@@ -162,15 +150,8 @@ class CurveEncoder(Network):
         self.norm_out = group_norm(widths[-1])
         self.conv_out = Convolution(widths[-1], config.code_dim, "wrap")
 
-    def forward(self, x: Float[Tensor, "B 1 H W"]) -> Float[Tensor, "B D h w"]:
-        """Shrink the image to its latents."""
-        x = self.conv_in(x)
-        for level in self.down:
-            x = level(x)
-        return self.conv_out(F.silu(self.norm_out(self.mid(x))))
 
-
-class CurveDecoder(Network):
+class CurveDecoder(ConvolutionalDecoder):
     """The network from latents (B, code_dim, h, w) to encoded range and, if it has the head, returns as 1 and -1."""
 
     def __init__(self, config: CurveVqvaeConfig) -> None:
@@ -181,23 +162,16 @@ class CurveDecoder(Network):
         levels = []  # from coarse to fine; the finest level has no stride of its own, and is a curve's
         strides = [*reversed(config.row_strides), 1]
         for pair, row_stride in zip(pairwise([widths[-1], *reversed(widths)]), strides, strict=True):
-            level = CurveLevel(*pair, config.residual_blocks + 1, _CURVE if row_stride == 1 else _SQUARE)
+            level = _level(*pair, config.residual_blocks + 1, _CURVE if row_stride == 1 else _SQUARE)
             if len(levels) < len(config.row_strides):
                 level.upsample = CurveUpsample(pair[1], row_stride)
             levels.append(level)
-        self.up = nn.ModuleList(reversed(levels))  # the reference numbers its levels from the finest
+        self.up = nn.ModuleList(reversed(levels))
         self.norm_out = group_norm(widths[0])
         self.conv_out = Convolution(widths[0], 1 + config.mask_head, "wrap", _CURVE)
 
-    def forward(self, z: Float[Tensor, "B D h w"]) -> Float[Tensor, "B heads H W"]:
-        """Grow the latents to an image."""
-        x = self.mid(self.conv_in(z))
-        for level in reversed(self.up):
-            x = level(x)
-        return self.conv_out(F.silu(self.norm_out(x)))
 
-
-class CurveVqvae(CodebookTokenizer[CurveVqvaeConfig]):
+class CurveVqvae(ConvolutionalTokenizer[CurveVqvaeConfig]):
     """The autoencoder of LiDM.
 
     Its discriminator is left out, whose weight is 0 after the first two steps because the program's condition is
@@ -224,20 +198,12 @@ class CurveVqvae(CodebookTokenizer[CurveVqvaeConfig]):
                 f"rows divisible by {factors[0]}, columns by {factors[1]}, for row_strides={config.row_strides}",
                 "use fewer strides, or another number of columns",
             )
-        self.num_codes = config.num_codes
         self.grid_size = (sensor.height // factors[0], sensor.width // factors[1])
         self.encoder, self.decoder = CurveEncoder(config), CurveDecoder(config)
-        self.quantize = VectorQuantiser(
-            config.num_codes, config.code_dim, config.codebook_loss, config.restart_dead_codes
-        )
-        self.quant_conv = nn.Conv2d(config.code_dim, config.code_dim, 1)
-        self.post_quant_conv = nn.Conv2d(config.code_dim, config.code_dim, 1)
+        self._add_codebook(config.num_codes, config.code_dim, config.codebook_loss, config.restart_dead_codes)
 
-    def latents(self, images: RangeImage) -> Float[Tensor, "B D h w"]:
-        """Return the continuous latents of a batch, before quantisation."""
-        if images.range_m.ndim != 3:
-            raise ConfigError("a single range image", "a batch", "make one with RangeImage.stack([image])")
-        return self.quant_conv(self.encoder(encode_range(images.range_m, self.config)[:, None]))
+    def _encoded(self, images: RangeImage) -> Float[Tensor, "B H W"]:
+        return encode_range(images.range_m, self.config)
 
     def decode(self, tokens: TokenGrid) -> Decoded:
         """Return range and returns of a batch of tokens; the logits of returns are infinite, for nothing is random."""

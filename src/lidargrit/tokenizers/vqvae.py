@@ -15,7 +15,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from lidargrit.errors import ConfigError
-from lidargrit.nn.blocks import Network
 from lidargrit.nn.convolution import (
     Convolution,
     Downsample,
@@ -27,11 +26,18 @@ from lidargrit.nn.convolution import (
 )
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.precision import Precision, at_least_32_bits, dtype_of
-from lidargrit.nn.quantiser import CodebookLoss, VectorQuantiser
+from lidargrit.nn.quantiser import CodebookLoss
 from lidargrit.projection import RangeEncoding
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import Decoded, RangeImage, TokenGrid
-from lidargrit.tokenizers import CodebookTokenizer, TokenizerConfig
+from lidargrit.tokenizers import TokenizerConfig
+from lidargrit.tokenizers._convolutional import (
+    ConvolutionalDecoder,
+    ConvolutionalEncoder,
+    ConvolutionalTokenizer,
+    Level,
+    check_sizes,
+)
 
 _LEVELS_AT_MOST = 16  # each further one halves both axes; after these 65,536 columns are two
 _NO_RETURN_BELOW = -0.9  # without a raydrop head, an encoded range below this is read as no return (the program's rule)
@@ -84,13 +90,7 @@ class VqvaeConfig(TokenizerConfig):
     restart_dead_codes: bool = True
 
     def __post_init__(self) -> None:
-        if self.channels < 32 or self.channels % 32:
-            raise ConfigError(
-                f"channels={self.channels}", "a positive multiple of 32", "the norms share 32 groups: round it up"
-            )
-        for name, most in (("residual_blocks", 100), ("code_dim", 16_384), ("num_codes", 65_536)):
-            if not 1 <= getattr(self, name) <= most:
-                raise ConfigError(f"{name}={getattr(self, name)}", f"1 to {most}", "correct it")
+        check_sizes(self.channels, self.residual_blocks, self.code_dim, self.num_codes)
         if not 1 <= len(self.channel_multipliers) <= _LEVELS_AT_MOST or min(self.channel_multipliers) < 1:
             raise ConfigError(
                 f"channel_multipliers={self.channel_multipliers}",
@@ -101,45 +101,18 @@ class VqvaeConfig(TokenizerConfig):
             raise ConfigError(f"dropout={self.dropout}", "a share in [0, 1)", "lower it")
 
 
-class Level(nn.Module):
-    """One resolution of the encoder or the decoder: residual blocks, then perhaps a change of resolution.
-
-    Args:
-        config: dropout and padding.
-        inputs: channels of the input.
-        width: channels of the output.
-        num_blocks: number of residual blocks.
-        downsamples: halve rows and columns after the blocks.
-        upsamples: double rows and columns after the blocks.
-    """
-
-    def __init__(
-        self,
-        config: VqvaeConfig,
-        inputs: int,
-        width: int,
-        num_blocks: int,
-        downsamples: bool = False,
-        upsamples: bool = False,
-    ) -> None:
-        super().__init__()
-        widths = [inputs, *[width] * num_blocks]
-        self.block = nn.ModuleList(
-            ResidualBlock(before, after, config.dropout, config.padding) for before, after in pairwise(widths)
-        )
-        self.downsample = Downsample(width, config.padding) if downsamples else None
-        self.upsample: Upsample | FoldedUpsample | None = Upsample(width, config.padding) if upsamples else None
-
-    def forward(self, x: Float[Tensor, "B C H W"]) -> Float[Tensor, "B D h w"]:
-        """Return the feature maps of the next level."""
-        for block in self.block:
-            x = block(x)
-        if self.downsample is not None:
-            x = self.downsample(x)
-        return x if self.upsample is None else self.upsample(x)
+def _level(
+    config: VqvaeConfig, inputs: int, width: int, num_blocks: int, downsamples: bool = False, upsamples: bool = False
+) -> Level:
+    """Make residual blocks, and after them what halves or doubles rows and columns if that is wanted."""
+    widths = [inputs, *[width] * num_blocks]
+    level = Level([ResidualBlock(*pair, config.dropout, config.padding) for pair in pairwise(widths)])
+    level.downsample = Downsample(width, config.padding) if downsamples else None
+    level.upsample = Upsample(width, config.padding) if upsamples else None
+    return level
 
 
-class Encoder(Network):
+class Encoder(ConvolutionalEncoder):
     """The network from encoded range (B, 1, H, W) to latents (B, code_dim, h, w)."""
 
     def __init__(self, config: VqvaeConfig) -> None:
@@ -147,22 +120,15 @@ class Encoder(Network):
         c, widths = config, _widths(config)
         self.conv_in = Convolution(1, c.channels, c.padding)
         self.down = nn.ModuleList(
-            Level(c, inputs, width, c.residual_blocks, downsamples=level < len(widths) - 1)
+            _level(c, inputs, width, c.residual_blocks, downsamples=level < len(widths) - 1)
             for level, (inputs, width) in enumerate(pairwise([c.channels, *widths]))
         )
         self.mid = _middle(c)
         self.norm_out = group_norm(widths[-1])
         self.conv_out = Convolution(widths[-1], c.code_dim, c.padding)
 
-    def forward(self, x: Float[Tensor, "B 1 H W"]) -> Float[Tensor, "B D h w"]:
-        """Shrink the image to its latents."""
-        x = self.conv_in(x)
-        for level in self.down:
-            x = level(x)
-        return self.conv_out(F.silu(self.norm_out(self.mid(x))))
 
-
-class Decoder(Network):
+class Decoder(ConvolutionalDecoder):
     """The network from latents (B, code_dim, h, w) to encoded range, before tanh, and return logits if it has them."""
 
     def __init__(self, config: VqvaeConfig) -> None:
@@ -171,25 +137,14 @@ class Decoder(Network):
         self.conv_in = Convolution(c.code_dim, widths[-1], c.padding)
         self.mid = _middle(c)
         coarse_to_fine = [
-            Level(c, inputs, width, c.residual_blocks + 1, upsamples=level > 0)
+            _level(c, inputs, width, c.residual_blocks + 1, upsamples=level > 0)
             for level, (inputs, width) in zip(
                 reversed(range(len(widths))), pairwise([widths[-1], *reversed(widths)]), strict=True
             )
         ]
-        self.up = nn.ModuleList(reversed(coarse_to_fine))  # the reference numbers its levels from the finest
+        self.up = nn.ModuleList(reversed(coarse_to_fine))
         self.norm_out = group_norm(widths[0])
         self.conv_out = Convolution(widths[0], 2 if c.raydrop_loss else 1, c.padding)
-
-    def forward(self, z: Float[Tensor, "B D h w"]) -> Float[Tensor, "B heads H W"]:
-        """Grow the latents to an image."""
-        return self.conv_out(self.features(z))
-
-    def features(self, z: Float[Tensor, "B D h w"]) -> Float[Tensor, "B C H W"]:
-        """Return the feature maps that the last convolution reads, at the image's full resolution, in 32 bits."""
-        x = self.mid(self.conv_in(z.to(self.conv_in.weight)))
-        for level in reversed(self.up):
-            x = level(x)
-        return F.silu(self.norm_out(x.to(self.conv_out.weight.dtype)))
 
     def prepared(self, precision: Precision) -> Decoder:
         """Return a copy for decoding only, quicker: channels last, upsampling folded, perhaps in 16 bits.
@@ -209,7 +164,7 @@ class Decoder(Network):
         return fast
 
 
-class Vqvae(CodebookTokenizer[VqvaeConfig]):
+class Vqvae(ConvolutionalTokenizer[VqvaeConfig]):
     """The adapted VQ-VAE of LidarGRIT.
 
     Args:
@@ -233,23 +188,14 @@ class Vqvae(CodebookTokenizer[VqvaeConfig]):
                 f"both sizes divisible by {factor}, for {len(config.channel_multipliers)} levels",
                 "use fewer channel_multipliers, or another number of columns",
             )
-        self.num_codes = config.num_codes
         self.grid_size = (sensor.height // factor, sensor.width // factor)
         self.num_features = _widths(config)[0]
         self.range_encoding = RangeEncoding(config.range_encoding, sensor.range_min_m, sensor.range_max_m)
         self.encoder, self.decoder = Encoder(config), Decoder(config)
-        self.quantize = VectorQuantiser(
-            config.num_codes, config.code_dim, config.codebook_loss, config.restart_dead_codes
-        )
-        self.quant_conv = nn.Conv2d(config.code_dim, config.code_dim, 1)
-        self.post_quant_conv = nn.Conv2d(config.code_dim, config.code_dim, 1)
+        self._add_codebook(config.num_codes, config.code_dim, config.codebook_loss, config.restart_dead_codes)
 
-    def latents(self, images: RangeImage) -> Float[Tensor, "B D h w"]:
-        """Return the continuous latents of a batch, before quantisation."""
-        if images.range_m.ndim != 3:
-            raise ConfigError("a single range image", "a batch", "make one with RangeImage.stack([image])")
-        encoded = self.range_encoding.encode(images.range_m, images.return_mask)
-        return self.quant_conv(self.encoder(encoded[:, None]))
+    def _encoded(self, images: RangeImage) -> Float[Tensor, "B H W"]:
+        return self.range_encoding.encode(images.range_m, images.return_mask)
 
     def decode(self, tokens: TokenGrid) -> Decoded:
         """Return clean range, return logits and the last feature maps of a batch of tokens."""

@@ -79,7 +79,7 @@ def _cpu_flops_per_s() -> float:
     matrix, seconds = torch.ones(_MATRIX, _MATRIX), []
     for _ in range(_REPETITIONS):
         begun = time.perf_counter()
-        matrix @ matrix
+        _ = matrix @ matrix
         seconds.append(time.perf_counter() - begun)
     return 2 * _MATRIX**3 / min(seconds)
 
