@@ -258,6 +258,7 @@ class ScanBits:
         tokens: bits of each token, given those before it.
         mask: bits of the return or ray drop of each pixel, given the tokens; None from a model without its probability.
         range: bits of the range of each pixel, 0 where there is no return, given tokens and mask; None likewise.
+        expected: bits that mask and range of each pixel take on average, given all before; None if not asked for.
     """
 
     step_mm: int
@@ -265,6 +266,7 @@ class ScanBits:
     tokens: Float[Tensor, "B h w"]
     mask: Float[Tensor, "B H W"] | None = None
     range: Float[Tensor, "B H W"] | None = None
+    expected: Float[Tensor, "B H W"] | None = None
 
     @property
     def is_whole(self) -> bool:
@@ -288,6 +290,20 @@ class ScanBits:
         for part in (self.mask, self.range):
             bits = bits if part is None else bits + part
         return bits
+
+    def surprise(self) -> Float[Tensor, "B H W"]:
+        """Return by how many bits mask and range of each pixel exceed what was expected: 0 on average, if all is usual.
+
+        Raises:
+            ConfigError: the expected bits were not asked for, or the model does not tell them.
+        """
+        if self.mask is None or self.range is None or self.expected is None:
+            raise ConfigError(
+                "bits without those that were expected",
+                "both, from a model with a pixel decoder",
+                "ask for them: model.bits(images, expected=True)",
+            )
+        return self.mask + self.range - self.expected
 
 
 @dataclass(frozen=True)

@@ -236,7 +236,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
 
     @final
     @torch.no_grad()
-    def bits(self, images: RangeImage, step_mm: int = 10) -> ScanBits:
+    def bits(self, images: RangeImage, step_mm: int = 10, expected: bool = False) -> ScanBits:
         """Return how many bits name each scan by the generator's exact probabilities (capability ``likelihood``).
 
         Ranges are rounded to a step first: without one, no number of bits would be enough. Systems compare by their
@@ -245,6 +245,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         Args:
             images: batch of range images (B, H, W).
             step_mm: step of the ranges in whole millimetres.
+            expected: whether to compute, too, what bits were to be expected, for :meth:`ScanBits.surprise`.
 
         Raises:
             ConfigError: images of other rays, another step, or a generator without the capability.
@@ -252,7 +253,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         self._require("likelihood")
         check_images(images, self.sensor)
         steps = RangeSteps(self.sensor, step_mm)
-        return self.eval()._bits(steps.round(images.to(self.device)), steps)
+        return self.eval()._bits(steps.round(images.to(self.device)), steps, expected)
 
     @abstractmethod
     def _sample(self, seeds: BatchSeeds, sampling: SamplingT) -> RangeImage:
@@ -268,7 +269,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     def _reconstruct(self, images: RangeImage) -> RangeImage:
         raise NotImplementedError
 
-    def _bits(self, images: RangeImage, steps: RangeSteps) -> ScanBits:
+    def _bits(self, images: RangeImage, steps: RangeSteps, expected: bool) -> ScanBits:
         raise NotImplementedError
 
     def _settings(self, given: SamplingT | None, default: Callable[[], SamplingT]) -> SamplingT:

@@ -162,14 +162,18 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
         seen = F.max_pool2d(observed[:, None].float(), cell)[:, 0] > 0
         return torch.where(seen, self.tokenizer.encode(filled).tokens, -1).flatten(1)
 
-    def _bits(self, images: RangeImage, steps: RangeSteps) -> ScanBits:
+    def _bits(self, images: RangeImage, steps: RangeSteps, expected: bool) -> ScanBits:
         """Return the bits of the tokens, and those of mask and ranges given the tokens, if there is a pixel decoder."""
         grid = self.tokenizer.encode(images)
         tokens = self.token_bits(grid)
         if self.pixels is None:
             return ScanBits(steps.step_mm, images.return_mask, tokens)
-        mask, range_ = (nats / math.log(2) for nats in self.pixels(self.tokenizer.decode(grid), images, steps))
-        return ScanBits(steps.step_mm, images.return_mask, tokens, mask, range_)
+        decoded = self.tokenizer.decode(grid)
+        mask, range_ = (nats / math.log(2) for nats in self.pixels(decoded, images, steps))
+        usual = None
+        if expected:
+            usual = sum(self.pixels.expected(decoded, images, steps), torch.zeros_like(mask)) / math.log(2)
+        return ScanBits(steps.step_mm, images.return_mask, tokens, mask, range_, usual)
 
     def token_bits(self, grid: TokenGrid) -> Float[Tensor, "B h w"]:
         """Return the bits of each token, as many for one as for another.

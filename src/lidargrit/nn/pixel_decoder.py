@@ -108,6 +108,24 @@ class PixelDecoder(nn.Module):
         assert range_nll is not None
         return PixelNll(mask_nll, range_nll)
 
+    def expected(self, decoded: Decoded, images: RangeImage, steps: RangeSteps) -> PixelNll:
+        """Return what :meth:`forward` is on average, over what each pixel could have been, given the earlier ones."""
+        guide = Guide.of(decoded)
+        guided = self.mask.guided(guide), self.range.guided(guide)
+        mask, v = images.return_mask, images.range_m.log1p()
+        mask_nats, range_nats = None, None
+        for phases in self.mask.by_spacing():
+            logits = self.mask.logits(phases, self.mask.outputs(phases, guided[0], guide, mask, v), guide)
+            # H(p) = ln(1 + e^z) - z p of the logit z
+            mask_nats = join_phases(mask_nats, F.softplus(logits) - logits * logits.sigmoid())
+            candidates = self.range.candidates(phases, guide, mask, v)
+            output = self.range.outputs(phases, guided[1], guide, mask, v)
+            entropy = self.range.mixture(phases, output, candidates, guide).entropy(steps)
+            range_nats = join_phases(range_nats, torch.where(at_phases(mask, phases), entropy, 0.0))
+        assert mask_nats is not None
+        assert range_nats is not None
+        return PixelNll(mask_nats, range_nats)
+
     def estimate(
         self, decoded: Decoded, images: RangeImage, rng: torch.Generator
     ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:

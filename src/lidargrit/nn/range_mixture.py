@@ -9,6 +9,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from lidargrit.nn.range_steps import RangeSteps
+
+_QUANTILES = (0.05, 0.2, 0.4, 0.6, 0.8, 0.95)
 _LEAST_MASS = 1e-6  # of a component within the limits; the logarithm stays finite
 
 
@@ -54,6 +57,20 @@ class RangeMixture:
         component = F.logsigmoid(below + width) + F.logsigmoid(-below) + (-(-width).expm1()).log()
         weighted = self.logits.log_softmax(-1) + component - self._mass().clamp(min=_LEAST_MASS).log()
         return weighted.logsumexp(-1)
+
+    def entropy(self, steps: RangeSteps) -> Float[Tensor, "*P"]:
+        """Return the expected -ln of the probability of a step, from quantiles of every component."""
+        low, mass = self._bounds()[0], self._mass()
+        total = torch.zeros_like(self.centres[..., 0])
+        weights = self.logits.softmax(-1)
+        for quantile in _QUANTILES:
+            level = (low + quantile * mass).clamp(1e-6, 1 - 1e-6)
+            v = self.centres + self.log_scales.exp() * level.logit()
+            for component in range(v.shape[-1]):
+                edges_m = steps.edges_m(steps.indices(v[..., component].expm1()))
+                nats = -self.log_mass(*edges_m).to(total.dtype)
+                total = total + weights[..., component] * nats / len(_QUANTILES)
+        return total
 
     def cdf(self, range_m: Float[Tensor, "*P"]) -> Float[Tensor, "*P"]:
         """Return the probability of a range of at most ``range_m``, which lies within the limits."""
