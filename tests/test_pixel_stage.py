@@ -144,6 +144,37 @@ def test_all_steps_of_a_range_are_sure_to_hold_it():
     assert torch.equal(steps.indices(steps.range_m(every)), every)
 
 
+def test_the_expected_bits_are_the_mean_over_all_steps():
+    steps, rng = RangeSteps(SENSOR, 500), torch.Generator().manual_seed(0)
+    logits, centres, scales = (torch.randn(5, 3, generator=rng) for _ in range(3))
+    limits_m = (SENSOR.range_min_m, SENSOR.range_max_m)
+    mixture = RangeMixture(logits, 2.5 + centres.clamp(-1, 1), scales - 3, limits_m)
+    every = torch.arange(steps.first, steps.last + 1).expand(5, -1)
+    parts = (part[:, None].expand(*every.shape, 3) for part in (mixture.logits, mixture.centres, mixture.log_scales))
+    nats = -RangeMixture(*parts, limits_m).log_mass(*steps.edges_m(every))
+    assert torch.allclose(mixture.entropy(steps).double(), (nats.exp().reciprocal() * nats).sum(-1), atol=0.15)
+
+
+def test_surprise_is_what_exceeds_the_expected_bits(tmp_path, capsys):
+    generator, images = made(), scans(2)
+    bits = generator.bits(images, expected=True)
+    assert bits.mask is not None
+    assert bits.range is not None
+    assert bits.expected is not None
+    assert torch.allclose(bits.surprise(), bits.mask + bits.range - bits.expected)
+    dropped = ~images.return_mask
+    assert bool((bits.expected[dropped] <= 1.0001).all())  # of a mask alone, at most one bit
+    for told in (generator.bits(images), made(None).bits(images, expected=True)):
+        with pytest.raises(ConfigError, match="got bits without those that were expected"):
+            told.surprise()
+    generator.save(tmp_path / "run")
+    words = ["view", "simulated:1:test", "--color", "surprise", "--model", str(tmp_path / "run"), "-n", "1"]
+    assert main([*words, "-o", str(tmp_path / "surprise.png")]) == 0
+    assert (tmp_path / "surprise.png").stat().st_size > 10_000
+    assert main([*words, "-o", str(tmp_path / "surprise.html")]) == 2
+    assert "got the colour surprise for" in capsys.readouterr().err
+
+
 def test_maskgit_counts_every_token_alike():
     generator = MaskGit(MaskGitConfig(TOKENIZER, TRANSFORMER, PIXELS), SENSOR).eval()
     bits = generator.bits(scans(1))

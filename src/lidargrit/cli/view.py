@@ -12,6 +12,7 @@ EXAMPLES = """\
   lidargrit view /data/scans                           range image, return mask and bird's-eye view
   lidargrit view /data/held_out runs/demo -o all.png   real, reconstructed and generated
   lidargrit view samples /data/held_out -o all.html -n 12       a page to turn, zoom and step through
+  lidargrit view /data/scans --color surprise          pixels that a model did not expect
 """
 
 
@@ -25,6 +26,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("-n", "--count", type=int, default=3, help="number of scans of each")
     parser.add_argument("--seed", type=seed_number, default=0, help="seed of the first generated scan")
+    colour = "colour of pixels: range, or surprise for the bits beyond those expected (.png only)"
+    parser.add_argument("--color", choices=["range", "surprise"], default="range", help=colour)
+    model = "run that is surprised, with a pixel decoder (default: the one in the package)"
+    parser.add_argument("--model", default="pretrained", help=model)
     add_scans(parser)
     parser.add_argument("--overwrite", action="store_true", help="replace the file if it exists")
 
@@ -37,5 +42,6 @@ def run(options: argparse.Namespace) -> None:
 
     ending = ".html" if options.out.suffix.lower() == ".html" else ".png"
     refuse_to_overwrite(options.out, options.overwrite, ending)
-    view(options.places, options.out, options.count, options.seed, scan_settings(options), TerminalReporter())
+    named = (options.places, options.out, options.count, options.seed, scan_settings(options), TerminalReporter())
+    view(*named, options.model if options.color == "surprise" else "")
     print(f"done: look at {options.out}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, ListedColormap, LogNorm, Normalize
 from matplotlib.figure import Figure
+from torch import Tensor
 
 from lidargrit.errors import ConfigError
 from lidargrit.files import atomic_path
@@ -22,6 +23,8 @@ from lidargrit.structures import RangeImage
 SCANS_AT_MOST = 8  # scans of a group; more make a picture that no viewer shows well
 _DOTS_PER_INCH = 100  # 1400 pixels across: a laptop shows the picture without shrinking it
 _WIDTH, _ROW, _HEAD, _FOOT = 14.0, 2.95, 0.75, 0.95  # inches: the picture, one scan of one group, title, colour bars
+_SURPRISED_BITS = 12.0  # beyond those expected: what happens to one pixel in some thousands
+_SURPRISE_NOTE = f"\nsurprise: black = as expected or less,\nyellow = {_SURPRISED_BITS:g} bits more or beyond"
 _NO_RETURN = "#e4e4e4"  # near white: no colour of the range scale comes near it
 
 
@@ -31,6 +34,7 @@ def plot_comparison(
     max_range_m: float | None = None,
     title: str = "",
     labels: list[str] | None = None,
+    surprise: dict[str, Float[Tensor, "B H W"]] | None = None,
 ) -> None:
     """Plot groups of range images below one another: range, return mask and bird's-eye view of every scan.
 
@@ -43,6 +47,8 @@ def plot_comparison(
         max_range_m: end of the range scale and of the bird's-eye view, in metres; None for the farthest return.
         title: title of the whole picture.
         labels: names of the scans; "scan 1", ... if not given.
+        surprise: bits of every pixel beyond those expected, by group, plotted in place of the return mask; see
+            :meth:`lidargrit.structures.ScanBits.surprise`.
 
     Raises:
         ConfigError: no group, no or too many images in one, a limit of range that is not positive, or fewer labels
@@ -56,6 +62,9 @@ def plot_comparison(
     if len(labels) <= rows[-1][0]:
         raise ConfigError(f"{len(labels)} labels", f"one for each of {rows[-1][0] + 1} scans", "give more labels")
     panels = [_panel(groups[name], index, f"{labels[index]}: {name}") for index, name in rows]
+    if surprise is not None:
+        bits = [surprise[name][index].detach().cpu().numpy() for index, name in rows]
+        panels = [replace(panel, surprise=each) for panel, each in zip(panels, bits, strict=True)]
     scales = _Scales.of(panels, max_range_m)
     height = _HEAD * bool(title) + _ROW * len(panels) + _FOOT
     figure = Figure(figsize=(_WIDTH, height), dpi=_DOTS_PER_INCH)
@@ -64,7 +73,7 @@ def plot_comparison(
         figure.text(0.5, 1 - 0.42 / height, title, ha="center", va="center", fontsize=17)
     for row, panel in enumerate(panels):
         _plot_row(figure, height, _FOOT + _ROW * (len(panels) - 1 - row), panel, scales)
-    _plot_scales(figure, height, scales)
+    _plot_scales(figure, height, scales, "" if surprise is None else _SURPRISE_NOTE)
     with atomic_path(path) as unfinished:
         figure.savefig(unfinished, format="png", dpi=_DOTS_PER_INCH)
 
@@ -78,6 +87,7 @@ class _Panel:
     return_mask: Bool[np.ndarray, "H W"]
     points_xyz_m: Float[np.ndarray, "n 3"]
     elevation_deg: tuple[float, float]  # of the top and the bottom row
+    surprise: Float[np.ndarray, "H W"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,11 +166,14 @@ def _plot_row(figure: Figure, height: float, bottom: float, panel: _Panel, scale
     ranges.set_title(f"{panel.title}  ({size}, {share:.0%} of rays returned)", loc="left", fontsize=12)
     ranges.set_xticks([])
     mask = axes(0.75, 0.45, 9.9, 1.05)
-    two = ListedColormap([_NO_RETURN, "#26323c"])
-    mask.imshow(panel.return_mask, cmap=two, vmin=0, vmax=1, aspect="auto", interpolation="nearest", extent=extent)
+    shape = {"aspect": "auto", "interpolation": "nearest", "extent": extent}
+    if panel.surprise is None:
+        mask.imshow(panel.return_mask, cmap=ListedColormap([_NO_RETURN, "#26323c"]), vmin=0, vmax=1, **shape)
+    else:
+        mask.imshow(panel.surprise, cmap="inferno", vmin=0, vmax=_SURPRISED_BITS, **shape)
     mask.set_xlabel("azimuth, counter-clockwise from forward", fontsize=10, labelpad=0)
     mask.set_xticks(np.arange(180, -181, -45), [f"{d}°" for d in range(180, -181, -45)], fontsize=9)
-    for axis, name in ((ranges, "range"), (mask, "return mask")):
+    for axis, name in ((ranges, "range"), (mask, "return mask" if panel.surprise is None else "surprise")):
         axis.set_yticks([0, -10, -20], ["0°", "−10°", "−20°"], fontsize=9)
         axis.set_ylabel(name, fontsize=10)
     view = axes(11.3, 0.45, 2.25, 2.25)
@@ -178,7 +191,7 @@ def _plot_row(figure: Figure, height: float, bottom: float, panel: _Panel, scale
     view.set_xlabel("left [m]", fontsize=10, labelpad=0)
 
 
-def _plot_scales(figure: Figure, height: float, scales: _Scales) -> None:
+def _plot_scales(figure: Figure, height: float, scales: _Scales, more: str = "") -> None:
     """Plot the two colour bars along the foot, and say what light grey means."""
     at = 0.55 / height, 0.14 / height
     bar = figure.add_axes((0.75 / _WIDTH, at[0], 6.6 / _WIDTH, at[1]))
@@ -187,7 +200,7 @@ def _plot_scales(figure: Figure, height: float, scales: _Scales) -> None:
     colour_bar.set_ticks(ticks, labels=[str(t) for t in ticks])
     colour_bar.minorticks_off()
     colour_bar.set_label("range [m]", fontsize=10, labelpad=1)
-    note = "light grey = no return"
+    note = "light grey = no return" + more
     figure.text(7.6 / _WIDTH, at[0] + at[1] / 2, note, fontsize=10, va="center")
     bar = figure.add_axes((11.3 / _WIDTH, at[0], 2.25 / _WIDTH, at[1]))
     colour_bar = figure.colorbar(

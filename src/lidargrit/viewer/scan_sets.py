@@ -47,6 +47,7 @@ def load_scan_sets(
     seed: int = 0,
     settings: ScanSettings | None = None,
     reporter: Reporter | None = None,
+    sensor: SensorModel | None = None,
 ) -> list[ScanSet]:
     """Read scans and samples, and sample from runs.
 
@@ -60,6 +61,7 @@ def load_scan_sets(
         seed: seed of the first generated scan.
         settings: sensor that scans are imaged with, and settings of reading them.
         reporter: receiver of messages about scans that are left out.
+        sensor: sensor to project scans to, if the settings name none, in place of those of runs and samples.
 
     Raises:
         ConfigError: no source.
@@ -70,7 +72,8 @@ def load_scan_sets(
     config = settings.data
     opened = [open_source(source, config.bad_points) for source in sources]
     generators = {source.text: source.generator for source in opened if isinstance(source, RunSource)}
-    sensor = settings.load_sensor() or next((generator.sensor for generator in generators.values()), None)
+    of_runs = (generator.sensor for generator in generators.values())
+    sensor = settings.load_sensor() or sensor or next(of_runs, None)
     if sensor is None:
         imaged = (source for source in opened if not isinstance(source, (DatasetSource, RunSource)))
         sensor = next((source.sensor for source in imaged), None)

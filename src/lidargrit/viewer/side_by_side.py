@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lidargrit.errors import ConfigError
+from lidargrit.generators import load
 from lidargrit.loading.config import ScanSettings
 from lidargrit.reporting import Reporter
 from lidargrit.viewer.interactive import PAGE_SCANS_AT_MOST, write_page
@@ -20,6 +21,7 @@ def view(
     seed: int = 0,
     settings: ScanSettings | None = None,
     reporter: Reporter | None = None,
+    surprise_by: str = "",
 ) -> None:
     """Plot scans, samples, and what runs generate and reconstruct.
 
@@ -30,6 +32,7 @@ def view(
         seed: seed of the first generated scan.
         settings: sensor that scans are imaged with, and settings of reading them.
         reporter: receiver of messages about scans that are left out.
+        surprise_by: run whose surprise at every pixel is plotted in place of the return mask; none if empty.
 
     Raises:
         ConfigError: too few or too many scans, or no source.
@@ -40,8 +43,15 @@ def view(
     at_most = PAGE_SCANS_AT_MOST if is_page else SCANS_AT_MOST
     if not 1 <= count <= at_most:
         raise ConfigError(f"{count} scans of each set", f"1 to {at_most}", "correct the number")
-    sets = load_scan_sets(sources, count, seed, settings, reporter)
+    if surprise_by and is_page:
+        raise ConfigError(f"the colour surprise for {out}", "a picture", "name a file that ends in .png")
+    model = load(surprise_by) if surprise_by else None
+    sets = load_scan_sets(sources, count, seed, settings, reporter, None if model is None else model.sensor)
+    groups = {scans.name: scans.images for scans in sets}
     if is_page:
         write_page(sets, out)
+    elif model is None:
+        plot_comparison(groups, out)
     else:
-        plot_comparison({scans.name: scans.images for scans in sets}, out)
+        surprise = {name: model.bits(images, expected=True).surprise() for name, images in groups.items()}
+        plot_comparison(groups, out, surprise=surprise)
