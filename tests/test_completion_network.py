@@ -117,13 +117,15 @@ def test_more_attention_than_blocks_is_refused():
         CompletionNetworkConfig(blocks=2, attention_layers=3)
 
 
-def test_training_hides_rows_sectors_and_pixels():
-    masks = random_patterns(60, 64, 32, torch.Generator().manual_seed(0))
+def test_training_hides_rows_sectors_boxes_and_pixels():
+    masks = random_patterns(90, 64, 32, torch.Generator().manual_seed(0))
     rows = (masks == masks[:, :, :1]).all((1, 2))
     sectors = (masks == masks[:, :1]).all((1, 2))
-    assert 15 < int(rows.sum()) < 36
-    assert 8 < int(sectors.sum()) < 26
-    assert 8 < int((~rows & ~sectors).sum()) < 26
+    boxes = ~rows & ~sectors & masks.all(2).any(1)  # some rows are whole
+    assert 22 < int(rows.sum()) < 46
+    assert 12 < int(sectors.sum()) < 36
+    assert 4 < int(boxes.sum()) < 24
+    assert 12 < int((~rows & ~sectors & ~boxes).sum()) < 36
     assert bool(masks.flatten(1).any(1).all())
     assert not bool(masks.flatten(1).all(1).any())
 

@@ -86,7 +86,11 @@ GOOD = {"model": 0, "seed": 3, "count": 2, "sampling": {"temperature": 1, "top_k
         ({"count": 10**9}, "from 1 to 8"),
         ({"model": 3}, "from 0 to 2"),
         ({"model": -1}, "from 0 to 2"),
-        ({"hidden": ["ahead"]}, "nothing, ahead, rows"),
+        ({"task": ["ahead"]}, "returns, ahead, rows"),
+        ({"region": [0, 0, 1]}, "left, top, right and bottom"),
+        ({"region": [0.5, 0, 0.5, 1]}, "draw it anew"),
+        ({"region": [0, 0, 1, float("nan")]}, "as shares of the image"),
+        ({"region": "all"}, "as shares of the image"),
         ({"sampling": {"temperature": "hot"}}, "a number up to 100"),
         ({"sampling": {"temperature": 1e300}}, "a number up to 100"),
         ({"sampling": {"temperature": False}}, "a number up to 100"),
@@ -135,6 +139,32 @@ def test_a_part_of_the_circle_and_rings_that_nobody_told(tmp_path):
     assert torch.equal(completed.images.range_m[kept], uploaded.images.range_m[kept])
     with pytest.raises(ScanError, match=r"degrees of azimuth in mine\.bin"):
         compute_result(made("maskgit")[0], replace(request, sampling={}))
+
+
+def test_a_region_is_drawn_and_filled_in_rows_are_added_and_returns_dropped(tmp_path, scan_file):
+    model = made("lidargrit")[0]
+    request = SampleRequest(0, count=2, task="region", file=str(scan_file), name="mine.ply")
+    assert [one.name for one in compute_result(model, request)] == ["as uploaded"], "to draw on"
+    whole, seen, completed = compute_result(model, replace(request, region=(0.25, 0.5, 0.5, 1.0)))
+    height, width = whole.images.range_m.shape[1:]
+    outside = torch.ones(height, width, dtype=torch.bool)
+    outside[height // 2 :, width // 4 : width // 2] = False
+    for images in (seen.images, completed.images):
+        assert all(torch.equal(one[outside], whole.images.range_m[0][outside]) for one in images.range_m)
+    assert not seen.images.return_mask[0][~outside].any()
+    assert len(completed.images) == 2
+    whole, dropped = compute_result(model, replace(request, task="raydrop"))
+    assert dropped.name == "with raydrop"
+    assert bool((dropped.images.return_mask <= whole.images.return_mask).all())
+    assert 0 < dropped.images.return_mask.float().mean() < whole.images.return_mask.float().mean()
+    load("ply").write(tmp_path / "few.ply", lidargrit.simulate(seed=5, sensor=lidargrit.load_sensor("vlp16")))
+    few = replace(request, task="vlp16", file=str(tmp_path / "few.ply"))
+    sparse, dense = compute_result(model, few)
+    rows = [int(one.images.return_mask.any(2).any(0).sum()) for one in (sparse, dense)]
+    assert rows[0] < 16
+    assert rows[1] > 50
+    with pytest.raises(ScanError, match=r"16 rings in mine\.ply"):
+        compute_result(model, replace(few, task="returns"))
 
 
 # In a browser.
@@ -218,7 +248,7 @@ def test_a_scan_that_is_uploaded_is_completed(opened, scan_file):
     fill(opened, "#model", "2")
     for name, value in QUICK.items():
         fill(opened, f"[name={name}]", str(value))
-    fill(opened, "#hidden", "ahead")
+    fill(opened, "#task", "ahead")
     choose_file(opened, scan_file)
     opened.click("#complete")
     finish(opened)
@@ -239,6 +269,32 @@ def test_a_scan_that_is_uploaded_is_completed(opened, scan_file):
     fill(opened, "#model", "1")
     assert opened.run("document.querySelector('#complete').disabled")
     assert "can neither complete" in opened.run("document.querySelector('#ability').textContent")
+    assert opened.troubles() == []
+
+
+def test_the_mouse_draws_the_region_that_is_filled_in(opened, scan_file):
+    fill(opened, "#task", "region")
+    choose_file(opened, scan_file)
+    opened.click("#complete")
+    finish(opened)
+    assert names(opened) == ["as uploaded"]
+    assert "Now drag over" in opened.run("document.querySelector('#status').textContent")
+    left, top, width, height = opened.box(".image")
+    opened.drag((left + 0.25 * width, top + 0.3 * height), (left + 0.5 * width, top + 0.8 * height))
+    assert opened.run("desk.region") == pytest.approx([0.25, 0.3, 0.5, 0.8], abs=0.02)
+    drawn = opened.box(".region")
+    assert drawn == pytest.approx((left + 0.25 * width, top + 0.3 * height, 0.25 * width, 0.5 * height), abs=4)
+    opened.click("#complete")
+    finish(opened)
+    assert said(opened) == ""
+    assert names(opened)[-3:] == ["as uploaded", "what the model saw", "completed by tiny-lidargrit"]
+    fill(opened, "#task", "raydrop")
+    assert opened.run("document.querySelectorAll('.region:not([hidden])').length") == 0
+    opened.click("#complete")
+    finish(opened)
+    assert names(opened)[-1] == "raydrop by tiny-lidargrit"
+    fill(opened, "#model", "2")
+    assert opened.run("document.querySelector('#task').value") == "returns", "r2dm drops nothing"
     assert opened.troubles() == []
 
 

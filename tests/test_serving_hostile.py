@@ -202,7 +202,7 @@ def test_too_much_is_cut_off_without_being_read(served):
     assert answer.startswith(b"HTTP/1.1 413") or not answer  # the last words may be lost where the line is cut
     answer, _ = served.say(f"GET / HTTP/1.1\r\nHost: {served.host}\r\nX: {'x' * 20_000}\r\n\r\n".encode())
     assert b" 431 " in answer[:20]
-    assert served.refused("/generate", {"seed": 1, "hidden": "x" * 5000})[0] == 400
+    assert served.refused("/generate", {"seed": 1, "task": "x" * 5000})[0] == 400
     assert served.refused("/complete?" + "request={}&" * 400, b"x")[0] == 400
     assert served.refused("/complete", b"x")[0] == 400
     assert seconds < 5

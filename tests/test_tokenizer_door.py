@@ -73,7 +73,7 @@ def test_a_second_tokenizer_trains_samples_and_is_scored_and_served(generator, t
     assert main(["sample", str(folder), str(samples), "-n", "4"]) == 0
     assert main(["evaluate", str(samples), "simulated:4:val"]) == 0
     assert "jsd" in capsys.readouterr().out
-    request = {"model": 0, "seed": 0, "count": 1, "sampling": {}, "file": "", "name": "", "hidden": "nothing"}
+    request = {"model": 0, "seed": 0, "count": 1, "sampling": {}, "file": "", "name": "", "task": "returns"}
     line = json.dumps({"request": request, "folder": str(tmp_path)})
     monkeypatch.setattr(sys, "stdin", io.StringIO(line + "\n"))
     run_worker([folder], "cpu")

@@ -17,7 +17,8 @@ from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
 _ROW_STEPS = (2, 4, 4, 8)  # one of so many rows is observed; four as often as the others together
-_KINDS = (0.38, 0.72)  # up to these: rows, then sectors, then pixels
+_KINDS = (0.36, 0.74)  # up to these: rows, then sectors, then pixels
+_BOXES = 1 / 3  # of the sectors, hidden in some rows only
 _SECTORS = (24 / 256, 128 / 256)  # of the columns, hidden
 _SHARES = (0.03, 0.5)  # of the pixels, observed
 _MASK_WEIGHT, _ALONE_WEIGHT, _LOG_WEIGHT, _METRE_WEIGHT = 3.0, 0.5, 1.5, 0.3
@@ -26,7 +27,7 @@ _MASK_WEIGHT, _ALONE_WEIGHT, _LOG_WEIGHT, _METRE_WEIGHT = 3.0, 0.5, 1.5, 0.3
 class CompletionObjective(Objective):
     """The errors of the hidden pixels: of the range, and of the mask, by its likelihood in phases and pixel by pixel.
 
-    Every scan has a random pattern: rows, a sector or single pixels. A scan of which more is hidden counts more, with
+    Every scan has a random pattern: rows, all but a sector or a box, or single pixels. A scan of which more is hidden counts more, with
     the root of the hidden share.
 
     Args:
@@ -58,14 +59,14 @@ class CompletionObjective(Objective):
 
 
 def random_patterns(count: int, height: int, width: int, rng: torch.Generator) -> Bool[Tensor, "B H W"]:
-    """Return masks of observed pixels for training: every second to eighth row, all but a sector, or single pixels."""
+    """Return masks of observed pixels for training: some rows, all but a sector or a box of it, or single pixels."""
 
     def uniform() -> float:
         return float(torch.rand((), generator=rng, device=rng.device))
 
     masks = []
     for _ in range(count):
-        kind, first, second = uniform(), uniform(), uniform()
+        kind, first, second, third = uniform(), uniform(), uniform(), uniform()
         mask = torch.zeros(height, width, dtype=torch.bool, device=rng.device)
         if kind < _KINDS[0]:
             step = _ROW_STEPS[int(first * len(_ROW_STEPS))]
@@ -73,6 +74,9 @@ def random_patterns(count: int, height: int, width: int, rng: torch.Generator) -
         elif kind < _KINDS[1]:
             hidden = round(width * (_SECTORS[0] + first * (_SECTORS[1] - _SECTORS[0])))
             mask[:, hidden:] = True
+            if third < _BOXES:
+                top, bottom = int(uniform() * height / 2), height // 2 + int(uniform() * height / 2)
+                mask[:top], mask[bottom:] = True, True
             mask = mask.roll(int(second * width), 1)
         else:
             share = _SHARES[0] * (_SHARES[1] / _SHARES[0]) ** first

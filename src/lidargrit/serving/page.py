@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from lidargrit import __version__
-from lidargrit.serving.requests import HIDDEN, PAGE_SEED_AT_MOST, upload_endings
+from lidargrit.serving.requests import PAGE_SEED_AT_MOST, TASKS, upload_endings
 from lidargrit.viewer import interactive
 from lidargrit.viewer.interactive import button, filled
 
@@ -18,7 +18,7 @@ def page() -> str:
     buttons = "".join(button(kind, f".{kind}") for kind in _SAVED) + button("remove", "Remove")
     parts = {
         "viewer": interactive.viewer_html("", f'<span class="soft">Save</span>{buttons}', f"lidargrit {__version__}."),
-        "hidden": "".join(f'<option value="{name}">{text}</option>' for name, text in HIDDEN.items()),
+        "tasks": "".join(f'<option value="{name}">{text}</option>' for name, text in TASKS.items()),
         "seed_at_most": str(PAGE_SEED_AT_MOST),
         "endings": ",".join(upload_endings()),
         "listed_endings": ", ".join(upload_endings()),

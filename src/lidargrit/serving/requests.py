@@ -17,10 +17,14 @@ from lidargrit.serving.limits import Limits
 from lidargrit.untrusted import parse_json
 
 PAGE_SEED_AT_MOST = 2**32 - 1  # what fits a field on a page; more seeds than anyone will try
-HIDDEN = {  # part of an uploaded scan that is hidden from the model → its description on the page
-    "nothing": "nothing: fill in the rays without a point",
-    "ahead": "the quarter straight ahead",
-    "rows": "three of every four rows",
+UPSAMPLED = {"vlp16": "a VLP-16", "hdl32e": "an HDL-32E", "vlp32c": "a VLP-32C"}  # sensors with few rows
+TASKS = {  # what a model makes of an uploaded scan → its description on the page
+    "returns": "fill in the rays without a point",
+    "ahead": "fill in the quarter straight ahead",
+    "rows": "fill in three of every four rows",
+    "region": "fill in a region that you draw",
+    **{sensor: f"add the rows that {name} lacks" for sensor, name in UPSAMPLED.items()},
+    "raydrop": "drop returns of a clean simulated scan",
 }
 _WHOLE_AT_MOST = 1024  # steps and the like: four times what any published sampler takes
 _FRACTION_AT_MOST = 100.0  # temperatures and the like: far beyond, everything is noise
@@ -54,7 +58,9 @@ class SampleRequest:
         seed: seed of the first scan; the next scan has the next seed.
         count: number of scans.
         sampling: values of the sampling settings that the client changed, by name.
-        hidden: part of the uploaded scan that is hidden from the model; a key of :data:`HIDDEN`.
+        task: what the model makes of the uploaded scan; a key of :data:`TASKS`.
+        region: left, top, right and bottom edge of the region that is to be filled in, as shares of the image's width
+            and height; empty if none was drawn.
         file: path of the uploaded scan; "" if there is none.
         name: name of the uploaded file on the client's side, for display.
     """
@@ -63,7 +69,8 @@ class SampleRequest:
     seed: int = 0
     count: int = 1
     sampling: dict[str, int | float] = field(default_factory=dict)
-    hidden: str = "nothing"
+    task: str = "returns"
+    region: tuple[float, ...] = ()
     file: str = ""
     name: str = ""
 
@@ -107,14 +114,14 @@ def parse_request(values: dict[str, Any], settings: list[list[SamplingSetting]],
     Raises:
         ConfigError: an unknown name, a value of another type, or one out of its bounds.
     """
-    known = ("model", "seed", "count", "sampling", "hidden", "name")
+    known = ("model", "seed", "count", "sampling", "task", "region", "name")
     for name in values:
         if name not in known:
             raise ConfigError(f"the word {name[:40]!r}", f"one of {', '.join(known)}", "use the page")
     model = _whole("model", values.get("model", 0), 0, len(settings) - 1)
-    hidden = values.get("hidden", "nothing")
-    if not isinstance(hidden, str) or hidden not in HIDDEN:
-        raise ConfigError(f"hidden={str(hidden)[:40]!r}", f"one of {', '.join(HIDDEN)}", "choose one")
+    task = values.get("task", "returns")
+    if not isinstance(task, str) or task not in TASKS:
+        raise ConfigError(f"task={str(task)[:40]!r}", f"one of {', '.join(TASKS)}", "choose one")
     changed = values.get("sampling", {})
     if not isinstance(changed, dict):
         raise ConfigError("sampling that is not a JSON object", "numbers by name", "use the page")
@@ -128,7 +135,8 @@ def parse_request(values: dict[str, Any], settings: list[list[SamplingSetting]],
         _whole("seed", values.get("seed", 0), 0, PAGE_SEED_AT_MOST),
         _whole("count", values.get("count", 1), 1, limits.scans),
         {name: _number(by_name[name], value) for name, value in changed.items()},
-        hidden,
+        task,
+        _region(values.get("region", [])),
         name=_harmless_name(values.get("name", "")),
     )
 
@@ -165,6 +173,19 @@ def _number(setting: SamplingSetting, value: Any) -> int | float:
     if type(value) not in (int, float) or not (abs(value) <= setting.at_most and math.isfinite(value)):
         raise ConfigError(f"{setting.name}={str(value)[:40]}", f"a number up to {setting.at_most:g}", "correct it")
     return float(value)
+
+
+def _region(value: Any) -> tuple[float, ...]:
+    numbers = value if isinstance(value, list) else [value]
+    if numbers and not (
+        len(numbers) == 4
+        and all(type(number) in (int, float) and 0 <= number <= 1 for number in numbers)
+        and numbers[0] < numbers[2]
+        and numbers[1] < numbers[3]
+    ):
+        wanted = "left, top, right and bottom as shares of the image"
+        raise ConfigError(f"region={str(value)[:40]}", wanted, "draw it anew")
+    return tuple(float(number) for number in numbers)
 
 
 def _harmless_name(name: Any) -> str:

@@ -6,9 +6,9 @@ A job that takes too long, or all memory, ends with this process; the next job s
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
+import math
 import os
 import sys
 import traceback
@@ -23,13 +23,15 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from lidargrit import formats
+from lidargrit.completion.inputs import InputScan, ScanReader
+from lidargrit.completion.sparse import SparseReader, observed_rows
 from lidargrit.conditions import Condition
-from lidargrit.errors import ConfigError, LidarGritError, OutputError, ScanError
+from lidargrit.conditions.patterns import Pattern
+from lidargrit.errors import ConfigError, LidarGritError, OutputError
 from lidargrit.files import atomic_path, write_text
 from lidargrit.generators import Generator, load
-from lidargrit.projection import project
-from lidargrit.sensors import SensorModel
-from lidargrit.serving.requests import SampleRequest, sampling_settings
+from lidargrit.sensors import load_sensor
+from lidargrit.serving.requests import TASKS, UPSAMPLED, SampleRequest, sampling_settings
 from lidargrit.structures import RangeImage
 from lidargrit.viewer.interactive import page_data
 from lidargrit.viewer.scan_sets import ScanSet
@@ -69,13 +71,14 @@ def describe_model(name: str, generator: Generator) -> dict[str, Any]:
         "generator": generator.public_name(),
         "sensor": f"{sensor.name}, {sensor.height} x {sensor.width}",
         "upload": next((able for able in ("complete", "encode") if able in generator.capabilities), ""),
+        "tasks": [task for task in TASKS if task != "raydrop" or "surfaces" in generator.conditions],
         "settings": [dataclasses.asdict(setting) for setting in sampling_settings(generator.Sampling())],
         "rays": sensor.to_json(),
     }
 
 
 def compute_result(generator: Generator, request: SampleRequest) -> list[ScanSet]:
-    """Sample new scans, or complete or reconstruct an uploaded scan.
+    """Sample new scans, or complete, upsample, drop or reconstruct an uploaded scan.
 
     Raises:
         LidarGritError: a file that cannot be used, or a setting out of its bounds.
@@ -87,58 +90,57 @@ def compute_result(generator: Generator, request: SampleRequest) -> list[ScanSet
     if not request.file:
         names = tuple(f"seed {seed}" for seed in seeds)
         return [ScanSet("generated", generator.sample(seeds, sampling).to("cpu"), names)]
-    image = _uploaded(request, generator.sensor, partial="complete" in generator.capabilities)
+    seen = _read_upload(request, _reader(request, generator))
+    image = RangeImage.stack([seen.image])
     sets = [ScanSet("as uploaded", image, (request.name,))]
     image = image.to(device)
     if "complete" not in generator.capabilities:
         return [*sets, ScanSet("reconstructed", generator.reconstruct(image).to("cpu"), (request.name,))]
-    hidden = _hidden(request.hidden, image)
-    if request.hidden != "nothing":
-        sets.append(ScanSet("what the model saw", _without(image, hidden).to("cpu"), (request.name,)))
+    if request.task == "region" and not request.region:
+        return sets  # on which the region is drawn
+    names = tuple(f"{request.name}, seed {seed}" for seed in seeds)
     images = RangeImage.stack([image[0]] * request.count)
-    condition = Condition.of_pixels(images, ~hidden.expand_as(images.return_mask))
-    completed = generator.complete(condition, seeds, sampling)
-    return [*sets, ScanSet("completed", completed.to("cpu"), tuple(f"{request.name}, seed {seed}" for seed in seeds))]
+    if request.task == "raydrop":
+        dropped = generator.complete(Condition.of_surfaces(images), seeds, sampling)
+        return [*sets, ScanSet("with raydrop", dropped.to("cpu"), names)]
+    observed = _observed(request, seen).to(device)
+    condition = Condition.of_pixels(images, observed.expand_as(images.return_mask))
+    if bool((images[0].return_mask & ~observed).any()):
+        sets.append(ScanSet("what the model saw", condition[0:1].images.to("cpu"), (request.name,)))
+    return [*sets, ScanSet("completed", generator.complete(condition, seeds, sampling).to("cpu"), names)]
 
 
-def _uploaded(request: SampleRequest, sensor: SensorModel, partial: bool) -> RangeImage:
-    """Read and project an uploaded file; messages give its name on the client's side, not its path on the server.
+def _reader(request: SampleRequest, generator: Generator) -> ScanReader:
+    """Return what projects an uploaded scan; it may be a part of the circle if the model completes it."""
+    partial = "complete" in generator.capabilities and request.task != "raydrop"
+    if request.task in UPSAMPLED:
+        return SparseReader(generator.sensor, partial=partial, source=load_sensor(request.task))
+    return ScanReader(generator.sensor, partial=partial)
 
-    A scan without rings, for a sensor that needs them, is projected by elevation.
-    """
+
+def _read_upload(request: SampleRequest, reader: ScanReader) -> InputScan:
+    """Read and project an uploaded file; messages give its name on the client's side, not its path on the server."""
     path = Path(request.file)
     try:
-        scan = dataclasses.replace(formats.read_scan(path, bad_points="drop"), source=request.name)
-        try:
-            image = project(scan, sensor, partial=partial)
-        except ScanError:
-            if sensor.projection == "spherical":
-                raise
-            with contextlib.suppress(ScanError):
-                return RangeImage.stack([project(scan, sensor, "spherical", partial=partial)])
-            raise
+        return reader.read(dataclasses.replace(formats.read_scan(path, bad_points="drop"), source=request.name))
     except LidarGritError as error:
         parts = [part.replace(str(path), request.name) for part in (error.got, error.wanted, error.cure)]
         raise type(error)(*parts) from None
-    return RangeImage.stack([image])
 
 
-def _hidden(what: str, image: RangeImage) -> Bool[Tensor, "1 H W"]:
-    """Return the pixels that are hidden from the model."""
-    if what == "nothing":
-        return ~image.return_mask
-    hidden = torch.zeros_like(image.return_mask)
-    if what == "ahead":
-        azimuth_rad = image.sensor.azimuth_rad.to(hidden.device).expand(hidden.shape[1:])
-        return (azimuth_rad.cos() > 0.5**0.5)[None]
-    hidden[:, torch.arange(hidden.shape[1]) % 4 != 0] = True
-    return hidden
-
-
-def _without(image: RangeImage, hidden: Bool[Tensor, "1 H W"]) -> RangeImage:
-    kept = image.return_mask & ~hidden
-    reflectance = None if image.reflectance is None else image.reflectance * kept
-    return RangeImage(image.range_m * kept, kept, image.sensor, reflectance)
+def _observed(request: SampleRequest, seen: InputScan) -> Bool[Tensor, "H W"]:
+    """Return the pixels that the model is told of."""
+    if request.task in UPSAMPLED:
+        return observed_rows(seen)
+    if request.task == "region":
+        height, width = seen.image.range_m.shape
+        left, top, right, bottom = request.region
+        observed = torch.ones(height, width, dtype=torch.bool)
+        rows = slice(math.floor(top * height), math.ceil(bottom * height))
+        observed[rows, math.floor(left * width) : math.ceil(right * width)] = False
+        return observed
+    pattern = {"returns": "returns", "ahead": "sector:45,315", "rows": "rows:4"}[request.task]
+    return Pattern(pattern).mask(seen.image)
 
 
 def _answer_request(generator: Generator, request: SampleRequest, folder: Path) -> dict[str, Any]:

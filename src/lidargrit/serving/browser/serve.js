@@ -16,6 +16,42 @@ class ServedPane extends Pane {
     this.part.remove.setAttribute("aria-label", `Remove ${source.name}`);
     this.part.remove.addEventListener("click", () => desk.remove(this));
     this.path = `/jobs/${job}/${group}`;
+    this.frame = Object.assign(document.createElement("div"), { className: "region", hidden: true });
+    this.part.image.after(this.frame);
+    this.part.image.addEventListener("pointerdown", (event) => this.beginRegion(event));
+    this.part.image.addEventListener("pointermove", (event) => this.stretch(event));
+  }
+
+  // Where the pointer is, as shares of the image's width and height.
+  at(event) {
+    const box = this.part.image.getBoundingClientRect();
+    const share = (value) => Math.min(1, Math.max(0, value));
+    return [share((event.clientX - box.left) / box.width), share((event.clientY - box.top) / box.height)];
+  }
+
+  beginRegion(event) {
+    if (desk.draws) {
+      event.preventDefault();
+      this.part.image.setPointerCapture(event.pointerId);
+      this.corner = this.at(event);
+    }
+  }
+
+  stretch(event) {
+    if (!desk.draws || !this.corner || !event.buttons) {
+      return;
+    }
+    const [corner, other] = [this.corner, this.at(event)];
+    const [low, high] = [Math.min, Math.max].map((end) => [0, 1].map((axis) => end(corner[axis], other[axis])));
+    desk.chooseRegion(low[0] < high[0] && low[1] < high[1] ? [...low, ...high] : null);
+  }
+
+  showRegion(region) {
+    this.frame.hidden = region === null;
+    if (region) {
+      const [left, top, right, bottom] = region.map((share) => 100 * share);
+      Object.assign(this.frame.style, { left: `${left}%`, top: `${top}%`, width: `${right - left}%`, height: `${bottom - top}%` });
+    }
   }
 
   async save(ending) {
@@ -51,6 +87,9 @@ class Desk {
     el("model").addEventListener("change", () => this.offer());
     el("request").addEventListener("submit", (event) => this.submit(event, () => this.generate()));
     el("own").addEventListener("submit", (event) => this.submit(event, () => this.complete()));
+    el("task").addEventListener("change", () => this.chooseRegion(null));
+    el("file").addEventListener("change", () => this.chooseRegion(null));
+    this.region = null;
     this.offer();
   }
 
@@ -60,20 +99,36 @@ class Desk {
 
   // Show what the chosen model can do, and the numbers that it lets the user set.
   offer() {
-    const { generator, sensor, settings, upload } = this.model;
+    const { generator, sensor, settings, upload, tasks } = this.model;
     el("sensor").textContent = `${generator}; ${sensor}`;
     const [first, ...others] = settings.map(fieldOf); // each generator's own order: what matters most comes first
     el("first").replaceChildren(...(first ? [first] : []));
     el("settings").replaceChildren(...others);
     el("more").hidden = others.length === 0;
-    el("hiding").hidden = upload !== "complete";
-    el("complete").textContent = upload === "encode" ? "Reconstruct it" : "Complete it";
+    el("tasks").hidden = upload !== "complete";
+    for (const option of el("task").options) {
+      option.hidden = option.disabled = !tasks.includes(option.value);
+    }
+    if (el("task").selectedOptions[0]?.disabled) {
+      el("task").value = "returns";
+    }
+    el("complete").textContent = upload === "encode" ? "Reconstruct it" : "Do it";
     el("file").disabled = upload === "";
     el("ability").textContent = {
-      complete: "The model fills in the rays that have no point, or that you hide from it.",
+      complete: "The model generates what the task says; all else stays as it is.",
       encode: "The model encodes the scan as tokens and decodes a scan from them: you see what the tokens keep.",
     }[upload] ?? `A ${generator} model can neither complete nor reconstruct scans.`;
     this.enable();
+  }
+
+  // Whether dragging over a range image draws a region.
+  get draws() {
+    return this.model.upload === "complete" && el("task").value === "region";
+  }
+
+  chooseRegion(region) {
+    this.region = region;
+    this.page?.panes.forEach((pane) => pane.showRegion(region));
   }
 
   enable() {
@@ -98,7 +153,10 @@ class Desk {
     if (file.size > this.limits.uploadBytes) {
       throw new Error(`The file has ${file.size.toLocaleString("en")} bytes; at most ${this.limits.uploadBytes.toLocaleString("en")} are taken.`);
     }
-    const request = { ...this.request(), name: file.name, hidden: el("hidden").value };
+    const request = { ...this.request(), name: file.name, task: el("task").value };
+    if (this.draws && this.region) {
+      request.region = this.region.map((share) => Number(share.toFixed(4)));
+    }
     return asked(`/complete?request=${encodeURIComponent(JSON.stringify(request))}`, { method: "POST", body: file });
   }
 
@@ -113,7 +171,8 @@ class Desk {
       const seconds = await this.waited(job);
       const data = await (await asked(`/jobs/${job}/scans`)).json();
       await this.show(data, job, by);
-      el("status").textContent = `Done in ${seconds} s.`;
+      const draw = this.draws && !this.region && data.sources.length === 1;
+      el("status").textContent = draw ? "Now drag over the part of the range image that is to be filled in, and press the button again." : `Done in ${seconds} s.`;
     });
     this.busy = false;
     this.enable();
@@ -150,7 +209,12 @@ class Desk {
     el("viewer").hidden = false;
     this.page ??= new Page({ ...data, sources: [] });
     const fresh = data.sources.map((source, group) => {
-      const name = { generated: by, completed: `completed by ${by}`, reconstructed: `reconstructed by ${by}` }[source.name];
+      const name = {
+        generated: by,
+        completed: `completed by ${by}`,
+        "with raydrop": `raydrop by ${by}`,
+        reconstructed: `reconstructed by ${by}`,
+      }[source.name];
       return new ServedPane(new Source({ ...source, name: name ?? source.name }), this.page, job, group, data.scales);
     });
     await this.arrange([...this.page.panes, ...fresh].slice(-Math.max(PANES_AT_MOST, fresh.length)));
@@ -172,6 +236,7 @@ class Desk {
       this.page.data.scales[mode] = [Math.min(...ends.map((end) => end[0])), Math.max(...ends.map((end) => end[1]))];
     }
     await this.page.go(this.page.index);
+    this.chooseRegion(this.region);
   }
 }
 
