@@ -10,12 +10,16 @@ import torch
 from lidargrit.cli import main
 from lidargrit.conditions import Condition
 from lidargrit.conditions.fills import FILLS, fill
+from lidargrit.errors import ConfigError
+from lidargrit.evaluation.raydrop import RAYDROP_CURVES, decoded_surfaces, raydrop_table, score_raydrop
 from lidargrit.formats.numpy_array import NumpyArray
 from lidargrit.formats.ply import Ply
+from lidargrit.generators import load, load_class
 from lidargrit.generators.lidargrit import LidarGrit
 from lidargrit.nn.pixel_networks import PixelDecoderConfig
 from lidargrit.projection import unproject
 from lidargrit.sensors import SensorModel, load_sensor
+from lidargrit.sources import open_images
 from lidargrit.structures import RangeImage
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
@@ -140,6 +144,42 @@ def test_upsample_adds_the_rows_that_lack(places, tmp_path):
     assert len(done.ring.unique()) > 40
     ground = done.points_xyz_m[(done.ring > 30) & (done.ring < 42)]  # between its rows that see the ground
     assert float((ground[:, 2] + 1.7).abs().median()) < 0.2
+
+
+def test_models_and_settings_are_compared_on_hidden_parts(places, tmp_path, capsys):
+    table = tmp_path / "table.json"
+    words = ["compare-completion", f"{places}/scans", f"{places}/run", f"{places}/run:mask=threshold"]
+    assert main([*words, "nearest", "triangulation", "--observed", "rows:4", "pixels:0.3", "--json", str(table)]) == 0
+    told = capsys.readouterr().out
+    scores = json.loads(table.read_text())["scores"]
+    assert [score["observed"] for score in scores] == ["rows:4"] * 4 + ["pixels:0.3"] * 4
+    run, plain, nearest, triangles = scores[:4]
+    assert told.count(plain["model"]) == 2
+    assert (run["mae_m"], run["iou"]) != (plain["mae_m"], plain["iou"])
+    assert triangles["mae_m"]["value"] < nearest["mae_m"]["value"] < run["mae_m"]["value"]
+    assert run["diversity_m"]["value"] > 0.1
+    difference = nearest["mae_m"]["value"] - triangles["mae_m"]["value"]
+    assert nearest["beside_triangulation_m"]["value"] == pytest.approx(difference)
+    assert main([*words[:2], f"{places}/run:completion=guess"]) == 2
+    assert "completion=guess" in capsys.readouterr().err
+
+
+def test_the_drops_of_a_model_are_scored_beside_those_of_a_coin(places):
+    model, true = load(places / "run"), RangeImage.stack([street(SENSOR)] * 4)
+    every = torch.ones_like(true.return_mask)
+    clean = RangeImage.masked(torch.where(true.return_mask, true.range_m, 30.0), every, SENSOR)
+    scores = score_raydrop(model, "simulated", clean, true)
+    assert [score.model.metric for score in scores] == list(RAYDROP_CURVES)
+    assert all(score.floor.value < 1e-3 < min(score.model.value, score.coin.value) for score in scores)
+    assert raydrop_table(scores).count("\n") == 5
+    decoded, same = decoded_surfaces(model, open_images(f"{places}/scans", SENSOR))
+    returns = same.return_mask.any(0)
+    assert bool(returns.any())
+    assert all(torch.equal(mask, returns) for mask in decoded.return_mask)
+    with pytest.raises(ConfigError, match="which drops no returns of clean scans"):
+        score_raydrop(
+            load_class("marginal")(load_class("marginal").smallest_config(SENSOR), SENSOR), "real", clean, true
+        )
 
 
 @pytest.mark.parametrize(

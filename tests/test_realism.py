@@ -10,6 +10,7 @@ import torch
 from lidargrit.cli import main
 from lidargrit.errors import ConfigError, DataError
 from lidargrit.evaluation.realism import CURVES, SimulatedScans, as_table, compare, drop_by_coin, simulate_pair
+from lidargrit.generators.lidargrit import LidarGrit
 from lidargrit.loading import DataConfig
 from lidargrit.metrics import load_metric
 from lidargrit.sensors import load_sensor
@@ -120,12 +121,16 @@ def test_the_picture_has_every_panel(scores, tmp_path):
 
 def test_the_verb(tmp_path, capsys):
     picture, file = tmp_path / "curves.png", tmp_path / "curves.json"
+    torch.manual_seed(0)
+    LidarGrit(LidarGrit.smallest_config(SENSOR), SENSOR).save(tmp_path / "run")
     words = ["compare-sim", "simulated:2:val", "-n", "2", "-o", str(picture), "--json", str(file)]
+    words += ["--model", str(tmp_path / "run")]
     assert main(words) == 0
     assert "drop_run_lengths" in capsys.readouterr().out
     told = json.loads(file.read_text())
     assert told["real"] == "simulated:2:val"
     assert {"simulated", "bernoulli", "real_against_real", "ratio"} == set(told["curves"][0])
+    assert [score["scans"] for score in told["raydrop"]] == ["simulated"] * 5 + ["real"] * 5
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert main(words) == 2  # it is there already
     assert "add --overwrite" in capsys.readouterr().err

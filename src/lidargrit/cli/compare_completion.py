@@ -11,6 +11,7 @@ from lidargrit.untrusted import seed_number
 EXAMPLES = """\
   lidargrit compare-completion simulated:64:test
   lidargrit compare-completion /data/kitti_odometry pretrained runs/r2dm linear triangulation -n 32
+  lidargrit compare-completion /data/held_out runs/mine runs/mine:completion=tokens      by two methods of one run
   lidargrit compare-completion /data/held_out --observed rows:8 pixels:0.05 --json table.json
 """
 

@@ -11,6 +11,7 @@ from lidargrit.untrusted import seed_number
 
 EXAMPLES = """\
   lidargrit compare-sim /data/kitti_odometry
+  lidargrit compare-sim /data/kitti_odometry --model pretrained       and how a model drops returns of clean scans
   lidargrit compare-sim kitti_raw:/data/kitti_raw:2011_09_26_drive_0001_sync -n 64 --json curves.json
 """
 
@@ -24,6 +25,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="compare every column that the sensor fires, not only those that the data set keeps",
     )
+    drops = "run that drops returns of clean scans; its drops are compared, too"
+    parser.add_argument("--model", default="", metavar="RUN", help=drops)
     parser.add_argument("--seed", type=seed_number, default=0, help="seed of the first simulated scan")
     parser.add_argument(
         "-o", "--out", type=Path, default=Path("compare_sim.png"), metavar="PNG", help="picture of the curves"
@@ -34,7 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Simulate, compare, print a table and plot the curves."""
-    from lidargrit.evaluation.realism import as_json, as_table, compare_source
+    from lidargrit.evaluation.raydrop import raydrop_json, raydrop_table, scores_of_model
+    from lidargrit.evaluation.realism import as_json, as_table, compare, scans_of_both
     from lidargrit.files import refuse_to_overwrite
     from lidargrit.reporting import TerminalReporter
     from lidargrit.viewer.curves import plot_curves
@@ -43,9 +47,12 @@ def run(options: argparse.Namespace) -> None:
     refuse_taken(options)
     settings = scan_settings(options)
     about = {"real": options.real, "count": options.count, "sensor": settings.sensor, "fine": options.fine}
-    scores = compare_source(
+    simulated, real = scans_of_both(
         options.real, options.count, settings.sensor, options.fine, options.seed, settings.data, TerminalReporter()
     )
+    scores = compare(simulated, real)
+    drops = scores_of_model(options.model, simulated, real) if options.model else []
     plot_curves(scores, options.out, f"real: {options.real}")
-    result = {**about, "seed": options.seed, "curves": as_json(scores)}
-    print_result(options, as_table(scores), result, f"done: look at {options.out}")
+    result = {**about, "seed": options.seed, "curves": as_json(scores), "raydrop": raydrop_json(drops)}
+    tables = "\n\n".join([as_table(scores), *([raydrop_table(drops)] if drops else [])])
+    print_result(options, tables, result, f"done: look at {options.out}")

@@ -165,13 +165,24 @@ def open_completers(words: Sequence[str], sensor: SensorModel | None = None, dev
     """Return several to be compared on the same scans: classical ways have the sensor of the first run among them.
 
     Args:
-        words: words of :func:`open_completer`.
+        words: words of :func:`open_completer`; a run may bring settings, as in ``pretrained:completion=tokens``.
         sensor: sensor of the scans; only needed where no run is among the words.
         device: device of the runs.
     """
-    runs = {word: open_completer(word, "pixels", sensor, (), device) for word in words if not is_classical(word)}
+    runs: dict[str, Completer] = {}
+    for word in words:
+        if not is_classical(word):
+            folder, settings = _with_settings(word)
+            runs[word] = open_completer(folder, "pixels", sensor, settings, device)
+            runs[word].name = word
     own = next((run.sensor for run in runs.values()), sensor)
     return [runs[word] if word in runs else open_completer(word, "pixels", own) for word in words]
+
+
+def _with_settings(word: str) -> tuple[str, list[str]]:
+    """Return the run that a word names, and the settings that follow it after a colon, if any do."""
+    folder, colon, settings = word.rpartition(":")
+    return (folder, settings.split(",")) if colon and "=" in settings else (word, [])
 
 
 def is_classical(word: str) -> bool:

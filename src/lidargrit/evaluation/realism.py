@@ -95,9 +95,9 @@ def compare(simulated: SimulatedScans, real: RangeImages, curves: Sequence[str] 
             continue
         scores.append(
             CurveScore(
-                _distance(name, [simulated.measured], _batches(real, 0, len(real))),
-                _distance(name, [coin], _batches(real, 0, len(real))),
-                _distance(name, _batches(real, 0, half), _batches(real, half, len(real))),
+                distance(name, [simulated.measured], _batches(real, 0, len(real))),
+                distance(name, [coin], _batches(real, 0, len(real))),
+                distance(name, _batches(real, 0, half), _batches(real, half, len(real))),
             )
         )
     return scores
@@ -118,7 +118,7 @@ def drop_by_coin(clean: RangeImage, return_share: float, seed: int = 0) -> Range
     return dropped if clean.reflectance is None else replace(dropped, reflectance=clean.reflectance * mask)
 
 
-def compare_source(
+def scans_of_both(
     source: str,
     count: int,
     sensor: str = "",
@@ -126,8 +126,8 @@ def compare_source(
     seed: int = 0,
     config: DataConfig | None = None,
     reporter: Reporter | None = None,
-) -> list[CurveScore]:
-    """Simulate scans and compare them with those of a source.
+) -> tuple[SimulatedScans, RangeImages]:
+    """Simulate scans, and open those of a source with which they are to be compared.
 
     Args:
         source: source of real scans.
@@ -152,7 +152,7 @@ def compare_source(
             pairs.append(simulate_pair(each, rays))
             progress.advance(1)
     clean, measured = (RangeImage.stack(list(side)) for side in zip(*pairs, strict=True))
-    return compare(SimulatedScans(clean, measured), real)
+    return SimulatedScans(clean, measured), real
 
 
 def simulate_pair(seed: int, sensor: SensorModel) -> tuple[RangeImage, RangeImage]:
@@ -181,9 +181,16 @@ def _batches(images: RangeImages, first: int, last: int) -> Iterator[RangeImage]
         yield images.batch(range(start, min(start + _BATCH, last)))
 
 
-def _distance(
+def distance(
     name: str, generated: Sequence[RangeImage] | Iterator[RangeImage], real: Iterator[RangeImage]
 ) -> MetricResult:
+    """Return the distance of one curve of generated scans from that of real ones.
+
+    Args:
+        name: name of a metric.
+        generated: batches of generated scans.
+        real: batches of real scans.
+    """
     metric = load_metric(name)()
     for side, is_real in ((generated, False), (real, True)):
         for batch in side:

@@ -27,8 +27,8 @@ _MASK_WEIGHT, _ALONE_WEIGHT, _LOG_WEIGHT, _METRE_WEIGHT = 3.0, 0.5, 1.5, 0.3
 class CompletionObjective(Objective):
     """The errors of the hidden pixels: of the range, and of the mask, by its likelihood in phases and pixel by pixel.
 
-    Every scan has a random pattern: rows, all but a sector or a box, or single pixels. A scan of which more is hidden counts more, with
-    the root of the hidden share.
+    Every scan has a random pattern: rows, all but a sector or a box, or single pixels. A scan of which more is hidden
+    counts more, with the root of the hidden share.
 
     Args:
         network: network that is trained.

@@ -58,7 +58,7 @@ class SampleRequest:
         seed: seed of the first scan; the next scan has the next seed.
         count: number of scans.
         sampling: values of the sampling settings that the client changed, by name.
-        task: what the model makes of the uploaded scan; a key of :data:`TASKS`.
+        task: name of the work on the uploaded scan, a key of :data:`TASKS`.
         region: left, top, right and bottom edge of the region that is to be filled in, as shares of the image's width
             and height; empty if none was drawn.
         file: path of the uploaded scan; "" if there is none.

@@ -1,0 +1,153 @@
+"""What a model drops from clean scans → how far the curves of its drops are from those of true masks, beside a coin."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+
+from lidargrit.conditions import Condition
+from lidargrit.errors import ConfigError
+from lidargrit.evaluation.realism import SimulatedScans, distance, drop_by_coin
+from lidargrit.generators import Generator, load, locate
+from lidargrit.loading import RangeImages
+from lidargrit.structures import MetricResult, RangeImage
+
+RAYDROP_CURVES = (
+    "return_rate_per_ring",
+    "return_rate_per_range",
+    "return_rate_by_incidence",
+    "drop_run_lengths",
+    "drop_correlation",
+)
+"""Curves that depend on which rays return, each a Jensen-Shannon distance."""
+
+
+@dataclass(frozen=True)
+class RaydropScore:
+    """How far one curve of true scans is from those of the same scans with sampled drops, from 0 (alike) to 1.
+
+    Args:
+        scans: kind of the scans whose clean ranges were dropped, ``simulated`` or ``real``.
+        model: distance of the model's drops.
+        coin: distance of drops by a coin of one rate, on the same clean ranges.
+        floor: distance between the two halves of the true scans.
+    """
+
+    scans: str
+    model: MetricResult
+    coin: MetricResult
+    floor: MetricResult
+
+
+def score_raydrop(
+    generator: Generator, scans: str, clean: RangeImage, true: RangeImage, seed: int = 0
+) -> list[RaydropScore]:
+    """Let a model and a coin drop returns of clean scans, and compare either with the true scans.
+
+    Args:
+        generator: model that takes clean surfaces.
+        scans: kind of the scans, ``simulated`` or ``real``.
+        clean: batch of range images in which every surface returns.
+        true: measured range images of the same scans, with true drops.
+        seed: seed of the first scan's drops, and of the coin.
+
+    Raises:
+        ConfigError: a model that does not take clean surfaces.
+    """
+    _check(generator)
+    dropped = []
+    for first in range(0, len(clean), generator.compute_batch):
+        some = clean[first : first + generator.compute_batch]
+        device = next(iter(generator.state_dict().values())).device
+        seeds = range(seed + first, seed + first + len(some))
+        dropped.append(generator.complete(Condition.of_surfaces(some).to(device), seeds).to("cpu"))
+    by_model = RangeImage.cat(dropped)
+    by_coin = drop_by_coin(clean, float(true.return_mask.float().mean()), seed)
+    half = len(true) // 2
+    return [
+        RaydropScore(
+            scans,
+            distance(name, [by_model], _only(true)),
+            distance(name, [by_coin], _only(true)),
+            distance(name, [true[:half]], _only(true[half:])),
+        )
+        for name in RAYDROP_CURVES
+    ]
+
+
+def scores_of_model(word: str, simulated: SimulatedScans, real: RangeImages, seed: int = 0) -> list[RaydropScore]:
+    """Score the drops of a run: on simulated scans, whose clean ranges are known, and on real ones as decoded.
+
+    Args:
+        word: folder of a finished run, or ``pretrained``.
+        simulated: simulated scans of the run's sensor, before and after drops.
+        real: real scans of its sensor.
+        seed: seed of the first scan's drops.
+
+    Raises:
+        ConfigError: a run that does not drop returns of clean scans, or of another sensor.
+    """
+    generator = load(locate(word))
+    clean, true = decoded_surfaces(generator, real)
+    of_simulated = score_raydrop(generator, "simulated", simulated.clean, simulated.measured, seed)
+    return of_simulated + score_raydrop(generator, "real", clean, true, seed)
+
+
+@torch.no_grad()
+def decoded_surfaces(generator: Generator, real: RangeImages) -> tuple[RangeImage, RangeImage]:
+    """Return scans with a range for every ray, as a tokenizer decodes them, and the scans as they are.
+
+    A ray that never returns in any of the scans, such as one that ends on the car, has no surface.
+
+    Args:
+        generator: model with a tokenizer.
+        real: scans of its sensor.
+
+    Raises:
+        ConfigError: a model without a tokenizer, or of another sensor.
+    """
+    if "encode" not in generator.capabilities:
+        got = f"{generator.public_name()!r}, which has no tokenizer to decode clean ranges by"
+        raise ConfigError(got, "a model with one, such as pretrained", "name another model")
+    if not generator.sensor.same_rays(real.sensor):
+        raise ConfigError(
+            f"a model of {generator.sensor.name!r}", f"one of {real.sensor.name!r}", "name a model of the scans' sensor"
+        )
+    tokenizer, sensor = generator.get_tokenizer(), generator.sensor
+    true = real.batch(range(len(real)))
+    device = next(iter(generator.state_dict().values())).device
+    ranges = [
+        tokenizer.decode(tokenizer.encode(true[index : index + 1].to(device))).range_m for index in range(len(true))
+    ]
+    range_m = torch.cat(ranges).float().cpu().clamp(sensor.range_min_m, sensor.range_max_m)
+    return RangeImage.masked(range_m, true.return_mask.any(0).expand_as(true.return_mask), sensor), true
+
+
+def raydrop_table(scores: Sequence[RaydropScore]) -> str:
+    """Return scores as lines for a terminal."""
+    lines = []
+    for scans in dict.fromkeys(score.scans for score in scores):
+        lines.append(f"{'raydrop of ' + scans + ' scans':<28}{'model':>10}{'coin':>10}{'halves':>10}")
+        for score in scores:
+            if score.scans == scans:
+                values = f"{score.model.value:>10.4f}{score.coin.value:>10.4f}{score.floor.value:>10.4f}"
+                lines.append(f"{score.model.metric:<28}{values}")
+    return "\n".join(lines)
+
+
+def raydrop_json(scores: Sequence[RaydropScore]) -> list[dict[str, Any]]:
+    """Return scores with their curves for a file."""
+    return [asdict(score) for score in scores]
+
+
+def _check(generator: Generator) -> None:
+    if "surfaces" not in generator.conditions:
+        got = f"{generator.public_name()!r}, which drops no returns of clean scans"
+        raise ConfigError(got, "a model that does, such as pretrained", "name another model")
+
+
+def _only(images: RangeImage) -> Iterator[RangeImage]:
+    yield images
