@@ -13,7 +13,7 @@ RECIPE = replace(
     training={
         **compact.RECIPE.training,
         "completion": FitConfig(
-            scans=24_000,
+            scans=22_000,
             batch_size=4,
             learning_rate=1.5e-3,
             schedule="cosine",
