@@ -32,8 +32,10 @@ def main(folder: Path, run: str = "pretrained") -> None:
     panels.append(("filled in by triangulation", fill("triangulation", known)[0]))
     sampled = model.complete(Condition.cat([known] * SAMPLES), range(SAMPLES), TokenSampling(completion="tokens"))
     panels += [(f"sampled by the model, seed {seed}", sampled[seed]) for seed in range(4)]
-    guess = ("the best guess of its network for completion", model.complete(known, [0])[0])
-    panels.append(guess if model.completion is not None else ("sampled by the model, seed 4", sampled[4]))
+    if model.completion is None:
+        panels.append(("sampled by the model, seed 4", sampled[4]))
+    else:
+        panels.append(("the best guess of its network for completion", model.complete(known, [0])[0]))
     plot(panels, folder / "completion.png")
     dropped = model.complete(Condition.cat([Condition.of_surfaces(clean)] * SAMPLES), range(SAMPLES))
     panels = [("clean ranges, as a simulator casts them", clean[0])]
@@ -44,7 +46,7 @@ def main(folder: Path, run: str = "pretrained") -> None:
     print(f"street {STREET} by {run}: {folder / 'completion.png'} and {folder / 'raydrop_by_model.png'}")
 
 
-def plot(panels: list[tuple[str, Float[Tensor, "H W"]]], path: Path, share: Float[Tensor, "H W"] | None = None) -> None:
+def plot(panels: list[tuple[str, RangeImage]], path: Path, share: Float[Tensor, "H W"] | None = None) -> None:
     """Plot range images below one another, and beneath them the share of returns."""
     count = len(panels) + (share is not None)
     figure, axes = plt.subplots(count, figsize=(8, 1.35 * count), layout="constrained")
