@@ -282,7 +282,8 @@ def test_doctor_tells_versions_and_room(typed):
     assert os.environ["LIDARGRIT_CACHE"] in told
 
 
-def test_demo_writes_its_page_and_writes_it_again(tmp_path, typed):
+def test_demo_writes_its_page_and_writes_it_again(tmp_path, typed, monkeypatch):
+    monkeypatch.setattr(lidargrit.demo, "_PACKAGED_SCANS", 1)
     words = ("demo", "--out", tmp_path / "demo", "--set", *TINY, *PIXELS)
     assert f"done: look at {tmp_path / 'demo'}" in typed(*words)
     before = contents(tmp_path / "demo")
@@ -292,6 +293,7 @@ def test_demo_writes_its_page_and_writes_it_again(tmp_path, typed):
         "scans_reconstructed_generated.png",
         "generated.png",
         "samples/00000015.npz",
+        "samples_of_packaged_model/00000000.npz",
         "model.safetensors",
     ):
         assert name in before

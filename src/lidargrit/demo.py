@@ -19,7 +19,7 @@ from lidargrit.evaluation.reconstruction import ReconstructionErrors, score_reco
 from lidargrit.evaluation.reference_rows import with_held_out, with_pixel_statistics
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.files import read_json, write_json
-from lidargrit.generators import Generator
+from lidargrit.generators import PRETRAINED, RUN_FILE, Generator, load
 from lidargrit.generators.lidargrit import LidarGrit
 from lidargrit.loading import DataConfig, RangeImages
 from lidargrit.nn.pixel_decoder import PixelSampling
@@ -27,7 +27,8 @@ from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
 from lidargrit.sources import load_range_images, open_source
 from lidargrit.sources.samples import read_samples, write_samples
-from lidargrit.training import check_folder, train
+from lidargrit.structures import RangeImage
+from lidargrit.training import Recipe, check_folder, train
 from lidargrit.training.log import LOG_FILE, read_log
 from lidargrit.viewer import plot_comparison
 from lidargrit.viewer.demo_page import DemoPage, write_demo_page
@@ -36,6 +37,10 @@ from lidargrit.viewer.scan_sets import ScanSet
 PAGE, PICTURE, TIMINGS = "demo.html", "scans_reconstructed_generated.png", "timings.json"
 _NUM_SAMPLES = 16
 _MAX_SCANS = 400  # of the user's: more would not be seen in the demo's few minutes
+# Seconds on two cores without 16-bit instructions, to estimate the time left before anything was measured.
+_SIMULATED_S, _READ_S, _SAMPLED_S, _SCORED_S = 45.0, 20.0, 20.0, 20.0
+_TRAINED_S = {"tokenizer": 0.23, "transformer": 0.06, "pixels": 0.14}  # for each scan seen
+_PACKAGED_SCANS = 6  # sampled by the model in the package, which was trained for three hours
 _SCANS_OF_A_SET = 6  # of each set on the page: enough to step through, and half a megabyte each
 
 
@@ -53,22 +58,32 @@ def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter
         recipe = replace(recipe, data=divided(data, reporter))
     recipe = override(recipe, settings)
     check_folder(folder, recipe)
-    reporter.message("lidargrit demo: about 14 minutes on two cores; stop it at any time, the same command goes on")
+    expected_s = _expected_s(recipe, simulates=data is None)
+    minutes = max(1, round(sum(expected_s.values()) / 60))
+    reporter.message(
+        f"lidargrit demo: about {minutes} minutes on two cores; stop it at any time, the same command goes on"
+    )
+    reporter.expect(expected_s)
     clock = _Clock(folder / TIMINGS)
     with clock.stage("read the scans and project them" if data else "simulate scans and project them"):
         real = load_range_images(recipe.data.train, recipe.data, reporter)
         val = load_range_images(recipe.data.val, recipe.data, reporter)
     generator = train(recipe, folder, reporter)
+    clock.keep()
     for stage in generator.stages:
         clock.add(f"train the {stage}", _trained_s(folder / stage / LOG_FILE))
-    clock.keep()
     with clock.stage(f"sample {_NUM_SAMPLES} new scans"):
         write_samples(generator, folder, folder / "samples", range(_NUM_SAMPLES), reporter=reporter)
     samples = read_samples(folder / "samples", _NUM_SAMPLES)
+    packaged = None
+    if data is None:
+        with clock.stage(f"sample {_PACKAGED_SCANS} scans from the packaged model"):
+            folders = PRETRAINED, folder / "samples_of_packaged_model"
+            write_samples(load(PRETRAINED), *folders, range(_PACKAGED_SCANS), reporter=reporter)
+        packaged = read_samples(folders[1], _PACKAGED_SCANS)
     with clock.stage("score reconstruction and new scans"):
         reconstruction = score_reconstruction(generator.get_tokenizer(), val)
         card = _score(samples, val, real, reporter)
-    clock.keep()
     write_json(
         folder / "evaluation.json",
         {"reconstruction_on_val": asdict(reconstruction), "generated_against_train": card.to_json()},
@@ -89,7 +104,7 @@ def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter
         f"LidarGRIT at a small size: {weights:.1f} million weights",
         f"{len(real):,} {kind} scans to learn from and {len(val):,} held out, of the sensor {generator.sensor.name}",
     )
-    write_results_page(generator, kind, val, samples, reconstruction, card, clock.seconds, facts, folder)
+    write_results_page(generator, kind, val, samples, reconstruction, card, clock.seconds, facts, folder, packaged)
     return folder
 
 
@@ -103,6 +118,7 @@ def write_results_page(
     seconds: dict[str, float],
     facts: tuple[str, ...],
     folder: Path,
+    packaged: RangeImages | None = None,
 ) -> None:
     """Write the page ``demo.html`` into a run's folder.
 
@@ -116,8 +132,10 @@ def write_results_page(
         seconds: time that each stage took, in seconds, by its name.
         facts: short sentences about the model and its training.
         folder: folder of the run.
+        packaged: scans sampled by the model in the package, to show what longer training gives; None for none.
     """
     tokenizer, held_out = generator.get_tokenizer(), val.batch(evenly_spaced(_SCANS_OF_A_SET, len(val)))
+    new = samples.batch(range(min(_SCANS_OF_A_SET, len(samples))))
     names = tuple(val.provenance.names[index].rpartition("/")[2] for index in evenly_spaced(_SCANS_OF_A_SET, len(val)))
     with torch.no_grad():
         tokens = tokenizer.encode(held_out[:1])
@@ -127,19 +145,29 @@ def write_results_page(
         if isinstance(generator, LidarGrit) and generator.pixels is not None:
             by_phases = generator.pixels.sample(decoded, [torch.Generator().manual_seed(0)], PixelSampling())
             coarsest_cell = generator.pixels.config.coarsest_cell
-        reconstructed = generator.reconstruct(held_out)
-    new = samples.batch(range(min(_SCANS_OF_A_SET, len(samples))))
     seeds = tuple(f"seed {seed}" for seed in range(len(new)))
-    sets = (
+    sets = [
         ScanSet(f"{kind}, held out", held_out, names),
-        ScanSet("reconstructed", reconstructed, names),
+        ScanSet("reconstructed", _reconstructed(generator, held_out), names),
         ScanSet("new", new, seeds),
-    )
+    ]
+    if packaged is not None:
+        sets.append(ScanSet("new, by the packaged model", packaged.batch(range(len(packaged))), seeds[: len(packaged)]))
     results = errors, card, seconds, facts, folder
     write_demo_page(
         DemoPage(kind, names[0], held_out[:1], tokens, decoded, sampled, by_phases, coarsest_cell, sets, *results),
         folder / PAGE,
     )
+
+
+@torch.no_grad()
+def _reconstructed(generator: Generator, images: RangeImage) -> RangeImage:
+    """Return scans decoded from the tokens of others just as those of new scans are, with sampled return masks."""
+    tokenizer = generator.get_tokenizer()
+    tokens, rngs = tokenizer.encode(images), [torch.Generator().manual_seed(seed) for seed in range(len(images))]
+    if isinstance(generator, LidarGrit) and generator.pixels is not None:
+        return generator.pixels.sample(tokenizer.decode(tokens), rngs, PixelSampling())
+    return tokenizer.sample(tokens, rngs)
 
 
 def divided(data: str, reporter: Reporter) -> DataConfig:
@@ -170,6 +198,17 @@ def divided(data: str, reporter: Reporter) -> DataConfig:
     return DataConfig(train=(train,), val=(val,), sensor=dataset.sensor, max_scans=_MAX_SCANS)
 
 
+def _expected_s(recipe: Recipe, simulates: bool) -> dict[str, float]:
+    """Return how long each long piece of the demo takes on two cores without 16-bit instructions, in seconds."""
+    training_s = {f"training {name}": fit.scans * _TRAINED_S.get(name, 0.2) for name, fit in recipe.training.items()}
+    return {
+        "projecting scans": _SIMULATED_S if simulates else _READ_S,
+        **training_s,
+        "sampling": _SAMPLED_S,
+        "scoring": _SCORED_S,
+    }
+
+
 def _score(samples: RangeImages, val: RangeImages, real: RangeImages, reporter: Reporter) -> Scorecard:
     """Score new scans against training scans, with held-out scans and pixel statistics beside them, as many of each."""
     count = min(len(samples), len(real), len(val))
@@ -182,10 +221,14 @@ def _score(samples: RangeImages, val: RangeImages, real: RangeImages, reporter: 
     return with_pixel_statistics(with_held_out(card, held_out, reference, settings), pair, real, settings)
 
 
-class _Clock:
-    """The time of each stage when it was first done, kept in a file: the same command does no stage again.
+_INTERRUPTED = " (interrupted)"  # end of the name of a stage that is not done yet, with the time that it took so far
 
-    The file is written once a run lies beside it, because a folder that holds anything else is refused.
+
+class _Clock:
+    """The time that each stage took until it was done, kept in a file: the same command does no stage again.
+
+    Stages that were interrupted keep the time that they had taken. The file is written once a run lies beside it,
+    because a folder that holds anything else is refused.
     """
 
     def __init__(self, path: Path) -> None:
@@ -196,15 +239,21 @@ class _Clock:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        begun = time.monotonic()
-        yield
-        self.add(name, time.monotonic() - begun)
+        begun, ended = time.monotonic(), False
+        try:
+            yield
+            ended = True
+        finally:
+            took = time.monotonic() - begun + self.seconds.pop(name + _INTERRUPTED, 0.0)
+            self.add(name if ended or name in self.seconds else name + _INTERRUPTED, took)
+            self.keep()
 
     def add(self, name: str, seconds: float) -> None:
         self.seconds.setdefault(name, round(seconds, 1))
 
     def keep(self) -> None:
-        write_json(self._path, self.seconds)
+        if (self._path.parent / RUN_FILE).is_file():
+            write_json(self._path, self.seconds)
 
 
 def _trained_s(log: Path) -> float:
@@ -221,7 +270,7 @@ def _plot_pictures(generator: Generator, kind: str, val: RangeImages, samples: R
     real = val.batch(evenly_spaced(3, len(val)))
     title = f"{kind} scans never trained on, what the tokens keep of them, and new scans"
     plot_comparison(
-        {kind: real, "reconstructed": generator.reconstruct(real), "generated": samples.batch(range(3))},
+        {kind: real, "reconstructed": _reconstructed(generator, real), "generated": samples.batch(range(3))},
         folder / PICTURE,
         title=title,
     )

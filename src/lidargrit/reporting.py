@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
+
+_SILENT_S_AT_MOST = 10.0  # between two lines of one piece of work, where there is no terminal
+_PRIOR_S = 10.0  # of expected work that counts as having taken as long as expected, so that first seconds mislead less
+_NOTE_COLUMNS = 110  # of a terminal; narrower ones show no note behind the bar
+_BAR_COLUMNS = 10, 40  # fewest and most columns of a bar
+_WORDS_COLUMNS = 72  # of all but the bar and the note
 
 
 class Progress:
@@ -21,6 +28,13 @@ class Reporter:
     def message(self, text: str) -> None:
         """Say one line."""
 
+    def expect(self, expected_s: Mapping[str, float]) -> None:
+        """Announce all pieces of work to come, so that the time left for all of them can be shown.
+
+        Args:
+            expected_s: expected seconds of each piece, by its name in :meth:`progress`, in order.
+        """
+
     @contextmanager
     def progress(self, what: str, total: int, done: int = 0) -> Iterator[Progress]:
         """Show how far a piece of work is and how long it will still take."""
@@ -31,39 +45,84 @@ class Reporter:
         return self
 
 
+class Schedule:
+    """Several pieces of work in a row: how long they will still take together.
+
+    The pace of the work so far, its seconds over the expected ones, is taken to be the pace of the rest. A piece that
+    never began although a later one has is taken to be done, as where its results were there already.
+
+    Args:
+        expected_s: expected seconds of each piece, by its name, in order.
+        clock: function that returns seconds.
+    """
+
+    def __init__(self, expected_s: Mapping[str, float], clock: Callable[[], float] = time.monotonic) -> None:
+        self._expected_s, self._clock = dict(expected_s), clock
+        self._left_s = dict(expected_s)  # expected seconds of what is not done yet
+        self._worked_s = self._took_s = 0.0  # expected and measured seconds of what was done
+        self._at = clock()
+
+    def begin(self, what: str, share: float) -> None:
+        """Note that a piece begins, of which a share is done already."""
+        if what not in self._expected_s:
+            return
+        for name in self._expected_s:
+            if name == what:
+                break
+            self._left_s[name] = 0.0
+        self._left_s[what] = min(self._left_s[what], (1 - share) * self._expected_s[what])
+        self._at = self._clock()
+
+    def advance(self, what: str, share: float) -> None:
+        """Note which share of a piece is done by now."""
+        if what not in self._expected_s:
+            return
+        left_s, now = min(self._left_s[what], (1 - share) * self._expected_s[what]), self._clock()
+        self._worked_s += self._left_s[what] - left_s
+        self._took_s += now - self._at
+        self._left_s[what], self._at = left_s, now
+
+    def left_s(self) -> float:
+        """Return the seconds that all pieces will still take."""
+        return sum(self._left_s.values()) * (self._took_s + _PRIOR_S) / (self._worked_s + _PRIOR_S)
+
+
 class TerminalReporter(Reporter):
-    """Speaks on standard error: bars on a terminal, a line now and then in a log file."""
+    """Speaks on standard error: bars on a terminal, a line every few seconds in a log file."""
 
     def __init__(self) -> None:
         from rich.console import Console  # noqa: PLC0415  only the command line needs it
 
         self._console = Console(file=sys.stderr, highlight=False)
+        self._schedule = Schedule({})
 
     def message(self, text: str) -> None:
         """Say one line."""
         self._console.print(text, markup=False, soft_wrap=True)
 
+    def expect(self, expected_s: Mapping[str, float]) -> None:
+        """Show from now on how long all pieces of work will still take."""
+        self._schedule = Schedule(expected_s)
+
     @contextmanager
     def progress(self, what: str, total: int, done: int = 0) -> Iterator[Progress]:
         """Show a bar with the time left."""
+        self._schedule.begin(what, done / max(total, 1))
+        if not self._console.is_terminal:
+            yield _LoggedProgress(self.message, self._schedule, what, total, done)
+            return
         from rich import progress as bars  # noqa: PLC0415
 
+        low, high = _BAR_COLUMNS
         columns: list[Any] = [
-            bars.TextColumn("{task.description:<22}"),
-            bars.BarColumn(),
+            bars.TextColumn("{task.description}"),
+            bars.BarColumn(bar_width=max(low, min(high, self._console.width - _WORDS_COLUMNS))),
             bars.MofNCompleteColumn(),
-            bars.TextColumn("{task.fields[rate]:>16}"),
-            bars.TimeElapsedColumn(),
-            bars.TextColumn("left"),
-            bars.TimeRemainingColumn(elapsed_when_finished=False),
-            bars.TextColumn("{task.fields[note]}"),
+            bars.TextColumn("{task.fields[words]}"),
         ]
-        if not self._console.is_terminal:
-            yield _LoggedProgress(self, what, total, done)
-            return
         with bars.Progress(*columns, console=self._console, speed_estimate_period=60) as display:
-            task = display.add_task(what, total=total, completed=done, note="", rate="")
-            yield _Bar(display, task)
+            task = display.add_task(what, total=total, completed=done, words="")
+            yield _Bar(display, task, self._schedule, self._console.width >= _NOTE_COLUMNS)
 
     def of_process(self, name: str) -> Reporter:
         """Return a reporter without bars, which would overwrite those of other processes."""
@@ -83,30 +142,45 @@ class _LineReporter(Reporter):
 
 
 class _Bar(Progress):
-    def __init__(self, display: Any, task: Any) -> None:
-        self._display, self._task = display, task
+    def __init__(self, display: Any, task: Any, schedule: Schedule, shows_note: bool) -> None:
+        self._display, self._task, self._schedule, self._shows_note = display, task, schedule, shows_note
 
     def advance(self, amount: int, note: str = "") -> None:
-        speed = self._display.tasks[self._task].speed
-        rate = f"{speed:.1f} scans/s" if speed else ""
-        self._display.update(self._task, advance=amount, note=note, rate=rate)
+        self._display.update(self._task, advance=amount)
+        task = self._display.tasks[self._task]
+        self._schedule.advance(task.description, task.completed / max(task.total, 1))
+        words = _words(task.speed or 0.0, float(task.time_remaining or 0), self._schedule.left_s())
+        self._display.update(self._task, words=f"{words} {note}".rstrip() if self._shows_note else words)
 
 
 class _LoggedProgress(Progress):
-    """One line at every tenth of the work, for output that is not a terminal."""
+    """A line every few seconds, and at every tenth of the work, for output that is not a terminal."""
 
-    def __init__(self, reporter: Reporter, what: str, total: int, done: int) -> None:
-        from time import monotonic  # noqa: PLC0415
-
-        self._reporter, self._what, self._total, self._done, self._clock = reporter, what, total, done, monotonic
-        self._begun, self._begun_at = monotonic(), done
+    def __init__(self, say: Callable[[str], None], schedule: Schedule, what: str, total: int, done: int) -> None:
+        self._say, self._schedule, self._what, self._total, self._done = say, schedule, what, total, done
+        self._begun_s = self._said_s = time.monotonic()
+        self._begun_at = done
 
     def advance(self, amount: int, note: str = "") -> None:
         before, self._done = self._done, self._done + amount
-        if self._total and before * 10 // self._total == self._done * 10 // self._total:
+        self._schedule.advance(self._what, self._done / max(self._total, 1))
+        now_s, tenth = time.monotonic(), max(self._total, 1) / 10
+        if before // tenth == self._done // tenth and now_s - self._said_s < _SILENT_S_AT_MOST:
             return
-        speed = (self._done - self._begun_at) / max(self._clock() - self._begun, 1e-9)
-        left_s = (self._total - self._done) / max(speed, 1e-9)
-        self._reporter.message(
-            f"{self._what}: {self._done}/{self._total}, {speed:.1f} scans/s, {left_s:.0f} s left {note}".rstrip()
-        )
+        self._said_s = now_s
+        speed = (self._done - self._begun_at) / max(now_s - self._begun_s, 1e-9)
+        words = _words(speed, (self._total - self._done) / max(speed, 1e-9), self._schedule.left_s())
+        self._say(f"{self._what}: {self._done}/{self._total} {words} {note}".rstrip())
+
+
+def _words(speed: float, left_s: float, all_left_s: float) -> str:
+    """Return speed and time left in words: ``1.2/s, 8:01 left, 12:30 in all``."""
+    in_all = f", {_minutes(all_left_s)} in all" if all_left_s > left_s else ""
+    return f"{speed:.1f}/s, {_minutes(left_s)} left{in_all}"
+
+
+def _minutes(seconds: float) -> str:
+    """Return a time as minutes and seconds, or hours, minutes and seconds."""
+    whole = round(min(seconds, 1e7))
+    hours, rest = divmod(whole, 3600)
+    return f"{hours}:{rest // 60:02d}:{rest % 60:02d}" if hours else f"{rest // 60}:{rest % 60:02d}"

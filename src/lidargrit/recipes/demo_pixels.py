@@ -5,7 +5,7 @@ from dataclasses import replace
 from lidargrit.configuration import override
 from lidargrit.recipes import compact_pixels
 
-_DATA = ("data.train=simulated:192:train", "data.val=simulated:16:val")
+_DATA = ("data.train=simulated:256:train", "data.val=simulated:16:val")
 _SMALLER = ("model.transformer.layers=3", "model.transformer.width=192")
 # So few scans that each stage takes about a quarter to a half of the time: measured step by step, in 32 bits.
 _TOKENIZER = ("scans=640", "warmup_scans=40", "average_over_scans=60", "validate_every=320", "checkpoint_every=160")

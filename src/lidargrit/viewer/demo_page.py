@@ -40,7 +40,7 @@ main{display:block;max-width:1240px}
 .three{display:grid;grid-template-columns:repeat(3,1fr);gap:4px 20px}
 .phases{display:grid;grid-template-columns:repeat(4,1fr);gap:4px 14px;margin-bottom:1em}
 .points{min-height:380px}
-@media (min-width:1000px){#panes{grid-template-columns:repeat(3,1fr)}}
+@media (min-width:1000px){#panes:has(> :nth-child(3):last-child){grid-template-columns:repeat(3,1fr)}}
 .bar rect,rect.bar{fill:var(--b)}
 .tokens{width:100%;max-width:760px;font-family:ui-monospace,monospace}
 .grid{display:block;width:100%;height:170px;border-radius:3px}
@@ -308,9 +308,15 @@ def _its_phases(demo: DemoPage) -> _Step:
 def _new_scans(demo: DemoPage) -> _Step:
     text = (
         "The second network, a transformer, samples new tokens one after another, each from probabilities that depend "
-        "on the tokens before it. The decoders turn them into new scans, in the set called <i>new</i>. Drag to turn "
-        "the points, use the wheel to zoom, and step through the scans with the arrows."
+        "on the tokens before it. The decoders turn them into new scans, in the set <i>new</i>. All sets but the "
+        "first come from tokens in the same way, with a sampled return mask. Drag to turn the points, use the wheel to "
+        "zoom, and step through the scans with the arrows."
     )
+    if len(demo.sets) > 3:
+        text += (
+            " The last set comes from the model in the package, which is of the same kind and was trained for three "
+            "hours on one core instead of a few minutes."
+        )
     buttons = button("bin", ".bin") + button("ply", ".ply")
     return _Step("New scans", text, interactive.viewer_html("", f"Save {buttons}", f"Made by lidargrit {__version__}."))
 

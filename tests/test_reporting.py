@@ -1,0 +1,86 @@
+"""What long work says: how much is left of it and of all work, on terminals and in files."""
+
+import io
+
+import pytest
+from rich.console import Console
+
+from lidargrit import reporting
+from lidargrit.demo import _INTERRUPTED, _Clock
+from lidargrit.files import read_json
+from lidargrit.generators import RUN_FILE
+from lidargrit.reporting import Schedule, TerminalReporter
+
+
+class Clock:
+    seconds = 0.0
+
+    def __call__(self) -> float:
+        return self.seconds
+
+
+def reporter_on(width: int, is_terminal: bool) -> tuple[TerminalReporter, io.StringIO]:
+    reporter, text = TerminalReporter(), io.StringIO()
+    reporter._console = Console(file=text, width=width, force_terminal=is_terminal, highlight=False)
+    return reporter, text
+
+
+def test_a_schedule_learns_the_pace_and_skips_what_was_done_already():
+    clock = Clock()
+    schedule = Schedule({"simulate": 50.0, "train": 100.0, "score": 10.0}, clock)
+    assert schedule.left_s() == 160.0, "as expected, before anything is known"
+    schedule.begin("train", 0.0)  # the scans were there
+    assert schedule.left_s() == 110.0
+    clock.seconds = 100.0
+    schedule.advance("train", 0.5)  # twice as slow as expected
+    assert schedule.left_s() == pytest.approx(60 * 110 / 60)
+    schedule.advance("train", 1.0)
+    schedule.begin("train", 0.0)  # again, as for a second source of scans
+    schedule.advance("train", 0.5)
+    schedule.begin("another", 0.0)
+    schedule.advance("another", 0.5)
+    assert schedule.left_s() == pytest.approx(10 * 110 / 110)
+
+
+def test_files_get_a_line_every_ten_seconds_and_at_every_tenth(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr(reporting.time, "monotonic", clock)
+    reporter, text = reporter_on(200, is_terminal=False)
+    reporter.expect({"training": 100.0, "scoring": 3600.0})
+    with reporter.progress("training", 1000) as progress:
+        for _ in range(30):
+            clock.seconds += 1.0
+            progress.advance(1, note="loss 1")
+        progress.advance(100)
+    lines = text.getvalue().splitlines()
+    assert [line.split()[1] for line in lines] == ["10/1000", "20/1000", "30/1000", "130/1000"]
+    assert lines[0].startswith("training: 10/1000 1.0/s, 16:30 left, ")
+    assert " in all loss 1" in lines[0]
+
+
+@pytest.mark.parametrize("width", [80, 160])
+def test_a_bar_fits_its_terminal(width):
+    reporter, text = reporter_on(width, is_terminal=True)
+    reporter.expect({"training transformer": 3000.0, "scoring": 30.0})
+    with reporter.progress("training transformer", 20_000, 10_000) as progress:
+        for _ in range(3):
+            progress.advance(8, note="loss 1.2345  0.8 GiB")
+    last = [line for line in text.getvalue().splitlines() if "10024/20000" in line][-1]
+    assert " left" in last
+    assert "…" not in last, "nothing is cut"
+    assert ("GiB" in last) == (width > 100)
+
+
+def test_interrupted_stages_keep_the_time_that_they_took(tmp_path):
+    (tmp_path / RUN_FILE).write_text("{}")
+    path = tmp_path / "timings.json"
+    with pytest.raises(KeyboardInterrupt), _Clock(path).stage("sample"):
+        raise KeyboardInterrupt
+    assert list(read_json(path)) == ["sample" + _INTERRUPTED]
+    path.write_text('{"sample (interrupted)": 41.0}')
+    with _Clock(path).stage("sample"):
+        pass
+    assert read_json(path) == {"sample": 41.0}
+    with _Clock(path).stage("sample"):  # the same command again
+        pass
+    assert read_json(path) == {"sample": 41.0}
