@@ -1,8 +1,8 @@
 # Two commands do everything on a fresh machine: `make demo` and `make test`.
-#   make demo              the main job on simulated streets, about 14 minutes on two cores
+#   make demo              the main job on simulated streets, about six minutes on two cores
 #   make demo DATA=FOLDER  the same on your own KITTI-style scans
 #   make test              all checks and all tests
-#   make environment       .venv alone, which all others make if it is missing
+#   make environment       .venv alone, which all others make if it is missing; a few minutes, see install.sh
 #   make docs              the documentation as a site, in site/
 #   make package           a wheel, installed where nothing else is, and tried; minutes, most of them for torch
 
@@ -32,11 +32,11 @@ package: .venv/.complete
 	$(BIN)/python tests/package/try_wheel.py
 
 .venv/.docs: .venv/.complete
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[docs]"
+	sh install.sh docs
 	touch $@
 
 # The mark is made last: an interrupted installation is taken up again.
 .venv/.complete: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
+	sh install.sh dev
 	touch $@

@@ -283,7 +283,7 @@ def test_doctor_tells_versions_and_room(typed):
 
 
 def test_demo_writes_its_page_and_writes_it_again(tmp_path, typed, monkeypatch):
-    monkeypatch.setattr(lidargrit.demo, "_PACKAGED_SCANS", 1)
+    monkeypatch.setattr("lidargrit.demo._PACKAGED_SCANS", 1)
     words = ("demo", "--out", tmp_path / "demo", "--set", *TINY, *PIXELS)
     assert f"done: look at {tmp_path / 'demo'}" in typed(*words)
     before = contents(tmp_path / "demo")

@@ -13,6 +13,7 @@ from lidargrit import demo
 from lidargrit.evaluation.intervals import RealAgainstReal
 from lidargrit.evaluation.reconstruction import score_reconstruction
 from lidargrit.evaluation.reference_rows import ImagesInMemory
+from lidargrit.generators import RUN_FILE
 from lidargrit.generators.lidargrit import LidarGrit
 from lidargrit.loading import Provenance, RangeImages
 from lidargrit.nn.pixel_networks import PixelDecoderConfig
@@ -135,6 +136,7 @@ def test_times_are_those_of_the_first_time(tmp_path):
         pass
     clock.add("b", 7.04)
     assert not (tmp_path / "timings.json").exists(), "a folder that is not ours is left as it is"
+    (tmp_path / RUN_FILE).write_text("{}")
     clock.keep()
     again = demo._Clock(tmp_path / "timings.json")
     again.add("b", 100.0)

@@ -138,7 +138,7 @@ def test_examples_run_and_draw_what_is_shown(path, tmp_path, capsys):
         setattr(module, name, 3)  # what is shown takes seconds more
     module.main(tmp_path)
     assert capsys.readouterr().out
-    drawn = re.findall(r"→ (\w+\.png)\.", module.__doc__ or "")
+    drawn = re.findall(r"→ (\w+\.(?:png|webp))\.", module.__doc__ or "")
     assert {file.name for file in tmp_path.iterdir()} == set(drawn)
     for name in drawn:
         with Image.open(tmp_path / name) as new, Image.open(ROOT / "docs" / "pictures" / name) as shown:

@@ -249,7 +249,7 @@ def test_one_camera_turns_all_views(opened):
 def test_colours_are_chosen_and_explained(opened):
     seen = {}
     opened.run("document.querySelector('#mode').focus()")
-    legends = {"range": "m away", "height": "above the sensor", "reflectance": "1, strong", "ring": "bottom row"}
+    legends = {"height": "above the sensor", "range": "m away", "reflectance": "1, strong", "ring": "bottom row"}
     for mode, legend in legends.items():
         assert opened.run("document.querySelector('#mode').value") == mode
         assert legend in opened.run("document.querySelector('#legend').textContent")

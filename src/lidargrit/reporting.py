@@ -169,14 +169,15 @@ class _LoggedProgress(Progress):
             return
         self._said_s = now_s
         speed = (self._done - self._begun_at) / max(now_s - self._begun_s, 1e-9)
-        words = _words(speed, (self._total - self._done) / max(speed, 1e-9), self._schedule.left_s())
+        left_s = (self._total - self._done) / speed if speed else 0.0
+        words = _words(speed, left_s, self._schedule.left_s())
         self._say(f"{self._what}: {self._done}/{self._total} {words} {note}".rstrip())
 
 
 def _words(speed: float, left_s: float, all_left_s: float) -> str:
     """Return speed and time left in words: ``1.2/s, 8:01 left, 12:30 in all``."""
-    in_all = f", {_minutes(all_left_s)} in all" if all_left_s > left_s else ""
-    return f"{speed:.1f}/s, {_minutes(left_s)} left{in_all}"
+    in_all = [f"{_minutes(all_left_s)} in all"] if all_left_s > left_s else []
+    return ", ".join([f"{speed:.1f}/s", f"{_minutes(left_s)} left", *in_all] if speed else in_all)
 
 
 def _minutes(seconds: float) -> str:

@@ -33,17 +33,18 @@ _SCRIPTS = ("scans.js", "camera.js", "points.js", "files.js", "pane.js", "page.j
 _RANGE_STEPS = 65_535  # 16 bits, of which 0 is no return
 _CLASSES_AT_MOST = 255  # 8 bits; SemanticKITTI has 34
 _RAMP_STEPS = 64
+_MOST = 0.85  # of the returns lie in what the first view shows
 # Which part of which scale: ends that would vanish into the background are left out.
 _RAMPS = {
     "dark": {
         "range": ("viridis_r", 0.0, 0.85),
-        "height": ("turbo", 0.1, 0.95),
+        "height": ("plasma", 0.12, 1.0),
         "reflectance": ("inferno", 0.25, 1.0),
         "ring": ("turbo", 0.1, 0.95),
     },
     "light": {
         "range": ("viridis_r", 0.12, 1.0),
-        "height": ("turbo", 0.03, 0.95),
+        "height": ("plasma", 0.0, 0.88),
         "reflectance": ("inferno_r", 0.18, 1.0),
         "ring": ("turbo", 0.03, 0.95),
     },
@@ -144,6 +145,7 @@ def page_data(sets: Sequence[ScanSet]) -> dict[str, Any]:
         "sources": [_source(one, numbers) for one in sets],
         "classes": [{"number": number, "name": name, "colour": colour} for number, name, colour in named],
         "scales": _scales(sets),
+        "reachM": _reach_m(sets),
         "looks": {
             theme: {
                 "ramps": {mode: _ramp(*of) for mode, of in ramps.items()},
@@ -176,6 +178,7 @@ def _source(scan_set: ScanSet, numbers: list[int]) -> dict[str, Any]:
         "elevation": _packed(images.sensor.elevation_rad.numpy().astype("<f4")),
         "azimuth": _packed(images.sensor.azimuth_rad.numpy().astype("<f4")),
         "rangeStepM": step_m,
+        "columnStride": images.sensor.column_stride,
         "endM": min(images.sensor.range_max_m, _far_m(scan_set)),  # a ray ends where returns do: the rest is empty
         "scans": scans,
     }
@@ -205,6 +208,12 @@ def _scales(sets: Sequence[ScanSet]) -> dict[str, tuple[float, float]]:
         "reflectance": (0.0, 1.0),
         "ring": (0.0, 1.0),
     }
+
+
+def _reach_m(sets: Sequence[ScanSet]) -> float:
+    """Return the range within which most returns of all sets lie: what the first view has to show."""
+    ranges = np.concatenate([one.images.range_m[one.images.return_mask].detach().cpu().numpy() for one in sets])
+    return round(float(np.quantile(ranges, _MOST)), 1) if len(ranges) else 24.0
 
 
 def _ramp(name: str, start: float, end: float) -> list[list[int]]:

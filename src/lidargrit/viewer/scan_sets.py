@@ -20,6 +20,7 @@ from lidargrit.sources import DatasetSource, RunSource, Source, open_source
 from lidargrit.structures import RangeImage, Scan
 
 _CLASS_BITS = 0xFFFF  # of a label; the instance stands above them
+_PIXELS_AT_MOST = 200_000  # of a scan on a page: what browsers still turn smoothly
 _BATCH = 8  # scans computed at once: what a laptop has memory for
 _NAME_LETTERS = 40  # of a source's name: what fits above a picture
 
@@ -48,6 +49,7 @@ def load_scan_sets(
     settings: ScanSettings | None = None,
     reporter: Reporter | None = None,
     sensor: SensorModel | None = None,
+    all_columns: bool = False,
 ) -> list[ScanSet]:
     """Read scans and samples, and sample from runs.
 
@@ -62,6 +64,8 @@ def load_scan_sets(
         settings: sensor that scans are imaged with, and settings of reading them.
         reporter: receiver of messages about scans that are left out.
         sensor: sensor to project scans to, if the settings name none, in place of those of runs and samples.
+        all_columns: whether scans are shown with all columns that their sensor fires, up to 200,000 pixels, rather than
+            those that its image keeps; not if a sensor is named, nor beside samples and runs.
 
     Raises:
         ConfigError: no source.
@@ -80,7 +84,8 @@ def load_scan_sets(
     sets: list[ScanSet] = []
     for source in opened:
         if not isinstance(source, RunSource):
-            how = (count, sensor, config, reporter)
+            rays = _fine(source.sensor) if sensor is None and all_columns else sensor
+            how = (count, rays, config, reporter)
             read = _of_scans(source, *how) if isinstance(source, DatasetSource) else _of_images(source, *how)
             sets.append(replace(read, name=_short(source.text)))
     scans = sets[0] if sets else None
@@ -96,6 +101,12 @@ def load_scan_sets(
     if not sets:
         raise ConfigError("no source", "a scan, a folder or a run", "name at least one")
     return sets
+
+
+def _fine(sensor: SensorModel) -> SensorModel:
+    """Return a sensor with all columns that it fires, or as it is if these are too many pixels for a page."""
+    fine = sensor.fine()
+    return fine if fine.height * fine.width <= _PIXELS_AT_MOST else sensor
 
 
 def _parts(count: int) -> list[slice]:

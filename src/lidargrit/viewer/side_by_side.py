@@ -46,7 +46,8 @@ def view(
     if surprise_by and is_page:
         raise ConfigError(f"the colour surprise for {out}", "a picture", "name a file that ends in .png")
     model = load(surprise_by) if surprise_by else None
-    sets = load_scan_sets(sources, count, seed, settings, reporter, None if model is None else model.sensor)
+    rays = None if model is None else model.sensor
+    sets = load_scan_sets(sources, count, seed, settings, reporter, rays, all_columns=is_page)
     groups = {scans.name: scans.images for scans in sets}
     if is_page:
         write_page(sets, out)

@@ -4,17 +4,21 @@ const FIELD_OF_VIEW = Math.PI / 3.6; // 50 degrees: what a person takes in witho
 const NEAREST_M = 0.2;
 const FARTHEST_M = 2000;
 
+const TYPICAL_REACH_M = 24; // within which most returns of a street lie
+
 class Camera {
-  constructor() {
+  // Most points of the scans to be looked at lie within reachM of the sensor.
+  constructor(reachM = TYPICAL_REACH_M) {
+    this.reachM = Math.min(120, Math.max(4, reachM));
     this.reset();
   }
 
-  // From behind and above, as one would follow the car.
+  // From behind and above, as one would follow the car, so near that the points fill the picture.
   reset() {
-    this.turn = Math.PI;
-    this.tilt = 0.55;
-    this.distanceM = 42;
-    this.target = [4, 0, 0];
+    this.turn = Math.PI + 0.35;
+    this.tilt = 0.5;
+    this.distanceM = 1.25 * this.reachM;
+    this.target = [0.12 * this.reachM, 0, -1];
   }
 
   orbit(turn, tilt) {

@@ -1,22 +1,25 @@
 // The whole page: controls, keys, and the panes that follow them.
 
+const DENSE = 50000; // pixels of a scan whose points would cover one another if they were as large as those of others
+
 class Page {
   constructor(data) {
     this.data = data;
     this.classes = data.classes;
-    this.camera = new Camera();
+    this.camera = new Camera(data.reachM);
     this.control = Object.fromEntries(
-      ["previous", "next", "position", "counter", "mode", "dropped", "size", "reset", "legend"].map((id) => [
+      ["previous", "next", "position", "counter", "mode", "dropped", "size", "light", "reset", "legend"].map((id) => [
         id,
         document.getElementById(id),
       ]),
     );
     this.panes = [];
     this.index = 0;
-    this.dark = window.matchMedia("(prefers-color-scheme: dark)");
     this.area = document.getElementById("panes");
     document.getElementById("slow").hidden = hasGraphicsCard();
     this.arrange(data.sources.map((source) => new Pane(new Source(source), this)));
+    const most = Math.max(0, ...data.sources.map((source) => source.width * source.height));
+    this.control.size.value = most > DENSE ? "1.5" : "3";
     this.listen();
   }
 
@@ -51,7 +54,7 @@ class Page {
   }
 
   listen() {
-    const { previous, next, position, mode, dropped, size, reset } = this.control;
+    const { previous, next, position, mode, dropped, size, light, reset } = this.control;
     previous.addEventListener("click", () => this.step(-1));
     next.addEventListener("click", () => this.step(1));
     position.addEventListener("input", () => this.go(Number(position.value) - 1));
@@ -59,7 +62,7 @@ class Page {
     dropped.addEventListener("change", () => this.redraw());
     size.addEventListener("input", () => this.redraw());
     reset.addEventListener("click", () => this.lookAgain());
-    this.dark.addEventListener("change", () => this.paint());
+    light.addEventListener("change", () => this.paint());
     window.addEventListener("keydown", (event) => this.press(event));
     new ResizeObserver(() => this.redraw()).observe(this.area);
   }
@@ -115,7 +118,8 @@ class Page {
   }
 
   look() {
-    const theme = this.dark.matches ? "dark" : "light";
+    const theme = this.control.light.checked ? "light" : "dark";
+    this.area.classList.toggle("on-light", this.control.light.checked);
     return {
       ...this.data.looks[theme],
       classes: this.classes,

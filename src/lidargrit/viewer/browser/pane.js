@@ -96,7 +96,7 @@ class Pane {
     const share = Math.round((100 * this.scan.returns) / this.source.size);
     const returns = this.scan.returns.toLocaleString("en");
     this.part.about.textContent =
-      `${this.scan.name} (${number} of ${this.source.count}): ${returns} points, from ${share} % of rays`;
+      `${this.scan.name} (${number} of ${this.source.count}): ${returns} points, from ${share} % of rays${this.source.columns}`;
   }
 
   paint(look) {

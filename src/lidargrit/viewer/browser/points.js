@@ -11,7 +11,7 @@ void main() {
   gl_Position = camera * vec4(point.xyz, 1.0);
   if (point.w + dropped < 0.5) gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
   float far = max(gl_Position.w, 0.5);
-  gl_PointSize = point.w > 0.5 ? clamp(size * 30.0 / far, size * 0.7, size * 2.5) : size * 0.6;
+  gl_PointSize = point.w > 0.5 ? clamp(size * 34.0 / far, size * 0.8, size * 3.0) : size * 0.6;
   shown = colour.rgb;
 }`;
 
@@ -19,6 +19,8 @@ const FRAGMENT = `
 precision mediump float;
 varying vec3 shown;
 void main() {
+  vec2 from_middle = gl_PointCoord - 0.5;
+  if (dot(from_middle, from_middle) > 0.25) discard; // a disc
   gl_FragColor = vec4(shown, 1.0);
 }`;
 
@@ -118,7 +120,7 @@ class PlainPoints {
       if (!seen) {
         continue;
       }
-      const grown = Math.min(2.5, Math.max(0.7, 30 / seen[2])); // as the vertex shader does it
+      const grown = Math.min(3, Math.max(0.8, 34 / seen[2])); // as the vertex shader does it
       const side = Math.max(1, Math.round(sizePx * (this.points[4 * pixel + 3] ? grown : 0.6)));
       const [left, top] = [Math.round(seen[0] - side / 2), Math.round(seen[1] - side / 2)];
       for (let y = Math.max(0, top); y < Math.min(height, top + side); y++) {

@@ -9,6 +9,7 @@ class Source {
     this.size = data.height * data.width;
     this.rangeStepM = data.rangeStepM;
     this.endM = data.endM;
+    this.columns = data.columnStride > 1 ? `, one in ${data.columnStride} columns` : "";
     this.data = data;
     this.unpacked = new Map();
   }

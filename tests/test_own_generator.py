@@ -1,0 +1,63 @@
+"""The page on a generator of one's own: its file is trained, sampled and compared without a recipe."""
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+
+import lidargrit.generators
+import lidargrit.recipes
+from lidargrit import _discovery
+from lidargrit.cli import main
+from lidargrit.errors import ConfigError, UnknownNameError
+from lidargrit.generators import load
+from lidargrit.recipes import default_recipe, load_recipe
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs/how-to/own-generator.md").read_text(encoding="utf-8")
+QUICK = ["data.train=[simulated:2:train]", "data.val=[simulated:2:val]", "data.workers=1"]
+
+
+@pytest.fixture
+def code(tmp_path, monkeypatch):
+    """Add a folder to the generators in which the page's file lies, and return the path of the file."""
+    ours = _discovery._folder("generators")
+    folder = tmp_path / "generators"
+    folder.mkdir()
+    for name in ("marginal", "__init__"):
+        shutil.copy(ours / f"{name}.py", folder)
+    find = _discovery._folder
+    monkeypatch.setattr(_discovery, "_folder", lambda package: folder if package == "generators" else find(package))
+    monkeypatch.setattr(lidargrit.generators, "__path__", [*lidargrit.generators.__path__, str(folder)])
+    monkeypatch.setenv("LIDARGRIT_CACHE", str(tmp_path / "cache"))
+    path = folder / "mean_street.py"
+    path.write_text(re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)[0], encoding="utf-8")
+    return path
+
+
+def test_the_file_of_the_page_is_compared_without_a_recipe(code, tmp_path, capsys, monkeypatch):
+    lines = [line for line in code.read_text().splitlines() if line and not line.startswith(("import", "from", '"""'))]
+    assert len(lines) < 40
+    monkeypatch.setattr(lidargrit.recipes, "_SCANS", 8)
+    words = ["compare", str(tmp_path / "table"), "marginal", "mean_street", "--against", "simulated:2:test", "-n", "2"]
+    words += ["--metrics", "bev_jsd", "--json", str(tmp_path / "table.json"), "--set", *QUICK]
+    assert main(words) == 0
+    table = capsys.readouterr().out
+    assert "mean_street: " in table
+    assert "marginal (pixel statistics)" in table
+    systems = json.loads((tmp_path / "table.json").read_text())
+    assert [each["system"] for each in systems] == ["marginal", "mean_street"]
+    assert float(load(tmp_path / "table" / "runs" / "mean_street").mean.range_m.detach().std()) > 0, "it has learned"
+
+
+def test_a_default_recipe_needs_defaults_and_a_known_name(code):
+    recipe = load_recipe("mean_street", ["model.start_m=20"])
+    assert (recipe.model.start_m, list(recipe.training)) == (20.0, ["mean"])
+    with pytest.raises(UnknownNameError, match="which is not among the recipes"):
+        load_recipe("mean_streets")
+    other = code.with_name("without_default.py")
+    other.write_text(code.read_text().replace("start_m: float = 10.0", "start_m: float"), encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"without_default without a recipe .* add recipes/without_default\.py"):
+        default_recipe("without_default")
