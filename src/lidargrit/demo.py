@@ -210,15 +210,17 @@ def _expected_s(recipe: Recipe, simulates: bool) -> dict[str, float]:
 
 
 def _score(samples: RangeImages, val: RangeImages, real: RangeImages, reporter: Reporter) -> Scorecard:
-    """Score new scans against training scans, with held-out scans and pixel statistics beside them, as many of each."""
-    count = min(len(samples), len(real), len(val))
-    sets = {"samples": samples, "val": val, "train": real}
-    new, held_out, reference = (
-        EvalSet(name, images, evenly_spaced(count, len(images))) for name, images in sets.items()
-    )
-    pair, settings = EvalPair(new, reference), EvalConfig()
+    """Score new scans against training scans, with held-out scans and pixel statistics beside them."""
+    count, settings = min(len(samples), len(real)), EvalConfig()
+
+    def some(name: str, images: RangeImages, at_most: int) -> EvalSet:
+        return EvalSet(name, images, evenly_spaced(min(at_most, len(images)), len(images)))
+
+    pair = EvalPair(some("samples", samples, count), some("train", real, count))
+    held_out = some("val", val, count)
     card = compare_pair(pair, settings, reporter)
-    return with_pixel_statistics(with_held_out(card, held_out, reference, settings), pair, real, settings)
+    card = with_held_out(card, held_out, some("train", real, len(held_out)), settings)
+    return with_pixel_statistics(card, pair, real, settings)
 
 
 _INTERRUPTED = " (interrupted)"  # end of the name of a stage that is not done yet, with the time that it took so far

@@ -40,8 +40,8 @@ def with_held_out(card: Scorecard, held_out: EvalSet, reference: EvalSet, settin
 
     Args:
         card: scores of the samples.
-        held_out: other real scans, as many as there are samples.
-        reference: reference of the samples' scores.
+        held_out: other real scans.
+        reference: scans of the samples' reference, as many as are held out.
         settings: protocol and its changes, as for the samples.
     """
     values = _values(_plain(EvalPair(held_out, reference), settings, card))
