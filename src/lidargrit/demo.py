@@ -75,12 +75,7 @@ def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter
     with clock.stage(f"sample {_NUM_SAMPLES} new scans"):
         write_samples(generator, folder, folder / "samples", range(_NUM_SAMPLES), reporter=reporter)
     samples = read_samples(folder / "samples", _NUM_SAMPLES)
-    packaged = None
-    if data is None:
-        with clock.stage(f"sample {_PACKAGED_SCANS} scans from the packaged model"):
-            folders = PRETRAINED, folder / "samples_of_packaged_model"
-            write_samples(load(PRETRAINED), *folders, range(_PACKAGED_SCANS), reporter=reporter)
-        packaged = read_samples(folders[1], _PACKAGED_SCANS)
+    packaged = _packaged_samples(folder / "samples_of_packaged_model", clock, reporter) if data is None else None
     with clock.stage("score reconstruction and new scans"):
         reconstruction = score_reconstruction(generator.get_tokenizer(), val)
         card = _score(samples, val, real, reporter)
@@ -168,6 +163,13 @@ def _reconstructed(generator: Generator, images: RangeImage) -> RangeImage:
     if isinstance(generator, LidarGrit) and generator.pixels is not None:
         return generator.pixels.sample(tokenizer.decode(tokens), rngs, PixelSampling())
     return tokenizer.sample(tokens, rngs)
+
+
+def _packaged_samples(folder: Path, clock: _Clock, reporter: Reporter) -> RangeImages:
+    """Sample from the model in the package, to show what hours of training give."""
+    with clock.stage(f"sample {_PACKAGED_SCANS} scans from the packaged model"):
+        write_samples(load(PRETRAINED), PRETRAINED, folder, range(_PACKAGED_SCANS), reporter=reporter)
+    return read_samples(folder, _PACKAGED_SCANS)
 
 
 def divided(data: str, reporter: Reporter) -> DataConfig:
