@@ -53,7 +53,7 @@ def plot(rows: list[dict], path: Path, title: str) -> None:
         axes = figure.add_subplot(1, len(METRICS), index + 1)
         first = {row["name"]: row for row in reversed(rows)}
         for row in rows:
-            value, low, high, real = row[metric]
+            value, low, high, _ = row[metric]
             exact = row["steps"] is None
             label = "one by one" if exact else f"{row['steps']}"
             axes.errorbar(
@@ -73,7 +73,7 @@ def plot(rows: list[dict], path: Path, title: str) -> None:
                 textcoords="offset points",
                 fontsize=9,
             )
-        axes.axhline(real, color="#2a8fbd", linestyle=":", label="real against real")
+        axes.axhline(rows[0][metric][3], color="#2a8fbd", linestyle=":", label="real against real")
         axes.set_xscale("log")
         axes.margins(x=0.15)
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))

@@ -18,6 +18,7 @@ from lidargrit.recipes import load_recipe
 from lidargrit.sensors import load_sensor
 from lidargrit.structures import RangeImage
 from lidargrit.training import compute
+from lidargrit.training.taken_stages import taken_stages
 from test_hdit import reference_network
 from tiny_runs import the_one_line
 
@@ -185,6 +186,16 @@ def test_a_distilled_model_takes_the_steps_that_it_has_learned():
         ReflowConfig(pairs=0)
     with pytest.raises(ConfigError, match="got distilled_steps=-1; wanted 0 to 256"):
         ReflowConfig(distilled_steps=-1)
+
+
+def test_a_trained_flow_is_taken_over_if_its_sizes_fit(tmp_path):
+    sizes = ("model.hdit.depths=[1,1]", "model.hdit.heads=[1,2]")
+    load_recipe("r2flow_small", sizes).build_generator().save(tmp_path)
+    recipe = load_recipe("r2flow_reflow_small", (*sizes, f"stages_from={tmp_path}"))
+    assert taken_stages(recipe, recipe.build_generator()).keys() == {"flow"}
+    wider = load_recipe("r2flow_reflow_small", (*sizes, "model.hdit.channels=32", f"stages_from={tmp_path}"))
+    with pytest.raises(ConfigError, match=r"got stages_from=.*, whose flow has weights of other sizes; wanted "):
+        taken_stages(wider, wider.build_generator())
 
 
 def test_operations_of_the_pairs_are_counted_once():

@@ -96,7 +96,6 @@ class ConvolutionalTokenizer(CodebookTokenizer[Config]):
     """A VQ-VAE: encoder, 1x1 convolution, codebook, 1x1 convolution, decoder."""
 
     encoder: ConvolutionalEncoder
-    decoder: ConvolutionalDecoder
     quant_conv: nn.Conv2d
     post_quant_conv: nn.Conv2d
 
