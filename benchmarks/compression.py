@@ -43,14 +43,14 @@ def codecs() -> dict[str, Bytes]:
     """Return the codecs of other programs, each at the effort at which files are smallest."""
     found: dict[str, Bytes] = {
         "PNG": png,
-        "zstd": lambda picture: Zstd(level=22).encode(picture.tobytes()),
+        "zstd": lambda picture: bytes(Zstd(level=22).encode(picture.tobytes())),
         "differences + LZMA": lambda picture: lzma.compress(picture.tobytes(), lzma.FORMAT_RAW, filters=_DELTA),
     }
     try:
         import imagecodecs  # noqa: PLC0415  not one of ours
     except ImportError:
         return found
-    return {**found, "JPEG XL": lambda picture: imagecodecs.jpegxl_encode(picture, lossless=True, effort=9)}
+    return {**found, "JPEG XL": lambda picture: bytes(imagecodecs.jpegxl_encode(picture, lossless=True, effort=9))}
 
 
 def measure(images: RangeImages, codec: ScanCodec) -> dict[str, tuple[Estimate, float]]:

@@ -122,11 +122,12 @@ def test_the_bits_are_those_of_tokens_mask_and_ranges():
     assert bits.range is not None
     assert bits.mask is not None
     assert bool((bits.range[~images.return_mask] == 0).all())
-    assert torch.allclose(bits.total(), sum(bits.per_scan().values()))
+    assert torch.allclose(bits.total(), torch.stack([*bits.per_scan().values()]).sum(0))
     assert torch.allclose(bits.per_pixel().double().sum((1, 2)), bits.total(), rtol=1e-5)
     # A step is nearly as likely as its width times the density, where it is narrower than every component.
     steps = RangeSteps(SENSOR, 1)
     rounded = steps.round(images)
+    assert generator.pixels is not None
     density = generator.pixels(generator.tokenizer.decode(generator.tokenizer.encode(rounded)), rounded).range
     expected = (density.sum() / math.log(2) - math.log2(0.001) * images.return_mask.sum()).item()
     assert float(generator.bits(images, 1).per_scan()["range"].sum()) == pytest.approx(expected, rel=2e-3)
@@ -150,8 +151,9 @@ def test_the_expected_bits_are_the_mean_over_all_steps():
     limits_m = (SENSOR.range_min_m, SENSOR.range_max_m)
     mixture = RangeMixture(logits, 2.5 + centres.clamp(-1, 1), scales - 3, limits_m)
     every = torch.arange(steps.first, steps.last + 1).expand(5, -1)
-    parts = (part[:, None].expand(*every.shape, 3) for part in (mixture.logits, mixture.centres, mixture.log_scales))
-    nats = -RangeMixture(*parts, limits_m).log_mass(*steps.edges_m(every))
+    parts = mixture.logits, mixture.centres, mixture.log_scales
+    logits, centres, scales = (part[:, None].expand(*every.shape, 3) for part in parts)
+    nats = -RangeMixture(logits, centres, scales, limits_m).log_mass(*steps.edges_m(every))
     assert torch.allclose(mixture.entropy(steps).double(), (nats.exp().reciprocal() * nats).sum(-1), atol=0.15)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from abc import ABC, abstractmethod
 from typing import Any
 
@@ -21,11 +22,10 @@ def range_coding() -> Any:
         ConfigError: the extra is not installed.
     """
     try:
-        import constriction  # noqa: PLC0415  an extra
+        return importlib.import_module("constriction").stream
     except ImportError:
         cure = 'install it: pip install "lidargrit[compression]"'
         raise ConfigError("no package constriction", "the range coder of the extra compression", cure) from None
-    return constriction.stream
 
 
 class Coder(ABC):

@@ -67,7 +67,8 @@ def compress_scans(
         ScanError: a scan that cannot be used.
     """
     codec = ScanCodec(load(model), step_mm)
-    inputs = open_inputs(source, ScanReader(codec.sensor, projection_of(locate(model)) or "exact"), config)
+    variant = "reference" if projection_of(locate(model)) == "reference" else "exact"
+    inputs = open_inputs(source, ScanReader(codec.sensor, variant), config)
     scans = returns = 0
     with atomic_path(out) as unfinished, unfinished.open("wb") as file:
         writer = ArchiveWriter(file, _header(codec, model))

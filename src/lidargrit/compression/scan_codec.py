@@ -145,8 +145,10 @@ class ScanCodec:
             output = network.outputs([phase], guided, guide, mask, v)
             mixture = network.mixture([phase], output, candidates, guide)
             returned = mask[(0, *phase.pixels)]
-            some = (part[0, 0][returned] for part in (mixture.logits, mixture.centres, mixture.log_scales))
-            steps = StepMixture(RangeMixture(*some, mixture.limits_m), rounding, self.steps)
+            parts = mixture.logits, mixture.centres, mixture.log_scales
+            logits, centres, log_scales = (part[0, 0][returned] for part in parts)
+            some = RangeMixture(logits, centres, log_scales, mixture.limits_m)
+            steps = StepMixture(some, rounding, self.steps)
             values = None if known is None else known[phase.pixels][returned.numpy()]
             pixels[phase.pixels][returned.numpy()] = coder.integers(steps, self.steps.first, self.steps.last, values)
             range_m = torch.from_numpy(pixels[phase.pixels] * self.steps.step_mm / 1000)
