@@ -138,7 +138,7 @@ class _LineReporter(Reporter):
 
     @contextmanager
     def progress(self, what: str, total: int, done: int = 0) -> Iterator[Progress]:
-        yield _LoggedProgress(self, what, total, done)
+        yield _LoggedProgress(self.message, Schedule({}), what, total, done)
 
 
 class _Bar(Progress):
