@@ -8,7 +8,7 @@ from pathlib import Path
 from lidargrit.cli._options import add_settings
 
 EXAMPLES = """\
-  lidargrit demo                                simulated streets, about six minutes on two cores
+  lidargrit demo                                simulated streets, about ten minutes on two cores
   lidargrit demo --data /data/kitti_odometry    your own scans: a KITTI tree, or any folder of .bin
 """
 

@@ -1,4 +1,4 @@
-"""The model in the package at a still smaller size, trained in six minutes on two CPU cores, for ``lidargrit demo``."""
+"""The model in the package at a still smaller size, trained in ten minutes on two CPU cores, for ``lidargrit demo``."""
 
 from dataclasses import replace
 
@@ -26,5 +26,5 @@ _TRAINING = [
 
 RECIPE = replace(
     override(compact_pixels.RECIPE, [*_DATA, *_SMALLER, *_TRAINING]),
-    title="LidarGRIT with a pixel decoder, demo: 64x256 in 256 tokens, for two CPU cores and six minutes",
+    title="LidarGRIT with a pixel decoder, demo: 64x256 in 256 tokens, for two CPU cores and ten minutes",
 )
