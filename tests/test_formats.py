@@ -57,7 +57,7 @@ def test_the_longest_ending_counts(tmp_path):
     assert [one.public_name() for one in candidates(tmp_path / "a.b.bin")] == ["kitti_bin", "xyz_bin"]
     assert [stem(tmp_path / name) for name in ("a.pcd.bin", "a.b.bin", "a.pcd", "a.b.txt")] == ["a", "a.b", "a", "a.b"]
     (tmp_path / "a.txt").write_text("no scan")
-    with pytest.raises(ScanError, match=r"a\.txt, whose ending we do not know; wanted one of \.bin, "):
+    with pytest.raises(ScanError, match=r"a\.txt, whose ending we do not know; wanted one of \.bag, \.bin, "):
         recognise(tmp_path / "a.txt")
 
 

@@ -23,7 +23,7 @@ MISTAKES = {
     "evaluate a b --format pdf": "got --format pdf; wanted text, markdown or latex; choose one",
     "list metric": "got 'metric'; wanted one such as metrics; see: lidargrit list --help",
     "demo --set": "got nothing after --set; wanted a value;",
-    "evaluate --pr x": "got --pr; wanted --protocol or --projection-variant; write it out",
+    "evaluate --pr x": "got --pr; wanted --protocol, --projection or --projection-variant; write it out",
     "view a --overwrite=3": "got --overwrite with 3; wanted --overwrite alone;",
     "list --json datasets": "got --json datasets; wanted a name in .json, or nothing; put --json last",
     "doctor --json facts.txt": "got --json facts.txt; wanted a name in .json",
@@ -103,7 +103,7 @@ def test_json_is_all_of_standard_output_or_a_file_besides(words, capsys, tmp_pat
 
 def test_every_verb_that_reports_knows_json():
     silent = {"complete", "completion", "demo", "export", "import-weights", "publish", "raydrop", "sample", "serve"}
-    silent |= {"simulate", "upsample", "view"}
+    silent |= {"compress", "decompress", "simulate", "upsample", "view"}
     parsers = {parser.prog.split()[1]: parser for parser in build_parser().verbs()}
     assert parsers.keys() == {name.replace("_", "-") for name in _discovery.names("cli")}
     assert {name for name, parser in parsers.items() if "--json" not in parser.format_help()} <= silent

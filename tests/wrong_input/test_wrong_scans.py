@@ -126,7 +126,7 @@ def test_a_sensor_that_does_not_fit_the_scan(refused, tmp_path):
     settings = [f"data.train=[{tmp_path / 'puck'}]", "data.sensor=hdl64e_kitti_360", "data.projection=spherical"]
     told = refused(*train_words(tmp_path / "run", *settings))
     assert re.search(r"got \d\d% of the points of .*puck/0\.bin outside the sensor's elevations .*-15.0 to 15.0", told)
-    assert re.search(r"wanted -2\d\.\d to \d\.\d degrees for 'hdl64e_kitti_360'; choose the sensor that made", told)
+    assert re.search(r"wanted -2\d\.\d to \d\.\d degrees for 'hdl64e_kitti_360'; .*lidargrit fit-sensor", told)
     told = refused(*train_words(tmp_path / "run", *settings[:1]))
     assert re.search(r"got 16 rings in .*puck/0\.bin; wanted the 64 rings of the sensor 'hdl64e_kitti_odometry'", told)
 
