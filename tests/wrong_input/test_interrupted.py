@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -112,7 +113,8 @@ def limited_to(size: int):
 
 def test_a_real_interrupt_from_the_keyboard(interrupt, tmp_path):
     words = train_words(tmp_path / "run", *LONG, "training.tokenizer.scans=1000000")
-    process = lidargrit(words)
+    heard = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # a shell's background jobs do not hear Ctrl-C
+    process = lidargrit(words, preexec_fn=heard)
     checkpoint = tmp_path / "run" / "tokenizer" / "checkpoint.safetensors"
     deadline = time.monotonic() + 60
     while not checkpoint.exists() and process.poll() is None and time.monotonic() < deadline:
