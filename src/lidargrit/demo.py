@@ -22,7 +22,6 @@ from lidargrit.files import read_json, write_json
 from lidargrit.generators import PRETRAINED, RUN_FILE, Generator, load
 from lidargrit.generators.lidargrit import LidarGrit, TokenSampling
 from lidargrit.loading import DataConfig, RangeImages
-from lidargrit.nn.pixel_decoder import PixelSampling
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
 from lidargrit.sources import load_range_images, open_source
@@ -41,7 +40,7 @@ _MAX_SCANS = 400  # of the user's: more would not be seen in the demo's few minu
 _SIMULATED_S, _READ_S, _SAMPLED_S, _SCORED_S = 58.0, 20.0, 30.0, 25.0
 _TRAINED_S = {"tokenizer": 0.38, "transformer": 0.08, "pixels": 0.16}  # for each scan seen
 # A pixel decoder that was trained for a minute is unsure of every range: sharper than by default, the ground is smooth.
-_SHARPER = PixelSampling(temperature=0.1, noise=0.2)
+_SHARPER = TokenSampling(range_temperature=0.1, range_noise=0.2)
 _PACKAGED_SCANS = 6  # sampled by the model in the package, which was trained for three hours
 _SCANS_OF_A_SET = 6  # of each set on the page: enough to step through, and half a megabyte each
 
@@ -75,8 +74,7 @@ def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter
     for stage in generator.stages:
         clock.add(f"train the {stage}", _trained_s(folder / stage / LOG_FILE))
     with clock.stage(f"sample {_NUM_SAMPLES} new scans"):
-        sampling = TokenSampling(range_temperature=_SHARPER.temperature, range_noise=_SHARPER.noise)
-        write_samples(generator, folder, folder / "samples", range(_NUM_SAMPLES), sampling, reporter)
+        write_samples(generator, folder, folder / "samples", range(_NUM_SAMPLES), _SHARPER, reporter)
     samples = read_samples(folder / "samples", _NUM_SAMPLES)
     packaged = _packaged_samples(folder / "samples_of_packaged_model", clock, reporter) if data is None else None
     with clock.stage("score reconstruction and new scans"):
@@ -101,8 +99,8 @@ def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter
     facts = (
         f"LidarGRIT at a small size: {weights:.1f} million weights",
         f"{len(real):,} {kind} scans to learn from and {len(val):,} held out, of the sensor {generator.sensor.name}",
-        f"ranges sampled sharper than by default (range_temperature={_SHARPER.temperature}, "
-        f"range_noise={_SHARPER.noise}), because so little training leaves them uncertain",
+        f"ranges sampled sharper than by default (range_temperature={_SHARPER.range_temperature}, "
+        f"range_noise={_SHARPER.range_noise}), because so little training leaves them uncertain",
     )
     write_results_page(generator, kind, val, samples, reconstruction, card, clock.seconds, facts, folder, packaged)
     return folder
@@ -143,7 +141,7 @@ def write_results_page(
         sampled = tokenizer.sample(tokens, [torch.Generator().manual_seed(0)])
         by_phases, coarsest_cell = None, 1
         if isinstance(generator, LidarGrit) and generator.pixels is not None:
-            by_phases = generator.pixels.sample(decoded, [torch.Generator().manual_seed(0)], _SHARPER)
+            by_phases = generator.pixels.sample(decoded, [torch.Generator().manual_seed(0)], _SHARPER.pixels())
             coarsest_cell = generator.pixels.config.coarsest_cell
     seeds = tuple(f"seed {seed}" for seed in range(len(new)))
     sets = [
@@ -166,7 +164,7 @@ def _reconstructed(generator: Generator, images: RangeImage) -> RangeImage:
     tokenizer = generator.get_tokenizer()
     tokens, rngs = tokenizer.encode(images), [torch.Generator().manual_seed(seed) for seed in range(len(images))]
     if isinstance(generator, LidarGrit) and generator.pixels is not None:
-        return generator.pixels.sample(tokenizer.decode(tokens), rngs, _SHARPER)
+        return generator.pixels.sample(tokenizer.decode(tokens), rngs, _SHARPER.pixels())
     return tokenizer.sample(tokens, rngs)
 
 
