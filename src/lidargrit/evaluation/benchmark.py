@@ -92,7 +92,7 @@ def run(
         )
     # Wrong words and runs of other recipes are refused before anything is trained.
     plans = [_Plan.of(system, folder, benchmark) for system in systems]
-    open_source(benchmark.reference, benchmark.settings.data.bad_points)
+    reference = open_source(benchmark.reference, benchmark.settings.data.bad_points)
     if not 1 <= processes <= _PROCESSES_AT_MOST:
         raise ConfigError(f"{processes} processes", f"1 to {_PROCESSES_AT_MOST}", "one for a core or two is enough")
     if (benchmark.recipe_settings or benchmark.flops) and not any(plan.recipe for plan in plans):
@@ -103,7 +103,7 @@ def run(
     remaining = _Remaining(list(systems), reporter)
     if processes == 1:
         for system in chain.from_iterable(by_run.values()):
-            _finish([system], folder, benchmark, reporter)
+            _finish([system], folder, benchmark, reporter, reference)
             remaining.without([system])
     else:
         with safe_multiprocessing(), ProcessPoolExecutor(processes, get_context("spawn"), _share, (processes,)) as pool:
@@ -120,10 +120,12 @@ def run(
     return [folder / name / f"{name}.json" for name in names]
 
 
-def _finish(systems: Sequence[str], folder: Path, benchmark: Benchmark, reporter: Reporter) -> None:
-    """Train or load systems of one run, sample from each, and score the samples."""
+def _finish(
+    systems: Sequence[str], folder: Path, benchmark: Benchmark, reporter: Reporter, reference: Source | None = None
+) -> None:
+    """Train or load systems of one run, sample from each, and score the samples; a process opens its own reference."""
     settings = replace(benchmark.settings, max_scans=benchmark.num_samples)
-    reference = open_source(benchmark.reference, settings.data.bad_points)
+    reference = reference or open_source(benchmark.reference, settings.data.bad_points)
     for system in systems:
         name, plan = _folder_name(system), _Plan.of(system, folder, benchmark)
         reporter.message(f"{name}:")
