@@ -1,11 +1,17 @@
 """Every Python process that the program starts ignores Python files in the current folder, whoever put them there."""
 
+import os
+import signal
+import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
+from lidargrit.errors import ConfigError, DataError
 from lidargrit.loading import DataConfig, prepare
+from lidargrit.processes import process_pool
 from lidargrit.sensors import load_sensor
 from lidargrit.serving.jobs import JobQueue
 from lidargrit.simulator.drives import DriveConfig, write_drives
@@ -48,3 +54,51 @@ def test_simulate_runs_nothing_from_the_current_folder(poisoned, tmp_path):
     sensor = load_sensor("hdl64e_kitti_odometry").with_columns(64)
     write_drives(tmp_path / "drives", 2, DriveConfig(sensor), workers=2)
     assert traces(poisoned) == []
+
+
+POOL = """
+import os, signal, time
+from lidargrit.processes import process_pool
+if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs do not hear Ctrl-C
+    with process_pool(2) as pool:
+        print(*{pool.submit(os.getpid).result() for _ in range(4)}, flush=True)
+        pool.submit(time.sleep, 60)
+        time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGKILL, -9), (signal.SIGTERM, -15), (signal.SIGINT, 1)])
+def test_processes_of_a_pool_end_with_the_one_that_began_them(tmp_path, number, code):
+    script = tmp_path / "pool.py"
+    script.write_text(POOL)
+    parent = subprocess.Popen(
+        [sys.executable, str(script)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    children = [int(word) for word in parent.stdout.readline().split()]
+    assert children
+    (os.killpg if number == signal.SIGINT else os.kill)(parent.pid, number)
+    told = parent.communicate(timeout=20)[1]
+    assert parent.returncode in (code, -number)
+    deadline = time.monotonic() + 10
+    while (living := [pid for pid in children if Path(f"/proc/{pid}").exists()]) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not living
+    assert told.count("Traceback") == (number == signal.SIGINT), (
+        told
+    )  # that of the script itself, which catches nothing
+
+
+def test_a_pool_runs_nothing_from_the_current_folder_and_a_death_in_it_is_one_line(poisoned):
+    with process_pool(1) as pool:
+        assert pool.submit(os.getpid).result() != os.getpid()
+    with pytest.raises(DataError, match="got a process that died"), process_pool(1) as pool:
+        pool.submit(os._exit, 3).result()
+    assert traces(poisoned) == []
+    for count in (0, 10**7):
+        with pytest.raises(ConfigError, match=f"got {count} processes; wanted 1 to 1,024"), process_pool(count):
+            pass

@@ -131,8 +131,24 @@ def test_raydrop_drops_points_of_clean_scans_and_tells_how_often(places, tmp_pat
     assert 0.05 < share[clean > 0].mean() < 0.95
     assert 0 < (dropped > 0).sum() < (clean > 0).sum()
     assert np.array_equal(dropped[dropped > 0], clean[dropped > 0])
+    assert main([*words, "--format", "image", "--probability", "3"]) == 2  # whose shares would not be written
+    assert main([*words, "--format", "image"]) == 0
     assert main(["raydrop", f"{places}/scans", str(tmp_path / "points"), "--model", f"{places}/run"]) == 0
     assert points_of(tmp_path / "points/drive/1.npz") < points_of(places / "scans/drive/1.npz")
+
+
+def test_two_images_whose_names_differ_in_letters_alone_are_two_files(tmp_path, recwarn):
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for name, factor in (("scan.npy", 1), ("scan.NPY", 1e300)):
+        with (folder / name).open("wb") as file:
+            np.save(file, street(SENSOR).range_m.double().numpy() * factor)
+    words = ["complete", str(folder), str(tmp_path / "out"), "--model", "nearest", "--observed", "rows:4"]
+    (tmp_path / "sensor.json").write_text(json.dumps(SENSOR.to_json()))
+    assert main([*words, "--sensor", f"{tmp_path}/sensor.json", "--bad-scans", "skip"]) == 0
+    scans = json.loads((tmp_path / "out/completed.json").read_text())["scans"]
+    assert scans == {"scan.NPY.npz": "scan.NPY", "scan.npz": "scan"}
+    assert not recwarn.list
 
 
 def test_upsample_adds_the_rows_that_lack(places, tmp_path):
@@ -194,6 +210,7 @@ def test_the_drops_of_a_model_are_scored_beside_those_of_a_coin(places):
         (["complete", "{}/scans", "--model", "nothing"], "nothing, which holds no finished model"),
         (["complete", "{}/scans", "--model", "linear", "-n", "2"], "-n 2 for linear; wanted 1"),
         (["complete", "{}/scans", "--model", "{}/run", "-n", "0"], "-n 0; wanted at least 1"),
+        (["complete", "{}/scans", "--model", "{}/run", "-n", "9999999"], "9,999,999 completions of each of 2 scans"),
         (["complete", "{}/scans", "--model", "{}/run", "--format", "las2"], "the format 'las2' to write"),
         (["raydrop", "{}/scans", "--model", "linear"], "--model linear for a task for a model"),
         (["upsample", "{}/scans", "--model", "{}/run", "--sensor", "hdl64e_kitti_odometry"], "with 64 rows from"),

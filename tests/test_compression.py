@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from lidargrit.nn.transformer import TransformerConfig
 from lidargrit.sensors import load_sensor
 from lidargrit.structures import RangeImage
 from lidargrit.tokenizers.vqvae import VqvaeConfig
+from tiny_runs import the_one_line
 
 pytest.importorskip("constriction")
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
@@ -138,6 +140,31 @@ def test_damaged_files_are_refused(tmp_path):
         path.write_bytes(content)
         with pytest.raises(ScanError, match=r"cut off or altered|does not begin as a file of compressed scans"):
             Archive(path).check()
+
+
+def test_a_strangers_file_writes_only_files_that_can_be_and_below_its_folder(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("lidargrit.compression.command._codec_of", lambda *_: ScanCodec(made(), 20))
+    path = tmp_path / "scans.lgz"
+    for names, told in (
+        (["../out"], "a scan that would lie outside"),
+        (["/tmp/out"], "a scan that would lie outside"),
+        ([".lidargrit-partial-0/lock"], "a scan that would lie outside"),
+        (["a\0b"], "with a NUL in it"),
+        (["\ud800"], "not UTF-8"),
+        (["x" * 300], "at most 255 bytes a name"),
+        (["one", "one"], "was cut off or altered"),
+    ):
+        with path.open("wb") as file:
+            writer = ArchiveWriter(file, {"step_mm": 20})
+            for name in names:
+                writer.add(name, b"")
+            writer.close()
+        assert main(["decompress", str(path), str(tmp_path / "out")]) == 2
+        assert told in the_one_line(capsys.readouterr().err, "decompress")
+        assert [one.name for one in tmp_path.iterdir()] == ["scans.lgz"]
+    os.mkfifo(tmp_path / "pipe.lgz")
+    assert main(["decompress", str(tmp_path / "pipe.lgz"), str(tmp_path / "out")]) == 2
+    assert "which is not a file" in the_one_line(capsys.readouterr().err, "decompress")
 
 
 def test_models_and_images_that_cannot_be_compressed_are_refused(codec):

@@ -34,7 +34,9 @@ def anchors(page: Path) -> set[str]:
 def commands(text: str) -> list[str]:
     """Return the commands of lidargrit that stand in a page's code, with lines joined that a backslash breaks."""
     text = text.replace("\\\n", " ")
-    typed = re.findall(r"^(?: {4})?(?:\w+=\S+ |torchrun .*-m )?lidargrit ([a-z][^#|>\n]*)", text, re.MULTILINE)
+    typed = re.findall(
+        r"^(?: {4})?(?:\w+=\S+ |torchrun --no-python .*?)?lidargrit ([a-z][^#|>\n]*)", text, re.MULTILINE
+    )
     return [*typed, *re.findall(r"`lidargrit ([a-z-]+(?: [^`]*)?)`", text)]
 
 

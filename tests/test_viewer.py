@@ -1,7 +1,9 @@
 """The pictures: written whole or not at all, plausible in size, and without a trace in matplotlib's global state."""
 
 import struct
+import subprocess
 import sys
+from pathlib import Path
 
 import matplotlib as mpl
 import pytest
@@ -54,6 +56,17 @@ def test_global_state_is_left_alone(images, tmp_path):
     plot_comparison({"real": images[0]}, tmp_path / "a.png")
     after = dict(mpl.rcParams), "matplotlib.pyplot" in sys.modules
     assert before == after
+
+
+def test_no_settings_of_the_current_folder_are_obeyed(tmp_path):
+    (tmp_path / "matplotlibrc").write_text("text.usetex: True\nfigure.dpi: 31\n")
+    script = "import runpy, sys; runpy.run_path(sys.argv[1]); import matplotlib, os; print(os.getcwd(), "
+    script += "matplotlib.rcParams['text.usetex'], matplotlib.rcParams['figure.dpi'])"
+    path = str(Path(pictures.__file__).with_name("_matplotlib.py"))
+    told = subprocess.run(
+        [sys.executable, "-c", script, path], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert told.stdout.split() == [str(tmp_path), "False", "100.0"]
 
 
 def test_older_picture_is_replaced_in_one_step(images, tmp_path, monkeypatch):

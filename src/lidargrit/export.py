@@ -13,7 +13,7 @@ from lidargrit import _discovery, formats
 from lidargrit.datasets import ScanDataset
 from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import DataError, OutputError, ScanError, UnknownNameError, nearest_names
-from lidargrit.files import atomic_path, claim_folder, is_taken, read_json, write_json
+from lidargrit.files import atomic_path, claim_folder, is_partial, is_taken, read_json, write_json
 from lidargrit.formats import ScanFormat
 from lidargrit.formats.kitti_bin import KittiBin
 from lidargrit.loading import DataConfig, RangeImages
@@ -21,6 +21,7 @@ from lidargrit.projection import unproject
 from lidargrit.reporting import Reporter
 from lidargrit.sources import DatasetSource, open_source
 from lidargrit.structures import Scan
+from lidargrit.untrusted import user_path
 
 MANIFEST = "export.json"
 TREE = "kitti_odometry"  # the data set that reads such a tree back
@@ -209,9 +210,11 @@ def claim_scans(manifest: Path, facts: dict[str, Any]) -> None:
         OutputError: the folder holds something else, or another scan in one of the files.
     """
     out = manifest.parent
-    escaping = [file for file in facts["scans"] if file.startswith("/") or ".." in PurePosixPath(file).parts]
-    if escaping:
-        raise OutputError(f"a scan that would lie outside, in {escaping[0]}", "names below a folder", "rename it")
+    for file in facts["scans"]:
+        parts = PurePosixPath(file).parts
+        if PurePosixPath(file).is_absolute() or ".." in parts or any(map(is_partial, parts)):
+            raise OutputError(f"a scan that would lie outside, in {file}", "names below a folder", "rename it")
+        user_path(str((out / file).absolute()), OutputError)  # refuses names that no file can have
     if is_taken(out) and not manifest.is_file():
         got = f"{out}, which is not empty and holds no {manifest.stem}"
         raise OutputError(got, "an empty folder", "choose another one")

@@ -307,6 +307,8 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     from safetensors import SafetensorError, safe_open  # noqa: PLC0415
 
     try:
+        if not path.is_file():  # a pipe would hang
+            raise OSError("no such file" if not path.exists() else "not a file")
         with safe_open(path, framework="pt") as opened:
             about = parse_json((opened.metadata() or {}).get("about", "{}"), str(path))
             return {name: opened.get_tensor(name) for name in opened.keys()}, about  # noqa: SIM118  not a dict

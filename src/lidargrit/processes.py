@@ -7,11 +7,19 @@ that lies among somebody's downloads would then run in place of Python's own mod
 from __future__ import annotations
 
 import os
+import signal
 import sys
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from multiprocessing import active_children, get_context, parent_process
+from multiprocessing.process import BaseProcess
 
-from lidargrit.errors import ConfigError
+from lidargrit.errors import ConfigError, DataError
+
+PROCESSES_AT_MOST = 1024  # on one machine
 
 
 def rank_and_world_size(rank: int | None = None, world_size: int | None = None) -> tuple[int, int]:
@@ -47,7 +55,63 @@ def module_command(module: str, *words: str) -> list[str]:
 
 
 @contextmanager
-def safe_multiprocessing() -> Iterator[None]:
+def process_pool(count: int, begin: Callable[[], None] | None = None) -> Iterator[ProcessPoolExecutor]:
+    """Yield a pool of processes that import no file of the current folder.
+
+    If the block fails or is interrupted, they are terminated. If this process is killed, they end by themselves: they
+    would else go on to write into a folder that nobody holds any more.
+
+    Args:
+        count: largest number of processes.
+        begin: function that each process calls first.
+
+    Raises:
+        ConfigError: less than one process, or more than :data:`PROCESSES_AT_MOST`.
+        DataError: one of them died.
+    """
+    if not 1 <= count <= PROCESSES_AT_MOST:
+        raise ConfigError(
+            f"{count} processes", f"1 to {PROCESSES_AT_MOST:,}", "choose about as many as there are cores"
+        )
+    before = {*active_children()}
+    try:
+        with _safe_import_path(), ProcessPoolExecutor(count, get_context("spawn"), _begin, (begin,)) as pool:
+            try:
+                yield pool
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                _terminate({*active_children()} - before)
+                raise
+    except BrokenProcessPool:
+        cure = "look for what ended it, such as a lack of memory; the same command goes on"
+        raise DataError("a process that died", "all to end well", cure) from None
+
+
+def _terminate(processes: set[BaseProcess]) -> None:
+    """Terminate processes and wait for their end; one that saves its work first may take up more, so tell it again."""
+    while living := [process for process in processes if process.is_alive()]:
+        for process in living:
+            process.terminate()
+        living[0].join(1)
+
+
+def _begin(begin: Callable[[], None] | None) -> None:
+    """Prepare a process of a pool."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the terminal sends Ctrl-C to all; the first process ends the others
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    if begin is not None:
+        begin()
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+@contextmanager
+def _safe_import_path() -> Iterator[None]:
     """Let processes that multiprocessing starts within the block begin with a safe import path.
 
     Its own helpers, such as the resource tracker, take no options; they read the environment.

@@ -31,6 +31,7 @@ _CONTINUED = frozenset(
     {
         "compare",
         "complete",
+        "decompress",
         "demo",
         "export",
         "prepare",

@@ -14,7 +14,7 @@ EXAMPLES = """\
   lidargrit sample runs/demo samples -n 100
   lidargrit sample runs/demo bolder -n 100 --set temperature=1.1 mask=threshold
   lidargrit sample runs/demo as_released -n 100 --set top_k=100
-  torchrun --nproc-per-node 8 -m lidargrit sample runs/demo many -n 100000       one process a GPU
+  torchrun --no-python --nproc-per-node 8 lidargrit sample runs/demo many -n 100000       one process a GPU
 """
 
 

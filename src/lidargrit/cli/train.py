@@ -12,7 +12,7 @@ EXAMPLES = """\
   lidargrit train small runs/mine
   lidargrit train small runs/mine --set data.train=/data/scans data.val=/data/held_out
   lidargrit train lidargrit_kitti_360 runs/k360 --set data.train=kitti_360:/data/kitti_360:train_without_val --dry-run
-  torchrun --nproc-per-node=2 -m lidargrit train small runs/mine
+  torchrun --no-python --nproc-per-node=2 lidargrit train small runs/mine
 """
 
 

@@ -25,6 +25,7 @@ from lidargrit.reporting import Reporter
 from lidargrit.structures import RangeImage
 
 IMAGE = "image"  # the word for range images as .npy
+_FILES_AT_MOST = 400_000  # as many as the largest data set has scans; the manifest names each
 _UNWRITABLE = ".npz"  # for scans whose own format cannot be written, and for range images
 
 
@@ -92,12 +93,17 @@ def write_completions(
         ScanError: a scan that cannot be used.
         DataError: no usable scan.
     """
+    if len(inputs) * wanted.count > _FILES_AT_MOST:
+        got = f"{wanted.count:,} completions of each of {len(inputs):,} scans"
+        raise ConfigError(got, f"at most {_FILES_AT_MOST:,} files", "ask for fewer")
     files = {
         (index, turn): _folder(turn, wanted.count) + inputs.name(index) + _suffix(inputs.suffix(index), wanted.format)
         for index in range(len(inputs))
         for turn in range(wanted.count)
     }
     manifest = {**facts, **completer.identity(), "count": wanted.count, "seed": wanted.seed, "format": wanted.format}
+    if wanted.probability:
+        manifest["probability"] = wanted.probability  # files of before it were written without these shares
     scans = {file: inputs.name(index) for (index, _), file in files.items()}
     left_out: set[int] = set()
     missing = [job for job, file in files.items() if not (out / file).exists()]

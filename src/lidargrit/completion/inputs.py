@@ -131,7 +131,8 @@ class _OfImageFiles(Inputs):
         return len(self._paths)
 
     def name(self, index: int) -> str:
-        return self._paths[index].stem
+        path = self._paths[index]
+        return path.stem if path.suffix == ".npy" else path.name  # beside scan.npy there may lie scan.NPY
 
     def read(self, index: int) -> InputScan:
         path, sensor = self._paths[index], self._sensor
@@ -142,7 +143,8 @@ class _OfImageFiles(Inputs):
                 f"{sensor.height}x{sensor.width}, as the sensor {sensor.name!r} has",
                 "render it with the rows and columns of this sensor",
             )
-        range_m = torch.from_numpy(array.astype(np.float32))
+        with np.errstate(over="ignore"):  # infinite, and so out of the sensor's limits
+            range_m = torch.from_numpy(array.astype(np.float32))
         within = (range_m >= sensor.range_min_m) & (range_m <= sensor.range_max_m)
         if not bool(within.any()):
             raise ScanError(f"no range within the sensor's limits in {path}", "ranges in metres", "check the unit")

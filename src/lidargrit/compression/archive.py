@@ -15,9 +15,11 @@ from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 from lidargrit.errors import ScanError
+from lidargrit.formats import open_file
 from lidargrit.untrusted import JSON_BYTES_AT_MOST, parse_json
 
 SUFFIX = ".lgz"
+_WANTED = "a file that lidargrit compress wrote"
 _MAGIC, _END = b"LGZ1", b"1ZGL"
 _START = struct.Struct("<4sII")
 _TAIL = struct.Struct("<QI4s")
@@ -76,7 +78,7 @@ class Archive:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        with path.open("rb") as file:
+        with open_file(path, _WANTED) as file:
             size = file.seek(0, 2)
             start, header, begins = self._header(file, size)
             self.header = parse_json(header, str(path), dict, ScanError)
@@ -98,7 +100,7 @@ class Archive:
             ScanError: altered bytes.
         """
         entry = self.entries[index]
-        with self.path.open("rb") as file:
+        with open_file(self.path, _WANTED) as file:
             file.seek(entry.offset)
             compressed = file.read(entry.length)
         if len(compressed) != entry.length or zlib.crc32(compressed) != entry.crc32:
@@ -115,7 +117,7 @@ class Archive:
         start = file.read(_START.size)
         if size < _START.size + _TAIL.size or start[:4] != _MAGIC:
             got = f"{self.path}, which does not begin as a file of compressed scans"
-            raise ScanError(got, "a file that lidargrit compress wrote", "check the path")
+            raise ScanError(got, _WANTED, "check the path")
         magic, length, crc32 = _START.unpack(start)
         header = file.read(min(length, size, JSON_BYTES_AT_MOST))
         if len(header) != length or zlib.crc32(header) != crc32:
@@ -141,6 +143,8 @@ class Archive:
             entries = [Entry(str(name), int(at), int(length), int(crc)) for name, at, length, crc in rows]
         except (TypeError, ValueError):
             raise self._damaged() from None
+        if len({entry.name for entry in entries}) < len(entries):  # two scans would be one file
+            raise self._damaged()
         return entries, offset
 
     def _damaged(self) -> ScanError:

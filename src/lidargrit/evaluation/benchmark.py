@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import chain
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +21,9 @@ from lidargrit.evaluation.comparison import EvalConfig, compare_pair, open_pair
 from lidargrit.evaluation.protocols import public_name
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.evaluation.tables import Format, side_by_side
-from lidargrit.files import read_json, write_json
+from lidargrit.files import claim_folder, read_json, write_json
 from lidargrit.generators import Generator, is_run, load, load_class, locate
-from lidargrit.processes import safe_multiprocessing
+from lidargrit.processes import process_pool
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
 from lidargrit.sources import Source, open_source
@@ -33,7 +33,6 @@ from lidargrit.training.compute import duration
 
 COSTS = "costs.json"
 _SAMPLES_AT_MOST = 10**8  # names of files have eight digits
-_PROCESSES_AT_MOST = 256
 
 
 @dataclass(frozen=True)
@@ -83,6 +82,7 @@ def run(
 
     Raises:
         ConfigError: a system that occurs twice, or a recipe that does not take a setting.
+        OutputError: another comparison writes into the folder, or it cannot be written to.
     """
     reporter = reporter or Reporter()
     names = [_folder_name(system) for system in systems]
@@ -93,30 +93,26 @@ def run(
     # Wrong words and runs of other recipes are refused before anything is trained.
     plans = [_Plan.of(system, folder, benchmark) for system in systems]
     reference = open_source(benchmark.reference, benchmark.settings.data.bad_points)
-    if not 1 <= processes <= _PROCESSES_AT_MOST:
-        raise ConfigError(f"{processes} processes", f"1 to {_PROCESSES_AT_MOST}", "one for a core or two is enough")
     if (benchmark.recipe_settings or benchmark.flops) and not any(plan.recipe for plan in plans):
         raise ConfigError("settings or a budget, and no recipe", "a recipe that they are for", "leave them out")
     by_run: dict[Path, list[str]] = {}  # systems of one run one after the other: it is trained once
     for system, plan in zip(systems, plans, strict=True):
         by_run.setdefault(plan.run, []).append(system)
     remaining = _Remaining(list(systems), reporter)
-    if processes == 1:
-        for system in chain.from_iterable(by_run.values()):
-            _finish([system], folder, benchmark, reporter, reference)
-            remaining.without([system])
-    else:
-        with safe_multiprocessing(), ProcessPoolExecutor(processes, get_context("spawn"), _share, (processes,)) as pool:
-            begun = {
-                pool.submit(_finish, some, folder, benchmark, reporter.of_process(run.name)): some
-                for run, some in by_run.items()
-            }
-            try:
+    with claim_folder(folder):
+        if processes == 1:
+            for system in chain.from_iterable(by_run.values()):
+                _finish([system], folder, benchmark, reporter, reference)
+                remaining.without([system])
+        else:
+            with process_pool(processes, partial(_share, processes)) as pool:
+                begun = {
+                    pool.submit(_finish, some, folder, benchmark, reporter.of_process(run.name)): some
+                    for run, some in by_run.items()
+                }
                 for done in as_completed(begun):
                     done.result()
                     remaining.without(begun[done])
-            finally:
-                pool.shutdown(wait=True, cancel_futures=True)
     return [folder / name / f"{name}.json" for name in names]
 
 

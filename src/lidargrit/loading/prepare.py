@@ -219,7 +219,7 @@ def _claim(folder: Path, spec: PreparedSpec, scans: list[tuple[str, str, int, in
             )
         return
     told, path = json.dumps(scans), folder / SCANS_FILE
-    half_claimed = path.is_file() and path.read_text(encoding="utf-8") == told
+    half_claimed = path.is_file() and path.read_bytes() == told.encode()
     if is_taken(folder) and not half_claimed:
         raise OutputError(f"{folder}, which holds something else", "an empty folder", "choose another one")
     write_text(path, told)

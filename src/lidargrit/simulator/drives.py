@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,7 +13,7 @@ from jaxtyping import Float64
 from lidargrit.errors import ConfigError, OutputError
 from lidargrit.files import atomic_path, claim_folder, is_taken, read_json, write_json, write_text
 from lidargrit.formats.kitti_bin import KittiBin
-from lidargrit.processes import safe_multiprocessing
+from lidargrit.processes import process_pool
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel
 from lidargrit.simulator import observe, scene_of
@@ -98,8 +96,7 @@ def write_drives(
                     write(scan)
                     progress.advance(1)
             else:
-                spawn = multiprocessing.get_context("spawn")
-                with safe_multiprocessing(), ProcessPoolExecutor(workers, spawn) as pool:
+                with process_pool(workers) as pool:
                     for _ in pool.map(write, missing, chunksize=4):
                         progress.advance(1)
         there = sum(1 for _ in out.glob("sequences/*/labels/[!.]*.label"))  # an earlier call may have made more

@@ -27,6 +27,7 @@ from lidargrit.files import (
     write_json,
     write_text,
 )
+from lidargrit.formats import open_file
 from lidargrit.generators import RUN_FILE, TRAINED_ON_FILE, WEIGHTS_FILE, Generator, recipe_settings
 from lidargrit.loading import Pixels, Provenance, RangeImages
 from lidargrit.reporting import Reporter
@@ -74,7 +75,7 @@ def write_samples(
         manifest["full_rows"] = [generator.full_rows.start, generator.full_rows.stop]
     _claim(folder, manifest, configuration.to_json(generator.Sampling()))
     if (run_folder / TRAINED_ON_FILE).is_file() and not (folder / TRAINED_ON_FILE).exists():
-        write_text(folder / TRAINED_ON_FILE, (run_folder / TRAINED_ON_FILE).read_text(encoding="utf-8"))
+        write_text(folder / TRAINED_ON_FILE, json.dumps(read_json(run_folder / TRAINED_ON_FILE)) + "\n")
     missing = _missing(folder, seeds)
     with (
         claim_folder(folder, shared=True) if missing else nullcontext(),
@@ -217,11 +218,13 @@ class _Files:
         path = self._paths[index]
         cure = "remove the file and sample again"
         try:
-            with path.open("rb") as file:
+            with open_file(path, "an .npz with range_m") as file:
                 arrays = read_arrays(
                     file, ("range_m", "reflectance"), 8 * math.prod(self._shape) + HEADER_BYTES_AT_MOST
                 )
             range_m, reflectance = arrays["range_m"], arrays.get("reflectance")
+        except ScanError:
+            raise
         except (OSError, ValueError, KeyError) as error:
             raise ScanError(f"{path}, which cannot be read ({error})", "an .npz with range_m", cure) from None
         if range_m.shape != self._shape or range_m.dtype != np.float32:

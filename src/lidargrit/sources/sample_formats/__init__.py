@@ -113,6 +113,8 @@ def read_tensor(path: Path) -> Tensor:
     """
     wanted, cure = f"one tensor of at most {_BYTES_AT_MOST >> 20} MB", "save it as one: torch.save(tensor, path)"
     try:
+        if not path.is_file():  # a pipe would hang
+            raise ValueError("not a file")
         with zipfile.ZipFile(path) as archive:
             size = sum(entry.file_size for entry in archive.infolist())
         if size > _BYTES_AT_MOST:
