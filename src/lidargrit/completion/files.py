@@ -93,14 +93,7 @@ def write_completions(
         ScanError: a scan that cannot be used.
         DataError: no usable scan.
     """
-    if len(inputs) * wanted.count > _FILES_AT_MOST:
-        got = f"{wanted.count:,} completions of each of {len(inputs):,} scans"
-        raise ConfigError(got, f"at most {_FILES_AT_MOST:,} files", "ask for fewer")
-    files = {
-        (index, turn): _folder(turn, wanted.count) + inputs.name(index) + _suffix(inputs.suffix(index), wanted.format)
-        for index in range(len(inputs))
-        for turn in range(wanted.count)
-    }
+    files = _files(inputs, wanted)
     manifest = {**facts, **completer.identity(), "count": wanted.count, "seed": wanted.seed, "format": wanted.format}
     if wanted.probability:
         manifest["probability"] = wanted.probability  # files of before it were written without these shares
@@ -125,6 +118,18 @@ def write_completions(
     if len(left_out) == len(inputs):
         raise DataError("no usable scan", "at least one", "see the messages above")
     return len(files) - len(left_out) * wanted.count
+
+
+def _files(inputs: Inputs, wanted: Wanted) -> dict[tuple[int, int], str]:
+    """Return the name of each file below the folder, by the index of its scan and the number of the completion."""
+    if len(inputs) * wanted.count > _FILES_AT_MOST:
+        got = f"{wanted.count:,} completions of each of {len(inputs):,} scans"
+        raise ConfigError(got, f"at most {_FILES_AT_MOST:,} files", "ask for fewer")
+    return {
+        (index, turn): _folder(turn, wanted.count) + inputs.name(index) + _suffix(inputs.suffix(index), wanted.format)
+        for index in range(len(inputs))
+        for turn in range(wanted.count)
+    }
 
 
 def _jobs(
