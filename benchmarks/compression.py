@@ -87,8 +87,8 @@ def main() -> None:
             for name, (bits, seconds) in measure(images, ScanCodec(generator, step_mm)).items():
                 row = {"source": source, "scans": len(images), "step_mm": step_mm, "codec": name}
                 rows.append({**row, "bits": bits.value, "low": bits.low, "high": bits.high, "seconds": seconds})
-                told = f"{bits.value:.2f} [{bits.low:.2f}, {bits.high:.2f}]"
-                print(f"| {source} | {len(images)} | {step_mm} mm | {name} | {told} | {seconds:.2f} |", flush=True)
+                interval = f"{bits.value:.2f} [{bits.low:.2f}, {bits.high:.2f}]"
+                print(f"| {source} | {len(images)} | {step_mm} mm | {name} | {interval} | {seconds:.2f} |", flush=True)
     if options.json:
         write_json(options.json, rows)
 

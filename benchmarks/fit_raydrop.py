@@ -60,15 +60,15 @@ class Remembering(Tracer):
 
     def __init__(self, *arguments) -> None:
         super().__init__(*arguments)
-        self.told: list[Hits] = []
-        self.place = 0
+        self.hits: list[Hits] = []
+        self.casts = 0
 
     def cast(self, origins_m, directions):
-        if self.place == len(self.told):
-            self.told.append(super().cast(origins_m, directions))
-        told = self.told[self.place]
-        self.place += 1
-        return Hits(told.range_m.copy(), told.triangle.copy(), told.cos_incidence.copy())
+        if self.casts == len(self.hits):
+            self.hits.append(super().cast(origins_m, directions))
+        hits = self.hits[self.casts]
+        self.casts += 1
+        return Hits(hits.range_m.copy(), hits.triangle.copy(), hits.cos_incidence.copy())
 
 
 class Street:
@@ -92,7 +92,7 @@ class Street:
 
     def _trace(self, *arguments):
         self.tracer = Remembering(*arguments) if self.tracer is None else self.tracer
-        self.tracer.place = 0
+        self.tracer.casts = 0
         return self.tracer
 
 

@@ -92,8 +92,8 @@ def plain_grid_counts(clouds: np.ndarray) -> np.ndarray:
     grid = grid[np.linalg.norm(grid, axis=1) <= 1].astype(np.float32)
     counts = np.zeros(len(grid), dtype=int)
     for cloud in clouds:
-        for place in ((cloud[:, None] - grid) ** 2).sum(axis=2).argmin(axis=1):
-            counts[place] += 1
+        for nearest in ((cloud[:, None] - grid) ** 2).sum(axis=2).argmin(axis=1):
+            counts[nearest] += 1
     return counts
 
 

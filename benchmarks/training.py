@@ -74,7 +74,7 @@ def plain(generator: Generator, stage: str, recipe: Recipe, images: RangeImages,
     config = recipe.training[stage]
     objective, critic = generator.objective(stage).to(DEVICE).train(), discriminator().to(DEVICE)
     optimiser = torch.optim.Adam(objective.parameters(), config.learning_rate, config.betas)
-    batch = images.batch([place % len(images) for place in range(config.batch_size)]).to(DEVICE)
+    batch = images.batch([index % len(images) for index in range(config.batch_size)]).to(DEVICE)
     begun = 0.0
     with sdpa_kernel(SDPBackend.MATH):
         for step in range(UNTIMED + steps):
@@ -127,8 +127,10 @@ def main() -> None:
             best = {"plain": 0.0, "ours": 0.0}
             for number in range(options.rounds):
                 best["plain"] = max(best["plain"], plain(copy.deepcopy(generator), stage, recipe, images, steps))
-                place = Path(folder, f"{stage}{number}")
-                best["ours"] = max(best["ours"], ours(copy.deepcopy(generator), stage, recipe, images, steps, place))
+                run_folder = Path(folder, f"{stage}{number}")
+                best["ours"] = max(
+                    best["ours"], ours(copy.deepcopy(generator), stage, recipe, images, steps, run_folder)
+                )
             a_scan, size = flops[stage] / recipe.training[stage].scans, recipe.training[stage].batch_size
             for name, rate in best.items():
                 print(f"{stage}, batches of {size}, {name}: {rate:.3g} scans/s, {rate * a_scan / 1e9:.0f} GFLOP/s")

@@ -32,8 +32,8 @@ def main() -> None:
     found = {name: curve for run in options.runs for name, curve in curves(run).items()}
     figure = Figure(figsize=(3.2 * len(found), 2.8), dpi=90)
     FigureCanvasAgg(figure)
-    for place, (name, (scans, losses)) in enumerate(found.items(), 1):
-        axes = figure.add_subplot(1, len(found), place)
+    for number, (name, (scans, losses)) in enumerate(found.items(), 1):
+        axes = figure.add_subplot(1, len(found), number)
         axes.plot(scans, losses, color="#26323c")
         axes.set_title(name, fontsize=9)
         axes.set_xlabel("scans seen", fontsize=8)

@@ -11,9 +11,9 @@ import lidargrit
 
 def main(folder: Path) -> None:
     """Write six scans in R2DM's layout (they stand for its samples), and score them against six others."""
-    with tempfile.TemporaryDirectory(dir=folder) as place:
-        write_as_r2dm_does(Path(place), 6)
-        card = lidargrit.evaluate(place, "simulated:6:test", metrics=["bev_jsd", "return_rate_per_ring"])
+    with tempfile.TemporaryDirectory(dir=folder) as samples:
+        write_as_r2dm_does(Path(samples), 6)
+        card = lidargrit.evaluate(samples, "simulated:6:test", metrics=["bev_jsd", "return_rate_per_ring"])
     print(card.as_table())
     for warning in card.warnings:  # six scans are far too few, and it says so
         print(f"warning: {warning}")

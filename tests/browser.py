@@ -122,11 +122,11 @@ class Browser:
     def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
         """Press the button at one place, and release it at another."""
         self.move(*start)
-        place = {"button": "left", "clickCount": 1}
-        self.send("Input.dispatchMouseEvent", type="mousePressed", x=start[0], y=start[1], buttons=1, **place)
+        button = {"button": "left", "clickCount": 1}
+        self.send("Input.dispatchMouseEvent", type="mousePressed", x=start[0], y=start[1], buttons=1, **button)
         if end != start:
             self.move(*end, buttons=1)
-        self.send("Input.dispatchMouseEvent", type="mouseReleased", x=end[0], y=end[1], buttons=0, **place)
+        self.send("Input.dispatchMouseEvent", type="mouseReleased", x=end[0], y=end[1], buttons=0, **button)
         self.settle()
 
     def press(self, key: str, modifiers: int = 0) -> None:

@@ -37,14 +37,14 @@ class Served:
             client.putheader("Content-Length", str(len(data)))
         client.endheaders(data)
         answer = client.getresponse()
-        told = answer.status, dict(answer.getheaders()), answer.read()
+        answered = answer.status, dict(answer.getheaders()), answer.read()
         client.close()
-        return told
+        return answered
 
     def refused(self, path: str, body: bytes | dict | None = None, **headers: str) -> tuple[int, str]:
         """Return the status and the one line of a request that is to be refused."""
-        status, _, told = self.ask(path, body, **headers)
-        line = json.loads(told)["error"]
+        status, _, answer = self.ask(path, body, **headers)
+        line = json.loads(answer)["error"]
         assert status >= 400
         assert line
         assert "\n" not in line
@@ -52,17 +52,17 @@ class Served:
 
     def take(self, path: str, body: bytes | dict) -> str:
         """Have a request taken on, and return the job's path."""
-        status, _, told = self.ask(path, body)
-        assert status == 202, told
-        return f"/jobs/{json.loads(told)['job']}"
+        status, _, answer = self.ask(path, body)
+        assert status == 202, answer
+        return f"/jobs/{json.loads(answer)['job']}"
 
     def ended(self, job: str) -> dict:
         """Wait until a job has ended, and return what is told of it."""
         end = time.monotonic() + 60
         while True:
-            told = json.loads(self.ask(job)[2])
-            if told["state"] in ("done", "failed"):
-                return told
+            state = json.loads(self.ask(job)[2])
+            if state["state"] in ("done", "failed"):
+                return state
             assert time.monotonic() < end
             time.sleep(0.03)
 

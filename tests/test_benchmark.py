@@ -49,16 +49,16 @@ def test_systems_are_made_once_and_set_side_by_side(tmp_path):
 def test_a_recipe_is_trained_once_in_how_many_ways_ever_it_is_drawn_from(tmp_path, capsys):
     words = ["compare", str(tmp_path), "r2dm_small:steps=1", "r2dm_small:steps=2", "--flops", "3e10", "-n", "2"]
     assert main([*words, "--against", "simulated:2:test", "--metrics", "bev_jsd", "--set", *FEW]) == 0
-    told = capsys.readouterr().out
-    assert "bev_jsd" in told
-    assert "sliced_wasserstein" not in told
+    output = capsys.readouterr().out
+    assert "bev_jsd" in output
+    assert "sliced_wasserstein" not in output
     assert [path.name for path in (tmp_path / "runs").iterdir()] == ["r2dm_small"]
-    assert "r2dm_small:steps=1 " in told
-    assert "r2dm_small:steps=2 " in told
+    assert "r2dm_small:steps=1 " in output
+    assert "r2dm_small:steps=2 " in output
 
 
 @pytest.mark.parametrize(
-    ("systems", "told"),
+    ("systems", "message"),
     [
         ([], "at least one"),
         (["marginal", "marginal"], "each once"),
@@ -66,8 +66,8 @@ def test_a_recipe_is_trained_once_in_how_many_ways_ever_it_is_drawn_from(tmp_pat
         (["r2dm_small:step=3"], "steps"),
     ],
 )
-def test_wrong_words_are_told_before_anything_is_trained(systems, told, tmp_path):
-    with pytest.raises(LidarGritError, match=told):
+def test_wrong_words_are_told_before_anything_is_trained(systems, message, tmp_path):
+    with pytest.raises(LidarGritError, match=message):
         run_benchmark(systems, tmp_path, BENCHMARK)
     assert not list(tmp_path.rglob("*"))
 
@@ -168,9 +168,9 @@ def test_an_a100_takes_days_or_seconds():
 def test_processes_make_a_table_that_can_be_extended(tmp_path, capfd):
     words = ["--against", "simulated:4:test", "-n", "4", "--metrics", "bev_jsd", "--set", *FEW]
     assert main(["compare", str(tmp_path), "marginal", "memorised", "--processes", "2", *words]) == 0
-    told = capfd.readouterr().err
-    assert "1 of 2 systems are done; left, for about" in told
-    assert "marginal: marginal:" in told, "lines of processes begin with the run"
+    output = capfd.readouterr().err
+    assert "1 of 2 systems are done; left, for about" in output
+    assert "marginal: marginal:" in output, "lines of processes begin with the run"
     run = str(tmp_path / "runs" / "marginal")
     assert main(["compare", str(tmp_path), "--add", run]) == 0
     table = json.loads((tmp_path / "table.json").read_text())

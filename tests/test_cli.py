@@ -114,9 +114,9 @@ def test_settings_may_come_before_the_names(run_folder, typed):
 
 
 def test_dry_run_tells_the_plan_and_writes_nothing(tmp_path, typed):
-    told = typed("train", "demo", tmp_path / "none", "--dry-run", "--set", *TINY)
+    output = typed("train", "demo", tmp_path / "none", "--dry-run", "--set", *TINY)
     for line in ("training.tokenizer.scans = 8", "range images of 64x64, 0.", "transformer: ", "8 scans in batches of"):
-        assert line in told
+        assert line in output
     assert not (tmp_path / "none").exists()
 
 
@@ -214,15 +214,15 @@ def test_samples_tell_what_they_cost_and_those_from_before_go_on(run_folder, tmp
 
 
 def test_evaluate_prints_a_table_and_writes_json(samples, tmp_path, typed):
-    told = typed("evaluate", samples, "simulated:3:test", "--json", tmp_path / "deep" / "scores.json")
-    words, _, numbers = told.rpartition("\n\n")
+    output = typed("evaluate", samples, "simulated:3:test", "--json", tmp_path / "deep" / "scores.json")
+    words, _, numbers = output.rpartition("\n\n")
     assert words == "" or "below 0" in words, "three scans are too few to set real against real"
-    told = numbers.splitlines()
-    assert " ".join(told[0].split()) == "metric variant score 95 % interval real against real better scans"
+    output = numbers.splitlines()
+    assert " ".join(output[0].split()) == "metric variant score 95 % interval real against real better scans"
     scores = json.loads((tmp_path / "deep" / "scores.json").read_text())
     assert scores["reference"] == "simulated:3:test"
-    assert [score["variant"] for score in scores["scores"]] == [line.split()[1] for line in told[1:]]
-    for score, line in zip(scores["scores"], told[1:], strict=True):
+    assert [score["variant"] for score in scores["scores"]] == [line.split()[1] for line in output[1:]]
+    for score, line in zip(scores["scores"], output[1:], strict=True):
         assert score["num_generated"] == score["num_reference"] == 3
         assert f" {format_value(score['value'])} " in line
         assert "lower" in line
@@ -230,9 +230,9 @@ def test_evaluate_prints_a_table_and_writes_json(samples, tmp_path, typed):
 
 def test_evaluate_one_variant_of_some_scans_twice_gives_the_same(samples, typed):
     words = ("evaluate", samples, "simulated:3:test", "--variant", "textbook", "-n", 2, "--seed", 5)
-    told = typed(*words)
-    assert any(line.split()[-3:] == ["2", "v", "2"] for line in told.splitlines())
-    assert typed(*words) == told
+    output = typed(*words)
+    assert any(line.split()[-3:] == ["2", "v", "2"] for line in output.splitlines())
+    assert typed(*words) == output
 
 
 def test_evaluate_real_against_real(typed):
@@ -262,11 +262,11 @@ def test_processes_share_the_seeds(run_folder, tmp_path, typed):
 
 
 def test_list_names_everything_there_is(typed):
-    told = typed("list")
+    output = typed("list")
     for kind in ("datasets", "formats", "sensors", "tokenizers", "generators", "metrics", "recipes"):
         assert typed("list", kind).splitlines()[0] == kind
         for name in _discovery.names(kind):
-            assert f"  {name} " in told
+            assert f"  {name} " in output
             assert f"  {name} " in typed("list", kind)
     assert "sample --set: temperature=1.0, top_k=0, top_p=1.0, mask=auto" in typed("list", "generators")
     assert "licence: " in typed("list", "datasets")
@@ -276,10 +276,10 @@ def test_list_names_everything_there_is(typed):
 
 
 def test_doctor_tells_versions_and_room(typed):
-    told = typed("doctor")
-    assert lidargrit.__version__ in told
-    assert torch.__version__ in told
-    assert os.environ["LIDARGRIT_CACHE"] in told
+    output = typed("doctor")
+    assert lidargrit.__version__ in output
+    assert torch.__version__ in output
+    assert os.environ["LIDARGRIT_CACHE"] in output
 
 
 def test_demo_writes_its_page_and_writes_it_again(tmp_path, typed, monkeypatch):

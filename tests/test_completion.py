@@ -37,7 +37,7 @@ def street(sensor: SensorModel) -> RangeImage:
 
 
 @pytest.fixture(scope="module")
-def places(tmp_path_factory):
+def folders(tmp_path_factory):
     """Write two scans, their sensor, scans of another sensor, and a small run with a pixel decoder."""
     root = tmp_path_factory.mktemp("completion")
     for name, sensor in (("scans", SENSOR), ("sparse", SIXTEEN)):
@@ -87,13 +87,13 @@ def test_an_edge_is_not_smeared():
         assert set(fill(method, Condition.of_pixels(image, observed)).range_m.unique().tolist()) == {5.0, 40.0}
 
 
-def test_complete_keeps_names_and_observed_points_and_goes_on(places, tmp_path, capsys):
-    words = ["complete", f"{places}/scans", str(tmp_path / "out"), "--observed", "rows:4"]
-    words += ["--model", "triangulation", "--sensor", f"{places}/sensor.json"]
+def test_complete_keeps_names_and_observed_points_and_goes_on(folders, tmp_path, capsys):
+    words = ["complete", f"{folders}/scans", str(tmp_path / "out"), "--observed", "rows:4"]
+    words += ["--model", "triangulation", "--sensor", f"{folders}/sensor.json"]
     assert main(words) == 0
     assert "done: 2 completed scans" in capsys.readouterr().out
     for number in (1, 2):
-        scan = NumpyArray.read(places / "scans/drive" / f"{number}.npz")
+        scan = NumpyArray.read(folders / "scans/drive" / f"{number}.npz")
         done = NumpyArray.read(tmp_path / "out/drive" / f"{number}.npz")
         kept = scan.ring % 4 == 2
         own = {tuple(point) for point in scan.points_xyz_m[kept].tolist()}
@@ -108,22 +108,22 @@ def test_complete_keeps_names_and_observed_points_and_goes_on(places, tmp_path, 
     assert "which holds other scans or another format" in capsys.readouterr().err
 
 
-def test_a_model_completes_in_several_ways_and_into_any_format(places, tmp_path):
+def test_a_model_completes_in_several_ways_and_into_any_format(folders, tmp_path):
     out = tmp_path / "out"
-    words = ["complete", f"{places}/scans", str(out), "--model", f"{places}/run", "--observed", "sector:90,270"]
+    words = ["complete", f"{folders}/scans", str(out), "--model", f"{folders}/run", "--observed", "sector:90,270"]
     assert main([*words, "-n", "2", "--format", "ply", "--device", "cpu"]) == 0
     ways = [points_of(out / f"completion_{way}/drive/1.ply", Ply) for way in (0, 1)]
-    own = points_of(places / "scans/drive/1.npz")
+    own = points_of(folders / "scans/drive/1.npz")
     behind = {point for point in own if point[0] < -0.5}
     assert all(behind <= way for way in ways)
     assert ways[0] != ways[1]
     assert points_of(out / "completion_0/drive/2.ply", Ply) != ways[0]  # another scan has another seed
 
 
-def test_raydrop_drops_points_of_clean_scans_and_tells_how_often(places, tmp_path):
+def test_raydrop_drops_points_of_clean_scans_and_tells_how_often(folders, tmp_path):
     clean = street(SENSOR).range_m.numpy()
     np.save(tmp_path / "clean.npy", np.where(clean > 0, clean, np.inf))
-    words = ["raydrop", str(tmp_path / "clean.npy"), str(tmp_path / "out"), "--model", f"{places}/run"]
+    words = ["raydrop", str(tmp_path / "clean.npy"), str(tmp_path / "out"), "--model", f"{folders}/run"]
     assert main([*words, "--format", "image", "--probability", "9"]) == 0
     dropped, share = np.load(tmp_path / "out/clean.npy"), np.load(tmp_path / "out/clean.probability.npy")
     assert set(np.unique(share * 9).round(4)) <= set(range(10))
@@ -133,8 +133,8 @@ def test_raydrop_drops_points_of_clean_scans_and_tells_how_often(places, tmp_pat
     assert np.array_equal(dropped[dropped > 0], clean[dropped > 0])
     assert main([*words, "--format", "image", "--probability", "3"]) == 2  # whose shares would not be written
     assert main([*words, "--format", "image"]) == 0
-    assert main(["raydrop", f"{places}/scans", str(tmp_path / "points"), "--model", f"{places}/run"]) == 0
-    assert points_of(tmp_path / "points/drive/1.npz") < points_of(places / "scans/drive/1.npz")
+    assert main(["raydrop", f"{folders}/scans", str(tmp_path / "points"), "--model", f"{folders}/run"]) == 0
+    assert points_of(tmp_path / "points/drive/1.npz") < points_of(folders / "scans/drive/1.npz")
 
 
 def test_two_images_whose_names_differ_in_letters_alone_are_two_files(tmp_path, recwarn):
@@ -151,44 +151,44 @@ def test_two_images_whose_names_differ_in_letters_alone_are_two_files(tmp_path, 
     assert not recwarn.list
 
 
-def test_upsample_adds_the_rows_that_lack(places, tmp_path):
-    words = ["upsample", f"{places}/sparse", str(tmp_path / "out"), "--sensor", "vlp16"]
-    assert main([*words, "--to", f"{places}/sensor.json", "--model", "triangulation"]) == 0
+def test_upsample_adds_the_rows_that_lack(folders, tmp_path):
+    words = ["upsample", f"{folders}/sparse", str(tmp_path / "out"), "--sensor", "vlp16"]
+    assert main([*words, "--to", f"{folders}/sensor.json", "--model", "triangulation"]) == 0
     done = NumpyArray.read(tmp_path / "out/drive/1.npz")
-    own = points_of(places / "sparse/drive/1.npz")
+    own = points_of(folders / "sparse/drive/1.npz")
     assert own & points_of(tmp_path / "out/drive/1.npz")
     assert len(done.ring.unique()) > 40
     ground = done.points_xyz_m[(done.ring > 30) & (done.ring < 42)]  # between its rows that see the ground
     assert float((ground[:, 2] + 1.7).abs().median()) < 0.2
 
 
-def test_models_and_settings_are_compared_on_hidden_parts(places, tmp_path, capsys):
+def test_models_and_settings_are_compared_on_hidden_parts(folders, tmp_path, capsys):
     table = tmp_path / "table.json"
-    words = ["compare-completion", f"{places}/scans", f"{places}/run", f"{places}/run:mask=threshold"]
+    words = ["compare-completion", f"{folders}/scans", f"{folders}/run", f"{folders}/run:mask=threshold"]
     assert main([*words, "nearest", "triangulation", "--observed", "rows:4", "pixels:0.3", "--json", str(table)]) == 0
-    told = capsys.readouterr().out
+    output = capsys.readouterr().out
     scores = json.loads(table.read_text())["scores"]
     assert [score["observed"] for score in scores] == ["rows:4"] * 4 + ["pixels:0.3"] * 4
     run, plain, nearest, triangles = scores[:4]
-    assert told.count(plain["model"]) == 2
+    assert output.count(plain["model"]) == 2
     assert (run["mae_m"], run["iou"]) != (plain["mae_m"], plain["iou"])
     assert triangles["mae_m"]["value"] < nearest["mae_m"]["value"] < run["mae_m"]["value"]
     assert run["diversity_m"]["value"] > 0.1
     difference = nearest["mae_m"]["value"] - triangles["mae_m"]["value"]
     assert nearest["beside_triangulation_m"]["value"] == pytest.approx(difference)
-    assert main([*words[:2], f"{places}/run:completion=guess"]) == 2
+    assert main([*words[:2], f"{folders}/run:completion=guess"]) == 2
     assert "completion=guess" in capsys.readouterr().err
 
 
-def test_the_drops_of_a_model_are_scored_beside_those_of_a_coin(places):
-    model, true = load(places / "run"), RangeImage.stack([street(SENSOR)] * 4)
+def test_the_drops_of_a_model_are_scored_beside_those_of_a_coin(folders):
+    model, true = load(folders / "run"), RangeImage.stack([street(SENSOR)] * 4)
     every = torch.ones_like(true.return_mask)
     clean = RangeImage.masked(torch.where(true.return_mask, true.range_m, 30.0), every, SENSOR)
     scores = score_raydrop(model, "simulated", clean, true)
     assert [score.model.metric for score in scores] == list(RAYDROP_CURVES)
     assert all(score.floor.value < 1e-3 < min(score.model.value, score.coin.value) for score in scores)
     assert raydrop_table(scores).count("\n") == 5
-    decoded, same = decoded_surfaces(model, open_images(f"{places}/scans", SENSOR))
+    decoded, same = decoded_surfaces(model, open_images(f"{folders}/scans", SENSOR))
     returns = same.return_mask.any(0)
     assert bool(returns.any())
     assert all(torch.equal(mask, returns) for mask in decoded.return_mask)
@@ -199,7 +199,7 @@ def test_the_drops_of_a_model_are_scored_beside_those_of_a_coin(places):
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         (["complete", "{}/sparse", "--model", "{}/run"], "16 rings in .*; wanted the 64 of the sensor"),
         (["complete", "{}/scans", "--model", "{}/run", "--observed", "{}/small.npy"], "a mask of 3x4 bool"),
@@ -220,15 +220,15 @@ def test_the_drops_of_a_model_are_scored_beside_those_of_a_coin(places):
         ),
     ],
 )
-def test_mistakes_are_told_in_one_line_and_nothing_is_written(words, told, places, tmp_path, capsys):
-    np.save(places / "small.npy", np.ones((3, 4), bool))
-    np.save(places / "all.npy", np.ones((64, 32), bool))
-    np.save(places / "none.npy", np.zeros((64, 32), bool))
-    np.save(places / "wide.npy", np.ones((64, 33), np.float32))
-    (places / "empty.npz").write_bytes(b"")
-    words = [word.replace("{}", str(places)) for word in words]
+def test_mistakes_are_told_in_one_line_and_nothing_is_written(words, message, folders, tmp_path, capsys):
+    np.save(folders / "small.npy", np.ones((3, 4), bool))
+    np.save(folders / "all.npy", np.ones((64, 32), bool))
+    np.save(folders / "none.npy", np.zeros((64, 32), bool))
+    np.save(folders / "wide.npy", np.ones((64, 33), np.float32))
+    (folders / "empty.npz").write_bytes(b"")
+    words = [word.replace("{}", str(folders)) for word in words]
     assert main([*words[:2], str(tmp_path / "out"), *words[2:]]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1
-    assert told.split("; ")[0].replace(".*", "").split(" in ")[0] in error
+    assert message.split("; ")[0].replace(".*", "").split(" in ")[0] in error
     assert not (tmp_path / "out").exists()

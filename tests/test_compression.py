@@ -107,16 +107,16 @@ def test_a_number_near_a_border_is_rounded_by_other_borders():
 
 
 def test_one_that_does_not_reproduce_the_probabilities_says_so(codec, compressed):
-    told = "probabilities that are not those of the machine"
-    with pytest.raises(ScanError, match=told):
+    message = "probabilities that are not those of the machine"
+    with pytest.raises(ScanError, match=message):
         ScanCodec(made(seed=4), 20).decompress(compressed)
     rng = np.random.default_rng(0)
     for _ in range(4):
         altered = bytearray(compressed)
         altered[rng.integers(1, len(altered))] ^= 1 << rng.integers(8)
-        with pytest.raises(ScanError, match=told):
+        with pytest.raises(ScanError, match=message):
             codec.decompress(bytes(altered))
-    with pytest.raises(ScanError, match=told):
+    with pytest.raises(ScanError, match=message):
         codec.decompress(compressed[:7])
 
 
@@ -191,12 +191,12 @@ def test_the_commands_restore_what_was_compressed(tmp_path, capsys):
     for index, range_m in enumerate(scans(2).range_m):
         assert np.abs(np.load(Path(out) / f"{index}.npy") - range_m.numpy()).max() <= 0.01 + 1e-6
     capsys.readouterr()
-    for words, told in (
+    for words, message in (
         (["--model", str(tmp_path / "other")], "compressed by the model 'run' of hash"),
         (["--model", run, "--only", "2"], "got --only 2; wanted indices from 0 to 1"),
     ):
         assert main(["decompress", file, str(tmp_path / "nothing"), *words]) == 2
-        assert told in capsys.readouterr().err
+        assert message in capsys.readouterr().err
     Path(file).write_bytes(Path(file).read_bytes()[:-40])
     assert main(["decompress", file, str(tmp_path / "nothing"), "--model", run]) == 2
     error = capsys.readouterr().err

@@ -70,7 +70,7 @@ def test_patterns_choose_rows_sectors_pixels_and_files(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("columns:4", "--observed columns:4; wanted rows:4, "),
         ("rows:1", "--observed rows:1; wanted rows:N with a whole N from 2 to 64"),
@@ -85,11 +85,11 @@ def test_patterns_choose_rows_sectors_pixels_and_files(tmp_path):
         ("none.npy", "--observed .*none.npy, by which no return is observed; wanted some returns"),
     ],
 )
-def test_observed_words_that_cannot_be_are_refused_in_one_line(text, told, tmp_path):
+def test_observed_words_that_cannot_be_are_refused_in_one_line(text, message, tmp_path):
     for name, mask in (("small", np.ones((3, 4), bool)), ("all", np.ones((64, 32))), ("none", np.zeros((64, 32)))):
         np.save(tmp_path / f"{name}.npy", mask)
     text = f"{tmp_path}/{text}" if text.endswith(".npy") and text != "nowhere.npy" else text
-    with pytest.raises(UsageError, match=f"^got {told}"):
+    with pytest.raises(UsageError, match=f"^got {message}"):
         Pattern(text).mask(scans(1)[0])
 
 

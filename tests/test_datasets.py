@@ -140,7 +140,7 @@ def test_a_folder_of_all_formats_is_listed_and_read(mixed):
             assert len(dataset.scan(index)) > 1000
 
 
-class Told(Reporter):
+class Heard(Reporter):
     def __init__(self) -> None:
         self.messages: list[str] = []
 
@@ -159,11 +159,11 @@ def test_one_bad_file_among_others_is_told_by_its_name_and_left_out(tmp_path, mo
     (folder / "bad.ply").write_bytes(good[: len(good) // 2])
     with pytest.raises(ScanError, match=r"bad\.ply.*data\.bad_scans=skip"):
         load_range_images([str(folder)], DataConfig())
-    told = Told()
-    images = load_range_images([str(folder)], DataConfig(bad_scans="skip"), told)
+    reporter = Heard()
+    images = load_range_images([str(folder)], DataConfig(bad_scans="skip"), reporter)
     assert len(images) == 5
-    assert [message for message in told.messages if str(folder / "bad.ply") in message] == told.messages
-    assert len(told.messages) == 1
+    assert [message for message in reporter.messages if str(folder / "bad.ply") in message] == reporter.messages
+    assert len(reporter.messages) == 1
 
 
 def test_an_example_overwrites_nothing(bin_file, tmp_path):

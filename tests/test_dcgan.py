@@ -49,8 +49,8 @@ def slow_transposed(x, weight, stride):
     out = np.zeros((weight.shape[1], (height - 1) * stride + down, (width - 1) * stride + along))
     for i in range(height):
         for j in range(width):
-            place = np.s_[:, i * stride : i * stride + down, j * stride : j * stride + along]
-            out[place] += np.einsum("c,cdkl->dkl", x[:, i, j], weight)
+            window = np.s_[:, i * stride : i * stride + down, j * stride : j * stride + along]
+            out[window] += np.einsum("c,cdkl->dkl", x[:, i, j], weight)
     return out / math.sqrt(weight[0].size)
 
 
@@ -171,9 +171,9 @@ def test_a_synthesis_wraps_around_the_circle():
 )
 def test_other_checkpoints_are_refused_in_one_line(content, match, tmp_path):
     torch.save(content, tmp_path / "checkpoint.pth")
-    with pytest.raises(CheckpointError, match=match) as told:
+    with pytest.raises(CheckpointError, match=match) as refusal:
         load_published(tmp_path / "checkpoint.pth")
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(refusal.value)
 
 
 def test_what_is_no_checkpoint_is_refused(tmp_path):

@@ -63,11 +63,11 @@ def test_translation_turns_columns_and_lets_zeros_in_above_and_below():
 
 
 def test_a_short_circle_loses_the_last_column():
-    places = torch.arange(64.0).expand(200, 1, 32, 64)
-    row = augmented("translation", images=places, defects=("short_circle",))[:, 0, 16]
+    columns = torch.arange(64.0).expand(200, 1, 32, 64)
+    row = augmented("translation", images=columns, defects=("short_circle",))[:, 0, 16]
     assert 63.0 not in row
     assert all(len(set(one.tolist())) == 63 for one in row)
-    whole = augmented("translation", images=places)[:, 0, 16]
+    whole = augmented("translation", images=columns)[:, 0, 16]
     assert all(len(set(one.tolist())) == 64 for one in whole)
 
 

@@ -147,10 +147,10 @@ def test_a_metric_that_cannot_be_had_leaves_the_others(monkeypatch, tmp_path, se
 def test_what_is_not_as_the_protocol_wants_is_told():
     scans = open_source("simulated:3:train"), open_source("simulated:3:test")
     pair = pair_for_protocol(*scans, load_protocol("lidargrit-kitti-odometry"), DataConfig(max_scans=2))
-    told = " | ".join(pair.deviations)
-    assert "2 of the 5,000 scans" in told
-    assert "the reference is simulated, not kitti_odometry" in told
-    assert "projected by 'exact', not by 'reference'" in told
+    deviations = " | ".join(pair.deviations)
+    assert "2 of the 5,000 scans" in deviations
+    assert "the reference is simulated, not kitti_odometry" in deviations
+    assert "projected by 'exact', not by 'reference'" in deviations
     assert len(pair.samples) == len(pair.reference) == 2
     other = pair_for_protocol(*scans, load_protocol("exact"), DataConfig())
     assert other.deviations == ()
@@ -173,7 +173,7 @@ def test_sets_that_overlap_and_roads_that_differ_are_told(sets, tmp_path):
     for samples, differs in zip(ours, (True, False), strict=True):
         card, pair = compare_sources(samples, sets[1], plain)
         assert any("different roads" in warning for warning in card.warnings) == differs
-        assert pair.samples.facts().projection == f"unfolding, {'exact' if differs else 'reference'}"
+        assert pair.samples.record().projection == f"unfolding, {'exact' if differs else 'reference'}"
 
 
 def test_metrics_by_name_take_the_protocols_definitions():
@@ -300,7 +300,7 @@ def test_the_command_line_writes_scores_page_and_table(tmp_path, capsys, sets):
     assert (tmp_path / "s.html").read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
     assert main(["evaluate", "--tables", str(tmp_path / "s.json"), "--format", "latex"]) == 0
     assert "tabular" in capsys.readouterr().out
-    for wrong, told in (
+    for wrong, message in (
         ([*words, *files], "there already"),
         (["evaluate", sets[0]], "alone; wanted samples and what they are compared with"),
         ([*words, "--weights", "pointnet"], "NAME=FILE"),
@@ -308,4 +308,4 @@ def test_the_command_line_writes_scores_page_and_table(tmp_path, capsys, sets):
         ([*words, "--groups", "2"], "half"),
     ):
         assert main(wrong) != 0
-        assert told in capsys.readouterr().err.replace("halves", "half")
+        assert message in capsys.readouterr().err.replace("halves", "half")

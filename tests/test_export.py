@@ -151,8 +151,8 @@ def test_a_tree_is_read_back_as_kitti_odometry_with_labels(streets):
 def test_a_tree_keeps_the_numbers_of_a_tree_and_numbers_folders(streets, samples, tmp_path):
     export_scans(f"{streets}:all[50%:]", tmp_path / "half", "kitti_odometry")
     assert open_dataset(f"kitti_odometry:{tmp_path / 'half'}").name(0) == "00/000001"
-    for place, folder in enumerate(("b", "a")):
-        export_scans(str(samples), tmp_path / "drives" / folder, "ply", DataConfig(max_scans=place + 1))
+    for number, folder in enumerate(("b", "a")):
+        export_scans(str(samples), tmp_path / "drives" / folder, "ply", DataConfig(max_scans=number + 1))
     export_scans(f"folder:{tmp_path / 'drives'}", tmp_path / "tree", "kitti_odometry")
     tree = open_dataset(f"kitti_odometry:{tmp_path / 'tree'}")
     assert [tree.name(index) for index in range(len(tree))] == ["00/000000", "00/000001", "01/000000"]
@@ -165,9 +165,9 @@ def test_prepared_scans_are_exported_with_the_points_of_their_pixels(streets, tm
     assert export_scans(str(tmp_path / "prepared"), tmp_path / "out", "bin") == 2
     wanted = unproject(open_images(str(tmp_path / "prepared")).batch([1])[0])
     assert torch.equal(read_scan(tmp_path / "out" / "000001.bin").points_xyz_m, wanted.points_xyz_m)
-    told = json.loads((tmp_path / "out" / MANIFEST).read_text(encoding="utf-8"))["scans"]
-    assert sorted(told) == ["000000.bin", "000001.bin"]
-    assert all(scan.endswith(f"velodyne/{file}") for file, scan in told.items())
+    manifest = json.loads((tmp_path / "out" / MANIFEST).read_text(encoding="utf-8"))["scans"]
+    assert sorted(manifest) == ["000000.bin", "000001.bin"]
+    assert all(scan.endswith(f"velodyne/{file}") for file, scan in manifest.items())
 
 
 def test_the_same_command_goes_on_and_adds(samples, tmp_path):
@@ -197,8 +197,8 @@ def test_what_is_not_ours_is_left_alone(samples, tmp_path):
     (tmp_path / "new").mkdir()
     (tmp_path / "new" / "samples.json").write_text(json.dumps({**about, "weights_sha256": "b"}), encoding="utf-8")
     (tmp_path / "new" / "00000000.npz").write_bytes((samples / "00000000.npz").read_bytes())
-    told = json.loads((out / MANIFEST).read_text(encoding="utf-8"))
-    (out / MANIFEST).write_text(json.dumps({**told, "source": str(tmp_path / "new")}), encoding="utf-8")
+    manifest = json.loads((out / MANIFEST).read_text(encoding="utf-8"))
+    (out / MANIFEST).write_text(json.dumps({**manifest, "source": str(tmp_path / "new")}), encoding="utf-8")
     with pytest.raises(OutputError, match=r"000000\.ply is another scan"):
         export_scans(str(tmp_path / "new"), out, "ply")
     assert (tmp_path / "000000.ply").read_bytes() == b"somebody's"
@@ -231,7 +231,7 @@ def test_other_formats_and_sources_are_refused(samples, tmp_path):
 def test_the_command(samples, tmp_path, capsys):
     words = ["export", str(samples), str(tmp_path / "out"), "--format", "pcd"]
     assert main(words) == 0
-    told = capsys.readouterr()
-    assert re.match(r"done: 2 scans in .*out", told.out)
+    captured = capsys.readouterr()
+    assert re.match(r"done: 2 scans in .*out", captured.out)
     assert main([*words[:-1], "ply"]) == 2
     assert "wanted an empty folder" in capsys.readouterr().err

@@ -224,9 +224,9 @@ def test_the_verb_writes_a_sensor_and_a_picture_that_others_accept(folder, tmp_p
     out, picture = tmp_path / "mine.json", tmp_path / "fit.png"
     command = ["fit-sensor", str(folder), "-o", str(out), "--picture", str(picture), "-n", "5"]
     assert main(command) == 0
-    told = capsys.readouterr().out
-    assert "rings       64" in told
-    assert "note: only 2 scans" in told
+    output = capsys.readouterr().out
+    assert "rings       64" in output
+    assert "note: only 2 scans" in output
     sensor = load_sensor(str(out))
     assert (sensor.height, sensor.name) == (64, "mine")
     assert picture.read_bytes().startswith(b"\x89PNG")

@@ -49,7 +49,7 @@ HUGE = ("-1", "0", "4000001", "2147483648", "18446744073709551617", "9" * 5000, 
 def test_text_that_claims_far_more_rows_than_it_has(refused):
     head = "VERSION 0.7\nFIELDS x y z h\nSIZE 4 4 4 1\nTYPE F F F U\nCOUNT 1 1 1 50\nWIDTH 4000000\nHEIGHT 1\n"
     assert "4000000 rows of 53 numbers" in refused((head + "POINTS 4000000\nDATA ascii\n1 2 3 4\n").encode(), "a.pcd")
-    many = "".join(f"property double p{place}\n" for place in range(200))
+    many = "".join(f"property double p{number}\n" for number in range(200))
     head = f"ply\nformat ascii 1.0\nelement vertex 4000000\nproperty float x\n{many}end_header\n"
     assert "4000000 rows of 201 numbers" in refused((head + "1 2 3\n").encode(), "a.ply")
 
@@ -194,8 +194,8 @@ def test_archives_of_many_arrays_that_each_unpack_to_far_more(refused, tmp_path)
 def test_archives_whose_directory_is_the_bomb(refused):
     with BytesIO() as buffer:
         with zipfile.ZipFile(buffer, "w") as archive:
-            for place in range(3000):
-                archive.writestr(f"{place}.npy", b"")
+            for number in range(3000):
+                archive.writestr(f"{number}.npy", b"")
         assert "no directory of at most 65536 bytes at its end" in refused(buffer.getvalue(), "a.npz")
 
 

@@ -345,9 +345,11 @@ def test_real_scan_as_pcd_is_the_same_scan_as_bin(real):
     """KITTI odometry 00, frame 11, which another program filtered and turned into a PCD of 0..255."""
     pcd = read_scan(real / "formats" / "pcd" / "000011.pcd")
     kitti = read_scan(real / "kitti_odometry" / "sequences" / "00" / "velodyne" / "000011.bin")
-    places = {point: place for place, point in enumerate(map(tuple, kitti.points_xyz_m.tolist()))}
+    index_of = {point: index for index, point in enumerate(map(tuple, kitti.points_xyz_m.tolist()))}
     found = [
-        (place, places[point]) for place, point in enumerate(map(tuple, pcd.points_xyz_m.tolist())) if point in places
+        (index, index_of[point])
+        for index, point in enumerate(map(tuple, pcd.points_xyz_m.tolist()))
+        if point in index_of
     ]
     assert len(found) > 0.9 * len(pcd)
     mine, theirs = torch.tensor(found).T

@@ -103,13 +103,13 @@ def test_streams_the_same_scans_without_end(name):
 
 def test_seeds_and_settings_that_cannot_be_are_refused(name):
     generator, sampling = made(name)
-    for seeds, told in (
+    for seeds, message in (
         ([], "no seeds"),
         ([0, -1], "the seed -1"),
         ([1 << 63], "the seed 9223372036854775808"),
         ([10**99], "the seed 1000"),
     ):
-        with pytest.raises(ConfigError, match=f"^got {told}.*"):
+        with pytest.raises(ConfigError, match=f"^got {message}.*"):
             generator.sample(seeds, sampling)
     assert generator.sample([(1 << 63) - 1], sampling).range_m.shape == (1, 64, 32)
     with pytest.raises(ConfigError, match=r"^got settings of type SensorModel; wanted \w+; "):
@@ -189,11 +189,11 @@ def test_what_it_cannot_do_is_told_with_who_can(name):
         if capability in generator.capabilities:
             continue
         able = [other for other in NAMES if capability in load_class(other).capabilities]
-        with pytest.raises(ConfigError) as told:
+        with pytest.raises(ConfigError) as refusal:
             call(generator, arguments)
-        assert re.match(rf"got a generator '{name}', which cannot .*; wanted one that can: ", str(told.value))
-        assert all(other in told.value.wanted for other in able)
-        assert "lidargrit list generators" in told.value.cure
+        assert re.match(rf"got a generator '{name}', which cannot .*; wanted one that can: ", str(refusal.value))
+        assert all(other in refusal.value.wanted for other in able)
+        assert "lidargrit list generators" in refusal.value.cure
 
 
 def test_what_it_can_do_besides_keeps_to_the_seeds_and_the_sensor(name):
@@ -234,9 +234,9 @@ def test_an_objective_has_a_finite_loss_and_gradients(name):
 def test_tells_what_it_writes_and_where_it_comes_from(name):
     cls = load_class(name)
     assert cls.facts is not Generator.facts, "the class names no facts of its own"
-    told = cls.about()
-    assert told[0] == f"writes {cls.facts.writes}"
-    assert any(line == "from: this project" or cls.facts.paper in line for line in told)
+    lines = cls.about()
+    assert lines[0] == f"writes {cls.facts.writes}"
+    assert any(line == "from: this project" or cls.facts.paper in line for line in lines)
     assert bool(cls.facts.weights_licence) or not cls.published_files, (
         "weights can be imported, their licence is not told"
     )

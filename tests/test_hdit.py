@@ -53,8 +53,8 @@ def test_velocities_and_rotary_tables_are_the_references(golden, name):
     assert tables
     for key in tables:
         axis, _, where = key.removeprefix(f"{name}_freqs_").partition("_")
-        place = {"level_0": "down_levels.level_0.0", "down_levels_level_0_0": "down_levels.level_0.0"}
-        module = place.get(where, "mid_levels.0")
+        modules = {"level_0": "down_levels.level_0.0", "down_levels_level_0_0": "down_levels.level_0.0"}
+        module = modules.get(where, "mid_levels.0")
         assert np.array_equal(network.get_buffer(f"{module}.residual_attn.rope.freqs_{axis}").numpy(), data[key])
 
 
@@ -111,7 +111,7 @@ def test_a_turned_image_gives_a_turned_answer_but_for_positions():
 
 
 @pytest.mark.parametrize(
-    ("sizes", "told"),
+    ("sizes", "message"),
     [
         ({"depths": (3, 3)}, r"depths=\(3, 3\), heads="),
         ({"depths": (0, 3, 3, 3)}, r"depths=\(0, 3, 3, 3\)"),
@@ -121,8 +121,8 @@ def test_a_turned_image_gives_a_turned_answer_but_for_positions():
         ({"time_channels": 3}, "time_channels=3"),
     ],
 )
-def test_sizes_that_cannot_be_are_refused(sizes, told):
-    with pytest.raises(ConfigError, match=told):
+def test_sizes_that_cannot_be_are_refused(sizes, message):
+    with pytest.raises(ConfigError, match=message):
         HditConfig(**sizes)
 
 

@@ -29,9 +29,9 @@ def python(words: list[str | bytes], folder: Path, environment: dict[str, str]) 
     ids=["German", "Chinese", "no UTF-8", "long"],
 )
 def test_names_of_missing_files_under_the_c_locale(name, tmp_path):
-    code, told = python(["-m", "lidargrit", "inspect", name], tmp_path, ASCII)
+    code, output = python(["-m", "lidargrit", "inspect", name], tmp_path, ASCII)
     assert code == 2
-    the_one_line(told, "inspect")
+    the_one_line(output, "inspect")
 
 
 SEVERAL = """
@@ -49,12 +49,12 @@ def test_files_with_such_names_are_used_under_the_c_locale_or_told_in_one_line(t
     (tmp_path / "scans").rename(tmp_path / "走")
     words = ["-c", SEVERAL, "inspect -o scan.png, view -o page.html -n 1, export out --format pcd", "走".encode()]
     cache = {"LIDARGRIT_CACHE": str(tmp_path / "cache")}
-    code, told = python(words, tmp_path, cache | ASCII)
+    code, output = python(words, tmp_path, cache | ASCII)
     assert code == 1
-    assert "in a locale without such letters; wanted a locale of UTF-8; set PYTHONUTF8=1" in told
-    the_one_line("\n".join(told.splitlines()[:-1]), "inspect")
-    code, told = python(words, tmp_path, cache | {"LC_ALL": "C"})
-    assert code == 0, told
+    assert "in a locale without such letters; wanted a locale of UTF-8; set PYTHONUTF8=1" in output
+    the_one_line("\n".join(output.splitlines()[:-1]), "inspect")
+    code, output = python(words, tmp_path, cache | {"LC_ALL": "C"})
+    assert code == 0, output
     assert (tmp_path / "out" / "straße.pcd").is_file()
     assert "straße" in json.loads((tmp_path / "out" / "export.json").read_text(encoding="utf-8"))["scans"].values()
     assert (tmp_path / "page.html").is_file()

@@ -71,10 +71,10 @@ def test_argument_docs_are_noun_phrases():
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             text = ast.get_docstring(node) or "" if isinstance(node, (ast.FunctionDef, ast.ClassDef)) else ""
             arguments = re.search(r"^Args:\n((?:    .*\n?|\n)+)", text, re.MULTILINE)
-            told = (_ENTRY.fullmatch(line) for line in (arguments[1] if arguments else "").splitlines())
+            entries = (_ENTRY.fullmatch(line) for line in (arguments[1] if arguments else "").splitlines())
             fragments += [
                 f"{path.relative_to(ROOT)}: {entry[0].strip()}"
-                for entry in told
+                for entry in entries
                 if entry and (_CONTINUES_THE_NAME.match(entry[1]) or len(entry[1].split()) < 2)
             ]
     assert not fragments, "\n".join(fragments)

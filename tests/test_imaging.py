@@ -134,10 +134,10 @@ def test_view_and_inspect_project_by_elevation_and_say_so(folders, capsys):
     assert seen.images.return_mask.float().mean() > 0.5
     assert "not in firing order" in listener.lines[0]
     assert cli.main(["inspect", scans]) == 0
-    told = capsys.readouterr()
-    assert "not in firing order" in told.err
-    assert "spherical, exact" in told.out
-    assert "problem" not in told.out
+    captured = capsys.readouterr()
+    assert "not in firing order" in captured.err
+    assert "spherical, exact" in captured.out
+    assert "problem" not in captured.out
 
 
 def test_rings_of_another_sensor_are_refused_with_the_cure():

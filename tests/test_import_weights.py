@@ -114,7 +114,7 @@ def test_the_same_import_again_changes_nothing_and_no_training_goes_on_there(fil
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         (lambda vq, gpt: vq.pop("quant_conv.bias"), r"vq\.pth .*the file lacks 'quant_conv\.bias'"),
         (lambda vq, gpt: vq.update({"extra.weight": torch.ones(2)}), r"the file has besides 'extra\.weight'"),
@@ -137,11 +137,11 @@ def test_the_same_import_again_changes_nothing_and_no_training_goes_on_there(fil
         ),
     ],
 )
-def test_weights_of_another_layout_are_refused_in_one_line(change, told, tmp_path, capsys):
+def test_weights_of_another_layout_are_refused_in_one_line(change, message, tmp_path, capsys):
     tokenizer, transformer = dict(drawn("tokenizer")), dict(drawn("transformer"))
     change(tokenizer, transformer)
     assert imported(tmp_path / "run", write_released(tmp_path, tokenizer, transformer)) == 2
-    assert re.search(told, the_one_line(capsys.readouterr().err, "import-weights"))
+    assert re.search(message, the_one_line(capsys.readouterr().err, "import-weights"))
     assert not (tmp_path / "run").exists()
 
 

@@ -53,7 +53,7 @@ def test_intensity_of_eight_bits_and_none(written):
 
 
 @pytest.mark.parametrize(
-    ("place", "kind", "value", "text"),
+    ("offset", "kind", "value", "text"),
     [
         (104, "<B", 0x80, r"compressed points \(LAZ\); .*unpack it"),
         (104, "<B", 11, "points of format 11"),
@@ -66,9 +66,9 @@ def test_intensity_of_eight_bits_and_none(written):
         (0, "<I", 0, "no LAS file"),
     ],
 )
-def test_headers_that_ask_for_more_than_there_is(written, place, kind, value, text):
+def test_headers_that_ask_for_more_than_there_is(written, offset, kind, value, text):
     data = bytearray(written.read_bytes())
-    struct.pack_into(kind, data, place, value)
+    struct.pack_into(kind, data, offset, value)
     written.write_bytes(data)
     with pytest.raises(ScanError, match=text):
         read_scan(written)

@@ -122,9 +122,9 @@ def test_the_autoencoder_and_its_objective_are_the_programs(numbers):
     seeded(numbers, "vae", wrapped)
     assert count(wrapped) == numbers["vae_parameters"]
     images = torch.from_numpy(numbers["vae_x"]).float()
-    told = generator.encode(images)
-    agree(told, numbers["vae_mu_logvar"])
-    mean, log_variance = told.chunk(2, dim=1)
+    encoded = generator.encode(images)
+    agree(encoded, numbers["vae_mu_logvar"])
+    mean, log_variance = encoded.chunk(2, dim=1)
     reconstructed = generator.decode(mean)
     agree(reconstructed, numbers["vae_eval"])
     kl = kl_nats(mean, log_variance)
@@ -136,11 +136,11 @@ def test_the_autoencoder_and_its_objective_are_the_programs(numbers):
 
 @pytest.mark.shared
 def test_both_losses_are_the_programs(numbers):
-    of_real, of_fake = (torch.from_numpy(numbers[f"loss_{name}"]) for name in ("real", "fake"))
+    of_real, of_generated = (torch.from_numpy(numbers[f"loss_{name}"]) for name in ("real", "fake"))
     for number, kind in enumerate(("relativistic", "plain")):
-        told = discriminator_loss(of_real, of_fake, kind), generator_loss(of_real, of_fake, kind)
+        losses = discriminator_loss(of_real, of_generated, kind), generator_loss(of_real, of_generated, kind)
         wanted = [float(numbers[f"loss{number}_{player}"]) for player in "DG"]
-        assert [float(loss) for loss in told] == pytest.approx(wanted, rel=1e-6)
+        assert [float(loss) for loss in losses] == pytest.approx(wanted, rel=1e-6)
 
 
 @pytest.mark.shared

@@ -42,7 +42,7 @@ def test_a_checkpoint_of_the_program_becomes_a_run(cls, recipe, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("cls", "change", "told"),
+    ("cls", "change", "message"),
     [
         (LidarGan, lambda c: c.pop("main.12.weight"), "holds no generator of LidarGAN"),
         (LidarGan, lambda c: c.update({"main.12.weight": torch.ones(2, 3, 4, 4)}), "generates 3 coordinates"),
@@ -58,11 +58,11 @@ def test_a_checkpoint_of_the_program_becomes_a_run(cls, recipe, tmp_path):
         (LidarVae, lambda c: c.update({"encode.out.weight": torch.ones(1).half()}), "is no float32 tensor"),
     ],
 )
-def test_checkpoints_of_another_form_are_refused(cls, change, told, tmp_path):
+def test_checkpoints_of_another_form_are_refused(cls, change, message, tmp_path):
     saved, path = checkpoint(cls), tmp_path / "gen_999.pth"
     change(saved)
     torch.save(saved, path)
-    with pytest.raises(CheckpointError, match=told):
+    with pytest.raises(CheckpointError, match=message):
         cls.from_published([path], cls.Config(), load_sensor("hdl64e_kitti_odometry"))
 
 

@@ -317,7 +317,7 @@ def test_a_checkpoint_of_the_program_becomes_a_run(image_channels, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         (lambda c: c.pop(), "holds no list of 5 parts"),
         (lambda c: c[0].pop("module.sigmas"), r"holds no 'module\.sigmas'"),
@@ -334,11 +334,11 @@ def test_a_checkpoint_of_the_program_becomes_a_run(image_channels, tmp_path):
         (lambda c: c[4].update({"end_conv.weight": torch.ones(7, 4, 3, 3)}), "images of 7 channels"),
     ],
 )
-def test_checkpoints_of_another_form_are_refused(change, told, tmp_path):
+def test_checkpoints_of_another_form_are_refused(change, message, tmp_path):
     saved, path = checkpoint(), tmp_path / "checkpoint.pth"
     change(saved)
     torch.save(saved, path)
-    with pytest.raises((CheckpointError, ConfigError), match=told):
+    with pytest.raises((CheckpointError, ConfigError), match=message):
         LidarGen.from_published([path], LidarGenConfig(), load_sensor("hdl64e_kitti_360"))
 
 
@@ -355,8 +355,8 @@ def test_code_in_a_checkpoint_is_never_run_and_cut_ones_write_nothing(tmp_path, 
     torch.save(checkpoint(), path)
     path.write_bytes(path.read_bytes()[:-2000])
     assert main(["import-weights", "lidargen_kitti_360", str(out), str(path)]) == 2
-    told = capsys.readouterr().err
-    assert "checkpoint.pth, which " in told
-    assert told.count("\n") == 1
+    output = capsys.readouterr().err
+    assert "checkpoint.pth, which " in output
+    assert output.count("\n") == 1
     assert not (tmp_path / "ran").exists()
     assert not out.exists()

@@ -347,7 +347,7 @@ def test_a_checkpoint_of_the_program_becomes_a_run(mask_head, averaged, tmp_path
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         (lambda s: s.pop("first_stage_model.decoder.conv_out.weight"), "holds no decoder of a tokenizer 'curve_vqvae'"),
         (lambda s: s.pop("first_stage_model.quant_conv.bias"), r"lacks 'quant_conv\.bias'"),
@@ -357,11 +357,11 @@ def test_a_checkpoint_of_the_program_becomes_a_run(mask_head, averaged, tmp_path
         (lambda s: s.update({"betas": torch.ones(3).half()}), "'betas' is no float32 tensor"),
     ],
 )
-def test_checkpoints_of_another_form_are_refused(change, told, tmp_path):
+def test_checkpoints_of_another_form_are_refused(change, message, tmp_path):
     saved, path = checkpoint()[0], tmp_path / "lidm.ckpt"
     change(saved["state_dict"])
     torch.save(saved, path)
-    with pytest.raises(CheckpointError, match=told):
+    with pytest.raises(CheckpointError, match=message):
         Lidm.from_published([path], SMALL, SENSOR)
 
 

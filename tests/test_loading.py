@@ -310,8 +310,8 @@ def test_prepared_images_are_read_from_a_bucket(tmp_path, monkeypatch):
 def test_batches_come_in_one_order_whatever_reads_them():
     images = load_range_images(("simulated:9",), SIMULATED)
 
-    def stream(workers_count, first=0, **place):
-        batches = Batches(images, 4, ("flip", "roll"), True, 3, workers=workers_count, **place)
+    def stream(workers_count, first=0, **process):
+        batches = Batches(images, 4, ("flip", "roll"), True, 3, workers=workers_count, **process)
         return [batch.range_m for batch in batches.stream(first, 24)]
 
     alone = stream(1)

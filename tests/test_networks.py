@@ -207,12 +207,12 @@ def test_normalised_images(variant, cut):
     batch = images()
     channels = NormalisedImages.of(variant)(batch).numpy()
     points = points_of_pixels(batch).numpy()
-    for place in np.ndindex(*batch.range_m.shape):
-        r = float(batch.range_m[place])
-        raw = np.array([r, *points[place], float(batch.reflectance[place])])
+    for pixel in np.ndindex(*batch.range_m.shape):
+        r = float(batch.range_m[pixel])
+        raw = np.array([r, *points[pixel], float(batch.reflectance[pixel])])
         expected = (raw - [12.12, 10.88, 0.23, -1.04, 0.21]) / [12.32, 11.47, 6.91, 0.86, 0.16]
         kept = r > 0 and (0.5 < r < 63 or not cut)
-        np.testing.assert_allclose(channels[place[0], :, place[1], place[2]], expected * kept, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(channels[pixel[0], :, pixel[1], pixel[2]], expected * kept, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["frechet_range_distance", "kernel_range_distance"])

@@ -315,13 +315,13 @@ def test_argoverse_of_damaged_bytes_is_a_scan_or_one_line(tmp_path_factory, swee
     for _ in range(data.draw(st.integers(1, 4))):
         content[data.draw(st.integers(0, len(content) - 1) | st.integers(0, 1500))] = data.draw(st.integers(0, 255))
     path.write_bytes(content[: data.draw(st.integers(0, len(content)) | st.just(len(content)))])
-    told = scan_or_refusal(path)
-    assert told.ring is not None if isinstance(told, Scan) else str(path) in told.got and "\n" not in str(told)
+    found = scan_or_refusal(path)
+    assert found.ring is not None if isinstance(found, Scan) else str(path) in found.got and "\n" not in str(found)
 
 
 def test_argoverse_logs_are_sequences_and_only_the_upright_sensor_is_taken(tmp_path, sweep):
-    for place in ("train/a", "train/b", "val/c"):
-        sweep(tmp_path / "av2" / place / "sensors" / "lidar" / "7.feather")
+    for log_folder in ("train/a", "train/b", "val/c"):
+        sweep(tmp_path / "av2" / log_folder / "sensors" / "lidar" / "7.feather")
     names = {}
     for split in ("all", "train", "val", "train/b"):
         dataset = open_dataset(f"{tmp_path / 'av2'}:{split}")

@@ -166,9 +166,9 @@ def test_surprise_is_what_exceeds_the_expected_bits(tmp_path, capsys):
     assert torch.allclose(bits.surprise(), bits.mask + bits.range - bits.expected)
     dropped = ~images.return_mask
     assert bool((bits.expected[dropped] <= 1.0001).all())  # of a mask alone, at most one bit
-    for told in (generator.bits(images), made(None).bits(images, expected=True)):
+    for lacking in (generator.bits(images), made(None).bits(images, expected=True)):
         with pytest.raises(ConfigError, match="got bits without those that were expected"):
-            told.surprise()
+            lacking.surprise()
     generator.save(tmp_path / "run")
     words = ["view", "simulated:1:test", "--color", "surprise", "--model", str(tmp_path / "run"), "-n", "1"]
     assert main([*words, "-o", str(tmp_path / "surprise.png")]) == 0
@@ -297,14 +297,14 @@ def test_the_likelihood_of_a_source_is_told_and_its_map_written(tmp_path, capsys
     made().save(tmp_path / "run")
     words = ["likelihood", "simulated:2:test", "--model", str(tmp_path / "run"), "--map", str(tmp_path / "bits.npy")]
     assert main([*words, "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["whole_scan"]
-    assert told["num_scans"] == 2
-    of_scans = [sum(scan[part] for part in ("tokens", "mask", "range")) for scan in told["scans"]]
-    assert told["bits"]["all"]["scan"]["value"] == pytest.approx(sum(of_scans) / 2)
-    returns = sum(scan["returns"] for scan in told["scans"])
-    assert told["bits"]["range"]["return"]["value"] == pytest.approx(
-        sum(scan["range"] for scan in told["scans"]) / returns
+    found = json.loads(capsys.readouterr().out)
+    assert found["whole_scan"]
+    assert found["num_scans"] == 2
+    of_scans = [sum(scan[part] for part in ("tokens", "mask", "range")) for scan in found["scans"]]
+    assert found["bits"]["all"]["scan"]["value"] == pytest.approx(sum(of_scans) / 2)
+    returns = sum(scan["returns"] for scan in found["scans"])
+    assert found["bits"]["range"]["return"]["value"] == pytest.approx(
+        sum(scan["range"] for scan in found["scans"]) / returns
     )
     pixels = np.load(tmp_path / "bits.npy")
     assert pixels.shape == (2, 64, 64)

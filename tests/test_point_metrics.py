@@ -93,7 +93,7 @@ def test_grid_and_divergence_are_the_programs(golden):
 
 
 def slow_farthest_points(points, candidates, num, start, precedence):
-    order = {int(index): place for place, index in enumerate(precedence)}
+    order = {int(index): rank for rank, index in enumerate(precedence)}
     nearest = np.where(candidates, np.float32(1e10), np.float32(-1))
     chosen, last = ([], np.zeros(3, np.float32)) if start is None else ([start], points[start])
     while len(chosen) < num:
@@ -152,8 +152,8 @@ def test_scans_of_few_returns_take_all_in_turn():
     images = RangeImage.masked(torch.full((2, 16, 64), 8.0), mask, SENSOR)
     empty, few = _clouds.FarthestPointClouds("exact")(images)
     assert (empty == 0).all()
-    places, times = np.unique(few, axis=0, return_counts=True)
-    assert len(places) == 5
+    points, times = np.unique(few, axis=0, return_counts=True)
+    assert len(points) == 5
     assert times.max() - times.min() <= 1
 
 

@@ -82,8 +82,8 @@ def test_an_index_that_lies_is_refused(folder, change):
     length = int.from_bytes(content[-16:-8], "little")
     index = json.loads(content[-16 - length : -16])
     index["entries"][0] |= change
-    told = json.dumps(index).encode()
-    for lie in (told, b"[" * 100_000, b"null", told[:-1] + b', "x": 1e400}'):
+    changed = json.dumps(index).encode()
+    for lie in (changed, b"[" * 100_000, b"null", changed[:-1] + b', "x": 1e400}'):
         path.write_bytes(content[: -16 - length] + lie + len(lie).to_bytes(8, "little") + content[-8:])
         with pytest.raises(DataError, match="shard"):
             PreparedImages(str(folder)).read(0)

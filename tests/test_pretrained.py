@@ -42,8 +42,8 @@ def test_all_of_it_is_small_and_its_card_is_whole():
 def test_it_is_what_its_recipe_makes(model):
     recipe = load_recipe("compact_pixels")
     assert model.config == recipe.model
-    told = json.loads((FOLDER / "run.json").read_text(encoding="utf-8"))["recipe"]
-    assert {stage: fit["scans"] for stage, fit in told["training"].items()} == {
+    trained = json.loads((FOLDER / "run.json").read_text(encoding="utf-8"))["recipe"]
+    assert {stage: fit["scans"] for stage, fit in trained["training"].items()} == {
         stage: fit.scans for stage, fit in recipe.training.items()
     }
 
@@ -99,7 +99,9 @@ def test_every_verb_that_takes_a_run_takes_the_word(tmp_path, monkeypatch, capsy
     assert main(["train", "compact", "run", "--set", *words]) == 0
     assert main(["publish", "run", "to_share"]) == 0
     assert json.loads((tmp_path / "to_share" / "run.json").read_text())["recipe"]["tokenizer_from"] is None
-    known = [json.loads((place / "trained_on.json").read_text())["fingerprints"] for place in (FOLDER, Path("run"))]
+    known = [
+        json.loads((run_folder / "trained_on.json").read_text())["fingerprints"] for run_folder in (FOLDER, Path("run"))
+    ]
     assert len(known[1]) == len({*known[0]} | {*known[1]}) > len(known[0]) - 1
     capsys.readouterr()
 
@@ -171,8 +173,8 @@ def test_samples_that_are_removed_meanwhile_are_an_error(model, monkeypatch, tmp
     empty = RangeImage(range_m, range_m > 0, model.sensor)
     monkeypatch.setattr(Generator, "stream", _streaming(empty, tmp_path / "out", removed))
     assert main(["sample", "pretrained", str(tmp_path / "out"), "-n", "2"]) == 2
-    told = the_one_line(capsys.readouterr().err, "sample")
-    assert "out, from which files were removed meanwhile; wanted" in told
+    line = the_one_line(capsys.readouterr().err, "sample")
+    assert "out, from which files were removed meanwhile; wanted" in line
     assert (tmp_path / "out").exists() == bool(removed)
 
 

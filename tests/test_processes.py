@@ -146,8 +146,8 @@ def launched(processes: int, folder: Path, words: list[str]) -> None:
         )
         for rank in range(processes)
     ]
-    told = [process.communicate(timeout=280)[0] for process in running]
-    assert [process.returncode for process in running] == [0] * processes, "\n".join(told)
+    outputs = [process.communicate(timeout=280)[0] for process in running]
+    assert [process.returncode for process in running] == [0] * processes, "\n".join(outputs)
 
 
 def test_two_processes_learn_what_one_does(tmp_path):

@@ -251,7 +251,7 @@ def test_an_imported_checkpoint_is_a_run_that_samples(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         (lambda c: c.pop("weights"), "which holds no 'weights'"),
         (lambda c: c["weights"].pop("tokenizer.0.weight"), r"another network \(KeyError: 'tokenizer\.0\.weight'\)"),
@@ -262,12 +262,12 @@ def test_an_imported_checkpoint_is_a_run_that_samples(tmp_path, capsys):
         (lambda c: c["weights"].update(coords=torch.ones(2).half()), "'coords' is no float32 tensor"),
     ],
 )
-def test_weights_of_another_form_are_refused(tmp_path, change, told):
+def test_weights_of_another_form_are_refused(tmp_path, change, message):
     checkpoint = seeded_checkpoint()
     change(checkpoint)
     torch.save(checkpoint, tmp_path / "1rf.pth")
     recipe = load_recipe("r2flow_kitti_360")
-    with pytest.raises(CheckpointError, match=told):
+    with pytest.raises(CheckpointError, match=message):
         R2flow.from_published([tmp_path / "1rf.pth"], recipe.model, recipe.data.load_sensor())
 
 

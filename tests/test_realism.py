@@ -127,10 +127,10 @@ def test_the_verb(tmp_path, capsys):
     words += ["--model", str(tmp_path / "run")]
     assert main(words) == 0
     assert "drop_run_lengths" in capsys.readouterr().out
-    told = json.loads(file.read_text())
-    assert told["real"] == "simulated:2:val"
-    assert {"simulated", "bernoulli", "real_against_real", "ratio"} == set(told["curves"][0])
-    assert [score["scans"] for score in told["raydrop"]] == ["simulated"] * 5 + ["real"] * 5
+    found = json.loads(file.read_text())
+    assert found["real"] == "simulated:2:val"
+    assert {"simulated", "bernoulli", "real_against_real", "ratio"} == set(found["curves"][0])
+    assert [score["scans"] for score in found["raydrop"]] == ["simulated"] * 5 + ["real"] * 5
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert main(words) == 2  # it is there already
     assert "add --overwrite" in capsys.readouterr().err

@@ -245,9 +245,9 @@ def test_return_rates_against_the_neighbours(name):
     counts = np.zeros((2, 2, len(edges) - 1), dtype=int)
     for which, side in enumerate(sides):
         for image, row, column in np.ndindex(3, 24, 32):
-            place = slow_surroundings(side[image], row, column)[name == "return_rate_by_incidence"]
-            if place is not None:
-                counts[which, int(side.return_mask[image, row, column]), np.searchsorted(edges, place) - 1] += 1
+            quantity = slow_surroundings(side[image], row, column)[name == "return_rate_by_incidence"]
+            if quantity is not None:
+                counts[which, int(side.return_mask[image, row, column]), np.searchsorted(edges, quantity) - 1] += 1
     tried, happened = counts.sum(axis=1), counts[:, 1]
     ever = tried.min(axis=0) > 0  # none is seen 500 times in sets as small as these
     assert 0 < tried.max() < 500

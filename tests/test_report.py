@@ -162,7 +162,7 @@ def test_a_scan_is_its_own_nearest(evaluated):
     assert [match.distance for match in other] == sorted(match.distance for match in other)
     rows = torch.linspace(0, pair.samples.images.sensor.height - 1, 32).round().long()
     columns = torch.linspace(0, pair.samples.images.sensor.width - 1, 128).round().long()
-    pair = [side.batch([place])[0].range_m for side, place in
+    pair = [side.batch([index])[0].range_m for side, index in
             ((pair.samples, other[0].generated), (pair.reference, other[0].real))]  # fmt: skip
     apart = [torch.log2(1 + one[rows][:, columns]) for one in pair]
     assert other[0].distance == pytest.approx(float((apart[0] - apart[1]).abs().mean()), rel=1e-4)

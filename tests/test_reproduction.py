@@ -53,16 +53,16 @@ def test_a_killed_reproduction_goes_on_and_ends_with_the_table(tmp_path, capsys)
     scored = first.stat().st_mtime_ns
 
     assert main(words_for(folder)) == 0
-    told = capsys.readouterr()
+    captured = capsys.readouterr()
     assert first.stat().st_mtime_ns == scored
-    assert "scores are there already" in told.err
+    assert "scores are there already" in captured.err
     for row in ("ablation_neither_small", "ablation_raydrop_small", "ablation_both_small"):
-        assert f"\n{row} " in told.out
+        assert f"\n{row} " in captured.out
     for metric in ("sliced_wasserstein", "minimum_matching_distance", "point_cloud_jsd"):
-        assert f"{metric} (reference)" in told.out
-    assert "Published figures of lidargrit_kitti_odometry\nleft out, for they do not compare: 4 of the" in told.out
-    assert "61.73" not in told.out
-    assert "the paper's row 'with both' is measured by ablation_both_small" in told.out
+        assert f"{metric} (reference)" in captured.out
+    assert "Published figures of lidargrit_kitti_odometry\nleft out, for they do not compare: 4 of the" in captured.out
+    assert "61.73" not in captured.out
+    assert "the paper's row 'with both' is measured by ablation_both_small" in captured.out
 
     # The killed run went on as if it had not been.
     recipe = load_recipe("ablation_raydrop_small", reproduction_of(folder).benchmark().recipe_settings)
@@ -83,10 +83,10 @@ def reproduction_of(folder: Path) -> Reproduction:
 
 @pytest.mark.parametrize("number", TABLES)
 def test_every_row_of_the_paper_is_measured(number):
-    told, table = published()[number - 1], TABLES[number]
-    assert f"table {number}" in told["source"]
-    assert told["protocol"] == table.protocol
-    assert {row["system"] for row in told["rows"]} == {*table.rows}
+    found, table = published()[number - 1], TABLES[number]
+    assert f"table {number}" in found["source"]
+    assert found["protocol"] == table.protocol
+    assert {row["system"] for row in found["rows"]} == {*table.rows}
     for recipe, small in table.rows.values():
         assert "simulated" in load_recipe(small).data.train[0]
         assert load_recipe(recipe).published
@@ -114,14 +114,14 @@ def test_a_plan_tells_scans_and_cost(tmp_path, capsys, monkeypatch):
         other.parent.mkdir(parents=True)
         other.write_bytes(scan.read_bytes())
     assert main(["reproduce", "1", str(tmp_path / "root"), str(tmp_path / "out"), "--dry-run"]) == 0
-    told = capsys.readouterr().out
+    output = capsys.readouterr().out
     for split in ("train_without_val", "val", "test"):
-        assert f"prepare kitti_360:{tmp_path / 'root'}:{split}: 1 scans" in told
-    assert "train r2dm_kitti_360 (to do)" in told
-    assert "1.00e+18 floating-point operations, by estimate" in told
-    assert "sample 5,000 scans" in told
-    assert "train lidargen_kitti_360 (to do)" in told
-    assert "train ultralidar_kitti_360 (to do)" in told
+        assert f"prepare kitti_360:{tmp_path / 'root'}:{split}: 1 scans" in output
+    assert "train r2dm_kitti_360 (to do)" in output
+    assert "1.00e+18 floating-point operations, by estimate" in output
+    assert "sample 5,000 scans" in output
+    assert "train lidargen_kitti_360 (to do)" in output
+    assert "train ultralidar_kitti_360 (to do)" in output
     assert not (tmp_path / "out").exists()
 
 

@@ -92,12 +92,12 @@ def test_every_cloud_of_the_busiest_topic_is_read(recording):
 
 def test_damaged_recordings_are_refused_in_one_line(recording, tmp_path):
     data, rng = recording.read_bytes(), np.random.default_rng(0)
-    told = []
+    messages = []
     for number in range(60):
         damaged = bytearray(data)
         if number % 3:
-            for place in rng.integers(0, len(data), 1 + number % 7):
-                damaged[place] = rng.integers(0, 256)
+            for offset in rng.integers(0, len(data), 1 + number % 7):
+                damaged[offset] = rng.integers(0, 256)
         else:
             del damaged[int(rng.integers(0, len(data))) :]
         path = tmp_path / f"{number}{recording.suffix}"
@@ -105,9 +105,9 @@ def test_damaged_recordings_are_refused_in_one_line(recording, tmp_path):
         try:
             read_scan(path, 0, "drop")
         except ScanError as error:
-            told.append(str(error).replace(str(path), ""))
-    assert len(told) >= 10
-    assert all("\n" not in line and len(line) < 400 for line in told)
+            messages.append(str(error).replace(str(path), ""))
+    assert len(messages) >= 10
+    assert all("\n" not in line and len(line) < 400 for line in messages)
 
 
 def test_a_view_in_place_of_the_messages_is_refused(tmp_path):

@@ -63,13 +63,13 @@ def test_a_folder_of_tensors_is_recognised_and_gives_metres(name, tmp_path):
     images = open_images(str(tmp_path))
     assert len(images) == 3
     batch = images.batch([0, 1, 2])
-    for place, index in enumerate((0, 2, 10)):  # by number, not by letter
+    for number, index in enumerate((0, 2, 10)):  # by number, not by letter
         range_m, reflectance = scan(index)
-        assert torch.allclose(batch.range_m[place], range_m, atol=0.01)
+        assert torch.allclose(batch.range_m[number], range_m, atol=0.01)
         if name == "lidargrit":
             assert batch.reflectance is None
         else:
-            assert torch.allclose(batch.reflectance[place], reflectance * (range_m > 0))
+            assert torch.allclose(batch.reflectance[number], reflectance * (range_m > 0))
     assert images.sensor.name == "hdl64e_kitti_360"
     assert torch.equal(open_source(str(tmp_path), samples_format=name).images().batch([0]).range_m, batch.range_m[:1])
 
@@ -142,8 +142,8 @@ def test_flipped_bytes_never_crash(seed, tmp_path):
     data = bytearray(path.read_bytes())
     rng = torch.Generator().manual_seed(seed)
     ends = list(range(600)) + list(range(len(data) - 600, len(data)))  # where everything but the pixels is
-    for place in torch.randint(len(ends), (5,), generator=rng).tolist():
-        data[ends[place]] = int(torch.randint(256, (1,), generator=rng))
+    for number in torch.randint(len(ends), (5,), generator=rng).tolist():
+        data[ends[number]] = int(torch.randint(256, (1,), generator=rng))
     path.write_bytes(bytes(data))
     with contextlib.suppress(ScanError):
         read_tensor_folder(tmp_path).batch([0])

@@ -163,9 +163,9 @@ def test_the_number_of_triangles_is_bounded(meshes):
     assert counts.max() < 90_000
 
 
-def _slow_sight(town, place, eye):
+def _slow_sight(town, point, eye):
     """Tell whether a house stands between, by many points on the way."""
-    way = eye + np.linspace(0, 1, 1000)[:, None] * (place - eye)
+    way = eye + np.linspace(0, 1, 1000)[:, None] * (point - eye)
     houses = town.houses
     for house in range(len(houses.length_m)):
         yaw, apart = houses.poses.yaw_rad[house], way - houses.poses.xyz_m[house, :2]
@@ -184,16 +184,16 @@ def test_things_count_as_far_only_behind_houses(seed):
     rng = np.random.default_rng(seed)
     plan = sample_street_plan(rng, "suburb")
     town = lay_out_houses(rng, plan)
-    places = rng.uniform(-50, 50, (60, 2))
-    away, straight = town.houses.nearest_approach_m(plan, places), plan.nearest_approach_m(places)
-    nearest = [min(np.hypot(*(place - eye)) for eye in plan.viewpoints_m) for place in places]
+    points = rng.uniform(-50, 50, (60, 2))
+    away, straight = town.houses.nearest_approach_m(plan, points), plan.nearest_approach_m(points)
+    nearest = [min(np.hypot(*(point - eye)) for eye in plan.viewpoints_m) for point in points]
     assert np.allclose(straight, nearest)
     hidden = away > straight
     assert np.array_equal(away[~hidden], straight[~hidden])
-    for place in places[hidden]:
-        assert not any(_slow_sight(town, place, eye) for eye in plan.viewpoints_m)
+    for point in points[hidden]:
+        assert not any(_slow_sight(town, point, eye) for eye in plan.viewpoints_m)
     checked = (straight > 12) & (straight < 40) & ~hidden
-    assert np.mean([any(_slow_sight(town, place, eye) for eye in plan.viewpoints_m) for place in places[checked]]) > 0.8
+    assert np.mean([any(_slow_sight(town, point, eye) for eye in plan.viewpoints_m) for point in points[checked]]) > 0.8
 
 
 def test_our_car_passes_what_is_drawn_in_detail(scenes):

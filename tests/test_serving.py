@@ -31,9 +31,9 @@ QUICK = {"steps": 3, "resamples": 2}
 def served(tmp_path_factory):
     with running(tmp_path_factory.mktemp("runs")) as served:
         yield served
-        place = served.queue._folder
-        assert place.is_dir()
-    assert not place.exists(), "nothing is left behind"
+        folder = served.queue._folder
+        assert folder.is_dir()
+    assert not folder.exists(), "nothing is left behind"
 
 
 @pytest.fixture(scope="module")

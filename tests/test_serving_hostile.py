@@ -143,10 +143,10 @@ def test_hostile_files_are_refused_and_removed(served, tmp_path):
         (tmp_path / name).write_bytes(data)
         assert len(data) < LIMITS.upload_bytes
         jobs[name] = upload(served, tmp_path / name, {"model": 2, "sampling": QUICK})
-        told = served.ended(jobs[name])
-        assert told["state"] == "failed", name
-        assert name in told["error"]
-        assert str(served.queue._folder) not in told["error"]
+        job = served.ended(jobs[name])
+        assert job["state"] == "failed", name
+        assert name in job["error"]
+        assert str(served.queue._folder) not in job["error"]
         assert served.ask(f"{jobs[name]}/scans")[0] == 404
     if status.exists():
         most_kb = int(re.search(r"VmHWM:\s+(\d+)", status.read_text())[1])
@@ -234,9 +234,9 @@ def test_fifty_clients_at_once(served):
 
     def client() -> None:
         page = served.ask("/")[0]
-        request, _, told = served.ask("/generate", {"model": 1})
+        request, _, answer = served.ask("/generate", {"model": 1})
         assert page == 200
-        assert request == 202 or b"others are waiting already" in told
+        assert request == 202 or b"others are waiting already" in answer
         answers.append(request)
 
     threads = [threading.Thread(target=client) for _ in range(50)]
@@ -258,11 +258,11 @@ def test_fifty_clients_at_once(served):
 
 def test_what_takes_too_long_is_ended(served):
     served.queue.limits = replace(LIMITS, seconds=0.4)
-    told = served.ended(served.take("/generate", LONG))
+    job = served.ended(served.take("/generate", LONG))
     served.queue.limits = LIMITS
-    assert told["state"] == "failed"
-    assert "takes longer than 0.4 seconds" in told["error"]
-    assert told["seconds"] < 5
+    assert job["state"] == "failed"
+    assert "takes longer than 0.4 seconds" in job["error"]
+    assert job["seconds"] < 5
 
 
 def test_old_results_are_forgotten(served):

@@ -100,8 +100,8 @@ def scipy_blur(image):
     return ndimage.convolve(image, KERNEL, mode="mirror")
 
 
-@pytest.mark.parametrize(("shifted", "place"), [(False, 0), (True, 1)])
-def test_pyramid_is_that_of_a_scipy_convolution(shifted, place):
+@pytest.mark.parametrize(("shifted", "offset"), [(False, 0), (True, 1)])
+def test_pyramid_is_that_of_a_scipy_convolution(shifted, offset):
     images = torch.randn(2, 64, 48, generator=rng_of(0))
     pyramid = swd.laplacian_pyramid(images, shifted=shifted)
     assert [tuple(level.shape) for level in pyramid] == [(2, 64, 48), (2, 32, 24)]
@@ -109,7 +109,7 @@ def test_pyramid_is_that_of_a_scipy_convolution(shifted, place):
         image = images[index].double().numpy()
         coarse = scipy_blur(image)[::2, ::2]
         fine = np.zeros_like(image)
-        fine[place::2, place::2] = coarse
+        fine[offset::2, offset::2] = coarse
         assert np.allclose(pyramid[0][index], image - 4 * scipy_blur(fine), atol=1e-5)
         assert np.allclose(pyramid[1][index], coarse, atol=1e-6)
 

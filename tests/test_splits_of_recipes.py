@@ -29,9 +29,9 @@ def roots(tmp_path_factory) -> dict[str, Path]:
     for name, (folder, drives) in TREES.items():
         roots[name] = tmp_path_factory.mktemp(name)
         for drive in drives:
-            place = roots[name] / folder.format(drive)
-            place.mkdir(parents=True)
-            (place / f"{0:010d}.bin").touch()
+            drive_folder = roots[name] / folder.format(drive)
+            drive_folder.mkdir(parents=True)
+            (drive_folder / f"{0:010d}.bin").touch()
     return roots
 
 

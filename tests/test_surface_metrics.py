@@ -65,10 +65,10 @@ def slow_flying_points(images):
             if not range_m or None in sides:
                 continue
             near, far = sorted(sides)
-            place = np.searchsorted(GAPS_M, far - near, side="right") - 1
-            if 0 <= place < 12:
-                counts[0, place] += 1
-                counts[1, place] += near + 0.3 < range_m < far - 0.3
+            gap = np.searchsorted(GAPS_M, far - near, side="right") - 1
+            if 0 <= gap < 12:
+                counts[0, gap] += 1
+                counts[1, gap] += near + 0.3 < range_m < far - 0.3
     return counts
 
 

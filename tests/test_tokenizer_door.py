@@ -106,7 +106,7 @@ def test_a_vqvae_is_written_without_a_name_and_read_with_or_without(generator):
 
 
 @pytest.mark.parametrize(
-    ("tokenizer", "told"),
+    ("tokenizer", "message"),
     [
         ({"name": "vqvea"}, r"got 'vqvea', which is not among the tokenizers; wanted one of vqvae or curve_vqvae"),
         ({"name": ["vqvae"]}, r"which is not among the tokenizers"),
@@ -117,10 +117,10 @@ def test_a_vqvae_is_written_without_a_name_and_read_with_or_without(generator):
         (None, r"that does not fit"),
     ],
 )
-def test_a_tokenizer_that_there_is_not_is_told_in_one_line(tokenizer, told, monkeypatch):
+def test_a_tokenizer_that_there_is_not_is_told_in_one_line(tokenizer, message, monkeypatch):
     installed(monkeypatch)
     data = configuration.to_json(LidarGritConfig()) | {"tokenizer": tokenizer}
-    with pytest.raises(LidarGritError, match=told) as refusal:
+    with pytest.raises(LidarGritError, match=message) as refusal:
         configuration.from_json(LidarGritConfig, data, "config.json")
     assert "\n" not in str(refusal.value)
 

@@ -291,8 +291,8 @@ def test_the_memory_of_weights_is_what_a_step_leaves_behind(images):
 
 def test_a_measured_plan_tells_operations_time_and_memory():
     recipe = load_recipe("demo", TINY)
-    told = [stage.as_text() for stage in measure(recipe)]
-    for line, (stage, flops) in zip(told, training_flops(recipe).items(), strict=True):
+    lines = [stage.as_text() for stage in measure(recipe)]
+    for line, (stage, flops) in zip(lines, training_flops(recipe).items(), strict=True):
         wanted = rf"{stage}: {flops:.2e} floating-point operations at [\d.e+]+ scans/s: [\d.]+ \w+ on cpu, [\d.]+ GiB"
         assert re.fullmatch(wanted.replace("e+", "e\\+", 1), line)
 

@@ -174,7 +174,7 @@ def test_sampling_settings_that_cannot_be_are_refused(settings):
 
 
 @pytest.mark.parametrize(
-    ("make", "told"),
+    ("make", "message"),
     [
         (lambda: VoxelAutoencoderConfig(patch=7), "patch=7"),
         (lambda: VoxelAutoencoderConfig(num_codes=1), "num_codes=1"),
@@ -188,8 +188,8 @@ def test_sampling_settings_that_cannot_be_are_refused(settings):
         ),
     ],
 )
-def test_models_that_cannot_be_are_refused(make, told):
-    with pytest.raises(ConfigError, match=told):
+def test_models_that_cannot_be_are_refused(make, message):
+    with pytest.raises(ConfigError, match=message):
         make()
 
 
@@ -244,7 +244,7 @@ def test_a_checkpoint_of_the_program_becomes_a_run(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         (lambda c: c.pop("state_dict"), "holds no 'state_dict'"),
         (lambda c: c["state_dict"].pop("vector_quantizer.embedding.weight"), r"holds no 'autoencoder\.quantiser"),
@@ -260,11 +260,11 @@ def test_a_checkpoint_of_the_program_becomes_a_run(tmp_path):
         ),
     ],
 )
-def test_checkpoints_of_another_form_are_refused(change, told, tmp_path):
+def test_checkpoints_of_another_form_are_refused(change, message, tmp_path):
     saved, path = checkpoint(TINY), tmp_path / "epoch_200.pth"
     change(saved)
     torch.save(saved, path)
-    with pytest.raises((CheckpointError, ConfigError), match=told):
+    with pytest.raises((CheckpointError, ConfigError), match=message):
         UltraLidar.from_published([path], TINY, SENSOR)
 
 

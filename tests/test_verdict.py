@@ -4,13 +4,13 @@ from dataclasses import replace
 
 from lidargrit.cli import main
 from lidargrit.evaluation.intervals import Interval, RealAgainstReal
-from lidargrit.evaluation.scorecard import Score, Scorecard, SetFacts
+from lidargrit.evaluation.scorecard import EvalSetRecord, Score, Scorecard
 from lidargrit.evaluation.tables import side_by_side
 from lidargrit.evaluation.verdict import counted_first, verdict
 from lidargrit.files import read_json, write_json
 from lidargrit.structures import MetricResult
 
-FACTS = SetFacts("a", "samples", "", 9, 9, "s 8x8", "spherical, exact", "ab" * 32)
+FACTS = EvalSetRecord("a", "samples", "", 9, 9, "s 8x8", "spherical, exact", "ab" * 32)
 
 
 def score(value, real=None, pixels=None, *, noise=0.1, metric="bev_jsd", higher=False, variant="exact"):

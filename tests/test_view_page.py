@@ -55,7 +55,7 @@ def shown() -> list[ScanSet]:
     return [ScanSet("real </script>", real, NAMES, labels(real)), ScanSet("generated", plain[:2], ("seed 0", "seed 1"))]
 
 
-def told(text: str) -> dict:
+def page_data(text: str) -> dict:
     return json.loads(re.search(r'id="scans">(.*?)</script>', text, re.DOTALL)[1])
 
 
@@ -68,7 +68,7 @@ def test_the_page_holds_all_pixels_and_nothing_foreign(shown):
     assert not re.search(r"https?://|src=|href=|@import|url\(", text)
     assert text.count("</script>") == 2, "names cannot end a script"
     assert "real &lt;/script&gt;" in text
-    data = told(text)
+    data = page_data(text)
     assert [source["name"] for source in data["sources"]] == ["real </script>", "generated"]
     for one, source in zip(shown, data["sources"], strict=True):
         assert len(source["scans"]) == len(one.images)
@@ -141,7 +141,7 @@ def test_scans_that_cannot_be_used_are_refused_or_left_out(tmp_path):
 def test_the_command_writes_a_page(tmp_path, capsys):
     out = tmp_path / "view.html"
     assert main(["view", "simulated:2:val", "-o", str(out), "-n", "2"]) == 0
-    assert len(told(out.read_text(encoding="utf-8"))["sources"][0]["scans"]) == 2
+    assert len(page_data(out.read_text(encoding="utf-8"))["sources"][0]["scans"]) == 2
     assert main(["view", "simulated:2:val", "-o", str(out)]) == 2
     assert "there already" in capsys.readouterr().err
     assert main(["view", "simulated:2:val", "-o", str(tmp_path / "no.html"), "-n", "101"]) == 2

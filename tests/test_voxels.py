@@ -91,7 +91,7 @@ def test_the_reference_variant_is_the_picture_of_swapped_clouds():
 
 
 @pytest.mark.parametrize(
-    ("settings", "told"),
+    ("settings", "message"),
     [
         ({"low_m": (1.0, -50.0, -3.73)}, "a box from"),
         ({"cells": (640, 640, 4)}, "a box from"),
@@ -101,6 +101,6 @@ def test_the_reference_variant_is_the_picture_of_swapped_clouds():
         ({"cells": (64000, 64000, 40)}, "cells="),
     ],
 )
-def test_boxes_that_cannot_be_are_refused(settings, told):
-    with pytest.raises(ConfigError, match=f"^got .*{told}"):
+def test_boxes_that_cannot_be_are_refused(settings, message):
+    with pytest.raises(ConfigError, match=f"^got .*{message}"):
         VoxelGrid(**settings)

@@ -238,8 +238,8 @@ def test_files_cut_short_or_damaged_are_refused(tmp_path):
     rng = np.random.default_rng(0)
     for _ in range(60):  # any damage is refused, or leaves tensors: it never ends otherwise
         damaged = bytearray(rng.choice([WHOLE, legacy, archive]))
-        for place in rng.integers(0, len(damaged), 8):
-            damaged[place] = rng.integers(256)
+        for offset in rng.integers(0, len(damaged), 8):
+            damaged[offset] = rng.integers(256)
         (tmp_path / "y").write_bytes(damaged)
         for published in (FILE, ARCHIVE):
             try:

@@ -87,8 +87,8 @@ def test_it_does_not_matter_which_set_has_no_raydrop(sets):
 def test_metrics_of_raydrop_alone_give_a_table_and_no_error(sets, capsys):
     words = ["evaluate", str(sets / "lidargan"), str(sets / "dusty"), "--metrics", "drop_correlation"]
     assert main(words) == 0
-    told = capsys.readouterr().out
-    assert "drop_correlation  exact    not applicable" in told
+    output = capsys.readouterr().out
+    assert "drop_correlation  exact    not applicable" in output
 
 
 def test_tables_and_pages_say_so_too(compared, sets, tmp_path):

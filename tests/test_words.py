@@ -122,8 +122,8 @@ def test_help_tells_the_exit_codes(capsys):
         with pytest.raises(SystemExit) as stopped:
             main(words)
         assert stopped.value.code == 0
-        told = capsys.readouterr().out
-        assert all(f"{code} " in told.partition("exit codes:")[2] for code in (0, 1, 2, 130, 143))
+        output = capsys.readouterr().out
+        assert all(f"{code} " in output.partition("exit codes:")[2] for code in (0, 1, 2, 130, 143))
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])

@@ -39,11 +39,11 @@ def entries(kind: str, in_full: bool = False) -> list[dict[str, Any]]:
 def lines(kind: str, entry: dict[str, Any]) -> list[str]:
     """Return what :func:`entries` tells of one in full as lines for people; none for kinds that have only a summary."""
     if kind == "datasets":
-        told = [f"{name}: {entry[name]}" for name in ("layout", "sensor", "licence", "cite")]
+        facts = [f"{name}: {entry[name]}" for name in ("layout", "sensor", "licence", "cite")]
         for number, scheme in enumerate(entry["schemes"]):
             parts = ", ".join(part if number == 0 else f"{scheme['name']}/{part}" for part in scheme["parts"])
-            told += [f"splits: {parts} ({scheme['name']}: {scheme['source']})", f"    leak: {scheme['leak']}"]
-        return told
+            facts += [f"splits: {parts} ({scheme['name']}: {scheme['source']})", f"    leak: {scheme['leak']}"]
+        return facts
     return entry["facts"] if kind in ("formats", "generators") else []
 
 
@@ -75,16 +75,16 @@ def _of_generator(name: str) -> dict[str, Any]:
     from lidargrit.generators import load_class
 
     cls = load_class(name)
-    sampling, told = configuration.to_json(cls.Sampling()), configuration.to_json(cls.facts)
-    return {"capabilities": sorted(cls.capabilities), **told, "sampling": sampling, "facts": cls.about()}
+    sampling, origin = configuration.to_json(cls.Sampling()), configuration.to_json(cls.facts)
+    return {"capabilities": sorted(cls.capabilities), **origin, "sampling": sampling, "facts": cls.about()}
 
 
 def _of_metric(name: str) -> dict[str, Any]:
     from lidargrit.metrics import load_metric
 
     cls = load_metric(name)
-    told = {"higher_is_better": cls.higher_is_better, "variants": list(cls.variants)}
-    return {"title": cls.title, **told, "needs_weights": cls.needs_weights}
+    facts = {"higher_is_better": cls.higher_is_better, "variants": list(cls.variants)}
+    return {"title": cls.title, **facts, "needs_weights": cls.needs_weights}
 
 
 def _of_sensor(name: str) -> dict[str, Any]:

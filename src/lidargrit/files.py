@@ -204,7 +204,7 @@ def refuse_to_overwrite(path: Path | None, overwrite: bool, ending: str = "") ->
 
     Also if a file stands where its folder should, or if its name has another ending than what will be in it.
     """
-    above = None if path is None else next((place for place in path.absolute().parents if place.exists()), None)
+    above = None if path is None else next((parent for parent in path.absolute().parents if parent.exists()), None)
     if above is not None and not above.is_dir():
         raise OutputError(f"{path}, whose folder {above} is a file", "a folder", "choose another place")
     if path is not None and ending and path.suffix.lower() != ending:

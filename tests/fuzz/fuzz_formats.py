@@ -94,14 +94,14 @@ def flipped(rng: random.Random, data: bytes, files: Files) -> bytes:
     changed = bytearray(data)
     for _ in range(rng.choice((1, 2, 8))):
         if changed:
-            changed[place_in(rng, data)] ^= 1 << rng.randrange(8)
+            changed[offset_in(rng, data)] ^= 1 << rng.randrange(8)
     return bytes(changed)
 
 
 def overwritten(rng: random.Random, data: bytes, files: Files) -> bytes:
-    place, value = place_in(rng, data), rng.choice(VALUES)
-    place -= place % rng.choice((1, 4))
-    return data[:place] + value + data[place + len(value) :]
+    offset, value = offset_in(rng, data), rng.choice(VALUES)
+    offset -= offset % rng.choice((1, 4))
+    return data[:offset] + value + data[offset + len(value) :]
 
 
 def renumbered(rng: random.Random, data: bytes, files: Files) -> bytes:
@@ -119,7 +119,7 @@ def spliced(rng: random.Random, data: bytes, files: Files) -> bytes:
 
 def moved(rng: random.Random, data: bytes, files: Files) -> bytes:
     """Cut a piece out, put a piece in twice, or put noise in."""
-    start = place_in(rng, data)
+    start = offset_in(rng, data)
     piece = data[start : start + rng.choice((1, 3, 4, 16, 100))]
     middle = rng.choice((b"", piece + piece, rng.randbytes(4), piece * 50, b"\n", b" "))
     return data[:start] + middle + data[start + len(piece) :]
@@ -136,7 +136,7 @@ DAMAGES: tuple[Callable[[random.Random, bytes, Files], bytes], ...] = (
 )
 
 
-def place_in(rng: random.Random, data: bytes) -> int:
+def offset_in(rng: random.Random, data: bytes) -> int:
     """Return a place, mostly in the header."""
     return rng.randrange(max(1, min(len(data), rng.choice((64, 512, 512, len(data))))))
 
@@ -167,11 +167,11 @@ def repacked(rng: random.Random, data: bytes) -> bytes:
 
 def with_new_sums(rng: random.Random, data: bytes) -> bytes:
     """Damage the chunks of a PNG and give them true sums."""
-    out, place = [data[:8]], 8
-    while place + 12 <= len(data):
-        length = struct.unpack(">I", data[place : place + 4])[0]
-        kind, body = data[place + 4 : place + 8], data[place + 8 : place + 8 + length]
-        place += 12 + length
+    out, offset = [data[:8]], 8
+    while offset + 12 <= len(data):
+        length = struct.unpack(">I", data[offset : offset + 4])[0]
+        kind, body = data[offset + 4 : offset + 8], data[offset + 8 : offset + 8 + length]
+        offset += 12 + length
         if rng.random() < 0.5:
             unpacked = zlib.decompress(body) if kind == b"IDAT" and rng.random() < 0.5 else body
             damaged = rng.choice((truncated, flipped, overwritten))(rng, unpacked, [])
@@ -275,8 +275,8 @@ def fuzz(inputs: int, seed: int = 0, only: str = "", first: int = 0, real: Path 
         files = small_files(folder) + (real_files(real, folder) if real else [])
         names = [one for one in NAMES if any(file[0] == one for file in files) and only in ("", one)]
         table: dict[str, Counter] = {one: Counter() for one in names}
-        for place, one in enumerate(names):
-            numbers = range(first, first + inputs // len(names) + (place < inputs % len(names)))
+        for rank, one in enumerate(names):
+            numbers = range(first, first + inputs // len(names) + (rank < inputs % len(names)))
             for number, outcome in zip(numbers, outcomes(one, numbers, seed, files, folder), strict=True):
                 table[one][outcome] += 1
                 if outcome not in WELL:

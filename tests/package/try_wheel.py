@@ -31,19 +31,19 @@ COMMANDS = (
 def main() -> int:
     """Build, look, install and run."""
     with tempfile.TemporaryDirectory() as name:
-        place = Path(name)
-        wheel = built(place)
+        folder = Path(name)
+        wheel = built(folder)
         if lacking := missing(wheel):
             print(f"the wheel lacks {', '.join(lacking)}", file=sys.stderr)
             return 1
-        python = installed(place / "environment", wheel)
-        return tried(python, place / "work")
+        python = installed(folder / "environment", wheel)
+        return tried(python, folder / "work")
 
 
-def built(place: Path) -> Path:
+def built(folder: Path) -> Path:
     """Build the wheel, and return it."""
-    run(sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(place), str(ROOT))
-    (wheel,) = place.glob("*.whl")
+    run(sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(folder), str(ROOT))
+    (wheel,) = folder.glob("*.whl")
     print(f"{wheel.name}: {wheel.stat().st_size / 1e6:.2f} MB")
     return wheel
 

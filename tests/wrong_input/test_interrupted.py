@@ -85,9 +85,9 @@ def test_interrupted_runs_say_so_and_go_on_to_the_same_weights(interrupt, uninte
     words = train_words(tmp_path / "run", *LONG)
     for steps in (1, 5, 1, 4, 6):  # the last in the second stage
         assert interrupt(steps, words) == 130
-        told = capsys.readouterr().err.strip().splitlines()
-        assert told[-1] == "lidargrit train: interrupted; the same command goes on"
-        assert "Traceback" not in "".join(told)
+        lines = capsys.readouterr().err.strip().splitlines()
+        assert lines[-1] == "lidargrit train: interrupted; the same command goes on"
+        assert "Traceback" not in "".join(lines)
     assert not (tmp_path / "run" / "config.json").exists()
     assert main(["sample", str(tmp_path / "run"), str(tmp_path / "new")]) == 2
     assert "which holds no finished model" in capsys.readouterr().err
@@ -120,10 +120,10 @@ def test_a_real_interrupt_from_the_keyboard(interrupt, tmp_path):
     while not checkpoint.exists() and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)
-    _, told = process.communicate(timeout=60)
-    assert process.returncode == 130, told
-    assert told.endswith("\nlidargrit train: interrupted; the same command goes on\n")
-    assert "Traceback" not in told
+    _, output = process.communicate(timeout=60)
+    assert process.returncode == 130, output
+    assert output.endswith("\nlidargrit train: interrupted; the same command goes on\n")
+    assert "Traceback" not in output
     seen = read_tensors(checkpoint)[1]["scans_seen"]
     assert hidden(tmp_path) == []
     assert interrupt(3, words) == 130
@@ -177,9 +177,9 @@ def test_termination_before_the_first_step(tmp_path):
     while set(cache.glob("*")) == before and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.02)
     process.send_signal(signal.SIGTERM)
-    _, told = process.communicate(timeout=60)
-    assert process.returncode == 143, told
-    assert told.endswith("\nlidargrit train: terminated; the same command goes on\n")
+    _, output = process.communicate(timeout=60)
+    assert process.returncode == 143, output
+    assert output.endswith("\nlidargrit train: terminated; the same command goes on\n")
     assert not folder.exists()
 
 
@@ -188,9 +188,9 @@ def test_a_full_disk_during_a_save(interrupt, uninterrupted, tmp_path):
     assert interrupt(4, words) == 130
     before = contents(tmp_path)
     process = lidargrit(words, preexec_fn=limited_to(100_000))
-    _, told = process.communicate(timeout=60)
-    assert process.returncode == 2, told
-    line = the_one_line(told, "train")
+    _, output = process.communicate(timeout=60)
+    assert process.returncode == 2, output
+    line = the_one_line(output, "train")
     assert re.search(r"got '.*' while writing .*checkpoint\.safetensors; .*free some space", line)
     name = "run/tokenizer/checkpoint.safetensors"
     assert contents(tmp_path)[name] == before[name]
@@ -202,9 +202,9 @@ def test_a_full_disk_during_a_save(interrupt, uninterrupted, tmp_path):
 def test_a_full_disk_while_sampling(run_folder, samples, tmp_path):
     before = contents(tmp_path)
     process = lidargrit(["sample", str(run_folder), str(samples), "-n", "3"], preexec_fn=limited_to(1000))
-    _, told = process.communicate(timeout=60)
-    assert process.returncode == 2, told
-    assert re.search(r"got '.*' while writing .*00000002\.npz; .*free some space", the_one_line(told, "sample"))
+    _, output = process.communicate(timeout=60)
+    assert process.returncode == 2, output
+    assert re.search(r"got '.*' while writing .*00000002\.npz; .*free some space", the_one_line(output, "sample"))
     assert contents(tmp_path) == before
 
 
@@ -216,9 +216,9 @@ def test_a_full_disk_before_the_first_step_and_while_projecting(tmp_path):
             preexec_fn=limited_to(size),
             env=os.environ | {"LIDARGRIT_CACHE": str(tmp_path / "cache")} if size else None,
         )
-        _, told = process.communicate(timeout=60)
-        assert process.returncode == 2, told
-        assert re.search(rf"got '.*' while writing .*{wanted}; ", the_one_line(told, "train"))
+        _, output = process.communicate(timeout=60)
+        assert process.returncode == 2, output
+        assert re.search(rf"got '.*' while writing .*{wanted}; ", the_one_line(output, "train"))
         assert hidden(tmp_path) == []
     assert main(train_words(tmp_path / "run")) == 0
 
@@ -229,9 +229,9 @@ def test_a_full_disk_while_logging(tmp_path, interrupt):
     log = tmp_path / "run" / "tokenizer" / "log.jsonl"
     log.mkdir()  # stands for anything that keeps the file from being opened
     process = lidargrit(words)
-    _, told = process.communicate(timeout=60)
-    assert process.returncode == 2, told
-    assert "log.jsonl" in the_one_line(told, "train")
+    _, output = process.communicate(timeout=60)
+    assert process.returncode == 2, output
+    assert "log.jsonl" in the_one_line(output, "train")
 
 
 KILLER = """

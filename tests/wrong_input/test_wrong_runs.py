@@ -18,8 +18,8 @@ from tiny_runs import the_one_line, train_words
 
 
 def test_a_folder_that_holds_another_run(refused, run_folder):
-    told = refused(*train_words(run_folder, "model.transformer.layers=2"))
-    assert "which holds another run (there model.transformer.layers=1, here 2)" in told
+    message = refused(*train_words(run_folder, "model.transformer.layers=2"))
+    assert "which holds another run (there model.transformer.layers=1, here 2)" in message
     assert "holds another run" in refused("demo", "--out", run_folder)
 
 
@@ -39,8 +39,8 @@ def test_a_folder_with_foreign_files(refused, run_folder, tmp_path):
 
 
 def test_samples_of_another_model_or_drawn_otherwise(refused, finished, samples):
-    told = refused("sample", finished["deeper"], samples)
-    assert "samples, which holds samples of another model or sampled in another way; wanted" in told
+    message = refused("sample", finished["deeper"], samples)
+    assert "samples, which holds samples of another model or sampled in another way; wanted" in message
     assert "sampled in another way" in refused("sample", finished["run"], samples, "--set", "temperature=0.5")
     assert main(["sample", str(finished["run"]), str(samples), "-n", "2"]) == 0
 
@@ -48,8 +48,8 @@ def test_samples_of_another_model_or_drawn_otherwise(refused, finished, samples)
 @pytest.mark.parametrize(("stage", "other"), [("tokenizer", "wider"), ("transformer", "deeper")])
 def test_weights_of_another_configuration(refused, finished, run_folder, tmp_path, stage, other):
     shutil.copy(finished[other] / stage / "checkpoint.safetensors", run_folder / stage)
-    told = refused(*train_words(run_folder))
-    assert re.search(rf"{stage}/checkpoint\.safetensors of another configuration \(.*; load them with", told)
+    message = refused(*train_words(run_folder))
+    assert re.search(rf"{stage}/checkpoint\.safetensors of another configuration \(.*; load them with", message)
     shutil.copy(finished[other] / "model.safetensors", run_folder)
     for words in (["sample", run_folder, tmp_path / "new"], ["view", run_folder, "-o", tmp_path / "picture.png"]):
         assert re.search(r"run/model\.safetensors of another configuration \(", refused(*words))
@@ -70,8 +70,8 @@ def test_a_configuration_of_other_weights(refused, run_folder, tmp_path):
 def test_json_that_is_not_ours(refused, run_folder, tmp_path, damaged, name):
     (run_folder / name).write_bytes(damaged)
     words = ["sample", run_folder, tmp_path / "new"] if name == "config.json" else train_words(run_folder)
-    told = refused(*words)
-    assert name in told or "not among the generators" in told
+    message = refused(*words)
+    assert name in message or "not among the generators" in message
 
 
 def test_a_run_whose_data_have_no_names(refused, run_folder):
@@ -117,10 +117,10 @@ def test_damaged_weights(refused, run_folder, tmp_path, damage):
                     "header": b"\xff" * 8 + content[8:],
                 }[damage]
             )
-    told = refused("sample", run_folder, tmp_path / "new")
-    assert re.search(r"run/model\.safetensors, which cannot be read .*train again", told)
-    told = refused(*train_words(run_folder))
-    assert re.search(r"transformer/checkpoint\.safetensors, which cannot be read .*train again", told)
+    message = refused("sample", run_folder, tmp_path / "new")
+    assert re.search(r"run/model\.safetensors, which cannot be read .*train again", message)
+    message = refused(*train_words(run_folder))
+    assert re.search(r"transformer/checkpoint\.safetensors, which cannot be read .*train again", message)
     if damage != "a folder":
         (run_folder / "transformer" / "checkpoint.safetensors").unlink()
         assert main(train_words(run_folder)) == 0, "the cure that the message names"

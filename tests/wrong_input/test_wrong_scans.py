@@ -71,9 +71,9 @@ def test_bad_scans_are_left_out_by_the_setting_that_the_message_names(refused, r
     setting = re.search(r"--set (data\.bad_scans=\w+)", refused(*words))
     assert setting
     assert main([*words, setting[1]]) == 0
-    told = capsys.readouterr().err
-    assert told.count("left out: got ") == 1
-    assert "000001.bin" in told
+    output = capsys.readouterr().err
+    assert output.count("left out: got ") == 1
+    assert "000001.bin" in output
     (tmp_path / "scans" / "000000.bin").unlink()
     (tmp_path / "scans" / "000002.bin").unlink()
     assert "no usable scan in" in refused(*train_words(tmp_path / "none"), *words[-1:], setting[1])
@@ -104,12 +104,12 @@ def test_a_folder_with_no_scan_in_it(refused, tmp_path):
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "notes.txt").write_text("no scan")
     for folder, what in (("empty", "is an empty folder"), ("other", "holds"), ("none", "does not exist")):
-        place = tmp_path / folder
+        source = tmp_path / folder
         for words in (
-            [*train_words(tmp_path / "run"), f"data.train=[{place}]"],
-            ["demo", "--data", place, "--out", tmp_path / "run"],
-            ["evaluate", place, "simulated:1:test"],
-            ["view", place, "-o", tmp_path / "picture.png"],
+            [*train_words(tmp_path / "run"), f"data.train=[{source}]"],
+            ["demo", "--data", source, "--out", tmp_path / "run"],
+            ["evaluate", source, "simulated:1:test"],
+            ["view", source, "-o", tmp_path / "picture.png"],
         ):
             assert re.search(f"{folder}, which {what}.*lidargrit list datasets", refused(*words))
     assert "no scan where this data set has them" in refused("view", f"kitti_raw:{tmp_path / 'other'}")
@@ -124,11 +124,15 @@ def test_a_sensor_that_does_not_fit_the_scan(refused, tmp_path):
     (tmp_path / "puck").mkdir()
     np.column_stack((xyz_m, np.full(len(xyz_m), 0.5))).astype("<f4").tofile(tmp_path / "puck" / "0.bin")
     settings = [f"data.train=[{tmp_path / 'puck'}]", "data.sensor=hdl64e_kitti_360", "data.projection=spherical"]
-    told = refused(*train_words(tmp_path / "run", *settings))
-    assert re.search(r"got \d\d% of the points of .*puck/0\.bin outside the sensor's elevations .*-15.0 to 15.0", told)
-    assert re.search(r"wanted -2\d\.\d to \d\.\d degrees for 'hdl64e_kitti_360'; .*lidargrit fit-sensor", told)
-    told = refused(*train_words(tmp_path / "run", *settings[:1]))
-    assert re.search(r"got 16 rings in .*puck/0\.bin; wanted the 64 rings of the sensor 'hdl64e_kitti_odometry'", told)
+    message = refused(*train_words(tmp_path / "run", *settings))
+    assert re.search(
+        r"got \d\d% of the points of .*puck/0\.bin outside the sensor's elevations .*-15.0 to 15.0", message
+    )
+    assert re.search(r"wanted -2\d\.\d to \d\.\d degrees for 'hdl64e_kitti_360'; .*lidargrit fit-sensor", message)
+    message = refused(*train_words(tmp_path / "run", *settings[:1]))
+    assert re.search(
+        r"got 16 rings in .*puck/0\.bin; wanted the 64 rings of the sensor 'hdl64e_kitti_odometry'", message
+    )
 
 
 @pytest.mark.parametrize(
@@ -196,8 +200,8 @@ def test_a_sensor_that_does_not_fit_the_scan(refused, tmp_path):
     ],
 )
 def test_wrong_words(refused, finished, tmp_path, words, text):
-    for word, place in (("OUT", tmp_path / "out"), ("RUN", finished["run"]), ("SAMPLES", finished["samples"])):
-        words = [re.sub(f"^{word}\\b", str(place), each) for each in words]
+    for word, path in (("OUT", tmp_path / "out"), ("RUN", finished["run"]), ("SAMPLES", finished["samples"])):
+        words = [re.sub(f"^{word}\\b", str(path), each) for each in words]
     if words[0] == "train":
         words = [*words, "--set", *MODEL, *SIMULATED, *SHORT, *words[4:]] if "--set" in words else words
     assert re.search(text, refused(*words))

@@ -27,10 +27,10 @@ def wanted(options: argparse.Namespace) -> tuple[list[str], Benchmark]:
     from lidargrit.evaluation.table_folder import read_table
 
     if options.add:
-        given = [name for name, default in DEFAULTS.items() if getattr(options, name) != default]
-        if options.systems or given:
+        changed = [name for name, default in DEFAULTS.items() if getattr(options, name) != default]
+        if options.systems or changed:
             raise ConfigError(
-                f"--add with {'systems before it' if options.systems else f'settings of its own ({given[0]})'}",
+                f"--add with {'systems before it' if options.systems else f'settings of its own ({changed[0]})'}",
                 "--add SYSTEM ... alone: all else is as in the table",
                 "leave them out, or begin a table in another folder",
             )

@@ -29,7 +29,7 @@ def run(options: argparse.Namespace) -> None:
     """Complete the scans, and say where they are."""
     from lidargrit.completion import is_classical, open_completer
     from lidargrit.completion.command import complete_scans
-    from lidargrit.completion.files import Wanted
+    from lidargrit.completion.files import OutputConfig
     from lidargrit.completion.inputs import sensor_of
     from lidargrit.conditions.patterns import Pattern
     from lidargrit.loading import DataConfig
@@ -39,7 +39,7 @@ def run(options: argparse.Namespace) -> None:
     named = options.sensor or is_classical(options.model)
     sensor = sensor_of(options.scans, options.sensor) if named else None
     completer = open_completer(options.model, "pixels", sensor, options.set, options.device)
-    wanted = Wanted(options.count, options.seed, options.format, options.bad_scans == "skip")
+    output = OutputConfig(options.count, options.seed, options.format, options.bad_scans == "skip")
     config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points)
-    count = complete_scans(options.scans, options.out, completer, pattern, wanted, config, TerminalReporter())
+    count = complete_scans(options.scans, options.out, completer, pattern, output, config, TerminalReporter())
     print(f"done: {count} completed scans in {options.out}; how they were made is told by completed.json")

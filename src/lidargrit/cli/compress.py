@@ -37,5 +37,5 @@ def run(options: argparse.Namespace) -> None:
     config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)
     named = (options.scans, options.out, options.model, options.step_mm)
     found = compress_scans(*named, config, TerminalReporter())
-    told = f"{found.num_bytes:,} bytes, {found.bits_per_return:.2f} bits a return in steps of {options.step_mm} mm"
-    print(f"done: {found.num_scans} scans in {options.out}: {told}")
+    size = f"{found.num_bytes:,} bytes, {found.bits_per_return:.2f} bits a return in steps of {options.step_mm} mm"
+    print(f"done: {found.num_scans} scans in {options.out}: {size}")

@@ -45,9 +45,9 @@ def run(options: argparse.Namespace) -> None:
         "cache_free_gib": round(shutil.disk_usage(existing).free / 2**30, 1),
         "gpus": [{"name": card.name, "memory_gib": round(card.total_memory / 2**30)} for card in cards],
     }
-    told = {name.replace("_gib", "").replace("_", " "): fact for name, fact in facts.items()}
-    told |= {name: f"{told[name]:.1f} GiB" for name in ("memory", "cache free")}
-    told["bfloat16"] = "yes" if has_bf16() else "no: training takes two to three times as long in 32 bits"
+    shown = {name.replace("_gib", "").replace("_", " "): fact for name, fact in facts.items()}
+    shown |= {name: f"{shown[name]:.1f} GiB" for name in ("memory", "cache free")}
+    shown["bfloat16"] = "yes" if has_bf16() else "no: training takes two to three times as long in 32 bits"
     none = "none that torch can use; the recipes small and demo are made for CPUs"
-    told["gpus"] = ", ".join(f"{card['name']}, {card['memory_gib']} GiB" for card in facts["gpus"]) or none
-    print_result(options, "\n".join(f"{name:<18}{fact}" for name, fact in told.items()), facts)
+    shown["gpus"] = ", ".join(f"{card['name']}, {card['memory_gib']} GiB" for card in facts["gpus"]) or none
+    print_result(options, "\n".join(f"{name:<18}{fact}" for name, fact in shown.items()), facts)

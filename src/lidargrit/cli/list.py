@@ -31,10 +31,10 @@ def run(options: argparse.Namespace) -> None:
     kinds: list[str] = [FORMER_KINDS.get(options.kind) or options.kind] if options.kind else list(KINDS)
     found = {kind: entries(kind, bool(options.kind)) for kind in kinds}
     wrapper = textwrap.TextWrapper(116, initial_indent=" " * 6, subsequent_indent=" " * 10, break_on_hyphens=False)
-    told = []
+    printed = []
     for kind, of_kind in found.items():
-        told.append(kind)
+        printed.append(kind)
         for entry in of_kind:
-            told.append(f"  {entry['name']:<36}{entry['summary']}")
-            told += [wrapper.fill(line) for line in (lines(kind, entry) if options.kind else [])]
-    print_result(options, "\n".join(told), found)
+            printed.append(f"  {entry['name']:<36}{entry['summary']}")
+            printed += [wrapper.fill(line) for line in (lines(kind, entry) if options.kind else [])]
+    print_result(options, "\n".join(printed), found)

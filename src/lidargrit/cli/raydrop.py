@@ -25,13 +25,13 @@ def run(options: argparse.Namespace) -> None:
     """Drop returns, and say where the scans are."""
     from lidargrit.completion import open_completer
     from lidargrit.completion.command import raydrop_scans
-    from lidargrit.completion.files import Wanted
+    from lidargrit.completion.files import OutputConfig
     from lidargrit.loading import DataConfig
     from lidargrit.reporting import TerminalReporter
 
     completer = open_completer(options.model, "surfaces", None, options.set, options.device)
     skips = options.bad_scans == "skip"
-    wanted = Wanted(options.count, options.seed, options.format, skips, options.probability)
+    output = OutputConfig(options.count, options.seed, options.format, skips, options.probability)
     config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points)
-    count = raydrop_scans(options.scans, options.out, completer, wanted, config, TerminalReporter())
+    count = raydrop_scans(options.scans, options.out, completer, output, config, TerminalReporter())
     print(f"done: {count} scans with raydrop in {options.out}")

@@ -25,7 +25,7 @@ def run(options: argparse.Namespace) -> None:
     """Add the rows, and say where the scans are."""
     from lidargrit.completion import open_completer
     from lidargrit.completion.command import upsample_scans
-    from lidargrit.completion.files import Wanted
+    from lidargrit.completion.files import OutputConfig
     from lidargrit.completion.inputs import sensor_of
     from lidargrit.loading import DataConfig
     from lidargrit.reporting import TerminalReporter
@@ -34,7 +34,7 @@ def run(options: argparse.Namespace) -> None:
     scans_sensor = sensor_of(options.scans, options.sensor)
     wanted_sensor = load_sensor(options.to) if options.to else None
     completer = open_completer(options.model, "pixels", wanted_sensor, options.set, options.device)
-    wanted = Wanted(options.count, options.seed, options.format, options.bad_scans == "skip")
+    output = OutputConfig(options.count, options.seed, options.format, options.bad_scans == "skip")
     config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points)
-    count = upsample_scans(options.scans, options.out, completer, scans_sensor, wanted, config, TerminalReporter())
+    count = upsample_scans(options.scans, options.out, completer, scans_sensor, output, config, TerminalReporter())
     print(f"done: {count} scans of {completer.sensor.name} in {options.out}")

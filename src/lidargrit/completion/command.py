@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from lidargrit.completion import Completer
-from lidargrit.completion.files import Wanted, write_completions
+from lidargrit.completion.files import OutputConfig, write_completions
 from lidargrit.completion.inputs import Inputs, InputScan, ScanReader, open_inputs
 from lidargrit.completion.sparse import SparseReader, observed_rows
 from lidargrit.conditions import Condition
@@ -22,7 +22,7 @@ def complete_scans(
     out: Path,
     completer: Completer,
     pattern: Pattern,
-    wanted: Wanted,
+    output: OutputConfig,
     config: DataConfig | None = None,
     reporter: Reporter | None = None,
 ) -> int:
@@ -33,7 +33,7 @@ def complete_scans(
         out: an empty folder, or one that the same command began.
         completer: model or classical way; see :func:`lidargrit.completion.open_completer`.
         pattern: choice of the observed pixels.
-        wanted: number and kind of files.
+        output: number and kind of files.
         config: number of scans, and what to do with unusable points; nothing else of it is used.
         reporter: receiver of progress and messages.
 
@@ -44,9 +44,9 @@ def complete_scans(
         UsageError: all pixels or no return are observed, or a mask of another size.
         ScanError: a scan that cannot be used, or of another sensor.
     """
-    if wanted.count > 1 and not completer.random:
+    if output.count > 1 and not completer.random:
         raise ConfigError(
-            f"-n {wanted.count} for {completer.name}", "1: it completes a scan in one way", "leave it out"
+            f"-n {output.count} for {completer.name}", "1: it completes a scan in one way", "leave it out"
         )
 
     def condition_of(scan: InputScan, seed: int) -> Condition:
@@ -54,7 +54,7 @@ def complete_scans(
 
     inputs = open_inputs(source, _reader(completer, pattern.partial), config or DataConfig())
     facts = {"verb": "complete", "source": source, "observed": pattern.text}
-    return write_completions(inputs, out, completer, condition_of, wanted, facts, reporter or Reporter())
+    return write_completions(inputs, out, completer, condition_of, output, facts, reporter or Reporter())
 
 
 def upsample_scans(
@@ -62,7 +62,7 @@ def upsample_scans(
     out: Path,
     completer: Completer,
     scans_sensor: SensorModel,
-    wanted: Wanted,
+    output: OutputConfig,
     config: DataConfig | None = None,
     reporter: Reporter | None = None,
 ) -> int:
@@ -70,7 +70,7 @@ def upsample_scans(
 
     Args:
         scans_sensor: sensor that made the scans.
-        source, out, completer, wanted, config, reporter: the arguments of :func:`complete_scans`.
+        source, out, completer, output, config, reporter: the arguments of :func:`complete_scans`.
 
     Raises:
         ConfigError: sensors whose rows hardly look the same ways.
@@ -83,21 +83,21 @@ def upsample_scans(
     reader = SparseReader(completer.sensor, completer.projection_variant, source=scans_sensor)
     inputs = open_inputs(source, reader, config or DataConfig())
     facts = {"verb": "upsample", "source": source, "scans_sensor": scans_sensor.to_json()}
-    return write_completions(inputs, out, completer, condition_of, wanted, facts, reporter or Reporter())
+    return write_completions(inputs, out, completer, condition_of, output, facts, reporter or Reporter())
 
 
 def raydrop_scans(
     source: str,
     out: Path,
     completer: Completer,
-    wanted: Wanted,
+    output: OutputConfig,
     config: DataConfig | None = None,
     reporter: Reporter | None = None,
 ) -> int:
     """Write clean scans, such as a simulator casts, with the returns dropped that the model's sensor would not get.
 
     Args:
-        source, out, completer, wanted, config, reporter: the arguments of :func:`complete_scans`; the completer takes
+        source, out, completer, output, config, reporter: the arguments of :func:`complete_scans`; the completer takes
             ranges of surfaces.
     """
 
@@ -106,7 +106,7 @@ def raydrop_scans(
 
     inputs: Inputs = open_inputs(source, _reader(completer, partial=False), config or DataConfig())
     facts = {"verb": "raydrop", "source": source}
-    return write_completions(inputs, out, completer, condition_of, wanted, facts, reporter or Reporter())
+    return write_completions(inputs, out, completer, condition_of, output, facts, reporter or Reporter())
 
 
 def _reader(completer: Completer, partial: bool) -> ScanReader:

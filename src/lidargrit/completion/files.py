@@ -30,7 +30,7 @@ _UNWRITABLE = ".npz"  # for scans whose own format cannot be written, and for ra
 
 
 @dataclass(frozen=True)
-class Wanted:
+class OutputConfig:
     """How many completions are wanted, and as which files.
 
     Args:
@@ -67,7 +67,7 @@ def write_completions(
     out: Path,
     completer: Completer,
     condition_of: Callable[[InputScan, int], Condition],
-    wanted: Wanted,
+    output: OutputConfig,
     facts: dict[str, Any],
     reporter: Reporter,
 ) -> int:
@@ -81,7 +81,7 @@ def write_completions(
         out: an empty folder, or one that the same command began.
         completer: model or classical way.
         condition_of: function from a scan and a seed to what is taken as known of it.
-        wanted: number and kind of files.
+        output: number and kind of files.
         facts: further entries that tell these files from others, for ``completed.json``.
         reporter: receiver of progress and messages.
 
@@ -93,14 +93,14 @@ def write_completions(
         ScanError: a scan that cannot be used.
         DataError: no usable scan.
     """
-    files = _files(inputs, wanted)
-    manifest = {**facts, **completer.identity(), "count": wanted.count, "seed": wanted.seed, "format": wanted.format}
-    if wanted.probability:
-        manifest["probability"] = wanted.probability  # files of before it were written without these shares
+    files = _files(inputs, output)
+    manifest = {**facts, **completer.identity(), "count": output.count, "seed": output.seed, "format": output.format}
+    if output.probability:
+        manifest["probability"] = output.probability  # files of before it were written without these shares
     scans = {file: inputs.name(index) for (index, _), file in files.items()}
     left_out: set[int] = set()
     missing = [job for job, file in files.items() if not (out / file).exists()]
-    remaining = _jobs(inputs, missing, condition_of, wanted, left_out, reporter)
+    remaining = _jobs(inputs, missing, condition_of, output, left_out, reporter)
     jobs = chain(
         list(islice(remaining, 1)), remaining
     )  # a mistake in the first scan is told before anything is written
@@ -108,27 +108,27 @@ def write_completions(
         claim_scans(out / "completed.json", {**manifest, "scans": scans})
         with reporter.progress("completing", len(files), len(files) - len(missing)) as progress:
             while batch := list(islice(jobs, completer.batch)):
-                for job, image in zip(batch, _completed(completer, batch, wanted.seed), strict=True):
+                for job, image in zip(batch, _completed(completer, batch, output.seed), strict=True):
                     file = files[job.index, job.turn]
-                    if wanted.probability and job.turn == 0:
-                        share = _return_share(completer, job, wanted)
+                    if output.probability and job.turn == 0:
+                        share = _return_share(completer, job, output)
                         _write_array(out / f"{file.removesuffix(Path(file).suffix)}{PROBABILITY}", share)
-                    _write(out / file, wanted.format, image, job)
+                    _write(out / file, output.format, image, job)
                     progress.advance(1)
     if len(left_out) == len(inputs):
         raise DataError("no usable scan", "at least one", "see the messages above")
-    return len(files) - len(left_out) * wanted.count
+    return len(files) - len(left_out) * output.count
 
 
-def _files(inputs: Inputs, wanted: Wanted) -> dict[tuple[int, int], str]:
+def _files(inputs: Inputs, output: OutputConfig) -> dict[tuple[int, int], str]:
     """Return the name of each file below the folder, by the index of its scan and the number of the completion."""
-    if len(inputs) * wanted.count > _FILES_AT_MOST:
-        got = f"{wanted.count:,} completions of each of {len(inputs):,} scans"
+    if len(inputs) * output.count > _FILES_AT_MOST:
+        got = f"{output.count:,} completions of each of {len(inputs):,} scans"
         raise ConfigError(got, f"at most {_FILES_AT_MOST:,} files", "ask for fewer")
     return {
-        (index, turn): _folder(turn, wanted.count) + inputs.name(index) + _suffix(inputs.suffix(index), wanted.format)
+        (index, turn): _folder(turn, output.count) + inputs.name(index) + _suffix(inputs.suffix(index), output.format)
         for index in range(len(inputs))
-        for turn in range(wanted.count)
+        for turn in range(output.count)
     }
 
 
@@ -136,7 +136,7 @@ def _jobs(
     inputs: Inputs,
     missing: Sequence[tuple[int, int]],
     condition_of: Callable[[InputScan, int], Condition],
-    wanted: Wanted,
+    output: OutputConfig,
     left_out: set[int],
     reporter: Reporter,
 ) -> Iterator[_Job]:
@@ -147,9 +147,9 @@ def _jobs(
             last, scan = index, None
             try:
                 scan = inputs.read(index)
-                condition = condition_of(scan, derive_seed(wanted.seed, index))
+                condition = condition_of(scan, derive_seed(output.seed, index))
             except ScanError as error:
-                if not wanted.skip_bad:
+                if not output.skip_bad:
                     raise
                 reporter.message(f"left out: {error}")
                 left_out.add(index)
@@ -164,15 +164,15 @@ def _completed(completer: Completer, jobs: Sequence[_Job], seed: int) -> list[Ra
     return [images[index] for index in range(len(jobs))]
 
 
-def _return_share(completer: Completer, job: _Job, wanted: Wanted) -> Float[Tensor, "H W"]:
+def _return_share(completer: Completer, job: _Job, output: OutputConfig) -> Float[Tensor, "H W"]:
     """Return how often each pixel returns, over samples that are not written themselves."""
     total = torch.zeros(job.condition.return_mask.shape[1:])
-    remaining = iter(range(wanted.probability))
+    remaining = iter(range(output.probability))
     while turns := list(islice(remaining, completer.batch)):
         condition = Condition.cat([job.condition] * len(turns))
-        seeds = [derive_seed(wanted.seed, job.index, turn, 1) for turn in turns]
+        seeds = [derive_seed(output.seed, job.index, turn, 1) for turn in turns]
         total += completer.complete(condition, seeds).return_mask.float().sum(0)
-    return total / wanted.probability
+    return total / output.probability
 
 
 def _seed(seed: int, job: _Job) -> int:

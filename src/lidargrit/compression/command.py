@@ -155,7 +155,7 @@ def _codec_of(archive: Archive, model: str) -> ScanCodec:
         raise not_reproduced()
     codec = ScanCodec(load(model), step_mm)
     if codec.digest() != digest:
-        told = f"{archive.path}, compressed by the model {archive.header.get('model')!r} of hash {digest[:12]}"
+        archive_of = f"{archive.path}, compressed by the model {archive.header.get('model')!r} of hash {digest[:12]}"
         cure = f"name that run with --model: {model} has the hash {codec.digest()[:12]}"
-        raise CheckpointError(told, "the same model to decompress it", cure)
+        raise CheckpointError(archive_of, "the same model to decompress it", cure)
     return codec

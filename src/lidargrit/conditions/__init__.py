@@ -52,8 +52,8 @@ class Condition:
     def __post_init__(self) -> None:
         check_observed(self.range_observed, self.range_m)
         check_observed(self.return_observed, self.range_m)
-        known = self.range_m[self.range_observed]
-        if not bool(((known > 0) & known.isfinite()).all()):
+        range_m = self.range_m[self.range_observed]
+        if not bool(((range_m > 0) & range_m.isfinite()).all()):
             raise ScanError("an observed range of 0 metres, NaN or infinity", "positive metres", "mark it as unknown")
         if bool((self.return_observed & self.return_mask & ~self.range_observed).any()):
             raise ScanError("an observed return of unknown range", "both, or neither", "mark it as unknown")
@@ -154,8 +154,8 @@ class Condition:
         range_m = torch.where(self.range_observed, self.range_m, generated.range_m)
         reflectance = None
         if generated.reflectance is not None and self.reflectance is not None:
-            known = self.return_observed & self.return_mask
-            reflectance = torch.where(known, self.reflectance, generated.reflectance)
+            observed = self.return_observed & self.return_mask
+            reflectance = torch.where(observed, self.reflectance, generated.reflectance)
         return RangeImage.masked(range_m, returned, self.sensor, reflectance)
 
 

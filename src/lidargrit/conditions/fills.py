@@ -29,24 +29,24 @@ class Observed:
     Args:
         range_m: observed ranges in metres, 0 elsewhere.
         returned: True where a return was observed.
-        known: True where it was observed whether there is a return.
+        observed: True where it was observed whether there is a return.
         elevation_rad: mean elevation of each row.
         azimuth_rad: azimuth of each column, falling; a full circle later it begins anew.
     """
 
     range_m: Float64[np.ndarray, "H W"]
     returned: Bool[np.ndarray, "H W"]
-    known: Bool[np.ndarray, "H W"]
+    observed: Bool[np.ndarray, "H W"]
     elevation_rad: Float64[np.ndarray, " H"]
     azimuth_rad: Float64[np.ndarray, " W"]
 
     @classmethod
     def of(cls, condition: Condition, index: int) -> Observed:
         """Return what a condition knows of one of its scans."""
-        known = condition.return_observed[index]
-        returned = condition.return_mask[index] & known
+        observed = condition.return_observed[index]
+        returned = condition.return_mask[index] & observed
         range_m = torch.where(returned, condition.range_m[index], 0.0).double()
-        return cls(range_m.cpu().numpy(), returned.cpu().numpy(), known.cpu().numpy(), *_angles(condition.sensor))
+        return cls(range_m.cpu().numpy(), returned.cpu().numpy(), observed.cpu().numpy(), *_angles(condition.sensor))
 
     def nearest(self, wanted: Bool[np.ndarray, "H W"]) -> tuple[Int64[np.ndarray, "H W"], Int64[np.ndarray, "H W"]]:
         """Return for every pixel row and column of the nearest wanted one by angle; of itself if none is wanted."""
@@ -106,7 +106,7 @@ class Triangles:
 def triangles(seen: Observed) -> Triangles:
     """Triangulate the observed returns by the angles of their rays; of a plane 1 / range is nearly linear in these."""
     width = len(seen.azimuth_rad)
-    near = maximum_filter1d(maximum_filter1d(~seen.known, _ROWS_NEAR, 0), _COLUMNS_NEAR, 1, mode="wrap")
+    near = maximum_filter1d(maximum_filter1d(~seen.observed, _ROWS_NEAR, 0), _COLUMNS_NEAR, 1, mode="wrap")
     helpful = seen.returned & near
     # The circle closes if as many columns as the widest gap are copied on either side.
     beside = min(width, _widest_gap(np.asarray(helpful.any(0))) + _COLUMNS_NEAR)
@@ -120,7 +120,7 @@ def triangles(seen: Observed) -> Triangles:
         tiling = Delaunay(corners + np.random.default_rng(0).normal(scale=_JITTER_RAD, size=corners.shape))
     except (QhullError, ValueError):  # too few returns, or all on one line
         return Triangles.none(linear(seen))
-    missing = np.nonzero(~seen.known)
+    missing = np.nonzero(~seen.observed)
     points = np.stack((seen.elevation_rad[missing[0]], seen.azimuth_rad[missing[1]]), axis=1)
     triangle = tiling.find_simplex(points)
     transform = tiling.transform[triangle]
@@ -165,7 +165,7 @@ def fill(method: str, condition: Condition) -> RangeImage:
     ranges, masks, reflectances = [], [], []
     for index in range(len(condition)):
         seen = Observed.of(condition, index)
-        mask = seen.returned[seen.nearest(seen.known)]
+        mask = seen.returned[seen.nearest(seen.observed)]
         range_m = np.clip(FILLS[method](seen), sensor.range_min_m, sensor.range_max_m) if seen.returned.any() else None
         masks.append(torch.from_numpy(mask))
         ranges.append(torch.from_numpy(seen.range_m if range_m is None else range_m).float())
@@ -186,9 +186,9 @@ def fill_from_nearest(images: RangeImage, observed: Bool[Tensor, "B H W"]) -> Ra
     """
     elevation_rad, _ = _angles(images.sensor)
     filled = []
-    for range_m, known in zip(images.range_m.cpu(), observed.cpu(), strict=True):
-        rows, columns = (torch.from_numpy(part) for part in _nearest(known.numpy(), elevation_rad))
-        filled.append(range_m[rows, columns] if bool(known.any()) else torch.zeros_like(range_m))
+    for range_m, mask in zip(images.range_m.cpu(), observed.cpu(), strict=True):
+        rows, columns = (torch.from_numpy(part) for part in _nearest(mask.numpy(), elevation_rad))
+        filled.append(range_m[rows, columns] if bool(mask.any()) else torch.zeros_like(range_m))
     range_m = torch.stack(filled).to(images.range_m.device)
     return RangeImage(range_m, range_m > 0, images.sensor)
 
@@ -224,10 +224,10 @@ def _part(pixels: tuple[np.ndarray, ...], chosen: Bool[np.ndarray, " n"]) -> tup
 
 def _widest_gap(some: Bool[np.ndarray, " W"]) -> int:
     """Return the length of the longest run of columns around the circle that have nothing."""
-    places = np.nonzero(some)[0]
-    if not len(places):
+    columns = np.nonzero(some)[0]
+    if not len(columns):
         return len(some)
-    return int(np.diff(np.append(places, places[0] + len(some))).max()) - 1
+    return int(np.diff(np.append(columns, columns[0] + len(some))).max()) - 1
 
 
 def _between(
@@ -239,10 +239,10 @@ def _between(
         range_m: ranges along each line, 0 where none was observed.
         angle_rad: angle of each pixel of a line, falling or rising.
     """
-    place = np.arange(range_m.shape[1])
-    before = np.maximum.accumulate(np.where(range_m > 0, place, -1), axis=1)
-    after = np.minimum.accumulate(np.where(range_m > 0, place, len(place))[:, ::-1], axis=1)[:, ::-1]
-    both = (before >= 0) & (after < len(place))
+    index = np.arange(range_m.shape[1])
+    before = np.maximum.accumulate(np.where(range_m > 0, index, -1), axis=1)
+    after = np.minimum.accumulate(np.where(range_m > 0, index, len(index))[:, ::-1], axis=1)[:, ::-1]
+    both = (before >= 0) & (after < len(index))
     before, after = np.where(both, before, 0), np.where(both, after, 0)
     first_m, second_m = (np.take_along_axis(range_m, at, axis=1) for at in (before, after))
     to_first, to_second = np.abs(angle_rad - angle_rad[before]), np.abs(angle_rad - angle_rad[after])

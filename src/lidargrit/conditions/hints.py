@@ -51,31 +51,31 @@ def hints_of(condition: Condition) -> Hints:
 def _of_one(seen: Observed) -> tuple[Float32[np.ndarray, "19 H W"], Float32[np.ndarray, "9 H W"]]:
     if not seen.returned.any():
         empty = np.zeros((NUM_MAPS, *seen.returned.shape), dtype=np.float32)
-        empty[0] = seen.known
+        empty[0] = seen.observed
         return empty, np.full((NUM_CANDIDATES, *seen.returned.shape), _TYPICAL_V, dtype=np.float32)
     tiling = triangles(seen)
     filled, lines, near = (np.log1p(part) for part in (tiling.range_m, linear(seen), seen.nearest_range_m))
     corners = np.log1p(tiling.corners_m[1:])
-    sides, distances = zip(
+    next_v, distances = zip(
         *(_next_return(seen, down, right) for down, right in ((-1, 0), (1, 0), (0, -1), (0, 1))), strict=True
     )
-    sides = [np.where(np.isnan(side), filled, side) for side in sides]
-    drops = seen.known & ~seen.returned
-    share_known, share_dropped = _share_around(seen.known), _share_around(drops)
+    next_v = [np.where(np.isnan(v), filled, v) for v in next_v]
+    drops = seen.observed & ~seen.returned
+    share_observed, share_dropped = _share_around(seen.observed), _share_around(drops)
     maps = [
-        seen.known,
+        seen.observed,
         seen.returned,
         drops,
         near - filled,
         filled - _TYPICAL_V,
-        *(side - filled for side in sides),
+        *(v - filled for v in next_v),
         *distances,
-        share_dropped / np.maximum(share_known, 1e-6),
-        share_known,
+        share_dropped / np.maximum(share_observed, 1e-6),
+        share_observed,
         *(corners - filled),
         *tiling.weights[1:],
     ]
-    return np.stack(maps).astype(np.float32), np.stack([filled, lines, near, *sides, *corners]).astype(np.float32)
+    return np.stack(maps).astype(np.float32), np.stack([filled, lines, near, *next_v, *corners]).astype(np.float32)
 
 
 def _share_around(part: Bool[np.ndarray, "H W"]) -> Float64[np.ndarray, "H W"]:
@@ -91,11 +91,11 @@ def _next_return(
     lines = np.tile(seen.range_m, (1, 3)) if right else seen.range_m.T
     backwards = down + right < 0
     lines = lines if backwards else lines[:, ::-1]
-    place = np.arange(lines.shape[1])
-    last = np.maximum.accumulate(np.where(lines > 0, place, -1), axis=1)
+    index = np.arange(lines.shape[1])
+    last = np.maximum.accumulate(np.where(lines > 0, index, -1), axis=1)
     last = np.concatenate((np.full((len(lines), 1), -1), last[:, :-1]), axis=1)  # not the pixel itself
     range_m = np.where(last >= 0, np.take_along_axis(lines, np.maximum(last, 0), axis=1), np.nan)
-    away = np.where(last >= 0, np.minimum((place - last) / _FAR_PIXELS, _FARTHEST), _FARTHEST)
+    away = np.where(last >= 0, np.minimum((index - last) / _FAR_PIXELS, _FARTHEST), _FARTHEST)
     width = seen.range_m.shape[1]
     v, away = (part if backwards else part[:, ::-1] for part in (np.log1p(range_m), away))
     middle = slice(width, 2 * width)

@@ -64,19 +64,19 @@ class FileDataset(ScanDataset):
 
     def scan(self, index: int) -> Scan:
         """Read one scan."""
-        path, place = self._scans[index]
-        return self._format(path).read(path, place, self.bad_points)
+        path, index_in_file = self._scans[index]
+        return self._format(path).read(path, index_in_file, self.bad_points)
 
     def name(self, index: int) -> str:
         """Name one scan: its sequence, its file, and its place in the file if that holds several.
 
         The ending is left out, unless another file of the sequence would then be called the same.
         """
-        path, place = self._scans[index]
+        path, index_in_file = self._scans[index]
         sequence = self.sequence_of(path.relative_to(self.root))
         stem = formats.stem(path)
         name = path.name if (sequence, stem) in self._taken else stem
-        name += f"#{place}" if path in self._several else ""
+        name += f"#{index_in_file}" if path in self._several else ""
         return name if sequence == "." else f"{sequence}/{name}"
 
     def path(self, index: int) -> Path:

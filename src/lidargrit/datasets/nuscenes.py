@@ -92,8 +92,8 @@ class Nuscenes(FileDataset):
         """Name the scene of a file, or its log where the tables do not say."""
         log, time_us = _log_and_time(relative)
         scenes = self._scenes_of_log.get(log, [])
-        place = bisect_right(scenes, time_us + _BESIDE_US, key=lambda scene: scene[0]) - 1
-        near = [scene for scene in scenes[max(place - 1, 0) : place + 1] if time_us <= scene[1] + _BESIDE_US]
+        last = bisect_right(scenes, time_us + _BESIDE_US, key=lambda scene: scene[0]) - 1
+        near = [scene for scene in scenes[max(last - 1, 0) : last + 1] if time_us <= scene[1] + _BESIDE_US]
         return min(near, key=lambda scene: max(scene[0] - time_us, time_us - scene[1], 0))[2] if near else log
 
     def recording_of(self, path: Path) -> str:

@@ -36,8 +36,8 @@ class Ouster(FileDataset):
 
     def name(self, index: int) -> str:
         """Name one scan by its recording and its place in it."""
-        path, place = self._scans[index]
-        return f"{self.sequence_of(path.relative_to(self.root))}#{place}"
+        path, index_in_file = self._scans[index]
+        return f"{self.sequence_of(path.relative_to(self.root))}#{index_in_file}"
 
     def sequence_of(self, relative: Path) -> str:
         """Name the recording."""

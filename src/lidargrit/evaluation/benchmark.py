@@ -229,7 +229,7 @@ def _sample(
 def _score(samples: str, reference: Source, settings: EvalConfig, path: Path, reporter: Reporter) -> Scorecard:
     """Return the scores of a file, if they are of these very images by these settings; else score, and write it."""
     pair = open_pair(open_source(samples), reference, settings, reporter)
-    facts = (settings.facts(), pair.samples.facts(), pair.reference.facts(), __version__)
+    facts = (settings.facts(), pair.samples.record(), pair.reference.record(), __version__)
     wanted = (public_name(settings.protocol), *facts)
     if path.is_file():
         there = Scorecard.read(path)

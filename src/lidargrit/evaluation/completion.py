@@ -96,10 +96,10 @@ def compare_completion(
     with reporter.progress("completing", len(patterns) * len(completers)) as progress:
         for pattern in patterns:
             masks = [pattern.mask(whole[index], derive_seed(seed, index)) for index in range(len(whole))]
-            known = Condition.of_pixels(whole, torch.stack(masks))
+            condition = Condition.of_pixels(whole, torch.stack(masks))
             of_pattern = []
             for completer in completers:
-                of_pattern.append(_score(completer, pattern, whole, known, completions, seed))
+                of_pattern.append(_score(completer, pattern, whole, condition, completions, seed))
                 progress.advance(1, completer.name)
             scores += _beside(of_pattern)
     return scores
@@ -148,13 +148,13 @@ def _check(completer: Completer, images: RangeImages, reporter: Reporter) -> Non
 
 
 def _score(
-    completer: Completer, pattern: Pattern, whole: RangeImage, known: Condition, completions: int, seed: int
+    completer: Completer, pattern: Pattern, whole: RangeImage, condition: Condition, completions: int, seed: int
 ) -> _OfPattern:
     turns = completions if completer.random else 1
     begin = time.perf_counter()
-    filled = [_complete(completer, known, turn, seed) for turn in range(turns)]
+    filled = [_complete(completer, condition, turn, seed) for turn in range(turns)]
     seconds = (time.perf_counter() - begin) / (len(whole) * turns)
-    hidden = ~known.return_observed
+    hidden = ~condition.return_observed
     errors = [_mean([_error_m(images[i], whole[i], hidden[i]) for images in filled]) for i in range(len(whole))]
     found = [_mean([_found(images[i], whole[i], hidden[i]) for images in filled]) for i in range(len(whole))]
     ious = [_mean([_iou(images[i], whole[i], hidden[i]) for images in filled]) for i in range(len(whole))]
@@ -179,10 +179,10 @@ def _score(
     return _OfPattern(score, errors)
 
 
-def _complete(completer: Completer, known: Condition, turn: int, seed: int) -> RangeImage:
+def _complete(completer: Completer, condition: Condition, turn: int, seed: int) -> RangeImage:
     parts = []
-    for first in range(0, len(known), completer.batch):
-        some = known[first : first + completer.batch]
+    for first in range(0, len(condition), completer.batch):
+        some = condition[first : first + completer.batch]
         seeds = [derive_seed(seed + turn, index) for index in range(first, first + len(some))]
         parts.append(completer.complete(some, seeds))
     return RangeImage.cat(parts)
@@ -223,8 +223,8 @@ def _voxels(points_xyz_m: Float[Tensor, "n 3"]) -> set[tuple[int, int, int]]:
 
 
 def _mean(values: Sequence[float]) -> float:
-    known = [value for value in values if not math.isnan(value)]
-    return sum(known) / len(known) if known else math.nan
+    finite = [value for value in values if not math.isnan(value)]
+    return sum(finite) / len(finite) if finite else math.nan
 
 
 def _told(of: Estimate, signed: bool = False) -> str:

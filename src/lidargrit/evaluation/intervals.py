@@ -156,8 +156,8 @@ def interval_of(
     values = []
     for _ in range(resampling.halves):
         halves = [
-            [side[index] for index in sorted(rng.permutation(len(side))[: len(side) // 2])]
-            for side in (generated, real)
+            [features[index] for index in sorted(rng.permutation(len(features))[: len(features) // 2])]
+            for features in (generated, real)
         ]
         try:
             values.append(merged(*halves).compute().value)

@@ -80,15 +80,16 @@ class Likelihood:
         """Return a table for people."""
         lines = [f"{'bits':8}" + "".join(f"{unit:>26}" for unit in _UNITS.values())]
         for part, estimates in self.estimates().items():
-            lines.append(f"{part:8}" + "".join(f"{_told(estimates[unit]):>26}" for unit in _UNITS))
-        told = f"{len(self.names)} scans, {sum(self.returns) / len(self.returns):,.0f} returns a scan, ranges in steps"
-        lines.append(f"{told} of {self.step_mm} mm; 95 % intervals over scans")
+            lines.append(f"{part:8}" + "".join(f"{_formatted(estimates[unit]):>26}" for unit in _UNITS))
+        returns = f"{sum(self.returns) / len(self.returns):,.0f} returns a scan"
+        steps = f"ranges in steps of {self.step_mm} mm"
+        lines.append(f"{len(self.names)} scans, {returns}, {steps}; 95 % intervals over scans")
         if not self.is_whole:
             lines.append("tokens alone: this model has no probabilities of returns and ranges (no pixel decoder)")
         return "\n".join(lines)
 
 
-def _told(estimate: Estimate) -> str:
+def _formatted(estimate: Estimate) -> str:
     digits = 0 if abs(estimate.value) >= 1000 else 3
     value = f"{estimate.value:,.{digits}f}"
     if np.isnan(estimate.low):

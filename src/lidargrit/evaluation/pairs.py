@@ -11,7 +11,7 @@ import torch
 from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import ConfigError
 from lidargrit.evaluation.protocols import Protocol
-from lidargrit.evaluation.scorecard import SetFacts
+from lidargrit.evaluation.scorecard import EvalSetRecord
 from lidargrit.loading import DataConfig, RangeImages
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel
@@ -62,10 +62,10 @@ class EvalSet:
         kept = RangeImage.masked(images.range_m, mask, images.sensor)
         return kept if reflectance is None else replace(kept, reflectance=torch.where(mask, reflectance, 0))
 
-    def facts(self) -> SetFacts:
-        """Return the entry of the set in a scorecard, with the hash of the compared pixels."""
+    def record(self) -> EvalSetRecord:
+        """Return the entry of the set in a score file, with the hash of the compared pixels."""
         sensor = self.images.sensor
-        return SetFacts(
+        return EvalSetRecord(
             self.source,
             self.data_set,
             self.split,
@@ -79,12 +79,12 @@ class EvalSet:
 
     def _sha256(self) -> str:
         content = hashlib.sha256()
-        known = self.images.provenance.fingerprints
-        if len(known) == len(self.images):  # of the images with all fine columns: of which some were compared
+        fingerprints = self.images.provenance.fingerprints
+        if len(fingerprints) == len(self.images):  # of the images with all fine columns: of which some were compared
             sensor = self.images.sensor
             content.update(f"{sensor.height}x{sensor.width} {sensor.projection} {self.projection_variant} ".encode())
             for index in self.indices:
-                content.update(known[index].encode())
+                content.update(fingerprints[index].encode())
         else:
             for first in range(0, len(self), _BATCH):
                 batch = self.images.batch(self.indices[first : first + _BATCH])
@@ -110,11 +110,11 @@ class EvalPair:
 
     def without_raydrop(self) -> str:
         """Say in a sentence which set has no raydrop, to which metrics of raydrop do not apply; "" if both have it."""
-        for side in (self.samples, self.reference):
-            if (rows := side.full_rows) is not None:
+        for each in (self.samples, self.reference):
+            if (rows := each.full_rows) is not None:
                 return (
-                    f"{side.source} has no raydrop: its generator fills rows {rows.start} to {rows.stop - 1} of "
-                    f"{side.images.sensor.height} with returns, and none of the others"
+                    f"{each.source} has no raydrop: its generator fills rows {rows.start} to {rows.stop - 1} of "
+                    f"{each.images.sensor.height} with returns, and none of the others"
                 )
         return ""
 
@@ -195,8 +195,8 @@ def _warnings(pair: EvalPair, shared: str) -> tuple[str, ...]:
     """Say what flatters the scores of two sets, or makes them measure something else."""
     found = []
     first, second = pair.samples, pair.reference
-    if told := pair.without_raydrop():
-        found.append(f"{told}; metrics of pixels and points count the empty rows as missing")
+    if without_raydrop := pair.without_raydrop():
+        found.append(f"{without_raydrop}; metrics of pixels and points count the empty rows as missing")
     if shared:
         found.append(f"{first.source} and the reference overlap ({shared}): the scores flatter it")
     theirs, ours = first.projection_variant, second.projection_variant

@@ -53,14 +53,14 @@ class Match:
 
 
 @torch.no_grad()
-def profile(side: EvalSet) -> Profile:
+def profile(scans: EvalSet) -> Profile:
     """Return the means over all compared scans of a set."""
-    sensor = side.images.sensor
+    sensor = scans.images.sensor
     total = torch.zeros(sensor.height, sensor.width, dtype=torch.float64)
     returns = torch.zeros_like(total)
     cells = torch.zeros(_CELLS * _CELLS, dtype=torch.float64)
-    for first in range(0, len(side), _BATCH):
-        images = side.batch(range(first, min(first + _BATCH, len(side))))
+    for first in range(0, len(scans), _BATCH):
+        images = scans.batch(range(first, min(first + _BATCH, len(scans))))
         total += images.range_m.double().sum(dim=0)
         returns += images.return_mask.sum(dim=0)
         points = points_of_pixels(images)[images.return_mask][:, :2]
@@ -68,7 +68,7 @@ def profile(side: EvalSet) -> Profile:
         cell = cell[((cell >= 0) & (cell < _CELLS)).all(dim=1)]
         cells += torch.bincount(cell[:, 0] * _CELLS + cell[:, 1], minlength=_CELLS * _CELLS)
     mean = torch.where(returns > 0, total / returns, torch.nan)
-    return Profile(mean.numpy(), (returns / len(side)).numpy(), (cells / len(side)).view(_CELLS, _CELLS).numpy())
+    return Profile(mean.numpy(), (returns / len(scans)).numpy(), (cells / len(scans)).view(_CELLS, _CELLS).numpy())
 
 
 def matches(samples: EvalSet, reference: EvalSet) -> list[Match]:

@@ -151,7 +151,7 @@ def scans_of_both(
         for each in range(seed, seed + count):
             pairs.append(simulate_pair(each, rays))
             progress.advance(1)
-    clean, measured = (RangeImage.stack(list(side)) for side in zip(*pairs, strict=True))
+    clean, measured = (RangeImage.stack(list(images)) for images in zip(*pairs, strict=True))
     return SimulatedScans(clean, measured), real
 
 
@@ -192,8 +192,8 @@ def distance(
         real: batches of real scans.
     """
     metric = load_metric(name)()
-    for side, is_real in ((generated, False), (real, True)):
-        for batch in side:
+    for batches, is_real in ((generated, False), (real, True)):
+        for batch in batches:
             for start in range(0, len(batch), _BATCH):
                 metric.update(batch[start : start + _BATCH], real=is_real)
     return metric.compute()

@@ -55,8 +55,8 @@ class LeftOut:
 
 
 @dataclass(frozen=True)
-class SetFacts:
-    """One of the two sets.
+class EvalSetRecord:
+    """Entry of one evaluation set in a score file: what remains of the set when its images are gone.
 
     Args:
         source: source, as the user named it.
@@ -89,8 +89,8 @@ class Scorecard:
     Args:
         protocol: name of the protocol.
         about: title, source and departures of the protocol.
-        samples: the first set.
-        reference: the second.
+        samples: record of the first set, usually generated.
+        reference: record of the second set, usually real.
         scores: scores in the protocol's order.
         left_out: metrics that could not be computed.
         deviations: differences of this evaluation from the protocol.
@@ -101,8 +101,8 @@ class Scorecard:
 
     protocol: str
     about: dict[str, Any]
-    samples: SetFacts
-    reference: SetFacts
+    samples: EvalSetRecord
+    reference: EvalSetRecord
     scores: tuple[Score, ...]
     left_out: tuple[LeftOut, ...] = ()
     deviations: tuple[str, ...] = ()
@@ -150,8 +150,8 @@ class Scorecard:
             return cls(
                 str(protocol.pop("name")),
                 protocol,
-                _input(data["inputs"]["samples"]),
-                _input(data["inputs"]["reference"]),
+                _set_record(data["inputs"]["samples"]),
+                _set_record(data["inputs"]["reference"]),
                 tuple(_score(each) for each in data["scores"]),
                 tuple(LeftOut(**{name: str(of) for name, of in each.items()}) for each in data["left_out"]),
                 tuple(map(str, data["deviations"])),
@@ -211,9 +211,9 @@ def _row(score: Score, with_pixels: bool) -> tuple[str, ...]:
     )
 
 
-def _input(data: dict[str, Any]) -> SetFacts:
+def _set_record(data: dict[str, Any]) -> EvalSetRecord:
     words = {name: str(data[name]) for name in ("source", "data_set", "split", "sensor", "projection", "sha256")}
-    return SetFacts(
+    return EvalSetRecord(
         **words,
         scans=int(data["scans"]),
         scans_used=int(data["scans_used"]),

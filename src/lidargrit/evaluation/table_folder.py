@@ -38,17 +38,17 @@ def read_table(folder: Path) -> tuple[list[str], Benchmark]:
         raise ConfigError(f"{folder}, which holds no {TABLE}", "the folder of a finished comparison", _CURE)
     try:
         data = read_json(folder / TABLE)
-        systems, told = [str(system) for system in data["systems"]], data["settings"]
+        systems, settings = [str(system) for system in data["systems"]], data["settings"]
         benchmark = Benchmark(
-            str(told["reference"]),
-            int(told["num_samples"]),
-            EvalConfig(protocol=str(told["protocol"]), metrics=tuple(map(str, told["metrics"]))),
-            tuple(map(str, told["recipe_settings"])),
-            float(told["flops"]),
+            str(settings["reference"]),
+            int(settings["num_samples"]),
+            EvalConfig(protocol=str(settings["protocol"]), metrics=tuple(map(str, settings["metrics"]))),
+            tuple(map(str, settings["recipe_settings"])),
+            float(settings["flops"]),
         )
     except (KeyError, TypeError, ValueError) as error:
         raise ConfigError(f"{folder / TABLE}, which cannot be used ({error})", "what compare wrote", _CURE) from None
-    if _settings(benchmark) != told:
+    if _settings(benchmark) != settings:
         raise ConfigError(f"{folder / TABLE}, made with settings that no option names", "those of the command", _CURE)
     return systems, benchmark
 

@@ -223,26 +223,26 @@ def _projection(rows: Rows, rings: Rings) -> ProjectionName:
 
 
 def _warnings(rows: Rows, rings: Rings, num_scans: int, columns: int | None) -> tuple[str, ...]:
-    said = []
+    found = []
     if len(rings.used) < num_scans:
         left = num_scans - len(rings.used)
-        said.append(f"{left} of {num_scans} scans have another number of rings than the rest, and were left out")
+        found.append(f"{left} of {num_scans} scans have another number of rings than the rest, and were left out")
     if len(rings.used) < _FEW_SCANS:
         scans = "one scan" if len(rings.used) == 1 else f"{len(rings.used)} scans"
-        said.append(f"only {scans}: rings that met little may be off; give {_FEW_SCANS} or more")
+        found.append(f"only {scans}: rings that met little may be off; give {_FEW_SCANS} or more")
     if columns is None:
-        said.append(f"the step between firings is not clear; {_COLUMNS_UNCLEAR} columns were assumed")
+        found.append(f"the step between firings is not clear; {_COLUMNS_UNCLEAR} columns were assumed")
     if rings.method == "elevation clusters":
-        said.append("the files do not tell which laser fired a point: rows are where elevations gather")
+        found.append("the files do not tell which laser fired a point: rows are where elevations gather")
     poor = int((rows.num_points < 0.05 * np.median(rows.num_points)).sum())
     if poor:
-        said.append(f"{poor} rings have few points, so that their elevations are uncertain")
+        found.append(f"{poor} rings have few points, so that their elevations are uncertain")
     gap = np.abs(np.diff(rows.elevation_deg))
     blurred = int((rows.residual_deg[1:] > gap / 2).sum())
     if blurred:
-        said.append(
+        found.append(
             f"{blurred} rings are blurred by more than half the way to the next: are the scans in their own frame?"
         )
     if rings.method == "ring field" and not bool((np.diff(rows.number) > 0).all()):
-        said.append("the rings of the files are not numbered from the top, so rows go by elevation")
-    return tuple(said)
+        found.append("the rings of the files are not numbered from the top, so rows go by elevation")
+    return tuple(found)

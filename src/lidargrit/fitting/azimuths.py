@@ -49,9 +49,9 @@ def columns_of_scans(
     power, total = np.zeros(_BINS // 2 + 1), 0
     for points, ring in list(zip(scans, rings, strict=True))[:: max(1, len(scans) // _SCANS_FOR_COLUMNS)]:
         far = (points.range_m > _FAR_M) & (ring >= 0)
-        place = np.minimum(((points.azimuth_deg[far] + 180) * (_BINS / 360)).astype(np.int64), _BINS - 1)
+        azimuth_bin = np.minimum(((points.azimuth_deg[far] + 180) * (_BINS / 360)).astype(np.int64), _BINS - 1)
         for number in np.unique(ring[far]):
-            on_circle = np.bincount(place[ring[far] == number], minlength=_BINS)
+            on_circle = np.bincount(azimuth_bin[ring[far] == number], minlength=_BINS)
             power += np.abs(np.fft.rfft(on_circle)) ** 2
             total += int(on_circle.sum())
     low, high = int(_AROUND[0] * usual), min(int(_AROUND[1] * usual) + 1, len(power) - 1)
@@ -72,7 +72,7 @@ def offsets_deg(
     """
     aside: list[list[np.ndarray]] = [[] for _ in range(lasers)]
     for points, ring in zip(scans, rings, strict=True):
-        firing = points.place // lasers
+        firing = points.index // lasers
         far = (points.range_m > _FAR_M) & (ring >= 0)
         azimuth = np.radians(points.azimuth_deg[far])
         east, north = (np.bincount(firing[far], part)[firing[far]] for part in (np.cos(azimuth), np.sin(azimuth)))

@@ -24,7 +24,7 @@ class Points:
         elevation_deg: elevation, up is positive.
         azimuth_deg: counter-clockwise from +x, in [-180, 180].
         ring: ring number from the file, or None.
-        place: index in the file of every point, counting those that are left out here.
+        index: index in the file of every point, counting those that are left out here.
         num_in_file: points with those that were left out.
     """
 
@@ -32,7 +32,7 @@ class Points:
     elevation_deg: Float64[np.ndarray, "n"]
     azimuth_deg: Float64[np.ndarray, "n"]
     ring: Int64[np.ndarray, "n"] | None
-    place: Int64[np.ndarray, "n"]
+    index: Int64[np.ndarray, "n"]
     num_in_file: int
 
     def __len__(self) -> int:
@@ -48,16 +48,16 @@ class Points:
         x, y, z = scan.points_xyz_m.double().numpy().T
         flat = np.hypot(x, y)
         range_m = np.hypot(flat, z)
-        place = np.flatnonzero(range_m > _NOISE_RANGE_M)
-        azimuth_deg = np.degrees(np.arctan2(y[place], x[place]))
+        index = np.flatnonzero(range_m > _NOISE_RANGE_M)
+        azimuth_deg = np.degrees(np.arctan2(y[index], x[index]))
         sectors = len(np.unique(np.floor(azimuth_deg * (_SECTORS / 360))))
-        if len(place) < _POINTS_AT_LEAST or sectors < _SECTORS_AT_LEAST:
+        if len(index) < _POINTS_AT_LEAST or sectors < _SECTORS_AT_LEAST:
             raise ScanError(
-                f"{len(place)} points beyond {_NOISE_RANGE_M:g} m, in {sectors * 360 // _SECTORS} of 360 degrees of "
+                f"{len(index)} points beyond {_NOISE_RANGE_M:g} m, in {sectors * 360 // _SECTORS} of 360 degrees of "
                 f"azimuth, in {scan.source}",
                 "a full revolution in the sensor's own frame",
                 "use uncropped scans",
             )
-        ring = None if scan.ring is None else scan.ring.numpy().astype(np.int64)[place]
-        elevation_deg = np.degrees(np.arctan2(z[place], flat[place]))
-        return cls(range_m[place], elevation_deg, azimuth_deg, ring, place, len(scan))
+        ring = None if scan.ring is None else scan.ring.numpy().astype(np.int64)[index]
+        elevation_deg = np.degrees(np.arctan2(z[index], flat[index]))
+        return cls(range_m[index], elevation_deg, azimuth_deg, ring, index, len(scan))

@@ -97,14 +97,14 @@ def _column_by_column(scans: Sequence[Points]) -> Rings | None:
     """Find the number of lasers as the distance in the file at which the same elevation comes again."""
     first = scans[0]
     elevation = np.full(first.num_in_file, np.nan)
-    elevation[first.place] = first.elevation_deg
+    elevation[first.index] = first.elevation_deg
     lags = range(2, min(_LASERS_AT_MOST, first.num_in_file // 8) + 1)
     change = np.array([float(np.nanmedian(np.abs(elevation[lag:] - elevation[:-lag]))) for lag in lags])
     same = change < _SAME_ELEVATION * float(np.median(change))  # multiples of the number of lasers come again as well
     lasers = next((lag for lag, again in zip(lags, same, strict=True) if again), None)
     if lasers is None or any(points.num_in_file % lasers for points in scans):
         return None
-    numbers = tuple(points.place % lasers for points in scans)
+    numbers = tuple(points.index % lasers for points in scans)
     turning, start = _turning(scans, numbers)
     return Rings("column by column", numbers, tuple(range(len(scans))), turning, start, by_column=True)
 

@@ -33,8 +33,8 @@ def as_table(fit: SensorFit) -> str:
         seen_deg = math.degrees(float(sensor.elevation_rad[row, 0]))
         laser_deg, spread_deg = fit.laser_elevation_deg[row], fit.residual_deg[row]
         rows.append(f"{row:>4}{seen_deg:>12.3f}{laser_deg:>10.3f}{spread_deg:>9.3f}{fit.points_per_ring[row]:>10}")
-    said = [f"note: {warning}" for warning in fit.warnings]
-    return "\n".join([*(f"{name:<12}{fact}" for name, fact in facts.items()), "", *rows, *said])
+    notes = [f"note: {warning}" for warning in fit.warnings]
+    return "\n".join([*(f"{name:<12}{fact}" for name, fact in facts.items()), "", *rows, *notes])
 
 
 def as_json(fit: SensorFit) -> dict[str, Any]:
@@ -58,11 +58,11 @@ def as_json(fit: SensorFit) -> dict[str, Any]:
 
 def _lasers(fit: SensorFit) -> str:
     """Tell where the lasers sit and look, as far as the points betray it."""
-    said = []
+    found = []
     if np.any(fit.laser_height_m):
         low_m, high_m = fit.laser_height_m.min(), fit.laser_height_m.max()
-        said.append(f"{low_m * 100:.1f} to {high_m * 100:.1f} cm above the origin")
+        found.append(f"{low_m * 100:.1f} to {high_m * 100:.1f} cm above the origin")
     if fit.sensor.azimuth_offset_rad is not None:
         low, high = (math.degrees(float(value)) for value in fit.sensor.azimuth_offset_rad.aminmax())
-        said.append(f"{low:.2f} to {high:.2f} degrees aside of their column")
-    return ", ".join(said) or "at the origin, as far as the points tell"
+        found.append(f"{low:.2f} to {high:.2f} degrees aside of their column")
+    return ", ".join(found) or "at the origin, as far as the points tell"

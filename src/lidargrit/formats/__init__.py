@@ -217,5 +217,5 @@ def first_bytes(path: Path, at_most: int) -> bytes:
 
 def damaged(path: Path, wanted: str, error: Exception) -> ScanError:
     """Return, in one line, what a library says of a file that it stumbled over."""
-    said = "".join(filter(str.isprintable, " ".join(str(error).split())))[:120] or type(error).__name__
-    return ScanError(f"{path}, a damaged file ({said})", wanted, "download it again, or remove it")
+    reason = "".join(filter(str.isprintable, " ".join(str(error).split())))[:120] or type(error).__name__
+    return ScanError(f"{path}, a damaged file ({reason})", wanted, "download it again, or remove it")

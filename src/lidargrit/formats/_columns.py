@@ -65,7 +65,7 @@ def known_name(name: str) -> str:
 
 def columns_of(scan: Scan) -> dict[str, np.ndarray]:
     """Return a scan's columns for a file: x, y, z and what it has of intensity, ring and label."""
-    columns = {axis: scan.points_xyz_m[:, place].numpy() for place, axis in enumerate("xyz")}
+    columns = {axis: scan.points_xyz_m[:, column].numpy() for column, axis in enumerate("xyz")}
     if scan.reflectance is not None:
         columns["intensity"] = scan.reflectance.numpy()
     for name, values, kind in (("ring", scan.ring, "<u2"), ("label", scan.label, "<u4")):
@@ -85,9 +85,9 @@ def text_rows(data: bytes, rows: int, names: list[str], path: Path, wanted: str)
     Raises:
         ScanError: fewer rows, other columns, or no numbers.
     """
-    says = f"the {rows} rows of {len(names)} numbers that its header says"
+    promised = f"the {rows} rows of {len(names)} numbers that its header says"
     if 2 * rows * len(names) > len(data) + 1:  # a number takes a digit and a blank; room is made for all rows at once
-        raise ScanError(f"{len(data)} bytes of text in {path}", says, "download it again: the file was cut short")
+        raise ScanError(f"{len(data)} bytes of text in {path}", promised, "download it again: the file was cut short")
     try:
         with warnings.catch_warnings(action="ignore"):  # of empty lines: what is missing is seen below
             table = np.loadtxt(BytesIO(data), np.float64, comments=None, max_rows=rows, ndmin=2, encoding="latin1")
@@ -96,7 +96,7 @@ def text_rows(data: bytes, rows: int, names: list[str], path: Path, wanted: str)
     if table.shape != (rows, len(names)):
         raise ScanError(
             f"{table.shape[0]} rows of {table.shape[1]} numbers in {path}",
-            says,
+            promised,
             "download it again: the file was cut short",
         )
     return dict(zip(names, table.T, strict=True))

@@ -60,25 +60,25 @@ def _packets_of_records(file: BufferedReader, start: bytes) -> Iterator[tuple[by
     if (major, minor) != (2, 4):  # older ones have their lengths in another order
         raise _DamagedError(f"version {major}.{minor} of the file format, not 2.4")
     longest = longest if 0 < longest < 1 << 31 else _BYTES_AT_MOST
-    lengths, place = struct.Struct(f"{order}8xI4x"), len(start)
-    while len(record := _read(file, place, lengths.size + _LOOK)) >= lengths.size:
+    lengths, offset = struct.Struct(f"{order}8xI4x"), len(start)
+    while len(record := _read(file, offset, lengths.size + _LOOK)) >= lengths.size:
         (size,) = lengths.unpack_from(record)
         if not 0 < size <= _BYTES_AT_MOST:
-            raise _DamagedError(f"a packet of {size:,} bytes at byte {place:,}")
+            raise _DamagedError(f"a packet of {size:,} bytes at byte {offset:,}")
         taken = min(size, longest)
         yield record[lengths.size :][:taken], taken
-        place += lengths.size + size
+        offset += lengths.size + size
 
 
 def _packets_of_blocks(file: BufferedReader) -> Iterator[tuple[bytes, int]]:
     """Yield the first bytes of each packet of a .pcapng, and how many libpcap takes of it."""
-    order, longest, place = "<", _BYTES_AT_MOST, 0
-    while len(block := _read(file, place, 28 + _LOOK)) >= 28:  # the shortest packet, and an end that is cut short
+    order, longest, offset = "<", _BYTES_AT_MOST, 0
+    while len(block := _read(file, offset, 28 + _LOOK)) >= 28:  # the shortest packet, and an end that is cut short
         if block[:4] == PCAPNG:  # each section has its own byte order
             order = "<" if block[8:12] == b"\x4d\x3c\x2b\x1a" else ">"
         kind, length = struct.unpack_from(f"{order}II", block)
         if not 12 <= length <= _BLOCK_AT_MOST:
-            raise _DamagedError(f"a block of {length:,} bytes at byte {place:,}")
+            raise _DamagedError(f"a block of {length:,} bytes at byte {offset:,}")
         if kind == 1:  # an interface
             (stated,) = struct.unpack_from(f"{order}I", block, 12)
             longest = stated if 0 < stated < 1 << 31 else _BYTES_AT_MOST
@@ -86,11 +86,11 @@ def _packets_of_blocks(file: BufferedReader) -> Iterator[tuple[bytes, int]]:
             (size,) = struct.unpack_from(f"{order}I", block, 8 if kind == 3 else 20)
             taken = min(size, longest)
             yield block[12 if kind == 3 else 28 :][:taken], taken
-        place += length
+        offset += length
 
 
-def _read(file: BufferedReader, place: int, size: int) -> bytes:
-    file.seek(place)
+def _read(file: BufferedReader, offset: int, size: int) -> bytes:
+    file.seek(offset)
     return file.read(size)
 
 

@@ -113,7 +113,7 @@ class ArgoverseFeather(ScanFormat):
         car_m = (scan.points_xyz_m.double().numpy() @ axes.T + origin_m).astype(np.float16)
         reflectance = torch.zeros(len(scan)) if scan.reflectance is None else scan.reflectance
         table = {
-            **{axis: car_m[:, place] for place, axis in enumerate("xyz")},
+            **{axis: car_m[:, column] for column, axis in enumerate("xyz")},
             "intensity": (255 * reflectance).round().numpy().astype(np.uint8),
             "laser_number": scan.ring.numpy().astype(np.uint8),
             "offset_ns": np.zeros(len(scan), np.int32),
@@ -228,8 +228,8 @@ def _unpacked_bytes(message: Any) -> int:
         return 0
     header, body = bytes(message.metadata), message.body
 
-    def number(kind: str, place: int) -> int:
-        return struct.unpack_from(kind, header, place)[0]
+    def number(kind: str, position: int) -> int:
+        return struct.unpack_from(kind, header, position)[0]
 
     def field(table: int, which: int) -> int:
         """Return the place of a field of a flatbuffers table, 0 if it is left out."""
@@ -238,14 +238,14 @@ def _unpacked_bytes(message: Any) -> int:
         offset = number("<H", offsets + 4 + 2 * which) if within else 0
         return table + offset if offset else 0
 
-    def follow(place: int) -> int:
-        return place + number("<I", place)
+    def follow(position: int) -> int:
+        return position + number("<I", position)
 
     batch = follow(field(follow(0), 2))
     buffers = follow(field(batch, 2))
     count = number("<I", buffers)
     if not field(batch, 3):  # not compressed: what it takes is what it is
         return len(body)
-    places = np.frombuffer(header, dtype="<i8", count=2 * count, offset=buffers + 4).reshape(-1, 2)
-    starts = [bytes(body[int(offset) : int(offset) + 8]) for offset, length in places if length >= 8]
+    buffer_table = np.frombuffer(header, dtype="<i8", count=2 * count, offset=buffers + 4).reshape(-1, 2)
+    starts = [bytes(body[int(offset) : int(offset) + 8]) for offset, length in buffer_table if length >= 8]
     return sum(max(size, 0) for (size,) in map(struct.Struct("<q").unpack, starts)) + len(body)

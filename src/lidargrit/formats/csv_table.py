@@ -42,7 +42,7 @@ class CsvTable(ScanFormat):
         data = read_bytes(path, BYTES_AT_MOST, _FORMAT)
         names, separator = _names(data[:_HEADER_BYTES])
         wanted = {
-            name: place for place, name in enumerate(names) if name.lower() in {"x", "y", "z"} or known_name(name)
+            name: index for index, name in enumerate(names) if name.lower() in {"x", "y", "z"} or known_name(name)
         }
         if not {"x", "y", "z"} <= {name.lower() for name in wanted}:
             there = ", ".join(map(ascii, names[:8]))[:120] or "nothing"

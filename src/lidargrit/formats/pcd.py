@@ -119,24 +119,24 @@ class _Header:
     def column_names(self) -> list[str]:
         """Name every value of a point, as pypcd4 does it: "f1", or "f1__0000", "f1__0001" where a field has several."""
         return [
-            f"f{place}" if count == 1 else f"f{place}__{part:04d}"
-            for place, count in enumerate(self.counts)
+            f"f{index}" if count == 1 else f"f{index}__{part:04d}"
+            for index, count in enumerate(self.counts)
             for part in range(count)
         ]
 
     def single_fields(self) -> dict[str, str]:
         """Return the column of every field that has one value a point; of fields of one name, that of the first."""
         columns: dict[str, str] = {}
-        for place, (field, count) in enumerate(zip(self.fields, self.counts, strict=True)):
+        for index, (field, count) in enumerate(zip(self.fields, self.counts, strict=True)):
             if count == 1:
-                columns.setdefault(field, f"f{place}")
+                columns.setdefault(field, f"f{index}")
         return columns
 
     def canonical(self) -> bytes:
         """Return a header that any reader understands, without the file's own names and liberties."""
         lines = {
             "VERSION": ("0.7",),
-            "FIELDS": [f"f{place}" for place in range(len(self.fields))],
+            "FIELDS": [f"f{index}" for index in range(len(self.fields))],
             "SIZE": self.sizes,
             "TYPE": self.types,
             "COUNT": self.counts,

@@ -128,10 +128,10 @@ class _Header:
             case other:
                 raise _refused(f"the format {' '.join(other[0] if other else [])[:40]!r}", path)
         elements = _elements(lines[2:], path)
-        place = next((place for place, element in enumerate(elements) if element.name == "vertex"), None)
-        if place is None:
+        index = next((index for index, element in enumerate(elements) if element.name == "vertex"), None)
+        if index is None:
             raise _refused("no vertices", path)
-        before, vertices = elements[:place], elements[place]
+        before, vertices = elements[:index], elements[index]
         if not 0 < vertices.rows <= POINTS_AT_MOST:
             raise _refused(f"{vertices.rows} vertices", path)
         for element in before:

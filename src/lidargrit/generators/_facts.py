@@ -35,7 +35,7 @@ class SystemFacts:
         origin = "; ".join(part for part in (self.paper, self.program) if part) or "this project"
         return [
             f"writes {self.writes}",
-            *(f"can {told} ({name})" for name, told in CAPABILITIES.items() if name in capabilities),
+            *(f"can {what} ({name})" for name, what in CAPABILITIES.items() if name in capabilities),
             f"from: {origin}",
             f"published weights: {self.weights_licence or 'none'}",
         ]

@@ -208,15 +208,15 @@ class FlowPairs:
 
     @torch.no_grad()
     def _clean(self, number: int, noise: Float[Tensor, "1 C H W"]) -> Float[Tensor, "1 C H W"]:
-        known = self._kept.get(number)
-        if known is None:
+        end = self._kept.get(number)
+        if end is None:
             with without_autocast(noise.device):
                 end = solve(self._network.to(noise.device), noise, self._solving).images
-            known = as_kept(end, self._sensor).cpu()
-            if known.nbytes <= self._free:
-                self._free -= known.nbytes
-                self._kept[number] = known
-        return known
+            end = as_kept(end, self._sensor).cpu()
+            if end.nbytes <= self._free:
+                self._free -= end.nbytes
+                self._kept[number] = end
+        return end
 
 
 def as_kept(values: Float[Tensor, "B C H W"], sensor: SensorModel) -> Float[Tensor, "B C H W"]:

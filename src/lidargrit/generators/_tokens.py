@@ -144,8 +144,8 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
             some = slice(first, first + _DECODED_AT_ONCE)
             grid = TokenGrid(tokens[some].unflatten(1, tokenizer.grid_size), tokenizer.num_codes)
             if self.pixels is not None and mask in ("auto", "pixels"):
-                known = None if condition is None else condition[some]
-                images.append(self.pixels.sample(tokenizer.decode(grid), rngs[some], pixels, known))
+                part = None if condition is None else condition[some]
+                images.append(self.pixels.sample(tokenizer.decode(grid), rngs[some], pixels, part))
             else:
                 images.append(tokenizer.sample(grid, rngs[some], "threshold" if mask == "threshold" else "bernoulli"))
         return RangeImage.cat(images)

@@ -210,14 +210,14 @@ class Dusty(Generator[DustyConfig, DustySampling]):
         return tensor.to(self.synthesis.project.weight)
 
     def _search(
-        self, images: RangeImage, known: Bool[Tensor, "B H W"], seeds: Sequence[int], sampling: DustySampling
+        self, images: RangeImage, observed: Bool[Tensor, "B H W"], seeds: Sequence[int], sampling: DustySampling
     ) -> Float[Tensor, "B D"]:
         """Return the latents whose clean ranges are nearest to the known returns: mean distance of inverse ranges."""
         target = self.encoding.encode(images)[:, 0]
 
         def error_of(latents: Tensor) -> Tensor:
             distance = (self.synthesis(latents)[0][:, 0] - target).abs() / 2
-            return (distance * known).sum((1, 2)) / known.sum((1, 2)).clamp(min=1)
+            return (distance * observed).sum((1, 2)) / observed.sum((1, 2)).clamp(min=1)
 
         return search_latents(error_of, self._normal(seeds, sampling.search_steps + 1), sampling.search_rate)
 

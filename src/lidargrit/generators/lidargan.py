@@ -182,14 +182,14 @@ class LidarGanObjective(Objective):
         latents = torch.randn(len(real), self.config.latent_dim, generator=rng, device=rng.device)
         if player == "discriminator":
             with torch.no_grad():
-                fake = self.decoder(latents)
-            of_real, of_fake = self._judged(real, {}), self._judged(fake, {})
-            loss = discriminator_loss(of_real, of_fake, self.config.loss)
+                generated = self.decoder(latents)
+            of_real, of_generated = self._judged(real, {}), self._judged(generated, {})
+            loss = discriminator_loss(of_real, of_generated, self.config.loss)
         else:
             frozen = {name: weight.detach() for name, weight in self.discriminator.named_parameters()}
-            of_real, of_fake = self._judged(real, frozen), self._judged(self.decoder(latents), frozen)
-            loss = generator_loss(of_real, of_fake, self.config.loss)
-        return {"loss": loss, "of_real": of_real.detach().mean(), "of_generated": of_fake.detach().mean()}
+            of_real, of_generated = self._judged(real, frozen), self._judged(self.decoder(latents), frozen)
+            loss = generator_loss(of_real, of_generated, self.config.loss)
+        return {"loss": loss, "of_real": of_real.detach().mean(), "of_generated": of_generated.detach().mean()}
 
     def _judged(self, images: Float[Tensor, "B 2 H W"], weights: dict[str, Tensor]) -> Float[Tensor, "B"]:
         """Return the discriminator's outputs, by given weights in place of its own."""

@@ -120,8 +120,8 @@ class LidarGen(Generator[LidarGenConfig, LangevinSampling]):
 
     def __init__(self, config: LidarGenConfig, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
-        for side in (sensor.height, sensor.width):
-            if side % 2 or side < SIDE_AT_LEAST:
+        for length in (sensor.height, sensor.width):
+            if length % 2 or length < SIDE_AT_LEAST:
                 raise ConfigError(
                     f"images of {sensor.height}x{sensor.width} for lidargen",
                     f"even numbers of rows and columns, at least {SIDE_AT_LEAST}",

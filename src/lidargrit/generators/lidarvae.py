@@ -175,9 +175,9 @@ class LidarVae(Generator[LidarVaeConfig, VaeSampling]):
         def error_of(latents: Tensor) -> Tensor:
             return (self.decode(latents) - target).abs().mean(dim=(1, 2, 3))
 
-        draws = self._normal(seeds, sampling.search_steps + 1)
-        draws[:, 0] = self.encode(target).chunk(2, dim=1)[0]
-        return self.image.decode(self.decode(search_latents(error_of, draws, sampling.search_rate)))
+        noise = self._normal(seeds, sampling.search_steps + 1)
+        noise[:, 0] = self.encode(target).chunk(2, dim=1)[0]
+        return self.image.decode(self.decode(search_latents(error_of, noise, sampling.search_rate)))
 
     def _normal(self, seeds: Sequence[int], count: int) -> Float[Tensor, "B count D"]:
         """Sample standard normal latents for each seed, on the CPU: the same numbers on every device."""

@@ -249,8 +249,8 @@ class LatentCache:
         device, pixels = images.range_m.device, images.range_m.cpu().numpy()
         keys = [hashlib.blake2b(one.tobytes(), digest_size=16).digest() for one in pixels]
         latents = [self._kept.get(key) for key in keys]
-        for index, (key, known) in enumerate(zip(keys, latents, strict=True)):
-            if known is None:
+        for index, (key, latent) in enumerate(zip(keys, latents, strict=True)):
+            if latent is None:
                 latents[index] = encoded = self._encoded(images[index : index + 1])
                 if encoded.nbytes <= self._free:
                     self._free -= encoded.nbytes

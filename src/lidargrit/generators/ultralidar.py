@@ -241,8 +241,8 @@ class VoxelReconstruction(Objective):
         perplexity = float(quantiser.perplexity())
         if perplexity >= _COLLAPSED_BELOW * count:
             return []
-        told = f"{perplexity:.1f} of {count} codes in effect, {quantiser.used_share():.0%} alive"
-        return [f"few codes are used: {told}; the remedy: more scans, or a lower model.autoencoder.num_codes"]
+        usage = f"{perplexity:.1f} of {count} codes in effect, {quantiser.used_share():.0%} alive"
+        return [f"few codes are used: {usage}; the remedy: more scans, or a lower model.autoencoder.num_codes"]
 
 
 class HiddenVoxelTokens(Objective):

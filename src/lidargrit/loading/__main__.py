@@ -3,9 +3,9 @@
 import sys
 from pathlib import Path
 
-from lidargrit.loading.workers import work
+from lidargrit.loading.workers import make_some_shards
 
 try:
-    sys.exit(work(Path(sys.argv[1]), int(sys.argv[2]), [int(shard) for shard in sys.argv[3:]]))
+    sys.exit(make_some_shards(Path(sys.argv[1]), int(sys.argv[2]), [int(shard) for shard in sys.argv[3:]]))
 except (KeyboardInterrupt, BrokenPipeError):
     sys.exit(130)

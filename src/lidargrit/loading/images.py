@@ -117,8 +117,8 @@ class RangeImages:
         first_columns = first_columns or [0] * len(indices)
         pixels = [self._pixels(index, first) for index, first in zip(indices, first_columns, strict=True)]
         range_m = torch.from_numpy(np.stack([one for one, _ in pixels]))
-        known = [reflectance for _, reflectance in pixels if reflectance is not None and self._all_have_reflectance]
-        reflectance = torch.from_numpy(np.stack(known)) if known and len(known) == len(pixels) else None
+        found = [reflectance for _, reflectance in pixels if reflectance is not None and self._all_have_reflectance]
+        reflectance = torch.from_numpy(np.stack(found)) if found and len(found) == len(pixels) else None
         return RangeImage(range_m, range_m > 0, self.sensor, reflectance)
 
     def _pixels(self, index: int, first_column: int) -> Pixels:

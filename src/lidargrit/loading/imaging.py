@@ -32,8 +32,8 @@ class Imaging:
     notes: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()
 
-    def tell(self, reporter: Reporter) -> None:
-        """Tell what was chosen, and warn of what is in doubt."""
+    def report(self, reporter: Reporter) -> None:
+        """Report what was chosen, and warn of what is in doubt."""
         for line in (*self.notes, *(f"WARNING: {doubt}" for doubt in self.doubts)):
             reporter.message(line)
 
@@ -58,8 +58,8 @@ def choose_imaging(source: str, dataset: ScanDataset, sensor: SensorModel, confi
     if fitting - {sensor.projection}:
         sensor, config = replace(sensor, projection="spherical"), replace(config, projection_variant="exact")
         notes.append(f"{source}: points that are not in firing order, so rows go by elevation (projection=spherical)")
-    told = (doubts_about_rays(scan, sensor, sensor.projection) for scan in probes)
-    doubt = next((each for each in told if each), "")
+    doubts_of_scans = (doubts_about_rays(scan, sensor, sensor.projection) for scan in probes)
+    doubt = next((each for each in doubts_of_scans if each), "")
     doubts = (f"{source}, imaged as {sensor.name}: {doubt}; name that sensor, {FIT_SENSOR}",) if doubt else ()
     return Imaging(sensor, config, tuple(notes), doubts)
 

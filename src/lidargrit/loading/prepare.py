@@ -143,7 +143,7 @@ def prepare_and_describe(
     """
     begun = time.monotonic()
     imaging = choose_imaging(source, dataset, config.load_sensor(), config)
-    imaging.tell(reporter)
+    imaging.report(reporter)
     config, sensor = imaging.config, imaging.sensor
     folder = prepare(source, config, folder, reporter, sensor, rank, world_size, dataset)
     if verify and (damaged := damaged_shards(folder, reporter)):
@@ -218,11 +218,11 @@ def _claim(folder: Path, spec: PreparedSpec, scans: list[tuple[str, str, int, in
                 "prepare into another folder, or remove this one",
             )
         return
-    told, path = json.dumps(scans), folder / SCANS_FILE
-    half_claimed = path.is_file() and path.read_bytes() == told.encode()
+    listing, path = json.dumps(scans), folder / SCANS_FILE
+    half_claimed = path.is_file() and path.read_bytes() == listing.encode()
     if is_taken(folder) and not half_claimed:
         raise OutputError(f"{folder}, which holds something else", "an empty folder", "choose another one")
-    write_text(path, told)
+    write_text(path, listing)
     write_json(folder / PLAN_FILE, asdict(spec))  # last: it says that the folder is ours
 
 

@@ -240,12 +240,12 @@ class PreparedImages:
 
     def evenly_spaced(self, count: int) -> PreparedImages:
         """Return so many of the images, evenly spaced, without opening the folder again."""
-        chosen, known, indices = copy.copy(self), self.provenance, evenly_spaced(count, len(self))
+        chosen, whole, indices = copy.copy(self), self.provenance, evenly_spaced(count, len(self))
         chosen._entries = [self._entries[index] for index in indices]
         chosen.provenance = Provenance(
             *(
                 tuple(of[index] for index in indices)
-                for of in (known.names, known.recordings, known.fingerprints, known.range_fingerprints)
+                for of in (whole.names, whole.recordings, whole.fingerprints, whole.range_fingerprints)
             )
         )
         return chosen
@@ -266,12 +266,12 @@ class PreparedImages:
         theirs = (self.spec.variant, prepared.projection, prepared.range_min_m, prepared.range_max_m)
         ours = (variant, wanted.projection, wanted.range_min_m, wanted.range_max_m)
         if theirs != ours:
-            told = [
+            projections = [
                 f"{variant}, {projection}, {near:g} to {far:g} m" for variant, projection, near, far in (theirs, ours)
             ]
             raise DataError(
-                f"{location}, prepared by the projection {told[0]}",
-                told[1],
+                f"{location}, prepared by the projection {projections[0]}",
+                projections[1],
                 "choose that projection with --set data.projection=... data.projection_variant=..., or prepare anew",
             )
 

@@ -137,8 +137,8 @@ class ShardWriter:
 
     def write(self, path: Path) -> None:
         """Write all of it into a file, which appears whole; more may be added afterwards."""
-        told = {"entries": [asdict(entry) for entry in self._entries], "left_out": self._left_out}
-        index = json.dumps(told).encode()
+        contents = {"entries": [asdict(entry) for entry in self._entries], "left_out": self._left_out}
+        index = json.dumps(contents).encode()
         with atomic_path(path) as temporary, temporary.open("wb") as file:
             file.writelines((_MAGIC, *self._blobs, index, len(index).to_bytes(8, "little"), _MAGIC))
 

@@ -102,13 +102,13 @@ def _made_by_processes(folder: Path, shares: list[list[int]]) -> Iterator[int]:
         subprocess.Popen([*command, *map(str, share)], stdout=subprocess.PIPE, text=True, env=environment)
         for share in shares
     ]
-    told: queue.Queue[str | None] = queue.Queue()
+    lines: queue.Queue[str | None] = queue.Queue()
     for process in processes:
-        threading.Thread(target=_listen, args=(process, told), daemon=True).start()
+        threading.Thread(target=_listen, args=(process, lines), daemon=True).start()
     try:
         running = len(processes)
         while running:
-            line = told.get()
+            line = lines.get()
             if line is None:
                 running -= 1
             elif line.startswith("{"):
@@ -124,12 +124,12 @@ def _made_by_processes(folder: Path, shares: list[list[int]]) -> Iterator[int]:
         raise DataError("a process that died while projecting scans", "all to end well", "the same command goes on")
 
 
-def _listen(process: subprocess.Popen[str], told: queue.Queue[str | None]) -> None:
+def _listen(process: subprocess.Popen[str], lines: queue.Queue[str | None]) -> None:
     assert process.stdout is not None
     with process.stdout:
         for line in process.stdout:
-            told.put(line)
-    told.put(None)
+            lines.put(line)
+    lines.put(None)
 
 
 def _error_of(line: str) -> LidarGritError:
@@ -137,7 +137,7 @@ def _error_of(line: str) -> LidarGritError:
     return getattr(errors, name)(*what)
 
 
-def work(folder: Path, parent: int, shards: list[int]) -> int:
+def make_some_shards(folder: Path, parent: int, shards: list[int]) -> int:
     """Make shards while the process that wants them lives; print a line for every scan, or the error."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that a half-written file is removed
     spec = PreparedFolder(str(folder)).read_spec()

@@ -109,7 +109,7 @@ class Metric(ABC, Generic[Features, Kept]):
         if self.variant not in self.variants:
             raise ConfigError(
                 f"variant {self.variant!r} of the metric {self.name!r}",
-                " or ".join(repr(known) for known in self.variants),
+                " or ".join(map(repr, self.variants)),
                 "choose one of these",
             )
         self.kind: ImageKind | None = None
@@ -216,12 +216,12 @@ class Metric(ABC, Generic[Features, Kept]):
     @final
     def require_same_kind(self, kind: ImageKind) -> None:
         """Refuse images of another size or other range limits than those before."""
-        known = self.kind or kind
-        if kind != known:
+        first = self.kind or kind
+        if kind != first:
             raise ConfigError(
-                f"range images of {kind}", f"{known}, as the images before", "project both sets with one sensor"
+                f"range images of {kind}", f"{first}, as the images before", "project both sets with one sensor"
             )
-        self.kind = known
+        self.kind = first
 
 
 class ImageMetric(Metric[RangeImage, np.ndarray]):

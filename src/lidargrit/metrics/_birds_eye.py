@@ -111,9 +111,9 @@ def occupied_cells(images: RangeImage, cells_per_m: int) -> Int64[np.ndarray, "c
     """
     points = points_of_pixels(images).float().numpy()[..., :2]
     inside = images.return_mask.numpy() & (np.abs(points) < LIDM_HALF_M).all(axis=-1)
-    side = 2 * LIDM_HALF_M * cells_per_m
-    cell = np.floor(points[inside].astype(np.float64) * cells_per_m).astype(np.int64) + side // 2
-    return np.unique((np.nonzero(inside)[0] * side + cell[:, 0]) * side + cell[:, 1])
+    cells = 2 * LIDM_HALF_M * cells_per_m
+    cell = np.floor(points[inside].astype(np.float64) * cells_per_m).astype(np.int64) + cells // 2
+    return np.unique((np.nonzero(inside)[0] * cells + cell[:, 0]) * cells + cell[:, 1])
 
 
 def jensen_shannon_distance(first: Int64[np.ndarray, "cells"], second: Int64[np.ndarray, "cells"]) -> float:

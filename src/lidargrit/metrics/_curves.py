@@ -107,7 +107,7 @@ def divergence(
 
     Two that are both empty are alike; an empty one and another have nothing in common.
     """
-    p, q = (normalised(side) for side in (first, second))
+    p, q = (normalised(counts) for counts in (first, second))
     middle = (p + q) / 2
     apart = (rel_entr(p, middle) + rel_entr(q, middle)).sum(axis=-1) / (2 * math.log(2))
     empty = np.isnan(p).any(axis=-1).astype(int) + np.isnan(q).any(axis=-1)
@@ -136,11 +136,11 @@ def compare_shares(
     """
     trials = np.minimum(generated[0], real[0])
     kept = trials >= _LEAST if (trials >= _LEAST).any() else trials > 0
-    yes_and_no = [np.stack((side[1], side[0] - side[1]), axis=-1) for side in (generated, real)]
+    yes_and_no = [np.stack((counts[1], counts[0] - counts[1]), axis=-1) for counts in (generated, real)]
     each = divergence(*yes_and_no)[kept]
     alike = not (generated[0].any() or real[0].any())
     mean = float(each.mean()) if len(each) else float(not alike)
-    plotted = [np.where(kept, normalised(side)[:, 0], np.nan) for side in yes_and_no]
+    plotted = [np.where(kept, normalised(counts)[:, 0], np.nan) for counts in yes_and_no]
     return Curves(mean, axis, *plotted)
 
 
@@ -234,5 +234,5 @@ def count_shares(
     quantity: Float[Tensor, "B H W"], happened: Tensor, edges: Float64[np.ndarray, " edges"]
 ) -> Int64[np.ndarray, "2 bins"]:
     """Count, in bins of a quantity (NaN where it is unknown), all pixels and those where something happened."""
-    known = ~quantity.isnan()
-    return np.stack((histogram(quantity[known], edges), histogram(quantity[known & happened], edges)))
+    finite = ~quantity.isnan()
+    return np.stack((histogram(quantity[finite], edges), histogram(quantity[finite & happened], edges)))

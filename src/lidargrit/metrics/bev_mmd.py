@@ -107,7 +107,7 @@ def shares(counts: np.ndarray) -> Float64[np.ndarray, "n cells"]:
 
 def frobenius(rows: RowShares, columns: ColumnShares) -> Float64[np.ndarray, "rows columns"]:
     """Return the sums of squares of the differences of all pairs."""
-    squares = [np.einsum("ij,ij->i", side, side) for side in (rows, columns)]
+    squares = [np.einsum("ij,ij->i", counts, counts) for counts in (rows, columns)]
     return np.maximum(squares[0][:, None] + squares[1] - 2 * rows @ columns.T, 0)
 
 

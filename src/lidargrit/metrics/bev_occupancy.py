@@ -41,7 +41,7 @@ class BevOccupancy(CurveMetric):
         self, generated: Int64[np.ndarray, "2 x y"], real: Int64[np.ndarray, "2 x y"], kind: ImageKind
     ) -> Curves:
         """Return the occupancy of every cell."""
-        shares = [side[1] / side[0] for side in (generated, real)]
+        shares = [counts[1] / counts[0] for counts in (generated, real)]
         ever = (shares[0] > 0) | (shares[1] > 0)
         yes_and_no = [np.stack((share[ever], 1 - share[ever]), axis=-1) for share in shares]
         mean = float(divergence(*yes_and_no).mean()) if ever.any() else 0.0

@@ -99,8 +99,8 @@ class SlicedWasserstein(ImageMetric):
         first = 0
         for level, num_patches in enumerate(self._patches_per_level()):
             part = slice(first, first := first + num_patches)
-            sides = (torch.from_numpy(each[:n, part].reshape(-1, _PATCH**2)) for each in (generated, real))
-            patches = [standardised(side, int(reference)) for side in sides]
+            samples = (torch.from_numpy(each[:n, part].reshape(-1, _PATCH**2)) for each in (generated, real))
+            patches = [standardised(sample, int(reference)) for sample in samples]
             repeats = [
                 sliced_distance(patches[0], patches[1], random_directions(rng, unit_length=not reference))
                 for _ in range(_REPEATS)
@@ -293,6 +293,6 @@ def sliced_distance(
     total = 0.0
     for some in directions.T.split(max(1, _MAX_PROJECTED // len(first))):
         # numpy sorts in place and without indices, several times faster than torch on a CPU
-        sides = [np.sort((some @ side.T).numpy(), axis=1) for side in (first, second)]
-        total += float(np.abs(sides[0] - sides[1]).mean(dtype=np.float64, axis=1).sum())
+        projected = [np.sort((some @ patches.T).numpy(), axis=1) for patches in (first, second)]
+        total += float(np.abs(projected[0] - projected[1]).mean(dtype=np.float64, axis=1).sum())
     return total / directions.shape[1]

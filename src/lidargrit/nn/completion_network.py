@@ -113,22 +113,22 @@ class CompletionNetwork(nn.Module):
     preferred: Tensor
     azimuth: Tensor
 
-    def forward(self, hints: Hints, known: Bool[Tensor, "B H W"]) -> Point:
+    def forward(self, hints: Hints, observed: Bool[Tensor, "B H W"]) -> Point:
         """Return the estimate of every pixel.
 
         Args:
             hints: classical fills of the observed pixels.
-            known: True where it was observed whether there is a return.
+            observed: True where it was observed whether there is a return.
         """
-        rows = self.rows[None, :, :, None].expand(len(known), -1, -1, known.shape[-1])
-        columns = self.azimuth[None, :, None].expand(len(known), -1, known.shape[-2], -1)
+        rows = self.rows[None, :, :, None].expand(len(observed), -1, -1, observed.shape[-1])
+        columns = self.azimuth[None, :, None].expand(len(observed), -1, observed.shape[-2], -1)
         output = self.unet(torch.cat((hints.maps, rows, columns), 1)).float()
         features, weights, moved, logits = output.split((self.num_features, NUM_CANDIDATES, 1, 1), 1)
         shares = (4 * weights + self.preferred).softmax(1)
         v = (shares * hints.candidates).sum(1) + 0.3 * moved[:, 0]
         return_logits = (2 * logits[:, 0] + 1.5).clamp(-_LOGIT_BOUND, _LOGIT_BOUND)
         v = v.clamp(*self.limits_v)
-        return Point(Guide(features, v.detach(), return_logits.detach(), known), v, return_logits)
+        return Point(Guide(features, v.detach(), return_logits.detach(), observed), v, return_logits)
 
     def sample(self, condition: Condition, rngs: Sequence[torch.Generator]) -> RangeImage:
         """Return completed scans: the range estimated, the mask sampled; a scan does not depend on the others.
@@ -136,7 +136,7 @@ class CompletionNetwork(nn.Module):
         The range is the mean of two estimates, of the scan and of its mirror image.
 
         Args:
-            condition: known pixels of as many scans.
+            condition: observed pixels of as many scans.
             rngs: random generators on the CPU, one for each scan.
         """
         images = []
@@ -162,7 +162,7 @@ class CompletionNetwork(nn.Module):
             rng: chooses one phase of each spacing, which stands for all; every phase is counted without it.
         """
         guide, total = point.guide, point.v.new_zeros(len(returned))
-        assert guide.known is not None
+        assert guide.observed is not None
         guided = self.mask.guided(guide)
         for phases in self.mask.by_spacing():
             chosen = phases
@@ -170,7 +170,7 @@ class CompletionNetwork(nn.Module):
                 chosen = [phases[int(torch.randint(len(phases), (), generator=rng, device=rng.device))]]
             logits = self.mask.logits(chosen, self.mask.outputs(chosen, guided, guide, returned, guide.v), guide)
             nll = F.binary_cross_entropy_with_logits(logits, at_phases(returned, chosen).float(), reduction="none")
-            unknown = ~at_phases(guide.known, chosen)
+            unknown = ~at_phases(guide.observed, chosen)
             total = total + (nll * unknown).sum((0, 2, 3)) * (len(phases) / len(chosen))
         return total
 

@@ -159,9 +159,9 @@ def repaint(
         for turn in range(1 if last_step else resamples):
             if turn:
                 image = step_forward(image, then, now, noise())
-            known = noised(clean, then, noise())
+            noised_observed = noised(clean, then, noise())
             image = step_back(image, _evaluated(denoiser, image, now), now, then, noise())
-            image = torch.where(observed, known, image)
+            image = torch.where(observed, noised_observed, image)
     return image
 
 

@@ -141,5 +141,5 @@ def _as_seen(image: Float[Tensor, "B C rows W"]) -> Float[Tensor, "B C rows W"]:
 
 
 def _box() -> str:
-    sides = [f"{low:g} < {axis} < {high:g} m" for axis, low, high in zip("xyz", _LOWEST_M, _HIGHEST_M, strict=True)]
-    return f"{', '.join(sides)}, {math.sqrt(_NEAREST_M2):.2f} m away or more"
+    limits = [f"{low:g} < {axis} < {high:g} m" for axis, low, high in zip("xyz", _LOWEST_M, _HIGHEST_M, strict=True)]
+    return f"{', '.join(limits)}, {math.sqrt(_NEAREST_M2):.2f} m away or more"

@@ -106,26 +106,28 @@ def _start(network: nn.Module, initial_std: float) -> None:
             nn.init.normal_(module.weight, 1.0, initial_std)
 
 
-def discriminator_loss(of_real: Float[Tensor, "B"], of_fake: Float[Tensor, "B"], kind: AdversarialLoss) -> Tensor:
+def discriminator_loss(of_real: Float[Tensor, "B"], of_generated: Float[Tensor, "B"], kind: AdversarialLoss) -> Tensor:
     """Return the least-squares loss of the discriminator.
 
     Args:
         of_real: output of the discriminator for real images.
-        of_fake: output for generated images.
+        of_generated: output for generated images.
         kind: ``plain`` compares each output with a constant, 1 for real and 0 for generated (Mao et al., LSGAN, 2017).
             ``relativistic`` compares it with the mean output for the other images: 1 above it, 1 below it
             (Jolicoeur-Martineau, The relativistic discriminator, 2019).
     """
     if kind == "plain":
-        return ((of_real - 1).square().mean() + of_fake.square().mean()) / 2
-    return ((of_real - of_fake.mean() - 1).square().mean() + (of_fake - of_real.mean() + 1).square().mean()) / 2
+        return ((of_real - 1).square().mean() + of_generated.square().mean()) / 2
+    return (
+        (of_real - of_generated.mean() - 1).square().mean() + (of_generated - of_real.mean() + 1).square().mean()
+    ) / 2
 
 
-def generator_loss(of_real: Float[Tensor, "B"], of_fake: Float[Tensor, "B"], kind: AdversarialLoss) -> Tensor:
+def generator_loss(of_real: Float[Tensor, "B"], of_generated: Float[Tensor, "B"], kind: AdversarialLoss) -> Tensor:
     """Return the loss of the generator; the arguments are those of :func:`discriminator_loss`."""
     if kind == "plain":
-        return (of_fake - 1).square().mean()
-    return discriminator_loss(of_fake, of_real, kind)
+        return (of_generated - 1).square().mean()
+    return discriminator_loss(of_generated, of_real, kind)
 
 
 def kl_nats(mean: Float[Tensor, "B D"], log_variance: Float[Tensor, "B D"]) -> Float[Tensor, "B"]:

@@ -192,15 +192,15 @@ class PixelDecoder(nn.Module):
         """
         guide, size = Guide.of(decoded), (3, self.sensor.height, self.sensor.width)
         uniform = torch.stack([torch.rand(size, generator=rng) for rng in rngs]).to(guide.v.device)
-        known = (condition or Condition.nothing(self.sensor, len(rngs))).to(guide.v.device)
+        condition = (condition or Condition.nothing(self.sensor, len(rngs))).to(guide.v.device)
         # One scan after the other on a CPU: with other batch sizes its sums have other rounding errors.
         step = 1 if guide.v.device.type == "cpu" else len(uniform)
         images = []
         for first in range(0, len(uniform), step):
             part = slice(first, first + step)
             some = guide.part(part)
-            mask = self.mask.sample(some, uniform[part, 0], known[part])
-            range_m = self._sample_range(some, uniform[part, 1:], mask, known[part], sampling)
+            mask = self.mask.sample(some, uniform[part, 0], condition[part])
+            range_m = self._sample_range(some, uniform[part, 1:], mask, condition[part], sampling)
             images.append(RangeImage(range_m, mask, self.sensor))
         return RangeImage.cat(images)
 
@@ -209,7 +209,7 @@ class PixelDecoder(nn.Module):
         guide: Guide,
         uniform: Float[Tensor, "B 2 H W"],
         mask: Bool[Tensor, "B H W"],
-        known: Condition,
+        condition: Condition,
         sampling: PixelSampling | None,
     ) -> Float[Tensor, "B H W"]:
         """Return the ranges of a whole mask, sampled phase by phase around those that are known."""
@@ -222,7 +222,7 @@ class PixelDecoder(nn.Module):
             mixture = self.range.mixture([phase], output, candidates, guide)
             component, within = uniform[pixels].unbind(1)
             sampled = mixture.sample(component[None], within[None], choices.temperature, choices.noise)[0]
-            sampled = torch.where(known.range_observed[pixels], known.range_m[pixels], sampled)
+            sampled = torch.where(condition.range_observed[pixels], condition.range_m[pixels], sampled)
             range_m[pixels] = torch.where(mask[pixels], sampled, 0.0)
             v[pixels] = range_m[pixels].log1p()
         return range_m

@@ -68,18 +68,18 @@ class Guide(NamedTuple):
         features: features of the decoder's last layer.
         v: ln(1 + decoded range in metres).
         return_logits: logits of the probability of a return, bounded.
-        known: True where the return is known before the first phase; None if it is known nowhere.
+        observed: True where it was observed whether there is a return; None if nothing was observed.
     """
 
     features: Float[Tensor, "B C H W"]
     v: Float[Tensor, "B H W"]
     return_logits: Float[Tensor, "B H W"]
-    known: Bool[Tensor, "B H W"] | None = None
+    observed: Bool[Tensor, "B H W"] | None = None
 
     def part(self, some: slice) -> Guide:
         """Return the guide of some of the scans."""
-        known = None if self.known is None else self.known[some]
-        return Guide(self.features[some], self.v[some], self.return_logits[some], known)
+        observed = None if self.observed is None else self.observed[some]
+        return Guide(self.features[some], self.v[some], self.return_logits[some], observed)
 
     @classmethod
     def of(cls, decoded: Decoded) -> Guide:
@@ -221,10 +221,10 @@ class MaskNetwork(PhaseNetwork):
     ) -> Float[Tensor, "B D h w"]:
         """Return for each pixel of a cell whether it is known to have returned, and whether it is known not to."""
         returned = cells_of(return_mask[:, None].to(v.dtype), phase.spacing)
-        known = generated_before(phase).to(returned)[:, None, None]
-        if guide.known is not None:
-            known = torch.maximum(known, cells_of(guide.known[:, None].to(v.dtype), phase.spacing))
-        return torch.cat((known * returned, known * (1 - returned)), 1)
+        certain = generated_before(phase).to(returned)[:, None, None]
+        if guide.observed is not None:
+            certain = torch.maximum(certain, cells_of(guide.observed[:, None].to(v.dtype), phase.spacing))
+        return torch.cat((certain * returned, certain * (1 - returned)), 1)
 
     def sample(self, guide: Guide, uniform: Float[Tensor, "B H W"], condition: Condition) -> Bool[Tensor, "B H W"]:
         """Return the mask, sampled phase by phase around what is known of it.
@@ -278,13 +278,13 @@ class RangeNetwork(PhaseNetwork):
     ) -> Float[Tensor, "B D h w"]:
         """Return the mask, the known ranges beside the decoded ones, and how far the candidates are apart."""
         returned, beside = cells_of(torch.stack((return_mask.to(v.dtype), v - guide.v), 1), phase.spacing).chunk(2, 1)
-        known = generated_before(phase).to(returned)[:, None, None] * returned
+        generated = generated_before(phase).to(returned)[:, None, None] * returned
         candidates = self.candidates([phase], guide, return_mask, v)[0]
         decoded = guide.v[(..., *phase.pixels)][:, None]
         first, second = candidates[:, 1:3], candidates[:, 4:6]
         apart = torch.cat((first.diff(dim=1), second.diff(dim=1), candidates[:, :1] - candidates[:, 3:4]), 1).abs()
         apart = ((apart + _SAME_SURFACE_V).log() + 5) / 2
-        return torch.cat((known, 1 - returned, known * beside, (candidates - decoded).clamp(-2, 2), apart), 1)
+        return torch.cat((generated, 1 - returned, generated * beside, (candidates - decoded).clamp(-2, 2), apart), 1)
 
     def candidates(
         self, phases: list[Phase], guide: Guide, return_mask: Bool[Tensor, "B H W"], v: Float[Tensor, "B H W"]

@@ -76,10 +76,10 @@ def read_r2dm_checkpoint(path: Path) -> R2dmCheckpoint:
         if not isinstance(file, dict):
             raise RefusedFileError("which holds no values by name")
         settings = _Settings(file["cfg"])
-        for name, known in _KNOWN_FORM.items():
-            if name in settings and settings[name] != known:
-                told = settings.name_in_file(name)
-                got, wanted = f"{told}={settings[name]!r}", f"{told}={known!r}"
+        for name, required in _KNOWN_FORM.items():
+            if name in settings and settings[name] != required:
+                full_name = settings.name_in_file(name)
+                got, wanted = f"{full_name}={settings[name]!r}", f"{full_name}={required!r}"
                 raise CheckpointError(f"{path} with {got:.200}", wanted, "use other weights")
         unet = UnetConfig(
             channels=int(settings["model.base_channels"]),
@@ -102,9 +102,9 @@ def read_r2dm_checkpoint(path: Path) -> R2dmCheckpoint:
     except RefusedFileError as why:
         raise CheckpointError(f"{path}, {why}", _WANTED, _CURE) from None
     except (OSError, KeyError, TypeError, ValueError, AttributeError) as error:
-        told = str(error).partition("\n")[0][:100]
+        reason = str(error).partition("\n")[0][:100]
         raise CheckpointError(
-            f"{path}, which cannot be read ({type(error).__name__}: {told})",
+            f"{path}, which cannot be read ({type(error).__name__}: {reason})",
             _WANTED,
             _CURE,
         ) from None

@@ -88,9 +88,9 @@ def read_ultralidar_checkpoint(path: Path, sizes: VoxelAutoencoderConfig) -> Ult
             )
         return UltraLidarCheckpoint(autoencoder, _blocks(weights, "prior"), weights)
     except (OSError, RefusedFileError, ConfigError) as why:
-        told = f"whose sizes cannot be: {why.got}" if isinstance(why, ConfigError) else why
+        reason = f"whose sizes cannot be: {why.got}" if isinstance(why, ConfigError) else why
         raise CheckpointError(
-            f"{path}, {told}", "a checkpoint of UltraLiDAR's program", "check which program saved it"
+            f"{path}, {reason}", "a checkpoint of UltraLiDAR's program", "check which program saved it"
         ) from None
 
 

@@ -118,8 +118,8 @@ def publish(run: Path, folder: Path, scores: Path | None = None, notes: str = ""
         if learned.recordings or learned.fingerprints:
             # A recording that has no name of its own is named by its folder, which is the user's.
             drives = [recording for recording in learned.recordings if not recording.startswith("#")]
-            known = {"fingerprints": learned.fingerprints, "range_fingerprints": learned.range_fingerprints}
-            hashes = {name: list(of) for name, of in known.items()}
+            found = {"fingerprints": learned.fingerprints, "range_fingerprints": learned.range_fingerprints}
+            hashes = {name: list(of) for name, of in found.items()}
             write_json(folder / TRAINED_ON_FILE, {"recordings": drives, **hashes})
         generator.save_pretrained(folder, card, half)  # the card last: it says that the folder is finished
     return card

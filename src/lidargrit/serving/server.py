@@ -126,9 +126,9 @@ def _listening(host: str, port: int) -> socket.socket:
     try:
         return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
     except OSError as error:
-        told = str(error.strerror).partition(" (")[0]
+        reason = str(error.strerror).partition(" (")[0]
         raise OutputError(
-            f"{host} port {port}, where nothing can be served ({told})",
+            f"{host} port {port}, where nothing can be served ({reason})",
             "an address of this machine, and a port that is free",
             "choose another one by --port",
         ) from None

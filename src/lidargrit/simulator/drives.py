@@ -56,7 +56,7 @@ class DriveConfig:
         """Return the seed of a scan's street and its frame there."""
         return self.seed + scan // self.frames, scan % self.frames
 
-    def place_of(self, scan: int) -> tuple[str, int]:
+    def sequence_and_number(self, scan: int) -> tuple[str, int]:
         """Return a scan's sequence and its number in it: a drive each, or many single streets together."""
         together = self.frames if self.frames > 1 else _SCANS_PER_SEQUENCE
         return f"{scan // together:02d}", scan % together
@@ -142,7 +142,7 @@ def _write_scan(out: Path, config: DriveConfig, scan: int) -> None:
 
 
 def _label_file(out: Path, config: DriveConfig, scan: int) -> Path:
-    sequence, number = config.place_of(scan)
+    sequence, number = config.sequence_and_number(scan)
     return out / "sequences" / sequence / "labels" / f"{number:06d}.label"
 
 
@@ -156,7 +156,7 @@ def _write_sequence_files(out: Path, config: DriveConfig, num_scans: int) -> Non
             if scene is not None:
                 moved = np.linalg.inv(scene.sensor_pose()) @ scene.sensor_pose(_FRAME_S * (scan - first))
                 relative = _CAMERA_FROM_SENSOR @ moved @ np.linalg.inv(_CAMERA_FROM_SENSOR)
-            poses.setdefault(config.place_of(scan)[0], []).append(relative)
+            poses.setdefault(config.sequence_and_number(scan)[0], []).append(relative)
     projection = _numbers(np.eye(3, 4))
     calibration = [f"P{camera}: {projection}" for camera in range(4)] + [f"Tr: {_numbers(_CAMERA_FROM_SENSOR[:3])}"]
     for sequence, relative in poses.items():

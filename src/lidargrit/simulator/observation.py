@@ -88,8 +88,8 @@ class Observation:
         # Rows are two runs already, which a stable sort joins in one pass.
         order = np.argsort(turn, axis=1, kind="stable")
         came_back = np.take_along_axis(self.return_mask, order, axis=1)
-        ring, place = np.nonzero(came_back)
-        column = order[ring, place]
+        ring, rank = np.nonzero(came_back)
+        column = order[ring, rank]
         at = ring * self.range_m.shape[1] + column
         xyz_m = self.directions.reshape(-1, 3)[at] * self.range_m.ravel()[at][:, None]
         label = self.label.ravel()[at].astype(np.int64) | (self.instance.ravel()[at].astype(np.int64) & 0xFFFF) << 16

@@ -207,9 +207,9 @@ class BeamNoise:
         """Sample the noise of a scan of one size."""
         num_knots = max(round(360 / model.patch_deg), 1)
         knots = rng.standard_normal((height, num_knots), dtype=np.float32) * np.float32(model.patch_spread)
-        place = np.arange(width, dtype=np.float32) * np.float32(num_knots / width)
-        left = place.astype(np.intp)
-        share = place - left.astype(np.float32)
+        position = np.arange(width, dtype=np.float32) * np.float32(num_knots / width)
+        left = position.astype(np.intp)
+        share = position - left.astype(np.float32)
         patch = knots[:, left] * (1 - share)
         patch += knots[:, (left + 1) % num_knots] * share
         return cls(

@@ -125,7 +125,7 @@ class DatasetSource(Source):
         """Project the scans once, and find them in the cache from then on."""
         config, reporter = config or DataConfig(), reporter or Reporter()
         imaging = self.imaging(sensor, config)
-        imaging.tell(reporter)
+        imaging.report(reporter)
         sensor, config = imaging.sensor, imaging.config
         folder = prepare(self.text, config, reporter=reporter, sensor=sensor, dataset=self._dataset)
         self.doubts, self._imaged_by = imaging.doubts, config.projection_variant

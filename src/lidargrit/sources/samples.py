@@ -121,8 +121,10 @@ def read_samples(folder: Path, count: int | None = None) -> RangeImages:
     try:
         sensor = SensorModel.from_json(manifest["sensor"])
     except (KeyError, TypeError, ConfigError) as error:
-        told = error.got if isinstance(error, ConfigError) else error
-        raise CheckpointError(f"{folder / MANIFEST}, in which {told}", "what lidargrit wrote", "sample anew") from None
+        reason = error.got if isinstance(error, ConfigError) else error
+        raise CheckpointError(
+            f"{folder / MANIFEST}, in which {reason}", "what lidargrit wrote", "sample anew"
+        ) from None
     paths = sorted(folder.glob("[!.]*.npz"))[:count]  # not what a killed process left half-written
     if not paths:
         raise DataError(

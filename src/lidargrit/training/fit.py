@@ -173,8 +173,8 @@ class Fit:
     def _log_terms(self, split: str, terms: dict[str, float], seconds: float) -> None:
         self.engine.by_first(lambda: self.log.write(split, self.scans_seen, seconds, terms))
         if split == "val":
-            told = "  ".join(f"{name} {value:.4g}" for name, value in terms.items())
-            self.reporter.message(f"  after {self.scans_seen} scans, on val: {told}")
+            losses = "  ".join(f"{name} {value:.4g}" for name, value in terms.items())
+            self.reporter.message(f"  after {self.scans_seen} scans, on val: {losses}")
             for warning in self.objective.warnings():
                 self.reporter.message(f"  WARNING: {warning}")
 

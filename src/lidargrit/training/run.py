@@ -194,7 +194,8 @@ def _write_trained_on(folder: Path, train_images: RangeImages, donor: str | None
                 "fingerprints": facts["fingerprints"] | {*theirs.fingerprints},
                 "range_fingerprints": facts["range_fingerprints"] | {*theirs.range_fingerprints},
             }
-        write_text(folder / TRAINED_ON_FILE, json.dumps({name: sorted(known) for name, known in facts.items()}) + "\n")
+        listed = {name: sorted(values) for name, values in facts.items()}
+        write_text(folder / TRAINED_ON_FILE, json.dumps(listed) + "\n")
 
 
 def _warn_of_overlap(train_images: RangeImages, val_images: RangeImages, reporter: Reporter) -> None:

@@ -45,9 +45,9 @@ def tracked(project: str, recipe: Recipe, folder: Path) -> Iterator[None]:
     except ImportError:
         raise ConfigError(f"--wandb {project}, and no wandb", wanted, cure) from None
     except Exception as error:  # its client has many kinds, from a missing key to a broken line, and changes them
-        told = f"{type(error).__name__}: {str(error).partition(chr(10))[0][:100]}"
+        reason = f"{type(error).__name__}: {str(error).partition(chr(10))[0][:100]}"
         cure = "log in with: wandb login, or set WANDB_MODE=offline"
-        raise ConfigError(f"--wandb {project}, where {told}", "a project that can be written to", cure) from None
+        raise ConfigError(f"--wandb {project}, where {reason}", "a project that can be written to", cure) from None
     failed = 1
     try:
         yield

@@ -64,9 +64,9 @@ def plot_curves(scores: Sequence[CurveScore], path: Path, title: str = "") -> No
         figure.savefig(unfinished, format="png", dpi=_DOTS_PER_INCH)
 
 
-def _curve(score: CurveScore, side: str) -> Float64[np.ndarray, "*rows n"]:
-    result = score.bernoulli if side == "coin" else score.simulated
-    return np.array(result.details["real" if side == "real" else "generated"], dtype=float)
+def _curve(score: CurveScore, which: str) -> Float64[np.ndarray, "*rows n"]:
+    result = score.bernoulli if which == "coin" else score.simulated
+    return np.array(result.details["real" if which == "real" else "generated"], dtype=float)
 
 
 def _title(score: CurveScore) -> str:
@@ -79,9 +79,9 @@ def _plot_lines(axes: Axes, score: CurveScore) -> None:
     details = score.simulated.details
     axis, label = np.array(details["axis"], dtype=float), details["axis_label"]
     lags = axis[0] < 0  # rows and columns share the axis: no line of numbers
-    for side, colour in _SIDES.items():
+    for which, colour in _SIDES.items():
         position = np.arange(len(axis)) if lags else axis
-        axes.plot(position, _curve(score, side), color=colour, label=side, marker=".", markersize=4, linewidth=1.2)
+        axes.plot(position, _curve(score, which), color=colour, label=which, marker=".", markersize=4, linewidth=1.2)
     axes.set_title(_title(score), loc="left", fontsize=10)
     axes.set(xlabel=label, ylabel=details["curve_label"])
     if lags:
@@ -105,11 +105,11 @@ def _plot_images(figure: Figure, cell: SubplotSpec, score: CurveScore) -> None:
     """Plot the three images on one scale, with the mean over rows beside them where rows share an axis."""
     details = score.simulated.details
     axis = np.array(details["axis"], dtype=float)
-    images = {side: _curve(score, side) for side in _SIDES}
+    images = {which: _curve(score, which) for which in _SIDES}
     is_map = images["real"].shape == (len(axis), len(axis))  # a view from above: both axes are metres
     grid = cell.subgridspec(1, 4, wspace=0.25)
     norm = PowerNorm(0.5, 0, np.nanmax([np.nanmax(image, initial=0) for image in images.values()]) or 1)
-    for index, (side, image) in enumerate(images.items()):
+    for index, (which, image) in enumerate(images.items()):
         axes = figure.add_subplot(grid[0, index])
         if is_map:
             half = axis[-1] + 0.5
@@ -119,13 +119,13 @@ def _plot_images(figure: Figure, cell: SubplotSpec, score: CurveScore) -> None:
             axes.pcolormesh(axis, np.arange(len(image)), np.nan_to_num(image), norm=norm, cmap="magma")
             axes.set(xlabel=details["axis_label"], ylim=(len(image) - 0.5, -0.5), ylabel="row" if index == 0 else "")
             _log_axis(axes)
-        axes.set_title(side, loc="left", fontsize=10)
+        axes.set_title(which, loc="left", fontsize=10)
     box = cell.get_position(figure)
     figure.text(box.x0, box.y1 + 0.35 / figure.get_figheight(), _title(score), fontsize=10)
     axes = figure.add_subplot(grid[0, 3])
-    for side, colour in _SIDES.items():
-        values = np.sort(images[side].ravel())[::-1] if is_map else np.nanmean(images[side], axis=0)
-        axes.plot(np.arange(1, len(values) + 1) if is_map else axis, values, color=colour, label=side, linewidth=1.2)
+    for which, colour in _SIDES.items():
+        values = np.sort(images[which].ravel())[::-1] if is_map else np.nanmean(images[which], axis=0)
+        axes.plot(np.arange(1, len(values) + 1) if is_map else axis, values, color=colour, label=which, linewidth=1.2)
     if is_map:
         axes.set(xscale="log", xlabel="rank of the cell")
         axes.set_title("cells, the fullest first", loc="left", fontsize=10)

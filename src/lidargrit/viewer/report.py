@@ -13,7 +13,7 @@ from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import without_folders
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
 from lidargrit.evaluation.profiles import HALF_VIEW_M, Match, Profile, matches, profile
-from lidargrit.evaluation.scorecard import NOT_APPLICABLE, Scorecard, SetFacts
+from lidargrit.evaluation.scorecard import NOT_APPLICABLE, EvalSetRecord, Scorecard
 from lidargrit.files import write_text
 from lidargrit.viewer.report_charts import line_chart
 from lidargrit.viewer.report_pictures import (
@@ -99,7 +99,7 @@ def _escaped(text: str) -> str:
     return escape(without_folders(text))
 
 
-def _kind(scans: SetFacts) -> str:
+def _kind(scans: EvalSetRecord) -> str:
     return " ".join(word for word in (scans.data_set or "not known", scans.split) if word)
 
 
@@ -190,8 +190,8 @@ def _matches(found: Sequence[Match], pair: EvalPair, limits_m: tuple[float, floa
 def _means(both: tuple[Profile, Profile], limits_m: tuple[float, float]) -> str:
     figures = []
     for name, scans in zip(("samples", "reference"), both, strict=True):
-        known = ~np.isnan(scans.mean_range_m)
-        picture = range_picture(np.where(known, scans.mean_range_m, 1.0), known, limits_m)
+        finite = ~np.isnan(scans.mean_range_m)
+        picture = range_picture(np.where(finite, scans.mean_range_m, 1.0), finite, limits_m)
         figures.append(_figure(picture, f"mean range image of the {name}", f"mean range of the {name}"))
     for name, scans in zip(("samples", "reference"), both, strict=True):
         caption = f"return rate of the {name}: dark blue never, yellow always"
@@ -202,8 +202,8 @@ def _means(both: tuple[Profile, Profile], limits_m: tuple[float, float]) -> str:
 
 def _rings(both: tuple[Profile, Profile], without_raydrop: str) -> str:
     if without_raydrop:
-        told = f"{NOT_APPLICABLE}: {without_raydrop}"
-        return f"<section><h2>Return rate by ring</h2><p>{_escaped(told[0].upper() + told[1:])}.</p></section>"
+        sentence = f"{NOT_APPLICABLE}: {without_raydrop}"
+        return f"<section><h2>Return rate by ring</h2><p>{_escaped(sentence[0].upper() + sentence[1:])}.</p></section>"
     rates = {name: scans.return_rate.mean(axis=1) for name, scans in zip(("samples", "reference"), both, strict=True)}
     count = len(rates["samples"])
     chart = line_chart(rates, "ring, 0 = the highest", "return rate", range(0, count, max(1, count // 8)))

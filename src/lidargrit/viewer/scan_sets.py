@@ -130,7 +130,7 @@ def _of_scans(
     source: DatasetSource, count: int, sensor: SensorModel | None, config: DataConfig, reporter: Reporter
 ) -> ScanSet:
     dataset, imaging = source.scans(), source.imaging(sensor, config)
-    imaging.tell(reporter)
+    imaging.report(reporter)
     sensor, config = imaging.sensor, imaging.config
     images, names, labels = [], [], []
     for index in evenly_spaced(count, len(dataset)):
@@ -146,8 +146,8 @@ def _of_scans(
         labels.append(_label_of_pixels(scan, images[-1], config))
     if not images:
         raise DataError(f"no usable scan in {source.text}", "at least one", "see the messages above")
-    known = [label for label in labels if label is not None]
-    label = torch.stack(known) if len(known) == len(images) else None
+    labelled = [label for label in labels if label is not None]
+    label = torch.stack(labelled) if len(labelled) == len(images) else None
     return ScanSet(source.text, RangeImage.stack(images), tuple(names), label)
 
 

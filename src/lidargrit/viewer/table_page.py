@@ -95,23 +95,23 @@ def _score(score: dict[str, Any] | None) -> str:
     if score is None or score["value"] is None:
         return '<td data-value="">-</td>'
     interval = score["interval"]
-    told = f"[{format_value(interval['low'])}, {format_value(interval['high'])}]" if interval else ""
+    limits = f"[{format_value(interval['low'])}, {format_value(interval['high'])}]" if interval else ""
     value = float(score["value"])
-    return f'<td class="number" data-value="{value!r}">{format_value(value)} <small>{told}</small></td>'
+    return f'<td class="number" data-value="{value!r}">{format_value(value)} <small>{limits}</small></td>'
 
 
 def _number(value: int | float | None) -> str:
     if value is None or not math.isfinite(value):
         return '<td data-value="">-</td>'
-    told = f"{value:,}" if isinstance(value, int) and value < 1e9 else f"{value:.3g}"
-    return f'<td class="number" data-value="{value!r}">{told}</td>'
+    text = f"{value:,}" if isinstance(value, int) and value < 1e9 else f"{value:.3g}"
+    return f'<td class="number" data-value="{value!r}">{text}</td>'
 
 
 def _real_against_real(cells: Sequence[dict[str, Any]], columns: Sequence[tuple[str, str]]) -> str:
-    known = {}
+    values = {}
     for score in (score for cell in cells for score in cell["scores"]["scores"]):
         real = score["real_against_real"] if "real_against_real" in score else score["floor"]  # its name before
         if real is not None:
-            known[_column(score)] = real["value"]
-    told = [f'<td class="number">{format_value(known[column]) if column in known else ""}</td>' for column in columns]
-    return f'<tr><th scope="row">real against real</th>{"".join(told)}<td colspan="{len(_COSTS)}"></td></tr>'
+            values[_column(score)] = real["value"]
+    row = [f'<td class="number">{format_value(values[column]) if column in values else ""}</td>' for column in columns]
+    return f'<tr><th scope="row">real against real</th>{"".join(row)}<td colspan="{len(_COSTS)}"></td></tr>'

@@ -76,7 +76,7 @@ def frechet_distance(first: Moments, second: Moments) -> float:
     Source:
         Dowson and Landau, The Fréchet distance between multivariate normal distributions, 1982.
     """
-    roots = [side.root() for side in (first, second)]
+    roots = [statistics.root() for statistics in (first, second)]
     apart = float(np.square(first.mean - second.mean).sum())
     spread = sum(float(np.square(root).sum()) for root in roots)
     common = float(np.linalg.svd(roots[0] @ roots[1].T, compute_uv=False).sum()) if all(map(len, roots)) else 0.0

@@ -30,9 +30,9 @@ class KernelMetric(FeatureMetric[np.ndarray]):
         self, generated: Float32[np.ndarray, "n d"], real: Float32[np.ndarray, "m d"]
     ) -> tuple[float, dict[str, Any]]:
         """Return the distance; the details name the weights."""
-        sides = _in_order(generated), _in_order(real)
+        ordered = _in_order(generated), _in_order(real)
         exact = self.variant == "exact"
-        value = kernel_distance(*sides) if exact else subset_kernel_distance(*sides, self.seed)
+        value = kernel_distance(*ordered) if exact else subset_kernel_distance(*ordered, self.seed)
         return value, self.weights_details()
 
 
@@ -46,9 +46,9 @@ def kernel_distance(first: Float[np.ndarray, "n d"], second: Float[np.ndarray, "
     first, second = first.astype(np.float64), second.astype(np.float64)
     between = _kernel_sum(first, second) / (len(first) * len(second))
     within = (
-        (_kernel_sum(side, side) - float(_cubic(np.square(side).sum(axis=1), side).sum()))
-        / (len(side) * (len(side) - 1))
-        for side in (first, second)
+        (_kernel_sum(features, features) - float(_cubic(np.square(features).sum(axis=1), features).sum()))
+        / (len(features) * (len(features) - 1))
+        for features in (first, second)
     )
     return sum(within) - 2 * between
 
@@ -70,7 +70,7 @@ def subset_kernel_distance(
         return kernel_distance(first, second)  # every subset is the whole set
     rng = np.random.default_rng(seed)
     distances = (
-        kernel_distance(*(side[rng.choice(len(side), size, replace=False)] for side in (first, second)))
+        kernel_distance(*(features[rng.choice(len(features), size, replace=False)] for features in (first, second)))
         for _ in range(subsets)
     )
     return sum(distances) / subsets

@@ -48,15 +48,15 @@ class Houses:
     wall_albedo: Float[np.ndarray, " n"]
     plain: np.ndarray
 
-    def nearest_approach_m(self, plan: StreetPlan, places_m: Num[np.ndarray, "p _"]) -> Float[np.ndarray, " p"]:
+    def nearest_approach_m(self, plan: StreetPlan, points_m: Num[np.ndarray, "p _"]) -> Float[np.ndarray, " p"]:
         """Return how near our car comes to places; those that houses hide from it count as far."""
-        away = plan.nearest_approach_m(places_m)
+        away = plan.nearest_approach_m(points_m)
         hides = np.flatnonzero((plan.nearest_approach_m(self.poses.xyz_m) < _OCCLUDERS_TO_M) & ~self.plain)
         beside = np.flatnonzero((away > 12.0) & (away < _HIDDEN_M))
         from_x, from_y = self._into(
             hides, plan.viewpoints_m
         )  # (houses, eyes): lines of sight in the frame of each house
-        to_x, to_y = self._into(hides, places_m[beside, :2])
+        to_x, to_y = self._into(hides, points_m[beside, :2])
         spans = []
         with np.errstate(divide="ignore", invalid="ignore"):  # a line along a wall counts as free
             for start, end, size in ((from_x, to_x, self.length_m), (from_y, to_y, self.depth_m)):
@@ -68,9 +68,9 @@ class Houses:
         away[beside[blocked.any(axis=0).all(axis=-1)]] = _HIDDEN_M
         return away
 
-    def _into(self, which: np.ndarray, places_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _into(self, which: np.ndarray, points_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return x and y of places (p, 2) in the frames of some houses (h, p)."""
-        x, y = (places_m[:, axis] - self.poses.xyz_m[which, axis, None] for axis in (0, 1))
+        x, y = (points_m[:, axis] - self.poses.xyz_m[which, axis, None] for axis in (0, 1))
         cos, sin = np.cos(self.poses.yaw_rad[which, None]), np.sin(self.poses.yaw_rad[which, None])
         return (cos * x + sin * y).astype(np.float32), (cos * y - sin * x).astype(np.float32)
 

@@ -74,16 +74,16 @@ def add_greenery(builder: MeshBuilder, rng: np.random.Generator, plan: StreetPla
     u, v = _clear_of_bridge(plan, *np.concatenate(trees).T)
     plants.add_trees(builder, rng, plan, town.houses, u, v, size=rng.uniform(0.7, 1.15), rise_m=plan.level_m[1])
     count = rng.poisson({"city": 60, "suburb": 230, "country": 50}[plan.theme] * green)
-    places = [np.column_stack((rng.normal(0, 30, count), rng.normal(0, 13, count))), *_parks(rng, town)]
-    u, v = _clear_of_bridge(plan, *_plantable(plan, town, np.concatenate(places), 1.0).T)
+    points = [np.column_stack((rng.normal(0, 30, count), rng.normal(0, 13, count))), *_parks(rng, town)]
+    u, v = _clear_of_bridge(plan, *_plantable(plan, town, np.concatenate(points), 1.0).T)
     plants.add_bushes(builder, rng, plan, town.houses, u, v, plan.level_m[1])
 
 
-def _plantable(plan: StreetPlan, town: Settlement, places: np.ndarray, spare_m: float) -> np.ndarray:
+def _plantable(plan: StreetPlan, town: Settlement, points: np.ndarray, spare_m: float) -> np.ndarray:
     """Return the places (n, 2) that lie off roads and houses, and not beyond what the sensor sees."""
-    u, v = places.T
+    u, v = points.T
     keep = _off_road(plan, u, v, spare_m) & ~town.covers(u, v, 0.5 * spare_m) & (np.hypot(u, v) < 115)
-    return places[keep]
+    return points[keep]
 
 
 def _parks(rng: np.random.Generator, town: Settlement) -> list[np.ndarray]:
@@ -159,9 +159,9 @@ def add_furniture(builder: MeshBuilder, rng: np.random.Generator, plan: StreetPl
             posts = _beside(plan, np.arange(first, first + rng.uniform(6, 25), 2.0), side * (edge + 0.35), 0.0)
             street_furniture.add_bollards(builder, rng, plan, posts[:, 0], posts[:, 1])
     adding = (street_furniture.add_lamps, street_furniture.add_signs, street_furniture.add_bins)
-    for add, places in zip(adding, (lamps, signs, bins), strict=True):
-        if places:
-            u, v, turn = np.concatenate(places).T
+    for add, poses in zip(adding, (lamps, signs, bins), strict=True):
+        if poses:
+            u, v, turn = np.concatenate(poses).T
             add(builder, rng, plan.poses(u, v, turn, rise_m=plan.level_m[0]))
 
 
@@ -251,11 +251,11 @@ def traffic(rng: np.random.Generator, plan: StreetPlan, town: Settlement) -> lis
     away = np.append(
         town.houses.nearest_approach_m(plan, plan.ground_points(resting.u_m, resting.v_m)), _nearest_m(plan, going)
     )
-    herds = make_vehicles(rng, kinds, placements, 1, away)
+    groups = make_vehicles(rng, kinds, placements, 1, away)
     following = len(placements) + 1
     walkers = _walkers(rng, plan)
     if len(walkers):
-        herds.append(make_walkers(rng, walkers, following))
+        groups.append(make_walkers(rng, walkers, following))
     following += len(walkers)
     count = rng.poisson(_CYCLISTS[plan.theme])
     side = rng.choice([-1, 1], count)
@@ -267,16 +267,16 @@ def traffic(rng: np.random.Generator, plan: StreetPlan, town: Settlement) -> lis
         away
     )
     if len(riders):
-        herds.append(make_cyclists(rng, riders, following))
+        groups.append(make_cyclists(rng, riders, following))
     following += len(riders)
     count = rng.poisson(1.2) if plan.theme != "country" else 0
-    place = rng.choice([-1, 1], count)
-    v = np.where(place > 0, plan.front(1) - 0.5, plan.front(-1) + 0.5)
+    side = rng.choice([-1, 1], count)
+    v = np.where(side > 0, plan.front(1) - 0.5, plan.front(-1) + 0.5)
     bicycles = Placements.of(rng.uniform(-40, 40, count), v, rng.normal(0, 0.3, count), rise_m=plan.level_m[1])
     clear = plan.in_side_street(bicycles.u_m, bicycles.v_m, 2.0) < 0
     if clear.any():
-        herds.append(make_cyclists(rng, bicycles.select(clear), following, ridden=False))
-    return herds
+        groups.append(make_cyclists(rng, bicycles.select(clear), following, ridden=False))
+    return groups
 
 
 def _nearest_m(plan: StreetPlan, going: Placements) -> np.ndarray:

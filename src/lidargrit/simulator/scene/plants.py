@@ -15,7 +15,7 @@ _LIMBS_TO_M = 30.0  # limbs farther away are thinner than a beam, and lost in le
 _BLOBS = 7  # round tufts that make up a crown
 
 
-def _places_in_tuft(count: int = 4096) -> np.ndarray:
+def _points_in_tuft(count: int = 4096) -> np.ndarray:
     """Return positions in a ball, denser at its surface, from which those of all leaves are sampled."""
     rng = np.random.default_rng(0)
     way = rng.normal(size=(count, 3))
@@ -23,7 +23,7 @@ def _places_in_tuft(count: int = 4096) -> np.ndarray:
     return (way * 0.42 * rng.random((count, 1)) ** 0.45).astype(np.float32)
 
 
-_TUFT = _places_in_tuft()
+_TUFT = _points_in_tuft()
 
 
 def _leaf_m(away_m: np.ndarray) -> np.ndarray:
@@ -148,12 +148,15 @@ def add_hedges(
     side = np.where(axis == 2, 0.5, np.where(inside[np.arange(len(home)), axis] > 0, 0.5, -0.5))
     deep = 0.12 * rng.random(len(home)) / size[home, axis]
     inside[np.arange(len(home)), axis] = side - np.sign(side) * deep
-    place = middle[home] + inside * size[home]
+    at_m = middle[home] + inside * size[home]
     corners = plan.ground_points(
         np.stack((low_u, high_u, low_u, high_u), axis=1), np.stack((low_v, low_v, high_v, high_v), axis=1)
     )
-    du, dv = (place[:, 0] - low_u[home]) / (high_u - low_u)[home], (place[:, 1] - low_v[home]) / (high_v - low_v)[home]
+    du, dv = (
+        (at_m[:, 0] - low_u[home]) / (high_u - low_u)[home],
+        (at_m[:, 1] - low_v[home]) / (high_v - low_v)[home],
+    )
     shares = np.stack(((1 - du) * (1 - dv), du * (1 - dv), (1 - du) * dv, du * dv), axis=1)
     centre = np.einsum("nk,nkc->nc", shares, corners[home])  # hedges are straight: no need to bend every leaf
-    centre[:, 2] += place[:, 2] + rise_m
+    centre[:, 2] += at_m[:, 2] + rise_m
     builder.add(leaves(centre, leaf[home]), materials.LEAVES, green[home], labels.VEGETATION)

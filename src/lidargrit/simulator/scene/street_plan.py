@@ -124,9 +124,9 @@ class StreetPlan:
         u = np.linspace(0.0, way, 1 + int(np.ceil(way / _VIEWPOINT_SPACING_M)))
         object.__setattr__(self, "viewpoints_m", self._flat(u, np.full(len(u), self.our_v_m)))
 
-    def nearest_approach_m(self, places_m: Num[np.ndarray, "n _"]) -> Float[np.ndarray, " n"]:
+    def nearest_approach_m(self, points_m: Num[np.ndarray, "n _"]) -> Float[np.ndarray, " n"]:
         """Return how near our car comes to places in the first seconds; one figure for all frames of a street."""
-        apart = places_m[:, :2] - self.viewpoints_m[:, None]
+        apart = points_m[:, :2] - self.viewpoints_m[:, None]
         return np.sqrt((apart[..., 0] ** 2 + apart[..., 1] ** 2).min(axis=0))
 
     def edge(self, side: int) -> float:
@@ -208,9 +208,9 @@ class StreetPlan:
                 u = u + street.skew * reach * np.exp(-(((np.asarray(u_m) - street.u_m) / _SKEW_WIDTH_M) ** 2))
         knots = self.line
         step = knots[1, 0] - knots[0, 0]
-        place = np.clip((u - knots[0, 0]) / step, 0, len(knots) - 1.001)
-        left = place.astype(np.intp)
-        share = (place - left)[..., None]
+        position = np.clip((u - knots[0, 0]) / step, 0, len(knots) - 1.001)
+        left = position.astype(np.intp)
+        share = (position - left)[..., None]
         near = knots[left]
         both = near + (knots[left + 1] - near) * share
         tangent = both[..., 3:]

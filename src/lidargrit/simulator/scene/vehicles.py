@@ -69,7 +69,7 @@ def make_vehicles(
     seats, metal = rng.uniform(0.03, 0.12, (count, 1)), rng.uniform(0.1, 0.4, (count, 1))
     instance = np.arange(first_instance, first_instance + count, dtype=np.int32)
     label = np.where(placements.speed_m_s != 0, _MOVING[kinds], _LABELS[kinds])
-    herds = []
+    groups = []
     for far in (False, True):
         some = np.flatnonzero((away_m > _DETAIL_TO_M) == far)
         if not len(some):
@@ -83,15 +83,15 @@ def make_vehicles(
             (_inside(kind, long, wide, tall, far), materials.CLOTH, seats[some]),
             (_rims(kind, long, wide, tall, far), materials.METAL, metal[some]),
         ]
-        herds.append(_object_batch(parts, label[some], instance[some], placements.select(some)))
+        groups.append(_object_batch(parts, label[some], instance[some], placements.select(some)))
     trucks = np.flatnonzero(kinds == TRUCK)
     if len(trucks):
         high = np.maximum(height[trucks] * rng.uniform(1.05, 1.45, len(trucks)), 2.6)
         half, nose = width[trucks] / 2 + 0.06, length[trucks] / 2
         cargo = boxes(rows_of(-nose, -half, 0.9), rows_of(nose - 0.26 * length[trucks], half, high))
         part = (cargo, materials.PAINT, rng.uniform(0.1, 0.5, (len(trucks), 1)))
-        herds.append(_object_batch([part], label[trucks], instance[trucks], placements.select(trucks)))
-    return herds
+        groups.append(_object_batch([part], label[trucks], instance[trucks], placements.select(trucks)))
+    return groups
 
 
 def _object_batch(parts: list[tuple], label: np.ndarray, instance: np.ndarray, placements: Placements) -> ObjectBatch:
@@ -141,8 +141,8 @@ def _body(
     glass = np.zeros((count, 13, 12), bool)
     glass[:, _WINDSCREEN, 4:7] = True
     glass[:, _REAR_SCREEN, 4:7] = (kinds < VAN)[:, None]
-    for place in _SIDE_PANES:
-        glass[:, place, 3:8:4] = ((kinds < VAN) | (place < 7))[:, None]
+    for pane in _SIDE_PANES:
+        glass[:, pane, 3:8:4] = ((kinds < VAN) | (pane < 7))[:, None]
     if far:
         rings = rings[:, _FAR_SECTIONS]
         glass = glass[:, _FAR_SECTIONS[:-1]][:, :, _FAR_FACES]

@@ -127,8 +127,8 @@ def read_tensor(path: Path) -> Tensor:
         if not tensor.is_floating_point():
             raise TypeError(f"numbers of type {tensor.dtype}")
     except Exception as error:  # damaged bytes make torch raise many kinds, for one cause
-        told = str(error).partition("\n")[0][:120]
-        raise ScanError(f"{path}, which cannot be used ({type(error).__name__}: {told})", wanted, cure) from None
+        reason = str(error).partition("\n")[0][:120]
+        raise ScanError(f"{path}, which cannot be used ({type(error).__name__}: {reason})", wanted, cure) from None
     return tensor.float()
 
 
@@ -139,24 +139,24 @@ class _Tensors:
         self._format, self._last = form, (Path(), torch.empty(0))
         first = self._tensor(paths[0])
         self.sensor = self._sensor(first, paths[0])
-        self._places: list[tuple[Path, int | None]] = []
+        self._scans: list[tuple[Path, int | None]] = []
         for path in paths:
             if first.ndim == 3:
-                self._places.append((path, None))
+                self._scans.append((path, None))
             else:
-                self._places += [(path, index) for index in range(len(self._tensor(path)))][:_SCANS_AT_MOST]
-            if count and len(self._places) >= count:
+                self._scans += [(path, index) for index in range(len(self._tensor(path)))][:_SCANS_AT_MOST]
+            if count and len(self._scans) >= count:
                 break
-        self._places = self._places[:count]
-        self.provenance = Provenance(tuple(f"{path} {index or 0}" for path, index in self._places))
+        self._scans = self._scans[:count]
+        self.provenance = Provenance(tuple(f"{path} {index or 0}" for path, index in self._scans))
 
     def __len__(self) -> int:
-        return len(self._places)
+        return len(self._scans)
 
     def read(self, index: int) -> Pixels:
-        path, place = self._places[index]
+        path, index_in_file = self._scans[index]
         tensor = self._tensor(path)
-        scan = tensor if place is None else tensor[place]
+        scan = tensor if index_in_file is None else tensor[index_in_file]
         if tuple(scan.shape) != (self._format.channels, self.sensor.height, self.sensor.width):
             wanted = f"{self._format.channels}x{self.sensor.height}x{self.sensor.width}, as the first"
             raise ScanError(f"a tensor of {tuple(scan.shape)} in {path}", wanted, "remove the file")
