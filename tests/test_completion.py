@@ -1,4 +1,4 @@
-"""Scans that are completed, upsampled and dropped on the command line, by classical ways and by a small model."""
+"""Scans that are completed, upsampled and dropped on the command line, by classical methods and by a small model."""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""LiDAR scans in, tokens between, new scans out."""
+"""LiDAR scans → tokens → new scans."""
 
 from __future__ import annotations
 

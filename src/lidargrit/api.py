@@ -47,7 +47,8 @@ def evaluate(
         max_scans: largest number of scans of each set; 0 for the protocol's.
 
     Returns:
-        scores with their intervals, beside them those of real scans against real scans; ``print(card.as_table())``, or
+        scores with intervals and, beside them, the scores of real scans against real scans; ``print(card.as_table())``,
+            or
         each of ``card.scores``.
     """
     settings = EvalConfig(protocol=protocol, metrics=tuple(metrics), max_scans=max_scans)

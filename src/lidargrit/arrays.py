@@ -22,7 +22,7 @@ def parse_array(data: bytes) -> np.ndarray:
     """Return the array in the bytes of an .npy file; it shares their memory.
 
     Args:
-        data: whole .npy file.
+        data: content of a whole .npy file.
 
     Raises:
         ValueError: a damaged header, other than numbers or truth values, or fewer bytes than the shape needs.
@@ -55,7 +55,7 @@ def open_archive(file: BytesIO | BufferedReader) -> zipfile.ZipFile:
     """Open an .npz archive.
 
     Args:
-        file: archive from its first byte to its last.
+        file: archive (.npz) that is open for reading, from its first byte to its last.
 
     Raises:
         ValueError: it is no archive, or its directory is too large.
@@ -79,7 +79,7 @@ def read_member(
     """Unpack one array of an archive.
 
     Args:
-        archive: opened by :func:`open_archive`.
+        archive: archive that :func:`open_archive` opened.
         info: directory entry of the array.
         bytes_at_most: largest size of the unpacked .npy, in bytes.
 
@@ -102,7 +102,7 @@ def read_arrays(
     """Read those arrays of an .npz that are wanted and there; the others are not unpacked.
 
     Args:
-        file: archive from its first byte to its last.
+        file: archive (.npz) that is open for reading, from its first byte to its last.
         names: names of the wanted arrays, without ``.npy``.
         bytes_at_most: largest size of each unpacked .npy, in bytes.
 

@@ -1,4 +1,4 @@
-"""What there is to choose from: a kind such as "datasets" → every name of it, with what is known of each."""
+"""What a user can choose from: a kind such as "datasets" → all its names, with the facts of each."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ FORMER_KINDS = {"dialects": "sample-formats"}
 
 
 def entries(kind: str, in_full: bool = False) -> list[dict[str, Any]]:
-    """Return name and summary of all of a kind, as plain values.
+    """Return the name and the summary of every entry of a kind, as plain values.
 
     Args:
         kind: one of ``KINDS``.
-        in_full: also what their classes tell: licence, splits and leaks of data sets; endings of formats; size and
-            limits of sensors; abilities, origin, licences and choices of generators; direction, variants and weights of
-            metrics.
+        in_full: whether the facts of each class are added: licence, splits and leaks of data sets; endings of formats;
+            size and limits of sensors; capabilities, origin, licences and sampling settings of generators; direction,
+            variants and weights of metrics.
 
     Example:
         >>> entries("sensors")[0]["name"]
@@ -37,7 +37,7 @@ def entries(kind: str, in_full: bool = False) -> list[dict[str, Any]]:
 
 
 def lines(kind: str, entry: dict[str, Any]) -> list[str]:
-    """Return what :func:`entries` tells of one in full as lines for people; none for kinds that have only a summary."""
+    """Return the facts of one entry as lines for people; none for kinds that have only a summary."""
     if kind == "datasets":
         facts = [f"{name}: {entry[name]}" for name in ("layout", "sensor", "licence", "cite")]
         for number, scheme in enumerate(entry["schemes"]):

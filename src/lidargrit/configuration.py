@@ -84,7 +84,7 @@ def defaults(config: T) -> T:
 def override(config: T, settings: Iterable[str], owner: str = "this recipe", cure: str = "see all with --dry-run") -> T:
     """Return the configuration with settings of the form ``a.b=value`` changed.
 
-    A value is read as YAML. A list needs no brackets: ``data.train=/data/one,/data/two``.
+    Values are read as YAML. A list needs no brackets: ``data.train=/data/one,/data/two``.
 
     Args:
         config: configuration to change; it stays as it is, and a changed copy is returned.
@@ -185,7 +185,7 @@ def _plain(node: Any) -> Any:
 
 
 def _kind(node: Any) -> str:
-    """Return the name that JSON says of a configuration: none of the default kind."""
+    """Return the ``name`` of a configuration in JSON; "" for the default kind."""
     return node.name() if isinstance(node, NamedConfig) and node.name() != node.default_name else ""
 
 

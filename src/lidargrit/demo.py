@@ -1,4 +1,4 @@
-"""The main job from end to end: scans → range images → trained networks → new scans → scores → one page."""
+"""The whole pipeline: scans → range images → trained networks → new scans → scores → one page."""
 
 from __future__ import annotations
 
@@ -130,7 +130,8 @@ def write_results_page(
         seconds: time that each stage took, in seconds, by its name.
         facts: short sentences about the model and its training.
         folder: folder of the run.
-        packaged: scans sampled by the model in the package, to show what longer training gives; None for none.
+        packaged: scans sampled by the model in the package, which show what longer training gives; None to leave them
+            out.
     """
     tokenizer, held_out = generator.get_tokenizer(), val.batch(evenly_spaced(_SCANS_OF_A_SET, len(val)))
     new = samples.batch(range(min(_SCANS_OF_A_SET, len(samples))))
@@ -169,7 +170,7 @@ def _reconstructed(generator: Generator, images: RangeImage) -> RangeImage:
 
 
 def _packaged_samples(folder: Path, clock: _Clock, reporter: Reporter) -> RangeImages:
-    """Sample from the model in the package, to show what hours of training give."""
+    """Sample from the model in the package, which was trained for hours, for comparison."""
     with clock.stage(f"sample {_PACKAGED_SCANS} scans from the packaged model"):
         write_samples(load(PRETRAINED), PRETRAINED, folder, range(_PACKAGED_SCANS), reporter=reporter)
     return read_samples(folder, _PACKAGED_SCANS)
@@ -204,7 +205,7 @@ def divided(data: str, reporter: Reporter) -> DataConfig:
 
 
 def _expected_s(recipe: Recipe, simulates: bool) -> dict[str, float]:
-    """Return how long each long piece of the demo takes on two cores, in seconds."""
+    """Return the expected time of each long step of the demo on two cores, in seconds."""
     training_s = {f"training {name}": fit.scans * _TRAINED_S.get(name, 0.2) for name, fit in recipe.training.items()}
     return {
         "projecting scans": _SIMULATED_S if simulates else _READ_S,

@@ -24,7 +24,7 @@ _SURELY_MEANT = 0.85  # of difflib's likeness: one letter wrong, missing or doub
 
 
 class LidarGritError(ValueError):
-    """A user's mistake, told in one line: what was got, what was wanted, the cure.
+    """A user's mistake, printed in one line: what was got, what was wanted, the cure.
 
     Parts may quote names of files and other foreign text, which :func:`one_line` makes safe to print.
     """
@@ -38,7 +38,7 @@ class LidarGritError(ValueError):
 
 
 class UsageError(LidarGritError):
-    """The words of a command are not such as it knows."""
+    """The words of a command are unknown or do not fit each other."""
 
 
 class ScanError(LidarGritError):
@@ -62,7 +62,7 @@ class CheckpointError(LidarGritError):
 
 
 class WeightsError(LidarGritError):
-    """Published weights of a network are not to be had, or not what they should be."""
+    """Published weights of a network cannot be found, or are not the right ones."""
 
 
 class OutputError(LidarGritError):
@@ -103,7 +103,7 @@ def without_folders(text: str) -> str:
 
 
 def nearest_names(name: str, known: Iterable[str], at_most: int = 3) -> str:
-    """Name the known names that look most like one, for a message: "a, b or c"; one alone where it surely was meant.
+    """Return the known names most like a given one, for a message: "a, b or c"; only one if it is clearly meant.
 
     Example:
         >>> nearest_names("bev_msd", ["bev_mmd", "bev_jsd", "coverage"])

@@ -81,7 +81,7 @@ def export_scans(
 
 
 def kinds() -> list[str]:
-    """Return what a user may ask for: the formats that can be written, and the tree."""
+    """Return the names that a user may choose: the formats that can be written, and the KITTI tree."""
     return [*(name for name in _discovery.names("formats") if formats.load(name).can_write()), TREE]
 
 
@@ -100,7 +100,7 @@ class _OfDataset:
         return self.dataset.name(self.indices[index])
 
     def identity(self, index: int) -> str:
-        """Return what tells it from every other scan that could be in its file."""
+        """Return what identifies the scan, so that another scan is not taken for it."""
         return self.name(index)
 
     def scan(self, index: int) -> Scan:

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, and folders that belong to one owner: bytes, arrays, tensors → disk."""
+"""Atomic files, and folders that one process holds: text, JSON, tensors → disk."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def claim_folder(folder: Path, shared: bool = False) -> Iterator[None]:
-    """Hold a folder of results while a command writes into it; at the end no partial file is left below it.
+    """Lock a folder of results while a command writes into it; at the end no partial file is left below it.
 
     Args:
         folder: folder of results; made if it is missing.
@@ -193,7 +193,7 @@ def _sweep(hidden: Path) -> None:
 
 
 def is_taken(folder: Path) -> bool:
-    """Tell whether a folder holds anything but partial files, or is no folder at all."""
+    """Return whether a folder holds anything but partial files, or is no folder at all."""
     if not folder.is_dir():
         return folder.exists()
     return any(not is_partial(path.name) for path in folder.iterdir())

@@ -1,4 +1,4 @@
-"""Processes that share work: which of them this one is, and how to start one that runs no file of strangers.
+"""Processes that share work: rank and world size; starting processes that import nothing from the current folder.
 
 ``python -m`` and multiprocessing put the current folder first on the import path of what they start. A file ``json.py``
 that lies among somebody's downloads would then run in place of Python's own module, with the user's rights.

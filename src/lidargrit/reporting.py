@@ -1,4 +1,4 @@
-"""How long work speaks to a person: nothing by default, a progress bar and messages on a terminal."""
+"""Progress and messages of long work: silent by default, a progress bar on a terminal, lines in a log file."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ class Progress:
     """One piece of long work; this one is silent."""
 
     def advance(self, amount: int, note: str = "") -> None:
-        """Say that ``amount`` more is done, with a short note such as the loss."""
+        """Report that ``amount`` more is done, with a short note such as the loss."""
 
 
 class Reporter:
-    """Tells of long work; this one is silent, as a library is."""
+    """Receiver of progress and messages; this one is silent, as a library should be."""
 
     def message(self, text: str) -> None:
         """Say one line."""
@@ -46,7 +46,7 @@ class Reporter:
 
 
 class Schedule:
-    """Several pieces of work in a row: how long they will still take together.
+    """Estimates the time left for several pieces of work in a row.
 
     The pace of the work so far, its seconds over the expected ones, is taken to be the pace of the rest. A piece that
     never began although a later one has is taken to be done, as where its results were there already.
@@ -88,7 +88,7 @@ class Schedule:
 
 
 class TerminalReporter(Reporter):
-    """Speaks on standard error: bars on a terminal, a line every few seconds in a log file."""
+    """Writes to standard error: bars on a terminal, a line every few seconds in a log file."""
 
     def __init__(self) -> None:
         from rich.console import Console  # noqa: PLC0415  only the command line needs it

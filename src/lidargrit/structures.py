@@ -215,14 +215,14 @@ class TokenGrid:
 
 @dataclass(frozen=True, eq=False)
 class Decoded:
-    """What a decoder tells of every pixel of a batch of scans, before it is decided which beams return.
+    """Output of a decoder for every pixel of a batch of scans, before returns are sampled.
 
     Args:
         range_m: range of the surface that the beam meets, in metres, whether or not it returns.
         return_logits: logits of the probability that the beam returns.
         sensor: sensor whose rays the pixels are.
         reflectance: reflectance of that surface, in [0, 1]; None from a decoder without reflectance.
-        features: feature maps of the decoder, for networks that decode further; None if it gives none.
+        features: feature maps of the decoder, for networks that refine its output; None if it gives none.
     """
 
     range_m: Float[Tensor, "B H W"]
@@ -250,15 +250,18 @@ class Decoded:
 
 @dataclass(frozen=True, eq=False)
 class ScanBits:
-    """How many bits name each scan of a batch, by a model's probabilities: -log2 of the likelihood, in its parts.
+    """Negative log-likelihood of each scan of a batch in bits, by parts.
 
     Args:
         step_mm: step in millimetres that ranges are rounded to.
         return_mask: returns of the scans.
         tokens: bits of each token, given those before it.
-        mask: bits of the return or ray drop of each pixel, given the tokens; None from a model without its probability.
-        range: bits of the range of each pixel, 0 where there is no return, given tokens and mask; None likewise.
-        expected: bits that mask and range of each pixel take on average, given all before; None if not asked for.
+        mask: bits of the return or ray drop of each pixel, given the tokens; None from a model that has no such
+            probability.
+        range: bits of the range of each pixel, given tokens and mask, 0 where there is no return; None from a model
+            that has no such probability.
+        expected: expected bits of mask and range of each pixel (the entropy), given all that comes before it; None if
+            not asked for.
     """
 
     step_mm: int
@@ -292,7 +295,7 @@ class ScanBits:
         return bits
 
     def surprise(self) -> Float[Tensor, "B H W"]:
-        """Return by how many bits mask and range of each pixel exceed what was expected: 0 on average, if all is usual.
+        """Return by how many bits each pixel's mask and range exceed their expected bits; 0 on average for usual scans.
 
         Raises:
             ConfigError: the expected bits were not asked for, or the model does not tell them.
@@ -308,11 +311,11 @@ class ScanBits:
 
 @dataclass(frozen=True)
 class MetricResult:
-    """A number with everything needed to read it.
+    """The value of a metric, with what is needed to read it.
 
     Args:
         metric: name of the metric.
-        value: the number, in the metric's unit.
+        value: value of the metric, in its unit.
         higher_is_better: whether a larger value is better.
         num_generated: number of generated scans.
         num_reference: number of real scans.

@@ -1,4 +1,4 @@
-"""Words and JSON that others wrote → values of bounded size, or one line that says what is wrong.
+"""Untrusted words and JSON → values of bounded size, or an error of one line.
 
 All bounds of what a command line, a JSON file or a message may ask for stand here; those of arrays in ``arrays.py``.
 """

@@ -48,7 +48,7 @@ _CONTINUED = frozenset(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one verb; 0 = done, 2 = the user's mistake, told in one line, 130 = interrupted, 143 = terminated."""
+    """Run one verb; 0 = done, 2 = the user's mistake, printed in one line, 130 = interrupted, 143 = terminated."""
     _let_threads_sleep()
     words = [*(sys.argv[1:] if arguments is None else arguments)]  # list() here is our own verb
     parser = build_parser()
@@ -82,15 +82,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _what_follows(verb: str) -> str:
-    """Return what the same command does after it was stopped."""
+    """Say what the same command does when it is run again after an interruption."""
     return "the same command goes on" if verb in _CONTINUED else "the same command begins anew"
 
 
 def _let_threads_sleep() -> None:
     """Have torch's threads sleep while they wait for one another, unless the user has set how they wait.
 
-    OpenMP lets them spin: beside a busy process each then takes the processor from the thread that it waits for, and
-    sampling takes ten times as long. The variables are read once, when torch is loaded.
+    OpenMP lets them spin by default. Beside a busy process, each spinning thread takes the processor from the thread
+    that it waits for, and sampling takes ten times as long. The variables are read once, when torch is loaded.
     """
     if "torch" not in sys.modules and not {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"} & os.environ.keys():
         os.environ.update(OMP_WAIT_POLICY="PASSIVE", GOMP_SPINCOUNT="0")
@@ -117,7 +117,7 @@ def build_parser() -> Parser:
 
 
 def _parsed(parser: Parser, words: list[str]) -> argparse.Namespace:
-    """Return the options that words mean, or raise UsageError."""
+    """Parse the words of a command, or raise UsageError."""
     options, too_many = parser.parse_known_args(words)
     if too_many:
         (options.words if options.verb else parser).refuse(too_many[0])
@@ -144,7 +144,7 @@ def _raising_on_termination() -> Iterator[None]:
 
 @contextmanager
 def _refusing_unusable_paths() -> Iterator[None]:
-    """Tell in one line of a path that the system refuses, whoever was first to open it."""
+    """Turn the system's refusal of a path into an error of one line, wherever the path was opened."""
     try:
         yield
     except OSError as error:

@@ -34,7 +34,7 @@ def add_bad_scans(parser: argparse.ArgumentParser, default: str | None = "refuse
 
 
 def add_scans(parser: argparse.ArgumentParser, *variant_aliases: str) -> None:
-    """Add what all verbs that read and project scans share; :func:`scan_settings` reads it.
+    """Add the options of all verbs that read and project scans; :func:`scan_settings` reads them.
 
     Args:
         parser: parser of the verb.
@@ -51,11 +51,11 @@ def add_scans(parser: argparse.ArgumentParser, *variant_aliases: str) -> None:
 
 
 def scan_settings(options: argparse.Namespace, **more: int | None) -> ScanSettings:
-    """Return what the user said of reading scans.
+    """Return the settings of reading scans that the user gave.
 
     Args:
-        options: words of the user, as :func:`add_scans` has them.
-        more: further settings of :class:`DataConfig` that are options of the verb; None for those not given.
+        options: parsed options of a verb to which :func:`add_scans` was applied.
+        more: further settings of :class:`DataConfig` that the verb has options for; None for those not given.
     """
     from lidargrit.loading.config import ScanSettings
 
@@ -76,7 +76,7 @@ def add_projection_variant(parser: argparse.ArgumentParser, *aliases: str, defau
 
 
 def add_rank(parser: argparse.ArgumentParser, what: str) -> None:
-    """Add ``--rank`` and ``--world-size`` of ``what`` shares the work: process or machine."""
+    """Add ``--rank`` and ``--world-size``, for work that several processes or machines (``what``) share."""
     rank = f"number of this {what}, from 0, if several share the work (default: $RANK, or 0)"
     parser.add_argument("--rank", type=int, help=rank)
     size = "how many share the work (default: $WORLD_SIZE, or 1); torchrun sets both"
@@ -90,7 +90,7 @@ def add_device(parser: argparse.ArgumentParser) -> None:
 
 
 def add_completion(parser: argparse.ArgumentParser, model: str) -> None:
-    """Add what the verbs that complete scans share: where from, where to, by which ``model``, how many, which files."""
+    """Add the options of all verbs that complete scans: source, folder, ``model``, number and kind of files."""
     scans = "scans: a file, a folder, NAME:ROOT:SPLIT, samples, prepared scans, or range images as .npy"
     parser.add_argument("scans", help=scans)
     parser.add_argument("out", type=Path, help="folder for the files: empty, or begun by the same command")

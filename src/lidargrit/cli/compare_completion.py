@@ -1,4 +1,4 @@
-"""Hide parts of whole scans, complete them by models and by classical ways, and measure how near they come."""
+"""Compare completions: hide parts of whole scans, fill them in by models and classical methods, and measure errors."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     each = "number of completions of each scan by a model that is random"
     parser.add_argument("--completions", type=int, default=2, help=each)
     parser.add_argument("--seed", type=seed_number, default=0, help="seed of the completions and of random pixels")
-    parser.add_argument("--sensor", default="", help="sensor of the scans, if only classical ways are compared")
+    parser.add_argument("--sensor", default="", help="sensor of the scans, if only classical methods are compared")
     add_bad_scans(parser)
     add_device(parser)
     add_json(parser)

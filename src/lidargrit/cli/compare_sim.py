@@ -1,4 +1,4 @@
-"""Measure how near simulated scans come to real ones: raydrop, ranges and reflectance, with a picture."""
+"""Compare simulated with real scans: raydrop, ranges and reflectance, with a picture of the curves."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     observed = "what is kept: returns, rows:N (every N-th), sector:A,B (degrees from A counter-clockwise to B, 0 is "
     observed += "ahead), pixels:SHARE (a random share), or an .npy of truth values, one for each pixel"
     parser.add_argument("--observed", default="returns", help=observed)
-    sensor = "sensor of the scans, for a classical way (default: the source's); a run has its own"
+    sensor = "sensor of the scans, for a classical method (default: the source's); a run has its own"
     parser.add_argument("--sensor", default="", help=sensor)
     add_completion(parser, "run that completes, or nearest, linear or triangulation")
     add_bad_scans(parser)

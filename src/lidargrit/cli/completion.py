@@ -1,4 +1,4 @@
-"""Print what makes a shell complete lidargrit's verbs, options and names: for bash, zsh or fish."""
+"""Print a script by which bash, zsh or fish completes lidargrit's verbs, options and names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Compress range images of scans to a few bits a return, lossless at a step of range, by a model's probabilities."""
+"""Compress range images to a few bits a return with a model, losslessly once ranges are rounded to a step."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Make a run of the weights that a system's authors published: their .pth files → a run folder."""
+"""Import the weights that a system's authors published: .pth files → a run folder."""
 
 from __future__ import annotations
 

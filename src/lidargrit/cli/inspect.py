@@ -1,4 +1,4 @@
-"""Say what a projection keeps of a scan, what it loses, and how far off it puts the rest."""
+"""Show which points a projection keeps, which it loses, and how far it moves those that it keeps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tell how many bits name scans by a model's probabilities: tokens, mask and ranges; the number to tune by."""
+"""Measure the likelihood of scans under a model, in bits: tokens, mask and ranges."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Write what of a run others need, with a model card, as the Hugging Face hub wants it; uploads nothing."""
+"""Write a folder for the Hugging Face hub: a run's weights and configuration, with a model card; uploads nothing."""
 
 from __future__ import annotations
 

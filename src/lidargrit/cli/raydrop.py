@@ -1,4 +1,4 @@
-"""Drop from clean simulated scans the returns that a real sensor would not get."""
+"""Add raydrop to clean simulated scans: drop the returns that a real sensor would not get."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Measure a table of the paper anew: prepare, train, sample, score, and set beside the published rows."""
+"""Reproduce a table of the paper: prepare, train, sample, score, and print it beside the published rows."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Reproduce, or tell the plan."""
+    """Reproduce the table, or print the plan."""
     from lidargrit.evaluation.benchmark import as_json
     from lidargrit.evaluation.reproduction import Reproduction, plan, plan_as_text, reproduce, table_of
     from lidargrit.reporting import TerminalReporter

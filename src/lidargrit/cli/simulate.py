@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Simulate, and say what lies where."""
+    """Simulate, and say where the files are."""
     from lidargrit.reporting import TerminalReporter
     from lidargrit.sensors import load_sensor
     from lidargrit.simulator.drives import DriveConfig, write_drives

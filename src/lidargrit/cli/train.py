@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Train, or tell the plan."""
+    """Train, or print the plan."""
     from lidargrit.errors import ConfigError
     from lidargrit.recipes import load_recipe
     from lidargrit.reporting import TerminalReporter

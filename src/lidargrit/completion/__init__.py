@@ -1,4 +1,4 @@
-"""What completes scans: the word of a run or of a classical way → one object that fills in what was not observed."""
+"""What completes scans: the name of a run or of a classical method → an object that generates unobserved pixels."""
 
 from __future__ import annotations
 
@@ -48,19 +48,19 @@ class Completer(ABC):
 
     @abstractmethod
     def takes(self) -> frozenset[ConditionKind]:
-        """Return the kinds of conditions that it takes."""
+        """Return the kinds of conditions that it accepts."""
 
     def learned_from(self) -> Provenance:
-        """Return the training scans; none of a classical way."""
+        """Return the training scans; none of a classical method."""
         return Provenance()
 
     @abstractmethod
     def identity(self) -> dict[str, Any]:
-        """Return, for a file, what tells its completions from those of another or of other settings."""
+        """Return entries for a file by which its completions are told from those of other models or settings."""
 
 
 class ClassicalCompleter(Completer):
-    """A way without a network; it completes scans of any sensor, always in the same way."""
+    """A method without a network; it completes scans of any sensor, always in the same way."""
 
     random = False
 
@@ -121,12 +121,12 @@ def open_completer(
     settings: Sequence[str] = (),
     device: str = "",
 ) -> Completer:
-    """Return what a user named to complete scans with.
+    """Return the model or the classical method that a user named.
 
     Args:
-        word: folder of a run, ``pretrained``, or a classical way: nearest, linear or triangulation.
+        word: folder of a run, ``pretrained``, or a classical method: nearest, linear or triangulation.
         kind: kind of the conditions that it will be given.
-        sensor: sensor of the scans, which a classical way needs; a run has its own.
+        sensor: sensor of the scans, which a classical method needs; a run has its own.
         settings: settings of the run's sampling, as NAME=VALUE.
         device: device of the run; a GPU if there is one and none is named.
 
@@ -162,11 +162,12 @@ def open_completer(
 
 
 def open_completers(words: Sequence[str], sensor: SensorModel | None = None, device: str = "") -> list[Completer]:
-    """Return several to be compared on the same scans: classical ways have the sensor of the first run among them.
+    """Return several models and methods for a comparison on the same scans; methods get the sensor of the first run.
 
     Args:
-        words: words of :func:`open_completer`; a run may bring settings, as in ``pretrained:completion=tokens``.
-        sensor: sensor of the scans; only needed where no run is among the words.
+        words: models and methods, each as in :func:`open_completer`; a run may bring settings, as in
+            ``pretrained:completion=tokens``.
+        sensor: sensor of the scans; needed only where there is no run among the words.
         device: device of the runs.
     """
     runs: dict[str, Completer] = {}
@@ -180,11 +181,11 @@ def open_completers(words: Sequence[str], sensor: SensorModel | None = None, dev
 
 
 def _with_settings(word: str) -> tuple[str, list[str]]:
-    """Return the run that a word names, and the settings that follow it after a colon, if any do."""
+    """Split a word into the name of a run and the settings after a colon, if there are any."""
     folder, colon, settings = word.rpartition(":")
     return (folder, settings.split(",")) if colon and "=" in settings else (word, [])
 
 
 def is_classical(word: str) -> bool:
-    """Tell whether a word names a classical way, and no folder that is called so."""
+    """Tell whether a word names a classical method, unless a folder has that name."""
     return word in FILLS and not Path(word).exists()

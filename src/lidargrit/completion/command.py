@@ -31,7 +31,7 @@ def complete_scans(
     Args:
         source: a file, a folder or another source of scans, samples, prepared scans, or range images as ``.npy``.
         out: an empty folder, or one that the same command began.
-        completer: model or classical way; see :func:`lidargrit.completion.open_completer`.
+        completer: model or classical method; see :func:`lidargrit.completion.open_completer`.
         pattern: choice of the observed pixels.
         output: number and kind of files.
         config: number of scans, and what to do with unusable points; nothing else of it is used.
@@ -94,7 +94,7 @@ def raydrop_scans(
     config: DataConfig | None = None,
     reporter: Reporter | None = None,
 ) -> int:
-    """Write clean scans, such as a simulator casts, with the returns dropped that the model's sensor would not get.
+    """Write clean scans, such as a simulator's, without the returns that the model's sensor would not get.
 
     Args:
         source, out, completer, output, config, reporter: the arguments of :func:`complete_scans`; the completer takes

@@ -31,16 +31,16 @@ _UNWRITABLE = ".npz"  # for scans whose own format cannot be written, and for ra
 
 @dataclass(frozen=True)
 class OutputConfig:
-    """How many completions are wanted, and as which files.
+    """Number and kind of the files that completions are written to.
 
     Args:
         count: number of completions of each scan.
-        seed: seed of the first completion; the next has the next.
-        format: name or ending of a format, or ``image`` for range images (H, W) in metres as ``.npy``; if empty, each
-            file is in the format of its scan where that can be written, and else ``.npz``.
-        skip_bad: whether a scan that cannot be used is left out, in place of ending the work.
-        probability: number of samples from which ``NAME.probability.npy`` tells each pixel's share of returns; 0 for
-            no such files.
+        seed: seed of the first completion of a scan; each further completion has the next seed.
+        format: name or ending of a format, or ``image`` for range images (H, W) in metres as ``.npy``. If empty, each
+            file has the format of its scan where that can be written, and ``.npz`` elsewhere.
+        skip_bad: whether a scan that cannot be used is left out; otherwise it ends the command.
+        probability: number of samples of the mask from which ``NAME.probability.npy`` gives each pixel's share of
+            returns; 0 for no such files.
     """
 
     count: int = 1
@@ -79,10 +79,10 @@ def write_completions(
     Args:
         inputs: scans of the user.
         out: an empty folder, or one that the same command began.
-        completer: model or classical way.
-        condition_of: function from a scan and a seed to what is taken as known of it.
+        completer: model or classical method.
+        condition_of: function that returns the condition for a scan and a seed.
         output: number and kind of files.
-        facts: further entries that tell these files from others, for ``completed.json``.
+        facts: further entries of ``completed.json``; a folder with other entries is refused.
         reporter: receiver of progress and messages.
 
     Returns:

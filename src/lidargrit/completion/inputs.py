@@ -39,7 +39,7 @@ class InputScan:
         image: range image (H, W).
         points: points of the scan; None where it was an image.
         point_of_pixel: index of the point that fills each pixel, -1 for none; None where it was an image.
-        on_grid: True for pixels that the scan tells anything about; all if None.
+        on_grid: True for pixels that the scan covers; None for all.
     """
 
     image: RangeImage
@@ -48,7 +48,8 @@ class InputScan:
     on_grid: Bool[Tensor, "H W"] | None = None
 
     def joined(self, completed: RangeImage, condition: Condition) -> Scan:
-        """Return the points of a completed scan: its own where ranges were observed, else on the rays of pixels.
+        """Return the points of a completed scan: its own where ranges were observed, elsewhere points on the pixels'
+        rays.
 
         Reflectance is kept where the whole completed scan has it.
         """
@@ -158,7 +159,7 @@ class ScanReader:
     Args:
         sensor: sensor of the image.
         variant: variant of the projection.
-        partial: whether a scan of a part of the circle will do.
+        partial: whether a scan of a part of the circle is accepted.
     """
 
     sensor: SensorModel

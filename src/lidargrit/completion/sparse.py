@@ -1,4 +1,4 @@
-"""Scans of a sensor with few rows → what they tell on the grid of a sensor with more rows."""
+"""Scans of a sensor with few rows → observed rows on the grid of a sensor with more rows."""
 
 from __future__ import annotations
 
@@ -84,6 +84,6 @@ class SparseReader(ScanReader):
 
 
 def observed_rows(scan: InputScan) -> Bool[Tensor, "H W"]:
-    """Return the pixels that a sparse scan tells about: all of its rows, with a return or without."""
+    """Return the pixels that a sparse scan covers: all of its rows, with a return or without."""
     assert scan.on_grid is not None
     return scan.on_grid

@@ -30,9 +30,9 @@ class Entry(NamedTuple):
 
     Args:
         name: name of the scan.
-        offset: index of its first byte in the file.
-        length: number of its bytes.
-        crc32: checksum of its bytes.
+        offset: position of the scan's first byte in the file.
+        length: number of bytes of the scan.
+        crc32: CRC-32 checksum of these bytes.
     """
 
     name: str

@@ -29,7 +29,7 @@ def range_coding() -> Any:
 
 
 class Coder(ABC):
-    """What coding and decoding share: both go through the same decisions, one knowing the outcome beforehand."""
+    """Base of encoder and decoder, which go through the same decisions; only the encoder knows the outcomes."""
 
     def __init__(self) -> None:
         stream = range_coding()
@@ -102,7 +102,7 @@ class Coder(ABC):
 
 
 class Encoder(Coder):
-    """Writes what is known."""
+    """Writes the outcomes of decisions."""
 
     def __init__(self) -> None:
         super().__init__()

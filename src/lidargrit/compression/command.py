@@ -30,7 +30,7 @@ IMAGE = "image"  # the word for range images as .npy
 
 @dataclass(frozen=True)
 class Compressed:
-    """What a file of compressed scans holds.
+    """Size and content of a file of compressed scans.
 
     Args:
         num_scans: number of scans.
@@ -44,7 +44,7 @@ class Compressed:
 
     @property
     def bits_per_return(self) -> float:
-        """Bits of the whole file by returns."""
+        """Bits of the whole file divided by the number of returns."""
         return 8 * self.num_bytes / max(self.num_returns, 1)
 
 

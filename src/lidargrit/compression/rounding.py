@@ -1,4 +1,4 @@
-"""What networks compute in 64 bits → integers that every machine gets, though its last bits differ."""
+"""64-bit outputs of networks → integers that are the same on every machine, although the last bits differ."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class Grid:
 
     Args:
         step: distance between two multiples, a power of 2.
-        margin: distance from a border within which another machine might round to the other side. Machines, numbers of
-            threads and libraries were seen to differ by a tenth of it or less.
+        margin: distance from a rounding border within which another machine might round to the other side. The
+            differences seen between machines, numbers of threads and libraries are a tenth of it or less.
     """
 
     step: float

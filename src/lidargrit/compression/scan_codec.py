@@ -31,11 +31,11 @@ Pixels = Int64[np.ndarray, "H W"]
 
 
 class ScanCodec:
-    """Compresses range images to the last bit, once their ranges are rounded to a step.
+    """Compresses range images losslessly, once their ranges are rounded to a step.
 
     Tokens, mask and ranges are coded in the order in which the generator would sample them, the latter two phase by
-    phase. Tokens are coded as equally likely: a transformer would save a hundredth of the file and take most of the
-    time. Scans are computed on the CPU, one by one, whatever device the generator is on.
+    phase. Tokens are coded as equally likely: a transformer would make the file one hundredth smaller, and would take
+    most of the time. Scans are computed on the CPU, one by one, whatever device the generator is on.
 
     Args:
         generator: generator with a pixel decoder.
@@ -114,7 +114,7 @@ class ScanCodec:
     def _code(
         self, coder: Coder, rounding: Rounding, tokens: Tensor | None = None, known: Pixels | None = None
     ) -> Pixels:
-        """Code or decode a scan, in one order; what is known of it is only given to the coder."""
+        """Code or decode a scan, in one order; the scan itself is given only to an encoder."""
         rows, columns = self._tokenizer.grid_size
         numbers = None if tokens is None else tokens.flatten().numpy()
         found = coder.uniform(rows * columns, self._tokenizer.num_codes, numbers)

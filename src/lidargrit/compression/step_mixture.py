@@ -1,4 +1,4 @@
-"""Rounded numbers of a mixture of logistics → its distribution function at the borders of steps, exactly everywhere."""
+"""Rounded parameters of a mixture of logistics → its distribution function at the borders of steps, bit for bit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is known about a wanted scan: range images and masks of what was observed → :class:`Condition`."""
+"""The observed part of a scan that is to be completed: range images and masks → :class:`Condition`."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ KINDS: dict[ConditionKind, str] = {
 
 @dataclass(frozen=True, eq=False)
 class Condition:
-    """What is known about a batch of wanted scans, on the sensor's grid; where nothing is observed, all is generated.
+    """The observed part of a batch of scans, on the sensor's grid; everything else is generated.
 
     Every quantity has a mask of its own that says where it was observed. Values elsewhere have no influence.
 
@@ -60,11 +60,11 @@ class Condition:
 
     @classmethod
     def of_pixels(cls, images: RangeImage, observed: Bool[Tensor, "B H W"]) -> Condition:
-        """Return the condition that some pixels of scans are known, be it as a return or as none.
+        """Return the condition that some pixels of scans were observed, whether they have a return or not.
 
         Args:
             images: batch of range images (B, H, W); pixels that were not observed have no influence.
-            observed: True for pixels that are known.
+            observed: True for observed pixels.
         """
         check_observed(observed, images.range_m)
         returned = images.return_mask & observed
@@ -86,7 +86,7 @@ class Condition:
 
     @classmethod
     def nothing(cls, sensor: SensorModel, count: int) -> Condition:
-        """Return the condition of a number of scans of which nothing is known."""
+        """Return the condition of a number of scans of which nothing was observed."""
         none = torch.zeros(count, sensor.height, sensor.width, dtype=torch.bool)
         return cls(none.float(), none, none, none, sensor)
 
@@ -130,7 +130,7 @@ class Condition:
 
     @property
     def kinds(self) -> frozenset[ConditionKind]:
-        """What the condition knows; empty where nothing is observed."""
+        """Kinds of observations in the condition; empty if there are none."""
         found: dict[ConditionKind, Tensor] = {
             "pixels": self.return_observed,
             "surfaces": self.range_observed & ~self.return_observed,
@@ -149,7 +149,7 @@ class Condition:
         return RangeImage.masked(self.range_m, self.range_observed, self.sensor, self.reflectance)
 
     def put_into(self, generated: RangeImage) -> RangeImage:
-        """Return generated scans in which whatever was observed stands as it is, bit for bit."""
+        """Return generated scans in which all observed values are put in, bit for bit."""
         returned = torch.where(self.return_observed, self.return_mask, generated.return_mask)
         range_m = torch.where(self.range_observed, self.range_m, generated.range_m)
         reflectance = None

@@ -1,4 +1,4 @@
-"""Classical ways to fill a scan in, without a network: observed pixels of one scan → all its pixels."""
+"""Classical methods to fill a scan in, without a network: observed pixels of one scan → all its pixels."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ _ROWS_NEAR, _COLUMNS_NEAR = 9, 17  # window in which a return helps to fill an u
 
 @dataclass(frozen=True)
 class Observed:
-    """What is observed of one scan, by the angles of its rays.
+    """The observed pixels of one scan, with the angles of its rays.
 
     Args:
         range_m: observed ranges in metres, 0 elsewhere.
         returned: True where a return was observed.
         observed: True where it was observed whether there is a return.
         elevation_rad: mean elevation of each row.
-        azimuth_rad: azimuth of each column, falling; a full circle later it begins anew.
+        azimuth_rad: azimuth of each column, falling from +pi to -pi.
     """
 
     range_m: Float64[np.ndarray, "H W"]
@@ -42,7 +42,7 @@ class Observed:
 
     @classmethod
     def of(cls, condition: Condition, index: int) -> Observed:
-        """Return what a condition knows of one of its scans."""
+        """Return the observed pixels of one scan of a condition."""
         observed = condition.return_observed[index]
         returned = condition.return_mask[index] & observed
         range_m = torch.where(returned, condition.range_m[index], 0.0).double()
@@ -71,7 +71,8 @@ def nearest(seen: Observed) -> Float64[np.ndarray, "H W"]:
 def linear(seen: Observed) -> Float64[np.ndarray, "H W"]:
     """Interpolate 1 / range along the row or the column, whichever has the nearer pair of observed returns.
 
-    Where the two lie on two surfaces, the nearer one by angle counts alone; where there is no pair, the nearest return.
+    Where the two lie on different surfaces, the range is that of the one nearer by angle; without a pair it is that of
+    the nearest return.
     """
     by_row, row_span = _between(np.tile(seen.range_m, (1, 3)), _thrice(seen.azimuth_rad))
     width = len(seen.azimuth_rad)
@@ -83,12 +84,14 @@ def linear(seen: Observed) -> Float64[np.ndarray, "H W"]:
 
 @dataclass(frozen=True)
 class Triangles:
-    """What the triangles of Delaunay between observed returns tell of every pixel.
+    """Ranges from a Delaunay triangulation of the observed returns, for every pixel.
 
     Args:
-        range_m: 1 / range interpolated linearly; the nearest return where a triangle spans an edge, and outside of all.
-        corners_m: ranges of the three corners, that of the largest weight first; the filled range without a triangle.
-        weights: barycentric weights of the corners; 1, 0 and 0 without a triangle.
+        range_m: inverse of the linearly interpolated 1 / range, in metres; the nearest return where a triangle spans an
+            edge, and outside of all triangles.
+        corners_m: ranges of the three corners in metres, the corner of the largest weight first; the filled range where
+            there is no triangle.
+        weights: barycentric weights of the corners; 1, 0 and 0 where there is no triangle.
     """
 
     range_m: Float64[np.ndarray, "H W"]
@@ -97,14 +100,14 @@ class Triangles:
 
     @classmethod
     def none(cls, range_m: Float64[np.ndarray, "H W"]) -> Triangles:
-        """Return what there is without a triangle: ranges that were filled in another way."""
+        """Return the values for pixels without a triangle, from ranges that were filled in another way."""
         weights = np.zeros((3, *range_m.shape))
         weights[0] = 1
         return cls(range_m.copy(), np.stack([range_m] * 3), weights)
 
 
 def triangles(seen: Observed) -> Triangles:
-    """Triangulate the observed returns by the angles of their rays; of a plane 1 / range is nearly linear in these."""
+    """Triangulate the observed returns by the angles of their rays, in which 1 / range of a plane is nearly linear."""
     width = len(seen.azimuth_rad)
     near = maximum_filter1d(maximum_filter1d(~seen.observed, _ROWS_NEAR, 0), _COLUMNS_NEAR, 1, mode="wrap")
     helpful = seen.returned & near
@@ -142,7 +145,7 @@ def triangles(seen: Observed) -> Triangles:
 
 
 def triangulation(seen: Observed) -> Float64[np.ndarray, "H W"]:
-    """Interpolate 1 / range linearly in the triangles of Delaunay between observed returns, within surfaces."""
+    """Interpolate 1 / range linearly in a Delaunay triangulation of the observed returns, within surfaces."""
     return triangles(seen).range_m
 
 
@@ -151,15 +154,15 @@ FILLS: dict[str, Callable[[Observed], Float64[np.ndarray, "H W"]]] = {
     "linear": linear,
     "triangulation": triangulation,
 }
-"""Classical ways by the name that a user types."""
+"""Classical methods by the name that a user types."""
 
 
 def fill(method: str, condition: Condition) -> RangeImage:
-    """Complete scans by a classical way: ranges by it, returns and reflectance as those of the nearest observed pixel.
+    """Fill ranges in by a classical method, and returns and reflectance from the nearest observed pixel.
 
     Args:
-        method: name of the way, one of :data:`FILLS`.
-        condition: observed pixels of a batch of scans; of a scan without an observed return nothing returns.
+        method: name of the method, one of :data:`FILLS`.
+        condition: observed pixels of a batch of scans; a scan without any observed return is filled without returns.
     """
     sensor = condition.sensor
     ranges, masks, reflectances = [], [], []
@@ -178,7 +181,7 @@ def fill(method: str, condition: Condition) -> RangeImage:
 
 
 def fill_from_nearest(images: RangeImage, observed: Bool[Tensor, "B H W"]) -> RangeImage:
-    """Return scans in which every pixel that was not observed is as the nearest one by angle that was; none, if none.
+    """Return scans in which every unobserved pixel is a copy of the nearest observed one by angle.
 
     Args:
         images: batch of range images; what was observed without a return has a range of 0.
@@ -223,7 +226,7 @@ def _part(pixels: tuple[np.ndarray, ...], chosen: Bool[np.ndarray, " n"]) -> tup
 
 
 def _widest_gap(some: Bool[np.ndarray, " W"]) -> int:
-    """Return the length of the longest run of columns around the circle that have nothing."""
+    """Return the length of the longest run of empty columns around the circle."""
     columns = np.nonzero(some)[0]
     if not len(columns):
         return len(some)
@@ -233,7 +236,7 @@ def _widest_gap(some: Bool[np.ndarray, " W"]) -> int:
 def _between(
     range_m: Float64[np.ndarray, "lines n"], angle_rad: Float64[np.ndarray, " n"]
 ) -> tuple[Float64[np.ndarray, "lines n"], Float64[np.ndarray, "lines n"]]:
-    """Interpolate between the last and the next return along lines, with the angle between the two; infinite without.
+    """Interpolate between the last and the next return along lines; return that and their angular distance.
 
     Args:
         range_m: ranges along each line, 0 where none was observed.

@@ -1,4 +1,4 @@
-"""What classical ways make of observed pixels → maps for a network that completes scans, and ranges to choose from."""
+"""Observed pixels → maps for a network that completes scans, and ranges to choose from, by classical methods."""
 
 from __future__ import annotations
 
@@ -22,13 +22,15 @@ _WINDOW = 9  # rows and columns in which shares are counted
 
 
 class Hints(NamedTuple):
-    """What is easily told of every pixel of partly observed scans; ranges are ln(1 + range in metres).
+    """Inputs of a completion network from classical methods, for every pixel; ranges are ln(1 + range in metres).
 
     Args:
-        maps: observed pixels, differences of the nearest return and its neighbours from triangulation, distances, and
-            of the triangle's second and third corner the same differences and the weights.
-        candidates: ranges by triangulation, by interpolation, of the nearest return, of the next return above, below,
-            to the left and to the right, and of the triangle's second and third corner.
+        maps: inputs of a network for every pixel: whether it was observed, returned or dropped; ln(1 + range) by
+            triangulation, and the differences from it of the nearest return, of the next return above, below, to the
+            left and to the right, and of the triangle's second and third corner; distances to those next returns;
+            weights of those corners; shares of observed and of dropped pixels around it.
+        candidates: candidates for ln(1 + range): by triangulation, by interpolation, of the nearest return, of the next
+            return above, below, to the left and to the right, and of the triangle's second and third corner.
     """
 
     maps: Float[Tensor, "B 19 H W"]
@@ -79,7 +81,7 @@ def _of_one(seen: Observed) -> tuple[Float32[np.ndarray, "19 H W"], Float32[np.n
 
 
 def _share_around(part: Bool[np.ndarray, "H W"]) -> Float64[np.ndarray, "H W"]:
-    """Return for every pixel the share of the pixels around it that belong to a part; the circle closes."""
+    """Return for every pixel the share of marked pixels in a window around it; columns wrap around."""
     down = uniform_filter1d(part.astype(np.float64), _WINDOW, 0, mode="constant")
     return uniform_filter1d(down, _WINDOW, 1, mode="wrap")
 
@@ -87,7 +89,7 @@ def _share_around(part: Bool[np.ndarray, "H W"]) -> Float64[np.ndarray, "H W"]:
 def _next_return(
     seen: Observed, down: int, right: int
 ) -> tuple[Float64[np.ndarray, "H W"], Float64[np.ndarray, "H W"]]:
-    """Return ln(1 + range) of the next observed return on one side, NaN without one, and how far away it is."""
+    """Return ln(1 + range) of the next observed return on one side, NaN without one, and its distance."""
     lines = np.tile(seen.range_m, (1, 3)) if right else seen.range_m.T
     backwards = down + right < 0
     lines = lines if backwards else lines[:, ::-1]

@@ -39,7 +39,7 @@ class Pattern:
 
     @property
     def partial(self) -> bool:
-        """Whether a scan of a part of the circle will do, because pixels without a return are taken as unknown."""
+        """Whether scans of a part of the circle are accepted, because pixels without a return count as unobserved."""
         return self.text == "returns"
 
     def mask(self, image: RangeImage, seed: int = 0) -> Bool[Tensor, "H W"]:

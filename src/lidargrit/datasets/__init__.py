@@ -1,4 +1,4 @@
-"""Scans with a car, and without: "NAME:ROOT:SPLIT" → :class:`ScanDataset`."""
+"""Data sets of scans, recorded and simulated: "NAME:ROOT:SPLIT" → :class:`ScanDataset`."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from lidargrit.untrusted import user_path
 
 @dataclass(frozen=True)
 class SplitScheme:
-    """One way to divide a data set, as some paper or program does it.
+    """One division of a data set into parts, as a paper or program defines it.
 
     Args:
         source: publication or program that defines it.
-        leak: one sentence on what the parts share but should not, for everybody who compares figures.
-        parts: the sequences of every part: train, val, test.
+        leak: one sentence on what the parts share but should not, for everyone who compares scores on them.
+        parts: sequences of each part: train, val, test.
     """
 
     source: str
@@ -120,7 +120,7 @@ class ScanDataset(ABC):
 
 
 def open_dataset(source: str, bad_points: BadPoints = "refuse") -> ScanDataset:
-    """Open a data set by a name and a place.
+    """Open a data set by its name and its folder.
 
     Args:
         source: "NAME:ROOT" or "NAME:ROOT:SPLIT"; "ROOT" or "ROOT:SPLIT" to have the layout recognised;
@@ -162,7 +162,7 @@ def open_dataset(source: str, bad_points: BadPoints = "refuse") -> ScanDataset:
 
 
 def data_set_and_split(source: str) -> tuple[str, str]:
-    """Return a source's data set and split, without the folder where a user keeps it; "" for what is not known.
+    """Return the data set and the split of a source, without its folder; "" for what is not known.
 
     Example:
         >>> data_set_and_split("kitti_360:/data/kitti_360:train")
@@ -185,7 +185,7 @@ def load(name: str) -> type[ScanDataset]:
 
 
 def recognise(root: Path, crawl: bool = True) -> str | None:
-    """Name the data set whose layout a folder has: the most specific that matches, None if none does.
+    """Return the name of the data set whose layout a folder has: the most specific match, None if there is none.
 
     Args:
         root: folder to look into.

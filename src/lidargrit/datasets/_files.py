@@ -68,7 +68,7 @@ class FileDataset(ScanDataset):
         return self._format(path).read(path, index_in_file, self.bad_points)
 
     def name(self, index: int) -> str:
-        """Name one scan: its sequence, its file, and its place in the file if that holds several.
+        """Name one scan: its sequence, its file, and its index in the file if that holds several.
 
         The ending is left out, unless another file of the sequence would then be called the same.
         """
@@ -185,7 +185,7 @@ class FileDataset(ScanDataset):
         return DataError(got, wanted, cure)
 
     def _nearby_root(self) -> Path | None:
-        """Find the root for a user who named a folder within the tree, or the one that the root lies in."""
+        """Find the root if the user named a folder within the tree, or the folder that contains the root."""
         if self.patterns[0].startswith("**"):  # any folder is a root
             return None
         here, depth = self.root.resolve(), self.patterns[0].count("/")
@@ -213,6 +213,6 @@ def scans_below(root: Path) -> Iterator[Path]:
 
 
 def unnamed_recording(path: Path) -> str:
-    """Name the recording of a file that nothing else names by its folder, without telling where that lies."""
+    """Name the recording of a file by a hash of its folder, which does not reveal the path."""
     folder = path.resolve().parent
     return f"#{hashlib.sha256(str(folder).encode()).hexdigest()[:12]}/{folder.name}"

@@ -1,4 +1,4 @@
-"""Which scans a user means: "train", "00+03", "all[:90%]" → names of sequences and a share of their scans."""
+"""Splits as users type them: "train", "00+03", "all[:90%]" → names of sequences and a share of their scans."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _SHARE = re.compile(r"\[(?:(\d+(?:\.\d+)?)%)?:(?:(\d+(?:\.\d+)?)%)?\]")
 
 @dataclass(frozen=True)
 class Split:
-    """What is between the brackets of ``all[:90%]``, and what is before them.
+    """A parsed split such as ``train+val[:90%]``: names of parts, and a share of their scans.
 
     Args:
         text: split as the user typed it.

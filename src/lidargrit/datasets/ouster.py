@@ -35,7 +35,7 @@ class Ouster(FileDataset):
                 self.sensor = "os1_64"
 
     def name(self, index: int) -> str:
-        """Name one scan by its recording and its place in it."""
+        """Name one scan by its recording and its index in it."""
         path, index_in_file = self._scans[index]
         return f"{self.sequence_of(path.relative_to(self.root))}#{index_in_file}"
 

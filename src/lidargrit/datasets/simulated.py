@@ -77,12 +77,12 @@ class Simulated(ScanDataset):
         return f"seed_{self._seeds[index]:07d}"
 
     def recording(self, index: int) -> str:
-        """Name the street of a scan: its seed, of which no other scan is."""
+        """Name the street of a scan by its seed, which no other scan shares."""
         return f"simulated/{self.name(index)}"
 
     @classmethod
     def matches(cls, root: Path) -> bool:
-        """Never: a count is not recognised, it has to be asked for by name."""
+        """Return False: simulated scans are only opened by name."""
         return False
 
     @classmethod

@@ -37,13 +37,14 @@ _SAMPLES_AT_MOST = 10**8  # names of files have eight digits
 
 @dataclass(frozen=True)
 class Benchmark:
-    """What all systems have in common.
+    """Settings that all systems of a benchmark share.
 
     Args:
-        reference: a source of scans that none was trained on.
+        reference: source of real scans on which none of the systems was trained.
         num_samples: number of samples of each system.
         settings: settings of the evaluation, above all its protocol.
-        recipe_settings: settings of every recipe, as for ``train --set``: the same data for all.
+        recipe_settings: settings that are given to every recipe, as by ``train --set``, so that all systems get the
+            same data.
         flops: operations of the training of each system; 0 keeps every recipe's own budget.
     """
 
@@ -74,8 +75,8 @@ def run(
     Args:
         systems: names of recipes or folders of finished runs, each with sampling choices after a colon if wanted:
             ``r2dm_small:steps=32``. A recipe that occurs with several sampling choices is trained once.
-        folder: output folder. It gets a run folder ``runs/RECIPE``, and for each system ``SYSTEM/samples``,
-            ``SYSTEM/SYSTEM.json`` with its scores and ``SYSTEM/costs.json``. Existing results are kept.
+        folder: output folder. It gets a run folder ``runs/RECIPE``, and for each system ``SYSTEM/samples``, scores in
+            ``SYSTEM/SYSTEM.json`` and ``SYSTEM/costs.json``. Existing results are kept.
         benchmark: settings that all systems share.
         reporter: receiver of the progress.
         processes: number of systems that are made at the same time, each in a process with its share of the cores.
@@ -119,7 +120,7 @@ def run(
 def _finish(
     systems: Sequence[str], folder: Path, benchmark: Benchmark, reporter: Reporter, reference: Source | None = None
 ) -> None:
-    """Train or load systems of one run, sample from each, and score the samples; a process opens its own reference."""
+    """Train or load the systems of one run, sample from each, and score the samples."""
     settings = replace(benchmark.settings, max_scans=benchmark.num_samples)
     reference = reference or open_source(benchmark.reference, settings.data.bad_points)
     for system in systems:
@@ -147,14 +148,14 @@ def _share(processes: int) -> None:
 
 
 class _Remaining:
-    """Tells which systems are left, and about how long they will take if each takes as long as those before."""
+    """Estimates how long the remaining systems take, each as long as the mean of those that are done."""
 
     def __init__(self, systems: list[str], reporter: Reporter) -> None:
         self._left, self._count, self._reporter = systems, len(systems), reporter
         self._begun = time.monotonic()
 
     def without(self, done: Sequence[str]) -> None:
-        """Tell what is left now that these are done."""
+        """Return a message about the remaining systems after some more are done."""
         self._left = [system for system in self._left if system not in done]
         if self._left:
             each_s = (time.monotonic() - self._begun) / (self._count - len(self._left))
@@ -179,7 +180,7 @@ def as_table(scores: Sequence[Path], form: Format = "text") -> str:
 
 
 def as_json(scores: Sequence[Path]) -> list[dict[str, Any]]:
-    """Return of each system its name, what it costs, and its scores as the files hold them."""
+    """Return the name, the costs and the scores of each system, as the files hold them."""
     return [
         {"system": path.stem, "costs": read_json(path.parent / COSTS), "scores": read_json(path)} for path in scores
     ]
@@ -187,11 +188,11 @@ def as_json(scores: Sequence[Path]) -> list[dict[str, Any]]:
 
 @dataclass(frozen=True)
 class _Plan:
-    """How one system comes about.
+    """How one system is made: from a finished run, or by training a recipe.
 
     Args:
         run: folder of a finished run, or of the one that the recipe gets.
-        recipe: None for a finished run.
+        recipe: recipe that is trained; None for a finished run.
         sampling: settings of the generator's own ``Sampling``.
     """
 
@@ -227,7 +228,7 @@ def _sample(
 
 
 def _score(samples: str, reference: Source, settings: EvalConfig, path: Path, reporter: Reporter) -> Scorecard:
-    """Return the scores of a file, if they are of these very images by these settings; else score, and write it."""
+    """Return the scores in a file if they belong to the same images and settings; else score, and write the file."""
     pair = open_pair(open_source(samples), reference, settings, reporter)
     facts = (settings.facts(), pair.samples.record(), pair.reference.record(), __version__)
     wanted = (public_name(settings.protocol), *facts)

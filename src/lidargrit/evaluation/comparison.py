@@ -135,7 +135,7 @@ def compare_sources(
 
 
 def open_pair(samples: Source, reference: Source, settings: EvalConfig, reporter: Reporter) -> EvalPair:
-    """Read the two sets of an evaluation, and warn of what speaks against comparing them."""
+    """Read the two sets of an evaluation, and warn where they are not comparable."""
     protocol = load_protocol(settings.protocol)
     variant = settings.projection_variant or protocol.variant
     config = replace(settings.data, projection_variant=variant, max_scans=settings.max_scans)
@@ -193,7 +193,7 @@ def compare_pair(pair: EvalPair, settings: EvalConfig, reporter: Reporter | None
 
 
 def _applicable(wanted: Sequence[MetricChoice], pair: EvalPair) -> tuple[list[MetricChoice], list[LeftOut]]:
-    """Return the metrics that apply to two sets, and the others, which measure the raydrop of a set that has none."""
+    """Divide metrics into those that apply to two sets, and those that measure raydrop where a set has none."""
     why = pair.without_raydrop()
     kept: list[MetricChoice] = []
     others: list[LeftOut] = []
@@ -220,7 +220,7 @@ def _factory(choice: MetricChoice, settings: EvalConfig, reporter: Reporter) -> 
 
 
 def _doubts(pair: EvalPair, scores: Sequence[Score], resampling: Resampling) -> list[str]:
-    """Return what is to be said against the numbers themselves."""
+    """Return warnings about the scores themselves."""
     found = []
     count = len(pair.samples)
     if count < _FEW:

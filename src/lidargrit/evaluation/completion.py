@@ -1,4 +1,4 @@
-"""How well scans are completed: whole scans, of which parts are hidden → errors of the filled pixels."""
+"""Errors of completion: whole scans with hidden parts → errors of the filled pixels."""
 
 from __future__ import annotations
 
@@ -33,20 +33,22 @@ VOXEL_M = 0.1
 
 @dataclass(frozen=True)
 class CompletionScore:
-    """How well one model or classical way fills in one pattern; only pixels that were not observed count.
+    """How well one model or classical method fills in one pattern; only pixels that were not observed count.
 
     Args:
-        model: word by which it was named.
+        model: name of the model or method, as the user typed it.
         observed: pattern of the observed pixels.
         num_scans: number of scans.
         mae_m: mean absolute error of the range, over pixels that return in both scans; lower is better.
-        found: share of the true returns that are filled in with a return. An error over fewer pixels is over easier
-            ones.
+        found: share of the true hidden returns where the completed scan has a return, too; ``mae_m`` covers only these.
         iou: intersection over union of the 0.1 m voxels that hold a point; higher is better.
-        drop_run_lengths: distance between the lengths of runs of drops in the completed and in the true scans.
-        diversity_m: mean absolute difference between two completions of a scan, where both return; None for one alone.
-        seconds_per_scan: time that one completion takes, here and now.
-        beside_triangulation_m: difference of the errors of the same scans from triangulation's, negative if better.
+        drop_run_lengths: distance between the distributions of the lengths of runs of drops in completed and true
+            scans.
+        diversity_m: mean absolute difference in metres between two completions of a scan, over pixels where both
+            return; None for a single completion.
+        seconds_per_scan: time in seconds that one completion took on this machine.
+        beside_triangulation_m: difference of ``mae_m`` from that of triangulation on the same scans; negative if
+            better.
     """
 
     model: str
@@ -73,7 +75,7 @@ def compare_completion(
 
     Args:
         images: whole scans.
-        completers: models and classical ways, of the sensor of the images.
+        completers: models and classical methods, of the sensor of the images.
         patterns: choices of the observed pixels; each scan has its own random pixels, the same for all models.
         completions: number of completions of each scan by a model that is random.
         seed: seed of the first completion, and of the random pixels.
@@ -189,7 +191,7 @@ def _complete(completer: Completer, condition: Condition, turn: int, seed: int) 
 
 
 def _beside(scores: Sequence[_OfPattern]) -> list[CompletionScore]:
-    """Return the scores of one pattern with their differences from triangulation's, if that is among them."""
+    """Add to the scores of one pattern their differences from triangulation's, if that is among them."""
     base = next((of.errors_m for of in scores if of.score.model == BASELINE), None)
     found = []
     for each in scores:

@@ -20,7 +20,7 @@ class Estimate:
     """A mean over scans, or a ratio of two.
 
     Args:
-        value: mean or ratio; NaN where no scan has it.
+        value: mean or ratio; NaN where no scan has a value.
         low: lower end of its 95 % interval, from groups of neighbouring scans; NaN with fewer than two groups.
         high: upper end of the interval.
     """

@@ -1,4 +1,4 @@
-"""How far a score would move with other scans: parts of two sets → 95 % interval, and real against real.
+"""Uncertainty of a score: metrics fed with parts of two sets → 95 % interval, and real against real.
 
 A set is cut into groups of neighbouring scans, and each group is fed to a metric of its own. Random halves of the
 groups of both sets, taken without replacement, are merged and computed. The spread of these values about their mean is
@@ -34,7 +34,7 @@ _LARGE_BYTES = 8 << 20
 
 @dataclass(frozen=True)
 class Resampling:
-    """How often and how coarsely sets are divided.
+    """Number of groups and of half-samples for intervals.
 
     Args:
         groups: number of groups into which each set is cut, 4 or more; fewer if there are fewer scans.
@@ -58,13 +58,13 @@ class Resampling:
 
 @dataclass(frozen=True)
 class Interval:
-    """A 95 % confidence interval of a score, from what scans happened to be in the two sets.
+    """A 95 % confidence interval of a score, over the choice of scans in the two sets.
 
     Args:
-        low: value minus t standard errors, within the metric's bounds, and not below 0 if no half is; t is Student's
-            97.5 % quantile, 2.13 for 16 groups and 20 halves (1.96 for many), since few halves give only a rough
-            standard error.
-        high: value plus t standard errors, within the metric's bounds.
+        low: value minus t standard errors, clipped to the metric's bounds, and to 0 if no half-sample is below 0. t is
+            Student's 97.5 % quantile: 2.13 for 16 groups and 20 halves (1.96 for many), since few halves give only a
+            rough standard error.
+        high: value plus t standard errors, clipped to the metric's bounds.
         standard_error: standard deviation of the scores of half-samples.
         halves: number of half-samples.
     """
@@ -77,7 +77,7 @@ class Interval:
 
 @dataclass(frozen=True)
 class RealAgainstReal:
-    """What real scans score in place of the samples: no generator can be expected to do better.
+    """Score of real scans in place of the samples: no generator can be expected to do better.
 
     Args:
         value: mean over halvings of the reference, one half against the other; or score of held-out scans.
@@ -141,7 +141,7 @@ def interval_of(
     resampling: Resampling,
     bounds: tuple[float, float],
 ) -> Interval | None:
-    """Return how far the score of the whole sets is to be trusted; None if there are too few scans to tell.
+    """Return the confidence interval of the score of the whole sets; None if there are too few scans.
 
     Args:
         result: score of the whole sets.

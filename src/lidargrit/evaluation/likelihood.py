@@ -1,4 +1,4 @@
-"""How many bits name the scans of a set by a model's probabilities: range images → bits with intervals, maps."""
+"""Likelihood of scans under a model: range images → bits with intervals, and maps of bits."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _UNITS = {"scan": "a scan", "return": "a return", "pixel": "a pixel"}
 
 @dataclass(frozen=True)
 class Likelihood:
-    """Bits of the scans of a set at one step of range.
+    """Bits of all scans of a set, with ranges rounded to one step.
 
     Args:
         step_mm: step in millimetres that ranges are rounded to.
@@ -34,7 +34,7 @@ class Likelihood:
         names: name of each scan.
         parts: bits of each scan, by the name of the part: ``tokens``, ``mask``, ``range``.
         returns: number of returns of each scan.
-        pixels: number of pixels of each scan, which is the same for all.
+        pixels: number of pixels of a scan, which is the same for all.
     """
 
     step_mm: int
@@ -57,7 +57,7 @@ class Likelihood:
         }
 
     def by_natural_unit(self) -> dict[str, float]:
-        """Return the bits of tokens and mask a pixel, and of ranges a return, by names that end in the unit."""
+        """Return the bits of tokens and mask per pixel, and of ranges per return, by names that end in the unit."""
         found = self.estimates()
         units = {"tokens": ("token", "pixel"), "mask": ("mask", "pixel"), "range": ("range", "return")}
         return {
@@ -136,7 +136,7 @@ def score_likelihood(
 
 @contextmanager
 def _maps(path: Path | None, size: tuple[int, int, int]) -> Iterator[np.memmap | None]:
-    """Give an array that is the file, so that no number of scans fills the memory."""
+    """Yield an array that is mapped to the file, so that memory does not grow with the number of scans."""
     if path is None:
         yield None
         return

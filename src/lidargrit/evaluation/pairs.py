@@ -1,4 +1,4 @@
-"""The two sets of an evaluation: sources → equally many range images of each, and objections to comparing them."""
+"""The two sets of an evaluation: sources → equally many range images of each, and warnings about the comparison."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ class EvalSet:
 
 @dataclass(frozen=True, eq=False)
 class EvalPair:
-    """Two sets of equally many images that are compared, and the objections to comparing them.
+    """Two sets of equally many images, and warnings about their comparison.
 
     Args:
         samples: first set, usually generated.
@@ -109,7 +109,7 @@ class EvalPair:
     warnings: tuple[str, ...] = ()
 
     def without_raydrop(self) -> str:
-        """Say in a sentence which set has no raydrop, to which metrics of raydrop do not apply; "" if both have it."""
+        """Return a sentence about the set without raydrop, to which metrics of raydrop do not apply; "" if none."""
         for each in (self.samples, self.reference):
             if (rows := each.full_rows) is not None:
                 return (

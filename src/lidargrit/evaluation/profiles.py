@@ -1,4 +1,4 @@
-"""What a set of range images looks like as a whole, and which scans of two sets are alike: sets → arrays to plot."""
+"""Summaries of sets of range images: sets → mean images, and the most similar pairs of scans, to plot."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ _GENERATED_AT_MOST, _REAL_AT_MOST = 500, 2000  # scans that are compared one by 
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """Means over a set.
+    """Mean images of a set of scans.
 
     Args:
-        mean_range_m: over the returns of each pixel; NaN where none ever returned.
+        mean_range_m: mean range of each pixel over its returns, in metres; NaN for a pixel without returns.
         return_rate: share of scans with a return, for each pixel.
         density: points per scan in each square metre; row 0 is behind the sensor, column 0 on its right.
     """
@@ -44,7 +44,7 @@ class Match:
     Args:
         generated: index of the generated scan in its set.
         real: index of the reference scan in its set.
-        distance: mean absolute difference of log2(1 + range in metres) over pixels, 0 for no return.
+        distance: mean absolute difference of log2(1 + range in metres) over pixels, where no return counts as 0.
     """
 
     generated: int

@@ -1,4 +1,4 @@
-"""What a model drops from clean scans → how far the curves of its drops are from those of true masks, beside a coin."""
+"""Drops of a model on clean scans → distances of their curves from those of true drops, beside a coin's."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ RAYDROP_CURVES = (
 
 @dataclass(frozen=True)
 class RaydropScore:
-    """How far one curve of true scans is from those of the same scans with sampled drops, from 0 (alike) to 1.
+    """Jensen-Shannon distances, from 0 (alike) to 1, of one curve between true scans and scans with sampled drops.
 
     Args:
-        scans: kind of the scans whose clean ranges were dropped, ``simulated`` or ``real``.
-        model: distance of the model's drops.
-        coin: distance of drops by a coin of one rate, on the same clean ranges.
+        scans: kind of the scans to which drops are added, ``simulated`` or ``real``.
+        model: distance between the model's drops and the true ones.
+        coin: distance between the true drops and drops of one constant probability, on the same clean ranges.
         floor: distance between the two halves of the true scans.
     """
 
@@ -98,7 +98,7 @@ def scores_of_model(word: str, simulated: SimulatedScans, real: RangeImages, see
 
 @torch.no_grad()
 def decoded_surfaces(generator: Generator, real: RangeImages) -> tuple[RangeImage, RangeImage]:
-    """Return scans with a range for every ray, as a tokenizer decodes them, and the scans as they are.
+    """Return scans with a decoded range for every ray, and the original scans.
 
     A ray that never returns in any of the scans, such as one that ends on the car, has no surface.
 

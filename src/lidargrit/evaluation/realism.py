@@ -1,4 +1,4 @@
-"""Real scans, simulated ones and a coin for every ray → how far their curves are apart, and which are nearer."""
+"""Real scans, simulated scans, and drops by a coin → distances between their curves."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _BATCH = 16
 
 @dataclass(frozen=True, eq=False)
 class SimulatedScans:
-    """Scans of the simulator, before and after the question which rays return.
+    """Simulated scans, before and after raydrop.
 
     Args:
         clean: range images where all surfaces within the sensor's limits return.
@@ -48,11 +48,12 @@ class SimulatedScans:
 
 @dataclass(frozen=True)
 class CurveScore:
-    """How far one curve of real scans is from others, each a Jensen-Shannon distance from 0 (alike) to 1.
+    """Jensen-Shannon distances, from 0 (alike) to 1, between one curve of real scans and those of other scans.
 
     Args:
-        simulated: distance of simulated scans; they are the generated side of the result.
-        bernoulli: distance of clean simulated ranges, each return of which is dropped with one constant probability.
+        simulated: distance between simulated and real scans; simulated scans are the generated set of the result.
+        bernoulli: distance between real scans and clean simulated ranges from which returns are dropped with one
+            constant probability.
         real_against_real: distance between the two halves of the real scans, which shows how much real scans differ.
     """
 
@@ -67,7 +68,7 @@ class CurveScore:
 
 
 def compare(simulated: SimulatedScans, real: RangeImages, curves: Sequence[str] = CURVES) -> list[CurveScore]:
-    """Compare real scans with simulated ones and with a coin, curve by curve.
+    """Compare real scans with simulated ones, and with drops by a coin, curve by curve.
 
     Args:
         simulated: scans of the real ones' sensor, as many as wanted.
@@ -127,13 +128,13 @@ def scans_of_both(
     config: DataConfig | None = None,
     reporter: Reporter | None = None,
 ) -> tuple[SimulatedScans, RangeImages]:
-    """Simulate scans, and open those of a source with which they are to be compared.
+    """Simulate scans, and open the real scans that they are compared with.
 
     Args:
         source: source of real scans.
         count: number of simulated scans, and largest number of real ones, which are evenly spaced.
         sensor: name or ``.json`` file of the sensor; the data set's own if empty.
-        fine: whether every column that the sensor fires is taken, not only those that its image keeps.
+        fine: whether all columns that the sensor fires are taken; otherwise those that its image keeps.
         seed: seed of the first simulated scan.
         config: settings for reading and projecting scans.
         reporter: receiver of the progress.
@@ -163,8 +164,8 @@ def simulate_pair(seed: int, sensor: SensorModel) -> tuple[RangeImage, RangeImag
 def pair_of(seen: Observation, sensor: SensorModel) -> tuple[RangeImage, RangeImage]:
     """Return the image of all surfaces within the sensor's limits, and what the sensor records of it.
 
-    Rays that end on the sensor's own carrier meet no surface. Where nothing returned the range has no noise, and the
-    reflectance is 0: too little light came back to read one.
+    Rays that end on the car itself meet no surface. Where nothing returned, the range has no noise, and the reflectance
+    is 0, because too little light came back to measure one.
     """
     range_m = torch.from_numpy(np.where(seen.return_mask, seen.range_m, seen.clean_range_m))
     within = (range_m >= sensor.range_min_m) & (range_m <= sensor.range_max_m) & torch.from_numpy(~seen.blocked)

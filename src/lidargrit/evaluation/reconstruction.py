@@ -1,4 +1,4 @@
-"""How well a tokenizer gives back what it was shown: pairs of real and decoded range images → errors."""
+"""Errors of a tokenizer's reconstructions: pairs of real and decoded range images → errors."""
 
 from __future__ import annotations
 
@@ -30,10 +30,11 @@ class ReconstructionErrors:
     Args:
         range_mae_m: mean absolute range error in metres; lower is better.
         range_rmse_m: root of the mean squared range error in metres; lower is better.
-        mask_accuracy: share of pixels whose return or ray drop is decoded as it was; higher is better, as below.
-        drop_precision: share of the decoded ray drops that are real ones.
-        drop_recall: share of the real ray drops that are decoded as such.
-        drop_iou: ray drops common to both by those of either.
+        mask_accuracy: share of pixels whose return or ray drop is decoded correctly; higher is better, here and in the
+            next three.
+        drop_precision: share of the decoded ray drops that are true.
+        drop_recall: share of the true ray drops that are decoded.
+        drop_iou: intersection over union of decoded and true ray drops.
         num_scans: number of pairs.
     """
 

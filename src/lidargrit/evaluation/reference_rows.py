@@ -1,4 +1,4 @@
-"""Scans to fit pixel statistics to, and two sets → scores between their reference rows."""
+"""Scores with their reference rows: pixel statistics, and held-out real scans."""
 
 from __future__ import annotations
 

@@ -34,10 +34,10 @@ class PaperTable:
         title: title of the table.
         protocol: name of the protocol that measures its figures.
         data_set: name of the data set.
-        train: split to train on; ``val`` and ``test`` are called so, and share no drive with it or with each other.
+        train: split to train on; it shares no drive with ``val`` and ``test``, the splits of these names.
         images: settings that make the protocol's images of the data set's scans.
         small_images: settings that make images with fewer columns.
-        rows: recipes of each row of the paper, by its name there: one of its size, and a small one.
+        rows: recipes of each row of the paper, by the row's name: one of the paper's size, and a small one.
         remarks: sentences that a reader of the measured rows must know.
     """
 
@@ -184,7 +184,7 @@ def table_of(wanted: Reproduction, scores: list[Path], form: Format = "text") ->
 
 
 def plan(wanted: Reproduction, folder: Path) -> dict[str, Any]:
-    """Return what :func:`reproduce` would do and what it would cost, as plain values."""
+    """Return the steps of :func:`reproduce` and their costs, as plain values."""
     benchmark = wanted.benchmark()
     recipes = {system: _recipe(system, benchmark) for system in wanted.systems().values()}
     data = next(iter(recipes.values())).data
@@ -235,6 +235,6 @@ def _prepare(benchmark: Benchmark, systems: list[str], reporter: Reporter) -> No
 
 
 def _words(wanted: Reproduction) -> str:
-    """Return which row is which, and what a reader must know of them."""
+    """Return a legend of the rows, and remarks that a reader must know."""
     lines = [f"the paper's row {row!r} is measured by {system}" for row, system in wanted.systems().items()]
     return "\n".join([*lines, *wanted.table.remarks])

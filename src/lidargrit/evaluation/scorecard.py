@@ -1,4 +1,4 @@
-"""What an evaluation found, with everything needed to repeat it: scores → table, JSON, and back."""
+"""The result of an evaluation, with everything needed to repeat it: scores → table, JSON, and back."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ LEFT_OUT, NOT_APPLICABLE = "left out", "not applicable"
 
 @dataclass(frozen=True)
 class Score:
-    """One number, how far it is to be trusted, and what the reference scores against itself.
+    """One score with its interval and its reference rows.
 
     Args:
         result: value of the metric.
-        interval: 95 %, if wanted and possible.
+        interval: 95 % interval; None if it was not wanted or cannot be computed.
         real_against_real: score of real scans in place of the samples; None if it was not computed.
         options: options of the metric, besides variant and seed.
         seconds: time that the metric, its interval and real against real took.
@@ -39,7 +39,7 @@ class Score:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """A number that the protocol asks for and that could not be had.
+    """A metric of the protocol that could not be computed.
 
     Args:
         metric: name of the metric.
@@ -67,8 +67,8 @@ class EvalSetRecord:
         sensor: name and size of its images.
         projection: description of the projection of its scans.
         sha256: hash of the pixels that were compared.
-        weights_sha256: hash of the weights that generated the scans; "" for scans of other origins, and in files of
-            before this was written.
+        weights_sha256: hash of the weights that generated the scans; "" for scans of other origins, and where an old
+            file lacks it.
     """
 
     source: str
@@ -84,7 +84,7 @@ class EvalSetRecord:
 
 @dataclass(frozen=True)
 class Scorecard:
-    """All that an evaluation found.
+    """Result of an evaluation.
 
     Args:
         protocol: name of the protocol.
@@ -190,7 +190,7 @@ class Scorecard:
 
 
 def format_value(value: float) -> str:
-    """Return a number with four digits that count."""
+    """Return a number with four significant digits."""
     if value == 0 or not math.isfinite(value):
         return f"{value:g}"
     return f"{value:.4f}" if 1e-2 <= abs(value) < 1e3 else f"{value:.4g}"

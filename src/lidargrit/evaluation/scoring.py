@@ -1,4 +1,4 @@
-"""Two sets and the metrics that are wanted → scores with intervals and real against real; shared features once."""
+"""Two sets and a list of metrics → scores with intervals and real against real; shared features are computed once."""
 
 from __future__ import annotations
 

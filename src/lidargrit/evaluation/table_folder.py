@@ -1,4 +1,4 @@
-"""A folder of systems that were compared alike → how, and the costs and scores of each; it can be extended."""
+"""The folder of a benchmark: settings, costs and scores of all systems ⇄ table.json, which can be extended."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _CURE = "name the systems and settings once more: lidargrit compare OUT SYSTEM .
 
 
 def write_table(folder: Path, systems: Sequence[str], benchmark: Benchmark, scores: Sequence[Path]) -> None:
-    """Write what :func:`read_table` reads, with every cell of the table.
+    """Write ``table.json``, with every cell of the table; :func:`read_table` reads it.
 
     Args:
         folder: output folder of the comparison.

@@ -27,9 +27,9 @@ class Block:
     Args:
         title: title of the block.
         columns: metrics and variants.
-        rows: a system and its figures, "" where there is none.
-        notes: lines below.
-        verdicts: lines above the rows, one for each system.
+        rows: name of a system with its scores, one for each column, "" where there is none.
+        notes: lines printed below the rows.
+        verdicts: lines printed above the rows, one for each system.
     """
 
     title: str

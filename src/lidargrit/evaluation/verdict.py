@@ -20,21 +20,21 @@ PIXEL_STATISTICS, MEMORISED = "marginal", "memorised"
 
 
 def noise(score: Score) -> float:
-    """Return half the width of a score's interval, 0 without one: how far chance alone may move it."""
+    """Return half the width of a score's interval, 0 without one."""
     if score.interval is None:
         return 0.0
     return max(score.interval.high - score.result.value, score.result.value - score.interval.low)
 
 
 def beats_pixel_statistics(score: Score) -> bool | None:
-    """Say whether a score is better than that of pixel statistics by more than chance; None where that is not known."""
+    """Return whether a score beats that of pixel statistics by more than chance; None where that is not known."""
     if score.pixel_statistics is None:
         return None
     return _worse_by(score, score.pixel_statistics, score.result.value) > noise(score)
 
 
 def is_like_real(score: Score) -> bool | None:
-    """Say whether a score is not worse than real against real by more than chance; None where that is not known."""
+    """Return whether a score is not worse than real against real by more than chance; None where that is not known."""
     if score.real_against_real is None:
         return None
     return _worse_by(score, score.result.value, score.real_against_real.value) <= noise(score)
@@ -48,7 +48,7 @@ def tells_apart(score: Score) -> bool | None:
 
 
 def counted_first(scores: Sequence[Score]) -> tuple[list[Score], list[Score]]:
-    """Divide scores into those that count and those set apart, whose metric does not see that pixels are unrelated."""
+    """Divide scores into those that count, and those whose metric cannot tell pixel statistics from real scans."""
     apart = [score for score in scores if tells_apart(score) is False]
     return [score for score in scores if tells_apart(score) is not False], apart
 

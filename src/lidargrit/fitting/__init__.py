@@ -1,4 +1,4 @@
-"""Scans of a sensor that nobody described → its :class:`SensorModel`, with all that speaks for and against it."""
+"""Scans of an unknown sensor → its :class:`SensorModel`, with the evidence for and against the fit."""
 
 from __future__ import annotations
 
@@ -34,18 +34,20 @@ class SensorFit:
     """A sensor that was found in its scans, and the evidence.
 
     Args:
-        sensor: ready to be written with ``to_json``; its rows are where returns are seen from the origin.
+        sensor: fitted sensor; its rows lie where returns are seen from the origin.
         method: way in which the laser of every point was found.
         num_scans: number of scans that were used.
-        laser_elevation_deg: elevations (H,) of the lasers, which far points approach; a maker's table holds these.
+        laser_elevation_deg: elevations (H,) of the lasers, which the elevations of far points approach; a maker's table
+            holds these.
         laser_height_m: height of every laser above the origin (H,), found from near points; all 0 if none is found.
-        residual_deg: spread of the points of every row around it (standard deviation, outliers left out).
+        residual_deg: robust standard deviation of the elevations of every row's points (H,).
         points_per_ring: number of points of each ring (H,), over all scans.
-        agree_share: share of the points nearer to their row than a quarter of the way to the next one.
-        counter_clockwise: whether the sensor turns so, seen from above; None if the order of points does not show it.
+        agree_share: share of the points that lie within a quarter of the row spacing of their row.
+        counter_clockwise: whether the sensor turns counter-clockwise, seen from above; None if the order of points does
+            not show it.
         start_deg: azimuth where a revolution begins in the file; None if unknown.
-        range_step_m: step of which all ranges are multiples, or None.
-        coordinate_step_m: step of which all coordinates are multiples, or None.
+        range_step_m: step of which all ranges are multiples, in metres; None if there is none.
+        coordinate_step_m: step of which all coordinates are multiples, in metres; None if there is none.
         elevations_deg: elevations (n,) of the points that were used, for a plot.
         row_of_point: row (n,) of each of these points, -1 for none.
         steps_deg: steps in azimuth (m,) between neighbouring points of a ring, for a plot.
@@ -214,7 +216,7 @@ def _model(
 
 
 def _projection(rows: Rows, rings: Rings) -> ProjectionName:
-    """Choose unfolding where it would give every point its row: by a field, or in the order of KITTI's files."""
+    """Choose unfolding if the files give the ring of every point, by a field or by KITTI's order of points."""
     top_down = bool((np.diff(rows.number) > 0).all())
     if rings.method == "ring field":
         return "unfolding" if top_down else "spherical"

@@ -1,4 +1,4 @@
-"""Points and their rings → the step between firings, columns of a revolution, how far aside each laser looks."""
+"""Points and their rings → the step between firings, columns of a revolution, azimuth offset of each laser."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def firing_steps_deg(scans: Sequence[Points], rings: Sequence[Int64[np.ndarray, 
 def columns_of_scans(
     scans: Sequence[Points], rings: Sequence[Int64[np.ndarray, "_"]], steps_deg: Float64[np.ndarray, "m"]
 ) -> int | None:
-    """Return the columns that the azimuths of every ring line up with best; None if points have no neighbours.
+    """Return the number of columns that fits the azimuths of every ring best; None if points have no neighbours.
 
     The Fourier coefficient of a ring's azimuths at frequency W is large where they are whole multiples of 360 / W
     degrees, however many of them are lost. The common steps tell where to look, and stand in where nothing lines up,
@@ -62,10 +62,10 @@ def columns_of_scans(
 def offsets_deg(
     scans: Sequence[Points], rings: Sequence[Int64[np.ndarray, "_"]], lasers: int
 ) -> Float64[np.ndarray, "H"] | None:
-    """Return how far counter-clockwise of its firing's middle each laser looks, for files written column by column.
+    """Return each laser's azimuth offset from its firing, counter-clockwise, for files written column by column.
 
-    Only files that keep a place for every laser of a firing tell: the firing of a point is then its place in the file
-    divided by the number of lasers.
+    Only files that keep an entry for every laser of a firing show it: the firing of a point is then its index in the
+    file divided by the number of lasers.
 
     Returns:
         one number a ring, in the order of the rings' numbers; None if a laser has too few far points.

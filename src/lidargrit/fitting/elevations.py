@@ -25,12 +25,12 @@ class Rows:
     """The rows of a sensor, from the top.
 
     Args:
-        elevation_deg: under which the points of a row are seen from the origin, at the range where most of them are.
-        laser_elevation_deg: elevation of the laser itself, which points at far range approach.
+        elevation_deg: elevation at which a row's points are seen from the origin, at the range where most of them are.
+        laser_elevation_deg: elevation of the laser itself, which the elevations of far points approach.
         laser_height_m: height of the laser above the origin; all 0 if it is not found.
-        residual_deg: spread of the points around these, as a standard deviation that outliers do not move.
+        residual_deg: robust standard deviation of the elevations of a row's points.
         num_points: number of points of every row (H,).
-        agree_share: share of all points nearer to their row than a quarter of the way to the next.
+        agree_share: share of all points that lie within a quarter of the row spacing of their row.
         number: index of every row among the given rings.
     """
 

@@ -19,7 +19,7 @@ def range_limits_m(range_m: Float64[np.ndarray, "n"]) -> tuple[float, float]:
 
 
 def quantum_m(values_m: Float64[np.ndarray, "n"]) -> float | None:
-    """Return the largest step of which nearly all values are whole multiples; None if there is none."""
+    """Return the largest step, in metres, of which nearly all values are whole multiples; None if there is none."""
     for step_m in _STEPS_M:
         off = np.abs(values_m / step_m - np.round(values_m / step_m))
         if float((off < _NEAR_A_STEP).mean()) > _SHARE_AT_LEAST:

@@ -1,4 +1,4 @@
-"""A scan in the angles that a fit looks at: :class:`Scan` → range, elevation and azimuth of every point."""
+"""Points in polar coordinates: :class:`Scan` → range, elevation and azimuth of every point."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ class Points:
     """The points of one scan in the order of its file, without those too near to have an angle.
 
     Args:
-        range_m: distance from the origin.
-        elevation_deg: elevation, up is positive.
-        azimuth_deg: counter-clockwise from +x, in [-180, 180].
-        ring: ring number from the file, or None.
-        index: index in the file of every point, counting those that are left out here.
-        num_in_file: points with those that were left out.
+        range_m: distance of every point from the origin, in metres.
+        elevation_deg: elevation of every point; up is positive.
+        azimuth_deg: azimuth of every point, counter-clockwise from +x, in [-180, 180].
+        ring: ring number of every point in the file; None if the file has none.
+        index: index of every point in the file, where points that are left out here count, too.
+        num_in_file: number of points in the file, those left out here included.
     """
 
     range_m: Float64[np.ndarray, "n"]

@@ -1,4 +1,4 @@
-"""Which laser fired each point: files → rings, by their own field or by the order of their points."""
+"""The laser of each point: scans → ring numbers, by a field of the files or by the order of their points."""
 
 from __future__ import annotations
 
@@ -29,12 +29,14 @@ class Rings:
     """The laser of every point of every scan.
 
     Args:
-        method: way in which it was found.
-        of_point: one array a scan; -1 where it is not known. Numbers are the file's own, or count in its order.
-        used: the scans that it could be found for.
-        counter_clockwise: whether the sensor turns so, seen from above; None if the order of points does not show it.
+        method: way in which the laser of every point was found.
+        of_point: ring number of every point, one array for each scan; -1 where it is not known. Numbers are the file's
+            own, or count in its order.
+        used: scans whose rings could be found.
+        counter_clockwise: whether the sensor turns counter-clockwise, seen from above; None if the order of points does
+            not show it.
         start_deg: azimuth where a file begins its rings or its first column; None if unknown.
-        by_column: whether files keep a place for every laser of every firing, one firing after another.
+        by_column: whether files keep an entry for every laser of every firing, one firing after another.
     """
 
     method: Method
@@ -110,7 +112,7 @@ def _column_by_column(scans: Sequence[Points]) -> Rings | None:
 
 
 def _turning(scans: Sequence[Points], numbers: Sequence[Int64[np.ndarray, "_"]]) -> tuple[bool | None, float | None]:
-    """Tell which way the points of each laser go round in the file, and where they begin."""
+    """Return in which direction the points of each laser turn in the file, and where they begin."""
     signs, starts = [], []
     for points, number in zip(scans, numbers, strict=True):
         for ring in np.unique(number)[::4]:

@@ -1,4 +1,4 @@
-"""A :class:`SensorFit` → a few lines that say what was found and how well, or the same as plain values."""
+"""A :class:`SensorFit` → a table of the fitted sensor and the quality of the fit, or the same as plain values."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _ROWS_SHOWN = 8  # spread over the sensor; the file and the picture have all
 
 
 def as_table(fit: SensorFit) -> str:
-    """Return what a user wants to know of a fit, one fact a line, and some of its rows."""
+    """Return the facts of a fit, one a line, and some of its rows."""
     sensor, step_m = fit.sensor, fit.range_step_m or fit.coordinate_step_m
     turning = {True: "counter-clockwise", False: "clockwise", None: "not known from the files"}[fit.counter_clockwise]
     start = "" if fit.start_deg is None else f", files begin at {fit.start_deg:.0f} degrees"
@@ -38,7 +38,7 @@ def as_table(fit: SensorFit) -> str:
 
 
 def as_json(fit: SensorFit) -> dict[str, Any]:
-    """Return the sensor and what speaks for it, a number for each row where there is one, as plain values."""
+    """Return the sensor and the evidence for it, as plain values."""
     return {
         "sensor": fit.sensor.to_json(),
         "method": fit.method,
@@ -57,7 +57,7 @@ def as_json(fit: SensorFit) -> dict[str, Any]:
 
 
 def _lasers(fit: SensorFit) -> str:
-    """Tell where the lasers sit and look, as far as the points betray it."""
+    """Describe the heights and azimuth offsets of the lasers, as far as the points show them."""
     found = []
     if np.any(fit.laser_height_m):
         low_m, high_m = fit.laser_height_m.min(), fit.laser_height_m.max()

@@ -21,7 +21,7 @@ POINTS_AT_MOST = 4_000_000  # thirty revolutions of an HDL-64E; a larger file is
 
 
 class ScanFormat(ABC):
-    """How one kind of file holds scans; the class has no state and is used as it is."""
+    """A file format of scans; the class has no state and is used without an instance."""
 
     title: ClassVar[str]
     """One line for lists."""
@@ -49,7 +49,7 @@ class ScanFormat(ABC):
 
     @classmethod
     def about(cls) -> list[str]:
-        """Return all that is known of the format, a fact a line."""
+        """Return the facts of the format, one a line."""
         facts = [f"endings: {', '.join(cls.suffixes)}", f"reflectance: {cls.reflectance}", f"axes: {cls.frame}"]
         facts += [f"sensor: {cls.sensor}"] if cls.sensor else []
         facts += ["several scans in one file"] if cls.several else []
@@ -64,7 +64,7 @@ class ScanFormat(ABC):
     @staticmethod
     @abstractmethod
     def recognises(path: Path) -> bool:
-        """Tell, from as few bytes as will do, whether a file looks like this format; False if it cannot be read."""
+        """Return whether a file looks like this format, from its first bytes; False if it cannot be read."""
 
     @staticmethod
     def count(path: Path) -> int:
@@ -216,6 +216,6 @@ def first_bytes(path: Path, at_most: int) -> bytes:
 
 
 def damaged(path: Path, wanted: str, error: Exception) -> ScanError:
-    """Return, in one line, what a library says of a file that it stumbled over."""
+    """Return the error of a file that a library could not read, with the library's reason in one line."""
     reason = "".join(filter(str.isprintable, " ".join(str(error).split())))[:120] or type(error).__name__
     return ScanError(f"{path}, a damaged file ({reason})", wanted, "download it again, or remove it")

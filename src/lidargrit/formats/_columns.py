@@ -103,7 +103,7 @@ def text_rows(data: bytes, rows: int, names: list[str], path: Path, wanted: str)
 
 
 def whole_number(text: str) -> int:
-    """Return the count that a word of a header is, or -1."""
+    """Return a word of a header as a whole number, or -1."""
     return int(text) if len(text) <= 18 and text.isascii() and text.isdigit() else -1
 
 

@@ -232,7 +232,7 @@ def _unpacked_bytes(message: Any) -> int:
         return struct.unpack_from(kind, header, position)[0]
 
     def field(table: int, which: int) -> int:
-        """Return the place of a field of a flatbuffers table, 0 if it is left out."""
+        """Return the position of a field of a flatbuffers table, 0 if it is left out."""
         offsets = table - number("<i", table)
         within = 4 + 2 * which < number("<H", offsets)
         offset = number("<H", offsets + 4 + 2 * which) if within else 0

@@ -23,10 +23,10 @@ _FORMAT = "float32 rows x, y, z, intensity, laser (0 to 31), 20 bytes a point"
 class NuscenesBin(ScanFormat):
     """LIDAR_TOP of nuScenes: little-endian, 32 points for each firing, moved to where the car was at the end.
 
-    Every beam has a row, also one that did not return: it is stored at the sensor's origin and then moved with the
-    car, up to a metre. Such points, and the car's own roof, are left out: points nearer than 1 m. nuScenes numbers the
-    lasers from the lowest; ``ring`` counts from the highest. The motion correction moves near points of one ring up
-    and down by a degree, so that ``--set data.projection=unfolding`` (rows by ring) places them better than elevation.
+    Every beam has a row, also one that did not return: it is stored at the sensor's origin and then moved with the car,
+    up to a metre. Such points, and the car's own roof, are left out: points nearer than 1 m. nuScenes numbers the
+    lasers from the lowest; ``ring`` counts from the highest. The motion correction moves near points of one ring up and
+    down by a degree, so that ``--set data.projection=unfolding`` (rows by ring) assigns rows better than elevation.
 
     Source:
         Caesar et al., nuScenes, CVPR 2020; its tools (nutonomy/nuscenes-devkit) leave out points nearer than 1 m too.

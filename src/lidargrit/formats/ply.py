@@ -104,9 +104,9 @@ class _Header:
     """What the first lines of a file say, after it has been checked.
 
     Args:
-        byte_order: numpy sign for the byte order; empty for text.
+        byte_order: numpy's sign for the byte order; empty for text.
         points: number of vertices.
-        properties: numpy's type of each.
+        properties: numpy type of each property, by its name.
         rows_before: number of rows of the elements before the vertices.
         bytes_before: size of the elements before the vertices, in bytes.
         end: position of the first element in the file, in bytes.

@@ -1,4 +1,4 @@
-"""Noise → range images: the contract of a generator, and how one is written to a folder and read back."""
+"""Base class of generators: seeds → range images; saving to a folder, and loading."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class NoSampling:
 
 @dataclass(frozen=True)
 class Cost:
-    """What sampling one scan takes, counted and not timed, so the same on every machine.
+    """Cost of sampling one scan, counted and not timed, so the same on every machine.
 
     Args:
         network_evaluations: number of passes through a network, one after the other.
@@ -94,7 +94,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
 
     @property
     def conditions(self) -> frozenset[ConditionKind]:
-        """Kinds of what may be known of a scan that is completed; they may depend on ``config``."""
+        """Kinds of conditions that :meth:`complete` accepts; they may depend on ``config``."""
         return frozenset({"pixels"} if "complete" in self.capabilities else set())
 
     @property
@@ -122,14 +122,14 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         return next(chain(self.parameters(), self.buffers())).device
 
     def fit_statistics(self, images: RangeImages) -> None:
-        """Take from the training scans what needs no objective, such as counts; called once, before the stages."""
+        """Compute statistics of the training scans that need no objective; called once, before the stages."""
 
     def objective(self, stage: str) -> Objective:
         """Return what a stage minimises; its trained weights are given back by :meth:`load_stage`."""
         raise NotImplementedError(f"{self.public_name()} has no stage {stage!r}")
 
     def load_stage(self, stage: str, objective: Objective) -> None:
-        """Take over the weights of a stage's trained objective."""
+        """Load the weights of a stage's trained objective."""
         raise NotImplementedError(f"{self.public_name()} has no stage {stage!r}")
 
     @final
@@ -138,7 +138,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         """Generate one scan for each seed; a seed gives the same scan whatever the others are, bit for bit.
 
         Args:
-            seeds: one for each scan, from 0 to 2^63 - 1.
+            seeds: seeds, one for each scan, from 0 to 2^63 - 1.
             sampling: settings of the generator's own ``Sampling``; its defaults if not given.
 
         Raises:
@@ -163,7 +163,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
 
     @abstractmethod
     def cost(self, sampling: SamplingT | None = None) -> Cost:
-        """Return what sampling one scan takes."""
+        """Return the cost of sampling one scan."""
 
     def get_tokenizer(self) -> Tokenizer[Any]:
         """Return the tokenizer whose tokens the generator samples (capability ``tokens``)."""
@@ -172,7 +172,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     @final
     @torch.no_grad()
     def reconstruct(self, images: RangeImage) -> RangeImage:
-        """Return what the generator's own code keeps of each scan (capability ``encode``).
+        """Encode each scan and decode it again (capability ``encode``).
 
         Args:
             images: batch of range images (B, H, W).
@@ -192,12 +192,12 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         seeds: Sequence[int],
         sampling: SamplingT | None = None,
     ) -> RangeImage:
-        """Return scans that keep what was observed, bit for bit, and generate the rest (capability ``complete``).
+        """Return scans that keep all observed values, bit for bit, and generate the rest (capability ``complete``).
 
         Args:
-            condition: known part of each scan, such as ``Condition.of_pixels(images, observed)``, of the kinds in
+            condition: observed part of each scan, such as ``Condition.of_pixels(images, observed)``, of the kinds in
                 :attr:`conditions`.
-            seeds: one for each scan, from 0 to 2^63 - 1.
+            seeds: seeds, one for each scan, from 0 to 2^63 - 1.
             sampling: settings of the generator's own ``Sampling``; :meth:`completion_sampling` if not given.
 
         Raises:
@@ -217,11 +217,11 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     @final
     @torch.no_grad()
     def invert(self, images: RangeImage, seeds: Sequence[int], sampling: SamplingT | None = None) -> RangeImage:
-        """Return for each scan the nearest that the generator can generate (capability ``invert``).
+        """Return for each scan the nearest one that the generator can generate (capability ``invert``).
 
         Args:
             images: batch of range images (B, H, W).
-            seeds: one for each image, from 0 to 2^63 - 1; the search starts at random.
+            seeds: seeds, one for each image, from 0 to 2^63 - 1; the search starts at random.
             sampling: settings of the generator's own ``Sampling``; its defaults if not given.
 
         Raises:
@@ -237,15 +237,15 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     @final
     @torch.no_grad()
     def bits(self, images: RangeImage, step_mm: int = 10, expected: bool = False) -> ScanBits:
-        """Return how many bits name each scan by the generator's exact probabilities (capability ``likelihood``).
+        """Return the negative log-likelihood of each scan in bits, exactly (capability ``likelihood``).
 
-        Ranges are rounded to a step first: without one, no number of bits would be enough. Systems compare by their
-        bits at one step if they tell those of the whole scan (:attr:`ScanBits.is_whole`).
+        Ranges are rounded to a step first, since a real number would need infinitely many bits. Systems can be compared
+        by their bits at one step if these are of the whole scan (:attr:`ScanBits.is_whole`).
 
         Args:
             images: batch of range images (B, H, W).
             step_mm: step of the ranges in whole millimetres.
-            expected: whether to compute, too, what bits were to be expected, for :meth:`ScanBits.surprise`.
+            expected: whether the expected number of bits (the entropy) is computed, too, for :meth:`ScanBits.surprise`.
 
         Raises:
             ConfigError: images of other rays, another step, or a generator without the capability.
@@ -260,7 +260,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         """Generate one scan for each of ``compute_batch`` seeds; scans of copies at their end may be left out."""
 
     def _complete(self, condition: Condition, seeds: BatchSeeds, sampling: SamplingT) -> RangeImage:
-        """Generate scans that agree with what was observed; the caller then puts this in."""
+        """Generate scans that agree with the observed values, which the caller then puts in."""
         raise NotImplementedError
 
     def _invert(self, images: RangeImage, seeds: BatchSeeds, sampling: SamplingT) -> RangeImage:

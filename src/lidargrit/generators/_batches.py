@@ -35,7 +35,7 @@ def in_batches(seeds: Sequence[int], size: int, compute: Callable[[list[int], Ba
     """Compute one scan for each seed in batches of one size.
 
     Args:
-        seeds: one for each scan.
+        seeds: seeds, one for each scan.
         size: number of scans of a batch.
         compute: function from the indices and the seeds of a batch to its scans; those of the copies are dropped, and
             may be left out.

@@ -1,4 +1,4 @@
-"""What a caller hands to a generator → the same, or one line that says what is wrong with it."""
+"""Checks of what a caller passes to a generator: seeds, images and conditions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def check_seeds(seeds: Sequence[int], count: int | None = None) -> None:
     """Refuse seeds that are out of bounds, none at all, or another number of them than there are images.
 
     Args:
-        seeds: one for each scan.
+        seeds: seeds, one for each scan.
         count: number of images; None where the seeds alone say how many scans are wanted.
     """
     if count is not None and len(seeds) != count:

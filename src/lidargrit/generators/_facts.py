@@ -1,4 +1,4 @@
-"""What is known of a system before one is made: what it generates and where it comes from → lines for a person."""
+"""Facts about a generative system: what it generates and where it comes from → lines for a person."""
 
 from __future__ import annotations
 

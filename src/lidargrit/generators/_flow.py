@@ -32,7 +32,7 @@ _HUBER_SCALE = 0.00054  # times the root of the number of an image's values, as 
 
 @dataclass(frozen=True)
 class FlowSampling:
-    """How the flow is followed from noise to a scan.
+    """Settings of following the flow from noise to a scan.
 
     Args:
         solver: ``euler`` takes equal steps (published for sampling); ``dopri5`` chooses its own by ``tolerance``, and
@@ -131,7 +131,7 @@ class FlowMatching(Objective):
 class PairMatching(Objective):
     """The later trainings: the pseudo-Huber error of the velocity between noise and the scan that it leads to.
 
-    Training images give no more than their number. Pairs are made by the network as it is when the training begins.
+    Of the training images, only their number is used. Pairs are made by the network as it is when the training begins.
 
     Args:
         network: network that is trained, from the weights that it has.
@@ -220,7 +220,7 @@ class FlowPairs:
 
 
 def as_kept(values: Float[Tensor, "B C H W"], sensor: SensorModel) -> Float[Tensor, "B C H W"]:
-    """Return what is learned of generated images that were saved as ranges in metres and read again.
+    """Return generated images as if they had been saved as ranges in metres and read again.
 
     Source:
         kazuto1011/r2flow@3f5afeb (MIT), whose pairs are files of metres, with the reflectance of all pixels.

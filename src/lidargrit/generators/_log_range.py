@@ -16,7 +16,7 @@ from lidargrit.structures import RangeImage
 
 
 def encode(images: RangeImage, with_reflectance: bool) -> Float[Tensor, "B C H W"]:
-    """Map a batch to what the network sees: log2(1 + range) over that of the limit, in [-1, 1], -1 without a return.
+    """Map a batch to the network's input: log2(1 + range) over that of the limit, in [-1, 1], -1 without a return.
 
     The shortest range of a return lies above -1: at -0.59 for 1.45 m of 80 m. Between the two is nothing, which is how
     the published models of R2DM and R2Flow tell a return from none.
@@ -36,10 +36,10 @@ def encode(images: RangeImage, with_reflectance: bool) -> Float[Tensor, "B C H W
 def decode(
     values: Float[Tensor, "B C H W"], sensor: SensorModel, returned: Bool[Tensor, "B H W"] | None = None
 ) -> RangeImage:
-    """Map what a network generated to range images; a second channel is reflectance.
+    """Map the output of a network to range images; a second channel is reflectance.
 
     Args:
-        values: level of the range, perhaps reflectance; cut to [-1, 1].
+        values: channels in [-1, 1], which are clipped to it: the encoded range, and the reflectance where there is one.
         sensor: sensor of the images.
         returned: mask of the returns; by default the pixels whose range lies inside the sensor's limits, as published.
     """

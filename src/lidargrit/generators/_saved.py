@@ -1,4 +1,4 @@
-"""A network with its configuration and sensor ⇄ the two files by which it is kept and shared."""
+"""A network with its configuration and sensor ⇄ the two files in which it is saved."""
 
 from __future__ import annotations
 

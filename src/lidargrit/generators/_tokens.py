@@ -1,4 +1,4 @@
-"""What generators of tokens have in common, whatever their tokenizer and in whatever order they sample its tokens."""
+"""Base of generators of tokens, with any tokenizer and any order of sampling."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class TokenGeneratorConfig:
 
     Args:
         tokenizer: configuration of any tokenizer.
-        transformer: sizes of the transformer over its tokens.
+        transformer: sizes of the transformer that models the tokens.
         pixels: sizes of a pixel decoder, which samples returns and ranges in phases; none in the paper.
     """
 
@@ -72,7 +72,7 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
 
     @abstractmethod
     def transformer_objective(self) -> Objective:
-        """Return what trains the transformer over the frozen tokenizer."""
+        """Return the objective of the transformer over the frozen tokenizer."""
 
     def objective(self, stage: str) -> Objective:
         """Return the tokenizer itself, or the objective of a network over the frozen tokenizer."""
@@ -117,18 +117,18 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
         tokenizer: Tokenizer,
         condition: Condition | None = None,
     ) -> RangeImage:
-        """Return the first scans of sampled tokens: those that are wanted, and what its batch takes along.
+        """Decode sampled tokens to scans: those that are wanted, and the rest of the last one's batch.
 
         Scans are decoded in batches of one size, as tokens are sampled, because kernels differ by the size.
 
         Args:
             tokens: tokens of ``compute_batch`` scans in raster order.
-            wanted: number of scans that are wanted; see ``BatchSeeds``.
+            wanted: number of scans to return; the rest are the copies of ``BatchSeeds``.
             rngs: random generators on the CPU, one for each scan.
             mask: method by which returns and ranges are decided.
             pixels: settings by which the pixel decoder samples ranges.
             tokenizer: the generator's own tokenizer, or its copy for decoding only.
-            condition: known part of the scans, by which a pixel decoder goes.
+            condition: observed part of the scans, which a pixel decoder keeps.
 
         Raises:
             ConfigError: ``mask`` asks for a pixel decoder, and there is none.
@@ -151,9 +151,9 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
         return RangeImage.cat(images)
 
     def observed_tokens(self, condition: Condition) -> Int[Tensor, "B T"]:
-        """Return the tokens of the cells of which a pixel was observed, and -1 for the others.
+        """Return the tokens of all cells with an observed pixel, and -1 for the others.
 
-        They are those of scans in which every other pixel is as the nearest observed one by angle, around the circle.
+        They are the tokens of scans in which every unobserved pixel is a copy of the nearest observed one by angle.
         """
         observed = condition.return_observed | condition.range_observed
         filled = fill_from_nearest(condition.surfaces, observed)
@@ -176,7 +176,7 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
         return ScanBits(steps.step_mm, images.return_mask, tokens, mask, range_, usual)
 
     def token_bits(self, grid: TokenGrid) -> Float[Tensor, "B h w"]:
-        """Return the bits of each token, as many for one as for another.
+        """Return the bits of each token if all tokens are equally likely.
 
         A generator whose transformer gives exact probabilities of tokens returns their bits instead.
         """

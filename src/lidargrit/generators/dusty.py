@@ -86,13 +86,13 @@ class DustyConfig:
 
 @dataclass(frozen=True)
 class DustySampling:
-    """How scans are sampled, and how the latent of a given scan is searched.
+    """Settings of sampling, and of the search for the latent of a scan.
 
     Args:
         mask: method by which returns are decided. ``bernoulli`` samples each return with its probability, as the
             program does; ``threshold`` keeps a return that is at least as likely as not.
-        raydrop_seed: number that is mixed with a scan's seed for its raydrop only; another one drops other rays of the
-            same scan.
+        raydrop_seed: number that is mixed with a scan's seed for its raydrop only; another number drops other rays of
+            the same scan.
         tolerance: smallest distance of a return from the far limit, as a share of the span of inverse range; nearer
             values count as no return. If not given, it is the program's: 0 with a mask, where only the limit itself
             counts as none, and 0.008 for ``baseline``, which was tuned on KITTI odometry and is 58 m there.
@@ -212,7 +212,7 @@ class Dusty(Generator[DustyConfig, DustySampling]):
     def _search(
         self, images: RangeImage, observed: Bool[Tensor, "B H W"], seeds: Sequence[int], sampling: DustySampling
     ) -> Float[Tensor, "B D"]:
-        """Return the latents whose clean ranges are nearest to the known returns: mean distance of inverse ranges."""
+        """Return the latents whose clean ranges are nearest to the observed returns, by mean inverse range error."""
         target = self.encoding.encode(images)[:, 0]
 
         def error_of(latents: Tensor) -> Tensor:
@@ -240,7 +240,7 @@ class InverseRange:
 
 
 class AdversarialObjective(Objective):
-    """What DUSty trains: two players who take turns, each with the same random numbers.
+    """DUSty's adversarial losses: two players take turns, with the same random numbers.
 
     The discriminator learns to tell real scans from generated ones. The other player, the generating network, learns to
     make it take its scans for real (the non-saturating loss of Goodfellow et al., 2014). At every ``penalty_every``-th

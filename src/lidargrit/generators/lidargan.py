@@ -163,7 +163,7 @@ class LidarGan(Generator[LidarGanConfig, NoSampling]):
 
 
 class LidarGanObjective(Objective):
-    """What LidarGAN trains: two players who take turns, each with the same real scans and latents.
+    """LidarGAN's adversarial losses: two players take turns, with the same real scans and latents.
 
     The program takes other real scans for the second player.
     """

@@ -35,7 +35,7 @@ _WINDOWS_M = {"frd": (0.5, 63.0), "bev": (3.0, 70.0), "sensor": (0.0, math.inf)}
 
 @dataclass(frozen=True)
 class LidarGenConfig:
-    """What the model learns, its network and its noise levels; the defaults are the published ones.
+    """Channels, network and noise levels of LiDARGen; the defaults are the published ones.
 
     Args:
         channels: number of channels of the network's finest level.
@@ -69,7 +69,7 @@ class LidarGenConfig:
 
 @dataclass(frozen=True)
 class LangevinSampling:
-    """How images are sampled, and which of their values count as returns.
+    """Settings of Langevin sampling, and of the window of ranges that count as returns.
 
     The published 232 levels, 5 steps and step size are those that the theory of Song and Ermon (2020) gives for 32x32
     colour images. For two channels of 64x1024 it gives about 1,450 levels and a step of 1.1e-6. Fewer levels and larger
@@ -161,7 +161,7 @@ class LidarGen(Generator[LidarGenConfig, LangevinSampling]):
         return self._decoded(images, sampling)
 
     def _complete(self, condition: Condition, seeds: Sequence[int], sampling: LangevinSampling) -> RangeImage:
-        """Generate scans that agree with the observed pixels, as the paper makes dense scans of sparse ones."""
+        """Generate scans that agree with the observed pixels, as the paper densifies sparse scans."""
         noise = SeededNoise(seeds, self.shape, self.device)
         levels, steps_each = self._counts(sampling)
         observed, images = condition.return_observed[:, None], condition.images
@@ -243,7 +243,7 @@ class ScoreMatching(Objective):
 
 
 def encode(images: RangeImage, config: LidarGenConfig) -> Float[Tensor, "B C H W"]:
-    """Map a batch to what the network sees: log2(1 + range) over ``log2_scale`` and reflectance, both in [0, 1].
+    """Map a batch to the network's input: log2(1 + range) over ``log2_scale`` and reflectance, both in [0, 1].
 
     A missing return is 2.4e-5, and its reflectance 0.
 

@@ -49,25 +49,27 @@ _COUNTERS = ("quantize.usage", "quantize.code_sums")  # of our training, which o
 
 @dataclass(frozen=True)
 class TokenSampling:
-    """How tokens and returns are sampled.
+    """Settings of sampling tokens, returns and ranges.
 
     Args:
         temperature: divisor of the logits: above 1 scans vary more than the model's own, below 1 less; 0 takes the
             likeliest token.
-        top_k: number of the likeliest tokens that are sampled from; 0 for all, the model's own distribution, since the
-            paper names no other. The released program takes 100, which makes a barely trained model bland.
-        top_p: probability that the likeliest tokens, which alone are sampled from, hold together; 1 for all.
+        top_k: number of the likeliest tokens that are sampled from. 0 takes all, which is the model's own distribution,
+            since the paper names no other number. The released program takes 100, which makes the scans of a barely
+            trained model bland.
+        top_p: total probability of the likeliest tokens that are sampled from; 1 for all.
         mask: method by which returns and ranges are decided. ``pixels`` samples both by the pixel decoder, phase by
             phase. ``bernoulli`` samples each return with its probability, independently of the others, and keeps the
             decoded ranges (the released program, so what the paper's scores were computed with). ``threshold`` keeps a
             return that is at least as likely as not (the paper's eq. 1). ``auto`` is ``pixels`` where there is a pixel
             decoder, and ``bernoulli`` elsewhere.
-        range_temperature: divisor of the logarithms of the pixel decoder's weights of surfaces; below 1 it prefers the
-            likelier surface. Only scans sampled with 1, and a noise of 1, have the likelihood that the model tells.
+        range_temperature: divisor of the logarithms of the pixel decoder's weights of surfaces; below 1 the likelier
+            surface is preferred. Only scans sampled with 1, and a noise of 1, follow the distribution whose likelihood
+            the model gives.
         range_noise: multiplier of the pixel decoder's spread of ranges about a surface.
-        completion: method by which scans are completed. ``network`` estimates ranges and samples the mask by a network
-            for completion; ``tokens`` samples the tokens of which no pixel is known, and then all unknown pixels.
-            ``auto`` is ``network`` where a model has one and pixels are known.
+        completion: method by which scans are completed. ``network`` estimates ranges, and samples the mask, by a
+            network for completion; ``tokens`` samples the tokens without any observed pixel, and then all pixels that
+            were not observed. ``auto`` is ``network`` where a model has one and pixels were observed.
         weights: number type of the transformer's weights. ``fp32`` is exact; ``bf16`` and ``int8`` (CPUs only) read
             less memory for a token and change probabilities a little, see docs/performance.md.
         decoder: number type of the decoder. ``fp32`` is exact; ``bf16`` is quicker and moves ranges a little; ``auto``
@@ -94,13 +96,13 @@ class TokenSampling:
             )
 
     def pixels(self) -> PixelSampling:
-        """Return the choices of the pixel decoder."""
+        """Return the settings of the pixel decoder."""
         return PixelSampling(self.range_temperature, self.range_noise)
 
 
 @dataclass(frozen=True)
 class LidarGritConfig(TokenGeneratorConfig):
-    """The two networks of the paper; with other tokenizers than its VQ-VAE or further networks, of systems like it.
+    """Configuration of the tokenizer, the transformer, and optional networks that the paper does not have.
 
     Args:
         completion: sizes of a network that completes scans; none in the paper.
@@ -153,7 +155,7 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
 
     @property
     def compute_batch(self) -> int:
-        """Number of scans whose tokens are sampled at once: a step takes little longer for several than for one."""
+        """Number of scans whose tokens are sampled at once; a step for several takes little longer than for one."""
         return 8 if self.device.type == "cpu" else 32
 
     def _sample(self, seeds: BatchSeeds, sampling: TokenSampling) -> RangeImage:
@@ -165,13 +167,14 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
 
     @property
     def conditions(self) -> frozenset[ConditionKind]:
-        """Known pixels, and known ranges of surfaces, of which it is sampled which return."""
+        """Observed pixels, and with a pixel decoder ranges of surfaces whose returns are sampled."""
         return frozenset({"pixels", "surfaces"})
 
     def _complete(self, condition: Condition, seeds: BatchSeeds, sampling: TokenSampling) -> RangeImage:
-        """Generate the tokens of which no pixel was observed, and with a pixel decoder the pixels around observed ones.
+        """Generate the tokens without any observed pixel, and with a pixel decoder the pixels around observed ones.
 
-        Tokens come row by row, pixels in phases: each knows of what was observed before its turn, and not of the rest.
+        Tokens come row by row, and pixels in phases. Each is conditioned on the observed ones before it, not on later
+        ones.
         """
         rngs = [torch.Generator().manual_seed(seed) for seed in seeds]
         if self._completes_by_network(condition, sampling):
@@ -185,7 +188,7 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         return self.decode(tokens, seeds.num_asked_for, rngs, sampling.mask, sampling.pixels(), tokenizer, condition)
 
     def _completes_by_network(self, condition: Condition, sampling: TokenSampling) -> bool:
-        """Tell whether the network for completion is what completes such a scan."""
+        """Return whether the network for completion completes such a scan."""
         if sampling.completion == "network" and self.completion is None:
             raise ConfigError(
                 "completion=network for a model without a network that completes scans",

@@ -49,7 +49,7 @@ class LidarVaeConfig:
         first_row: index of the highest of these rows. The program leaves out the highest 17 and the lowest 7 of 64.
         warmup_scans: number of training scans, in each process, over which the weight of the divergence rises linearly
             from 0 to 1; 0 for a weight of 1 from the start.
-        free_nats: divergence of a scan, in nats, up to which it is not lowered further.
+        free_nats: KL divergence of a scan's latent, in nats, below which it adds nothing to the loss (free bits).
         initial_std: standard deviation of the new weights of both networks.
     """
 
@@ -70,11 +70,11 @@ class LidarVaeConfig:
 
 @dataclass(frozen=True)
 class VaeSampling:
-    """How scans are completed and inverted; sampling itself leaves nothing to choose.
+    """Settings of completing and inverting scans; sampling itself has none.
 
     Args:
-        spread: standard deviations around the mean latent of a scan's known pixels, from which a latent is sampled to
-            complete the scan; 0 takes the mean, as the paper's evaluation does.
+        spread: factor on the standard deviations by which a latent is sampled around the mean latent of the observed
+            pixels when a scan is completed; 0 takes the mean, as the paper does in its evaluation.
         search_steps: number of steps of the optimiser that searches for a latent.
         search_rate: highest learning rate of that optimiser.
     """
@@ -92,8 +92,8 @@ class VaeSampling:
 class LidarVae(Generator[LidarVaeConfig, VaeSampling]):
     """A variational autoencoder over horizontal distance and height, of scans whose holes were filled.
 
-    Every ray of its rows returns, and no ray of the others: see :attr:`full_rows`. It completes a scan by filling what
-    was not observed as it fills other holes, encoding that and decoding it.
+    Every ray of its rows returns, and no ray of the others: see :attr:`full_rows`. To complete a scan, it fills
+    unobserved pixels as it fills other holes, encodes the result and decodes it.
 
     Source:
         Caccia et al., Deep Generative Modeling of LiDAR Data, IROS 2019; numbers from
@@ -223,7 +223,7 @@ class LidarVae(Generator[LidarVaeConfig, VaeSampling]):
 
 
 class LidarVaeObjective(Objective):
-    """What the VAE trains: the absolute error of the decoded image, and the divergence of its latent from the prior."""
+    """The VAE's loss: the absolute error of the decoded image, and the divergence of its latent from the prior."""
 
     scans_seen: Tensor
 

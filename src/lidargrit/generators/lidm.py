@@ -35,7 +35,7 @@ _NOT_READ = (f"{_FIRST_STAGE}loss.*", f"{_AVERAGE}decay", f"{_AVERAGE}num_update
 
 @dataclass(frozen=True)
 class LidmConfig:
-    """The two networks, and the noise between scan and nothing; the defaults are the published ones.
+    """The two networks and the noise schedule; the defaults are the published ones.
 
     Args:
         tokenizer: configuration of a tokenizer with a codebook; ``curve_vqvae`` is LiDM's own, ``vqvae`` LidarGRIT's.
@@ -58,13 +58,13 @@ class LidmConfig:
 
 @dataclass(frozen=True)
 class LidmSampling:
-    """How latents and returns are sampled.
+    """Settings of sampling latents and returns.
 
     Args:
         steps: number of evaluations of the network; 50 are published.
         eta: share of each step's noise that is fresh: 1 in the authors' ``sample.py``, 0 for none after the beginning.
-        mask: method by which returns are decided where the tokenizer tells their probability. ``bernoulli`` samples
-            each return, ``threshold`` keeps one that is at least as likely as not. LiDM's tokenizer tells none.
+        mask: method by which returns are decided where the tokenizer gives their probability. ``bernoulli`` samples
+            each return, ``threshold`` keeps one that is at least as likely as not. LiDM's tokenizer gives none.
     """
 
     steps: int = 50
@@ -232,7 +232,7 @@ class LatentCache:
     0.29 s with all of its 8 latents kept, and 0.74 s with none.
 
     Args:
-        tokenizer: tokenizer, which is frozen.
+        tokenizer: frozen tokenizer whose latents are kept.
         bytes_at_most: bound of the memory that latents take.
     """
 

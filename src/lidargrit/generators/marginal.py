@@ -20,7 +20,7 @@ _BATCH = 16
 
 @dataclass(frozen=True)
 class MarginalConfig:
-    """How finely ranges are counted.
+    """Resolution of the histograms of range.
 
     Args:
         bins: number of bins of a logarithmic axis between the sensor's limits; with 128, each is 4 % wide.
@@ -34,7 +34,7 @@ class MarginalConfig:
 
 
 class Marginal(Generator[MarginalConfig, NoSampling]):
-    """Knows of each pixel how often it returns and how far, and nothing of how pixels hang together.
+    """Samples every pixel from its own histogram of range and return, independently of all others.
 
     A metric that gives it a good score does not look at shapes. It has no stage to train by an objective: it counts,
     see :meth:`fit_statistics`.

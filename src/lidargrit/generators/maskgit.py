@@ -31,7 +31,7 @@ from lidargrit.structures import RangeImage
 
 @dataclass(frozen=True)
 class MaskedSampling:
-    """How tokens and returns are sampled.
+    """Settings of sampling tokens, returns and ranges.
 
     Args:
         steps: number of passes of the transformer; at most one for each token.
@@ -71,7 +71,7 @@ class MaskedSampling:
             )
 
     def pixels(self) -> PixelSampling:
-        """Return the choices of the pixel decoder."""
+        """Return the settings of the pixel decoder."""
         return PixelSampling(self.range_temperature, self.range_noise)
 
 

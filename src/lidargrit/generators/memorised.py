@@ -1,4 +1,4 @@
-"""Memorised: the training scans themselves, which is cheating; seeds → range images."""
+"""Memorised training scans, as a reference row: seeds → range images."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from lidargrit.structures import RangeImage
 
 @dataclass(frozen=True)
 class MemorisedConfig:
-    """How many scans are kept.
+    """Number of training scans that are kept.
 
     Args:
         scans: largest number of training scans that are kept, evenly spaced; 64x1024 pixels take 0.26 MB each.
@@ -34,7 +34,7 @@ class MemorisedConfig:
 
 
 class Memorised(Generator[MemorisedConfig, NoSampling]):
-    """Gives back what it was shown: the best that a generator without a thought of its own can score.
+    """Returns training scans: the best score of a generator that learns nothing.
 
     A generator that scores better on held-out scans has learned something; one that scores the same may have learned
     them by heart. It has no stage to train by an objective: it keeps scans, see :meth:`fit_statistics`.

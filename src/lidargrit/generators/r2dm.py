@@ -36,12 +36,12 @@ _CALIBRATION_SEED = 1 << 40  # of the first scan that is sampled for it: no user
 
 @dataclass(frozen=True)
 class R2dmConfig:
-    """What the model learns, and its network.
+    """Channels and network of R2DM.
 
     Args:
         unet: sizes of the U-Net.
-        reflectance: learn it beside the range, as published; set it to false where scans have none, or for a sharper
-            range (the authors' own remark).
+        reflectance: whether reflectance is learned beside the range, as published; set it to false where scans have
+            none, or for a sharper range (the authors' own remark).
         calibration_scans: number of scans sampled at the end of training to fit the threshold of the ``calibrated``
             raydrop; 0 for none.
     """
@@ -57,14 +57,14 @@ class R2dmConfig:
 
 @dataclass(frozen=True)
 class DiffusionSampling:
-    """How images are sampled, and where there is no return.
+    """Settings of sampling, and the rule by which a pixel is a return.
 
     Args:
-        steps: evaluations of the network; 256 are published, for completion 32.
+        steps: number of evaluations of the network; 256 are published, and 32 for completion.
         sampler: ``ddpm`` adds fresh noise after each step (published), ``ddim`` only at the beginning.
         raydrop: rule by which a pixel is a return. ``published``: its range lies inside the sensor's limits.
-            ``calibrated``, which is not of the paper: its value is above a threshold, fitted so that as many rays
-            return as in the training scans; a barely trained model may lose near returns by it.
+            ``calibrated`` (not in the paper): its value is above a threshold, fitted so that as many rays return as in
+            the training scans; a barely trained model may lose near returns by it.
         resamples: number of times that each step is taken when a scan is completed.
     """
 

@@ -31,7 +31,7 @@ _COST_SEED = 0
 
 @dataclass(frozen=True)
 class R2flowConfig:
-    """What the model learns, and its network.
+    """Channels, network and trainings of R2Flow.
 
     Args:
         hdit: sizes of the network.

@@ -51,13 +51,14 @@ class UltraLidarConfig:
 
 @dataclass(frozen=True)
 class VoxelSampling(FillSampling):
-    """How tokens are filled in, and how their voxels become scans.
+    """Settings of filling tokens in, and of turning voxels into scans.
 
     Args:
         rounds: number of times that a sampled scan is encoded again, half of its tokens hidden and replaced by the
             likeliest ones; 8 are published.
-        points: ``exact`` ends every ray at the first occupied voxel, at the range of its centre. ``reference`` does the
-            same with the clouds that the program writes, whose x and y are swapped, and whose points are lower corners.
+        points: rule by which voxels become ranges. ``exact`` ends every ray at the first occupied voxel, at the range
+            of its centre. ``reference`` does the same with the clouds that the program writes, whose x and y are
+            swapped, and whose points are lower corners.
     """
 
     rounds: int = 8
@@ -216,7 +217,7 @@ class UltraLidar(Generator[UltraLidarConfig, VoxelSampling]):
 
 
 class VoxelReconstruction(Objective):
-    """The first stage's objective: cross-entropy of voxels, codes near latents, and no code idle for long."""
+    """The first stage's objective: cross-entropy of voxels, and the distance of codes and latents."""
 
     def __init__(self, autoencoder: VoxelAutoencoder, sensor: SensorModel, flips: bool) -> None:
         super().__init__(sensor)

@@ -1,4 +1,4 @@
-"""Scans seen so far → the next training batch, read ahead by threads whose number changes nothing."""
+"""Training batches as a function of the scans seen so far; the number of threads that read ahead has no influence."""
 
 from __future__ import annotations
 

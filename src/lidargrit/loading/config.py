@@ -65,7 +65,7 @@ class DataConfig:
 
 @dataclass(frozen=True)
 class ScanSettings:
-    """What a command line says of reading scans, in one way for all commands.
+    """Settings of reading scans from a command line, the same for all commands.
 
     Args:
         data: settings of reading and projecting scans.

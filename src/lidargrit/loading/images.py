@@ -22,7 +22,7 @@ Pixels = tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "H W"] | None]
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where images come from; two provenances tell which scans or drives two sets share.
+    """Where images come from; two provenances show which scans or drives two sets share.
 
     Args:
         names: one name for each image: the file of its scan, or another identifier.
@@ -85,7 +85,7 @@ class RangeImages:
 
     @classmethod
     def joined(cls, sensor: SensorModel, parts: Sequence[RangeImages]) -> RangeImages:
-        """Return the images of several sets as one set, in their order."""
+        """Join the images of several sets into one set, in their order."""
         return cls(sensor, [store for part in parts for store in part._stores])
 
     def __len__(self) -> int:
@@ -112,7 +112,8 @@ class RangeImages:
 
         Args:
             indices: numbers of the images.
-            first_columns: fine column at which each image begins, below the sensor's column stride; 0 if not given.
+            first_columns: index of the fine column at which each image begins, below the sensor's column stride; 0 if
+                not given.
         """
         first_columns = first_columns or [0] * len(indices)
         pixels = [self._pixels(index, first) for index, first in zip(indices, first_columns, strict=True)]

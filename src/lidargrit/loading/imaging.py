@@ -1,4 +1,4 @@
-"""A few scans of a set → how all of them become images, and what tells that they are of another sensor."""
+"""A few scans of a set → the projection for all of them, and signs of a wrong sensor."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _PROBES = 3  # scans that are looked at: the first would do, were a folder not s
 
 @dataclass(frozen=True, eq=False)
 class Imaging:
-    """How the scans of one set become images.
+    """Settings by which the scans of one set become images.
 
     Args:
         sensor: sensor of the images, with the projection that fits the scans.
@@ -39,13 +39,13 @@ class Imaging:
 
 
 def choose_imaging(source: str, dataset: ScanDataset, sensor: SensorModel, config: DataConfig) -> Imaging:
-    """Look at a few scans of a set, and choose how all of them become images.
+    """Look at a few scans of a set, and choose the projection for all of them.
 
-    Points that are not in firing order go by elevation, in the exact variant: no row of theirs can be told by order.
-    ``projection=unfolding`` keeps the order nevertheless, and such scans are then refused one by one.
+    Points that are not in firing order get their rows by elevation, in the exact variant, since their order does not
+    show their rows. ``projection=unfolding`` keeps the order nevertheless, and such scans are then refused one by one.
 
     Args:
-        source: name of the set, for the sentences.
+        source: name of the set, for notes and doubts.
         dataset: scans of the set. Simulated ones are looked at only if they are of another sensor.
         sensor: sensor of the images.
         config: settings of the projection; one that is named there comes before the sensor's own.

@@ -89,15 +89,15 @@ def prepare(
 
 @dataclass(frozen=True)
 class Prepared:
-    """What a prepared folder holds.
+    """Size and content of a prepared folder.
 
     Args:
         folder: path of the folder.
         images: number of images.
         rows: number of rows of an image.
         columns: number of fine columns of an image.
-        size: bytes of all shards.
-        seconds: time that the work took.
+        size: size of all shards, in bytes.
+        seconds: time that the preparation took, in seconds.
         left_out: reasons why scans were left out, one line for each scan.
     """
 
@@ -176,7 +176,7 @@ def damaged_shards(folder: Path, reporter: Reporter | None = None) -> list[int]:
 def _spec(
     source: str, dataset: ScanDataset, sensor: SensorModel, config: DataConfig
 ) -> tuple[PreparedSpec, list[tuple[str, str, int, int]]]:
-    """Return what the images depend on, and for every scan its name, its drive, and its file's size and time."""
+    """Return the specification of the folder, and for every scan its name, drive, file size and time."""
     fine, scans = sensor.fine(), []
     for index in evenly_spaced(config.max_scans or len(dataset), len(dataset)):
         path = dataset.path(index)

@@ -33,8 +33,8 @@ class PreparedSpec:
         source: source of the scans, as the user typed it.
         sensor: JSON of the sensor, with all its fine columns.
         variant: projection variant, ``exact`` or ``reference``.
-        bad_points: ``refuse`` or ``drop``.
-        bad_scans: ``refuse`` or ``skip``.
+        bad_points: treatment of bad points, ``refuse`` or ``drop``.
+        bad_scans: treatment of bad scans, ``refuse`` or ``skip``.
         max_scans: largest number of scans taken from the source, evenly spaced; 0 for all.
         range_step_m: step in which ranges are kept, in metres.
         shard_scans: number of scans in a shard; the last shard may have fewer.
@@ -76,7 +76,7 @@ def shard_name(shard: int) -> str:
 
 
 def unfinished_name(shard: int) -> str:
-    """Return the file name of what is done of a shard that does not yet hold all of its scans."""
+    """Return the name of the file that holds the finished part of a shard."""
     return f"{shard:06d}.unfinished"
 
 
@@ -89,7 +89,7 @@ def is_prepared(source: str) -> bool:
 
 
 class PreparedFolder:
-    """The files of a prepared folder.
+    """The files of a prepared folder, on this machine or behind a URL.
 
     Args:
         location: path on this machine, or a URL that fsspec opens, such as s3://bucket/scans.

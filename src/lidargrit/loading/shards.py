@@ -34,16 +34,16 @@ _CODEC = Blosc(cname="zstd", clevel=3, shuffle=SHUFFLE)
 
 @dataclass(frozen=True)
 class Entry:
-    """Where one image lies in a shard.
+    """Position of one image in a shard, and its hashes.
 
     Args:
         scan: index of the image's scan among all scans of the prepared folder.
         offset: position of the image's first byte in the file.
-        range_bytes: length of the compressed range.
-        reflectance_bytes: length of the compressed reflectance, which follows the range; 0 if there is none.
+        range_bytes: length of the compressed range, in bytes.
+        reflectance_bytes: length of the compressed reflectance, in bytes, which follows the range; 0 if there is none.
         fingerprint: hash of the pixels before compression.
-        range_fingerprint: hash of the ranges alone, by which a scan is known without its reflectance; "" in shards of
-            before it was written.
+        range_fingerprint: hash of the ranges alone, by which a scan without its reflectance is recognised; "" in older
+            shards.
     """
 
     scan: int

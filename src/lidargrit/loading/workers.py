@@ -95,7 +95,7 @@ def make_shard(
 
 
 def _made_by_processes(folder: Path, shares: list[list[int]]) -> Iterator[int]:
-    """Yield how many scans more are done, each time that one of the processes says so."""
+    """Start processes that make shards, and yield the numbers of further scans done."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}  # one core each: threads of several would fight for them
     command = module_command("lidargrit.loading", str(folder), str(os.getpid()))
     processes = [
@@ -138,7 +138,7 @@ def _error_of(line: str) -> LidarGritError:
 
 
 def make_some_shards(folder: Path, parent: int, shards: list[int]) -> int:
-    """Make shards while the process that wants them lives; print a line for every scan, or the error."""
+    """Make shards until the parent process ends; print a line for every scan, or the error."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that a half-written file is removed
     spec = PreparedFolder(str(folder)).read_spec()
     dataset = open_dataset(spec.source, "drop" if spec.bad_points == "drop" else "refuse")

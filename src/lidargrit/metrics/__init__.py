@@ -238,7 +238,7 @@ def update_together(metrics: Sequence[tuple[Metric[Any, Any], bool]], images: Ra
     """Feed a batch of images to several metrics, and compute features that several of them need only once.
 
     Args:
-        metrics: each metric with whether the images belong to its real set.
+        metrics: metrics, each with whether the images belong to its real set.
         images: a batch of range images, or a single one.
 
     Raises:

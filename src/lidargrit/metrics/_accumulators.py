@@ -1,4 +1,4 @@
-"""What a metric keeps of one set: summaries of batches → all of them together, joined in any number of parts."""
+"""Accumulators of a metric: summaries of batches → one summary of a set, which can be merged from parts."""
 
 from __future__ import annotations
 

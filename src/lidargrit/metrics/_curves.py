@@ -42,7 +42,7 @@ class Curves:
 
 
 class CurveMetric(ImageMetric):
-    """Counts something in the pixels of every image and compares what the counts of two sets say.
+    """Counts a quantity in the pixels of every image, and compares the curves of two sets.
 
     The value is the Jensen-Shannon distance: the square root of the divergence in base 2, from 0 (alike) to 1 (nothing
     in common). The details hold the curves with their labels: ``axis``, ``generated`` and ``real``, None where too
@@ -174,10 +174,10 @@ class LocalSurface:
     return is not used: returns and drops are treated alike, and the share of returns is not biased.
 
     Args:
-        range_m: interpolated along the row between the nearest return on either side, NaN where there is none within
-            11 degrees on both or where the two differ by more than a tenth (the sky, the edge of an object).
-        incidence_rad: angle between the ray and the normal of the plane through these two and the nearest returns
-            above and below; NaN also where these two say another range than the first, by more than a tenth.
+        range_m: range interpolated along the row between the nearest return on either side. NaN where one of them is
+            missing within 11 degrees, or where the two differ by more than a tenth (the sky, the edge of an object).
+        incidence_rad: angle between the ray and the normal of the plane through these two and the nearest returns above
+            and below; NaN also where the latter give a range that differs from the first by more than a tenth.
     """
 
     range_m: Float[Tensor, "B H W"]

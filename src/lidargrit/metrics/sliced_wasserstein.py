@@ -191,7 +191,7 @@ def laplacian_pyramid(images: Float[Tensor, "B H W"], *, shifted: bool) -> list[
     Azimuth is not treated as circular: borders are mirrored, as in both sources.
 
     Args:
-        images: encoded, in [-1, 1].
+        images: encoded range images, in [-1, 1].
         shifted: True repeats LidarGRIT's program, where a coarse pixel lands one pixel down and right of where it came
             from; False keeps it in its place.
     """

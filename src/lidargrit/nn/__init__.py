@@ -1,1 +1,1 @@
-"""Parts without opinions: blocks that models share, tensors → tensors."""
+"""Networks and building blocks that models share: tensors → tensors."""

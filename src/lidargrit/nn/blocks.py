@@ -1,4 +1,4 @@
-"""Base classes of networks and of the blocks they repeat, and how training has them compute."""
+"""Base classes of networks and of their repeated blocks; compilation and recomputation in training."""
 
 from __future__ import annotations
 

@@ -33,14 +33,14 @@ class CompletionNetworkConfig:
     """Sizes of the network that completes scans.
 
     Args:
-        widths: channels at a half, a quarter and an eighth of the image's rows and columns.
-        blocks: residual blocks at an eighth.
-        attention_layers: layers of attention between all pixels at an eighth, among the residual blocks; what stands in
-            a wide gap follows from the other side of the street, too.
-        heads: attention heads of each layer.
-        features: channels that the phases of the mask see.
-        mask_width: channels of the layers of the mask's phases.
-        row_channels: learned numbers of every row.
+        widths: numbers of channels at a half, a quarter and an eighth of the image's rows and columns.
+        blocks: number of residual blocks at an eighth of the image's size.
+        attention_layers: number of attention layers between all pixels at an eighth of the image's size, among the
+            residual blocks: a wide gap is filled by what stands on the other side of the street, too.
+        heads: number of attention heads of each layer.
+        features: number of channels that the phases of the mask see.
+        mask_width: number of channels of the layers of the mask's phases.
+        row_channels: number of learned values of every row.
     """
 
     widths: tuple[int, int, int] = (48, 64, 128)
@@ -64,7 +64,7 @@ class CompletionNetworkConfig:
 
 
 class Point(NamedTuple):
-    """The network's estimate of every pixel.
+    """Point estimate of every pixel by the network.
 
     Args:
         guide: inputs of the phases of the mask.
@@ -78,14 +78,14 @@ class Point(NamedTuple):
 
 
 class CompletionNetwork(nn.Module):
-    """A small U-Net that weighs what classical ways say of each range, and a mask that is sampled in phases behind it.
+    """A small U-Net that weighs the ranges of classical methods, and a mask that is sampled in phases behind it.
 
     The range is a point estimate, the best single guess, and not a sample; the mask is sampled, each phase given the
     observed pixels and the earlier phases, so that drops cluster as real ones do.
 
     Args:
         config: sizes of the network.
-        sensor: the rays and limits of the range images.
+        sensor: sensor with the rays and limits of the range images.
     """
 
     def __init__(self, config: CompletionNetworkConfig, sensor: SensorModel) -> None:
@@ -159,7 +159,8 @@ class CompletionNetwork(nn.Module):
         Args:
             point: estimate of every pixel.
             returned: true masks.
-            rng: chooses one phase of each spacing, which stands for all; every phase is counted without it.
+            rng: random generator that chooses one phase of each spacing to stand for all of that spacing; None to
+                compute every phase.
         """
         guide, total = point.guide, point.v.new_zeros(len(returned))
         assert guide.observed is not None
@@ -206,7 +207,7 @@ class _Unet(Network):
 
 
 class _Attention(nn.Module):
-    """A layer of a transformer whose tokens are pixels; convolutions tell them where they are."""
+    """A layer of a transformer whose tokens are pixels; convolutions give them their positions."""
 
     def __init__(self, config: TransformerConfig) -> None:
         super().__init__()

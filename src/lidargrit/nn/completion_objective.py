@@ -1,4 +1,4 @@
-"""What trains a network that completes scans: whole scans, of which random parts are hidden → the terms of a loss."""
+"""Objective of the completion network: whole scans, with random parts hidden → the terms of a loss."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ _MASK_WEIGHT, _ALONE_WEIGHT, _LOG_WEIGHT, _METRE_WEIGHT = 3.0, 0.5, 1.5, 0.3
 class CompletionObjective(Objective):
     """The errors of the hidden pixels: of the range, and of the mask, by its likelihood in phases and pixel by pixel.
 
-    Every scan has a random pattern: rows, all but a sector or a box, or single pixels. A scan of which more is hidden
-    counts more, with the root of the hidden share.
+    Every scan has a random pattern: rows, all but a sector or a box, or single pixels. Scans are weighed by the square
+    root of their hidden share.
 
     Args:
         network: network that is trained.

@@ -1,4 +1,4 @@
-"""The two networks of a GAN of range images, whose azimuth wraps: latents → maps, an image → how real it looks."""
+"""The two networks of a GAN of range images, whose azimuth wraps: latents → images, images → logits of being real."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ class _Double(nn.ConvTranspose2d):
 def _start(layer: nn.Conv2d | nn.ConvTranspose2d, gain: float) -> float:
     """Set a layer's first weights at random, and return the factor by which they are multiplied when used.
 
-    It is the program's scale, which for transposed convolutions counts outputs where it means to count inputs.
+    The factor is the program's, which for transposed convolutions counts outputs instead of inputs.
     """
     assert layer.bias is not None
     nn.init.normal_(layer.weight)

@@ -1,4 +1,4 @@
-"""A device's name, such as "cpu" or "cuda:1" → the device, once it is known to be there."""
+"""The name of a device, such as "cpu" or "cuda:1" → the device, if it exists."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gaussian diffusion in continuous time, told by its log signal-to-noise ratio: (network, noise) → images.
+"""Gaussian diffusion in continuous time, by its log signal-to-noise ratio: (network, noise) → images.
 
 An image x at log SNR λ is α x₀ + σ ε with α² = sigmoid(λ), σ² = sigmoid(-λ). Time runs from 0, clean, to 1, noise.
 
@@ -45,7 +45,7 @@ def noised(
 
 
 def min_snr_weight(log_snr: Float[Tensor, "*B"], most: float = 5.0) -> Float[Tensor, "*B"]:
-    """Return min(SNR, most) / SNR, by which an error of the noise counts as one of the image does with min(SNR, most).
+    """Return min(SNR, most) / SNR, the weight of an error of the noise; it is min(SNR, most) for one of the image.
 
     Source:
         Hang et al., Efficient Diffusion Training via Min-SNR Weighting, 2023.
@@ -76,7 +76,7 @@ def step_back(
     then: Float[Tensor, ""],
     fresh: Float[Tensor, "B C H W"] | None,
 ) -> Float[Tensor, "B C H W"]:
-    """Go to a cleaner image: the predicted one is cut to [-1, 1], and what it and the noisy one say is joined.
+    """Go to a cleaner image: the predicted clean image is clipped to [-1, 1], and combined with the noisy one.
 
     Args:
         noisy: noisy images at the log SNR ``now``.
@@ -119,7 +119,7 @@ def sample(
     Args:
         denoiser: a network.
         noise: function that returns fresh noise at each call.
-        steps: evaluations of the network.
+        steps: number of evaluations of the network.
         sampler: ``ddpm`` adds fresh noise after each step, ``ddim`` only at the beginning.
     """
     image = noise()

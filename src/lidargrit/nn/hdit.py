@@ -63,7 +63,7 @@ class HditConfig:
 
 
 class Hdit(Network):
-    """Predicts the velocity of range images; azimuth wraps, and every token is told where its rays look.
+    """Predicts the velocity of range images; azimuth wraps, and attention depends on the rays of the tokens.
 
     Args:
         config: sizes of the network.
@@ -250,7 +250,7 @@ class _Rotary(nn.Module):
 
 
 def _turned(x: Tensor, turn_rad: Tensor) -> Tensor:
-    """Turn each channel of the first half of a head together with its fellow of the second half."""
+    """Rotate each channel of the first half of a head together with the corresponding one of the second half."""
     (first, second), cos, sin = x.chunk(2, dim=-1), turn_rad.cos(), turn_rad.sin()
     return torch.cat((first * cos - second * sin, second * cos + first * sin), dim=-1)
 
@@ -283,7 +283,7 @@ class _TimeFeedForward(nn.Module):
 
 
 class _Geglu(nn.Linear):
-    """A linear layer whose second half opens and closes its first half."""
+    """A linear layer whose second half gates its first half."""
 
     def __init__(self, channels: int) -> None:
         super().__init__(channels, 2 * _WIDENING * channels, bias=False)
@@ -336,7 +336,7 @@ class _Expand(nn.Module):
 
 
 def _zero_linear(inputs: int, outputs: int) -> nn.Linear:
-    """Begin with zeros: a block that adds nothing yet."""
+    """Return a linear layer of zeros, so that a new block adds nothing."""
     layer = nn.Linear(inputs, outputs, bias=False)
     nn.init.zeros_(layer.weight)
     return layer

@@ -1,4 +1,4 @@
-"""The latent from which a network generates what is nearest to a given scan: an error of latents → latents."""
+"""Inversion of a generating network: an error as a function of latents → the latents of the least error."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ _RISE, _FALL = 0.05, 0.25  # shares of steps in which the rate rises from 0, and
 def search_latents(
     error_of: Callable[[Tensor], Tensor], noise: Float[Tensor, "B steps_and_start D"], rate: float
 ) -> Float[Tensor, "B D"]:
-    """Search for each row of a batch the latent of the least error, each for itself.
+    """Search the latent of the least error for each row of a batch, independently.
 
-    Latents stay on the sphere on which almost all random ones lie, and are shaken at first, to leave dead ends.
+    Latents stay on the sphere on which almost all random ones lie. Noise is added at first, to leave local minima.
 
     Args:
-        error_of: latents (B, D) → an error for each, of which nothing but the own latent matters.
-        noise: standard normal numbers: where to start, then one shake for each step.
-        rate: the learning rate of Adam at its highest.
+        error_of: function from latents (B, D) to one error for each, which depends on that latent alone.
+        noise: standard normal numbers: the start of the search, then one disturbance for each step.
+        rate: highest learning rate of Adam.
 
     Source:
         Karras et al., StyleGAN2, 2020, appendix D, with the numbers and the sphere of kazuto1011/dusty-gan@0374a5e,

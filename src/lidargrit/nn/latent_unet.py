@@ -122,7 +122,7 @@ class LatentUnet(Network):
         )
 
     def forward(self, noisy: Float[Tensor, "B D h w"], step: Float[Tensor, "B"]) -> Float[Tensor, "B D h w"]:
-        """Return the noise that it sees in latents of these time steps, whole numbers from 0."""
+        """Return the predicted noise in latents of these time steps, whole numbers from 0."""
         embedding = self.time_embed(_waves(step, self.waves))
         x, passed = noisy, []
         for block in self.input_blocks:
@@ -170,7 +170,7 @@ class _Residual(Block):
 
 
 class _Attention(Block):
-    """Every latent looks at every other."""
+    """Self-attention between all latents."""
 
     def __init__(self, channels: int, config: LatentUnetConfig) -> None:
         super().__init__()
@@ -217,7 +217,7 @@ def _waves(step: Float[Tensor, "B"], channels: int) -> Float[Tensor, "B C"]:
 
 
 def _silenced(layer: nn.Module) -> nn.Module:
-    """Begin with zeros: a block that adds nothing yet."""
+    """Set the weights to zero, so that a new block adds nothing."""
     for parameter in layer.parameters():
         nn.init.zeros_(parameter)
     return layer

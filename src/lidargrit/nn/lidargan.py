@@ -1,4 +1,4 @@
-"""Caccia's two convolutional networks: latents → images, an image → numbers that tell about it; and their losses."""
+"""LidarGAN's two convolutional networks, and the losses of GAN and VAE: latents → images, images → vectors."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Decoder(Network):
 
 
 class Encoder(Network):
-    """Images → numbers: how real an image looks (one number), or the mean and log-variance of its latent.
+    """Images → vectors: one number for the discriminator, or the mean and log-variance of a latent for the encoder.
 
     Its convolutions are those of :class:`Decoder` in the opposite order.
 
@@ -79,7 +79,7 @@ class Encoder(Network):
         _start(self, initial_std)
 
     def forward(self, images: Float[Tensor, "B 2 H W"]) -> Float[Tensor, "B outputs"]:
-        """Tell about images."""
+        """Return one vector for each image."""
         return self.out(self.main(images)).float()[..., 0, 0]
 
 
@@ -149,7 +149,7 @@ def vae_loss(
         reconstructed: images that were decoded.
         kl: divergence of each latent.
         kl_weight: weight of the divergence, from 0 to 1.
-        free_nats: divergence up to which all is one, so that nothing presses on a latent that says little.
+        free_nats: divergence of a latent, in nats, below which it adds nothing to the loss.
     """
     error = (reconstructed - images).abs().sum(dim=(1, 2, 3)).mean()
     loss = error + kl_weight * kl.clamp(min=free_nats).mean()

@@ -25,7 +25,7 @@ _SIGMAS = "module.sigmas"
 
 
 class LidarGenCheckpoint(NamedTuple):
-    """What a checkpoint tells of its network.
+    """Sizes, noise levels and weights in a checkpoint.
 
     Args:
         channels: number of channels of the finest level.

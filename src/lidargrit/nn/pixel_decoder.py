@@ -1,4 +1,4 @@
-"""Pixels generated in phases from coarse to fine, with exact probabilities: what a decoder tells → range images."""
+"""Pixels generated in phases from coarse to fine, with exact probabilities: output of a decoder → range images."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ BITS_STEP_M = 0.01  # bits of a return are those of naming its range to a centim
 
 @dataclass(frozen=True)
 class PixelSampling:
-    """How ranges are sampled from their mixtures.
+    """Settings of sampling ranges from their mixtures.
 
-    The defaults are sharper than the mixtures themselves, which have speckles where a surface is uncertain. Scans that
-    are sampled with 1 and 1 have exactly the likelihood that the model tells; sharper ones have none.
+    The defaults are sharper than the mixtures themselves, which have speckles where a surface is uncertain. Only scans
+    that are sampled with 1 and 1 follow the distribution whose likelihood the model computes.
 
     Args:
         temperature: temperature of the components' weights; 1 leaves them unchanged, below 1 prefers the likelier
@@ -55,8 +55,8 @@ class PixelNll(NamedTuple):
 
     Args:
         mask: negative log-likelihood of the mask (a return or none), given the earlier pixels.
-        range: negative log-likelihood of the range, given the whole mask and the earlier ranges; 0 without a return.
-            The likelihood is the probability of a step where ranges have steps, else a density per metre.
+        range: negative log-likelihood of the range, given the whole mask and the earlier ranges; 0 without a return. It
+            is that of a step where ranges have steps, and otherwise of a density per metre.
     """
 
     mask: Float[Tensor, "B H W"]
@@ -71,8 +71,8 @@ class PixelDecoder(nn.Module):
 
     Args:
         config: sizes of the networks.
-        sensor: the rays and limits of the range images.
-        features: channels of the tokenizer's features.
+        sensor: sensor with the rays and limits of the range images.
+        features: number of channels of the tokenizer's features.
 
     Source:
         Reed et al., Parallel Multiscale Autoregressive Density Estimation, 2017: phases from coarse to fine.
@@ -109,7 +109,7 @@ class PixelDecoder(nn.Module):
         return PixelNll(mask_nll, range_nll)
 
     def expected(self, decoded: Decoded, images: RangeImage, steps: RangeSteps) -> PixelNll:
-        """Return what :meth:`forward` is on average, over what each pixel could have been, given the earlier ones."""
+        """Return the expected value of :meth:`forward` for each pixel (its entropy), given the earlier ones."""
         guide = Guide.of(decoded)
         guided = self.mask.guided(guide), self.range.guided(guide)
         mask, v = images.return_mask, images.range_m.log1p()
@@ -187,8 +187,8 @@ class PixelDecoder(nn.Module):
             decoded: output of the tokenizer's decoder for as many scans.
             rngs: random generators on the CPU, one for each scan.
             sampling: settings of the sampling of ranges.
-            condition: known part of the scans; nothing if not given. Known returns and ranges are taken over as they
-                are, when their phase comes: later phases know of them, earlier ones not.
+            condition: observed part of the scans; nothing if not given. Observed returns and ranges are kept as they
+                are when their phase comes: later phases know of them, earlier ones do not.
         """
         guide, size = Guide.of(decoded), (3, self.sensor.height, self.sensor.width)
         uniform = torch.stack([torch.rand(size, generator=rng) for rng in rngs]).to(guide.v.device)
@@ -212,7 +212,7 @@ class PixelDecoder(nn.Module):
         condition: Condition,
         sampling: PixelSampling | None,
     ) -> Float[Tensor, "B H W"]:
-        """Return the ranges of a whole mask, sampled phase by phase around those that are known."""
+        """Return the ranges of a whole mask, sampled phase by phase around the observed ones."""
         guided, choices = self.range.guided(guide), sampling or PixelSampling()
         range_m, v = torch.zeros_like(guide.v), torch.zeros_like(guide.v)
         for phase in self.range.phases:

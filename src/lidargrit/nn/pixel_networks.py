@@ -1,4 +1,4 @@
-"""The two networks of a pixel decoder: what is known of a scan so far → mask and range of the next phase's pixels."""
+"""The two networks of a pixel decoder: pixels so far → mask and range of the next phase's pixels."""
 
 from __future__ import annotations
 
@@ -36,13 +36,14 @@ class PixelDecoderConfig:
     Args:
         coarsest_cell: rows and columns of the cells of which the first phase generates one pixel each; a power of 2
             that divides both sides of the image.
-        mask_features: channels of the tokenizer's features that the mask network sees.
-        range_features: channels of the tokenizer's features that the range network sees.
-        row_channels: learned numbers of every row.
-        mask_width: channels of the mask network's layers.
-        range_width: channels of the range network's layers.
-        blocks: residual blocks of each network.
-        free_components: components of a range that do not begin at a neighbour's range; there are 6 more that do.
+        mask_features: number of channels of the tokenizer's features that the mask network sees.
+        range_features: number of channels of the tokenizer's features that the range network sees.
+        row_channels: number of learned values of every row.
+        mask_width: number of channels of the mask network's layers.
+        range_width: number of channels of the range network's layers.
+        blocks: number of residual blocks of each network.
+        free_components: number of components of a range's distribution that do not begin at a neighbour's range; 6 more
+            do.
     """
 
     coarsest_cell: int = 8
@@ -83,7 +84,7 @@ class Guide(NamedTuple):
 
     @classmethod
     def of(cls, decoded: Decoded) -> Guide:
-        """Return the guide of what was decoded from tokens.
+        """Return the guide from the output of the tokenizer's decoder.
 
         Raises:
             ConfigError: a tokenizer whose decoder gives no features.
@@ -142,7 +143,7 @@ class _SpacingNetwork(Network):
 
 
 class PhaseNetwork(nn.Module, ABC):
-    """What the mask's and the range's network share: a small network for each spacing, run anew for every phase."""
+    """Base of the mask's and the range's network: a small network for each spacing, run anew for every phase."""
 
     def __init__(
         self, config: PixelDecoderConfig, sensor: SensorModel, features: int, kept: int, width: int, outputs: int
@@ -164,10 +165,10 @@ class PhaseNetwork(nn.Module, ABC):
     def context(
         self, phase: Phase, guide: Guide, return_mask: Bool[Tensor, "B H W"], v: Float[Tensor, "B H W"]
     ) -> Float[Tensor, "B D h w"]:
-        """Return what is known before a phase, on its cells; later pixels are not looked at."""
+        """Return the inputs that are known before a phase, on its cells; later pixels have no influence."""
 
     def guided(self, guide: Guide) -> dict[int, Tensor]:
-        """Return by spacing what the first layer makes of the guide, (B, C, h, w), the same for all its phases."""
+        """Return the first layer's output for the guide, (B, C, h, w), by spacing, the same for all phases."""
         rows = self.rows[None, :, :, None].expand(len(guide.v), -1, -1, guide.v.shape[-1])
         decoded = torch.stack((guide.v - _TYPICAL_V, guide.return_logits / 4), 1)
         maps = torch.cat((self.features(guide.features), rows, decoded), 1)
@@ -227,12 +228,12 @@ class MaskNetwork(PhaseNetwork):
         return torch.cat((certain * returned, certain * (1 - returned)), 1)
 
     def sample(self, guide: Guide, uniform: Float[Tensor, "B H W"], condition: Condition) -> Bool[Tensor, "B H W"]:
-        """Return the mask, sampled phase by phase around what is known of it.
+        """Return the mask, sampled phase by phase around its observed pixels.
 
         Args:
             guide: output of the decoder for every pixel.
             uniform: random numbers in [0, 1).
-            condition: known part of the scans, whose returns are taken over as they are.
+            condition: observed part of the scans, whose returns are kept as they are.
         """
         guided = self.guided(guide)
         mask = condition.return_mask & condition.return_observed

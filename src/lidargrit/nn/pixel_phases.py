@@ -20,8 +20,8 @@ class Phase(NamedTuple):
 
     Args:
         spacing: distance between two pixels of the lattice, in rows and in columns of the image.
-        row: 0 or 1, within the 2x2 pixels.
-        column: 0 or 1, within the 2x2 pixels.
+        row: row of the pixel within its 2x2 pixels, 0 or 1.
+        column: column of the pixel within its 2x2 pixels, 0 or 1.
     """
 
     spacing: int
@@ -86,7 +86,7 @@ class Neighbours(NamedTuple):
 def neighbours_of(phase: Phase, values: Float[Tensor, "B H W"], known: Bool[Tensor, "B H W"]) -> Neighbours:
     """Return the nearest pixels of earlier phases: above, below, left and right, or at the corners.
 
-    The first phase has none: nothing is known to it. Columns wrap around; rows beyond the image are not known.
+    The first phase has none. Columns wrap around; rows beyond the image are not known.
     """
     step = slice(None, None, phase.spacing)
     values, known = values[..., step, step], known[..., step, step]
@@ -115,7 +115,7 @@ def join_phases(coarser: Float[Tensor, "B h w"] | None, values: Float[Tensor, "P
     """Return a lattice's values, from those of the coarser lattice and those of all phases of its own spacing.
 
     Args:
-        coarser: None for the coarsest spacing, whose phases are four.
+        coarser: values of the next coarser lattice; None for the coarsest spacing, which has four phases.
         values: values of three phases, or of four, in their order.
     """
     corner = values[0] if coarser is None else coarser

@@ -1,4 +1,4 @@
-"""A file of torch.save, which may be anybody's → the tensors in it, by name, and nothing else."""
+"""An untrusted file of torch.save → the tensors in it, by name, and nothing else."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _ZIP, _PICKLE = b"PK\x03\x04", b"\x80"  # how files of torch.save begin: since v
 
 
 class RefusedFileError(Exception):
-    """Why a file is not read; follows its name in a sentence."""
+    """Reason why a file is not read; it follows the file's name in a sentence."""
 
 
 def read_checkpoint(

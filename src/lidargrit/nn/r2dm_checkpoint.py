@@ -50,7 +50,7 @@ _FIRST_NAMES = {  # names of the second layout → those of the first, where the
 
 
 class R2dmCheckpoint(NamedTuple):
-    """What a checkpoint tells of its network.
+    """Sizes and weights in a checkpoint.
 
     Args:
         unet: sizes of the network.

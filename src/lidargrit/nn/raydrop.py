@@ -1,4 +1,4 @@
-"""Coins that gradients flow through: logits of a return → 0 or 1 for each ray."""
+"""Differentiable sampling of returns: logits of a return → 0 or 1 for each ray."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 def logistic_noise(size: tuple[int, ...], rng: torch.Generator) -> Float[Tensor, "..."]:
-    """Sample numbers that turn a logit into a coin: logit + noise is above 0 with the logit's probability."""
+    """Sample logistic noise: logit + noise is above 0 with the logit's probability."""
     uniform = torch.rand(size, generator=rng, device=rng.device).clamp(min=torch.finfo(torch.float32).tiny)
     return uniform.log() - (-uniform).log1p()
 

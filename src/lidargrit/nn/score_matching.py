@@ -79,11 +79,11 @@ def langevin(
 def pull_towards(
     observed: Bool[Tensor, "B 1 H W"], reference: Float[Tensor, "B C H W"], strength: float
 ) -> Callable[[Float[Tensor, "B C H W"]], Float[Tensor, "B C H W"]]:
-    """Return the pull of images towards the observed values of others; with strength 1 it is all that lies between.
+    """Return the term that moves images towards observed values; with strength 1 it is their whole difference.
 
     Args:
-        observed: True where values are known.
-        reference: known values; others have no influence.
+        observed: True for observed values.
+        reference: observed values; those elsewhere have no influence.
         strength: share of the difference that one step makes up.
     """
     return lambda image: torch.where(observed, strength * (reference - image), 0)

@@ -32,8 +32,8 @@ def numbers_at_most(
 
     Args:
         count: largest number of weights and buffer elements of all modules that are built in the block.
-        what: words for the network in the message of an error.
-        cure: advice in that message.
+        what: name of the network, for the message of an error.
+        cure: advice to the user, for the same message.
 
     Raises:
         ConfigError: there are more, or the system has no memory for one of them.

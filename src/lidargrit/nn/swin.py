@@ -30,7 +30,7 @@ class SwinConfig:
     Args:
         width: length of the vector that stands for a token.
         heads: number of attention heads in each block.
-        blocks: number of blocks; windows of every second one are shifted by half a window.
+        blocks: number of blocks; the windows of every second block are shifted by half a window.
     """
 
     width: int = 512

@@ -28,7 +28,7 @@ class TransformerConfig:
         heads: number of attention heads in each block.
         width: length of the vector that stands for a token.
         embedding_dropout: probability of dropout on the embedded tokens.
-        residual_dropout: probability of dropout on what a block adds.
+        residual_dropout: probability of dropout on the output of each block's two branches.
         attention_dropout: probability of dropout on attention weights.
     """
 

@@ -39,10 +39,10 @@ _POSITIONS = "lidar_encoder.pos_embed"
 
 
 class UltraLidarCheckpoint(NamedTuple):
-    """What a checkpoint tells of its networks.
+    """Sizes and weights in a checkpoint.
 
     Args:
-        autoencoder: sizes of the first stage, its cells where the caller said.
+        autoencoder: sizes of the first stage; its cells are those that the caller gave.
         prior: sizes of the second stage.
         weights: weights under the names of lidargrit.generators.ultralidar.
     """

@@ -32,7 +32,7 @@ class UnetConfig:
     """Sizes of the network; the defaults are the published ones.
 
     Args:
-        channels: channels of the finest level; the embedding of the noise level has four times as many.
+        channels: number of channels of the finest level; the embedding of the noise level has four times as many.
         channel_multipliers: channels of each level over those of the finest, from fine to coarse; each further level
             halves both axes.
         residual_blocks: number of residual blocks of each level, on the way down and again on the way up.
@@ -129,7 +129,7 @@ class EfficientUnet(Network):
         self.out_conv = _silenced(Convolution(widths[0], images, "wrap"))
 
     def forward(self, noisy: Float[Tensor, "B C H W"], log_snr: Float[Tensor, "B"]) -> Float[Tensor, "B C H W"]:
-        """Return the noise that it sees in images of these signal-to-noise ratios."""
+        """Return the predicted noise in images of these signal-to-noise ratios."""
         embedding = self.time_embedding(log_snr)
         x = self.in_conv(torch.cat((noisy, self.ray_features().expand(len(noisy), -1, -1, -1)), dim=1))
         passed: list[Tensor] = []
@@ -214,7 +214,7 @@ class _AdaptiveNorm(nn.Module):
 
 
 class _Attention(nn.Module):
-    """Every pixel of the coarsest level looks at every other."""
+    """Self-attention between all pixels of the coarsest level."""
 
     def __init__(self, config: UnetConfig, channels: int) -> None:
         super().__init__()
@@ -282,7 +282,7 @@ def _up(x: Tensor) -> Tensor:
 
 
 def _silenced(layer: Layer) -> Layer:
-    """Begin with zeros: a block that adds nothing yet."""
+    """Set the weights to zero, so that a new block adds nothing."""
     for parameter in layer.parameters():
         nn.init.zeros_(parameter)
     return layer

@@ -78,7 +78,7 @@ class VoxelAutoencoder(nn.Module):
         self.pre_quant.apply(initialise_linear)
 
     def quantise(self, voxels: Float[Tensor, "B z y x"]) -> tuple[Quantised, Float[Tensor, "B T D"]]:
-        """Return what the codebook makes of scans, and the latents before it."""
+        """Return the quantised latents of scans, and the latents before quantisation."""
         latents = self.pre_quant(self.encoder(voxels))
         return self.quantiser(latents.transpose(1, 2).unflatten(2, self.config.tokens)), latents
 

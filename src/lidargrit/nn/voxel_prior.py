@@ -31,7 +31,7 @@ Fill = Callable[[Float[Tensor, "B T K"]], Int[Tensor, "B T"]]
 
 @dataclass(frozen=True)
 class FillSampling:
-    """How hidden tokens are filled in.
+    """Settings of filling hidden tokens in.
 
     Args:
         steps: number of passes of the transformer; 30 are published.
@@ -39,8 +39,8 @@ class FillSampling:
             logarithm of a token's probability and falls to 0 with the last pass.
         blank_share: share of all codes that stand for empty space. They are those that the first pass finds likeliest,
             over all tokens; 20 of 1,024 codes are published.
-        blank_steps: number of passes, from the first, in which none of these codes may be sampled. Without, most scans
-            come out empty: empty space is the surest token, and sure tokens are shown first.
+        blank_steps: number of passes, from the first, in which none of these codes may be sampled. Without this, most
+            scans come out empty: empty space is the surest token, and sure tokens are shown first.
     """
 
     steps: int = 30

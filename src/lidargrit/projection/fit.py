@@ -1,4 +1,4 @@
-"""Does a scan fit a sensor? Scan, sensor → the problems, the projection that fits, and the sensors that would fit."""
+"""Whether a scan fits a sensor: scan, sensor → problems, the projection that fits, and the sensors that would fit."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def projection_that_fits(scan: Scan, sensor: SensorModel) -> ProjectionName:
 
 
 def doubts_about_rays(scan: Scan, sensor: SensorModel, method: ProjectionName) -> str:
-    """Say in a few words what tells that another sensor than the named one made a scan; "" if nothing does.
+    """Return signs that another sensor than the named one made a scan, in a few words; "" if there are none.
 
     The image of such a scan is not wrong, point by point, but its rows are not those of the lasers.
     """
@@ -193,7 +193,7 @@ def _wrong_rows(scan: Scan, sensor: SensorModel, method: ProjectionName, pixels:
 def _misplaced(
     scan: Scan, sensor: SensorModel, method: ProjectionName, pixels: PixelCoordinates, variant: ProjectionVariant
 ) -> ScanError | None:
-    """Return what to say of an image whose rows are not where its points lie."""
+    """Return the message about an image whose rows are not where its points lie."""
     if (method == "spherical" and variant == "exact") or not _is_misplaced(scan, sensor, pixels.row):
         return None  # rows by elevation are right by themselves
     if method == "unfolding" and scan.ring is None:

@@ -1,4 +1,4 @@
-"""What a projection keeps of a scan and how well: scan, sensor → :class:`Inspection`."""
+"""Losses and errors of a projection: scan, sensor → :class:`Inspection`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Weights that change hands: the files of a system's authors → a run folder; a run → a folder that can be shared."""
+"""Import and publication of weights: files of a system's authors → a run folder; a run → a folder for others."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from lidargrit.sources.samples import is_sample_folder, trained_on, weights_of
 
 
 def import_weights(recipe: str, folder: Path, files: Sequence[Path], settings: Sequence[str] = ()) -> Generator:
-    """Make a run folder of the weights that a system's authors published, or that their program saved.
+    """Make a run folder from weights that a system's authors published, or that their program saved.
 
     Args:
         recipe: name of the recipe, which names the generator, its sizes and the sensor; nothing is trained.
@@ -75,8 +75,7 @@ def publish(run: Path, folder: Path, scores: Path | None = None, notes: str = ""
     Args:
         run: folder of a finished run.
         folder: folder that gets ``model.safetensors``, ``config.json``, the run's recipe and training recordings
-            without paths and file names, and last a model card (``README.md``). Like the run itself, it is read
-            wherever a run is wanted.
+            without paths and file names, and last a model card (``README.md``). It can be used wherever a run can.
         scores: scores of the run's samples, as ``lidargrit evaluate --json`` wrote them.
         notes: Markdown for the end of the card: what the model is good for, and where it fails.
         half: whether parameters are rounded to 16 bits.
@@ -152,7 +151,7 @@ def _public_facts(about: dict[str, Any], generator: Generator) -> dict[str, Any]
 def _check_scores(scores: Scorecard, run: Path) -> None:
     """Raise ConfigError if the scores are of other weights.
 
-    Scores of before they told their weights are believed, unless the samples are still where they were and tell.
+    Old scores do not name their weights: they are accepted, unless the samples still exist and name other weights.
     """
     theirs, samples = scores.samples.weights_sha256, scores.samples.source
     if not theirs:

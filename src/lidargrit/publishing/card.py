@@ -1,4 +1,4 @@
-"""What is known of a run → a model card: Markdown for people, with a head for the Hugging Face hub."""
+"""The facts of a run → a model card: Markdown for people, with a header for the Hugging Face hub."""
 
 from __future__ import annotations
 
@@ -195,12 +195,12 @@ def _scores(card: Scorecard) -> str:
 
 
 def _text(words: Any) -> str:
-    """Return foreign words for Markdown: one line without HTML, links and table borders."""
+    """Return untrusted text for Markdown: one line without HTML, links and table borders."""
     return re.sub(r"([\\`|\[\]])", r"\\\1", html.escape(one_line(str(words)), quote=False))
 
 
 def _code(words: Any) -> str:
-    """Return foreign words as code, in which Markdown reads nothing but its end."""
+    """Return untrusted text as inline code for Markdown."""
     return "`" + one_line(str(words)).replace("`", "'") + "`"
 
 
@@ -215,7 +215,7 @@ def _licences(about: dict[str, Any]) -> list[str]:
 
 
 def _hub_licence(licences: list[str]) -> str:
-    """Return the hub's word for what the data demand: ``other`` where none fits, "" where they demand nothing."""
+    """Return the hub's name for the licence of the data: ``other`` where none fits, "" where there is none."""
     bound = [_CREATIVE_COMMONS.fullmatch(licence) for licence in licences if licence != _FREE]
     words = {f"cc-{found[1]}-{found[2]}".lower() if found else "other" for found in bound}
     return "other" if len(words) > 1 else "".join(words)

@@ -28,7 +28,7 @@ def load_recipe(name: str, settings: Sequence[str] = ()) -> Recipe:
 
 
 def default_recipe(generator: str) -> Recipe:
-    """Return a recipe for a generator that has none: its default configuration, on simulated streets, for minutes.
+    """Return a recipe for a generator that has none: its default configuration, and minutes on simulated streets.
 
     Args:
         generator: name of the generator.

@@ -1,4 +1,4 @@
-"""Memorised: training scans given back, which is cheating; simulated or your own scans; trains in seconds."""
+"""Memorised training scans, as a reference row; simulated or your own scans; trains in seconds."""
 
 from lidargrit.generators.memorised import MemorisedConfig
 from lidargrit.loading import DataConfig

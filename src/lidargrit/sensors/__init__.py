@@ -1,4 +1,4 @@
-"""What looks: the ray table of a sensor, name → :class:`SensorModel`."""
+"""Sensors, by name or from a file: tables of ray directions and range limits → :class:`SensorModel`."""
 
 from __future__ import annotations
 
@@ -25,11 +25,12 @@ class SensorModel:
 
     Args:
         name: public name of the sensor.
-        elevation_rad: elevation of every row (H, 1), or of every pixel (H, W); falls from row 0 down; up is positive.
-        azimuth_rad: azimuth of every column (1, W), or of every pixel (H, W); falls from near +pi at column 0 to near
-            -pi; counter-clockwise from +x is positive.
-        range_min_m: a shorter range is no return.
-        range_max_m: a longer range is no return.
+        elevation_rad: elevation of every row (H, 1), or of every pixel (H, W), in radians, falling from row 0 down; up
+            is positive.
+        azimuth_rad: azimuth of every column (1, W), or of every pixel (H, W), in radians, falling from near +pi at
+            column 0 to near -pi; counter-clockwise from +x is positive.
+        range_min_m: shortest range of a return, in metres.
+        range_max_m: longest range of a return, in metres.
         projection: default projection of the sensor's scans, ``spherical`` or ``unfolding``.
         column_stride: the image keeps every n-th of ``W * n`` fine columns (the paper's 64x256: every 8th of 2048).
         source: origin of the numbers, such as a data sheet.

@@ -1,4 +1,4 @@
-"""The numbers of a sensor, as code or as a stranger's JSON gives them → checked, or one line on what is wrong."""
+"""Checks of a sensor's tables and limits, from code or from an untrusted JSON file."""
 
 from __future__ import annotations
 

@@ -78,7 +78,7 @@ class Application:
     """The WSGI application of the server.
 
     Args:
-        queue: the jobs of all clients.
+        queue: queue with the jobs of all clients.
         host: address at which it is served; the loopback's names are known besides.
     """
 

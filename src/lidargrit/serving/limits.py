@@ -17,7 +17,7 @@ class Limits:
         scans: largest number of scans in one request.
         seconds: longest time that one job may compute; the worker process is ended when it is over.
         start_seconds: longest time that the worker process may take to read the runs.
-        waiting: largest number of jobs in the queue; the next client is told to try again.
+        waiting: largest number of jobs in the queue; a further client is asked to try again.
         unpolled_seconds: time after which a waiting job is dropped if its client no longer asks for it.
         kept: number of finished results that are kept; the oldest is removed first.
         connections: largest number of open connections, each of which holds at most one upload in memory.

@@ -14,7 +14,7 @@ _SAVED = ("npz", "ply", "bin")
 
 
 def page() -> str:
-    """Return the page without models and scans; its script asks the server for them."""
+    """Return the page without models and scans, which its script requests from the server."""
     buttons = "".join(button(kind, f".{kind}") for kind in _SAVED) + button("remove", "Remove")
     parts = {
         "viewer": interactive.viewer_html("", f'<span class="soft">Save</span>{buttons}', f"lidargrit {__version__}."),

@@ -28,7 +28,7 @@ class RunningServer(NamedTuple):
 
     Args:
         port: port at which it listens.
-        queue: the jobs of all clients.
+        queue: queue with the jobs of all clients.
         run: function that answers requests until Ctrl-C.
     """
 

@@ -64,7 +64,7 @@ def run_worker(runs: Sequence[Path], device: str) -> None:
 
 
 def describe_model(name: str, generator: Generator) -> dict[str, Any]:
-    """Return what a page needs to know of a model."""
+    """Return the facts of a model that the page needs."""
     sensor = generator.sensor
     return {
         "name": name,
@@ -129,7 +129,7 @@ def _read_upload(request: SampleRequest, reader: ScanReader) -> InputScan:
 
 
 def _observed(request: SampleRequest, seen: InputScan) -> Bool[Tensor, "H W"]:
-    """Return the pixels that the model is told of."""
+    """Return the mask of the pixels that are kept."""
     if request.task in UPSAMPLED:
         return observed_rows(seen)
     if request.task == "region":

@@ -1,4 +1,4 @@
-"""Scans without a car: a seed → a scene of triangles → the returns of a sensor in it."""
+"""Simulated scans: a seed → a scene of triangles → the returns of a sensor in it."""
 
 from __future__ import annotations
 
@@ -42,11 +42,11 @@ def simulate(
         sensor: sensor to simulate, with every column that it fires; the HDL-64E of KITTI odometry if not given.
         theme: kind of street.
         frame: index of the revolution, 0.1 s apart; the frames of one seed are a drive through one street.
-        motion: leave the points as a moving car measures them, bent by its motion; otherwise all are as seen from where
-            the revolution began, which is how KITTI odometry stores them.
+        motion: whether points stay as a moving car measures them, distorted by its motion; otherwise all are as seen
+            from where the revolution began, which is how KITTI odometry stores them.
         wet: wetness of asphalt and concrete, from 0 (dry) to 1 (soaked).
-        kept_columns_only: cast only the columns that the sensor's image keeps, at a fraction of the work. The points
-            are those of the whole scan that fall into these columns.
+        kept_columns_only: whether only the columns that the sensor's image keeps are cast, which takes a fraction of
+            the time. The points are those of the whole scan that fall into these columns.
         model: model of which beams return.
 
     Returns:
@@ -85,7 +85,7 @@ def observe(
     kept_columns_only: bool = False,
     model: RaydropModel = _HDL64E_OF_KITTI,
 ) -> Observation:
-    """Simulate one revolution as :func:`simulate` does, and tell of every pixel what is there and how it answers.
+    """Simulate one revolution as :func:`simulate` does, and return surface, signal and label of every pixel.
 
     Args, Raises: as for :func:`simulate`.
 
@@ -108,7 +108,7 @@ def observe(
 
 
 def scene_of(seed: int, theme: Theme = "mixed") -> Scene:
-    """Return the street that a seed stands for, which :func:`simulate` looks at: its triangles, and the car's way.
+    """Return the street of a seed, which :func:`simulate` scans: its triangles, and the path of the car.
 
     Raises:
         ConfigError: a negative seed, or an unknown theme.

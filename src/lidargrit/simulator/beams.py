@@ -1,4 +1,4 @@
-"""Where a sensor looks when it fires: a sensor and a random stream → one ray for each pixel, in its frame or a scene's.
+"""Rays of a sensor: a sensor and a random stream → one ray for each pixel, in its frame or a scene's.
 
 A revolution begins straight ahead and goes counter-clockwise, in the firing order of KITTI's files.
 """

@@ -27,17 +27,17 @@ _CAMERA_FROM_SENSOR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0
 
 @dataclass(frozen=True)
 class DriveConfig:
-    """What is simulated.
+    """Settings of simulated drives.
 
     Args:
         sensor: sensor to simulate.
         seed: seed of the first street; each further street has the next seed.
         frames: scans of each street, 0.1 s apart; with 1, every scan shows another street.
         theme: kind of street.
-        motion: leave the distortion by the car's own motion in the scans; KITTI odometry has it removed.
+        motion: whether scans keep the distortion by the car's own motion; KITTI odometry has it removed.
         wet: wetness of the ground, from 0 (dry) to 1 (soaked).
-        clean: also write what a raydrop model learns from and is judged by: the clean range of every pixel, the
-            probability of a return, the sampled mask, reflectance and label, as ``observation/NNNNNN.npz``.
+        clean: whether ``observation/NNNNNN.npz`` is written, too, from which raydrop models are trained and judged: the
+            clean range of every pixel, the probability of a return, the sampled mask, reflectance and label.
     """
 
     sensor: SensorModel

@@ -1,4 +1,4 @@
-"""What a receiver hears: beams of some width in a scene → one echo a pixel, of one surface or a mixture."""
+"""Echoes of beams of finite width: beams in a scene → one echo a pixel, of one surface or a mixture."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _FAR_M = 1e6  # stands for infinity where ranges are subtracted
 
 @dataclass(frozen=True, eq=False)
 class Echoes:
-    """The echo that each beam's receiver answers to.
+    """The strongest echo of each beam.
 
     Args:
         power: received power.

@@ -1,4 +1,4 @@
-"""What is particular to the car that recorded KITTI: rays → which of them end on it; and how strong its lasers are."""
+"""Facts about the car that recorded KITTI: which rays end on the car, and the gains of its lasers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a thing is: a name → its number in SemanticKITTI.
+"""Classes of objects: a name → its number in SemanticKITTI.
 
 Source: Behley et al., SemanticKITTI, ICCV 2019, and the configuration published with it.
 """

@@ -1,4 +1,4 @@
-"""What surfaces are made of: a material's name → how it answers a beam of 905 nm."""
+"""Materials of surfaces: a name → how the material reflects a beam of 905 nm."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Material:
-    """How one kind of surface answers a beam; how bright it scatters (albedo) belongs to each triangle.
+    """Reflection properties of one kind of surface; the albedo belongs to each triangle.
 
     Args:
         name: name of the material.

@@ -1,4 +1,4 @@
-"""What a scene is made of: triangles, each with a material, a brightness, a class and an instance."""
+"""Meshes of a scene: triangles, each with a material, a brightness, a class and an instance."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a sensor sees of a scene: a scene, a sensor and a random stream → all there is to know about every pixel."""
+"""Observation of a scene: a scene, a sensor and a random stream → surface, signal and label of every pixel."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from lidargrit.structures import Scan
 
 @runtime_checkable
 class ObservableScene(Protocol):
-    """What a sensor needs of a scene."""
+    """Interface of a scene that a sensor can observe."""
 
     def mesh(self, time_s: float = 0.0) -> Mesh:
-        """Return what there is to meet at a time."""
+        """Return the triangles at a time, in seconds."""
         ...
 
     def sensor_pose(self, time_s: float = 0.0) -> Float64[np.ndarray, "4 4"]:
@@ -104,7 +104,7 @@ class Observation:
 
 @dataclass(frozen=True)
 class ObservationConfig:
-    """How a scene is looked at.
+    """Settings of one observation of a scene.
 
     Args:
         time_s: time at which the revolution begins.
@@ -128,9 +128,9 @@ def observe_scene(
     beam_rng: np.random.Generator,
     config: ObservationConfig,
 ) -> Observation:
-    """Look at a scene for one revolution.
+    """Observe a scene for one revolution.
 
-    Things other than the sensor stand still during a revolution.
+    Everything but the sensor stands still during a revolution.
 
     Args:
         scene: triangles and sensor poses.

@@ -1,4 +1,4 @@
-"""What of a beam comes back: surfaces, incidence and range → power, the chance of a return, and reflectance."""
+"""Received power of a beam: surfaces, incidence and range → power, probability of a return, and reflectance."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lidargrit.simulator.mesh import Mesh
 
 @dataclass(frozen=True)
 class RaydropModel:
-    """All numbers that decide which beams come back, and what is measured; the defaults suit the HDL-64E of KITTI.
+    """Parameters of which beams return and what is measured; the defaults suit the HDL-64E of KITTI.
 
     Powers are in units of what a white plate at 1 m would send back, were the receiver in focus there. "Fitted" numbers
     bring simulated scans nearest to 67 scans of KITTI, all together: ``benchmarks/fit_raydrop.py`` finds them, and
@@ -84,7 +84,7 @@ class RaydropModel:
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """How every triangle of a scene answers; the last entry is for rays that hit nothing.
+    """Reflection properties of every triangle of a scene; the last entry is for rays that hit nothing.
 
     Args:
         albedo: share of light scattered evenly.
@@ -141,7 +141,7 @@ class Surfaces:
     def brightness(
         self, triangle: Int32[np.ndarray, " n"], cos_incidence: Float32[np.ndarray, " n"]
     ) -> Float32[np.ndarray, " n"]:
-        """Return how brightly surfaces answer: Lambert's law, a mirror-like lobe, and retroreflection.
+        """Return the brightness of surfaces: Lambert's law, a mirror-like lobe, and retroreflection.
 
         A foil sends light back whatever the incidence; only the area that it turns to the beam shrinks.
         """
@@ -166,7 +166,7 @@ def received_power(
 
 @dataclass(frozen=True, eq=False)
 class Lasers:
-    """How the lasers of one sensor differ, row by row; they are alike in all scans.
+    """Differences between the lasers of one sensor, row by row; they are the same in all scans.
 
     Args:
         log_gain: natural log of each laser's gain.
@@ -190,7 +190,7 @@ class Lasers:
 
 @dataclass(frozen=True, eq=False)
 class BeamNoise:
-    """All that is random about the beams of one scan besides where they look.
+    """Random numbers of the beams of one scan, besides their directions.
 
     Args:
         patch: natural log of the gain along a ring.

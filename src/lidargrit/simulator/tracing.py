@@ -1,4 +1,4 @@
-"""What rays meet first: triangles and rays → range, triangle and incidence, with Intel's Embree, on the CPU only."""
+"""Ray casting: triangles and rays → range, triangle and incidence, with Intel's Embree, on the CPU only."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _device = EmbreeDevice()  # one for the process; every scene is freed with its t
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """What every ray meets first.
+    """The first hit of every ray.
 
     Args:
-        range_m: distance to it along the ray, infinite where nothing is met.
+        range_m: distance to the hit along the ray in metres, infinite where nothing is hit.
         triangle: index of the triangle that is hit, or NOTHING.
-        cos_incidence: cosine between the ray and the triangle's normal, 0 to 1; 0 where nothing is met.
+        cos_incidence: cosine between the ray and the triangle's normal, 0 to 1; 0 where nothing is hit.
     """
 
     range_m: Float32[np.ndarray, " n"]
@@ -42,7 +42,7 @@ def in_reach(
 ) -> Mesh:
     """Leave out triangles that no ray can meet: too far, or wholly above or below all rays.
 
-    Embree takes longer to be told of a triangle than to find out that a ray misses it.
+    Embree takes longer to add a triangle than to find out that a ray misses it.
 
     Args:
         mesh: triangles in the scene's frame.

@@ -1,4 +1,4 @@
-"""What a user names as a source → one object that knows what it is, so that nobody has to ask again."""
+"""Sources of scans, by what a user types → one object with the kind, the data and the provenance of the source."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from lidargrit.sources.samples import is_sample_folder, projection_of, read_samp
 
 
 class Source(ABC):
-    """What a user named to take scans from; :func:`open_source` finds out its kind.
+    """A source of scans or range images; :func:`open_source` recognises its kind.
 
     Args:
         text: name of the source, as the user typed it.
@@ -66,7 +66,7 @@ class Source(ABC):
         Args:
             sensor: sensor that scans are projected with; the source's own if not given. Samples keep theirs.
             config: settings of reading and projecting scans; its sources and sensor are ignored.
-            reporter: told about progress and about scans that are left out.
+            reporter: receiver of progress, and of messages about scans that are left out.
 
         Raises:
             DataError: no usable scan, or prepared scans of another sensor or projection.
@@ -209,7 +209,7 @@ class TensorSource(Source):
     Args:
         text: name of the source.
         folder: folder of ``.pth`` files.
-        samples_format: name of the sample format; told from the first file if empty.
+        samples_format: name of the sample format; recognised from the first file if empty.
     """
 
     kind, data_set = "generated range images", "samples"
@@ -275,14 +275,15 @@ class RunSource(Source):
 
 
 def open_source(text: str, bad_points: BadPoints = "refuse", samples_format: str = "") -> Source:
-    """Find out what a user named, and open it once.
+    """Recognise the kind of a source, and open it.
 
     Args:
         text: folder of a finished run or the word ``pretrained``; folder of samples, of ours or of another program
-            (``.pth``); folder or URL of prepared scans; or what data sets are opened by ("kitti_raw:ROOT:SPLIT",
-            "FOLDER", "simulated:COUNT", ...).
+            (``.pth``); folder or URL of prepared scans; or a data set as in :func:`lidargrit.datasets.open_dataset`
+            ("kitti_raw:ROOT:SPLIT", "FOLDER", "simulated:COUNT", ...).
         bad_points: treatment of NaN, infinite and origin points in scans.
-        samples_format: name of the program that wrote a folder of ``.pth`` files; told from the first file if empty.
+        samples_format: name of the program that wrote a folder of ``.pth`` files; recognised from the first file if
+            empty.
 
     Raises:
         DataError: nothing that is known lies there.
@@ -325,7 +326,7 @@ def load_range_images(
     Args:
         sources: names of data sets, folders of scans, and prepared folders, as in :class:`DataConfig`.
         config: settings of projecting scans; its own sources are ignored.
-        reporter: told about progress.
+        reporter: receiver of progress.
         sensor: sensor to project with, in place of the configuration's.
 
     Raises:
@@ -359,10 +360,10 @@ def open_images(
 
 
 def overlap(source: Source, images: RangeImages | None, reference: RangeImages) -> str:
-    """Say in a few words which scans a source, or the model behind it, shares with the reference; "" for none.
+    """Return in a few words which scans a source, or the model behind it, shares with the reference; "" for none.
 
     Args:
-        source: source of the set; of samples and runs, the training scans of the model count.
+        source: source of the set; for samples and runs, the training scans of the model count as its scans.
         images: images of the set, where it holds any.
         reference: set that it is compared with.
     """

@@ -49,8 +49,8 @@ def write_samples(
     """Write one file for each seed, at bounded memory; seeds that are there already are not sampled again.
 
     Args:
-        generator: generator to sample from, as loaded from
-        run_folder: run folder whose weights identify it.
+        generator: generator to sample from.
+        run_folder: folder that the generator was read from; the hash of its weights identifies the samples.
         folder: output folder for ``samples.json`` and ``SEED.npz`` with ``range_m`` (H, W) in metres, 0 for no return,
             and ``reflectance`` in [0, 1] if the generator writes it.
         seeds: one seed for each scan; other processes may write other seeds into the same folder meanwhile.
@@ -112,7 +112,7 @@ def read_samples(folder: Path, count: int | None = None) -> RangeImages:
 
     Args:
         folder: folder that :func:`write_samples` wrote.
-        count: largest number of scans; those of the lowest seeds are taken, since the order of seeds favours none.
+        count: largest number of scans; those of the lowest seeds are taken, since the order of seeds has no meaning.
 
     Raises:
         DataError: no samples in the folder.

@@ -61,7 +61,7 @@ class Tokenizer(Objective, Generic[Config]):
 
     @abstractmethod
     def decode(self, tokens: TokenGrid) -> Decoded:
-        """Return what a batch of tokens (B, h, w) tells of every pixel."""
+        """Decode a batch of tokens (B, h, w) to ranges and return logits of every pixel."""
 
     @abstractmethod
     def decoding_flops(self) -> int:
@@ -77,7 +77,7 @@ class Tokenizer(Objective, Generic[Config]):
         """Return one scan for each token grid of a batch, its random numbers from its own generator.
 
         Args:
-            tokens: (B, h, w).
+            tokens: token grids (B, h, w).
             rngs: random generators on the CPU, one for each scan.
             mask: ``bernoulli`` samples each return with its probability (the authors' program); ``threshold`` keeps a
                 return whose probability is at least 0.5 (the paper).
@@ -87,7 +87,7 @@ class Tokenizer(Objective, Generic[Config]):
 
     @torch.no_grad()
     def reconstruct(self, images: RangeImage) -> RangeImage:
-        """Return what the tokens keep of a batch of scans, nothing of it at random."""
+        """Encode and decode a batch of scans, the mask by threshold."""
         return self.decode(self.encode(images)).threshold()
 
 

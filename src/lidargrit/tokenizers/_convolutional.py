@@ -1,4 +1,4 @@
-"""What the VQ-VAEs share: checked sizes, levels of residual blocks, encoder and decoder, and the codebook between."""
+"""Base of the VQ-VAEs: checks of sizes, levels of residual blocks, encoder, decoder and codebook."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ class ConvolutionalTokenizer(CodebookTokenizer[Config]):
 
     @abstractmethod
     def _encoded(self, images: RangeImage) -> Float[Tensor, "B H W"]:
-        """Map the ranges of a batch to what the encoder sees."""
+        """Map the ranges of a batch to the encoder's input."""
 
     def latents(self, images: RangeImage) -> Float[Tensor, "B D h w"]:
         """Return the continuous latents of a batch, before quantisation.

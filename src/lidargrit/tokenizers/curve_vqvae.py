@@ -42,18 +42,20 @@ class CurveVqvaeConfig(TokenizerConfig):
     Args:
         channels: number of channels at the finest level, a multiple of 32.
         channel_multipliers: channels of each level, from fine to coarse, over those of the finest.
-        row_strides: rows of each level that become one at the next coarser level, 1 or 2; columns are always halved.
+        row_strides: number of rows of each level that become one row at the next coarser level, 1 or 2; columns are
+            always halved.
         residual_blocks: number of residual blocks of each encoder level; a decoder level has one more.
         code_dim: length of a code.
         num_codes: number of codes in the codebook.
         range_encoding: map from metres to [-1, 1]; LiDM's models with ``*`` in their names have the linear one.
         range_scale: encoded range that becomes 1: log2(1 + range in metres), or metres for the linear encoding. 5.84
             and 56 are published, and end at 56 m. Longer ranges are learned as no return.
-        mask_head: whether a second channel of the decoder learns which beams return. Without it, only a range of a few
-            millimetres is no return.
+        mask_head: whether a second channel of the decoder learns which beams return. Without it, a range of a few
+            millimetres stands for no return.
         codebook_loss: ``paper``, ``reference``, ``vqvae`` or ``ema``; see lidargrit.nn.quantiser. LiDM's program has
-            the bug that ``reference`` stands for.
-        restart_dead_codes: whether codes that are hardly ever used restart from latents; not so in LiDM's program.
+            the same bug as ``reference``.
+        restart_dead_codes: whether codes that are hardly ever used restart from latents; LiDM's program does not do
+            this.
     """
 
     channels: int = 64
@@ -106,7 +108,7 @@ class CurveUpsample(nn.Module):
 
 
 class LatentAttention(Block):
-    """Every latent looks at every other, with one head."""
+    """Self-attention between all latents, with one head."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -179,7 +181,7 @@ class CurveVqvae(ConvolutionalTokenizer[CurveVqvaeConfig]):
 
     Args:
         config: sizes and losses.
-        sensor: rays and limits of its range images.
+        sensor: sensor with the rays and limits of its range images.
 
     Raises:
         ConfigError: the image's rows or columns cannot be divided as often as the strides say.

@@ -169,7 +169,7 @@ class Vqvae(ConvolutionalTokenizer[VqvaeConfig]):
 
     Args:
         config: sizes and losses.
-        sensor: rays and limits of its range images.
+        sensor: sensor with the rays and limits of its range images.
 
     Raises:
         ConfigError: the image's rows or columns cannot be halved at every level.

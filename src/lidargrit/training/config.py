@@ -23,16 +23,16 @@ class FitConfig:
         scans: number of scans seen over the whole training of the stage.
         batch_size: number of scans in a batch, over all processes.
         accumulate: number of parts in which each process takes its share of a batch, one after the other. More parts
-            need less memory and give the same step up to rounding; only a codebook, which moves or restarts its codes
-            after each part, comes out differently.
+            need less memory and give the same step up to rounding. Only a codebook comes out differently, since its
+            codes move or restart after each part.
         learning_rate: highest learning rate.
         schedule: course of the learning rate. ``constant``; ``cosine`` falls to 0 over all scans;
             ``linear_second_half`` stays constant for the first half and falls to 0 over the second, as LidarGRIT's
             program does for its KITTI-360 transformer.
         warmup_scans: number of scans over which the learning rate rises linearly from 0.
         optimiser: ``adamw``, as in all papers here, or ``muon``: Muon for the linear layers in a transformer's blocks,
-            which makes their updates orthogonal (Jordan et al., 2024), and AdamW for all other weights. A transformer
-            learns more from as many scans with it.
+            whose updates it makes orthogonal (Jordan et al., 2024), and AdamW for all other weights. A transformer
+            learns more from equally many scans with it.
         betas: decay rates of Adam's two moments.
         weight_decay: decay of the weights of linear layers; other weights do not decay, as in LidarGRIT's program.
         gradient_clip: largest norm of the gradient; 0 for no limit.
@@ -100,7 +100,7 @@ class Recipe:
         training: settings of the training, by the name of the stage.
         seed: seed of everything random: weights, order, augmentation, dropout.
         published: scores that a paper reports for the experiment, for the reader; empty if no paper does.
-        tokenizer_from: folder of a finished run whose tokenizer is used as it is; without it, a tokenizer is trained.
+        tokenizer_from: folder of a finished run whose tokenizer is used as it is; if empty, a tokenizer is trained.
         stages_from: folder of a finished run whose stages are all used as they are; only stages that it lacks are
             trained, such as a pixel decoder over a finished model.
     """
@@ -129,7 +129,7 @@ class Recipe:
         """Return the generator with new random weights.
 
         Args:
-            sensor: sensor of its scans, in place of that of the data.
+            sensor: sensor of its scans; that of the data if not given.
 
         Raises:
             ConfigError: the generator does not fit the sensor, or is too large.

@@ -78,7 +78,7 @@ class Fit:
         Args:
             train: range images to learn from.
             val: range images for validation.
-            what: words beside the progress bar.
+            what: text beside the progress bar.
 
         Raises:
             TrainingError: the loss is not finite; names the scans seen and the last good checkpoint.

@@ -52,7 +52,7 @@ class Log:
         Args:
             split: ``train`` or ``val``.
             scans_seen: number of training scans seen so far, over all processes.
-            seconds: time since the start or the resumption of the stage.
+            seconds: time since the start or the resumption of the stage, in seconds.
             terms: values of the loss terms, by name.
 
         Raises:

@@ -1,4 +1,4 @@
-"""A recipe → what its training would do: every setting by its name, sizes, budgets and estimated cost."""
+"""The plan of a recipe's training: every setting by its name, sizes, budgets and estimated cost."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from lidargrit.training.optimiser import memory_of_weights
 
 @dataclass(frozen=True)
 class StagePlan:
-    """What the training of one stage would do.
+    """Size and cost of the training of one stage.
 
     Args:
         name: name of the stage.
         parameters: number of weights that the stage trains or uses.
         scans: number of scans seen.
         batch_size: number of scans in a step, over all processes.
-        memory: bytes of weights, their average, gradients and the optimiser's moments, without activations.
+        memory: size of weights, their average, gradients and the optimiser's moments, in bytes, without activations.
         flops: number of floating-point operations of all steps.
         precision: precision of the operations.
     """
@@ -40,7 +40,7 @@ class StagePlan:
 
 @dataclass(frozen=True)
 class TrainingPlan:
-    """What the training of a recipe would do.
+    """Settings, sizes and costs of the training of a recipe.
 
     Args:
         title: title of the recipe.
@@ -92,7 +92,7 @@ def check_data(recipe: Recipe) -> None:
 
 
 def plan_training(recipe: Recipe) -> TrainingPlan:
-    """Return what the training of a recipe would do; nothing is read or written."""
+    """Return the plan of a recipe's training; nothing is read or written."""
     sensor = recipe.data.load_sensor()
     stages, flops = [], training_flops(recipe)
     with torch.device("meta"):  # sizes alone, without values, so that wide networks take no time

@@ -179,7 +179,7 @@ def _claim(folder: Path, recipe: Recipe, train_images: RangeImages, val_images: 
 
 
 def _write_trained_on(folder: Path, train_images: RangeImages, donor: str | None) -> None:
-    """Write which scans the model learns from, without names of the user's files, so that samples can carry it on."""
+    """Write hashes of the training scans, without names of the user's files, so that samples can name them, too."""
     if not (folder / TRAINED_ON_FILE).exists():
         came_from = train_images.provenance
         facts = {

@@ -1,4 +1,4 @@
-"""What a trained model does, on one page for newcomers: a scan, its tokens, reconstruction and new scans → HTML."""
+"""The page of the demo, for newcomers: a scan, its tokens, its reconstruction and new scans → HTML."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ code{overflow-wrap:anywhere}
 
 @dataclass(frozen=True, eq=False)
 class DemoPage:
-    """All that the page shows.
+    """Content of the page.
 
     Args:
         kind: kind of the scans: "real" or "simulated".

@@ -1,4 +1,4 @@
-"""What a projection does to one scan, as a picture: :class:`Inspection` → PNG."""
+"""Losses and errors of a projection as a picture: :class:`Inspection` → PNG."""
 
 from __future__ import annotations
 

@@ -114,7 +114,7 @@ def viewer_html(heading: str, buttons: str, note: str) -> str:
 
     Args:
         heading: HTML before the controls.
-        buttons: HTML of the buttons of each set.
+        buttons: HTML of the buttons of each set of scans.
         note: last sentence of the instructions.
     """
     return filled(_read("viewer.html"), {"heading": heading, "buttons": buttons, "precision": note})

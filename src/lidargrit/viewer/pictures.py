@@ -47,7 +47,7 @@ def plot_comparison(
         max_range_m: end of the range scale and of the bird's-eye view, in metres; None for the farthest return.
         title: title of the whole picture.
         labels: names of the scans; "scan 1", ... if not given.
-        surprise: bits of every pixel beyond those expected, by group, plotted in place of the return mask; see
+        surprise: bits of every pixel beyond the expected ones, by group, plotted in place of the return mask; see
             :meth:`lidargrit.structures.ScanBits.surprise`.
 
     Raises:
@@ -192,7 +192,7 @@ def _plot_row(figure: Figure, height: float, bottom: float, panel: _Panel, scale
 
 
 def _plot_scales(figure: Figure, height: float, scales: _Scales, more: str = "") -> None:
-    """Plot the two colour bars along the foot, and say what light grey means."""
+    """Plot the two colour bars along the bottom, and the meaning of light grey."""
     at = 0.55 / height, 0.14 / height
     bar = figure.add_axes((0.75 / _WIDTH, at[0], 6.6 / _WIDTH, at[1]))
     ticks = [t for t in (1, 2, 5, 10, 20, 50, 100) if scales.range_norm(t) >= 0 and scales.range_norm(t) <= 1]

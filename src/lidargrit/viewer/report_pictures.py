@@ -22,7 +22,7 @@ Picture = str
 def range_picture(
     range_m: Float[np.ndarray, "H W"], finite: Bool[np.ndarray, "H W"], limits_m: tuple[float, float]
 ) -> Picture:
-    """Render ranges from near (yellow) to far (violet) on a logarithmic scale, light grey where ``known`` is False."""
+    """Render ranges from near (yellow) to far (violet) on a logarithmic scale, light grey where ``finite`` is False."""
     colours = colormaps["viridis_r"](LogNorm(*limits_m, clip=True)(np.where(finite, range_m, limits_m[0])))[..., :3]
     colours[~finite] = to_rgb(NO_RETURN)
     return _picture(_bytes(colours), (_WIDE, _TALL))

@@ -1,4 +1,4 @@
-"""How a report looks: light and dark, narrow and wide → CSS."""
+"""Style sheet of reports, for light and dark, narrow and wide screens."""
 
 STYLE = """
 :root{--ink:#1d2730;--paper:#fff;--soft:#5b6873;--line:#d5dbe0;--a:#c2314b;--b:#1b6f9c;--warn:#fff4d6;--edge:#b98900}

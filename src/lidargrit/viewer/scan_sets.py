@@ -27,10 +27,10 @@ _NAME_LETTERS = 40  # of a source's name: what fits above a picture
 
 @dataclass(frozen=True, eq=False)
 class ScanSet:
-    """Scans that are sets together, under one name.
+    """A set of scans that are shown together, under one name.
 
     Args:
-        name: name of their source, and of what a model made of it.
+        name: name of the scans' source, or of what a model made of it.
         images: a batch of range images.
         scan_names: name of each image.
         label: class of every pixel by SemanticKITTI's numbers; 0 where it is not known or there is no return.
@@ -63,9 +63,9 @@ def load_scan_sets(
         seed: seed of the first generated scan.
         settings: sensor that scans are imaged with, and settings of reading them.
         reporter: receiver of messages about scans that are left out.
-        sensor: sensor to project scans to, if the settings name none, in place of those of runs and samples.
-        all_columns: whether scans are shown with all columns that their sensor fires, up to 200,000 pixels, rather than
-            those that its image keeps; not if a sensor is named, nor beside samples and runs.
+        sensor: sensor to project scans with if the settings name none; those of runs and samples keep theirs.
+        all_columns: whether scans are shown with all columns that their sensor fires, up to 200,000 pixels; otherwise
+            with those that its image keeps. It has no effect if a sensor is named, nor beside samples and runs.
 
     Raises:
         ConfigError: no source.

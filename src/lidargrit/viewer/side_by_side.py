@@ -23,7 +23,7 @@ def view(
     reporter: Reporter | None = None,
     surprise_by: str = "",
 ) -> None:
-    """Plot scans, samples, and what runs generate and reconstruct.
+    """Plot scans, samples, and the scans that runs generate and reconstruct.
 
     Args:
         sources: sources, as :func:`load_scan_sets` takes them.
@@ -32,7 +32,8 @@ def view(
         seed: seed of the first generated scan.
         settings: sensor that scans are imaged with, and settings of reading them.
         reporter: receiver of messages about scans that are left out.
-        surprise_by: run whose surprise at every pixel is plotted in place of the return mask; none if empty.
+        surprise_by: folder of the run whose surprise at every pixel is plotted in place of the return mask; none if
+            empty.
 
     Raises:
         ConfigError: too few or too many scans, or no source.

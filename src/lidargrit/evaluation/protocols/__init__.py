@@ -31,18 +31,18 @@ class MetricChoice:
 
 @dataclass(frozen=True)
 class Protocol:
-    """All that two scores of one name must have in common before they may be compared.
+    """Everything that must be equal before two scores of one name may be compared.
 
     Args:
         title: description of one line.
         source: paper or program (with its commit) that the protocol follows.
         metrics: metrics that are computed, in the order of the table.
         sensor: name of the sensor whose rays the images have; that of the samples or of the scans if empty.
-        columns: number of columns into which the circle is divided; the sensor's own if 0.
+        columns: number of columns of the full circle; the sensor's own if 0.
         column_stride: step between the columns that are kept.
         variant: definition of the projection of real scans.
-        range_m: open interval of range in metres, outside which a return of either set counts as none; the sensor's
-            own limits if None.
+        range_m: open interval of range in metres, outside which a return of either set counts as no return; the
+            sensor's own limits if None.
         num_scans: number of scans of each set; as many as there are if 0.
         data_set: name of the data set of the reference; any if empty.
         splits: names that the split of the reference may have; any if empty.

@@ -34,10 +34,10 @@ class UnitClouds:
 
     Args:
         unit_m: length that becomes 1, in metres.
-        window_m: returns outside this open interval of range count as dropped; None keeps all.
-        returns_only: a dropped pixel repeats a return of its image, which changes nothing since the network takes the
-            largest value over all points; else it is a point at the origin. An image without any return is one point at
-            the origin.
+        window_m: open interval of range in metres, outside which a return counts as dropped; None keeps all.
+        returns_only: whether dropped pixels have no influence: each then repeats a return of its image, which changes
+            nothing, since the network takes the largest value over all points. Otherwise each is a point at the origin,
+            as is an image without any return.
     """
 
     unit_m: float
@@ -75,7 +75,7 @@ class NormalisedImages:
     """Inputs of RangeNet++: range, x, y, z and reflectance by the mean and deviation of its training, 0 where dropped.
 
     Args:
-        window_m: returns outside this open interval of range count as dropped; None keeps all.
+        window_m: open interval of range in metres, outside which a return counts as dropped; None keeps all.
     """
 
     window_m: tuple[float, float] | None

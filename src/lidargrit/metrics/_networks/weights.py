@@ -1,4 +1,4 @@
-"""The weights that others have published for a network → a file on this computer, fetched if need be → its tensors."""
+"""Published weights of a network → a file on this computer, downloaded if necessary → tensors."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _failures: dict[str, tuple[float, str]] = {}  # by address: when, and why
 
 @dataclass(frozen=True)
 class PublishedWeights:
-    """Where the weights of a network can be had, and on which terms.
+    """Address, licence and checksum of published weights.
 
     Args:
         name: name of the network in ``--weights NAME=FILE``.
@@ -63,7 +63,7 @@ class PublishedWeights:
 
 
 def find_weights(published: PublishedWeights, given: Path | None = None, reporter: Reporter | None = None) -> Path:
-    """Return the file with the weights: the given one, else one that lies ready, else fetch it into the cache.
+    """Return the file with the weights: the given one, else one that is there already, else download it to the cache.
 
     It is looked for in ``$LIDARGRIT_WEIGHTS`` and in ``weights`` in the cache, by the name that it has at its source.
 

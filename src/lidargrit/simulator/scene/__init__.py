@@ -1,4 +1,4 @@
-"""A street scene: random numbers → triangles all around a car that carries a sensor, at any time."""
+"""A street scene: random numbers → triangles around a car with a sensor, at any time."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SENSOR_HEIGHT_M = 1.73  # of the Velodyne above the road, Geiger et al., IJRR 20
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What stands and moves around our car, which is not part of it.
+    """Standing and moving objects around our car, which is not part of the scene.
 
     The world has z up, its origin on the road below the sensor at time 0, and x along the heading there.
 
@@ -45,7 +45,7 @@ class Scene:
 
     @property
     def speed_m_s(self) -> float:
-        """Our own car's."""
+        """Speed of our own car, in metres per second."""
         return self.plan.speed_m_s
 
     def mesh(self, time_s: float = 0.0) -> Mesh:

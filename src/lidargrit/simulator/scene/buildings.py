@@ -1,4 +1,4 @@
-"""Houses: where they stand and how large → walls with windows, doors, balconies, roofs."""
+"""Houses: positions and sizes → walls with windows, doors, balconies, roofs."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Houses:
     plain: np.ndarray
 
     def nearest_approach_m(self, plan: StreetPlan, points_m: Num[np.ndarray, "p _"]) -> Float[np.ndarray, " p"]:
-        """Return how near our car comes to places; those that houses hide from it count as far."""
+        """Return the smallest distance of our car from points; points that houses hide from it count as far."""
         away = plan.nearest_approach_m(points_m)
         hides = np.flatnonzero((plan.nearest_approach_m(self.poses.xyz_m) < _OCCLUDERS_TO_M) & ~self.plain)
         beside = np.flatnonzero((away > 12.0) & (away < _HIDDEN_M))
@@ -69,7 +69,7 @@ class Houses:
         return away
 
     def _into(self, which: np.ndarray, points_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return x and y of places (p, 2) in the frames of some houses (h, p)."""
+        """Return x and y (h, p) of points (p, 2) in the frames of some houses."""
         x, y = (points_m[:, axis] - self.poses.xyz_m[which, axis, None] for axis in (0, 1))
         cos, sin = np.cos(self.poses.yaw_rad[which, None]), np.sin(self.poses.yaw_rad[which, None])
         return (cos * x + sin * y).astype(np.float32), (cos * y - sin * x).astype(np.float32)
@@ -119,7 +119,7 @@ def _walls(plan: StreetPlan, houses: Houses) -> _Walls:
 def _on_wall(
     houses: Houses, walls: _Walls, which: np.ndarray, along_m: np.ndarray, deep_m: np.ndarray, z_m: np.ndarray
 ) -> np.ndarray:
-    """Return world points (m, k, 3) of places on walls: along the wall, behind its face, and up."""
+    """Return world coordinates (m, k, 3) of points on walls: along the wall, behind its face, and up."""
     along, start = walls.along[which][:, None], walls.start[which][:, None]
     inward = np.stack((-along[..., 1], along[..., 0]), axis=-1)
     flat = start + along * along_m[..., None] + inward * deep_m[..., None]

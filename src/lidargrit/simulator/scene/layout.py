@@ -80,7 +80,7 @@ def add_greenery(builder: MeshBuilder, rng: np.random.Generator, plan: StreetPla
 
 
 def _plantable(plan: StreetPlan, town: Settlement, points: np.ndarray, spare_m: float) -> np.ndarray:
-    """Return the places (n, 2) that lie off roads and houses, and not beyond what the sensor sees."""
+    """Return the points (n, 2) that lie off roads and houses, and within the sensor's reach."""
     u, v = points.T
     keep = _off_road(plan, u, v, spare_m) & ~town.covers(u, v, 0.5 * spare_m) & (np.hypot(u, v) < 115)
     return points[keep]
@@ -127,7 +127,7 @@ def _tree_rows(rng: np.random.Generator, plan: StreetPlan) -> list[np.ndarray]:
 
 
 def _off_road(plan: StreetPlan, u: np.ndarray, v: np.ndarray, spare_m: float) -> np.ndarray:
-    """Tell which places are clear of roads and pavements."""
+    """Return which points are clear of roads and pavements."""
     edge = np.where(v > 0, plan.edge_m[1] + plan.pavement_m[1], plan.edge_m[0] + plan.pavement_m[0])
     pavement = max((s.pavement_m for s in plan.side_streets), default=0.0)
     return (np.abs(v) > edge + spare_m * 0.6) & (plan.in_side_street(u, v, pavement + spare_m * 0.6) < 0)
@@ -280,7 +280,7 @@ def traffic(rng: np.random.Generator, plan: StreetPlan, town: Settlement) -> lis
 
 
 def _nearest_m(plan: StreetPlan, going: Placements) -> np.ndarray:
-    """Return how near those that drive come to our car, which drives too, in the first seconds."""
+    """Return the smallest distance of driving vehicles from our car, which drives too, in the first seconds."""
     apart = []
     for time_s in (0.0, 1.0, 2.0):
         u, v = going.positions_at(time_s)

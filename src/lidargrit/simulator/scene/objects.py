@@ -1,4 +1,4 @@
-"""Things that stand or move on their own: shapes in their own frames and where they are → triangles at a time."""
+"""Objects that stand or move: shapes in their own frames, and poses → triangles at a time."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from lidargrit.simulator.scene.street_plan import StreetPlan
 
 @dataclass(frozen=True, eq=False)
 class Placements:
-    """Where things are in the street, and how they move.
+    """Positions and motion of objects in the street.
 
     Args:
         u_m: position along the street at time 0.
         v_m: position to the left of the street's axis.
         turn_rad: heading relative to the street's u axis (the v axis for ``across``).
-        speed_m_s: speed along the object's heading; 0 for objects that stand still.
+        speed_m_s: speed in metres per second along the object's heading; 0 for objects that stand still.
         across: True for objects that keep to a side street and head along v.
         rise_m: height of the ground above the road's level, such as a pavement's.
     """
@@ -41,13 +41,13 @@ class Placements:
         across: bool = False,
         rise_m: float | Num[np.ndarray, " n"] = 0.0,
     ) -> Placements:
-        """Make placements of arrays, or of numbers that hold for all."""
+        """Make placements from arrays, or from numbers that are the same for all."""
         u, v, turn, speed, rise = (np.full(len(u_m), a, np.float64) for a in (u_m, v_m, turn_rad, speed_m_s, rise_m))
         return cls(u, v, turn, speed, np.full(len(u), across), rise)
 
     @classmethod
     def join(cls, placements: list[Placements]) -> Placements:
-        """Return all of several."""
+        """Join several placements into one."""
         return cls(*(np.concatenate([getattr(s, f.name) for s in placements]) for f in fields(cls)))
 
     def select(self, which: Shaped[np.ndarray, " m"]) -> Placements:
@@ -55,7 +55,7 @@ class Placements:
         return Placements(*(getattr(self, f.name)[which] for f in fields(self)))
 
     def positions_at(self, time_s: float) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
-        """Return where they are in the street, u and v, at a time."""
+        """Return the positions in the street, u and v, at a time."""
         way = self.speed_m_s * time_s
         along, aside = way * np.cos(self.turn_rad), way * np.sin(self.turn_rad)
         return self.u_m + np.where(self.across, -aside, along), self.v_m + np.where(self.across, along, aside)
@@ -66,7 +66,7 @@ class Placements:
 
 @dataclass(frozen=True, eq=False)
 class ObjectBatch:
-    """Things of one topology, each with x ahead and its foot at the origin.
+    """Objects of one topology, each with x ahead and its foot at the origin.
 
     Args:
         local_m: triangles of each object in its own frame.
@@ -85,7 +85,7 @@ class ObjectBatch:
     placements: Placements
 
     def add_to(self, builder: MeshBuilder, plan: StreetPlan, time_s: float = 0.0) -> None:
-        """Add the things where they are at a time."""
+        """Add the objects to a mesh at their positions at a time."""
         if not len(self.placements):
             return
         s = self.placements

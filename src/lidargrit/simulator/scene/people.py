@@ -1,4 +1,4 @@
-"""People on foot and on bicycles: sizes and places → limbs, wheels and frames."""
+"""People on foot and on bicycles: sizes and positions → limbs, wheels and frames."""
 
 from __future__ import annotations
 

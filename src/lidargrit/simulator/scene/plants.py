@@ -1,4 +1,4 @@
-"""Trees, bushes and hedges: places and sizes → trunks and crowns of many small leaves that let beams through."""
+"""Trees, bushes and hedges: positions and sizes → trunks and crowns of many small leaves that let beams through."""
 
 from __future__ import annotations
 

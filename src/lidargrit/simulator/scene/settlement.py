@@ -1,4 +1,4 @@
-"""Where houses stand: a plan → rows along the streets, garages, blocks behind, and the gaps between."""
+"""Positions of houses: a plan → rows along the streets, garages, blocks behind, and the gaps between."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Settlement:
     parks_m: Float[np.ndarray, "p 3"]
 
     def covers(self, u_m: Num[np.ndarray, " p"], v_m: Num[np.ndarray, " p"], spare_m: float) -> Bool[np.ndarray, " p"]:
-        """Tell which places lie in a house, or nearer to one than a spare way."""
+        """Return which points lie in a house, or nearer to one than a margin."""
         return _covered(self.boxes_m, np.asarray(u_m), np.asarray(v_m), spare_m)
 
 

@@ -1,4 +1,4 @@
-"""What lines a street: places → walls, fences, guard rails, poles, lamps, signs, bins and cabinets."""
+"""Street furniture: positions → walls, fences, guard rails, poles, lamps, signs, bins and cabinets."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def add_fences(
     height_m: Float[np.ndarray, " n"],
     rise_m: float = 0.0,
 ) -> None:
-    """Add fences of pickets, from the first to the second place each; beams pass between the pickets."""
+    """Add picket fences, each from a first to a second point; beams pass between the pickets."""
     length = np.hypot(u_m[:, 1] - u_m[:, 0], v_m[:, 1] - v_m[:, 0])
     pitch = rng.uniform(0.12, 0.3, len(length))
     count = np.clip(length / pitch, 2, 90).astype(int)

@@ -1,4 +1,4 @@
-"""The lie of the land: random numbers → where roads run, how the ground rises, and where street places are in metres.
+"""Plan of a street: random numbers → roads, heights of the ground, and the map from street coordinates to the world.
 
 Everything is laid out in street coordinates: u runs along our road, v to its left, both in metres. Roads and houses are
 upright rectangles there; one smooth map bends them into the world.
@@ -41,7 +41,7 @@ class SideStreet:
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """Where things stand: foot points, headings and the slope of the ground there."""
+    """Poses of objects: foot points, headings and the slope of the ground there."""
 
     xyz_m: Float[np.ndarray, "n 3"]
     yaw_rad: Float[np.ndarray, " n"]
@@ -71,7 +71,7 @@ class Poses:
 
 @dataclass(frozen=True, eq=False)
 class StreetPlan:
-    """Where everything may stand.
+    """Plan of one street, in street coordinates.
 
     Args:
         theme: kind of street: city, suburb or country.
@@ -125,7 +125,7 @@ class StreetPlan:
         object.__setattr__(self, "viewpoints_m", self._flat(u, np.full(len(u), self.our_v_m)))
 
     def nearest_approach_m(self, points_m: Num[np.ndarray, "n _"]) -> Float[np.ndarray, " n"]:
-        """Return how near our car comes to places in the first seconds; one figure for all frames of a street."""
+        """Return the smallest distance of our car from points in the first seconds, the same for all frames."""
         apart = points_m[:, :2] - self.viewpoints_m[:, None]
         return np.sqrt((apart[..., 0] ** 2 + apart[..., 1] ** 2).min(axis=0))
 
@@ -139,7 +139,7 @@ class StreetPlan:
         return side * (self.edge_m[which] + self.pavement_m[which] + self.setback_m[which])
 
     def ground_points(self, u_m: Num[np.ndarray, "*s"], v_m: Num[np.ndarray, "*s"]) -> Float[np.ndarray, "*s 3"]:
-        """Return the points of the ground, at the level of the road, of places in the street."""
+        """Return the points of the ground, at the level of the road, at positions in the street."""
         flat = self._flat(u_m, v_m)
         return np.concatenate((flat, self._height(flat, u_m, v_m)[..., None]), axis=-1)
 
@@ -191,7 +191,7 @@ class StreetPlan:
     def in_side_street(
         self, u_m: Num[np.ndarray, "*s"], v_m: Num[np.ndarray, "*s"], spare_m: float = 0.0
     ) -> Float[np.ndarray, "*s"]:
-        """Return by how many metres places lie inside a side street (negative: outside all)."""
+        """Return by how many metres points lie inside a side street (negative: outside all)."""
         inside = np.full(np.broadcast_shapes(np.shape(u_m), np.shape(v_m)), -np.inf)
         for street in self.side_streets:
             depth = street.half_m + spare_m - np.abs(np.asarray(u_m) - street.u_m)

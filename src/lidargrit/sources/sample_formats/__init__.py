@@ -29,15 +29,17 @@ Decoded = tuple[Float[Tensor, "H W"], Float[Tensor, "H W"] | None]
 
 @dataclass(frozen=True)
 class SampleFormat:
-    """How one program writes a scan.
+    """The format in which one program stores its samples.
 
     Args:
         title: name of the program that writes such samples.
         source: origin of the facts.
-        channels: channels of its tensors, (channels, rows, columns) or (scans, channels, rows, columns).
-        sensors: possible sensors: name, fine columns, every n-th of them kept; 0 columns for the sensor's own.
+        channels: number of channels of its tensors, which are (channels, rows, columns) or (scans, channels, rows,
+            columns).
+        sensors: possible sensors, each as a name, the number of fine columns (0 for the sensor's own), and the step
+            between the columns that are kept.
         variant: projection variant of its training scans.
-        decode: turns what is in a tensor into metres.
+        decode: function from the values of a tensor to metres.
     """
 
     title: str
