@@ -282,8 +282,7 @@ def open_source(text: str, bad_points: BadPoints = "refuse", samples_format: str
             (``.pth``); folder or URL of prepared scans; or a data set as in :func:`lidargrit.datasets.open_dataset`
             ("kitti_raw:ROOT:SPLIT", "FOLDER", "simulated:COUNT", ...).
         bad_points: treatment of NaN, infinite and origin points in scans.
-        samples_format: name of the program that wrote a folder of ``.pth`` files; recognised from the first file if
-            empty.
+        samples_format: program that wrote a folder of ``.pth`` files; recognised from the first file if empty.
 
     Raises:
         DataError: nothing that is known lies there.
