@@ -86,14 +86,14 @@ def test_the_likelihood_of_the_mask_counts_unknown_pixels_alone():
     network, images = made(), scans(2)
     known = rows_of(images)
     point = network(hints_of(known), known.return_observed)
-    nats = network.mask_nats(point, images.return_mask, None)
+    nats = network.mask.nats(point.guide, images.return_mask, None)
     assert nats.shape == (2,)
     rng = torch.Generator().manual_seed(0)
-    estimates = torch.stack([network.mask_nats(point, images.return_mask, rng) for _ in range(40)])
+    estimates = torch.stack([network.mask.nats(point.guide, images.return_mask, rng) for _ in range(40)])
     assert torch.allclose(estimates.mean(0), nats, rtol=0.1)
     whole = Condition.of_pixels(images, torch.ones_like(images.return_mask))
     point = network(hints_of(whole), whole.return_observed)
-    assert network.mask_nats(point, images.return_mask, None).tolist() == [0, 0]
+    assert network.mask.nats(point.guide, images.return_mask, None).tolist() == [0, 0]
 
 
 def test_it_learns():

@@ -38,6 +38,7 @@ from lidargrit.sources import load_range_images
 from lidargrit.structures import RangeImage
 from lidargrit.tokenizers.vqvae import VqvaeConfig
 from lidargrit.training import FitConfig, Recipe, train
+from lidargrit.training.taken_stages import taken_stages
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(512, stride=8)  # 64x64 pixels
 TOKENIZER = VqvaeConfig(
@@ -276,6 +277,11 @@ def test_a_run_of_other_sizes_or_another_kind_gives_no_stages(tmp_path):
     other = replace(recipe, generator="maskgit", model=MaskGitConfig(TOKENIZER, TRANSFORMER, PIXELS))
     with pytest.raises(ConfigError, match="a run of the generator 'lidargrit'"):
         train(other, tmp_path / "third")
+    anew = replace(recipe, train_anew=("transformer",))
+    assert taken_stages(anew, anew.build_generator()).keys() == {"tokenizer"}
+    unknown = replace(recipe, train_anew=("mask",))
+    with pytest.raises(ConfigError, match="train_anew=mask; wanted one of tokenizer, transformer, pixels"):
+        taken_stages(unknown, unknown.build_generator())
     with pytest.raises(ConfigError, match="tokenizer_from and stages_from together"):
         replace(recipe, tokenizer_from="pretrained")
 

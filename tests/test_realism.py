@@ -130,7 +130,8 @@ def test_the_verb(tmp_path, capsys):
     found = json.loads(file.read_text())
     assert found["real"] == "simulated:2:val"
     assert {"simulated", "bernoulli", "real_against_real", "ratio"} == set(found["curves"][0])
-    assert [score["scans"] for score in found["raydrop"]] == ["simulated"] * 5 + ["real"] * 5
+    kinds = ["simulated"] * 5 + ["real"] * 5 + ["real_triangulated"] * 5
+    assert [score["scans"] for score in found["raydrop"]] == kinds
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert main(words) == 2  # it is there already
     assert "add --overwrite" in capsys.readouterr().err

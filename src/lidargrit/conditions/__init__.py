@@ -138,6 +138,11 @@ class Condition:
         return frozenset(kind for kind, mask in found.items() if bool(mask.any()))
 
     @property
+    def has_all_surfaces(self) -> bool:
+        """Whether each ray's range is observed, or that it does not return, and the return of some rays is open."""
+        return bool((self.range_observed | self.return_observed).all()) and "surfaces" in self.kinds
+
+    @property
     def images(self) -> RangeImage:
         """The observed returns as range images, without a return in all other pixels."""
         kept = self.return_mask & self.return_observed

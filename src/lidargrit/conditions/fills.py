@@ -14,11 +14,13 @@ from scipy.spatial import Delaunay, QhullError
 from torch import Tensor
 
 from lidargrit.conditions import Condition
+from lidargrit.errors import ScanError
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
 EDGE = 0.8  # of ln(1 + range in metres): two observed returns further apart lie on two surfaces
 _JITTER_RAD = 1e-6  # a twentieth of a millimetre at 50 m
+_BLOCKS = (1, 2, 4)  # rows and columns of what is left out at once, where ranges are interpolated from other rays
 _ROWS_NEAR, _COLUMNS_NEAR = 9, 17  # window in which a return helps to fill an unknown pixel in; farther are others
 
 
@@ -194,6 +196,38 @@ def fill_from_nearest(images: RangeImage, observed: Bool[Tensor, "B H W"]) -> Ra
         filled.append(range_m[rows, columns] if bool(mask.any()) else torch.zeros_like(range_m))
     range_m = torch.stack(filled).to(images.range_m.device)
     return RangeImage(range_m, range_m > 0, images.sensor)
+
+
+def ranges_from_others(images: RangeImage, rng: torch.Generator) -> RangeImage:
+    """Return for every ray a range that is interpolated from other rays' returns, whether it returned itself or not.
+
+    Blocks of pixels are divided at random into two halves, and each half is triangulated from the returns of the other.
+    So returned and dropped rays cannot be distinguished by the noise of a measured range.
+
+    Args:
+        images: batch of range images.
+        rng: source of the halves.
+
+    Raises:
+        ScanError: a scan without returns in one half.
+    """
+    sensor, device = images.sensor, images.range_m.device
+    height, width = sensor.height, sensor.width
+    found = []
+    for index in range(len(images)):
+        side = _BLOCKS[int(torch.randint(len(_BLOCKS), (), generator=rng, device=rng.device))]
+        rows, columns = -(-height // side), -(-width // side)
+        coins = torch.rand((rows, columns), generator=rng, device=rng.device) < 0.5
+        half = coins.repeat_interleave(side, 0).repeat_interleave(side, 1)[:height, :width].to(device)
+        range_m = torch.zeros(height, width, dtype=torch.float64)
+        for given in (half, ~half):
+            seen = Observed.of(Condition.of_pixels(images[index : index + 1], given[None]), 0)
+            if not seen.returned.any():
+                raise ScanError("a scan with hardly any return", "returns on every side", "leave the scan out")
+            range_m = torch.where(given.cpu(), range_m, torch.from_numpy(triangulation(seen)))
+        found.append(range_m.float().clamp(sensor.range_min_m, sensor.range_max_m))
+    range_m = torch.stack(found).to(device)
+    return RangeImage(range_m, torch.ones_like(images.return_mask), sensor)
 
 
 def _nearest(

@@ -2,89 +2,25 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import ClassVar
-
-from lidargrit.datasets import ScanDataset, SplitScheme
-from lidargrit.datasets._splits import Split
-from lidargrit.errors import DataError, nearest_names
-from lidargrit.formats import BadPoints
+from lidargrit.datasets._streets import Streets
 from lidargrit.sensors import load_sensor
 from lidargrit.structures import Scan
 
-_SEEDS_APART = 1_000_000  # distance between the splits' first seeds, and so the largest count
 
-
-class Simulated(ScanDataset):
-    """Scans of simulated streets; a split is a range of seeds, so that no scene is in two. ``all`` is ``train``.
+class Simulated(Streets):
+    """Scans of simulated streets.
 
     Args:
-        root: the number of scans, where other data sets have a folder.
+        root: number of scans, where other data sets have a folder.
         split: ``train``, ``val`` or ``test``.
         bad_points: without effect; the simulator makes none.
-
-    Raises:
-        DataError: no count, or an unknown split.
     """
 
     title = "simulated streets"
-    licence = "none needed: made by this program"
-    citation = "none needed: made by this program"
-    tree = "COUNT, a number of scans from 1 to 1000000, not a folder"
-    sensor = "hdl64e_kitti_odometry"
-    schemes: ClassVar[dict[str, SplitScheme]] = {
-        "seeds": SplitScheme(
-            source="lidargrit",
-            leak="None: every street is sampled anew.",
-            parts={"train": ("0",), "val": ("1000000",), "test": ("2000000",)},  # the first seed of each
-        )
-    }
-
-    def __init__(self, root: Path, split: str = "all", bad_points: BadPoints = "refuse") -> None:
-        super().__init__(root, split, bad_points)
-        digits = str(root)
-        count = int(digits) if digits.isdecimal() and len(digits) <= 7 else 0
-        if not 1 <= count <= _SEEDS_APART:
-            raise DataError(f"{digits!r} where a count belongs", self.tree, "type for example simulated:1000")
-        wanted = Split.parse(split)
-        first_seeds = {**self.splits(), "all": self.splits()["train"]}
-        name = "+".join(wanted.parts)
-        if name not in first_seeds:
-            raise DataError(
-                f"the split {split!r} of simulated scans",
-                f"one of {nearest_names(name, first_seeds)}",
-                "type for example simulated:1000:val",
-            )
-        first_seed = int(first_seeds[name][0])
-        self._seeds = range(first_seed, first_seed + count)[wanted.block(count)]
-        if not self._seeds:
-            raise DataError(
-                f"the split {split!r} of {count} scans, which leaves none", "at least one scan", "ask for more"
-            )
-
-    def __len__(self) -> int:
-        return len(self._seeds)
 
     def scan(self, index: int) -> Scan:
         """Simulate one scan."""
         # Only here: naming and counting need no simulator.
         from lidargrit.simulator import simulate  # noqa: PLC0415
 
-        return simulate(seed=self._seeds[index], sensor=load_sensor(self.sensor))
-
-    def name(self, index: int) -> str:
-        """Name one scan by its seed: "seed_0000012"."""
-        return f"seed_{self._seeds[index]:07d}"
-
-    def recording(self, index: int) -> str:
-        """Name the street of a scan by its seed, which no other scan shares."""
-        return f"simulated/{self.name(index)}"
-
-    @classmethod
-    def matches(cls, root: Path) -> bool:
-        """Return False: simulated scans are only opened by name."""
-        return False
-
-    @classmethod
-    def write_example(cls, root: Path, num_scans: int) -> None:
-        """Write nothing: ``root`` is a count, and nothing has to exist for it."""
+        return simulate(seed=self.seeds[index], sensor=load_sensor(self.sensor))

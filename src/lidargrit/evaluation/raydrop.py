@@ -7,8 +7,10 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from lidargrit.conditions import Condition
+from lidargrit.conditions.fills import ranges_from_others
 from lidargrit.errors import ConfigError
 from lidargrit.evaluation.realism import SimulatedScans, distance, drop_by_coin
 from lidargrit.generators import Generator, load, locate
@@ -24,13 +26,20 @@ RAYDROP_CURVES = (
 )
 """Curves that depend on which rays return, each a Jensen-Shannon distance."""
 
+_TITLES = {
+    "simulated": "raydrop of simulated scans",
+    "real": "... real scans, decoded",
+    "real_triangulated": "... real, triangulated",
+}
+
 
 @dataclass(frozen=True)
 class RaydropScore:
     """Jensen-Shannon distances, from 0 (alike) to 1, of one curve between true scans and scans with sampled drops.
 
     Args:
-        scans: kind of the scans to which drops are added, ``simulated`` or ``real``.
+        scans: kind of the scans to which drops are added: ``simulated``; ``real``, with ranges that a tokenizer decodes;
+            or ``real_triangulated``, with ranges that are interpolated from other rays' returns.
         model: distance between the model's drops and the true ones.
         coin: distance between the true drops and drops of one constant probability, on the same clean ranges.
         floor: distance between the two halves of the true scans.
@@ -49,7 +58,7 @@ def score_raydrop(
 
     Args:
         generator: model that takes clean surfaces.
-        scans: kind of the scans, ``simulated`` or ``real``.
+        scans: kind of the scans; see :class:`RaydropScore`.
         clean: batch of range images in which every surface returns.
         true: measured range images of the same scans, with true drops.
         seed: seed of the first scan's drops, and of the coin.
@@ -79,7 +88,7 @@ def score_raydrop(
 
 
 def scores_of_model(word: str, simulated: SimulatedScans, real: RangeImages, seed: int = 0) -> list[RaydropScore]:
-    """Score the drops of a run: on simulated scans, whose clean ranges are known, and on real ones as decoded.
+    """Score the drops of a run: on simulated scans, whose clean ranges are known, and on real ones, estimated twice.
 
     Args:
         word: folder of a finished run, or ``pretrained``.
@@ -91,9 +100,13 @@ def scores_of_model(word: str, simulated: SimulatedScans, real: RangeImages, see
         ConfigError: a run that does not drop returns of clean scans, or of another sensor.
     """
     generator = load(locate(word))
-    clean, true = decoded_surfaces(generator, real)
-    of_simulated = score_raydrop(generator, "simulated", simulated.clean, simulated.measured, seed)
-    return of_simulated + score_raydrop(generator, "real", clean, true, seed)
+    decoded, true = decoded_surfaces(generator, real)
+    pairs = {
+        "simulated": (simulated.clean, simulated.measured),
+        "real": (decoded, true),
+        "real_triangulated": (triangulated_surfaces(true, seed), true),
+    }
+    return [score for scans, (clean, of) in pairs.items() for score in score_raydrop(generator, scans, clean, of, seed)]
 
 
 @torch.no_grad()
@@ -123,14 +136,31 @@ def decoded_surfaces(generator: Generator, real: RangeImages) -> tuple[RangeImag
         tokenizer.decode(tokenizer.encode(true[index : index + 1].to(device))).range_m for index in range(len(true))
     ]
     range_m = torch.cat(ranges).float().cpu().clamp(sensor.range_min_m, sensor.range_max_m)
-    return RangeImage.masked(range_m, true.return_mask.any(0).expand_as(true.return_mask), sensor), true
+    return _surfaces(range_m, true), true
+
+
+def triangulated_surfaces(true: RangeImage, seed: int = 0) -> RangeImage:
+    """Return scans with a range for every ray, interpolated from the returns of other rays.
+
+    A ray that never returns in any of the scans, such as one that ends on the car, has no surface.
+
+    Args:
+        true: batch of real scans.
+        seed: seed of the choice of the other rays; see :func:`lidargrit.conditions.fills.ranges_from_others`.
+    """
+    return _surfaces(ranges_from_others(true, torch.Generator().manual_seed(seed)).range_m, true)
+
+
+def _surfaces(range_m: Tensor, true: RangeImage) -> RangeImage:
+    """Return clean scans of these ranges, with no surface where none of the true scans has a return."""
+    return RangeImage.masked(range_m, true.return_mask.any(0).expand_as(true.return_mask), true.sensor)
 
 
 def raydrop_table(scores: Sequence[RaydropScore]) -> str:
     """Return scores as lines for a terminal."""
     lines = []
     for scans in dict.fromkeys(score.scans for score in scores):
-        lines.append(f"{'raydrop of ' + scans + ' scans':<28}{'model':>10}{'coin':>10}{'halves':>10}")
+        lines.append(f"{_TITLES[scans]:<28}{'model':>10}{'coin':>10}{'halves':>10}")
         for score in scores:
             if score.scans == scans:
                 values = f"{score.model.value:>10.4f}{score.coin.value:>10.4f}{score.floor.value:>10.4f}"

@@ -33,6 +33,8 @@ from lidargrit.nn.objective import Objective
 from lidargrit.nn.pixel_decoder import PixelSampling
 from lidargrit.nn.precision import Precision
 from lidargrit.nn.published import read_checkpoint
+from lidargrit.nn.raydrop_network import RaydropConfig, RaydropNetwork
+from lidargrit.nn.raydrop_objective import RaydropObjective
 from lidargrit.nn.transformer import CausalTransformer
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage, TokenGrid
@@ -67,9 +69,10 @@ class TokenSampling:
             surface is preferred. Only scans sampled with 1, and a noise of 1, follow the distribution whose likelihood
             the model gives.
         range_noise: multiplier of the pixel decoder's spread of ranges about a surface.
-        completion: method by which scans are completed. ``network`` estimates ranges, and samples the mask, by a
-            network for completion; ``tokens`` samples the tokens without any observed pixel, and then all pixels that
-            were not observed. ``auto`` is ``network`` where a model has one and pixels were observed.
+        completion: method by which scans are completed. ``network`` takes the network that was trained for what was
+            observed: the one for completion where pixels were, the one for raydrop where all surfaces were. ``tokens``
+            samples the tokens without any observed pixel, and then all pixels that were not observed. ``auto`` is
+            ``network`` where a model has one.
         weights: number type of the transformer's weights. ``fp32`` is exact; ``bf16`` and ``int8`` (CPUs only) read
             less memory for a token and change probabilities a little, see docs/performance.md.
         decoder: number type of the decoder. ``fp32`` is exact; ``bf16`` is quicker and moves ranges a little; ``auto``
@@ -106,9 +109,11 @@ class LidarGritConfig(TokenGeneratorConfig):
 
     Args:
         completion: sizes of a network that completes scans; none in the paper.
+        raydrop: sizes of a network that tells which surfaces of clean scans return; none in the paper.
     """
 
     completion: CompletionNetworkConfig | None = None
+    raydrop: RaydropConfig | None = None
 
 
 class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
@@ -137,16 +142,22 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         self.completion: CompletionNetwork | None = None
         if config.completion is not None:
             self.completion = CompletionNetwork(config.completion, sensor)
+        self.raydrop: RaydropNetwork | None = None
+        if config.raydrop is not None:
+            self.raydrop = RaydropNetwork(config.raydrop, sensor)
 
     @property
     def stages(self) -> tuple[str, ...]:
-        """Those of every generator of tokens, then the network that completes scans, if there is one."""
-        return super().stages if self.config.completion is None else (*super().stages, "completion")
+        """Those of every generator of tokens, then the networks for completion and for raydrop, if there are any."""
+        further = {"completion": self.config.completion, "raydrop": self.config.raydrop}
+        return (*super().stages, *(name for name, config in further.items() if config is not None))
 
     def objective(self, stage: str) -> Objective:
         """Return the objective of a stage."""
         if stage == "completion" and self.completion is not None:
             return CompletionObjective(self.completion, self.sensor)
+        if stage == "raydrop" and self.raydrop is not None:
+            return RaydropObjective(self.raydrop, self.sensor)
         return super().objective(stage)
 
     def transformer_objective(self) -> Objective:
@@ -177,9 +188,9 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         ones.
         """
         rngs = [torch.Generator().manual_seed(seed) for seed in seeds]
-        if self._completes_by_network(condition, sampling):
-            assert self.completion is not None
-            return self.completion.sample(condition, rngs[: seeds.num_asked_for])
+        network = self._completing_network(condition, sampling)
+        if network is not None:
+            return network.sample(condition, rngs[: seeds.num_asked_for])
         uniform = torch.stack([torch.rand(self.transformer.context_length, generator=rng) for rng in rngs])
         decoder, tokenizer = self._prepare(len(seeds), sampling)
         tokens = self.observed_tokens(condition)
@@ -187,15 +198,22 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
             tokens = decoder.generate(uniform.to(self.device), tokens)
         return self.decode(tokens, seeds.num_asked_for, rngs, sampling.mask, sampling.pixels(), tokenizer, condition)
 
-    def _completes_by_network(self, condition: Condition, sampling: TokenSampling) -> bool:
-        """Return whether the network for completion completes such a scan."""
-        if sampling.completion == "network" and self.completion is None:
+    def _completing_network(
+        self, condition: Condition, sampling: TokenSampling
+    ) -> CompletionNetwork | RaydropNetwork | None:
+        """Return the network that was trained for such conditions and is to complete them; None for tokens."""
+        if sampling.completion == "tokens":
+            return None
+        network = self.raydrop if condition.has_all_surfaces else None
+        if condition.kinds == {"pixels"}:
+            network = self.completion
+        if network is None and sampling.completion == "network":
             raise ConfigError(
-                "completion=network for a model without a network that completes scans",
+                "completion=network for a model without a network for what is known of these scans",
                 "a model with one",
-                "leave completion out, or train a recipe with the stage completion, such as compact_completion",
+                "leave completion out, or train a recipe with its stage: compact_completion or compact_raydrop",
             )
-        return sampling.completion != "tokens" and self.completion is not None and condition.kinds == {"pixels"}
+        return network
 
     def token_bits(self, grid: TokenGrid) -> Float[Tensor, "B h w"]:
         """Return the bits of each token given those before it."""

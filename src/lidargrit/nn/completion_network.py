@@ -8,22 +8,17 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from lidargrit.conditions import Condition
 from lidargrit.conditions.hints import NUM_CANDIDATES, NUM_MAPS, Hints, hints_of
 from lidargrit.errors import ConfigError
-from lidargrit.nn.blocks import Network
-from lidargrit.nn.convolution import Convolution
-from lidargrit.nn.pixel_networks import Guide, MaskNetwork, PixelDecoderConfig, Residual
-from lidargrit.nn.pixel_phases import at_phases
-from lidargrit.nn.transformer import TransformerBlock, TransformerConfig
+from lidargrit.nn.pixel_networks import Guide, MaskNetwork
+from lidargrit.nn.small_unet import SmallUnet, SmallUnetConfig, check_image
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
-_CELL = 8  # rows and columns of an image are multiples of it
 _TRUST = 3.0  # logit by which triangulation is preferred to the other candidates at first
 _LOGIT_BOUND = 8.0
 
@@ -90,21 +85,14 @@ class CompletionNetwork(nn.Module):
 
     def __init__(self, config: CompletionNetworkConfig, sensor: SensorModel) -> None:
         super().__init__()
-        if sensor.height % _CELL or sensor.width % _CELL:
-            raise ConfigError(
-                f"range images of {sensor.height}x{sensor.width} for a network that completes scans",
-                f"rows and columns in multiples of {_CELL}",
-                "choose another sensor or number of columns",
-            )
+        check_image(sensor, "a network that completes scans")
         self.limits_v = (math.log1p(sensor.range_min_m), math.log1p(sensor.range_max_m))
         self.rows = nn.Parameter(torch.zeros(config.row_channels, sensor.height))
         azimuth_rad = sensor.azimuth_rad.double().mean(0).float()
         self.register_buffer("azimuth", torch.stack((azimuth_rad.sin(), azimuth_rad.cos())), persistent=False)
-        self.unet = _Unet(config, NUM_MAPS + config.row_channels + 2, config.features + NUM_CANDIDATES + 2)
-        sizes = PixelDecoderConfig(
-            coarsest_cell=_CELL, mask_features=config.features, mask_width=config.mask_width, blocks=2
-        )
-        self.mask = MaskNetwork(sizes, sensor, config.features)
+        sizes = SmallUnetConfig(config.widths, config.blocks, config.attention_layers, config.heads)
+        self.unet = SmallUnet(sizes, NUM_MAPS + config.row_channels + 2, config.features + NUM_CANDIDATES + 2)
+        self.mask = MaskNetwork.behind(config.features, config.mask_width, sensor)
         preferred = torch.zeros(NUM_CANDIDATES)
         preferred[0] = _TRUST
         self.register_buffer("preferred", preferred[:, None, None], persistent=False)
@@ -150,69 +138,3 @@ class CompletionNetwork(nn.Module):
             low_m, high_m = condition.sensor.range_min_m, condition.sensor.range_max_m
             images.append(RangeImage.masked(v.expm1().clamp(low_m, high_m), mask, condition.sensor))
         return RangeImage.cat(images)
-
-    def mask_nats(
-        self, point: Point, returned: Bool[Tensor, "B H W"], rng: torch.Generator | None
-    ) -> Float[Tensor, " B"]:
-        """Return the negative log-likelihood of the unknown part of each mask in nats.
-
-        Args:
-            point: estimate of every pixel.
-            returned: true masks.
-            rng: random generator that chooses one phase of each spacing to stand for all of that spacing; None to
-                compute every phase.
-        """
-        guide, total = point.guide, point.v.new_zeros(len(returned))
-        assert guide.observed is not None
-        guided = self.mask.guided(guide)
-        for phases in self.mask.by_spacing():
-            chosen = phases
-            if rng is not None:
-                chosen = [phases[int(torch.randint(len(phases), (), generator=rng, device=rng.device))]]
-            logits = self.mask.logits(chosen, self.mask.outputs(chosen, guided, guide, returned, guide.v), guide)
-            nll = F.binary_cross_entropy_with_logits(logits, at_phases(returned, chosen).float(), reduction="none")
-            unknown = ~at_phases(guide.observed, chosen)
-            total = total + (nll * unknown).sum((0, 2, 3)) * (len(phases) / len(chosen))
-        return total
-
-
-class _Unet(Network):
-    """Maps at full size → maps at full size, through a half, a quarter and an eighth of the rows and columns."""
-
-    def __init__(self, config: CompletionNetworkConfig, inputs: int, outputs: int) -> None:
-        super().__init__()
-        first, second, third = config.widths
-        self.enter, self.level1 = Convolution(4 * inputs, first, "wrap"), Residual(first)
-        self.down1, self.level2 = nn.Conv2d(4 * first, second, 1), Residual(second)
-        self.down2 = nn.Conv2d(4 * second, third, 1)
-        self.level3 = nn.Sequential()
-        for index in range(config.blocks):
-            self.level3.append(Residual(third))
-            if index < config.attention_layers:
-                self.level3.append(_Attention(TransformerConfig(1, config.heads, third, embedding_dropout=0.0)))
-        self.up2, self.after2 = nn.Conv2d(third, 4 * second, 1), Residual(second)
-        self.up1, self.after1 = nn.Conv2d(second, 4 * first, 1), Residual(first)
-        self.out = nn.Conv2d(first, 4 * outputs, 1)
-        nn.init.normal_(self.out.weight, std=0.02)
-        assert self.out.bias is not None
-        nn.init.zeros_(self.out.bias)
-
-    def forward(self, maps: Float[Tensor, "B C H W"]) -> Float[Tensor, "B D H W"]:
-        one = self.level1(self.enter(F.pixel_unshuffle(maps, 2)))
-        two = self.level2(self.down1(F.pixel_unshuffle(one, 2)))
-        three = self.level3(self.down2(F.pixel_unshuffle(two, 2)))
-        two = self.after2(two + F.pixel_shuffle(self.up2(three), 2))
-        one = self.after1(one + F.pixel_shuffle(self.up1(two), 2))
-        return F.pixel_shuffle(self.out(F.silu(one)), 2)
-
-
-class _Attention(nn.Module):
-    """A layer of a transformer whose tokens are pixels; convolutions give them their positions."""
-
-    def __init__(self, config: TransformerConfig) -> None:
-        super().__init__()
-        self.layer = TransformerBlock(config, causal=False)
-
-    def forward(self, x: Float[Tensor, "B C h w"]) -> Float[Tensor, "B C h w"]:
-        size = x.shape[-2:]
-        return self.layer(x.flatten(2).transpose(1, 2)).transpose(1, 2).unflatten(2, size)

@@ -47,7 +47,7 @@ class CompletionObjective(Objective):
         hidden = ~observed
         returns = (hidden & images.return_mask).float()
         count, num_returns = hidden.sum((1, 2)).clamp(min=1), returns.sum((1, 2)).clamp(min=1)
-        nats = self.completion.mask_nats(point, images.return_mask, rng if self.training else None) / count
+        nats = self.completion.mask.nats(point.guide, images.return_mask, rng if self.training else None) / count
         alone = F.binary_cross_entropy_with_logits(point.return_logits, images.return_mask.float(), reduction="none")
         alone = (alone * hidden).sum((1, 2)) / count
         log_error = ((point.v - images.range_m.log1p()).abs() * returns).sum((1, 2)) / num_returns

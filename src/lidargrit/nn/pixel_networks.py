@@ -217,6 +217,18 @@ class MaskNetwork(PhaseNetwork):
         super().__init__(config, sensor, features, config.mask_features, config.mask_width, 1)
         self.row_bias = nn.Parameter(torch.zeros(sensor.height))
 
+    @classmethod
+    def behind(cls, features: int, width: int, sensor: SensorModel) -> MaskNetwork:
+        """Return a network that samples masks behind another network than a tokenizer's decoder, all of whose features
+        it sees.
+
+        Args:
+            features: channels of the other network's features.
+            width: channels of the layers.
+            sensor: the rays of the range images.
+        """
+        return cls(PixelDecoderConfig(mask_features=features, mask_width=width), sensor, features)
+
     def context(
         self, phase: Phase, guide: Guide, return_mask: Bool[Tensor, "B H W"], v: Float[Tensor, "B H W"]
     ) -> Float[Tensor, "B D h w"]:
@@ -248,6 +260,29 @@ class MaskNetwork(PhaseNetwork):
         """Return the logits of the pixels of phases of one spacing."""
         decoded = guide.return_logits + self.row_bias[:, None]
         return output[:, :, 0] + at_phases(decoded, phases)
+
+    def nats(
+        self, guide: Guide, returned: Bool[Tensor, "B H W"], rng: torch.Generator | None = None
+    ) -> Float[Tensor, " B"]:
+        """Return the negative log-likelihood of the unknown part of each mask in nats.
+
+        Args:
+            guide: output of a decoder for every pixel, and what is known before the first phase.
+            returned: true masks.
+            rng: chooses one phase of each spacing, which stands for all; every phase is counted without it.
+        """
+        guided, total = self.guided(guide), guide.v.new_zeros(len(returned))
+        for phases in self.by_spacing():
+            chosen = phases
+            if rng is not None:
+                index = torch.randint(len(phases), (), generator=rng, device=rng.device)
+                chosen = [phases[0 if index.is_meta else int(index)]]  # all take as many operations, if counted
+            logits = self.logits(chosen, self.outputs(chosen, guided, guide, returned, guide.v), guide)
+            nll = F.binary_cross_entropy_with_logits(logits, at_phases(returned, chosen).float(), reduction="none")
+            if guide.observed is not None:
+                nll = nll * ~at_phases(guide.observed, chosen)
+            total = total + nll.sum((0, 2, 3)) * (len(phases) / len(chosen))
+        return total
 
 
 class RangeNetwork(PhaseNetwork):

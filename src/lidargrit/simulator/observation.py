@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -100,6 +100,23 @@ class Observation:
             torch.from_numpy(label),
             source=source,
         )
+
+    def surfaces(self, source: str, limits_m: tuple[float, float]) -> Scan:
+        """Return a point on every surface within limits, without noise, in the firing order of KITTI's files.
+
+        The reflectance says which beams came back: 1, or 0 for a surface that was lost. Rays that end on the car that
+        carries the sensor meet no surface.
+
+        Args:
+            source: origin of the scan, for messages.
+            limits_m: nearest and farthest range of a surface, in metres.
+
+        Raises:
+            ScanError: no surface at all.
+        """
+        within = (self.clean_range_m >= limits_m[0]) & (self.clean_range_m <= limits_m[1]) & ~self.blocked
+        came_back = self.return_mask.astype(np.float32)
+        return replace(self, return_mask=within, range_m=self.clean_range_m, reflectance=came_back).scan(source)
 
 
 @dataclass(frozen=True)

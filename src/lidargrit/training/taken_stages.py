@@ -34,7 +34,9 @@ def taken_stages(recipe: Recipe, generator: Generator) -> dict[str, Objective]:
             f"a run of {generator.public_name()!r}",
             "choose another run, or set tokenizer_from to take its tokenizer alone",
         )
-    stages = [stage for stage in generator.stages if stage in donor.stages]
+    if unknown := sorted({*recipe.train_anew} - {*generator.stages}):
+        raise ConfigError(f"train_anew={unknown[0]}", f"one of {', '.join(generator.stages)}", "name a stage")
+    stages = [stage for stage in generator.stages if stage in donor.stages and stage not in recipe.train_anew]
     for stage in stages:
         _check(f"stages_from={recipe.stages_from}", generator, donor, stage)
     return {stage: donor.objective(stage) for stage in stages}

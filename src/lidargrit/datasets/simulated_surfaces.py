@@ -1,0 +1,29 @@
+"""Simulated streets with a point on every surface, whose reflectance says which beams came back: to learn raydrop."""
+
+from __future__ import annotations
+
+from lidargrit.datasets._streets import Streets
+from lidargrit.sensors import load_sensor
+from lidargrit.structures import Scan
+
+
+class SimulatedSurfaces(Streets):
+    """The streets of ``simulated``, seed by seed, as they would be measured if every surface returned.
+
+    The reflectance is 1 where ``simulated`` has a return, and 0 where that beam was lost.
+
+    Args:
+        root: number of scans, where other data sets have a folder.
+        split: ``train``, ``val`` or ``test``.
+        bad_points: without effect; the simulator makes none.
+    """
+
+    title = "simulated streets: every surface, and which of them return"
+
+    def scan(self, index: int) -> Scan:
+        """Simulate one scan."""
+        # Only here: naming and counting need no simulator.
+        from lidargrit.simulator import observe  # noqa: PLC0415
+
+        sensor, source = load_sensor(self.sensor), f"surfaces of {self.name(index)}"
+        return observe(self.seeds[index], sensor).surfaces(source, (sensor.range_min_m, sensor.range_max_m))
