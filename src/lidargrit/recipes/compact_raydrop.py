@@ -27,6 +27,7 @@ RECIPE = replace(
             augmentations=("flip",),
             average_over_scans=300,
             validate_every=1000,
+            validation_scans=32,
             checkpoint_every=500,
         ),
     },
