@@ -1,0 +1,67 @@
+"""A model's raydrop of clean test streets beside the simulator's own, drawn anew, and a coin → a Markdown table.
+
+    python benchmarks/raydrop.py runs/dropping -n 128
+
+The true scans are those of ``simulated:512:test``: the first N to drop returns of, and as many others for the distance
+between two sets of true scans. `pixel by pixel` takes the probabilities of the model's network of raydrop, but samples
+each return independently of the others. The simulator draws its noise from pulse to pulse anew, and knows the rest.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import torch
+
+from lidargrit.conditions import Condition
+from lidargrit.evaluation.raydrop import RAYDROP_CURVES
+from lidargrit.evaluation.realism import distance, drop_by_coin, pair_of
+from lidargrit.generators import load, locate
+from lidargrit.generators.lidargrit import LidarGrit
+from lidargrit.simulator import observe
+from lidargrit.structures import RangeImage
+
+_FIRST_TEST_SEED = 2_000_000
+
+
+def main() -> None:
+    """Simulate, drop, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", help="run with a network of raydrop, or pretrained")
+    parser.add_argument("-n", "--count", type=int, default=128, help="number of streets")
+    options = parser.parse_args()
+    model = load(locate(options.run))
+    assert isinstance(model, LidarGrit), "a run of lidargrit"
+    assert model.raydrop is not None, "a run with a network of raydrop"
+    clean, true, redrawn = [], [], []
+    rng = torch.Generator().manual_seed(0)
+    for seed in range(_FIRST_TEST_SEED, _FIRST_TEST_SEED + 2 * options.count):
+        seen = observe(seed, model.sensor, kept_columns_only=True)
+        of_clean, of_true = pair_of(seen, model.sensor)
+        again = torch.rand(of_clean.range_m.shape, generator=rng) < torch.from_numpy(seen.return_probability)
+        clean.append(of_clean)
+        true.append(of_true)
+        redrawn.append(RangeImage.masked(of_clean.range_m, of_clean.return_mask & again, model.sensor))
+    surfaces, others = RangeImage.stack(clean[: options.count]), RangeImage.stack(true[options.count :])
+    measured = RangeImage.stack(true[: options.count])
+    dropped = model.complete(Condition.of_surfaces(surfaces), range(options.count))
+    with torch.no_grad():
+        logits = torch.cat(
+            [model.raydrop(one.range_m[None], one.return_mask[None]).logits for one in clean[: options.count]]
+        )
+    alone = surfaces.return_mask & (torch.rand(logits.shape, generator=rng) < logits.sigmoid())
+    rows = {
+        "true scans of the same streets": measured,
+        "the simulator, drawn anew": RangeImage.stack(redrawn[: options.count]),
+        "model": dropped,
+        "its probabilities, pixel by pixel": RangeImage.masked(surfaces.range_m, alone, model.sensor),
+        "coin": drop_by_coin(surfaces, float(measured.return_mask.float().mean())),
+    }
+    print("| drops by | " + " | ".join(RAYDROP_CURVES) + " |\n|---" + "|---" * len(RAYDROP_CURVES) + "|")
+    for name, images in rows.items():
+        values = [distance(curve, [images], iter([others])).value for curve in RAYDROP_CURVES]
+        print(f"| {name} | " + " | ".join(f"{value:.4f}" for value in values) + " |")
+
+
+if __name__ == "__main__":
+    main()
