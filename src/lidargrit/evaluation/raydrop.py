@@ -38,8 +38,8 @@ class RaydropScore:
     """Jensen-Shannon distances, from 0 (alike) to 1, of one curve between true scans and scans with sampled drops.
 
     Args:
-        scans: kind of the scans to which drops are added: ``simulated``; ``real``, with ranges that a tokenizer decodes;
-            or ``real_triangulated``, with ranges that are interpolated from other rays' returns.
+        scans: kind of the scans to which drops are added: ``simulated``; ``real``, with ranges that a tokenizer
+            decodes; or ``real_triangulated``, with ranges that are interpolated from other rays' returns.
         model: distance between the model's drops and the true ones.
         coin: distance between the true drops and drops of one constant probability, on the same clean ranges.
         floor: distance between the two halves of the true scans.
