@@ -117,7 +117,8 @@ def test_a_run_with_it_drops_by_it(tmp_path):
     assert torch.equal(by_default.return_mask, named.return_mask)
     assert not torch.equal(by_default.return_mask, by_tokens.return_mask)
     assert torch.equal(by_default.range_m[by_default.return_mask], known.range_m[by_default.return_mask])
+    observed = torch.ones_like(known.range_observed)
+    observed[:, 9] = False
+    of_pixels = Condition.of_pixels(pairs(2), observed)
     with pytest.raises(ConfigError, match="without a network for what is known"):
-        observed = torch.ones_like(known.range_observed)
-        observed[:, 9] = False
-        again.complete(Condition.of_pixels(pairs(2), observed), [3, 4], TokenSampling(completion="network"))
+        again.complete(of_pixels, [3, 4], TokenSampling(completion="network"))

@@ -16,9 +16,7 @@ from lidargrit.nn.raydrop_network import RaydropNetwork
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
-_NOISE_M = (
-    0.03  # largest standard deviation of the noise added in training: clean ranges of simulators have noise, or none
-)
+_NOISE_M = 0.03  # largest standard deviation of noise added in training: clean ranges may come with noise or not
 _ALONE_WEIGHT = 0.5
 
 

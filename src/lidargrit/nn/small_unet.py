@@ -88,7 +88,7 @@ class SmallUnet(Network):
 
 
 class _Attention(nn.Module):
-    """A layer of a transformer whose tokens are pixels; convolutions tell them where they are."""
+    """A layer of a transformer whose tokens are pixels; convolutions give them their positions."""
 
     def __init__(self, config: TransformerConfig) -> None:
         super().__init__()
