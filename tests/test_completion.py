@@ -214,6 +214,8 @@ def test_the_drops_of_a_model_are_scored_beside_those_of_a_coin(folders):
         (["complete", "{}/scans", "--model", "{}/run", "--format", "las2"], "the format 'las2' to write"),
         (["raydrop", "{}/scans", "--model", "linear"], "--model linear for a task for a model"),
         (["upsample", "{}/scans", "--model", "{}/run", "--sensor", "hdl64e_kitti_odometry"], "with 64 rows from"),
+        (["upsample", "{}/flat.npy", "--model", "{}/run", "--sensor", "vlp16"], "a range image, which has no rows"),
+        (["upsample", "{}/scans", "--model", "linear", "--sensor", "vlp16", "--to", "{}/row.json"], "some of the 1 "),
         (
             ["upsample", "{}/sparse", "--model", "{}/run", "--sensor", "vlp16", "--to", "os1_64"],
             "the sensor 'os1_64', 64x1024, for",
@@ -225,6 +227,9 @@ def test_mistakes_are_told_in_one_line_and_nothing_is_written(words, message, fo
     np.save(folders / "all.npy", np.ones((64, 32), bool))
     np.save(folders / "none.npy", np.zeros((64, 32), bool))
     np.save(folders / "wide.npy", np.ones((64, 33), np.float32))
+    np.save(folders / "flat.npy", np.full((64, 32), 9, np.float32))
+    one_row = replace(SENSOR, elevation_rad=torch.zeros(1, 1))
+    (folders / "row.json").write_text(json.dumps(one_row.to_json()))
     (folders / "empty.npz").write_bytes(b"")
     words = [word.replace("{}", str(folders)) for word in words]
     assert main([*words[:2], str(tmp_path / "out"), *words[2:]]) == 2

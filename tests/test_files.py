@@ -11,8 +11,17 @@ from pathlib import Path
 
 import pytest
 
-from lidargrit.errors import OutputError
-from lidargrit.files import atomic_path, claim_folder, is_taken, remove_partials, write_text
+from lidargrit.errors import CheckpointError, OutputError, ScanError
+from lidargrit.files import (
+    atomic_path,
+    claim_folder,
+    is_taken,
+    read_tensors,
+    refuse_to_overwrite,
+    remove_partials,
+    write_text,
+)
+from lidargrit.sources.sample_formats import read_tensor
 
 WRITE_AND_WAIT = """
 import sys, time
@@ -188,3 +197,15 @@ def test_the_command_that_finishes_a_killed_one_leaves_whole_files_alone(tmp_pat
         process.wait()
     subprocess.run([sys.executable, "-c", script, str(tmp_path / "out")], check=True)
     assert not [name for name in everything_in(tmp_path / "out") if name.startswith(".") or "/." in name]
+
+
+def test_a_folder_is_never_taken_for_a_file_to_replace(tmp_path):
+    with pytest.raises(OutputError, match="which is a folder; wanted a file"):
+        refuse_to_overwrite(tmp_path, overwrite=True)
+
+
+@pytest.mark.parametrize(("read", "error"), [(read_tensors, CheckpointError), (read_tensor, ScanError)])
+def test_a_pipe_is_refused_and_does_not_hang(tmp_path, read, error):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(error, match="not a file"):
+        read(tmp_path / "pipe")

@@ -165,6 +165,9 @@ WRONG = {
     "degrees": changed(elevation_rad=[[15.0], [0.0], [-25.0]]),
     "rows that rise": changed(elevation_rad=[[-0.2], [0.0], [0.1]]),
     "too many rows": changed(elevation_rad=[[1 - 1e-4 * i] for i in range(5000)], azimuth_offset_rad=None),
+    "too many pixels": changed(
+        elevation_rad=[[1 - 1e-3 * i] for i in range(2000)], azimuth_rad=[[0.0] * 10_000], azimuth_offset_rad=None
+    ),
     "a huge stride": changed(column_stride=10**9),
     "a stride of 0": changed(column_stride=0),
     "a stride of a half": changed(column_stride=0.5),

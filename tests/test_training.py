@@ -12,7 +12,7 @@ import torch
 from lidargrit import configuration
 from lidargrit.datasets.kitti_odometry import KittiOdometry
 from lidargrit.errors import CheckpointError, OutputError, TrainingError
-from lidargrit.files import claim_folder, read_tensors, write_json
+from lidargrit.files import claim_folder, read_tensors, write_json, write_tensors
 from lidargrit.loading import Batches, DataConfig
 from lidargrit.nn.objective import Objective
 from lidargrit.recipes import load_recipe
@@ -21,6 +21,7 @@ from lidargrit.sensors import load_sensor
 from lidargrit.sources import load_range_images
 from lidargrit.tokenizers.vqvae import Vqvae
 from lidargrit.training import FitConfig, check_folder, measure, train, training_flops
+from lidargrit.training.checkpoint import load_checkpoint, save_checkpoint
 from lidargrit.training.fit import Fit
 from lidargrit.training.log import Log, read_log
 from lidargrit.training.optimiser import WeightAverage, learning_rate_at, make_optimiser, memory_of_weights
@@ -330,3 +331,29 @@ def test_tensorboard_draws_what_the_log_says(tmp_path):
     seen = EventAccumulator(str(tmp_path)).Reload().Scalars("loss/train")
     assert [(event.step, event.value) for event in seen] == [(4, 0.5), (8, 0.125)]
     assert [json.loads(line)["loss"] for line in (tmp_path / "log.jsonl").read_text().splitlines()] == [0.5, 0.125]
+
+
+def test_a_checkpoint_that_does_not_fit_its_optimiser_is_refused(tmp_path):
+    path, layer = tmp_path / "checkpoint.safetensors", OneWeight(load_sensor("vlp16"))
+    layer.bias = torch.nn.Parameter(torch.ones(3))
+    optimiser = torch.optim.AdamW(layer.parameters())
+    (layer.weight.sum() + layer.bias.sum()).backward()
+    optimiser.step()
+    average = WeightAverage(layer, 0)
+    save_checkpoint(path, layer, average, optimiser, 8, "")
+    assert load_checkpoint(path, layer, average, optimiser, "") == 8
+    tensors, about = read_tensors(path)
+    moment = "optimiser.0.exp_avg"
+    for changed, told in (
+        ({moment: torch.ones(2, 2)}, "moments of another size for weight 0"),
+        ({moment: None}, "moments that some weights lack"),
+        ({"optimiser.7.step": torch.ones(())}, "moments of more than 2 weights"),
+        ({"optimiser.x.step": torch.ones(())}, "invalid literal"),
+        ({"scans_seen": -1}, "-1 scans seen"),
+        ({"scans_seen": 1e300}, "1e[+]300 scans seen"),
+        ({"scans_seen": None}, "None scans seen"),
+    ):
+        kept = {name: of for name, of in {**tensors, **changed}.items() if isinstance(of, torch.Tensor)}
+        write_tensors(path, kept, {name: changed.get(name, of) for name, of in about.items()})
+        with pytest.raises(CheckpointError, match=rf"cannot be used \({told}.*train again"):
+            load_checkpoint(path, layer, average, optimiser, "")

@@ -202,13 +202,16 @@ def is_taken(folder: Path) -> bool:
 def refuse_to_overwrite(path: Path | None, overwrite: bool, ending: str = "") -> None:
     """Raise OutputError if something stands where a user's result is to be written, unless that is allowed.
 
-    Also if a file stands where its folder should, or if its name has another ending than what will be in it.
+    Also if a file stands where its folder should, a folder where the file should, or if its name has another ending
+    than what will be in it.
     """
     above = None if path is None else next((parent for parent in path.absolute().parents if parent.exists()), None)
     if above is not None and not above.is_dir():
         raise OutputError(f"{path}, whose folder {above} is a file", "a folder", "choose another place")
     if path is not None and ending and path.suffix.lower() != ending:
         raise OutputError(f"{path}, which will hold {ending[1:].upper()}", f"a name in {ending}", "choose another name")
+    if path is not None and path.is_dir():
+        raise OutputError(f"{path}, which is a folder", "a file", "choose another name")
     if path is not None and path.exists() and not overwrite:
         raise OutputError(f"{path}, which is there already", "a new name", "choose another, or add --overwrite")
 

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Int64
 from torch import Tensor
 
 from lidargrit.completion.inputs import InputScan, ScanReader
-from lidargrit.errors import ConfigError
+from lidargrit.errors import ConfigError, ScanError
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage, Scan
 
@@ -65,7 +65,7 @@ class SparseReader(ScanReader):
         assert self.source is not None
         own = self.source.elevation_rad.double().mean(1).numpy()
         wanted = self.sensor.elevation_rad.double().mean(1).numpy()
-        half_step = np.gradient(wanted)
+        half_step = np.gradient(wanted) if len(wanted) > 1 else np.zeros(1)
         distance = np.abs(own[:, None] - wanted[None, :])
         rows = distance.argmin(1)
         away = distance.min(1)
@@ -84,6 +84,15 @@ class SparseReader(ScanReader):
 
 
 def observed_rows(scan: InputScan) -> Bool[Tensor, "H W"]:
-    """Return the pixels that a sparse scan covers: all of its rows, with a return or without."""
-    assert scan.on_grid is not None
+    """Return the pixels that a sparse scan covers: all of its rows, with a return or without.
+
+    Raises:
+        ScanError: a scan that was an image of all rows.
+    """
+    if scan.on_grid is None:
+        raise ScanError(
+            "a range image, which has no rows between its own",
+            "points of a sensor with few rows",
+            "name a file or a folder of point clouds",
+        )
     return scan.on_grid

@@ -18,6 +18,9 @@ _MAY_BE_LEFT_OUT = {"source", "column_stride", "azimuth_offset_rad"}
 _NUMBER_AT_MOST = 1e9  # anything larger is no number of a sensor, and some are too large to become a float
 _ROWS_AT_MOST = 4096  # sensors have up to 256 lasers; a table beyond this is a mistake that would fill the memory
 FINE_COLUMNS_AT_MOST = 65536  # sensors fire up to 4096 times a revolution
+_PIXELS_AT_MOST = (
+    2**24
+)  # 128 rows of 4096 columns have a thirtieth; images of a stranger's sensor would fill the memory
 _NAME_AT_MOST = 200  # letters: a name is part of messages
 _CURE = "compare it with what SensorModel.to_json writes"
 
@@ -39,10 +42,13 @@ def check_tables(name: str, elevation: Tensor, azimuth: Tensor, offset: Tensor |
             "put each elevation into a row of its own and all azimuths into one row",
         )
     height, width = len(elevation), azimuth.shape[1]
-    if not (1 <= height <= _ROWS_AT_MOST and column_stride >= 1 <= width * column_stride <= FINE_COLUMNS_AT_MOST):
+    columns = width * column_stride
+    fits = 1 <= height <= _ROWS_AT_MOST and column_stride >= 1 <= columns <= FINE_COLUMNS_AT_MOST
+    if not fits or height * columns > _PIXELS_AT_MOST:
         raise ConfigError(
             f"{height} rows, {width} columns and every {column_stride}th kept for {name!r}",
-            f"1 to {_ROWS_AT_MOST} rows, and 1 to {FINE_COLUMNS_AT_MOST} columns before any is left out",
+            f"1 to {_ROWS_AT_MOST} rows, 1 to {FINE_COLUMNS_AT_MOST} columns before any is left out, and at most "
+            f"{_PIXELS_AT_MOST:,} pixels",
             "correct the sensor's tables",
         )
     if offset is not None and offset.shape != (height,):

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from lidargrit.errors import CheckpointError
 from lidargrit.files import load_exactly, read_tensors, write_tensors
 from lidargrit.training.optimiser import WeightAverage
+from lidargrit.untrusted import SEED_AT_MOST
 
 
 def save_checkpoint(
@@ -56,12 +57,45 @@ def load_checkpoint(
         )
     load_exactly(objective, _below(tensors, "objective."), path)
     load_exactly(average.objective, _below(tensors, "average."), path)
+    try:
+        state = _optimiser_state(_below(tensors, "optimiser."), optimiser)
+        optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
+        scans_seen = about["scans_seen"]
+        if type(scans_seen) is not int or not 0 <= scans_seen <= SEED_AT_MOST:
+            raise ValueError(f"{str(scans_seen)[:40]} scans seen")
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        raise CheckpointError(
+            f"{path}, which cannot be used ({error})",
+            "what lidargrit wrote",
+            "restore the file, or remove it and train again",
+        ) from None
+    return scans_seen
+
+
+def _optimiser_state(tensors: dict[str, Tensor], optimiser: torch.optim.Optimizer) -> dict[int, dict[str, Tensor]]:
+    """Return the state of each weight by the weight's number.
+
+    Raises:
+        ValueError: a weight that there is not, a moment of another size, or one that lacks.
+    """
     state: dict[int, dict[str, Tensor]] = {}
-    for name, tensor in _below(tensors, "optimiser.").items():
+    for name, tensor in tensors.items():
         index, _, key = name.partition(".")
         state.setdefault(int(index), {})[key] = tensor
-    optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
-    return int(about["scans_seen"])
+    number = 0
+    for group in optimiser.param_groups:
+        kinds = set[frozenset[str]]()
+        for weight in group["params"]:
+            moments = state.get(number, {})
+            kinds |= {frozenset(moments)} if moments else set()
+            if any(moment.numel() != 1 and moment.shape != weight.shape for moment in moments.values()):
+                raise ValueError(f"moments of another size for weight {number}")
+            number += 1
+        if len(kinds) > 1:
+            raise ValueError("moments that some weights lack")
+    if state.keys() - range(number):
+        raise ValueError(f"moments of more than {number} weights")
+    return state
 
 
 def _below(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
