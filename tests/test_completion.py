@@ -206,6 +206,7 @@ def test_the_drops_of_a_model_are_scored_beside_those_of_a_coin(folders):
         (["complete", "{}/scans", "--model", "{}/run", "--observed", "{}/all.npy"], "by which all pixels are observed"),
         (["complete", "{}/scans", "--model", "{}/run", "--observed", "{}/none.npy"], "by which no return is observed"),
         (["complete", "{}/empty.npz", "--model", "{}/run"], "an empty file"),
+        (["complete", "", "--model", "{}/run"], "an empty source"),
         (["complete", "{}/wide.npy", "--model", "{}/run"], "a range image of 64x33; wanted 64x32"),
         (["complete", "{}/scans", "--model", "nothing"], "nothing, which holds no finished model"),
         (["complete", "{}/scans", "--model", "linear", "-n", "2"], "-n 2 for linear; wanted 1"),
@@ -222,7 +223,10 @@ def test_the_drops_of_a_model_are_scored_beside_those_of_a_coin(folders):
         ),
     ],
 )
-def test_mistakes_are_told_in_one_line_and_nothing_is_written(words, message, folders, tmp_path, capsys):
+def test_mistakes_are_told_in_one_line_and_nothing_is_written(words, message, folders, tmp_path, capsys, monkeypatch):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    np.save(tmp_path / "here" / "whole.npy", np.full((64, 32), 9, np.float32))
     np.save(folders / "small.npy", np.ones((3, 4), bool))
     np.save(folders / "all.npy", np.ones((64, 32), bool))
     np.save(folders / "none.npy", np.zeros((64, 32), bool))

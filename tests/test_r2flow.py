@@ -57,7 +57,8 @@ def seeded_checkpoint():
         weights = {name: torch.randn(of.shape) for name, of in network.state_dict().items()}
     state = {"state": {0: {"step": torch.tensor(5.0), "exp_avg": torch.ones(2)}}, "param_groups": [{"lr": 1e-4}]}
     schedule = {"last_epoch": 3, "lr_lambdas": [None]}
-    cfg = {"model": {"base_channels": 8}, "data": {"dataset": "kitti_360"}}
+    data = {"dataset": "kitti_360", "data_format": "logscale", "min_depth": 1.45, "max_depth": 80.0}
+    cfg = {"model": {"base_channels": 8}, "data": data}  # and, of files since 819d7d3, "finetuning"
     return {"cfg": cfg, "weights": weights, "optimizer": state, "lr_scheduler": schedule, "num_images": 2_560_000}
 
 
@@ -251,8 +252,24 @@ def test_an_imported_checkpoint_is_a_run_that_samples(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
+    ("k_distil", "reflow"), [(None, None), (1, ReflowConfig(distilled_steps=1)), (4, ReflowConfig(distilled_steps=4))]
+)
+def test_a_checkpoint_that_was_distilled_takes_the_steps_that_it_has_learned(tmp_path, k_distil, reflow):
+    checkpoint = seeded_checkpoint()
+    checkpoint["cfg"]["finetuning"] = {"init_ckpt": "2rf.pth", "sample_dir": "pairs", "k_distil": k_distil}
+    torch.save(checkpoint, tmp_path / "td.pth")
+    recipe = load_recipe("r2flow_kitti_360")
+    generator = R2flow.from_published([tmp_path / "td.pth"], recipe.model, recipe.data.load_sensor())
+    assert generator.config == R2flowConfig(PUBLISHED, True, reflow)
+    assert generator.cost().network_evaluations == (k_distil or 256)
+
+
+@pytest.mark.parametrize(
     ("change", "message"),
     [
+        (lambda c: c["cfg"]["data"].update(data_format="metric"), "with data.data_format=metric; wanted .*=logscale"),
+        (lambda c: c["cfg"]["data"].update(max_depth=120.0), "with data.max_depth=120.0; wanted data.max_depth=80.0"),
+        (lambda c: c["cfg"].update(finetuning={"k_distil": -1}), "k_distil=-1; wanted a number of steps"),
         (lambda c: c.pop("weights"), "which holds no 'weights'"),
         (lambda c: c["weights"].pop("tokenizer.0.weight"), r"another network \(KeyError: 'tokenizer\.0\.weight'\)"),
         (lambda c: c["weights"].pop("detokenizer.0.scale"), r"the file lacks 'network\.detokenizer\.0\.scale'"),

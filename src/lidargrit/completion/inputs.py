@@ -19,13 +19,14 @@ from lidargrit.conditions import Condition
 from lidargrit.datasets import ScanDataset
 from lidargrit.datasets.folder import Folder
 from lidargrit.determinism import evenly_spaced
-from lidargrit.errors import LidarGritError, ScanError
+from lidargrit.errors import DataError, LidarGritError, ScanError
 from lidargrit.formats import read_bytes
 from lidargrit.loading import DataConfig, RangeImages
 from lidargrit.projection import ProjectionVariant, index_map, project, unproject
 from lidargrit.sensors import ProjectionName, SensorModel, load_sensor
 from lidargrit.sources import DatasetSource, open_source
 from lidargrit.structures import RangeImage, Scan
+from lidargrit.untrusted import user_path
 
 PROBABILITY = ".probability.npy"  # how files end that tell the share of returns, and are no scans
 _IMAGE = "a range image: an .npy of (H, W) ranges in metres"
@@ -221,10 +222,10 @@ def _chosen(count: int, config: DataConfig) -> list[int]:
 
 def _image_files(source: str) -> list[Path]:
     """Return the range images that a source names: one ``.npy``, or a folder of nothing else."""
-    path = Path(source)
     try:
+        path = user_path(source)  # refuses an empty word, which would else be the current folder
         found = [path] if path.is_file() else sorted(path.iterdir())
-    except (OSError, ValueError):
+    except (OSError, DataError):
         return []
     found = [one for one in found if one.is_file() and not one.name.startswith(".") and formats.candidates(one)]
     found = [one for one in found if not one.name.endswith(PROBABILITY)]

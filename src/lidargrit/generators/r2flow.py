@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
-from lidargrit.errors import CheckpointError, ConfigError
 from lidargrit.files import load_exactly
 from lidargrit.generators import Cost, Generator, SystemFacts
 from lidargrit.generators._flow import FlowMatching, FlowSampling, PairMatching, ReflowConfig, solve, steps_of
@@ -20,12 +17,11 @@ from lidargrit.nn.diffusion import SeededNoise
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.hdit import Hdit, HditConfig
 from lidargrit.nn.objective import Objective
-from lidargrit.nn.published import read_checkpoint
+from lidargrit.nn.r2flow_checkpoint import read_r2flow_checkpoint
 from lidargrit.nn.size import numbers_of_file
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
-_BYTES_AT_MOST = 1 << 31  # the published network with the optimiser's state takes 1 GB
 _COST_SEED = 0
 
 
@@ -120,15 +116,15 @@ class R2flow(Generator[R2flowConfig, FlowSampling]):
 
     @classmethod
     def from_published(cls, files: Sequence[Path], config: R2flowConfig, sensor: SensorModel) -> R2flow:
-        """Make a generator of one checkpoint, which tells the sizes of its network.
+        """Make a generator of one checkpoint, which tells the sizes of its network, and if its flow was distilled.
 
         The network keeps the ray angles of its training, at the edges of cells; where a pixel's point lies is the
         sensor's.
         """
-        weights = read_checkpoint(files[0], ("weights",), _BYTES_AT_MOST)
-        hdit, channels = _sizes(weights, files[0])
+        hdit, channels, steps, weights = read_r2flow_checkpoint(files[0], sensor)
+        reflow = ReflowConfig(distilled_steps=steps) if steps else None
         with numbers_of_file(files[0]):
-            generator = cls(R2flowConfig(hdit, reflectance=channels > 1), sensor)
+            generator = cls(R2flowConfig(hdit, channels > 1, reflow), sensor)
         load_exactly(generator, {f"network.{name}": tensor for name, tensor in weights.items()}, files[0])
         return generator.eval()
 
@@ -139,23 +135,3 @@ class R2flow(Generator[R2flowConfig, FlowSampling]):
     @property
     def _distilled_steps(self) -> int:
         return 0 if self.config.reflow is None else self.config.reflow.distilled_steps
-
-
-def _sizes(weights: dict[str, Tensor], path: Path) -> tuple[HditConfig, int]:
-    """Return the network's sizes and the number of its images' channels, as the shapes of its weights tell them."""
-    try:
-        channels, images, *_ = weights["tokenizer.0.weight"].shape
-        time_channels = len(weights["timestep_pe.0.linear.weight"])
-        halvings = next(n for n in itertools.count() if f"down_levels.merge_{n}.1.weight" not in weights)
-        depths, heads = [], []
-        for name in (*(f"down_levels.level_{level}" for level in range(halvings)), "mid_levels"):
-            scales = [f"{name}.{block}.residual_attn.scale" for block in range(len(weights))]
-            depths.append(next(block for block, scale in enumerate(scales) if scale not in weights))
-            heads.append(len(weights[scales[0]]))
-        return HditConfig(channels, time_channels, tuple(depths), tuple(heads)), images
-    except (KeyError, ValueError, TypeError, ConfigError) as error:
-        raise CheckpointError(
-            f"{path}, whose weights are of another network ({type(error).__name__}: {error})",
-            "a checkpoint of R2Flow's authors or of their train.py",
-            "check which program saved it, or download it from kazuto1011/r2flow, its releases",
-        ) from None

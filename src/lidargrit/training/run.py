@@ -30,7 +30,7 @@ from lidargrit.training.checkpoint import fingerprint
 from lidargrit.training.config import FitConfig, Recipe
 from lidargrit.training.engine import Engine
 from lidargrit.training.fit import Fit
-from lidargrit.training.taken_stages import taken_stages
+from lidargrit.training.taken_stages import check_donor, taken_stages
 
 _WORDS = {"title", "published"}  # of a recipe; they change nothing that is computed
 
@@ -64,6 +64,7 @@ def train(
     reporter = reporter if reporter and engine.rank == 0 else Reporter()
     with ExitStack() as held, engine.lost_processes_reported():
         engine.by_first(lambda: check_folder(folder, recipe))
+        engine.by_first(lambda: check_donor(recipe))
         engine.by_first(lambda: held.enter_context(claim_folder(folder)))
         return _train(recipe, folder, reporter, plot, engine)
 

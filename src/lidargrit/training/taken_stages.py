@@ -9,9 +9,20 @@ import torch
 
 from lidargrit import configuration
 from lidargrit.errors import ConfigError
-from lidargrit.generators import Generator, load
+from lidargrit.generators import Generator, is_run, load, locate
 from lidargrit.nn.objective import Objective
 from lidargrit.training.config import Recipe
+
+
+def check_donor(recipe: Recipe) -> None:
+    """Refuse a run to take stages from that is none, before any scan is read.
+
+    Raises:
+        CheckpointError: no finished run.
+    """
+    for donor in (recipe.tokenizer_from, recipe.stages_from):
+        if donor is not None and not is_run(locate(donor)):
+            load(donor)  # which says what is wrong
 
 
 def taken_stages(recipe: Recipe, generator: Generator) -> dict[str, Objective]:
