@@ -82,14 +82,14 @@ def test_processes_of_a_pool_end_with_the_one_that_began_them(tmp_path, number, 
     children = [int(word) for word in parent.stdout.readline().split()]
     assert children
     (os.killpg if number == signal.SIGINT else os.kill)(parent.pid, number)
-    told = parent.communicate(timeout=20)[1]
+    stderr = parent.communicate(timeout=20)[1]
     assert parent.returncode in (code, -number)
     deadline = time.monotonic() + 10
     while (living := [pid for pid in children if Path(f"/proc/{pid}").exists()]) and time.monotonic() < deadline:
         time.sleep(0.05)
     assert not living
-    assert told.count("Traceback") == (number == signal.SIGINT), (
-        told
+    assert stderr.count("Traceback") == (number == signal.SIGINT), (
+        stderr
     )  # that of the script itself, which catches nothing
 
 

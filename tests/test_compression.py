@@ -145,7 +145,7 @@ def test_damaged_files_are_refused(tmp_path):
 def test_a_strangers_file_writes_only_files_that_can_be_and_below_its_folder(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("lidargrit.compression.command._codec_of", lambda *_: ScanCodec(made(), 20))
     path = tmp_path / "scans.lgz"
-    for names, told in (
+    for names, message in (
         (["../out"], "a scan that would lie outside"),
         (["/tmp/out"], "a scan that would lie outside"),
         ([".lidargrit-partial-0/lock"], "a scan that would lie outside"),
@@ -160,7 +160,7 @@ def test_a_strangers_file_writes_only_files_that_can_be_and_below_its_folder(tmp
                 writer.add(name, b"")
             writer.close()
         assert main(["decompress", str(path), str(tmp_path / "out")]) == 2
-        assert told in the_one_line(capsys.readouterr().err, "decompress")
+        assert message in the_one_line(capsys.readouterr().err, "decompress")
         assert [one.name for one in tmp_path.iterdir()] == ["scans.lgz"]
     os.mkfifo(tmp_path / "pipe.lgz")
     assert main(["decompress", str(tmp_path / "pipe.lgz"), str(tmp_path / "out")]) == 2

@@ -344,7 +344,7 @@ def test_a_checkpoint_that_does_not_fit_its_optimiser_is_refused(tmp_path):
     assert load_checkpoint(path, layer, average, optimiser, "") == 8
     tensors, about = read_tensors(path)
     moment = "optimiser.0.exp_avg"
-    for changed, told in (
+    for changed, message in (
         ({moment: torch.ones(2, 2)}, "moments of another size for weight 0"),
         ({moment: None}, "moments that some weights lack"),
         ({"optimiser.7.step": torch.ones(())}, "moments of more than 2 weights"),
@@ -355,7 +355,7 @@ def test_a_checkpoint_that_does_not_fit_its_optimiser_is_refused(tmp_path):
     ):
         kept = {name: of for name, of in {**tensors, **changed}.items() if isinstance(of, torch.Tensor)}
         write_tensors(path, kept, {name: changed.get(name, of) for name, of in about.items()})
-        with pytest.raises(CheckpointError, match=rf"cannot be used \({told}.*train again"):
+        with pytest.raises(CheckpointError, match=rf"cannot be used \({message}.*train again"):
             load_checkpoint(path, layer, average, optimiser, "")
 
 

@@ -63,10 +63,10 @@ def test_no_settings_of_the_current_folder_are_obeyed(tmp_path):
     script = "import runpy, sys; runpy.run_path(sys.argv[1]); import matplotlib, os; print(os.getcwd(), "
     script += "matplotlib.rcParams['text.usetex'], matplotlib.rcParams['figure.dpi'])"
     path = str(Path(pictures.__file__).with_name("_matplotlib.py"))
-    told = subprocess.run(
+    printed = subprocess.run(
         [sys.executable, "-c", script, path], cwd=tmp_path, capture_output=True, text=True, check=True
     )
-    assert told.stdout.split() == [str(tmp_path), "False", "100.0"]
+    assert printed.stdout.split() == [str(tmp_path), "False", "100.0"]
 
 
 def test_older_picture_is_replaced_in_one_step(images, tmp_path, monkeypatch):

@@ -65,8 +65,8 @@ def read_r2flow_checkpoint(path: Path, sensor: SensorModel) -> R2flowCheckpoint:
     except CheckpointError:
         raise
     except (KeyError, ValueError, TypeError, ConfigError) as error:
-        told = f"{path}, whose weights are of another network ({type(error).__name__}: {error})"
-        raise CheckpointError(told, _WANTED, _CURE) from None
+        message = f"{path}, whose weights are of another network ({type(error).__name__}: {error})"
+        raise CheckpointError(message, _WANTED, _CURE) from None
     return R2flowCheckpoint(hdit, channels, steps, weights)
 
 
