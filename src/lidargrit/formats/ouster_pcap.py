@@ -70,7 +70,9 @@ class OusterPcap(ScanFormat):
             full_scale = float(np.iinfo(reflectivity.dtype).max)
             reflectance = torch.from_numpy((reflectivity[returned] / full_scale).astype(np.float32))
         ring = torch.from_numpy(row_to_ring[np.nonzero(returned)[0]])
-        return scan_of(torch.from_numpy(xyz_m.astype(np.float32)), reflectance, ring, str(path), bad_points)
+        with np.errstate(over="ignore"):  # infinite, and so refused or dropped
+            points_xyz_m = torch.from_numpy(xyz_m.astype(np.float32))
+        return scan_of(points_xyz_m, reflectance, ring, str(path), bad_points)
 
 
 def sensor_of(path: Path) -> SensorModel:
