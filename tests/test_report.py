@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from lidargrit.evaluation.comparison import EvalConfig, compare_sources
-from lidargrit.evaluation.intervals import Interval, RealAgainstReal
+from lidargrit.evaluation.intervals import Interval, RealAgainstReal, Score
 from lidargrit.evaluation.profiles import matches, profile
-from lidargrit.evaluation.scorecard import LeftOut, Score
+from lidargrit.evaluation.scorecard import LeftOut
 from lidargrit.projection import points_of_pixels
 from lidargrit.structures import MetricResult
 from lidargrit.viewer.report import page, write_report

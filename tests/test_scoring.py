@@ -8,10 +8,9 @@ import pytest
 import torch
 
 from lidargrit.errors import LidarGritError
-from lidargrit.evaluation.intervals import Resampling
+from lidargrit.evaluation.intervals import Resampling, Score
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
 from lidargrit.evaluation.protocols import MetricChoice
-from lidargrit.evaluation.scorecard import Score
 from lidargrit.evaluation.scoring import MetricFactory, score_metrics
 from lidargrit.loading import Provenance, RangeImages
 from lidargrit.metrics import load_metric

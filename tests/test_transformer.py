@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy import stats
 
-from lidargrit.generators.lidargrit import START_TOKEN, TokenSampling, after_start, sample_by_recomputing, sample_token
+from lidargrit.generators.lidargrit import START_TOKEN, TokenSampling, after_start, sample_token
 from lidargrit.nn.decoding import CachedDecoder
 from lidargrit.nn.transformer import CausalTransformer, TransformerConfig
 from reference_weights import seeded_weights
@@ -107,6 +107,15 @@ def test_a_token_never_sees_what_follows(transformer):
         before, after = transformer(tokens), transformer(changed)
     assert torch.equal(before[:, :12], after[:, :12])
     assert not torch.allclose(before[:, 12:], after[:, 12:])
+
+
+def sample_by_recomputing(transformer, uniform, sampling):
+    """Sample as the released program does: every step reads the whole prefix again."""
+    tokens = torch.full((len(uniform), 1), START_TOKEN)
+    for step in range(uniform.shape[1]):
+        chosen = sample_token(transformer(tokens)[:, -1], uniform[:, step], sampling)
+        tokens = torch.cat((tokens, chosen[:, None]), dim=1)
+    return tokens[:, 1:]
 
 
 @pytest.mark.parametrize("sampling", [TokenSampling(), TokenSampling(0.7, 5), TokenSampling(1.2, 0, 0.8), GREEDY])

@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 from lidargrit.cli import main
-from lidargrit.evaluation.intervals import Interval, RealAgainstReal
-from lidargrit.evaluation.scorecard import EvalSetRecord, Score, Scorecard
+from lidargrit.evaluation.intervals import Interval, RealAgainstReal, Score
+from lidargrit.evaluation.scorecard import EvalSetRecord, Scorecard
 from lidargrit.evaluation.tables import side_by_side
 from lidargrit.evaluation.verdict import counted_first, verdict
 from lidargrit.files import read_json, write_json

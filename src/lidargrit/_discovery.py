@@ -5,8 +5,9 @@ from __future__ import annotations
 import ast
 import importlib
 import pkgutil
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from lidargrit.errors import UnknownNameError, nearest_names
 
@@ -30,9 +31,12 @@ def load_class(package: str, name: str, base: type[T]) -> type[T]:
     Raises:
         UnknownNameError: no such file; names its nearest neighbours.
     """
-    return _the_one(
-        package, name, lambda v, module: isinstance(v, type) and issubclass(v, base) and v.__module__ == module
-    )
+
+    def own_subclass(value: object, module: str) -> type[T] | None:
+        fits = isinstance(value, type) and issubclass(value, base) and value.__module__ == module
+        return value if fits else None
+
+    return _the_one(package, name, own_subclass)
 
 
 def load_instance(package: str, name: str, base: type[T]) -> T:
@@ -41,7 +45,7 @@ def load_instance(package: str, name: str, base: type[T]) -> T:
     Raises:
         UnknownNameError: no such file; names its nearest neighbours.
     """
-    return _the_one(package, name, lambda v, module: isinstance(v, base))
+    return _the_one(package, name, lambda value, _: value if isinstance(value, base) else None)
 
 
 def _folder(package: str) -> Path:
@@ -50,7 +54,7 @@ def _folder(package: str) -> Path:
     return folder
 
 
-def _the_one(package: str, name: str, fits: Any) -> Any:
+def _the_one(package: str, name: str, chosen: Callable[[object, str], T | None]) -> T:
     known = names(package)
     if name not in known:
         raise UnknownNameError(
@@ -59,6 +63,7 @@ def _the_one(package: str, name: str, fits: Any) -> Any:
             f"see all with: lidargrit list {package}",
         )
     module = importlib.import_module(f"lidargrit.{package}.{name}")
-    found = {id(v): v for k, v in vars(module).items() if not k.startswith("_") and fits(v, module.__name__)}
+    public = {id(value): value for key, value in vars(module).items() if not key.startswith("_")}
+    found = [one for value in public.values() if (one := chosen(value, module.__name__)) is not None]
     assert len(found) == 1, f"{module.__name__} must define exactly one public object of its kind, has {len(found)}"
-    return next(iter(found.values()))
+    return found[0]

@@ -140,14 +140,14 @@ def write_results_page(
         tokens = tokenizer.encode(held_out[:1])
         decoded = tokenizer.decode(tokens)
         sampled = tokenizer.sample(tokens, [torch.Generator().manual_seed(0)])
-        by_phases, coarsest_cell = None, 1
-        if isinstance(generator, LidarGrit) and generator.pixels is not None:
-            by_phases = generator.pixels.sample(decoded, [torch.Generator().manual_seed(0)], _SHARPER.pixels())
-            coarsest_cell = generator.pixels.config.coarsest_cell
+        reconstructed = _reconstructed(generator, held_out)
+    by_phases, coarsest_cell = None, 1
+    if isinstance(generator, LidarGrit) and generator.pixels is not None:
+        by_phases, coarsest_cell = reconstructed[:1], generator.pixels.config.coarsest_cell
     seeds = tuple(f"seed {seed}" for seed in range(len(new)))
     sets = [
         ScanSet(f"{kind}, held out", held_out, names),
-        ScanSet("reconstructed", _reconstructed(generator, held_out), names),
+        ScanSet("reconstructed", reconstructed, names),
         ScanSet("new", new, seeds),
     ]
     if packaged is not None:
@@ -159,7 +159,6 @@ def write_results_page(
     )
 
 
-@torch.no_grad()
 def _reconstructed(generator: Generator, images: RangeImage) -> RangeImage:
     """Return scans decoded from the tokens of others just as those of new scans are, with sampled return masks."""
     tokenizer = generator.get_tokenizer()

@@ -18,7 +18,6 @@ from lidargrit.errors import ScanError
 from lidargrit.formats import open_file
 from lidargrit.untrusted import JSON_BYTES_AT_MOST, parse_json
 
-SUFFIX = ".lgz"
 _WANTED = "a file that lidargrit compress wrote"
 _MAGIC, _END = b"LGZ1", b"1ZGL"
 _START = struct.Struct("<4sII")

@@ -96,15 +96,15 @@ def run(
     reference = open_source(benchmark.reference, benchmark.settings.data.bad_points)
     if (benchmark.recipe_settings or benchmark.flops) and not any(plan.recipe for plan in plans):
         raise ConfigError("settings or a budget, and no recipe", "a recipe that they are for", "leave them out")
-    by_run: dict[Path, list[str]] = {}  # systems of one run one after the other: it is trained once
-    for system, plan in zip(systems, plans, strict=True):
-        by_run.setdefault(plan.run, []).append(system)
+    by_run: dict[Path, list[_Plan]] = {}  # systems of one run one after the other: it is trained once
+    for plan in plans:
+        by_run.setdefault(plan.run, []).append(plan)
     remaining = _Remaining(list(systems), reporter)
     with claim_folder(folder):
         if processes == 1:
-            for system in chain.from_iterable(by_run.values()):
-                _finish([system], folder, benchmark, reporter, reference)
-                remaining.without([system])
+            for plan in chain.from_iterable(by_run.values()):
+                _finish([plan], folder, benchmark, reporter, reference)
+                remaining.without([plan.system])
         else:
             with process_pool(processes, partial(_share, processes)) as pool:
                 begun = {
@@ -113,18 +113,18 @@ def run(
                 }
                 for done in as_completed(begun):
                     done.result()
-                    remaining.without(begun[done])
+                    remaining.without([plan.system for plan in begun[done]])
     return [folder / name / f"{name}.json" for name in names]
 
 
 def _finish(
-    systems: Sequence[str], folder: Path, benchmark: Benchmark, reporter: Reporter, reference: Source | None = None
+    plans: Sequence[_Plan], folder: Path, benchmark: Benchmark, reporter: Reporter, reference: Source | None = None
 ) -> None:
     """Train or load the systems of one run, sample from each, and score the samples."""
     settings = replace(benchmark.settings, max_scans=benchmark.num_samples)
     reference = reference or open_source(benchmark.reference, settings.data.bad_points)
-    for system in systems:
-        name, plan = _folder_name(system), _Plan.of(system, folder, benchmark)
+    for plan in plans:
+        name = _folder_name(plan.system)
         reporter.message(f"{name}:")
         generator = (
             load(plan.run) if plan.recipe is None or is_run(plan.run) else train(plan.recipe, plan.run, reporter)
@@ -191,14 +191,16 @@ class _Plan:
     """How one system is made: from a finished run, or by training a recipe.
 
     Args:
+        system: name of the system, as the user typed it.
         run: folder of a finished run, or of the one that the recipe gets.
         recipe: recipe that is trained; None for a finished run.
         sampling: settings of the generator's own ``Sampling``.
     """
 
+    system: str
     run: Path
     recipe: Recipe | None
-    sampling: Any
+    sampling: object
 
     @classmethod
     def of(cls, system: str, folder: Path, benchmark: Benchmark) -> _Plan:
@@ -211,13 +213,13 @@ class _Plan:
         if recipe is not None and benchmark.flops:
             recipe = with_budget(recipe, benchmark.flops)
         if recipe is None:
-            return cls(run, None, sampling)
+            return cls(system, run, None, sampling)
         check_folder(folder / "runs" / name, recipe)
-        return cls(folder / "runs" / name, recipe, sampling)
+        return cls(system, folder / "runs" / name, recipe, sampling)
 
 
 def _sample(
-    generator: Generator, run: Path, folder: Path, sampling: Any, benchmark: Benchmark, reporter: Reporter
+    generator: Generator, run: Path, folder: Path, sampling: object, benchmark: Benchmark, reporter: Reporter
 ) -> float | None:
     """Sample what is not there yet, and return the seconds for a scan; None if all was there."""
     before = len(list(folder.glob("[!.]*.npz"))) if folder.is_dir() else 0
@@ -243,7 +245,7 @@ def _score(samples: str, reference: Source, settings: EvalConfig, path: Path, re
 
 
 def _write_costs(
-    path: Path, recipe: Recipe | None, generator: Generator, sampling: Any, seconds: float | None, num_samples: int
+    path: Path, recipe: Recipe | None, generator: Generator, sampling: object, seconds: float | None, num_samples: int
 ) -> None:
     """Write what a system costs, once: a later call that samples nothing has measured no time."""
     if seconds is None and path.exists():

@@ -11,10 +11,10 @@ from typing import Any
 
 from lidargrit import __version__, _discovery
 from lidargrit.errors import ConfigError, LidarGritError, nearest_names
-from lidargrit.evaluation.intervals import Resampling
+from lidargrit.evaluation.intervals import Resampling, Score
 from lidargrit.evaluation.pairs import EvalPair, pair_for_protocol
 from lidargrit.evaluation.protocols import DEFAULT, MetricChoice, load_protocol, public_name
-from lidargrit.evaluation.scorecard import NOT_APPLICABLE, LeftOut, Score, Scorecard
+from lidargrit.evaluation.scorecard import NOT_APPLICABLE, LeftOut, Scorecard
 from lidargrit.evaluation.scoring import MetricFactory, score_metrics
 from lidargrit.loading import DataConfig
 from lidargrit.metrics import load_metric

@@ -17,8 +17,9 @@ from __future__ import annotations
 import pickle
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from scipy.stats import t as student
@@ -89,6 +90,27 @@ class RealAgainstReal:
     value: float
     num_scans: int
     halvings: int
+
+
+@dataclass(frozen=True)
+class Score:
+    """One score with its interval and its reference rows.
+
+    Args:
+        result: value of the metric.
+        interval: 95 % interval; None if it was not wanted or cannot be computed.
+        real_against_real: score of real scans in place of the samples; None if it was not computed.
+        options: options of the metric, besides variant and seed.
+        seconds: time that the metric, its interval and real against real took.
+        pixel_statistics: score of the generator ``marginal`` in place of the samples; None if it was not computed.
+    """
+
+    result: MetricResult
+    interval: Interval | None = None
+    real_against_real: RealAgainstReal | None = None
+    options: dict[str, Any] = field(default_factory=dict)
+    seconds: float = 0.0
+    pixel_statistics: float | None = None
 
 
 def blocks(count: int, groups: int) -> list[range]:

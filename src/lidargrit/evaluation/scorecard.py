@@ -8,33 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from lidargrit.errors import DataError
-from lidargrit.evaluation.intervals import Interval, RealAgainstReal
+from lidargrit.evaluation.intervals import Interval, RealAgainstReal, Score
 from lidargrit.evaluation.verdict import counted_first, verdict
 from lidargrit.files import read_json
 from lidargrit.structures import MetricResult
 
 LEFT_OUT, NOT_APPLICABLE = "left out", "not applicable"
-
-
-@dataclass(frozen=True)
-class Score:
-    """One score with its interval and its reference rows.
-
-    Args:
-        result: value of the metric.
-        interval: 95 % interval; None if it was not wanted or cannot be computed.
-        real_against_real: score of real scans in place of the samples; None if it was not computed.
-        options: options of the metric, besides variant and seed.
-        seconds: time that the metric, its interval and real against real took.
-        pixel_statistics: score of the generator ``marginal`` in place of the samples; None if it was not computed.
-    """
-
-    result: MetricResult
-    interval: Interval | None = None
-    real_against_real: RealAgainstReal | None = None
-    options: dict[str, Any] = field(default_factory=dict)
-    seconds: float = 0.0
-    pixel_statistics: float | None = None
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,9 @@ from typing import Any
 
 from lidargrit import _discovery
 from lidargrit.errors import ConfigError, LidarGritError, ScanError
-from lidargrit.evaluation.intervals import Part, Resampling, blocks, interval_of, merged, real_against_real
+from lidargrit.evaluation.intervals import Part, Resampling, Score, blocks, interval_of, merged, real_against_real
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
 from lidargrit.evaluation.protocols import MetricChoice
-from lidargrit.evaluation.scorecard import Score
 from lidargrit.metrics import Metric, WholeImages, load_metric, update_together
 from lidargrit.reporting import Reporter
 

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from lidargrit.errors import DataError
-from lidargrit.evaluation.scorecard import NOT_APPLICABLE, LeftOut, Score, Scorecard, format_value
+from lidargrit.evaluation.intervals import Score
+from lidargrit.evaluation.scorecard import NOT_APPLICABLE, LeftOut, Scorecard, format_value
 from lidargrit.evaluation.verdict import MEMORISED, PIXEL_STATISTICS, verdict
 from lidargrit.files import read_json
 

@@ -10,10 +10,8 @@ Every score table of this program knows three bounds, by these names alone:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:  # the scorecard shows a verdict of its own scores
-    from lidargrit.evaluation.scorecard import Score
+from lidargrit.evaluation.intervals import Score
 
 PIXEL_STATISTICS, MEMORISED = "marginal", "memorised"
 """The generators whose scans are the second and the third bound."""

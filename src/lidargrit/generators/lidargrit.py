@@ -284,25 +284,6 @@ def after_start(tokens: Int[Tensor, "B T"]) -> Int[Tensor, "B T+1"]:
     return F.pad(tokens, (1, 0), value=START_TOKEN)
 
 
-def sample_by_recomputing(
-    transformer: CausalTransformer, uniform: Float[Tensor, "B T"], sampling: TokenSampling
-) -> Int[Tensor, "B T"]:
-    """Sample token sequences in raster order as the released program does: every step reads the whole prefix again.
-
-    :class:`CachedDecoder` gives the same tokens in less time, and is tested against this function.
-
-    Args:
-        transformer: model of the next token.
-        uniform: random numbers in [0, 1), one for each token; see :func:`sample_tokens`.
-        sampling: temperature, top-k and top-p.
-    """
-    tokens = torch.full((len(uniform), 1), START_TOKEN, dtype=torch.long, device=uniform.device)
-    for step in range(uniform.shape[1]):
-        chosen = sample_token(transformer(tokens)[:, -1], uniform[:, step], sampling)
-        tokens = torch.cat((tokens, chosen[:, None]), dim=1)
-    return tokens[:, 1:]
-
-
 def sample_token(
     logits: Float[Tensor, "B K"], uniform: Float[Tensor, "B"], sampling: TokenSampling
 ) -> Int[Tensor, "B"]:

@@ -116,7 +116,8 @@ class ShardWriter:
         levels = None if image.reflectance is None else np.rint(image.reflectance.numpy() * 255).astype(np.uint8)
         range_blob, reflectance_blob = _compress(steps), b"" if levels is None else _compress(levels)
         lengths = len(range_blob), len(reflectance_blob)
-        hashes = _fingerprint(steps, levels), _fingerprint(steps, None)
+        of_ranges = _fingerprint(steps, None)
+        hashes = of_ranges if levels is None else _fingerprint(steps, levels), of_ranges
         self._append(Entry(scan, self._end, *lengths, *hashes), range_blob + reflectance_blob)
 
     def add_from(self, file: Bytes, name: str) -> None:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import nn
 from torch.utils.checkpoint import checkpoint
 
 from lidargrit.errors import ConfigError
+
+ModuleT = TypeVar("ModuleT", bound=nn.Module)
 
 
 class Network(nn.Module):
@@ -45,7 +47,7 @@ def prepare_for_training(objective: nn.Module, recompute: bool, compiled: bool) 
         network.compile()
 
 
-def _parts(objective: nn.Module, kind: type[nn.Module], setting: str) -> list[Any]:
+def _parts(objective: nn.Module, kind: type[ModuleT], setting: str) -> list[ModuleT]:
     found = [module for module in objective.modules() if isinstance(module, kind)]
     if not found:
         raise ConfigError(

@@ -72,12 +72,6 @@ class RangeMixture:
                 total = total + weights[..., component] * nats / len(_QUANTILES)
         return total
 
-    def cdf(self, range_m: Float[Tensor, "*P"]) -> Float[Tensor, "*P"]:
-        """Return the probability of a range of at most ``range_m``, which lies within the limits."""
-        low, mass = self._bounds()[0], self._mass().clamp(min=_LEAST_MASS)
-        below = (range_m.log1p()[..., None] - self.centres) * (-self.log_scales).exp()
-        return (self.logits.softmax(-1) * (below.sigmoid() - low) / mass).sum(-1)
-
     def sample(
         self, component: Float[Tensor, "*P"], within: Float[Tensor, "*P"], temperature: float = 1.0, noise: float = 1.0
     ) -> Float[Tensor, "*P"]:

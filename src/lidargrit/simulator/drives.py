@@ -16,7 +16,7 @@ from lidargrit.formats.kitti_bin import KittiBin
 from lidargrit.processes import process_pool
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel
-from lidargrit.simulator import observe, scene_of
+from lidargrit.simulator import Theme, observe, scene_of
 
 MANIFEST = "simulated.json"
 _SCANS_PER_SEQUENCE = 10_000  # of streets seen once each: a folder that any file browser still opens
@@ -43,7 +43,7 @@ class DriveConfig:
     sensor: SensorModel
     seed: int = 0
     frames: int = 1
-    theme: Any = "mixed"
+    theme: Theme = "mixed"
     motion: bool = False
     wet: float = 0.0
     clean: bool = False

@@ -28,7 +28,7 @@ from lidargrit.files import (
     write_text,
 )
 from lidargrit.formats import open_file
-from lidargrit.generators import RUN_FILE, TRAINED_ON_FILE, WEIGHTS_FILE, Generator, recipe_settings
+from lidargrit.generators import RUN_FILE, TRAINED_ON_FILE, WEIGHTS_FILE, Generator, SamplingT, recipe_settings
 from lidargrit.loading import Pixels, Provenance, RangeImages
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel
@@ -39,11 +39,11 @@ _LATER_ENTRIES = ("projection_variant", "generator")  # not in folders of before
 
 
 def write_samples(
-    generator: Generator,
+    generator: Generator[Any, SamplingT],
     run_folder: Path,
     folder: Path,
     seeds: Sequence[int],
-    sampling: Any = None,
+    sampling: SamplingT | None = None,
     reporter: Reporter | None = None,
 ) -> None:
     """Write one file for each seed, at bounded memory; seeds that are there already are not sampled again.

@@ -8,7 +8,8 @@ from html import escape
 import numpy as np
 from jaxtyping import Float
 
-from lidargrit.evaluation.scorecard import Score, format_value
+from lidargrit.evaluation.intervals import Score
+from lidargrit.evaluation.scorecard import format_value
 
 _WIDE, _TALL = 320, 34  # a score's chart
 _CHART_WIDE, _CHART_TALL = 720, 260

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from html import escape
 
-from lidargrit.evaluation.scorecard import Score, format_value
+from lidargrit.evaluation.intervals import Score
+from lidargrit.evaluation.scorecard import format_value
 from lidargrit.evaluation.verdict import counted_first, verdict
 from lidargrit.metrics import load_metric
 from lidargrit.viewer.report_charts import score_chart
