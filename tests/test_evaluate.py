@@ -248,7 +248,7 @@ def test_published_figures_stand_apart_and_only_beside_their_equals(card, tmp_pa
     assert len(tables) == 2
     assert all(table.startswith("Published, not measured here:") for table in tables)
     assert "0.1515" in text  # printed as 15.15, times 100
-    # Another reference stands in a block of its own, and what is not the protocol gets no published figures.
+    # Another reference stands in a block of its own, and what is not the protocol gets no published scores.
     deviant = as_if(card, "lidargrit_kitti_odometry", ("the reference is simulated, not kitti_odometry",), "cd" * 32)
     write_json(paths[2], deviant.to_json())
     text = side_by_side([paths[2]])

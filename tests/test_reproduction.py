@@ -60,7 +60,7 @@ def test_a_killed_reproduction_goes_on_and_ends_with_the_table(tmp_path, capsys)
         assert f"\n{row} " in captured.out
     for metric in ("sliced_wasserstein", "minimum_matching_distance", "point_cloud_jsd"):
         assert f"{metric} (reference)" in captured.out
-    assert "Published figures of lidargrit_kitti_odometry\nleft out, for they do not compare: 4 of the" in captured.out
+    assert "Published scores of lidargrit_kitti_odometry\nleft out, for they do not compare: 4 of the" in captured.out
     assert "61.73" not in captured.out
     assert "the paper's row 'with both' is measured by ablation_both_small" in captured.out
 

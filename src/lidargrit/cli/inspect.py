@@ -11,7 +11,7 @@ from lidargrit.cli._results import add_json, print_result, refuse_taken
 EXAMPLES = """\
   lidargrit inspect scan.bin                                     with the sensor of ours that looks closest
   lidargrit inspect /data/kitti_odometry --projection spherical  the first scan of a data set
-  lidargrit inspect scan.bin --sensor vlp16 -o picture.png --json figures.json
+  lidargrit inspect scan.bin --sensor vlp16 -o picture.png --json inspection.json
 """
 
 

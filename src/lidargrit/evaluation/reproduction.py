@@ -32,7 +32,7 @@ class PaperTable:
 
     Args:
         title: title of the table.
-        protocol: name of the protocol that measures its figures.
+        protocol: name of the protocol that measures its scores.
         data_set: name of the data set.
         train: split to train on; it shares no drive with ``val`` and ``test``, the splits of these names.
         images: settings that make the protocol's images of the data set's scans.
@@ -69,7 +69,7 @@ TABLES = {
         (*_KITTI_360_IMAGES[:2], "data.column_stride=8"),
         remarks=(
             "R2DM learns here from the images that it is scored against; the paper's were projected otherwise",
-            "all figures of UltraLiDAR measure the cells of its voxels too; the paper has no SWD and FPD of it",
+            "all scores of UltraLiDAR measure the cells of its voxels too; the paper has no SWD and FPD of it",
         ),
     ),
     2: PaperTable(
@@ -207,7 +207,7 @@ def plan_as_text(wanted: Reproduction, facts: dict[str, Any]) -> str:
     lines = [f"table {wanted.number} of the paper: {table.title}, protocol {table.protocol}", ""]
     lines += [f"prepare {source}: {count:,} scans" for source, count in facts["prepare"].items()]
     for system, of in facts["systems"].items():
-        lines += ["", f"train {system} ({of['state']}), {of['plan']['published'] or 'no published figure'}"]
+        lines += ["", f"train {system} ({of['state']}), {of['plan']['published'] or 'no published score'}"]
         for stage in of["plan"]["stages"]:
             lines.append(
                 f"  {stage['name']}: {stage['scans']:,} scans, {computing_time(stage['flops'], stage['precision'])}"

@@ -1,4 +1,4 @@
-"""Several systems side by side: files of scores → text, Markdown or LaTeX; published figures in blocks of their own."""
+"""Several systems side by side: files of scores → text, Markdown or LaTeX; published scores in blocks of their own."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Block:
 def side_by_side(paths: Sequence[Path], form: Format = "text") -> str:
     """Set the scores of several files side by side.
 
-    Rows share a block only if they were measured by one protocol against the very same reference. Published figures
+    Rows share a block only if they were measured by one protocol against the very same reference. Published scores
     never stand among measured ones: they get blocks of their own, and only where the measured rows are what the
     protocol wants; else a line says why they do not compare. A file called ``marginal`` is the row of pixel statistics,
     and one called ``memorised`` that of memorised training scans.
@@ -127,14 +127,14 @@ def _published(cards: Sequence[tuple[str, Scorecard]]) -> list[Block]:
         return []
     why = list(dict.fromkeys(text for _, card in cards for text in card.deviations))
     if why:
-        title = f"Published figures of {cards[0][1].protocol}"
+        title = f"Published scores of {cards[0][1].protocol}"
         return [Block(title, (), (), (f"left out, for they do not compare: {'; '.join(why)}",))]
     return [
         Block(
             f"Published, not measured here: {table['title']}",
             tuple((column["metric"], column["variant"]) for column in table["columns"]),
             tuple((row["system"], _printed(row["printed"], table["columns"])) for row in table["rows"]),
-            (f"source: {table['source']}", "these figures have neither an interval nor a real-against-real row"),
+            (f"source: {table['source']}", "these scores have neither an interval nor a real-against-real row"),
         )
         for table in tables
     ]
@@ -147,7 +147,7 @@ def published() -> list[dict[str, Any]]:
 
 
 def _printed(values: Sequence[Any], columns: Sequence[dict[str, Any]]) -> tuple[str, ...]:
-    """Return printed figures in the metric's own unit, since papers multiply them, with no digit that was not there."""
+    """Return printed scores in the metric's own unit, since papers multiply them, with no digit that was not there."""
     return tuple(
         "" if value is None else f"{value / column['divided_by']:.4g}"
         for value, column in zip(values, columns, strict=True)
