@@ -118,10 +118,10 @@ def as_table(scores: Sequence[CompletionScore]) -> str:
         for score in scores:
             if score.observed != pattern:
                 continue
-            beside = "" if score.beside_triangulation_m is None else _told(score.beside_triangulation_m, signed=True)
+            beside = "" if score.beside_triangulation_m is None else score.beside_triangulation_m.as_text("+.3f")
             diversity = "" if score.diversity_m is None else f"{score.diversity_m.value:.3f}"
             lines.append(
-                f"{score.model:<{width}}{_told(score.mae_m):>24}{beside:>24}{score.found.value:>8.3f}"
+                f"{score.model:<{width}}{score.mae_m.as_text('.3f'):>24}{beside:>24}{score.found.value:>8.3f}"
                 f"{score.iou.value:>8.3f}{score.drop_run_lengths:>11.4f}{diversity:>15}{score.seconds_per_scan:>10.3f}"
             )
     return "\n".join(lines)
@@ -227,8 +227,3 @@ def _voxels(points_xyz_m: Float[Tensor, "n 3"]) -> set[tuple[int, int, int]]:
 def _mean(values: Sequence[float]) -> float:
     finite = [value for value in values if not math.isnan(value)]
     return sum(finite) / len(finite) if finite else math.nan
-
-
-def _told(of: Estimate, signed: bool = False) -> str:
-    sign = "+" if signed else ""
-    return f"{of.value:{sign}.3f} [{of.low:{sign}.3f}, {of.high:{sign}.3f}]"

@@ -33,8 +33,8 @@ class Estimate:
     def of(cls, values: Sequence[float]) -> Estimate:
         """Return the mean of one value a scan, without those that are NaN, with Student's interval over groups."""
         every = np.asarray(values, dtype=float)
-        known = every[~np.isnan(every)]
-        mean = float(known.mean()) if len(known) else math.nan
+        present = every[~np.isnan(every)]
+        mean = float(present.mean()) if len(present) else math.nan
         return cls._around(mean, every)
 
     @classmethod
@@ -49,6 +49,11 @@ class Estimate:
             return cls(math.nan, math.nan, math.nan)
         ratio = float(value.sum() / count.sum())
         return cls._around(ratio, ratio + (value - ratio * count) / count.mean())
+
+    def as_text(self, form: str) -> str:
+        """Return the value and its interval, if there is one, in a format such as ``.3f``."""
+        interval = "" if math.isnan(self.low) else f" [{self.low:{form}}, {self.high:{form}}]"
+        return f"{self.value:{form}}{interval}"
 
     @classmethod
     def _around(cls, estimate: float, values: Float64[np.ndarray, " n"]) -> Estimate:

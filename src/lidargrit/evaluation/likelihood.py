@@ -80,7 +80,7 @@ class Likelihood:
         """Return a table for people."""
         lines = [f"{'bits':8}" + "".join(f"{unit:>26}" for unit in _UNITS.values())]
         for part, estimates in self.estimates().items():
-            lines.append(f"{part:8}" + "".join(f"{_formatted(estimates[unit]):>26}" for unit in _UNITS))
+            lines.append(f"{part:8}" + "".join(f"{_as_text(estimates[unit]):>26}" for unit in _UNITS))
         returns = f"{sum(self.returns) / len(self.returns):,.0f} returns a scan"
         steps = f"ranges in steps of {self.step_mm} mm"
         lines.append(f"{len(self.names)} scans, {returns}, {steps}; 95 % intervals over scans")
@@ -89,12 +89,8 @@ class Likelihood:
         return "\n".join(lines)
 
 
-def _formatted(estimate: Estimate) -> str:
-    digits = 0 if abs(estimate.value) >= 1000 else 3
-    value = f"{estimate.value:,.{digits}f}"
-    if np.isnan(estimate.low):
-        return value
-    return f"{value} [{estimate.low:,.{digits}f}, {estimate.high:,.{digits}f}]"
+def _as_text(estimate: Estimate) -> str:
+    return estimate.as_text(",.0f" if abs(estimate.value) >= 1000 else ",.3f")
 
 
 def score_likelihood(
