@@ -100,7 +100,7 @@ def remove_partials(folder: Path) -> None:
 
 
 def is_partial(name: str) -> bool:
-    """Tell whether a name in a folder is that of the hidden folder of partial files."""
+    """Return whether a name in a folder is that of the hidden folder of partial files."""
     return name.startswith(_PARTIALS[: _PARTIALS.rindex("-")])
 
 
@@ -207,7 +207,7 @@ def refuse_to_overwrite(path: Path | None, overwrite: bool, ending: str = "") ->
     """
     above = None if path is None else next((parent for parent in path.absolute().parents if parent.exists()), None)
     if above is not None and not above.is_dir():
-        raise OutputError(f"{path}, whose folder {above} is a file", "a folder", "choose another place")
+        raise OutputError(f"{path}, whose folder {above} is a file", "a folder", "choose another path")
     if path is not None and ending and path.suffix.lower() != ending:
         raise OutputError(f"{path}, which will hold {ending[1:].upper()}", f"a name in {ending}", "choose another name")
     if path is not None and path.is_dir():

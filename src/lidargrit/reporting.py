@@ -26,7 +26,7 @@ class Reporter:
     """Receiver of progress and messages; this one is silent, as a library should be."""
 
     def message(self, text: str) -> None:
-        """Say one line."""
+        """Report one line."""
 
     def expect(self, expected_s: Mapping[str, float]) -> None:
         """Announce all pieces of work to come, so that the time left for all of them can be shown.

@@ -177,7 +177,7 @@ def _finite(text: str) -> float:
 
 
 def _is_deep(value: Any) -> bool:
-    """Tell whether a value nests deeper than is allowed, level by level: recursion is what it protects from."""
+    """Return whether a value nests deeper than is allowed, level by level: recursion is what it protects from."""
     level = [value]
     for _ in range(JSON_DEPTH_AT_MOST + 1):
         level = [

@@ -1,4 +1,4 @@
-"""Tell what this machine has, and where lidargrit keeps its cache."""
+"""Show what this machine has, and where lidargrit keeps its cache."""
 
 from __future__ import annotations
 

@@ -187,5 +187,5 @@ def _with_settings(word: str) -> tuple[str, list[str]]:
 
 
 def is_classical(word: str) -> bool:
-    """Tell whether a word names a classical method, unless a folder has that name."""
+    """Return whether a word names a classical method, unless a folder has that name."""
     return word in FILLS and not Path(word).exists()

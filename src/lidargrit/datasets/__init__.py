@@ -107,7 +107,7 @@ class ScanDataset(ABC):
     @classmethod
     @abstractmethod
     def matches(cls, root: Path) -> bool:
-        """Tell whether a folder looks like this tree."""
+        """Return whether a folder looks like this tree."""
 
     @classmethod
     @abstractmethod

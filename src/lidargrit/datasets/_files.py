@@ -89,7 +89,7 @@ class FileDataset(ScanDataset):
 
     @classmethod
     def matches(cls, root: Path) -> bool:
-        """Tell whether a folder holds a file where this tree has them, in the same format.
+        """Return whether a folder holds a file where this tree has them, in the same format.
 
         Where the tree names no folder, scans of other formats must not lie there too: they would go unseen.
         """

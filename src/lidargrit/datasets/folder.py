@@ -32,7 +32,7 @@ class Folder(FileDataset):
 
     @classmethod
     def matches(cls, root: Path) -> bool:
-        """Tell whether a folder holds, or a single file is, what is called like a scan; reading tells if it is one."""
+        """Return whether a folder holds a file with the ending of a scan, or a single file has one."""
         return next(scans_below(root), None) is not None
 
     @classmethod

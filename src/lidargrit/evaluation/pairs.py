@@ -172,7 +172,7 @@ def pair_for_protocol(
 
 
 def deviations(pair: EvalPair, protocol: Protocol) -> tuple[str, ...]:
-    """Say in which ways two sets are not what a protocol wants."""
+    """Return the differences between two sets and what a protocol wants, one sentence each."""
     found = []
     reference, sensor, wanted = pair.reference, pair.samples.images.sensor, protocol.load_sensor()
     if protocol.num_scans and len(pair.samples) != protocol.num_scans:
@@ -192,7 +192,7 @@ def deviations(pair: EvalPair, protocol: Protocol) -> tuple[str, ...]:
 
 
 def _warnings(pair: EvalPair, shared: str) -> tuple[str, ...]:
-    """Say what flatters the scores of two sets, or makes them measure something else."""
+    """Return reasons why the scores of two sets may mislead, one sentence each."""
     found = []
     first, second = pair.samples, pair.reference
     if without_raydrop := pair.without_raydrop():

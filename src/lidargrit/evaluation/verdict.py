@@ -39,7 +39,7 @@ def is_like_real(score: Score) -> bool | None:
 
 
 def tells_apart(score: Score) -> bool | None:
-    """Say whether the metric tells pixel statistics from real scans by more than chance; None where not known."""
+    """Return whether the metric separates pixel statistics from real scans by more than chance; None if not known."""
     if score.pixel_statistics is None or score.real_against_real is None:
         return None
     return _worse_by(score, score.pixel_statistics, score.real_against_real.value) > noise(score)

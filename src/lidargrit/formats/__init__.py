@@ -58,7 +58,7 @@ class ScanFormat(ABC):
 
     @classmethod
     def can_write(cls) -> bool:
-        """Tell whether :meth:`write` writes."""
+        """Return whether :meth:`write` writes."""
         return "write" in cls.__dict__
 
     @staticmethod

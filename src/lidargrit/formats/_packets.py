@@ -95,7 +95,7 @@ def _read(file: BufferedReader, offset: int, size: int) -> bytes:
 
 
 def _is_empty_udp(head: bytes, size: int) -> bool:
-    """Tell whether a packet of some bytes holds, anywhere near its beginning, the IP header of an empty UDP packet.
+    """Return whether a packet of some bytes holds, anywhere near its beginning, the IP header of an empty UDP packet.
 
     It is found by the number of its protocol, so that it does not matter what stands before it: Ethernet, with tags or
     without, or another IP. Fragments are put together first, and an empty packet is none.

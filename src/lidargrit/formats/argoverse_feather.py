@@ -61,7 +61,7 @@ class ArgoverseFeather(ScanFormat):
 
     @staticmethod
     def recognises(path: Path) -> bool:
-        """Tell whether a file begins as an Arrow file."""
+        """Return whether a file begins as an Arrow file."""
         return first_bytes(path, 8) == b"ARROW1\0\0"
 
     @staticmethod

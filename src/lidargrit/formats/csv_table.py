@@ -33,7 +33,7 @@ class CsvTable(ScanFormat):
 
     @staticmethod
     def recognises(path: Path) -> bool:
-        """Tell whether the first line names x, y and z."""
+        """Return whether the first line names x, y and z."""
         return {"x", "y", "z"} <= {name.lower() for name in _names(first_bytes(path, _HEADER_BYTES))[0]}
 
     @staticmethod

@@ -31,7 +31,7 @@ class KittiBin(ScanFormat):
 
     @staticmethod
     def recognises(path: Path) -> bool:
-        """Tell whether rows of four hold a reflectance in [0, 1] at their end."""
+        """Return whether rows of four hold a reflectance in [0, 1] at their end."""
         start = first_bytes(path, _ROW_BYTES * _ROWS_TO_LOOK_AT)
         if not start or path.stat().st_size % _ROW_BYTES:
             return False

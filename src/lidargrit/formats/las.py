@@ -48,7 +48,7 @@ class Las(ScanFormat):
 
     @staticmethod
     def recognises(path: Path) -> bool:
-        """Tell whether a file begins with a header of uncompressed LAS."""
+        """Return whether a file begins with a header of uncompressed LAS."""
         try:
             _check_header(first_bytes(path, _HEADER_BYTES_14), None, path)
         except ScanError:

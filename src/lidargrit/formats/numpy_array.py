@@ -39,7 +39,7 @@ class NumpyArray(ScanFormat):
 
     @staticmethod
     def recognises(path: Path) -> bool:
-        """Tell whether a file is an array, or an archive with an array of points."""
+        """Return whether a file is an array, or an archive with an array of points."""
         if first_bytes(path, 6) == b"\x93NUMPY":
             return True
         try:

@@ -41,7 +41,7 @@ class NuscenesBin(ScanFormat):
 
     @staticmethod
     def recognises(path: Path) -> bool:
-        """Tell whether rows of five end in the number of a laser."""
+        """Return whether rows of five end in the number of a laser."""
         start = first_bytes(path, _ROW_BYTES * _ROWS_TO_LOOK_AT)
         if not start or path.stat().st_size % _ROW_BYTES:
             return False

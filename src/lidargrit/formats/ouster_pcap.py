@@ -45,7 +45,7 @@ class OusterPcap(ScanFormat):
 
     @staticmethod
     def recognises(path: Path) -> bool:
-        """Tell whether a file begins as a recording of packets."""
+        """Return whether a file begins as a recording of packets."""
         return first_bytes(path, 4) in (*PCAP, PCAPNG)
 
     @staticmethod

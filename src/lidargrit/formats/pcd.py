@@ -44,7 +44,7 @@ class Pcd(ScanFormat):
 
     @staticmethod
     def recognises(path: Path) -> bool:
-        """Tell whether a file begins with a header of PCD."""
+        """Return whether a file begins with a header of PCD."""
         try:
             _Header.parse(first_bytes(path, _HEADER_BYTES_AT_MOST), path)
         except ScanError:

@@ -64,7 +64,7 @@ class Ply(ScanFormat):
 
     @staticmethod
     def recognises(path: Path) -> bool:
-        """Tell whether a file begins with a header of PLY."""
+        """Return whether a file begins with a header of PLY."""
         try:
             _Header.parse(first_bytes(path, _HEADER_BYTES_AT_MOST), path)
         except ScanError:

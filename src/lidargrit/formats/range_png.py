@@ -47,7 +47,7 @@ class RangePng(ScanFormat):
 
     @staticmethod
     def recognises(path: Path) -> bool:
-        """Tell whether a file begins as a 16-bit grey PNG of 64 rows."""
+        """Return whether a file begins as a 16-bit grey PNG of 64 rows."""
         try:
             _columns(first_bytes(path, _HEADER_BYTES), path)
         except ScanError:

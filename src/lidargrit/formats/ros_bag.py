@@ -47,7 +47,7 @@ class RosBag(ScanFormat):
 
     @staticmethod
     def recognises(path: Path) -> bool:
-        """Tell whether a file begins as a recording."""
+        """Return whether a file begins as a recording."""
         return first_bytes(path, 16).startswith(tuple(_MAGIC.values()))
 
     @staticmethod

@@ -32,7 +32,7 @@ class XyzBin(ScanFormat):
 
     @staticmethod
     def recognises(path: Path) -> bool:
-        """Tell whether a file holds coordinates that resemble themselves after three values."""
+        """Return whether a file holds coordinates that resemble themselves after three values."""
         start = first_bytes(path, _ROW_BYTES * _ROWS_TO_LOOK_AT)
         if not start or path.stat().st_size % _ROW_BYTES:
             return False

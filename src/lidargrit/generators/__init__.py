@@ -344,7 +344,7 @@ def locate(run: str | Path) -> Path:
 
 
 def is_run(folder: Path) -> bool:
-    """Tell whether a folder is that of a finished run."""
+    """Return whether a folder is that of a finished run."""
     return (folder / CONFIG_FILE).is_file()
 
 

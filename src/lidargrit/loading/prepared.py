@@ -81,7 +81,7 @@ def unfinished_name(shard: int) -> str:
 
 
 def is_prepared(source: str) -> bool:
-    """Tell whether a source is where prepared scans lie: a URL, or a folder with a plan."""
+    """Return whether a source is where prepared scans lie: a URL, or a folder with a plan."""
     try:
         return "://" in source or (user_path(source) / PLAN_FILE).is_file()
     except (OSError, DataError):  # no file can be called so, or no home folder is there
@@ -158,7 +158,7 @@ class PreparedFolder:
 
 
 def _is_named(scan: Any) -> bool:
-    """Tell whether an entry of the list of scans begins with the scan's name and its recording."""
+    """Return whether an entry of the list of scans begins with the scan's name and its recording."""
     return isinstance(scan, list) and len(scan) >= 2 and isinstance(scan[0], str) and isinstance(scan[1], str)
 
 

@@ -101,7 +101,7 @@ class FilledRows(nn.Module):
 
 
 def in_box(points_xyz_m: Float[Tensor, "*shape 3"]) -> Bool[Tensor, "*shape"]:
-    """Tell which points lie in the box around the car, and not on the car itself."""
+    """Return which points lie in the box around the car, and not on the car itself."""
     lowest, highest = (points_xyz_m.new_tensor(corner) for corner in (_LOWEST_M, _HIGHEST_M))
     within = ((points_xyz_m >= lowest) & (points_xyz_m <= highest)).all(dim=-1)
     return within & (points_xyz_m[..., :2].square().sum(dim=-1) >= _NEAREST_M2)

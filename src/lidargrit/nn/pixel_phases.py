@@ -57,7 +57,7 @@ def phases_of(coarsest_cell: int) -> list[Phase]:
 
 
 def generated_before(phase: Phase) -> Bool[Tensor, "4"]:
-    """Tell which of the 2x2 pixels, row by row, are generated before a phase's."""
+    """Return which of the 2x2 pixels, row by row, are generated before a phase's."""
     before = torch.zeros(2, 2, dtype=torch.bool)
     for row, column in _ORDER[: phase.rank]:
         before[row, column] = True

@@ -13,7 +13,7 @@ Precision = Literal["fp32", "bf16", "auto"]
 
 
 def has_bf16() -> bool:
-    """Tell whether this machine computes in bfloat16 natively."""
+    """Return whether this machine computes in bfloat16 natively."""
     if torch.cuda.is_available():
         return torch.cuda.is_bf16_supported(including_emulation=False)
     # Torch has no public question for this yet; a torch without this one is taken for a machine without bfloat16.

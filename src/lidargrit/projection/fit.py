@@ -218,7 +218,7 @@ def _no_firing_order(scan: Scan) -> ScanError:
 
 
 def _is_misplaced(scan: Scan, sensor: SensorModel, row: Int[np.ndarray, "n"]) -> bool:
-    """Tell whether most points lie far from the elevation of the row that they are put into."""
+    """Return whether most points lie far from the elevation of the row that they are put into."""
     if len(scan) < _POINTS_TO_TELL:
         return False
     step = max(1, len(scan) // _POINTS_MEASURED)
@@ -230,7 +230,7 @@ def _is_misplaced(scan: Scan, sensor: SensorModel, row: Int[np.ndarray, "n"]) ->
 
 
 def _is_ring_by_ring(scan: Scan, ring: Int[np.ndarray, "n"]) -> bool:
-    """Tell whether rings that were found in the order of the points each keep to one elevation."""
+    """Return whether rings that were found in the order of the points each keep to one elevation."""
     elevation_deg = elevations_deg(scan.points_xyz_m).astype(np.float64)
     points = np.maximum(np.bincount(ring), 1)
     mean_deg = np.bincount(ring, elevation_deg) / points

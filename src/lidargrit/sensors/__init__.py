@@ -127,7 +127,7 @@ class SensorModel:
         return cls(**checked_entries(data, get_args(ProjectionName)))
 
     def same_rays(self, other: SensorModel) -> bool:
-        """Tell whether two sensors look along the same rays, within a hundredth of a degree."""
+        """Return whether two sensors look along the same rays, within a hundredth of a degree."""
         if (self.height, self.width) != (other.height, other.width):
             return False
         tolerance = math.radians(0.01)

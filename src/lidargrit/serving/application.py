@@ -206,7 +206,7 @@ class Application:
 
 
 def is_own(host: str, served_at: str) -> bool:
-    """Tell whether a request's Host names this machine, and not a foreign name that was made to lead here.
+    """Return whether a request's Host names this machine, and not a foreign name that was made to lead here.
 
     A page served at a loopback address accepts the loopback's names only. A page served elsewhere accepts numeric
     addresses as well: an attack through somebody's browser needs a name.

@@ -60,7 +60,7 @@ LASER_READINGS = (
 def hidden_by_car(
     azimuth_rad: Float[np.ndarray, "#H W"], elevation_rad: Float[np.ndarray, "H #W"]
 ) -> Bool[np.ndarray, "H W"]:
-    """Tell which rays end on the car that carries the sensor; each is as the laser of the nearest elevation.
+    """Return which rays end on the car that carries the sensor, by the laser of the nearest elevation.
 
     Args:
         azimuth_rad: azimuth, counter-clockwise from straight ahead.

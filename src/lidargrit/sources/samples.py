@@ -184,7 +184,7 @@ def weights_of(folder: Path) -> str:
 
 
 def is_sample_folder(folder: Path) -> bool:
-    """Tell whether a folder holds samples that lidargrit wrote."""
+    """Return whether a folder holds samples that lidargrit wrote."""
     return (folder / MANIFEST).is_file()
 
 
@@ -195,7 +195,7 @@ def _missing(folder: Path, seeds: Sequence[int]) -> list[int]:
 
 
 def _same(there: Any, manifest: dict[str, Any], defaults: dict[str, Any]) -> bool:
-    """Tell whether samples there were sampled as these will be; their cost follows from the rest.
+    """Return whether samples there were sampled as these will be; their cost follows from the rest.
 
     A choice that folders of before it existed do not name was what is now its default.
     """

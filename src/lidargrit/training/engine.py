@@ -70,7 +70,7 @@ class Engine:
 
     @contextmanager
     def lost_processes_reported(self) -> Iterator[None]:
-        """Say in one line that another process has died, whatever the library of the connection says.
+        """Report in one line that another process has died, whatever the library of the connection prints.
 
         Raises:
             TrainingError: another process does not answer any more.

@@ -68,7 +68,7 @@ def load_sample_format(name: str) -> SampleFormat:
 
 
 def is_tensor_folder(folder: Path) -> bool:
-    """Tell whether a folder holds samples as tensors."""
+    """Return whether a folder holds samples as tensors."""
     try:
         return folder.is_dir() and any(True for _ in folder.glob("[!.]*.pth"))
     except OSError:  # a name longer than names can be
