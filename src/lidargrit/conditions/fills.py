@@ -190,12 +190,13 @@ def fill_from_nearest(images: RangeImage, observed: Bool[Tensor, "B H W"]) -> Ra
         observed: True for pixels that were observed.
     """
     elevation_rad, _ = _angles(images.sensor)
+    parts = [images.range_m] if images.reflectance is None else [images.range_m, images.reflectance]
     filled = []
-    for range_m, mask in zip(images.range_m.cpu(), observed.cpu(), strict=True):
+    for pixels, mask in zip(torch.stack(parts, 1).cpu(), observed.cpu(), strict=True):
         rows, columns = (torch.from_numpy(part) for part in _nearest(mask.numpy(), elevation_rad))
-        filled.append(range_m[rows, columns] if bool(mask.any()) else torch.zeros_like(range_m))
-    range_m = torch.stack(filled).to(images.range_m.device)
-    return RangeImage(range_m, range_m > 0, images.sensor)
+        filled.append(pixels[:, rows, columns] if bool(mask.any()) else torch.zeros_like(pixels))
+    range_m, *reflectance = torch.stack(filled).to(images.range_m.device).unbind(1)
+    return RangeImage(range_m, range_m > 0, images.sensor, reflectance[0] if reflectance else None)
 
 
 def ranges_from_others(images: RangeImage, rng: torch.Generator) -> RangeImage:

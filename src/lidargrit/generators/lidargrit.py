@@ -125,7 +125,7 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
 
     Config = LidarGritConfig
     facts = SystemFacts(
-        writes="range and raydrop, decoded apart from each other",
+        writes="range and raydrop, decoded apart from each other; reflectance if model.tokenizer.reflectance is set",
         paper="Haghighi et al., Taming Transformers for Realistic Lidar Point Cloud Generation, 2024",
         program="hamedhaghighi/LidarGRIT@a3f86e7 (no licence)",
         weights_licence="no licence stated",

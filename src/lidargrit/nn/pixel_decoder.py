@@ -66,6 +66,8 @@ class PixelNll(NamedTuple):
 class PixelDecoder(nn.Module):
     """Mask and range of every pixel, phase by phase, each phase given all earlier ones.
 
+    Reflectance is not sampled: it is the mean that the tokenizer's decoder gives, if it gives one.
+
     First comes the whole mask, one Bernoulli number a pixel, then the range of what returned, from a mixture that may
     stand on either side of an edge. The pixels of one phase are independent of one another, given the earlier ones.
 
@@ -201,7 +203,8 @@ class PixelDecoder(nn.Module):
             some = guide.part(part)
             mask = self.mask.sample(some, uniform[part, 0], condition[part])
             range_m = self._sample_range(some, uniform[part, 1:], mask, condition[part], sampling)
-            images.append(RangeImage(range_m, mask, self.sensor))
+            reflectance = None if decoded.reflectance is None else decoded.reflectance[part]
+            images.append(RangeImage.masked(range_m, mask, self.sensor, reflectance))
         return RangeImage.cat(images)
 
     def _sample_range(

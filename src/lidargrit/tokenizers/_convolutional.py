@@ -55,7 +55,7 @@ class Level(nn.Module):
 
 
 class ConvolutionalEncoder(Network):
-    """The network from encoded range (B, 1, H, W) to latents (B, code_dim, h, w)."""
+    """The network from encoded images (B, channels, H, W) to latents (B, code_dim, h, w)."""
 
     conv_in: Convolution
     down: nn.ModuleList
@@ -63,7 +63,7 @@ class ConvolutionalEncoder(Network):
     norm_out: nn.Module
     conv_out: Convolution
 
-    def forward(self, x: Float[Tensor, "B 1 H W"]) -> Float[Tensor, "B D h w"]:
+    def forward(self, x: Float[Tensor, "B C H W"]) -> Float[Tensor, "B D h w"]:
         """Shrink the image to its latents."""
         x = self.conv_in(x)
         for level in self.down:
@@ -106,8 +106,8 @@ class ConvolutionalTokenizer(CodebookTokenizer[Config]):
         self.quant_conv, self.post_quant_conv = (nn.Conv2d(code_dim, code_dim, 1) for _ in range(2))
 
     @abstractmethod
-    def _encoded(self, images: RangeImage) -> Float[Tensor, "B H W"]:
-        """Map the ranges of a batch to the encoder's input."""
+    def _encoded(self, images: RangeImage) -> Float[Tensor, "B C H W"]:
+        """Map the images of a batch to the encoder's input channels."""
 
     def latents(self, images: RangeImage) -> Float[Tensor, "B D h w"]:
         """Return the continuous latents of a batch, before quantisation.
@@ -117,4 +117,4 @@ class ConvolutionalTokenizer(CodebookTokenizer[Config]):
         """
         if images.range_m.ndim != 3:
             raise ConfigError("a single range image", "a batch", "make one with RangeImage.stack([image])")
-        return self.quant_conv(self.encoder(self._encoded(images)[:, None]))
+        return self.quant_conv(self.encoder(self._encoded(images)))

@@ -204,8 +204,8 @@ class CurveVqvae(ConvolutionalTokenizer[CurveVqvaeConfig]):
         self.encoder, self.decoder = CurveEncoder(config), CurveDecoder(config)
         self._add_codebook(config.num_codes, config.code_dim, config.codebook_loss, config.restart_dead_codes)
 
-    def _encoded(self, images: RangeImage) -> Float[Tensor, "B H W"]:
-        return encode_range(images.range_m, self.config)
+    def _encoded(self, images: RangeImage) -> Float[Tensor, "B 1 H W"]:
+        return encode_range(images.range_m, self.config)[:, None]
 
     def decode(self, tokens: TokenGrid) -> Decoded:
         """Return range and returns of a batch of tokens; the logits of returns are infinite, for nothing is random."""

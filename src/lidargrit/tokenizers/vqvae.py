@@ -69,6 +69,9 @@ class VqvaeConfig(TokenizerConfig):
         error_unit: ``encoded`` for the error between encodings, as in the paper; ``metres`` for the error between
             ranges, scaled so that with the linear encoding the two are equal. With the logarithmic encoding the first
             weighs near surfaces more, the second far ones.
+        reflectance: whether reflectance is encoded and decoded beside the range; not so in the paper.
+        reflectance_weight: weight of the mean absolute error of the reflectance of returns, mapped to [-1, 1] as the
+            encoded range is. 1 as in R2DM and LiDARGen, whose losses weigh the channels of range and reflectance alike.
         codebook_loss: ``paper``, ``reference``, ``vqvae`` or ``ema``; see lidargrit.nn.quantiser.
         restart_dead_codes: whether codes that are hardly ever used restart from latents, so that the codebook does not
             collapse; the reference has no such remedy.
@@ -86,6 +89,8 @@ class VqvaeConfig(TokenizerConfig):
     raydrop_weight: float = 0.1
     reconstruction: Literal["paper", "reference", "returns"] = "paper"
     error_unit: Literal["encoded", "metres"] = "encoded"
+    reflectance: bool = False
+    reflectance_weight: float = 1.0
     codebook_loss: CodebookLoss = "paper"
     restart_dead_codes: bool = True
 
@@ -113,12 +118,12 @@ def _level(
 
 
 class Encoder(ConvolutionalEncoder):
-    """The network from encoded range (B, 1, H, W) to latents (B, code_dim, h, w)."""
+    """The network from encoded range, and perhaps reflectance, (B, channels, H, W) to latents (B, code_dim, h, w)."""
 
     def __init__(self, config: VqvaeConfig) -> None:
         super().__init__()
         c, widths = config, _widths(config)
-        self.conv_in = Convolution(1, c.channels, c.padding)
+        self.conv_in = Convolution(1 + c.reflectance, c.channels, c.padding)
         self.down = nn.ModuleList(
             _level(c, inputs, width, c.residual_blocks, downsamples=level < len(widths) - 1)
             for level, (inputs, width) in enumerate(pairwise([c.channels, *widths]))
@@ -129,7 +134,10 @@ class Encoder(ConvolutionalEncoder):
 
 
 class Decoder(ConvolutionalDecoder):
-    """The network from latents (B, code_dim, h, w) to encoded range, before tanh, and return logits if it has them."""
+    """The network from latents (B, code_dim, h, w) to encoded range, return logits and reflectance, if it has these.
+
+    The encoded range is given before tanh, the reflectance as a logit.
+    """
 
     def __init__(self, config: VqvaeConfig) -> None:
         super().__init__()
@@ -144,7 +152,7 @@ class Decoder(ConvolutionalDecoder):
         ]
         self.up = nn.ModuleList(reversed(coarse_to_fine))
         self.norm_out = group_norm(widths[0])
-        self.conv_out = Convolution(widths[0], 2 if c.raydrop_loss else 1, c.padding)
+        self.conv_out = Convolution(widths[0], 1 + c.raydrop_loss + c.reflectance, c.padding)
 
     def prepared(self, precision: Precision) -> Decoder:
         """Return a copy for decoding only, quicker: channels last, upsampling folded, perhaps in 16 bits.
@@ -194,14 +202,17 @@ class Vqvae(ConvolutionalTokenizer[VqvaeConfig]):
         self.encoder, self.decoder = Encoder(config), Decoder(config)
         self._add_codebook(config.num_codes, config.code_dim, config.codebook_loss, config.restart_dead_codes)
 
-    def _encoded(self, images: RangeImage) -> Float[Tensor, "B H W"]:
-        return self.range_encoding.encode(images.range_m, images.return_mask)
+    def _encoded(self, images: RangeImage) -> Float[Tensor, "B C H W"]:
+        encoded = self.range_encoding.encode(images.range_m, images.return_mask)
+        if not self.config.reflectance:
+            return encoded[:, None]
+        return torch.stack((encoded, 2 * _reflectance_of(images) * images.return_mask - 1), 1)
 
     def decode(self, tokens: TokenGrid) -> Decoded:
-        """Return clean range, return logits and the last feature maps of a batch of tokens."""
+        """Return clean range, return logits, perhaps reflectance, and the last feature maps of a batch of tokens."""
         features = self.decoder.features(self.post_quant_conv(self.quantize.lookup(tokens.tokens)))
-        encoded, return_logits = self._heads(self.decoder.conv_out(features))
-        return Decoded(self.range_encoding.decode(encoded), return_logits, self.sensor, features=features)
+        encoded, return_logits, reflectance = self._heads(self.decoder.conv_out(features))
+        return Decoded(self.range_encoding.decode(encoded), return_logits, self.sensor, reflectance, features)
 
     def for_decoding(self, precision: Precision) -> Vqvae:
         """Return a tokenizer with the same weights that only decodes, quicker; see :meth:`Decoder.prepared`."""
@@ -217,7 +228,7 @@ class Vqvae(ConvolutionalTokenizer[VqvaeConfig]):
     def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the loss of eq. 5 of the paper and its terms, the range error in metres, and the mask's accuracy."""
         z = self.quantize(self.latents(images), rng)
-        encoded, return_logits = self._heads(self.decoder(self.post_quant_conv(z.latents)))
+        encoded, return_logits, reflectance = self._heads(self.decoder(self.post_quant_conv(z.latents)))
         mask, encoding = images.return_mask, self.range_encoding
         range_m = encoding.decode(encoded)
         if self.config.error_unit == "metres":
@@ -235,19 +246,26 @@ class Vqvae(ConvolutionalTokenizer[VqvaeConfig]):
         else:
             terms["reconstruction"] = (pair[0] - pair[1]).abs().mean()  # holes are learned as the range -1
             loss = terms["reconstruction"] + z.loss
+        if reflectance is not None:
+            error = reconstruction_loss(2 * reflectance - 1, 2 * _reflectance_of(images) - 1, mask, mask, "returns")
+            loss = loss + self.config.reflectance_weight * error
+            terms["reflectance_mae"] = error.detach() / 2
         with torch.no_grad():
             error_m = (range_m - images.range_m).abs()
             terms["range_mae_m"] = (error_m * mask).sum() / mask.sum().clamp(min=1)
             terms["mask_accuracy"] = ((return_logits >= 0) == mask).float().mean()
         return {"loss": loss, **terms}
 
-    def _heads(self, raw: Float[Tensor, "B heads H W"]) -> tuple[Float[Tensor, "B H W"], Float[Tensor, "B H W"]]:
-        """Return encoded range and return logits of what the decoder's last layer gives."""
+    def _heads(
+        self, raw: Float[Tensor, "B heads H W"]
+    ) -> tuple[Float[Tensor, "B H W"], Float[Tensor, "B H W"], Float[Tensor, "B H W"] | None]:
+        """Return encoded range, return logits and reflectance, if there is any, of what the decoder's last layer gives."""
         raw = at_least_32_bits(raw)
         encoded = raw[:, 0].tanh()
+        reflectance = raw[:, -1].sigmoid() if self.config.reflectance else None
         if self.config.raydrop_loss:
-            return encoded, raw[:, 1]
-        return encoded, torch.where(encoded > _NO_RETURN_BELOW, math.inf, -math.inf)
+            return encoded, raw[:, 1], reflectance
+        return encoded, torch.where(encoded > _NO_RETURN_BELOW, math.inf, -math.inf), reflectance
 
 
 def reconstruction_loss(
@@ -269,6 +287,17 @@ def reconstruction_loss(
     if kind == "paper":
         return error.mean()
     return (error.sum((1, 2)) / return_mask.sum((1, 2)).clamp(min=1)).mean()
+
+
+def _reflectance_of(images: RangeImage) -> Float[Tensor, "B H W"]:
+    """Return the reflectance of scans, in [0, 1]; refuse scans without it."""
+    if images.reflectance is None:
+        raise ConfigError(
+            "range images without reflectance",
+            "images with it, for a tokenizer of range and reflectance (model.tokenizer.reflectance=true)",
+            "take scans that have it, or a model without it",
+        )
+    return images.reflectance
 
 
 def _widths(config: VqvaeConfig) -> list[int]:
