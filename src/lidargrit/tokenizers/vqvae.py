@@ -259,7 +259,7 @@ class Vqvae(ConvolutionalTokenizer[VqvaeConfig]):
     def _heads(
         self, raw: Float[Tensor, "B heads H W"]
     ) -> tuple[Float[Tensor, "B H W"], Float[Tensor, "B H W"], Float[Tensor, "B H W"] | None]:
-        """Return encoded range, return logits and reflectance, if there is any, of what the decoder's last layer gives."""
+        """Return encoded range, return logits and, if there is any, reflectance of the last layer's output."""
         raw = at_least_32_bits(raw)
         encoded = raw[:, 0].tanh()
         reflectance = raw[:, -1].sigmoid() if self.config.reflectance else None
