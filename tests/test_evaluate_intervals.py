@@ -10,7 +10,7 @@ from lidargrit import _discovery
 from lidargrit.errors import ConfigError
 from lidargrit.evaluation.intervals import Part, Resampling, around, blocks, interval_of, merged, real_against_real
 from lidargrit.metrics import ImageMetric, load_metric
-from lidargrit.metrics._accumulators import Rows
+from lidargrit.metrics._accumulators import RowAccumulator
 from lidargrit.sensors import load_sensor
 from lidargrit.structures import MetricResult, RangeImage
 
@@ -24,7 +24,7 @@ class Ratio(ImageMetric):
     It is fed with lists and merged by hand, since half a million merges of range images would take minutes.
     """
 
-    title, accumulator = "a ratio", Rows
+    title, accumulator = "a ratio", RowAccumulator
 
     def __init__(self):
         super().__init__()

@@ -11,7 +11,7 @@ import torch
 from lidargrit import _discovery
 from lidargrit.errors import ConfigError, DataError, UnknownNameError
 from lidargrit.metrics import Metric, load_metric
-from lidargrit.metrics._accumulators import Total
+from lidargrit.metrics._accumulators import SumAccumulator
 from lidargrit.metrics._networks.network import PretrainedNetwork
 from lidargrit.sensors import load_sensor
 from lidargrit.structures import MetricResult, RangeImage
@@ -216,7 +216,7 @@ def test_unknown_names_are_refused_with_neighbours(name, variant):
         load_metric(name + "x")
 
     class Known(Metric):
-        title, variants, accumulator = "", (variant,), Total
+        title, variants, accumulator = "", (variant,), SumAccumulator
         extractor = summarise = compare = lambda self: None
 
     with pytest.raises(ConfigError, match=f"got variant 'nonsense'.*wanted '{variant}'"):

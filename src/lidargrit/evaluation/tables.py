@@ -22,7 +22,7 @@ _BOUNDS = {PIXEL_STATISTICS: " (pixel statistics)", MEMORISED: " (memorised trai
 
 
 @dataclass(frozen=True)
-class Block:
+class TableBlock:
     """Rows that may be compared with one another.
 
     Args:
@@ -71,7 +71,7 @@ def read_tables(paths: Sequence[Path], form: Format = "text") -> tuple[str, dict
     return side_by_side(paths, form), {path.stem: read_json(path) for path in paths}
 
 
-def _measured(cards: Sequence[tuple[str, Scorecard]]) -> Block:
+def _measured(cards: Sequence[tuple[str, Scorecard]]) -> TableBlock:
     cards = _with_pixel_statistics(cards)
     words = [{(each.metric, each.variant): each.verdict for each in _not_applicable(card)} for _, card in cards]
     scored = (_column(score) for _, card in cards for score in card.scores)
@@ -98,7 +98,7 @@ def _measured(cards: Sequence[tuple[str, Scorecard]]) -> Block:
         for name, card in cards
         if name not in _BOUNDS and (sentences := verdict(card.scores))
     )
-    return Block(title, tuple(columns), tuple(rows), tuple(notes), verdicts)
+    return TableBlock(title, tuple(columns), tuple(rows), tuple(notes), verdicts)
 
 
 def _with_pixel_statistics(cards: Sequence[tuple[str, Scorecard]]) -> list[tuple[str, Scorecard]]:
@@ -120,7 +120,7 @@ def _not_applicable(card: Scorecard) -> list[LeftOut]:
     return [each for each in card.left_out if each.verdict == NOT_APPLICABLE]
 
 
-def _published(cards: Sequence[tuple[str, Scorecard]]) -> list[Block]:
+def _published(cards: Sequence[tuple[str, Scorecard]]) -> list[TableBlock]:
     """Return the published tables of the protocol, or why they do not compare."""
     tables = [table for table in published() if table["protocol"] == cards[0][1].protocol]
     if not tables:
@@ -128,9 +128,9 @@ def _published(cards: Sequence[tuple[str, Scorecard]]) -> list[Block]:
     why = list(dict.fromkeys(text for _, card in cards for text in card.deviations))
     if why:
         title = f"Published scores of {cards[0][1].protocol}"
-        return [Block(title, (), (), (f"left out, for they do not compare: {'; '.join(why)}",))]
+        return [TableBlock(title, (), (), (f"left out, for they do not compare: {'; '.join(why)}",))]
     return [
-        Block(
+        TableBlock(
             f"Published, not measured here: {table['title']}",
             tuple((column["metric"], column["variant"]) for column in table["columns"]),
             tuple((row["system"], _printed(row["printed"], table["columns"])) for row in table["rows"]),
@@ -166,12 +166,12 @@ def _cell(score: Score) -> str:
     )
 
 
-def _grid(block: Block) -> list[list[str]]:
+def _grid(block: TableBlock) -> list[list[str]]:
     heads = ["system", *(f"{metric} ({variant})" for metric, variant in block.columns)]
     return [heads, *([name, *(cell or "-" for cell in cells)] for name, cells in block.rows)]
 
 
-def _as_text(block: Block) -> str:
+def _as_text(block: TableBlock) -> str:
     lines = [block.title, *block.verdicts]
     if block.columns:
         grid = _grid(block)
@@ -180,7 +180,7 @@ def _as_text(block: Block) -> str:
     return "\n".join([*lines, *block.notes])
 
 
-def _as_markdown(block: Block) -> str:
+def _as_markdown(block: TableBlock) -> str:
     lines = [f"**{_marked(block.title)}**", "", *(f"- {_marked(each)}" for each in block.verdicts)]
     lines += [""] if block.verdicts else []
     if block.columns:
@@ -195,7 +195,7 @@ def _marked(text: str) -> str:
     return " ".join(text.split())
 
 
-def _as_latex(block: Block) -> str:
+def _as_latex(block: TableBlock) -> str:
     lines = [f"% {' '.join(text.split())}" for text in (block.title, *block.verdicts)]
     if block.columns:
         head, *rows = [" & ".join(_typeset(text) for text in row) + r" \\" for row in _grid(block)]

@@ -12,7 +12,7 @@ from jaxtyping import Float64, Int64
 from lidargrit.datasets import BadPoints, open_dataset
 from lidargrit.errors import ConfigError, ScanError
 from lidargrit.fitting.azimuths import columns_of_scans, firing_steps_deg, offsets_deg
-from lidargrit.fitting.elevations import Rows, cluster_rows, nearest_row, rows_of_rings
+from lidargrit.fitting.elevations import FittedRows, cluster_rows, nearest_row, rows_of_rings
 from lidargrit.fitting.limits import quantum_m, range_limits_m
 from lidargrit.fitting.points import Points
 from lidargrit.fitting.rings import Method, Rings, recover_rings
@@ -150,7 +150,7 @@ def fit_sensor_to_source(
     return fit_sensor([dataset.scan(index * len(dataset) // wanted) for index in range(wanted)], name)
 
 
-def _rows_by_order(scans: Sequence[Points], rings: Rings) -> tuple[Rows | None, Rings | None]:
+def _rows_by_order(scans: Sequence[Points], rings: Rings) -> tuple[FittedRows | None, Rings | None]:
     """Fit rows to recovered rings; nothing if the order of the points was misread."""
     used = [scans[index] for index in rings.used]
     elevation = np.concatenate([points.elevation_deg for points in used])
@@ -162,7 +162,7 @@ def _rows_by_order(scans: Sequence[Points], rings: Rings) -> tuple[Rows | None, 
     return rows, rings
 
 
-def _rows_by_elevation(scans: Sequence[Points], source: str) -> tuple[Rows, Rings]:
+def _rows_by_elevation(scans: Sequence[Points], source: str) -> tuple[FittedRows, Rings]:
     """Find rows where elevations gather, and give every point the nearest."""
     elevation = np.concatenate([points.elevation_deg for points in scans])
     range_m = np.concatenate([points.range_m for points in scans])
@@ -179,7 +179,7 @@ def _rows_by_elevation(scans: Sequence[Points], source: str) -> tuple[Rows, Ring
     return rows, Rings("elevation clusters", numbers, tuple(range(len(scans))))
 
 
-def _row_numbers(rows: Rows, number: Int64[np.ndarray, "n"]) -> Int64[np.ndarray, "n"]:
+def _row_numbers(rows: FittedRows, number: Int64[np.ndarray, "n"]) -> Int64[np.ndarray, "n"]:
     """Replace the rings' own numbers by rows counted from the top."""
     row_of = np.full(max(int(number.max()), int(rows.number.max())) + 1, -1)
     row_of[rows.number] = np.arange(len(rows.number))
@@ -188,7 +188,7 @@ def _row_numbers(rows: Rows, number: Int64[np.ndarray, "n"]) -> Int64[np.ndarray
 
 def _model(
     name: str,
-    rows: Rows,
+    rows: FittedRows,
     columns: int | None,
     used: Sequence[Points],
     row_of_point: Sequence[Int64[np.ndarray, "_"]],
@@ -215,7 +215,7 @@ def _model(
     )
 
 
-def _projection(rows: Rows, rings: Rings) -> ProjectionName:
+def _projection(rows: FittedRows, rings: Rings) -> ProjectionName:
     """Choose unfolding if the files give the ring of every point, by a field or by KITTI's order of points."""
     top_down = bool((np.diff(rows.number) > 0).all())
     if rings.method == "ring field":
@@ -224,7 +224,7 @@ def _projection(rows: Rows, rings: Rings) -> ProjectionName:
     return "unfolding" if top_down and as_kitti else "spherical"
 
 
-def _warnings(rows: Rows, rings: Rings, num_scans: int, columns: int | None) -> tuple[str, ...]:
+def _warnings(rows: FittedRows, rings: Rings, num_scans: int, columns: int | None) -> tuple[str, ...]:
     found = []
     if len(rings.used) < num_scans:
         left = num_scans - len(rings.used)

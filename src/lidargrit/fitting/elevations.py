@@ -21,7 +21,7 @@ _STEPS = 12  # of the robust fit; it stands still after eight
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class FittedRows:
     """The rows of a sensor, from the top.
 
     Args:
@@ -45,7 +45,7 @@ class Rows:
 
 def rows_of_rings(
     elevation_deg: Float64[np.ndarray, "n"], range_m: Float64[np.ndarray, "n"], ring: Int64[np.ndarray, "n"]
-) -> Rows:
+) -> FittedRows:
     """Fit elevation = laser + height / range to the points of every ring, robustly, and sort the rows from the top.
 
     Lasers sit centimetres above one another, so that a near point is seen higher or lower than a far one. Where the
@@ -72,7 +72,7 @@ def rows_of_rings(
         np.abs(elevation_deg[group] - fit[i, 0] - fit[i, 1] / range_m[group]) < half_gap[i]
         for i, group in enumerate(groups)
     ]
-    return Rows(
+    return FittedRows(
         seen_deg[top_down],
         fit[top_down, 0],
         np.radians(fit[top_down, 1]),

@@ -13,7 +13,7 @@ from typing import Any
 from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import DataError
 from lidargrit.loading.images import Pixels, Provenance
-from lidargrit.loading.shards import Bytes, Entry, LocalBytes, read_image, read_index
+from lidargrit.loading.shards import Bytes, LocalBytes, ShardEntry, read_image, read_index
 from lidargrit.sensors import SensorModel
 from lidargrit.untrusted import JSON_BYTES_AT_MOST, parse_json, user_path
 
@@ -210,7 +210,7 @@ class PreparedImages:
         self.spec = self._folder.read_spec()
         self.sensor = SensorModel.from_json(self.spec.sensor)
         self._shape = (self.sensor.height, self.sensor.width)
-        self._entries: list[tuple[int, Entry]] = []
+        self._entries: list[tuple[int, ShardEntry]] = []
         self.left_out: dict[int, str] = {}
         self._open: dict[int, Bytes] = {}
         self._lock = threading.Lock()
@@ -293,7 +293,7 @@ class PreparedImages:
         """Return the number of the shard that holds an image."""
         return self._entries[index][0]
 
-    def _read_index(self, shard: int) -> tuple[list[Entry], dict[int, str]]:
+    def _read_index(self, shard: int) -> tuple[list[ShardEntry], dict[int, str]]:
         return read_index(self._bytes(shard), shard_name(shard))
 
     def _bytes(self, shard: int) -> Bytes:

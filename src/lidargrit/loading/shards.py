@@ -33,7 +33,7 @@ _CODEC = Blosc(cname="zstd", clevel=3, shuffle=SHUFFLE)
 
 
 @dataclass(frozen=True)
-class Entry:
+class ShardEntry:
     """Position of one image in a shard, and its hashes.
 
     Args:
@@ -99,7 +99,7 @@ class ShardWriter:
 
     def __init__(self, step_m: float) -> None:
         self._step_m = step_m
-        self._entries: list[Entry] = []
+        self._entries: list[ShardEntry] = []
         self._blobs: list[bytes] = []  # of the same images, each its range and then its reflectance
         self._left_out: dict[int, str] = {}
         self._end = len(_MAGIC)
@@ -118,7 +118,7 @@ class ShardWriter:
         lengths = len(range_blob), len(reflectance_blob)
         of_ranges = _fingerprint(steps, None)
         hashes = of_ranges if levels is None else _fingerprint(steps, levels), of_ranges
-        self._append(Entry(scan, self._end, *lengths, *hashes), range_blob + reflectance_blob)
+        self._append(ShardEntry(scan, self._end, *lengths, *hashes), range_blob + reflectance_blob)
 
     def add_from(self, file: Bytes, name: str) -> None:
         """Add all that another file of this class holds.
@@ -143,13 +143,13 @@ class ShardWriter:
         with atomic_path(path) as temporary, temporary.open("wb") as file:
             file.writelines((_MAGIC, *self._blobs, index, len(index).to_bytes(8, "little"), _MAGIC))
 
-    def _append(self, entry: Entry, blob: bytes) -> None:
+    def _append(self, entry: ShardEntry, blob: bytes) -> None:
         self._entries.append(entry)
         self._blobs.append(blob)
         self._end += len(blob)
 
 
-def read_index(file: Bytes, name: str) -> tuple[list[Entry], dict[int, str]]:
+def read_index(file: Bytes, name: str) -> tuple[list[ShardEntry], dict[int, str]]:
     """Return the entries of a shard's images, and for each scan that was left out the reason.
 
     Raises:
@@ -163,7 +163,7 @@ def read_index(file: Bytes, name: str) -> tuple[list[Entry], dict[int, str]]:
     data = bytes(file.read(start, file.size - _TAIL))
     try:
         index = parse_json(data, "its index")
-        entries = [Entry(**entry) for entry in index["entries"]]
+        entries = [ShardEntry(**entry) for entry in index["entries"]]
         for entry in entries:
             numbers = entry.scan, entry.offset, entry.range_bytes, entry.reflectance_bytes
             if not all(type(number) is int and number >= 0 for number in numbers):
@@ -178,7 +178,7 @@ def read_index(file: Bytes, name: str) -> tuple[list[Entry], dict[int, str]]:
 
 
 def read_image(
-    file: Bytes, entry: Entry, shape: tuple[int, int], step_m: float, name: str, verify: bool = False
+    file: Bytes, entry: ShardEntry, shape: tuple[int, int], step_m: float, name: str, verify: bool = False
 ) -> Pixels:
     """Return the pixels of one image of a shard; ``verify`` compares them with their fingerprint.
 

@@ -26,7 +26,7 @@ class Accumulator(ABC, Generic[Kept]):
         """Return everything collected so far, from at least one batch."""
 
 
-class Rows(Accumulator[np.ndarray]):
+class RowAccumulator(Accumulator[np.ndarray]):
     """Keeps every row of every summary, one row per image, in the order in which they came."""
 
     def __init__(self) -> None:
@@ -38,7 +38,7 @@ class Rows(Accumulator[np.ndarray]):
 
     def merge(self, other: Accumulator[np.ndarray]) -> None:
         """Append the rows of another."""
-        assert isinstance(other, Rows)
+        assert isinstance(other, RowAccumulator)
         self._parts += other._parts
 
     def value(self) -> np.ndarray:
@@ -48,7 +48,7 @@ class Rows(Accumulator[np.ndarray]):
         return self._parts[0]
 
 
-class Total(Accumulator[np.ndarray]):
+class SumAccumulator(Accumulator[np.ndarray]):
     """Keeps the sum of all summaries, so that memory does not grow with the number of images."""
 
     def __init__(self) -> None:
@@ -60,7 +60,7 @@ class Total(Accumulator[np.ndarray]):
 
     def merge(self, other: Accumulator[np.ndarray]) -> None:
         """Add the sum of another."""
-        assert isinstance(other, Total)
+        assert isinstance(other, SumAccumulator)
         if other._total is not None:
             self.add(other._total)
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from lidargrit.metrics import FeatureExtractor, Metric
-from lidargrit.metrics._accumulators import Accumulator, Rows
+from lidargrit.metrics._accumulators import Accumulator, RowAccumulator
 from lidargrit.metrics._farthest_points import farthest_points
 from lidargrit.projection import points_of_pixels
 from lidargrit.sensors import SensorModel
@@ -49,7 +49,7 @@ class CloudMetric(Metric[Clouds, np.ndarray]):
     """
 
     variants = ("exact", "reference")
-    accumulator: type[Accumulator[np.ndarray]] = Rows
+    accumulator: type[Accumulator[np.ndarray]] = RowAccumulator
 
     @final
     def extractor(self, sensor: SensorModel) -> FarthestPointClouds:

@@ -14,7 +14,7 @@ from scipy.special import rel_entr
 from torch import Tensor
 
 from lidargrit.metrics import ImageKind, ImageMetric
-from lidargrit.metrics._accumulators import Total
+from lidargrit.metrics._accumulators import SumAccumulator
 from lidargrit.structures import RangeImage
 
 _LEAST = 500  # pixels in a bin: the standard error of a share stays below 0.5 / sqrt(500) = 0.022
@@ -59,7 +59,7 @@ class CurveMetric(ImageMetric):
 
     bounds = (0.0, 1.0)
     fewest_images = 1
-    accumulator = Total
+    accumulator = SumAccumulator
     axis_label: ClassVar[str]
     """What the axis of the curves is, with its unit."""
     curve_label: ClassVar[str]

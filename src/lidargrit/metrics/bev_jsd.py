@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from lidargrit.metrics import Metric
-from lidargrit.metrics._accumulators import Total
+from lidargrit.metrics._accumulators import SumAccumulator
 from lidargrit.metrics._birds_eye import JSD_BOUNDS, VARIANTS, BirdsEyeHistograms, jensen_shannon_distance
 from lidargrit.sensors import SensorModel
 
@@ -36,7 +36,7 @@ class BevJsd(Metric[Int64[np.ndarray, "B cells"], np.ndarray]):
     title = "Jensen-Shannon distance of points seen from above"
     variants = VARIANTS
     bounds = JSD_BOUNDS
-    accumulator = Total
+    accumulator = SumAccumulator
 
     def extractor(self, sensor: SensorModel) -> BirdsEyeHistograms:
         """Return what counts points in cells."""

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64, Int64, UInt
 
 from lidargrit.metrics import Metric
-from lidargrit.metrics._accumulators import Rows
+from lidargrit.metrics._accumulators import RowAccumulator
 from lidargrit.metrics._birds_eye import CELLS, VARIANTS, BirdsEyeHistograms
 from lidargrit.sensors import SensorModel
 
@@ -49,7 +49,7 @@ class BevMmd(Metric[Int64[np.ndarray, "B cells"], np.ndarray]):
     title = "Maximum mean discrepancy of scans seen from above"
     variants = VARIANTS
     bounds = (-math.inf, math.inf)  # the unbiased estimate may lie below 0
-    accumulator = Rows
+    accumulator = RowAccumulator
 
     def extractor(self, sensor: SensorModel) -> BirdsEyeHistograms:
         """Return what counts points in cells."""

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from lidargrit.metrics import ImageMetric
-from lidargrit.metrics._accumulators import Total
+from lidargrit.metrics._accumulators import SumAccumulator
 from lidargrit.metrics._birds_eye import JSD_BOUNDS, LIDM_HALF_M, jensen_shannon_distance, occupied_cells
 from lidargrit.structures import RangeImage
 
@@ -36,7 +36,7 @@ class LidmBevJsd(ImageMetric):
 
     title = "Jensen-Shannon distance of occupied 5 cm cells (LiDM)"
     bounds = JSD_BOUNDS
-    accumulator = Total
+    accumulator = SumAccumulator
 
     def summarise(self, features: RangeImage, *, real: bool) -> Int64[np.ndarray, "cells"]:
         """Count, for every cell, the scans of a batch that have a point in it."""

@@ -9,7 +9,7 @@ from jaxtyping import Float64, UInt8
 from scipy.ndimage import distance_transform_edt
 
 from lidargrit.metrics import ImageMetric
-from lidargrit.metrics._accumulators import Rows
+from lidargrit.metrics._accumulators import RowAccumulator
 from lidargrit.metrics._birds_eye import LIDM_HALF_M, occupied_cells
 from lidargrit.structures import RangeImage
 
@@ -41,7 +41,7 @@ class LidmBevMatching(ImageMetric):
     """
 
     title = "Minimum matching distance of occupied 0.5 m cells (LiDM)"
-    accumulator = Rows
+    accumulator = RowAccumulator
 
     def summarise(self, features: RangeImage, *, real: bool) -> UInt8[np.ndarray, "B bytes"]:
         """Return one bit for every cell of every scan."""

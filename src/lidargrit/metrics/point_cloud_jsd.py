@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 from scipy.spatial import KDTree
 
-from lidargrit.metrics._accumulators import Total
+from lidargrit.metrics._accumulators import SumAccumulator
 from lidargrit.metrics._clouds import CloudMetric, Clouds
 from lidargrit.metrics._curves import divergence
 
@@ -37,7 +37,7 @@ class PointCloudJsd(CloudMetric):
 
     title = "Jensen-Shannon divergence of point clouds in space"
     bounds = (0.0, 1.0)
-    accumulator = Total
+    accumulator = SumAccumulator
 
     def summarise(self, features: Clouds, *, real: bool) -> Int64[np.ndarray, "grid"]:
         """Count the points of a batch at every grid point."""

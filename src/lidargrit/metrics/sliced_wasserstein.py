@@ -14,7 +14,7 @@ from torch import Tensor
 
 from lidargrit.errors import ConfigError
 from lidargrit.metrics import ImageMetric
-from lidargrit.metrics._accumulators import Rows
+from lidargrit.metrics._accumulators import RowAccumulator
 from lidargrit.projection import RangeEncoding
 from lidargrit.structures import RangeImage
 
@@ -62,7 +62,7 @@ class SlicedWasserstein(ImageMetric):
 
     title = "Sliced Wasserstein distance between patches of range images"
     variants = ("reference", "textbook")
-    accumulator = Rows
+    accumulator = RowAccumulator
 
     def __init__(self, *, variant: Literal["reference", "textbook"] = "reference", seed: int = 0) -> None:
         super().__init__(variant=variant, seed=seed)

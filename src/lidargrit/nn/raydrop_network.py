@@ -108,7 +108,8 @@ class RaydropNetwork(nn.Module):
         """Return the surfaces that return, of each scan by its own random numbers; ranges stay as they are.
 
         Args:
-            condition: as many scans, of which each ray's range is observed, or that it does not return.
+            condition: surfaces of as many scans: the range of every ray that meets one, and no return for all other
+                rays.
             rngs: random generators on the CPU, one for each scan.
         """
         images = []

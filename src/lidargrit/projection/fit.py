@@ -29,7 +29,7 @@ _SECTORS_AT_LEAST = 27  # with a return: KITTI's scans have all, a crop to the c
 # Real scans in their own sensor's rows: up to 0.02; images without elevations (Karlsruhe): 0.08; rows by a firing
 # order that is none, or upside down, or by rings of another sensor: 0.24 and more.
 _MISPLACED_AT_MOST = 0.125
-_POINTS_TO_TELL = 100  # fewer tell nothing of an order
+_POINTS_FOR_ORDER = 100  # fewer do not show an order
 _POINTS_MEASURED = 8192
 _WITHIN_RINGS_AT_MOST = (
     0.1  # share of the elevations' variance; 0.01 in files stored ring by ring, 0.9 in shuffled ones
@@ -73,7 +73,7 @@ def projection_that_fits(scan: Scan, sensor: SensorModel) -> ProjectionName:
     generated, simulated and shuffled clouds. A file whose rings are in order but too many or too few keeps the sensor's
     projection, which refuses it: it was cut, or is of another sensor.
     """
-    if sensor.projection == "spherical" or scan.ring is not None or len(scan) < _POINTS_TO_TELL:
+    if sensor.projection == "spherical" or scan.ring is not None or len(scan) < _POINTS_FOR_ORDER:
         return sensor.projection
     ring = unfolding.rings_from_firing_order(np.ascontiguousarray(scan.points_xyz_m.numpy().T))
     if not _is_ring_by_ring(scan, ring):
@@ -89,7 +89,7 @@ def doubts_about_rays(scan: Scan, sensor: SensorModel, method: ProjectionName) -
     """
     pixels = pixel_coordinates(scan, sensor, method, "exact")
     kept = np.flatnonzero(pixels.in_rows() & within_limits(pixels.range_m, sensor))
-    if len(kept) < _POINTS_TO_TELL:
+    if len(kept) < _POINTS_FOR_ORDER:
         return ""
     row = pixels.row[kept].astype(np.int64)
     count = np.bincount(row, minlength=sensor.height)
@@ -219,7 +219,7 @@ def _no_firing_order(scan: Scan) -> ScanError:
 
 def _is_misplaced(scan: Scan, sensor: SensorModel, row: Int[np.ndarray, "n"]) -> bool:
     """Return whether most points lie far from the elevation of the row that they are put into."""
-    if len(scan) < _POINTS_TO_TELL:
+    if len(scan) < _POINTS_FOR_ORDER:
         return False
     step = max(1, len(scan) // _POINTS_MEASURED)
     rays_deg = np.degrees(row_elevation_rad(sensor))

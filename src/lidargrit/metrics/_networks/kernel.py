@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32
 
-from lidargrit.metrics._accumulators import Rows
+from lidargrit.metrics._accumulators import RowAccumulator
 from lidargrit.metrics._networks.features import FeatureMetric
 
 _SUBSETS, _SUBSET_SIZE = 100, 1000  # of R2DM, after Bińkowski et al. 2018
@@ -24,7 +24,7 @@ class KernelMetric(FeatureMetric[np.ndarray]):
     """
 
     bounds = (-math.inf, math.inf)
-    accumulator = Rows
+    accumulator = RowAccumulator
 
     def compare(
         self, generated: Float32[np.ndarray, "n d"], real: Float32[np.ndarray, "m d"]
