@@ -1,21 +1,25 @@
 """Scans that are completed, upsampled and dropped on the command line, by classical methods and by a small model."""
 
 import json
+import os
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from lidargrit.cli import main
+from lidargrit.completion.inputs import ScanReader, open_inputs
 from lidargrit.conditions import Condition
 from lidargrit.conditions.fills import FILLS, fill
-from lidargrit.errors import ConfigError
+from lidargrit.errors import ConfigError, DataError
 from lidargrit.evaluation.raydrop import RAYDROP_CURVES, decoded_surfaces, raydrop_table, score_raydrop
 from lidargrit.formats.numpy_array import NumpyArray
 from lidargrit.formats.ply import Ply
 from lidargrit.generators import load, load_class
 from lidargrit.generators.lidargrit import LidarGrit
+from lidargrit.loading import DataConfig
 from lidargrit.nn.pixel_networks import PixelDecoderConfig
 from lidargrit.projection import unproject
 from lidargrit.sensors import SensorModel, load_sensor
@@ -135,6 +139,13 @@ def test_raydrop_drops_points_of_clean_scans_and_tells_how_often(folders, tmp_pa
     assert main([*words, "--format", "image"]) == 0
     assert main(["raydrop", f"{folders}/scans", str(tmp_path / "points"), "--model", f"{folders}/run"]) == 0
     assert points_of(tmp_path / "points/drive/1.npz") < points_of(folders / "scans/drive/1.npz")
+
+
+def test_an_image_whose_name_is_no_text_is_refused(tmp_path):
+    with Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff.npy")).open("wb") as file:
+        np.save(file, np.full((64, 32), 9, np.float32))
+    with pytest.raises(DataError, match="which is not UTF-8"):
+        open_inputs(str(tmp_path), ScanReader(SENSOR), DataConfig())
 
 
 def test_two_images_whose_names_differ_in_letters_alone_are_two_files(tmp_path, recwarn):

@@ -15,7 +15,7 @@ from lidargrit.cli import main
 from lidargrit.conditions import Condition
 from lidargrit.errors import ConfigError
 from lidargrit.evaluation.estimates import Estimate
-from lidargrit.evaluation.likelihood import score_likelihood
+from lidargrit.evaluation.likelihood import _maps, score_likelihood
 from lidargrit.generators import load
 from lidargrit.generators._batches import in_batches
 from lidargrit.generators.lidargrit import (
@@ -319,6 +319,14 @@ def test_the_likelihood_of_a_source_is_told_and_its_map_written(tmp_path, capsys
     assert "--overwrite" in capsys.readouterr().err
     assert main([*words[:4], "--step-mm", "0"]) == 2
     assert "got a step of 0 mm; wanted a whole number of millimetres" in capsys.readouterr().err
+
+
+def test_a_map_takes_room_on_the_disk_only_as_it_is_written(tmp_path):
+    with _maps(tmp_path / "bits.npy", (3, 2, 4)) as file:  # a hole in the file, on a disk that is full, ends a process
+        (unfinished,) = tmp_path.rglob("*.partial")
+        assert unfinished.stat().st_size < 96
+        file.write(np.arange(24, dtype="<f4").tobytes())
+    assert np.load(tmp_path / "bits.npy").tolist() == np.arange(24.0).reshape(3, 2, 4).tolist()
 
 
 def test_the_interval_of_a_ratio_holds_what_other_scans_would_give():

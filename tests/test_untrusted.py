@@ -11,8 +11,10 @@ import pytest
 from lidargrit.api import load_scan
 from lidargrit.arrays import open_archive, parse_array, read_arrays
 from lidargrit.cli import main
+from lidargrit.configuration import override
 from lidargrit.errors import CheckpointError, ConfigError, DataError, LidarGritError, ScanError, UsageError
 from lidargrit.files import read_json, read_text, write_json
+from lidargrit.generators import load_class
 from lidargrit.nn.devices import usable_device
 from lidargrit.untrusted import check_path, parse_json, positive_number, seed_number, user_path, whole_number
 
@@ -203,3 +205,22 @@ def test_a_device_without_numbers_is_refused():
     for name in ("meta", "nonsense", "cuda:99"):
         with pytest.raises(LidarGritError, match="one that PyTorch finds"):
             usable_device(name)
+
+
+@pytest.mark.parametrize(
+    ("generator", "name"),
+    [
+        ("r2dm", "steps"),
+        ("r2dm", "resamples"),
+        ("r2flow", "steps"),
+        ("lidm", "steps"),
+        ("maskgit", "steps"),
+        ("dusty", "search_steps"),
+        ("lidarvae", "search_steps"),
+        ("lidargen", "levels"),
+        ("lidargen", "steps_each"),
+    ],
+)
+def test_a_sampler_takes_no_number_of_steps_that_fills_the_memory(generator, name):
+    with pytest.raises(ConfigError, match=name.removesuffix("s")):
+        override(load_class(generator).Sampling(), [f"{name}={2**31}"])

@@ -231,6 +231,8 @@ def _image_files(source: str) -> list[Path]:
     found = [one for one in found if not one.name.endswith(PROBABILITY)]
     if not found or any(one.suffix.lower() != ".npy" for one in found):
         return []
+    for one in found:
+        user_path(str(one.absolute()))  # refuses a name that is not UTF-8, which others could not write again
     array = _array(found[0])
     return found if array.ndim == 2 and array.shape[1] > 5 else []  # else rows of x, y, z and more
 

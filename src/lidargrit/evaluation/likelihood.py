@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import torch
@@ -125,21 +125,23 @@ def score_likelihood(
             returns += bits.return_mask.sum((1, 2)).tolist()
             whole = bits.is_whole
             if pixels is not None:
-                pixels[some.start : some.stop] = bits.per_pixel().cpu().numpy()
+                pixels.write(bits.per_pixel().cpu().numpy().astype("<f4").tobytes())
             progress.advance(len(some))
     return Likelihood(step_mm, whole, images.provenance.names, parts, returns, sensor.height * sensor.width)
 
 
 @contextmanager
-def _maps(path: Path | None, size: tuple[int, int, int]) -> Iterator[np.memmap | None]:
-    """Yield an array that is mapped to the file, so that memory does not grow with the number of scans."""
+def _maps(path: Path | None, size: tuple[int, int, int]) -> Iterator[BinaryIO | None]:
+    """Yield a file that takes the pixels of one scan after the other, so that memory does not grow with their number.
+
+    An array that is mapped to the file would end the process without a word where the disk is full.
+    """
     if path is None:
         yield None
         return
-    with atomic_path(path) as unfinished:
-        maps = np.lib.format.open_memmap(unfinished, mode="w+", dtype=np.float32, shape=size)
-        yield maps
-        maps.flush()
+    with atomic_path(path) as unfinished, unfinished.open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, {"descr": "<f4", "fortran_order": False, "shape": size})
+        yield file
 
 
 def likelihood_of_source(

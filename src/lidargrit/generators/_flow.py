@@ -22,6 +22,7 @@ from lidargrit.nn.objective import Objective
 from lidargrit.nn.precision import without_autocast
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
+from lidargrit.untrusted import STEPS_AT_MOST
 
 _STEPS = 256  # of Euler, as published for the first training
 _KEPT_BYTES_AT_MOST = 1 << 30  # of pairs in memory: 16,000 scans of 64x256
@@ -47,8 +48,8 @@ class FlowSampling:
     tolerance: float = 1e-5
 
     def __post_init__(self) -> None:
-        if self.steps < 0:
-            raise ConfigError(f"steps={self.steps}", "0 or more", "256 are published")
+        if not 0 <= self.steps <= STEPS_AT_MOST:
+            raise ConfigError(f"steps={self.steps}", f"0 to {STEPS_AT_MOST:,}", "256 are published")
         if not 1e-7 <= self.tolerance <= 1:  # below, 32 bits of the network are the larger error
             raise ConfigError(f"tolerance={self.tolerance:g}", "a number from 1e-7 to 1", "change it")
 

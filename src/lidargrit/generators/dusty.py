@@ -32,6 +32,7 @@ from lidargrit.nn.raydrop import logistic_noise, straight_through
 from lidargrit.projection import RangeEncoding
 from lidargrit.sensors import SensorModel, load_sensor
 from lidargrit.structures import MaskDecoding, RangeImage
+from lidargrit.untrusted import SEARCH_STEPS_AT_MOST
 
 DustyVariant = Literal["dusty_1", "dusty_2", "baseline"]
 
@@ -107,6 +108,9 @@ class DustySampling:
     search_rate: float = 0.1
 
     def __post_init__(self) -> None:
+        if self.search_steps > SEARCH_STEPS_AT_MOST:
+            got = f"search_steps={self.search_steps}"
+            raise ConfigError(got, f"at most {SEARCH_STEPS_AT_MOST:,}", "lower it")
         for name, least in (("raydrop_seed", 0), ("tolerance", 0), ("search_steps", 1), ("search_rate", 0)):
             value = getattr(self, name)
             if value is not None and not value >= least:

@@ -33,6 +33,7 @@ from lidargrit.nn.published import read_checkpoint
 from lidargrit.nn.size import numbers_of_file
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
+from lidargrit.untrusted import SEARCH_STEPS_AT_MOST
 
 _BYTES_AT_MOST = 1 << 29  # the largest published network takes 120 MB
 
@@ -84,6 +85,9 @@ class VaeSampling:
     search_rate: float = 0.05
 
     def __post_init__(self) -> None:
+        if self.search_steps > SEARCH_STEPS_AT_MOST:
+            got = f"search_steps={self.search_steps}"
+            raise ConfigError(got, f"at most {SEARCH_STEPS_AT_MOST:,}", "lower it")
         for name, least in (("spread", 0), ("search_steps", 1), ("search_rate", 0)):
             if not least <= getattr(self, name) < math.inf:
                 raise ConfigError(f"{name}={getattr(self, name)}", f"at least {least}, and finite", "correct it")

@@ -27,6 +27,7 @@ from lidargrit.nn.precision import Precision, dtype_of
 from lidargrit.nn.transformer import MaskedTransformer
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
+from lidargrit.untrusted import STEPS_AT_MOST
 
 
 @dataclass(frozen=True)
@@ -63,10 +64,10 @@ class MaskedSampling:
 
     def __post_init__(self) -> None:
         self.pixels()
-        if not (self.steps >= 1 and self.temperature >= 0 and self.order_temperature >= 0):
+        if not (1 <= self.steps <= STEPS_AT_MOST and self.temperature >= 0 and self.order_temperature >= 0):
             raise ConfigError(
                 f"steps={self.steps}, temperature={self.temperature}, order_temperature={self.order_temperature}",
-                "steps >= 1, and no negative temperature",
+                f"1 to {STEPS_AT_MOST:,} steps, and no negative temperature",
                 "correct the one that is out of bounds",
             )
 

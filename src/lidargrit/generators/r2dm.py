@@ -27,6 +27,7 @@ from lidargrit.nn.r2dm_checkpoint import read_r2dm_checkpoint
 from lidargrit.nn.unet import EfficientUnet, UnetConfig
 from lidargrit.sensors import SensorModel, load_sensor
 from lidargrit.structures import RangeImage
+from lidargrit.untrusted import STEPS_AT_MOST
 
 _BATCH = 8
 _PUBLISHED_SENSOR = "hdl64e_kitti_360"
@@ -74,8 +75,9 @@ class DiffusionSampling:
     resamples: int = 16
 
     def __post_init__(self) -> None:
-        if self.steps < 1 or self.resamples < 1:
-            raise ConfigError(f"steps={self.steps}, resamples={self.resamples}", "at least 1 of both", "raise it")
+        if not 1 <= min(self.steps, self.resamples) <= max(self.steps, self.resamples) <= STEPS_AT_MOST:
+            got = f"steps={self.steps}, resamples={self.resamples}"
+            raise ConfigError(got, f"1 to {STEPS_AT_MOST:,} of both", "256 and 16 are the default")
 
 
 _CALIBRATION = DiffusionSampling(steps=32)
