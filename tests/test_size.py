@@ -22,6 +22,11 @@ def test_weights_and_buffers_of_all_modules_are_counted():
     nn.Linear(100, 100)  # afterwards nothing is counted
 
 
+def test_modules_are_counted_too_however_small_they_are():
+    with pytest.raises(ConfigError, match="got a network of more than 20,000 modules"), numbers_at_most():
+        nn.Sequential(*(nn.Identity() for _ in range(20_001)))
+
+
 @pytest.mark.parametrize(
     "setting",
     [

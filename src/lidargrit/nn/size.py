@@ -9,12 +9,14 @@ from pathlib import Path
 from torch import Tensor, nn
 from torch.nn.modules.module import (
     register_module_buffer_registration_hook,
+    register_module_module_registration_hook,
     register_module_parameter_registration_hook,
 )
 
 from lidargrit.errors import ConfigError
 
 NUMBERS_AT_MOST = 2**30  # 4.3 GB in 32 bits, thirty times the largest network of our recipes
+_MODULES_AT_MOST = 20_000  # many small ones take minutes to build; the largest networks of our recipes have 2,000
 
 
 def numbers_of_file(path: Path) -> AbstractContextManager[None]:
@@ -28,7 +30,8 @@ def numbers_at_most(
 ) -> Iterator[None]:
     """Refuse to build networks of more than ``count`` numbers within the ``with`` block, before memory is filled.
 
-    Weights and buffers are counted as modules register them, which they do before they fill them.
+    Weights and buffers are counted as modules register them, which they do before they fill them. More than
+    20,000 modules are refused, too, however small they are.
 
     Args:
         count: largest number of weights and buffer elements of all modules that are built in the block.
@@ -46,7 +49,16 @@ def numbers_at_most(
         if found > count:
             raise ConfigError(f"{what} of more than {count:,} numbers", "fewer", cure)
 
+    modules = 0
+
+    def add_module(module: nn.Module, name: str, part: nn.Module | None) -> None:
+        nonlocal modules
+        modules += 1
+        if modules > _MODULES_AT_MOST:
+            raise ConfigError(f"{what} of more than {_MODULES_AT_MOST:,} modules", "fewer", cure)
+
     hooks = [register_module_parameter_registration_hook(add), register_module_buffer_registration_hook(add)]
+    hooks.append(register_module_module_registration_hook(add_module))
     try:
         yield
     except (RuntimeError, MemoryError, OverflowError, TypeError) as error:  # a single tensor that no machine can hold
