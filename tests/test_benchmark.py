@@ -9,11 +9,12 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
 from lidargrit.cli import main
-from lidargrit.errors import ConfigError, LidarGritError
+from lidargrit.errors import CheckpointError, ConfigError, LidarGritError, OutputError
 from lidargrit.evaluation.benchmark import Benchmark, as_table
 from lidargrit.evaluation.benchmark import run as run_benchmark
 from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.evaluation.intervals import Resampling
+from lidargrit.files import claim_folder
 from lidargrit.generators import load_class
 from lidargrit.nn.flops import flops_of
 from lidargrit.recipes import load_recipe
@@ -198,3 +199,16 @@ def test_a_page_of_foreign_names_holds_no_code_of_theirs():
     assert "&lt;script&gt;alert" in page
     assert page.count("<script>") == 1
     assert "0.25" in page
+
+
+@pytest.mark.parametrize("change", [{"parameters": "many"}, {"training_flops": [1]}, {"flops_per_scan": None}, None])
+def test_damaged_costs_are_refused_in_one_line(change, tmp_path):
+    costs = {"parameters": 3, "training_flops": None, "network_evaluations": 1, "flops_per_scan": 5.0}
+    (tmp_path / "costs.json").write_text(json.dumps({**costs, "seconds_per_scan": 1, **change} if change else costs))
+    with pytest.raises(CheckpointError, match="is no number; wanted what lidargrit compare wrote; remove"):
+        as_table([tmp_path / "scores.json"])
+
+
+def test_a_second_comparison_in_the_same_folder_is_refused(tmp_path):
+    with claim_folder(tmp_path), pytest.raises(OutputError, match=r"which process \d+ on .* is writing"):
+        run_benchmark(["marginal"], tmp_path, BENCHMARK)

@@ -16,7 +16,7 @@ import torch
 
 from lidargrit import __version__
 from lidargrit.configuration import override
-from lidargrit.errors import ConfigError
+from lidargrit.errors import CheckpointError, ConfigError
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair, open_pair
 from lidargrit.evaluation.protocols import public_name
 from lidargrit.evaluation.scorecard import Scorecard
@@ -169,7 +169,7 @@ def as_table(scores: Sequence[Path], form: Format = "text") -> str:
     """Return the scores side by side, and below them what each system costs."""
     lines = [f"{'system':<32}{'parameters':>12}{'training':>11}{'evaluations':>13}{'a scan':>11}{'seconds':>9}"]
     for path in scores:
-        of = read_json(path.parent / COSTS)
+        of = _read_costs(path.parent / COSTS)
         training, flops = of["training_flops"], of["flops_per_scan"]
         lines.append(
             f"{path.stem:<32}{of['parameters']:>12,}{f'{training:.2g}' if training is not None else '-':>11}"
@@ -182,8 +182,23 @@ def as_table(scores: Sequence[Path], form: Format = "text") -> str:
 def as_json(scores: Sequence[Path]) -> list[dict[str, Any]]:
     """Return the name, the costs and the scores of each system, as the files hold them."""
     return [
-        {"system": path.stem, "costs": read_json(path.parent / COSTS), "scores": read_json(path)} for path in scores
+        {"system": path.stem, "costs": _read_costs(path.parent / COSTS), "scores": read_json(path)} for path in scores
     ]
+
+
+def _read_costs(path: Path) -> dict[str, Any]:
+    """Read what :func:`_write_costs` wrote.
+
+    Raises:
+        CheckpointError: the file cannot be read, or an entry lacks or is no number.
+    """
+    of = read_json(path)
+    for name in ("parameters", "training_flops", "network_evaluations", "flops_per_scan", "seconds_per_scan"):
+        may_lack = name in ("training_flops", "seconds_per_scan")
+        if name not in of or not (type(of[name]) in (int, float) or (may_lack and of[name] is None)):
+            cure = "remove the folder of this system, and compare again"
+            raise CheckpointError(f"{path}, whose {name} is no number", "what lidargrit compare wrote", cure)
+    return of
 
 
 @dataclass(frozen=True)
