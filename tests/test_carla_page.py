@@ -1,0 +1,43 @@
+"""The page on CARLA: its lines of Python save what CARLA's LiDAR sends so that every ray has a pixel of its own."""
+
+import re
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import torch
+
+import lidargrit
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "how-to" / "carla.md"
+CHANNELS, COLUMNS, UPPER_DEG, LOWER_DEG = 64, 1024, 2.0, -24.8
+
+
+def measured(wall_right_m):
+    """Return the bytes that CARLA sends of one revolution: channel by channel, from straight behind to the right.
+
+    Angles, order and hand as in RayCastSemanticLidar.cpp of CARLA 0.9: yaw from -180 degrees, positive to the right.
+    """
+    elevation = np.radians(UPPER_DEG - np.arange(CHANNELS)[:, None] * (UPPER_DEG - LOWER_DEG) / (CHANNELS - 1))
+    yaw = np.radians(-180 + 360 * np.arange(COLUMNS) / COLUMNS)[None]
+    range_m = np.where(np.sin(yaw) > 0.5, wall_right_m, 20.0) * np.ones_like(elevation)
+    x, right = range_m * np.cos(elevation) * np.cos(yaw), range_m * np.cos(elevation) * np.sin(yaw)
+    rows = np.stack((x, right, range_m * np.sin(elevation), np.exp(-0.004 * range_m)), axis=-1)
+    return rows.astype(np.float32).tobytes()
+
+
+def test_the_pages_lines_give_one_point_to_every_pixel_and_keep_left_and_right(tmp_path, monkeypatch):
+    record, describe = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    monkeypatch.setitem(sys.modules, "carla", ModuleType("carla"))
+    monkeypatch.chdir(tmp_path)
+    recording: dict = {}
+    exec(record, recording)
+    recording["save_scan"](SimpleNamespace(raw_data=measured(wall_right_m=5.0), frame=42), tmp_path)
+    exec(describe, {})
+    sensor = lidargrit.load_sensor("carla.json")
+    image = lidargrit.project(lidargrit.load_scan("000042.npy"), sensor)
+    assert image.return_mask.all()
+    right = torch.sin(sensor.azimuth_rad[0]) < -0.51  # azimuth is positive to the left
+    assert torch.allclose(image.range_m[:, right], torch.tensor(5.0))
+    assert torch.allclose(image.range_m[:, torch.sin(sensor.azimuth_rad[0]) > -0.49], torch.tensor(20.0))
