@@ -276,6 +276,31 @@ def test_prepared_images_are_a_source_here_and_by_url(tmp_path):
         load_range_images(("gopher://somewhere",), SIMULATED)
 
 
+def test_images_of_more_columns_serve_fewer_as_a_projection_would(tree, tmp_path):
+    def set_of(source, columns, stride=1, **settings):
+        config = DataConfig(columns=columns, column_stride=stride, workers=1, **settings)
+        return load_range_images((str(source),), config)
+
+    wide = prepare(str(tree), DataConfig(workers=1), tmp_path / "wide")  # 2048 columns, of which images keep 256
+    for columns, stride in ((512, 1), (512, 2), (256, 1)):
+        gathered, projected = set_of(wide, columns, stride), set_of(tree, columns, stride)
+        one, other = gathered.batch([0, 4], [stride - 1] * 2), projected.batch([0, 4], [stride - 1] * 2)
+        assert one.range_m.shape == (2, 64, columns // stride)
+        assert torch.equal(one.range_m, other.range_m)
+        assert one.reflectance is not None
+        assert other.reflectance is not None
+        nearest_is_one = (one.reflectance - other.reflectance).abs() < 1e-6
+        assert nearest_is_one.float().mean() > 0.999, "two returns may lie within a step of 2 mm"
+    assert gathered.provenance.names == projected.provenance.names
+    odd, exact = set_of(wide, 360).batch([0]), set_of(tree, 360).batch([0])
+    assert (odd.return_mask == exact.return_mask).float().mean() > 0.9
+    with pytest.raises(DataError, match="prepared for"):
+        set_of(wide, 4096)
+    rounded = prepare(str(tree), DataConfig(workers=1, projection_variant="reference"), tmp_path / "rounded")
+    with pytest.raises(DataError, match="prepared for"):
+        set_of(rounded, 512, projection_variant="reference")
+
+
 class Bucket(LocalFileSystem):
     """A store as the libraries of stores are: a version comes before the range of bytes, and errors are their own."""
 

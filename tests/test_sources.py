@@ -5,15 +5,17 @@ import json
 from collections import Counter
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from lidargrit import sources
 from lidargrit.cli import main
-from lidargrit.errors import ConfigError, DataError, UnknownNameError
+from lidargrit.errors import ConfigError, DataError, ScanError, UnknownNameError
 from lidargrit.evaluation.benchmark import Benchmark
 from lidargrit.evaluation.comparison import EvalConfig, compare_sources
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.loading import DataConfig, PreparedImages, prepare
+from lidargrit.sensors import load_sensor
 from lidargrit.sources import (
     DatasetSource,
     PreparedSource,
@@ -23,6 +25,7 @@ from lidargrit.sources import (
     load_range_images,
     open_source,
 )
+from lidargrit.sources.image_files import ImageFileSource
 from lidargrit.sources.samples import write_samples
 from test_generator_contract import made
 
@@ -53,6 +56,34 @@ def test_every_kind_is_told_from_its_name(folders):
     samples = open_source(str(folders / "samples"))
     assert (samples.data_set, len(samples.images())) == ("samples", 2)
     assert samples.sensor.same_rays(open_source(str(folders / "run")).sensor)
+
+
+def test_range_images_in_npy_files_are_a_set_of_a_named_sensor(tmp_path, capsys):
+    sensor, folder = load_sensor("vlp16").with_columns(90), tmp_path / "images"
+    folder.mkdir()
+    for index in range(4):
+        range_m = np.full((16, 90), 10.0 + index, np.float64)
+        range_m[:, :30], range_m[0, 40], range_m[1, 41] = 0, np.nan, np.inf
+        np.save(folder / f"{index}.npy", range_m)
+    source = open_source(str(folder))
+    assert type(source) is ImageFileSource
+    images = source.images(sensor, DataConfig(max_scans=2))
+    assert images.batch([1]).return_mask.sum() == 16 * 60 - 2
+    assert images.batch([1]).range_m.max() == 12, "two of four, evenly spaced"
+    words = ["evaluate", str(folder), str(folder), "--metrics", "bev_jsd", "--intervals", "0", "--json", "scores.json"]
+    assert main([*words, "--overwrite"]) == 2
+    assert "got range images of 16x90 in" in (told := capsys.readouterr().err)
+    assert "name it with --sensor NAME or FILE.json" in told
+    out = tmp_path / "scores.json"
+    named = ["--sensor", "vlp16", "--set", "data.columns=90"]
+    assert main([*words[:-1], str(out), *named]) == 0
+    assert [score["value"] for score in json.loads(out.read_text())["scores"]] == [pytest.approx(0, abs=1e-6)]
+    assert main(["view", str(folder), "-o", str(tmp_path / "view.png"), "-n", "1", *named]) == 0
+    np.save(folder / "4.npy", np.ones((16, 91), np.float32))
+    with pytest.raises(ScanError, match=r"4.npy, a range image of 16x91; wanted 16x90, as the sensor 'vlp16' has"):
+        open_source(str(folder)).images(sensor).batch([4])
+    np.save(tmp_path / "points.npy", np.ones((100, 4), np.float32))
+    assert type(open_source(str(tmp_path / "points.npy"))) is DatasetSource
 
 
 def test_two_prepared_folders_are_opened_once_each(folders, monkeypatch):

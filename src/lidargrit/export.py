@@ -19,7 +19,9 @@ from lidargrit.formats.kitti_bin import KittiBin
 from lidargrit.loading import DataConfig, RangeImages
 from lidargrit.projection import unproject
 from lidargrit.reporting import Reporter
+from lidargrit.sensors import SensorModel
 from lidargrit.sources import DatasetSource, open_source
+from lidargrit.sources.image_files import ImageFileSource
 from lidargrit.structures import Scan
 from lidargrit.untrusted import user_path
 
@@ -29,7 +31,12 @@ _KITTI_NAME = re.compile(r"\d{2}/\d{6}")  # sequence and number
 
 
 def export_scans(
-    source: str, out: Path, kind: str, config: DataConfig | None = None, reporter: Reporter | None = None
+    source: str,
+    out: Path,
+    kind: str,
+    config: DataConfig | None = None,
+    reporter: Reporter | None = None,
+    sensor: SensorModel | None = None,
 ) -> int:
     """Write every scan of a source to a file of its own; files that are there already are not written again.
 
@@ -44,6 +51,7 @@ def export_scans(
             ``sequences/SS/velodyne/NNNNNN.bin``, with SemanticKITTI's ``labels/NNNNNN.label`` where scans have labels.
         config: number of scans, and what to do with unusable points and scans; nothing else of it is used.
         reporter: receiver of progress and messages.
+        sensor: sensor of range images that do not name theirs, as ``.npy``; not used for other sources.
 
     Returns:
         Number of scans that are there now.
@@ -56,7 +64,7 @@ def export_scans(
     """
     config, reporter = config or DataConfig(), reporter or Reporter()
     layout = _Tree(out) if kind == TREE else _Flat(out, *writable_format(kind))
-    scans = _open(source, config)
+    scans = _open(source, config, sensor)
     files = layout.files([scans.name(index) for index in range(len(scans))])
     identities = [scans.identity(index) for index in range(len(scans))]
     with claim_folder(out):
@@ -128,10 +136,10 @@ class _OfImages:
         return unproject(self.images.batch([index])[0])
 
 
-def _open(source: str, config: DataConfig) -> _OfDataset | _OfImages:
+def _open(source: str, config: DataConfig, sensor: SensorModel | None) -> _OfDataset | _OfImages:
     opened = open_source(source, config.bad_points)
     if not isinstance(opened, DatasetSource):
-        return _OfImages(opened.images(None, config))
+        return _OfImages(opened.images(sensor if isinstance(opened, ImageFileSource) else None, config))
     dataset = opened.scans()
     return _OfDataset(dataset, evenly_spaced(config.max_scans or len(dataset), len(dataset)))
 

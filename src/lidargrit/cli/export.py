@@ -30,6 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-n", "--max-scans", type=int, default=0, help="number of scans to export, evenly spaced; 0 for all"
     )
+    sensor = "name or .json file of the sensor, for range images in .npy files"
+    parser.add_argument("--sensor", default="", help=sensor)
     add_bad_scans(parser)
 
 
@@ -38,7 +40,9 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.export import export_scans
     from lidargrit.loading import DataConfig
     from lidargrit.reporting import TerminalReporter
+    from lidargrit.sensors import load_sensor
 
+    sensor = load_sensor(options.sensor) if options.sensor else None
     config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)
-    count = export_scans(options.source, options.out, options.format, config, TerminalReporter())
+    count = export_scans(options.source, options.out, options.format, config, TerminalReporter(), sensor)
     print(f"done: {count} scans in {options.out}; export.json says which file holds which scan")

@@ -15,13 +15,14 @@ from torch import Tensor
 
 from lidargrit import formats
 from lidargrit.completion import Completer
-from lidargrit.completion.inputs import PROBABILITY, Inputs, InputScan
+from lidargrit.completion.inputs import Inputs, InputScan
 from lidargrit.conditions import Condition
 from lidargrit.determinism import derive_seed
 from lidargrit.errors import ConfigError, DataError, ScanError
 from lidargrit.export import claim_scans, writable_format
 from lidargrit.files import atomic_path, claim_folder
 from lidargrit.reporting import Reporter
+from lidargrit.sources.image_files import PROBABILITY
 from lidargrit.structures import RangeImage
 
 IMAGE = "image"  # the word for range images as .npy

@@ -14,22 +14,16 @@ from jaxtyping import Bool, Int64
 from torch import Tensor
 
 from lidargrit import formats
-from lidargrit.arrays import ARRAY_BYTES_AT_MOST, parse_array
 from lidargrit.conditions import Condition
 from lidargrit.datasets import ScanDataset
-from lidargrit.datasets.folder import Folder
 from lidargrit.determinism import evenly_spaced
-from lidargrit.errors import DataError, LidarGritError, ScanError
-from lidargrit.formats import read_bytes
+from lidargrit.errors import ScanError
 from lidargrit.loading import DataConfig, RangeImages
 from lidargrit.projection import ProjectionVariant, index_map, project, unproject
 from lidargrit.sensors import ProjectionName, SensorModel, load_sensor
 from lidargrit.sources import DatasetSource, open_source
+from lidargrit.sources.image_files import ImageFileSource
 from lidargrit.structures import RangeImage, Scan
-from lidargrit.untrusted import user_path
-
-PROBABILITY = ".probability.npy"  # how files end that tell the share of returns, and are no scans
-_IMAGE = "a range image: an .npy of (H, W) ranges in metres"
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,47 +104,17 @@ class _OfDataset(Inputs):
 
 
 class _OfImages(Inputs):
-    def __init__(self, images: RangeImages) -> None:
-        self._images = images
+    def __init__(self, images: RangeImages, names: Sequence[str]) -> None:
+        self._images, self._names = images, names
 
     def __len__(self) -> int:
         return len(self._images)
 
     def name(self, index: int) -> str:
-        return f"{index:06d}"
+        return self._names[index]
 
     def read(self, index: int) -> InputScan:
         return InputScan(self._images.batch([index])[0])
-
-
-class _OfImageFiles(Inputs):
-    """Range images as ``.npy``, 0 or what is not finite where nothing returned."""
-
-    def __init__(self, paths: list[Path], sensor: SensorModel) -> None:
-        self._paths, self._sensor = paths, sensor
-
-    def __len__(self) -> int:
-        return len(self._paths)
-
-    def name(self, index: int) -> str:
-        path = self._paths[index]
-        return path.stem if path.suffix == ".npy" else path.name  # beside scan.npy there may lie scan.NPY
-
-    def read(self, index: int) -> InputScan:
-        path, sensor = self._paths[index], self._sensor
-        array = _array(path)
-        if array.shape != (sensor.height, sensor.width):
-            raise ScanError(
-                f"{path}, a range image of {'x'.join(map(str, array.shape))}",
-                f"{sensor.height}x{sensor.width}, as the sensor {sensor.name!r} has",
-                "render it with the rows and columns of this sensor",
-            )
-        with np.errstate(over="ignore"):  # infinite, and so out of the sensor's limits
-            range_m = torch.from_numpy(array.astype(np.float32))
-        within = (range_m >= sensor.range_min_m) & (range_m <= sensor.range_max_m)
-        if not bool(within.any()):
-            raise ScanError(f"no range within the sensor's limits in {path}", "ranges in metres", "check the unit")
-        return InputScan(RangeImage.masked(range_m.nan_to_num(0, 0, 0), within, sensor))
 
 
 @dataclass(frozen=True)
@@ -199,52 +163,23 @@ def open_inputs(source: str, reader: ScanReader, config: DataConfig) -> Inputs:
         reader: projection of points to range images.
         config: number of scans, and what to do with unusable points.
     """
-    paths = _image_files(source)
-    if paths:
-        return _OfImageFiles([paths[index] for index in _chosen(len(paths), config)], reader.sensor)
     opened = open_source(source, config.bad_points)
     if isinstance(opened, DatasetSource):
         dataset = opened.scans()
-        return _OfDataset(dataset, _chosen(len(dataset), config), reader)
-    return _OfImages(opened.images(reader.sensor, config))
+        return _OfDataset(dataset, evenly_spaced(config.max_scans or len(dataset), len(dataset)), reader)
+    images = opened.images(reader.sensor, config)
+    if isinstance(opened, ImageFileSource):
+        return _OfImages(images, [_name_of(Path(name)) for name in images.provenance.names])
+    return _OfImages(images, [f"{index:06d}" for index in range(len(images))])
 
 
 def sensor_of(source: str, name: str = "") -> SensorModel:
     """Return the sensor of a source of scans, or the one that is named for it by a name or a ``.json`` file."""
-    if _image_files(source):
-        return load_sensor(name or Folder.sensor)
     return load_sensor(name) if name else open_source(source).sensor
 
 
-def _chosen(count: int, config: DataConfig) -> list[int]:
-    return evenly_spaced(config.max_scans or count, count)
-
-
-def _image_files(source: str) -> list[Path]:
-    """Return the range images that a source names: one ``.npy``, or a folder of nothing else."""
-    try:
-        path = user_path(source)  # refuses an empty word, which would else be the current folder
-        found = [path] if path.is_file() else sorted(path.iterdir())
-    except (OSError, DataError):
-        return []
-    found = [one for one in found if one.is_file() and not one.name.startswith(".") and formats.candidates(one)]
-    found = [one for one in found if not one.name.endswith(PROBABILITY)]
-    if not found or any(one.suffix.lower() != ".npy" for one in found):
-        return []
-    for one in found:
-        user_path(str(one.absolute()))  # refuses a name that is not UTF-8, which others could not write again
-    array = _array(found[0])
-    return found if array.ndim == 2 and array.shape[1] > 5 else []  # else rows of x, y, z and more
-
-
-def _array(path: Path) -> np.ndarray:
-    try:
-        array = parse_array(read_bytes(path, ARRAY_BYTES_AT_MOST, _IMAGE))
-    except LidarGritError:
-        raise
-    except ValueError as error:
-        raise ScanError(f"{path}, which cannot be read ({error})", _IMAGE, "save it anew") from None
-    return array
+def _name_of(image: Path) -> str:
+    return image.stem if image.suffix == ".npy" else image.name  # beside scan.npy there may lie scan.NPY
 
 
 def _together(own: Scan, added: Scan) -> Scan:

@@ -12,7 +12,8 @@ from typing import Any
 
 from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import DataError
-from lidargrit.loading.images import Pixels, Provenance
+from lidargrit.loading.columns import FewerColumns, has_fewer_columns
+from lidargrit.loading.images import ImageStore, Pixels, Provenance
 from lidargrit.loading.shards import Bytes, LocalBytes, ShardEntry, read_image, read_index
 from lidargrit.sensors import SensorModel
 from lidargrit.untrusted import JSON_BYTES_AT_MOST, parse_json, user_path
@@ -250,14 +251,20 @@ class PreparedImages:
         )
         return chosen
 
-    def require_projection(self, sensor: SensorModel, variant: str) -> None:
-        """Refuse images that were prepared for other rays than a sensor's, or projected in another way than is wanted.
+    def on_rays_of(self, sensor: SensorModel, variant: str) -> ImageStore:
+        """Return the images with all fine columns of a sensor, which may be fewer than were prepared.
+
+        Args:
+            sensor: sensor whose rays are wanted.
+            variant: projection variant that is wanted. The reference's columns cannot be gathered into fewer: it rounds
+                points to the nearest column.
 
         Raises:
-            DataError: says what they were prepared for.
+            DataError: images that were prepared for other rays, or projected in another way; says for which.
         """
         location, prepared, wanted = self._folder.location, self.sensor, sensor.fine()
-        if not prepared.same_rays(wanted):
+        is_wider = variant == "exact" and has_fewer_columns(wanted, prepared)
+        if not (is_wider or prepared.same_rays(wanted)):
             raise DataError(
                 f"{location}, prepared for {prepared.name!r} ({prepared.height}x{prepared.width})",
                 f"the rays of {sensor.name!r} ({wanted.height}x{wanted.width} with every fine column)",
@@ -274,6 +281,7 @@ class PreparedImages:
                 projections[1],
                 "choose that projection with --set data.projection=... data.projection_variant=..., or prepare anew",
             )
+        return FewerColumns(self, prepared.width, wanted.width) if is_wider else self
 
     def read(self, index: int, verify: bool = False) -> Pixels:
         """Return the pixels of one image.

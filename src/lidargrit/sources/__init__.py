@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import ClassVar
 
 from lidargrit.datasets import ScanDataset, data_set_and_split, open_dataset
 from lidargrit.errors import DataError, LidarGritError
@@ -25,69 +23,10 @@ from lidargrit.loading import (
 )
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel, load_sensor
+from lidargrit.sources.image_files import ImageFileSource, image_files
 from lidargrit.sources.sample_formats import is_tensor_folder, load_sample_format, read_tensor_folder, recognise
 from lidargrit.sources.samples import is_sample_folder, projection_of, read_samples, trained_on, weights_of
-
-
-class Source(ABC):
-    """A source of scans or range images; :func:`open_source` recognises its kind.
-
-    Args:
-        text: name of the source, as the user typed it.
-    """
-
-    kind: ClassVar[str]
-    """What the source is, in words for a message."""
-    data_set: str = ""
-    """Name of the data set; ``samples`` for what a generator made; "" where it is not known."""
-    split: str = ""
-    """Part of the data set, or the sample format of tensors; "" where there is none."""
-    doubts: tuple[str, ...] = ()
-    """Reasons to doubt that the sensor of the images that were opened last made the scans, one sentence each."""
-
-    def __init__(self, text: str) -> None:
-        self.text = text
-
-    @property
-    @abstractmethod
-    def sensor(self) -> SensorModel:
-        """Sensor whose rays the scans or images lie on."""
-
-    @abstractmethod
-    def projection_variant(self, config: DataConfig) -> str:
-        """Return the variant of the projection by which scans become, or became, images; "" where it is not known."""
-
-    @abstractmethod
-    def images(
-        self, sensor: SensorModel | None = None, config: DataConfig | None = None, reporter: Reporter | None = None
-    ) -> RangeImages:
-        """Return the range images of the source; pixels are read when they are asked for.
-
-        Args:
-            sensor: sensor that scans are projected with; the source's own if not given. Samples keep theirs.
-            config: settings of reading and projecting scans; its sources and sensor are ignored.
-            reporter: receiver of progress, and of messages about scans that are left out.
-
-        Raises:
-            DataError: no usable scan, or prepared scans of another sensor or projection.
-            ScanError: a scan or a sample that cannot be used.
-        """
-
-    def scans(self) -> ScanDataset:
-        """Return the points of the scans; only a data set has them.
-
-        Raises:
-            DataError: a source that holds range images, or a run.
-        """
-        raise DataError(f"{self.text}, which holds {self.kind}", "the points of scans", "name a data set or its folder")
-
-    def learned_from(self) -> Provenance | None:
-        """Return the training scans of the model behind the source; None where no model is behind it."""
-        return None
-
-    def weights_sha256(self) -> str:
-        """Return the hash of the weights that generated the scans; "" where there are none, or it is not known."""
-        return ""
+from lidargrit.sources.source import Source
 
 
 class DatasetSource(Source):
@@ -129,7 +68,9 @@ class DatasetSource(Source):
         sensor, config = imaging.sensor, imaging.config
         folder = prepare(self.text, config, reporter=reporter, sensor=sensor, dataset=self._dataset)
         self.doubts, self._imaged_by = imaging.doubts, config.projection_variant
-        return _read_prepared(self.text, PreparedImages(str(folder)), sensor, reporter)
+        prepared = PreparedImages(str(folder))
+        _require_some(self.text, prepared, reporter)
+        return RangeImages(sensor, [prepared])
 
     def imaging(self, sensor: SensorModel | None, config: DataConfig) -> Imaging:
         """Choose how the scans become images: see :func:`lidargrit.loading.choose_imaging`.
@@ -163,11 +104,15 @@ class PreparedSource(Source):
     def images(
         self, sensor: SensorModel | None = None, config: DataConfig | None = None, reporter: Reporter | None = None
     ) -> RangeImages:
-        """Read the images as they are."""
-        config, sensor = config or DataConfig(), sensor or self.sensor
-        self._prepared.require_projection(sensor, config.projection_variant)
+        """Read the images, with all columns that were prepared, or with fewer if the sensor has fewer."""
+        config, sensor, reporter = config or DataConfig(), sensor or self.sensor, reporter or Reporter()
         chosen = self._prepared.evenly_spaced(config.max_scans) if config.max_scans else self._prepared
-        return _read_prepared(self.text, chosen, sensor, reporter or Reporter())
+        store = chosen.on_rays_of(sensor, config.projection_variant)
+        if store is not chosen:
+            columns = f"{self.sensor.width} columns gathered into {sensor.width * sensor.column_stride}"
+            reporter.message(f"{self.text}: {columns}, of each pixel the nearest return")
+        _require_some(self.text, chosen, reporter)
+        return RangeImages(sensor, [store])
 
 
 class SampleSource(Source):
@@ -279,8 +224,9 @@ def open_source(text: str, bad_points: BadPoints = "refuse", samples_format: str
 
     Args:
         text: folder of a finished run or the word ``pretrained``; folder of samples, of ours or of another program
-            (``.pth``); folder or URL of prepared scans; or a data set as in :func:`lidargrit.datasets.open_dataset`
-            ("kitti_raw:ROOT:SPLIT", "FOLDER", "simulated:COUNT", ...).
+            (``.pth``); folder or URL of prepared scans; range images as ``.npy``, one file or a folder of nothing else;
+            or a data set as in :func:`lidargrit.datasets.open_dataset` ("kitti_raw:ROOT:SPLIT", "FOLDER",
+            "simulated:COUNT", ...).
         bad_points: treatment of NaN, infinite and origin points in scans.
         samples_format: program that wrote a folder of ``.pth`` files; recognised from the first file if empty.
 
@@ -311,7 +257,8 @@ def open_source(text: str, bad_points: BadPoints = "refuse", samples_format: str
         return TensorSource(text, folder)
     if "://" in text or (here and is_prepared(text)):
         return PreparedSource(text)
-    return DatasetSource(text, bad_points)
+    images = image_files(folder) if text and (here or folder.is_file()) else []
+    return ImageFileSource(text, images) if images else DatasetSource(text, bad_points)
 
 
 def load_range_images(
@@ -392,9 +339,9 @@ def _data_set_or_nothing(text: str) -> tuple[str, str]:
         return "", ""
 
 
-def _read_prepared(text: str, prepared: PreparedImages, sensor: SensorModel, reporter: Reporter) -> RangeImages:
+def _require_some(text: str, prepared: PreparedImages, reporter: Reporter) -> None:
+    """Tell which scans were left out, and raise DataError if these are all."""
     for why in prepared.left_out.values():
         reporter.message(f"left out: {why}")
     if not len(prepared):
         raise DataError(f"no usable scan in {text}", "at least one", "see the messages above")
-    return RangeImages(sensor, [prepared])
