@@ -1,6 +1,8 @@
 #!/bin/sh
 # Installs this project with the extras that are named into .venv: sh install.sh dev. Called by make.
-# PyPI's torch for Linux brings 3 GB for NVIDIA GPUs; PyTorch's own index has a build for CPUs of a fifteenth of it.
+# PyPI's torch for Linux brings 2.7 GB for NVIDIA GPUs; PyTorch's own index has a build for CPUs of 0.2 GB.
+# Where uv is installed, it does the work: it resolves in seconds and downloads many files at once. It does not know of
+# indexes, mirrors and certificates that pip is configured with, so there, and wherever it fails, pip does the work.
 set -eu
 
 extras=$1
@@ -15,10 +17,20 @@ reachable() {
 set -- -c constraints.txt -e ".[$extras]"
 if [ "$(uname -s)" = Linux ] && ! command -v nvidia-smi >/dev/null 2>&1 && ! has_torch; then
     if reachable; then
-        echo "No NVIDIA GPU here: installing PyTorch's build for CPUs. About 0.5 GB to download in all, 1.8 GB on disk."
+        echo "No NVIDIA GPU here: installing PyTorch's build for CPUs. 0.43 GB to download in all, 1.8 GB on disk."
         set -- --extra-index-url "$cpu_builds" "$@"
     else
-        echo "$cpu_builds does not answer: installing the torch that pip finds. If it is PyPI's, about 3 GB to download."
+        echo "$cpu_builds does not answer: installing the torch that pip finds. If it is PyPI's, 3.0 GB to download in all."
     fi
 fi
-"$python" -m pip install --disable-pip-version-check --progress-bar on "$@"
+
+pip_is_configured() { "$python" -m pip config list 2>/dev/null | grep -qE "index-url|find-links|no-index|proxy|cert"; }
+# As pip does, of all indexes the best version: the build for CPUs counts as newer than the same version without.
+by_uv() { uv pip install --python "$python" --index-strategy unsafe-best-match "$@"; }
+by_pip() { "$python" -m pip install --disable-pip-version-check --progress-bar on "$@"; }
+
+if command -v uv >/dev/null 2>&1 && ! pip_is_configured; then
+    by_uv "$@" || by_pip "$@"
+else
+    by_pip "$@"
+fi
