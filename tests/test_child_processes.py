@@ -79,6 +79,7 @@ def test_processes_of_a_pool_end_with_the_one_that_began_them(tmp_path, number, 
         text=True,
         start_new_session=True,
     )
+    assert parent.stdout is not None
     children = [int(word) for word in parent.stdout.readline().split()]
     assert children
     (os.killpg if number == signal.SIGINT else os.kill)(parent.pid, number)
