@@ -19,7 +19,7 @@ RECIPE = replace(
     title="LidarGRIT with a pixel decoder: 64x256 in 256 tokens, for one CPU core and three hours",
     model=replace(
         compact.RECIPE.model,
-        # Sizes that leave the whole model, rounded to 16 bits, below 16 MB.
+        # Sizes that leave these three networks, rounded to 16 bits, below 16 MB.
         pixels=PixelDecoderConfig(mask_features=6, range_features=6, row_channels=2, range_width=36),
     ),
     data=replace(compact.RECIPE.data, train=("simulated:4352:train",)),
