@@ -2,33 +2,43 @@
 
     python benchmarks/surprise.py --scans simulated:24:test --json surprise.json
 
-Each scan is changed in four ways: a ball that floats, dirt on the window, rain-like returns, and a sensor that is
-turned about its lateral axis. The first two are found by cells of 8x8 pixels, rain by pixels, a turned sensor by whole
-scans: the area is the probability that what was changed has a higher score than what was not. The scores are the bits
-of a cell's token, the bits of its pixels beyond those expected, all bits, and the error of reconstruction: how far a
-return is from the decoded range, in ln(1 + range), and how unlikely its mask was by the tokenizer's decoder.
+Each scan is changed in five ways: a block that lies askew in the street, put in by the simulator where the scans are
+simulated; a ball that floats; dirt on the window; rain-like returns; and a sensor turned about its lateral axis. The
+first three are found by cells of 8x8 pixels, rain by pixels, a turned sensor by whole scans: the area is the
+probability that what was changed has a higher score than what was not. The scores are the bits of a cell's token, the
+bits of its pixels beyond those expected, all bits, and the error of reconstruction: how far a return is from the
+decoded range, in ln(1 + range), and how unlikely its mask was by the tokenizer's decoder.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
-from scipy.stats import rankdata
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from lidargrit.evaluation.estimates import Estimate
 from lidargrit.files import write_json
 from lidargrit.generators import Generator, load
 from lidargrit.loading import DataConfig
+from lidargrit.sensors import SensorModel
+from lidargrit.simulator.mesh import Mesh
+from lidargrit.simulator.observation import ObservationConfig, observe_scene
+from lidargrit.simulator.scene import sample_scene
+from lidargrit.simulator.scene.shapes import boxes
 from lidargrit.sources import open_images
 from lidargrit.structures import RangeImage
 
 CELL = 8
+_BLOCK = "a block askew in the street"
+_OTHER_OBJECT = 99  # SemanticKITTI's number; no street has any
 Changed = tuple[RangeImage, Bool[Tensor, "1 H W"]]
 
 
@@ -91,6 +101,24 @@ def turned(image: RangeImage, rng: torch.Generator) -> Changed:
     return _with(image, range_m, range_m > 0), torch.ones_like(image.return_mask)
 
 
+def with_block(seed: int, sensor: SensorModel, rng: torch.Generator) -> Changed:
+    """Simulate a street again with a block of 2.5 x 1.2 x 1.2 m in it, turned at random, 6 to 15 m away."""
+    away, turn, *axis = torch.rand(5, generator=rng).tolist()
+    low, high = (np.array([[sign * 1.25, sign * 0.6, sign * 0.6]]) for sign in (-1, 1))
+    turned_by = Rotation.from_rotvec(2 * np.pi * (np.array(axis) - 0.5)).as_matrix()
+    angle, distance_m = 2 * np.pi * turn, 6 + 9 * away
+    centre = np.array([distance_m * np.cos(angle), distance_m * np.sin(angle), 0.9])
+    corners = boxes(low, high)[0] @ turned_by.T + centre
+    scene_rng, beam_rng = np.random.default_rng(seed).spawn(2)  # as in simulate
+    scene = sample_scene(scene_rng, "mixed")
+    block = Mesh.of(corners, material=int(scene.standing.material[0]), albedo=0.5, label=_OTHER_OBJECT)
+    scene = replace(scene, standing=Mesh.join([scene.standing, block]))
+    seen = observe_scene(scene, sensor, scene_rng, beam_rng, ObservationConfig(kept_columns_only=True))
+    mask = torch.from_numpy(seen.return_mask)[None]
+    changed = torch.from_numpy(seen.label == _OTHER_OBJECT)[None] & mask
+    return RangeImage.masked(torch.from_numpy(seen.range_m)[None], mask, sensor), changed
+
+
 CHANGES = {
     "a floating ball": Change(ball, "cells"),
     "dirt on the window": Change(dirt, "cells"),
@@ -125,10 +153,15 @@ def by_unit(score: Tensor, unit: str) -> Tensor:
     return F.avg_pool2d(score[:, None].float(), CELL).flatten() if unit == "cells" else score.float().mean()[None]
 
 
-def area(changed: Tensor, others: Tensor) -> float:
-    """Return the area under the ROC curve: the probability that a changed one scores higher than another."""
-    ranks = rankdata(torch.cat((changed, others)).double().numpy())
-    return float((ranks[: len(changed)].sum() / len(changed) - (len(changed) + 1) / 2) / len(others))
+def area(changed: list[Tensor], others: list[Tensor]) -> Estimate:
+    """Return the area under the ROC curve: the probability that a changed one scores higher than another.
+
+    The interval is over scans with changes; what was left as it was counts as known.
+    """
+    left = torch.cat(others).double().sort().values.numpy()
+    scans = [each.double().numpy() for each in changed if len(each)]
+    higher = [(np.searchsorted(left, each) + np.searchsorted(left, each, "right")).sum() / 2 for each in scans]
+    return Estimate.of_ratio([float(each) / len(left) for each in higher], [float(len(each)) for each in scans])
 
 
 @torch.no_grad()
@@ -145,19 +178,24 @@ def main() -> None:
     for index in range(len(images)):
         whole = images.batch([index])
         before = scores(generator, whole)
-        for name, change in CHANGES.items():
+        changes = dict(CHANGES)
+        if options.scans.startswith("simulated:"):
+            seed = int(images.provenance.names[index].rpartition("_")[2])
+            changes[_BLOCK] = Change(lambda image, rng, seed=seed: with_block(seed, image.sensor, rng), "cells")
+        for name, change in changes.items():
             image, pixels = change.make(whole, torch.Generator().manual_seed(index))
             at = by_unit(pixels, change.unit) >= (0.25 if change.unit == "cells" else 1)
             for way, score in scores(generator, image).items():
                 changed, others = found.setdefault((name, way), ([], []))
                 changed.append(by_unit(score, change.unit)[at])
                 others.append(by_unit(before[way], change.unit))
-    rows = [
-        {"change": name, "score": way, "unit": CHANGES[name].unit, "area": area(torch.cat(changed), torch.cat(others))}
-        for (name, way), (changed, others) in found.items()
-    ]
-    for row in rows:
-        print(f"| {row['change']} | {row['unit']} | {row['score']} | {row['area']:.3f} |", flush=True)
+    rows = []
+    for (name, way), (changed, others) in found.items():
+        unit, told = CHANGES[name].unit if name in CHANGES else "cells", area(changed, others)
+        rows.append(
+            {"change": name, "score": way, "unit": unit, "area": told.value, "low": told.low, "high": told.high}
+        )
+        print(f"| {name} | {unit} | {way} | {told.value:.3f} [{told.low:.3f}, {told.high:.3f}] |", flush=True)
     if options.json:
         write_json(options.json, rows)
 

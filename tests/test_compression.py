@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import os
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +14,12 @@ import torch
 
 from lidargrit.cli import main
 from lidargrit.compression import rounding
-from lidargrit.compression.archive import Archive, ArchiveWriter
+from lidargrit.compression.archive import Archive, writing
 from lidargrit.compression.arithmetic import exp, ln, sigmoid
 from lidargrit.compression.scan_codec import ScanCodec
-from lidargrit.errors import ConfigError, ScanError
+from lidargrit.errors import ConfigError, OutputError, ScanError
 from lidargrit.generators.lidargrit import LidarGrit, LidarGritConfig, TokenSampling
+from lidargrit.generators.multiscale import Multiscale, MultiscaleConfig
 from lidargrit.nn.pixel_networks import PixelDecoderConfig
 from lidargrit.nn.transformer import TransformerConfig
 from lidargrit.sensors import load_sensor
@@ -67,6 +70,17 @@ def test_pixels_come_back_rounded_to_the_step(codec, compressed):
     assert float((back.range_m - image.range_m[0]).abs().max()) <= 0.01 + 1e-6
 
 
+def test_a_model_without_tokens_compresses_too():
+    generator = Multiscale(MultiscaleConfig(replace(PIXELS, coarsest_cell=4, column_halvings=1)), SENSOR)
+    rng = torch.Generator().manual_seed(3)
+    for weight in generator.parameters():
+        weight.data = torch.empty_like(weight).normal_(std=0.1, generator=rng)
+    codec, image = ScanCodec(generator, 20), scans(1)
+    compressed = codec.compress(image[0])
+    assert torch.equal(codec.decompress(compressed).range_m, codec.steps.round(image).range_m[0])
+    assert 8 * len(compressed) == pytest.approx(float(generator.bits(image, 20).total()), rel=0.01)
+
+
 def test_a_scan_takes_as_many_bits_as_the_model_tells(codec):
     image = made().sample([0], TokenSampling(range_temperature=1.0, range_noise=1.0))
     compressed, bits = codec.compress(image[0]), made().bits(image, 20)
@@ -113,7 +127,7 @@ def test_one_that_does_not_reproduce_the_probabilities_says_so(codec, compressed
     rng = np.random.default_rng(0)
     for _ in range(4):
         altered = bytearray(compressed)
-        altered[rng.integers(1, len(altered))] ^= 1 << rng.integers(8)
+        altered[rng.integers(len(altered))] ^= 1 << rng.integers(8)
         with pytest.raises(ScanError, match=message):
             codec.decompress(bytes(altered))
     with pytest.raises(ScanError, match=message):
@@ -122,15 +136,13 @@ def test_one_that_does_not_reproduce_the_probabilities_says_so(codec, compressed
 
 def test_damaged_files_are_refused(tmp_path):
     path, rng = tmp_path / "scans.lgz", np.random.default_rng(0)
-    with path.open("wb") as file:
-        writer = ArchiveWriter(file, {"step_mm": 20})
+    with writing(path, {"step_mm": 20}) as writer:
         for name in ("one", "two"):
-            writer.add(name, rng.bytes(300))
-        assert writer.close() == file.tell()
+            writer.add(name, rng.bytes(300), 5)
     whole = path.read_bytes()
     archive = Archive(path)
     archive.check()
-    assert [entry.name for entry in archive.entries] == ["one", "two"]
+    assert archive.names == ["one", "two"]
     damaged = [whole[:length] for length in range(0, len(whole), 7)] + [whole + b"\0", whole[1:]]
     for bit in rng.choice(8 * len(whole), 500, replace=False):
         altered = bytearray(whole)
@@ -140,6 +152,36 @@ def test_damaged_files_are_refused(tmp_path):
         path.write_bytes(content)
         with pytest.raises(ScanError, match=r"cut off or altered|does not begin as a file of compressed scans"):
             Archive(path).check()
+
+
+def test_an_interrupted_file_goes_on_and_ends_as_an_uninterrupted_one(tmp_path):
+    rng, names = np.random.default_rng(0), ["one", "bad", "two", "three"]
+    content = {name: b"" if name == "bad" else rng.bytes(200) for name in names}
+    begun, whole, unfinished = tmp_path / "scans.lgz", tmp_path / "whole.lgz", tmp_path / "scans.lgz.unfinished"
+    with writing(whole, {"step_mm": 20}) as writer:
+        for name in names:
+            writer.add(name, content[name], 7)
+    with suppress(KeyboardInterrupt), writing(begun, {"step_mm": 20}) as writer:
+        for name in names[:3]:
+            writer.add(name, content[name], 7)
+        raise KeyboardInterrupt
+    assert not begun.exists()
+    with (unfinished / "scans").open("r+b") as file:  # as after a loss of power: the last scan is not there as a whole
+        file.truncate((unfinished / "scans").stat().st_size - 10)
+    with pytest.raises(OutputError, match="scans of another model, step or version"), writing(begun, {"step_mm": 2}):
+        pass
+    with (
+        pytest.raises(OutputError, match="the scan one, which is not the next of these"),
+        writing(begun, {"step_mm": 20}) as writer,
+    ):
+        writer.go_on(iter(["other"]))
+    with writing(begun, {"step_mm": 20}) as writer:
+        assert writer.go_on(iter(names)) == 2
+        for name in names[2:]:
+            writer.add(name, content[name], 7)
+    assert begun.read_bytes() == whole.read_bytes()
+    assert Archive(begun).names == ["one", "two", "three"]
+    assert not unfinished.exists()
 
 
 def test_a_strangers_file_writes_only_files_that_can_be_and_below_its_folder(tmp_path, monkeypatch, capsys):
@@ -154,11 +196,10 @@ def test_a_strangers_file_writes_only_files_that_can_be_and_below_its_folder(tmp
         (["x" * 300], "at most 255 bytes a name"),
         (["one", "one"], "was cut off or altered"),
     ):
-        with path.open("wb") as file:
-            writer = ArchiveWriter(file, {"step_mm": 20})
+        path.unlink(missing_ok=True)
+        with writing(path, {"step_mm": 20}) as writer:
             for name in names:
-                writer.add(name, b"")
-            writer.close()
+                writer.add(name, b"a", 1)
         assert main(["decompress", str(path), str(tmp_path / "out")]) == 2
         assert message in the_one_line(capsys.readouterr().err, "decompress")
         assert [one.name for one in tmp_path.iterdir()] == ["scans.lgz"]

@@ -27,13 +27,15 @@ def tiny_sensor(rows: int, columns: int) -> SensorModel:
     return SensorModel("tiny", elevation_rad, azimuth_rad, 1.0, 80.0, "spherical")
 
 
-def random_decoder(sensor: SensorModel, cell: int, spread: float = 0.3) -> PixelDecoder:
+def random_decoder(
+    sensor: SensorModel, cell: int, spread: float = 0.3, halvings: int = 0, features: int = FEATURES
+) -> PixelDecoder:
     """Return a decoder none of whose weights are zero, so that everything depends on everything it may."""
     torch.manual_seed(0)
     config = PixelDecoderConfig(
-        coarsest_cell=cell, mask_features=3, range_features=3, mask_width=6, range_width=6, blocks=1
+        cell, halvings, mask_features=3, range_features=3, mask_width=6, range_width=6, blocks=1
     )
-    decoder = PixelDecoder(config, sensor, FEATURES)
+    decoder = PixelDecoder(config, sensor, features)
     for weight in decoder.parameters():
         weight.data = spread * torch.randn_like(weight)
     return decoder.eval()
@@ -63,22 +65,22 @@ def repeated(decoded: Decoded, times: int) -> Decoded:
     return Decoded(range_m, logits, decoded.sensor, features=features)
 
 
-@pytest.mark.parametrize("cell", [2, 4, 8])
-def test_phases_cover_every_pixel_once(cell: int) -> None:
-    phases, count = phases_of(cell), torch.zeros(1, 16, 32)
+@pytest.mark.parametrize(("cell", "halvings"), [(2, 0), (4, 0), (8, 0), (4, 2)])
+def test_phases_cover_every_pixel_once(cell: int, halvings: int) -> None:
+    phases, count = phases_of(cell, halvings), torch.zeros(1, 16, 32)
     for phase in phases:
         count[(..., *phase.pixels)] += 1
     assert torch.equal(count, torch.ones_like(count))
-    assert len(phases) == 1 + 3 * int(math.log2(cell))
+    assert len(phases) == 1 + 3 * int(math.log2(cell)) + 2 * halvings
     assert [int(generated_before(phase).sum()) for phase in phases[:4]] == [0, 1, 2, 3]
+    assert [int(generated_before(phase).sum()) for phase in phases[len(phases) - 2 * halvings :]] == [2, 3] * halvings
 
 
-def test_joining_phases_undoes_taking_them_apart() -> None:
-    image = torch.randn(3, 16, 32)
-    joined = None
-    for spacing in (4, 2, 1):
-        of_spacing = [phase for phase in phases_of(8) if phase.spacing == spacing]
-        joined = join_phases(joined, at_phases(image, of_spacing))
+@pytest.mark.parametrize("halvings", [0, 2])
+def test_joining_phases_undoes_taking_them_apart(halvings: int) -> None:
+    image, joined, phases = torch.randn(3, 16, 64), None, phases_of(8, halvings)
+    for lattice in dict.fromkeys(phase.lattice for phase in phases):
+        joined = join_phases(joined, at_phases(image, [phase for phase in phases if phase.lattice == lattice]))
     assert joined is not None
     assert torch.equal(joined, image)
 
@@ -125,13 +127,14 @@ def independent_masks(probability: Tensor, masks: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("cell", [2, 8])
-def test_a_phase_knows_of_earlier_pixels_only(cell: int) -> None:
+@pytest.mark.parametrize(("cell", "halvings", "features"), [(2, 0, FEATURES), (8, 0, FEATURES), (4, 2, 0)])
+def test_a_phase_knows_of_earlier_pixels_only(cell: int, halvings: int, features: int) -> None:
     sensor = tiny_sensor(8, 16)
-    decoder, decoded = random_decoder(sensor, cell), random_decoded(sensor, 2)
+    decoder = random_decoder(sensor, cell, halvings=halvings, features=features)
+    decoded = random_decoded(sensor, 2) if features else None
     truth, other = random_images(sensor, 2), random_images(sensor, 2, seed=3)
     nll = decoder(decoded, truth)
-    phases = phases_of(cell)
+    phases = phases_of(cell, halvings)
     for number, phase in enumerate(phases):
         later = torch.ones(8, 16, dtype=torch.bool)
         for earlier in phases[: number + 1]:
@@ -158,7 +161,7 @@ def test_a_range_is_as_likely_as_a_loop_over_components_says() -> None:
     for phase in decoder.range.phases:
         candidates = decoder.range.candidates([phase], guide, images.return_mask, v)
         output = decoder.range.outputs([phase], guided, guide, images.return_mask, v)
-        mixture = decoder.range.mixture([phase], output, candidates, guide)
+        mixture = decoder.range.mixture(output, candidates)
         rows, columns = torch.arange(4)[phase.pixels[0]].tolist(), torch.arange(8)[phase.pixels[1]].tolist()
         for (i, row), (j, column) in product(enumerate(rows), enumerate(columns)):
             if not images.return_mask[0, row, column]:
@@ -321,7 +324,7 @@ def test_bits_of_a_return_are_those_of_a_centimetre() -> None:
 
 
 def test_an_image_that_cells_do_not_divide_is_refused() -> None:
-    with pytest.raises(ConfigError, match="coarsest_cell that divides both sides"):
+    with pytest.raises(ConfigError, match="cells that divide both sides"):
         PixelDecoder(PixelDecoderConfig(), tiny_sensor(12, 16), FEATURES)
     with pytest.raises(ConfigError, match="a power of 2"):
         PixelDecoderConfig(coarsest_cell=6)

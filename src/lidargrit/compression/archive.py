@@ -1,68 +1,192 @@
 """Compressed scans in one file: a header, the scans one after the other, and an index that finds each of them.
 
-The file begins with ``LGZ1``, the length of the header and its CRC-32. It ends with the offset of the index, the CRC-32
-of the index, and ``1ZGL``. Numbers have 32 bits, the offset 64, the lowest byte first. Header and index are JSON, the
-index compressed by zlib. Each scan has a CRC-32 in the index, and the scans lie without gaps: a file that was cut off,
-or of which one byte was altered, is refused.
+The file begins with ``LGZ2``, the length of the header and its CRC-32. It ends with the offset of the index, the CRC-32
+of the index, and ``2ZGL``. Numbers have 32 bits, the offset 64, the lowest byte first. The header is JSON. The index is
+compressed by zlib and has one line of JSON for each scan: name, number of bytes, their CRC-32, number of returns. The
+scans lie without gaps, and one that was left out has no bytes. A file that was cut off, or of which one byte was
+altered, is refused.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import struct
 import zlib
+from array import array
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
-from lidargrit.errors import ScanError
+import numpy as np
+
+from lidargrit.errors import LidarGritError, OutputError, ScanError
+from lidargrit.files import claim_folder
 from lidargrit.formats import open_file
 from lidargrit.untrusted import JSON_BYTES_AT_MOST, parse_json
 
 _WANTED = "a file that lidargrit compress wrote"
-_MAGIC, _END = b"LGZ1", b"1ZGL"
+UNFINISHED = ".unfinished"  # ending of the folder beside the file, in which it is written
+_MAGIC, _END = b"LGZ2", b"2ZGL"
 _START = struct.Struct("<4sII")
 _TAIL = struct.Struct("<QI4s")
+_INDEX_BYTES_AT_MOST = 256 * 2**20  # of the index's lines: those of a million scans take 50 MB
+_CHUNK = 2**20
 
 
 class Entry(NamedTuple):
-    """The part of the file that holds one scan.
+    """A line of the index.
 
     Args:
         name: name of the scan.
-        offset: position of the scan's first byte in the file.
-        length: number of bytes of the scan.
+        length: number of bytes of the scan; 0 for one that was left out.
         crc32: CRC-32 checksum of these bytes.
+        num_returns: number of returns of the scan.
     """
 
     name: str
-    offset: int
     length: int
     crc32: int
+    num_returns: int
+
+    @classmethod
+    def parse(cls, line: bytes) -> Entry:
+        """Parse a line; raises ScanError, TypeError or ValueError if it is none."""
+        name, length, crc32, num_returns = parse_json(line, "a line of the index", list, ScanError)
+        if not (isinstance(name, str) and all(isinstance(each, int) for each in (length, crc32, num_returns))):
+            raise ValueError
+        if length < 0:
+            raise ValueError
+        return cls(name, length, crc32, num_returns)
+
+
+@contextmanager
+def writing(path: Path, header: dict[str, Any]) -> Iterator[ArchiveWriter]:
+    """Give a writer of a file that appears when the block has ended well; if it was interrupted, the next goes on.
+
+    Until then scans lie in a folder beside the file, named as the file with ``.unfinished``.
+
+    Args:
+        path: file to write.
+        header: facts that all scans have in common, as JSON.
+
+    Raises:
+        OutputError: the folder cannot be written to, another process is writing, or an unfinished file has another
+            header.
+    """
+    folder = path.with_name(path.name + UNFINISHED)
+    scans, index = folder / "scans", folder / "index"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with claim_folder(folder), scans.open("a+b") as scans_file, index.open("a+b") as index_file:
+            writer = ArchiveWriter(scans_file, index_file, header, folder)
+            try:
+                yield writer
+                writer.close()
+                scans.replace(path)
+                index.unlink()
+            finally:
+                if index.exists() and scans.stat().st_size <= writer.num_header_bytes:  # nothing to go on with
+                    scans.unlink()
+                    index.unlink()
+    except OSError as error:
+        told = f"'{error.strerror or error}' while writing {path}"
+        cure = "free some space; the same command goes on"
+        raise OutputError(told, "a folder with room that may be written to", cure) from error
+    finally:
+        with suppress(OSError):
+            folder.rmdir()  # unless it holds what the next command goes on with
 
 
 class ArchiveWriter:
-    """Writes a file of compressed scans, one by one; without :meth:`close` it is one that was cut off.
+    """Writes a file of compressed scans, one by one, and keeps nothing of them in memory.
 
     Args:
-        file: file that is open to be written.
+        scans: file of the header and the scans, open to be read and appended to.
+        index: file of the lines of the index, open to be read and appended to.
         header: facts that all scans have in common, as JSON.
+        folder: folder of the two files, for messages.
+
+    Raises:
+        OutputError: the files hold scans of another header.
     """
 
-    def __init__(self, file: BinaryIO, header: dict[str, Any]) -> None:
-        self._file, self._entries = file, list[Entry]()
+    def __init__(self, scans: BinaryIO, index: BinaryIO, header: dict[str, Any], folder: Path) -> None:
+        self._scans, self._index, self._folder = scans, index, folder
+        self.num_scans = self.num_returns = self.num_names = 0
         text = json.dumps(header, sort_keys=True).encode()
-        self._offset = file.write(_START.pack(_MAGIC, len(text), zlib.crc32(text))) + file.write(text)
+        self._start = _START.pack(_MAGIC, len(text), zlib.crc32(text)) + text
+        self._offset = self.num_header_bytes = len(self._start)
+        self._scans.seek(0)
+        there = self._scans.read(len(self._start))
+        if there != self._start[: len(there)]:
+            raise self._of_others("scans of another model, step or version")
+        if not there:
+            self._scans.write(self._start)
 
-    def add(self, name: str, compressed: bytes) -> None:
-        """Write one scan."""
-        self._entries.append(Entry(name, self._offset, len(compressed), zlib.crc32(compressed)))
-        self._offset += self._file.write(compressed)
+    def go_on(self, names: Iterator[str]) -> int:
+        """Keep the scans of an unfinished file, up to one that was not written whole, and return their number.
 
-    def close(self) -> int:
-        """Write the index, and return the size of the whole file in bytes."""
-        index = zlib.compress(json.dumps([list(entry) for entry in self._entries]).encode(), 9)
-        self._file.write(index)
-        return self._offset + len(index) + self._file.write(_TAIL.pack(self._offset, zlib.crc32(index), _END))
+        Args:
+            names: names of the scans that are to be written.
+
+        Raises:
+            OutputError: the unfinished file holds other scans.
+        """
+        self._scans.seek(len(self._start))
+        self._index.seek(0)
+        end = 0
+        for line in self._index:
+            try:
+                entry = Entry.parse(line)
+            except (LidarGritError, TypeError, ValueError):
+                break
+            compressed = self._scans.read(entry.length)
+            if not line.endswith(b"\n") or len(compressed) != entry.length or zlib.crc32(compressed) != entry.crc32:
+                break
+            if entry.name != next(names, None):
+                raise self._of_others(f"the scan {entry.name}, which is not the next of these")
+            end += len(line)
+            self._count(entry)
+        self._index.truncate(end)
+        self._scans.truncate(self._offset)
+        self._scans.seek(0, 2)
+        return self.num_names
+
+    def add(self, name: str, compressed: bytes, num_returns: int) -> None:
+        """Write one scan; without bytes, that it was left out."""
+        entry = Entry(name, len(compressed), zlib.crc32(compressed), num_returns)
+        self._scans.write(compressed)
+        self._scans.flush()
+        self._index.write(json.dumps(entry).encode() + b"\n")
+        self._index.flush()
+        self._count(entry)
+
+    def close(self) -> None:
+        """Write the index, after which the file is whole."""
+        self._index.seek(0)
+        packer, crc32 = zlib.compressobj(9), 0
+        while chunk := self._index.read(_CHUNK):
+            crc32 = self._append(packer.compress(chunk), crc32)
+        crc32 = self._append(packer.flush(), crc32)
+        self._scans.write(_TAIL.pack(self._offset, crc32, _END))
+        self._scans.flush()
+        os.fsync(self._scans.fileno())
+
+    def _append(self, packed: bytes, crc32: int) -> int:
+        self._scans.write(packed)
+        return zlib.crc32(packed, crc32)
+
+    def _count(self, entry: Entry) -> None:
+        self._offset += entry.length
+        self.num_names += 1
+        self.num_scans += entry.length > 0
+        self.num_returns += entry.num_returns
+
+    def _of_others(self, held: str) -> OutputError:
+        got = f"{self._folder}, an unfinished file with {held}"
+        return OutputError(got, "the command that began it", "give that command again, or remove the folder")
 
 
 class Archive:
@@ -76,21 +200,27 @@ class Archive:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        self.path, self.names = path, list[str]()
+        lengths, crc32s = array("Q"), array("Q")
         with open_file(path, _WANTED) as file:
             size = file.seek(0, 2)
             start, header, begins = self._header(file, size)
             self.header = parse_json(header, str(path), dict, ScanError)
-            self.entries, end = self._index(file, size)
-        for entry in self.entries:
-            if entry.offset != begins or entry.length < 0:
-                raise self._damaged()
-            begins += entry.length
-        if begins != end or start != _MAGIC:
+            index, scans_end = self._index(file, size)
+        for entry in self._entries(index):
+            if entry.length:
+                self.names.append(entry.name)
+                lengths.append(entry.length)
+                crc32s.append(entry.crc32)
+        if len(set(self.names)) < len(self.names):  # two scans would be one file
+            raise self._damaged()
+        self._ends = begins + np.cumsum(np.frombuffer(lengths, dtype=np.uint64), dtype=np.uint64)
+        self._begins, self._crc32s = begins, crc32s
+        if (int(self._ends[-1]) if len(self) else begins) != scans_end or start != _MAGIC:
             raise self._damaged()
 
     def __len__(self) -> int:
-        return len(self.entries)
+        return len(self.names)
 
     def read(self, index: int) -> bytes:
         """Return the bytes of one scan.
@@ -98,11 +228,11 @@ class Archive:
         Raises:
             ScanError: altered bytes.
         """
-        entry = self.entries[index]
+        begins, ends = int(self._ends[index - 1]) if index else self._begins, int(self._ends[index])
         with open_file(self.path, _WANTED) as file:
-            file.seek(entry.offset)
-            compressed = file.read(entry.length)
-        if len(compressed) != entry.length or zlib.crc32(compressed) != entry.crc32:
+            file.seek(begins)
+            compressed = file.read(ends - begins)
+        if len(compressed) != ends - begins or zlib.crc32(compressed) != self._crc32s[index]:
             raise self._damaged()
         return compressed
 
@@ -123,28 +253,31 @@ class Archive:
             raise self._damaged()
         return magic, header, _START.size + length
 
-    def _index(self, file: BinaryIO, size: int) -> tuple[list[Entry], int]:
+    def _index(self, file: BinaryIO, size: int) -> tuple[bytes, int]:
+        """Return the compressed index, and where in the file it begins."""
         file.seek(size - _TAIL.size)
         offset, crc32, end = _TAIL.unpack(file.read(_TAIL.size))
         if end != _END or not offset <= size - _TAIL.size:
             raise self._damaged()
         file.seek(offset)
-        packed = file.read(min(size - _TAIL.size - offset, JSON_BYTES_AT_MOST))
+        packed = file.read(size - _TAIL.size - offset)
         if zlib.crc32(packed) != crc32:
             raise self._damaged()
-        opened = zlib.decompressobj()
+        return packed, offset
+
+    def _entries(self, packed: bytes) -> Iterator[Entry]:
+        opened, rest, total = zlib.decompressobj(), b"", 0
         try:
-            text = opened.decompress(packed, JSON_BYTES_AT_MOST)
-        except zlib.error:
+            while not opened.eof:
+                text = opened.decompress(packed, _CHUNK)
+                packed, total = opened.unconsumed_tail, total + len(text)
+                *lines, rest = (rest + text).split(b"\n")
+                for line in lines:
+                    yield Entry.parse(line)
+                if total > _INDEX_BYTES_AT_MOST or not (text or opened.eof):
+                    raise ValueError
+        except (zlib.error, ScanError, TypeError, ValueError):
             raise self._damaged() from None
-        rows = parse_json(text, f"the index of {self.path}", list, ScanError)
-        try:
-            entries = [Entry(str(name), int(at), int(length), int(crc)) for name, at, length, crc in rows]
-        except (TypeError, ValueError):
-            raise self._damaged() from None
-        if len({entry.name for entry in entries}) < len(entries):  # two scans would be one file
-            raise self._damaged()
-        return entries, offset
 
     def _damaged(self) -> ScanError:
         got = f"{self.path}, which was cut off or altered (its checksums do not hold)"

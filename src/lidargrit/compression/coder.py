@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import importlib
 from abc import ABC, abstractmethod
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
+from lidargrit.compression.rounding import ATTEMPTS, Rounding, TooNearABorderError
 from lidargrit.compression.step_mixture import StepMixture
 from lidargrit.errors import ConfigError, ScanError
 
 ONE = 1 << 16  # probabilities are counted in 65,536ths, and are never 0 or 1
+_SHIFTED = np.array([ONE // 100])  # probability that borders are shifted, in one phase of a scan
+RoundedT = TypeVar("RoundedT")
 
 
 def range_coding() -> Any:
@@ -46,6 +50,14 @@ class Coder(ABC):
         """
         share = np.clip(probability, 1, ONE - 1).astype(np.float32) / np.float32(ONE)  # exact in 32 bits
         return self._pass(self._model.Bernoulli(perfect=False), outcome, share) if len(share) else share > 1
+
+    @abstractmethod
+    def rounded(self, by: Callable[[Rounding], RoundedT]) -> RoundedT:
+        """Return numbers, rounded with borders that are coded or decoded before.
+
+        Args:
+            by: function that rounds; it raises :class:`TooNearABorderError` if roundings are checked.
+        """
 
     def uniform(self, count: int, size: int, numbers: Int64[np.ndarray, " n"] | None) -> Int64[np.ndarray, " n"]:
         """Code or decode ``count`` numbers below ``size``, each as likely as another."""
@@ -112,6 +124,22 @@ class Encoder(Coder):
         """Return what was written, in the byte order of little-endian machines."""
         return self._encoder.get_compressed().astype("<u4").tobytes()
 
+    def rounded(self, by: Callable[[Rounding], RoundedT]) -> RoundedT:
+        """Code the first attempt in which no number lies near a border.
+
+        Raises:
+            ScanError: there is none.
+        """
+        for attempt in range(ATTEMPTS):
+            try:
+                found = by(Rounding(attempt, checked=True))
+            except TooNearABorderError:
+                continue
+            if self.decisions(_SHIFTED, np.array([attempt > 0]))[0]:
+                self.uniform(1, ATTEMPTS, np.array([attempt]))
+            return found
+        raise ScanError("a scan whose numbers lie at borders in every attempt", "another", "report it as a fault")
+
     def _pass(self, family: Any, outcome: Bool[np.ndarray, " n"] | None, share: np.ndarray) -> Bool[np.ndarray, " n"]:
         assert outcome is not None
         self._encoder.encode(outcome.astype(np.int32), family, share)
@@ -133,6 +161,11 @@ class Decoder(Coder):
     def __init__(self, words: bytes) -> None:
         super().__init__()
         self._decoder = self._queue.RangeDecoder(np.frombuffer(words, dtype="<u4").astype(np.uint32))
+
+    def rounded(self, by: Callable[[Rounding], RoundedT]) -> RoundedT:
+        """Decode the attempt, and round without checks."""
+        shifted = bool(self.decisions(_SHIFTED, None)[0])
+        return by(Rounding(int(self.uniform(1, ATTEMPTS, None)[0]) if shifted else 0, checked=False))
 
     def _pass(self, family: Any, outcome: Bool[np.ndarray, " n"] | None, share: np.ndarray) -> Bool[np.ndarray, " n"]:
         return self._read(family, share).astype(bool)

@@ -12,7 +12,7 @@ import torch
 
 from lidargrit import __version__
 from lidargrit.completion.inputs import ScanReader, open_inputs
-from lidargrit.compression.archive import Archive, ArchiveWriter
+from lidargrit.compression.archive import Archive, writing
 from lidargrit.compression.coder import not_reproduced
 from lidargrit.compression.scan_codec import ScanCodec
 from lidargrit.errors import CheckpointError, DataError, ScanError, UsageError
@@ -55,7 +55,7 @@ def compress_scans(
 
     Args:
         source: a file, a folder or another source of scans, samples, prepared scans, or range images as ``.npy``.
-        out: file to write, which appears when it is whole.
+        out: file to write, which appears when it is whole; the same command goes on with one that was interrupted.
         model: run with a pixel decoder; scans are projected with its sensor, in the way of its training.
         step_mm: step in millimetres that ranges are rounded to.
         config: number of scans, and what to do with unusable points and scans.
@@ -64,29 +64,29 @@ def compress_scans(
     Raises:
         ConfigError: a model without a pixel decoder, a step that is not one, or no range coder.
         DataError: no usable scan.
+        OutputError: an unfinished file of another command, or one that cannot be written.
         ScanError: a scan that cannot be used.
     """
     codec = ScanCodec(load(model), step_mm)
     variant = "reference" if projection_of(locate(model)) == "reference" else "exact"
     inputs = open_inputs(source, ScanReader(codec.sensor, variant), config)
-    scans = returns = 0
-    with atomic_path(out) as unfinished, unfinished.open("wb") as file:
-        writer = ArchiveWriter(file, _header(codec, model))
-        with reporter.progress("compressing", len(inputs)) as progress:
-            for index in range(len(inputs)):
+    with writing(out, _header(codec, model)) as writer:
+        done = writer.go_on(inputs.name(index) for index in range(len(inputs)))
+        with reporter.progress("compressing", len(inputs), done) as progress:
+            for index in range(done, len(inputs)):
                 try:
                     image = inputs.read(index).image
                 except ScanError as error:
                     if config.bad_scans == "refuse":
                         raise
                     reporter.message(f"left out: {error}")
+                    writer.add(inputs.name(index), b"", 0)
                 else:
-                    writer.add(inputs.name(index), codec.compress(image))
-                    scans, returns = scans + 1, returns + int(image.return_mask.sum())
+                    writer.add(inputs.name(index), codec.compress(image), int(image.return_mask.sum()))
                 progress.advance(1)
-        if not scans:
+        if not writer.num_scans:
             raise DataError(f"no usable scan in {source}", "at least one", "see the messages above")
-        return Compressed(scans, returns, writer.close())
+    return Compressed(writer.num_scans, writer.num_returns, out.stat().st_size)
 
 
 def decompress_scans(path: Path, out: Path, model: str, kind: str, chosen: Sequence[int], reporter: Reporter) -> int:
@@ -114,8 +114,8 @@ def decompress_scans(path: Path, out: Path, model: str, kind: str, chosen: Seque
     archive.check()
     codec = _codec_of(archive, model)
     form, suffix = (None, ".npy") if kind == IMAGE else writable_format(kind)
-    files = {index: archive.entries[index].name + suffix for index in chosen or range(len(archive))}
-    scans = {file: archive.entries[index].name for index, file in files.items()}
+    files = {index: archive.names[index] + suffix for index in chosen or range(len(archive))}
+    scans = {file: archive.names[index] for index, file in files.items()}
     missing = [index for index, file in files.items() if not (out / file).exists()]
     with claim_folder(out):
         facts = {"source": path.name, "step_mm": codec.steps.step_mm, "format": kind}

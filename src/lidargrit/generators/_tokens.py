@@ -77,7 +77,7 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
     def objective(self, stage: str) -> Objective:
         """Return the tokenizer itself, or the objective of a network over the frozen tokenizer."""
         if stage == "pixels" and self.pixels is not None:
-            return PixelObjective(self.tokenizer, self.pixels)
+            return PixelObjective(self.pixels, self.tokenizer)
         return self.tokenizer if stage == "tokenizer" else self.transformer_objective()
 
     @classmethod
@@ -217,21 +217,28 @@ class TokenObjective(Objective):
 
 
 class PixelObjective(Objective):
-    """Objective of a pixel decoder over a frozen tokenizer: negative log-likelihood of the pixels given the tokens."""
+    """Objective of a pixel decoder: negative log-likelihood of the pixels, given the tokens of a tokenizer if any.
 
-    def __init__(self, tokenizer: Tokenizer, pixels: PixelDecoder) -> None:
-        super().__init__(tokenizer.sensor)
+    Args:
+        pixels: the pixel decoder.
+        tokenizer: the frozen tokenizer; None for a pixel decoder without tokens.
+    """
+
+    def __init__(self, pixels: PixelDecoder, tokenizer: Tokenizer | None = None) -> None:
+        super().__init__(pixels.sensor)
         self.pixels = pixels
-        self._frozen = [tokenizer.eval().requires_grad_(False)]  # in a list: its weights are not this stage's
+        # in a list: its weights are not this stage's
+        self._frozen = [] if tokenizer is None else [tokenizer.eval().requires_grad_(False)]
 
     def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the nats of the mask a pixel and of the range a return, together and apart, the latter in bits.
 
         In training some phases of each scan stand for all; in validation all are counted.
         """
-        with torch.no_grad():
-            tokenizer = self._frozen[0].to(images.range_m.device)
-            decoded = tokenizer.decode(tokenizer.encode(images))
+        decoded = None
+        for tokenizer in self._frozen:
+            with torch.no_grad():
+                decoded = tokenizer.to(images.range_m.device).decode(tokenizer.encode(images))
         if self.training:
             mask_nats, range_nats = self.pixels.estimate(decoded, images, rng)
         else:

@@ -15,12 +15,14 @@ from torch import Tensor, nn
 from lidargrit.conditions import Condition
 from lidargrit.errors import ConfigError
 from lidargrit.nn.pixel_networks import Guide, MaskNetwork, PixelDecoderConfig, RangeNetwork
-from lidargrit.nn.pixel_phases import Phase, at_phases, join_phases
+from lidargrit.nn.pixel_phases import Lattice, Phase, at_phases, join_phases
 from lidargrit.nn.range_steps import RangeSteps
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import Decoded, RangeImage
 
-_Guided = tuple[dict[int, Tensor], dict[int, Tensor]]  # by spacing: the guide's part of the first layers, of both
+_Guided = tuple[
+    dict[Lattice, Tensor], dict[Lattice, Tensor]
+]  # by lattice: the guide's part of the first layers, of both
 
 BITS_STEP_M = 0.01  # bits of a return are those of naming its range to a centimetre
 
@@ -74,7 +76,7 @@ class PixelDecoder(nn.Module):
     Args:
         config: sizes of the networks.
         sensor: sensor with the rays and limits of the range images.
-        features: number of channels of the tokenizer's features.
+        features: number of channels of the tokenizer's features; 0 for a decoder without a tokenizer.
 
     Source:
         Reed et al., Parallel Multiscale Autoregressive Density Estimation, 2017: phases from coarse to fine.
@@ -82,64 +84,68 @@ class PixelDecoder(nn.Module):
 
     def __init__(self, config: PixelDecoderConfig, sensor: SensorModel, features: int) -> None:
         super().__init__()
-        cell = config.coarsest_cell
-        if sensor.height % cell or sensor.width % cell:
+        rows, columns = config.coarsest_cell, config.coarsest_cell * 2**config.column_halvings
+        if sensor.height % rows or sensor.width % columns:
             raise ConfigError(
-                f"range images of {sensor.height}x{sensor.width} for a pixel decoder of coarsest_cell={cell}",
-                "a coarsest_cell that divides both sides",
-                "lower coarsest_cell, or choose another number of columns",
+                f"range images of {sensor.height}x{sensor.width} for a pixel decoder of cells of {rows}x{columns}",
+                "cells that divide both sides",
+                "lower coarsest_cell or column_halvings, or choose another number of columns",
             )
         self.config, self.sensor = config, sensor
         self.mask, self.range = MaskNetwork(config, sensor, features), RangeNetwork(config, sensor, features)
 
-    def forward(self, decoded: Decoded, images: RangeImage, steps: RangeSteps | None = None) -> PixelNll:
+    def forward(self, decoded: Decoded | None, images: RangeImage, steps: RangeSteps | None = None) -> PixelNll:
         """Return the exact negative log-likelihood of every pixel, given what was decoded from the tokens.
 
         Args:
-            decoded: output of the tokenizer's decoder.
+            decoded: output of the tokenizer's decoder; None without a tokenizer.
             images: range images, rounded to the steps if there are any.
             steps: steps whose probability is the likelihood of a range; without them it is a density per metre.
         """
-        guide = Guide.of(decoded)
+        guide = self.guide(decoded, len(images))
         guided = self.mask.guided(guide), self.range.guided(guide)
         mask_nll, range_nll = None, None  # of the pixels of a lattice, from the coarsest to the whole image
-        for phases in self.mask.by_spacing():
+        for phases in self.mask.by_lattice():
             of_mask, of_range = self._nll(phases, guided, guide, images, steps)
             mask_nll, range_nll = join_phases(mask_nll, of_mask), join_phases(range_nll, of_range)
         assert mask_nll is not None
         assert range_nll is not None
         return PixelNll(mask_nll, range_nll)
 
-    def expected(self, decoded: Decoded, images: RangeImage, steps: RangeSteps) -> PixelNll:
+    def guide(self, decoded: Decoded | None, count: int) -> Guide:
+        """Return what the networks are told of every pixel of a number of scans before the first phase."""
+        return Guide.nothing(self.mask.rows, count, self.sensor) if decoded is None else Guide.of(decoded)
+
+    def expected(self, decoded: Decoded | None, images: RangeImage, steps: RangeSteps) -> PixelNll:
         """Return the expected value of :meth:`forward` for each pixel (its entropy), given the earlier ones."""
-        guide = Guide.of(decoded)
+        guide = self.guide(decoded, len(images))
         guided = self.mask.guided(guide), self.range.guided(guide)
         mask, v = images.return_mask, images.range_m.log1p()
         mask_nats, range_nats = None, None
-        for phases in self.mask.by_spacing():
+        for phases in self.mask.by_lattice():
             logits = self.mask.logits(phases, self.mask.outputs(phases, guided[0], guide, mask, v), guide)
             # H(p) = ln(1 + e^z) - z p of the logit z
             mask_nats = join_phases(mask_nats, F.softplus(logits) - logits * logits.sigmoid())
             candidates = self.range.candidates(phases, guide, mask, v)
             output = self.range.outputs(phases, guided[1], guide, mask, v)
-            entropy = self.range.mixture(phases, output, candidates, guide).entropy(steps)
+            entropy = self.range.mixture(output, candidates).entropy(steps)
             range_nats = join_phases(range_nats, torch.where(at_phases(mask, phases), entropy, 0.0))
         assert mask_nats is not None
         assert range_nats is not None
         return PixelNll(mask_nats, range_nats)
 
     def estimate(
-        self, decoded: Decoded, images: RangeImage, rng: torch.Generator
+        self, decoded: Decoded | None, images: RangeImage, rng: torch.Generator
     ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-        """Return the mean nats of the mask a pixel and of the range a return, estimated by one phase of each spacing.
+        """Return the mean nats of the mask a pixel and of the range a return, estimated by one phase of each lattice.
 
         A step of training costs a third, and so there are three times as many. The estimate of the mask is unbiased.
         """
-        guide = Guide.of(decoded)
+        guide = self.guide(decoded, len(images))
         guided = self.mask.guided(guide), self.range.guided(guide)
         mask_nats, range_nats = guide.v.new_zeros(()), guide.v.new_zeros(())
         returns = guide.v.new_zeros(())
-        for phases in self.mask.by_spacing():
+        for phases in self.mask.by_lattice():
             index = torch.randint(len(phases), (), generator=rng, device=rng.device)
             chosen = [phases[0 if index.is_meta else int(index)]]  # all take as many operations, if these are counted
             of_mask, of_range = self._nll(chosen, guided, guide, images)
@@ -160,7 +166,7 @@ class PixelDecoder(nn.Module):
     def _nll(
         self, phases: list[Phase], guided: _Guided, guide: Guide, images: RangeImage, steps: RangeSteps | None = None
     ) -> tuple[Float[Tensor, "P B h w"], Float[Tensor, "P B h w"]]:
-        """Return the negative log-likelihood of mask and range at phases of one spacing."""
+        """Return the negative log-likelihood of mask and range at phases of one lattice."""
         mask, v = images.return_mask, images.range_m.log1p()
         returned = at_phases(mask, phases)
         logits = self.mask.logits(phases, self.mask.outputs(phases, guided[0], guide, mask, v), guide)
@@ -169,7 +175,7 @@ class PixelDecoder(nn.Module):
         output = self.range.outputs(phases, guided[1], guide, mask, v)
         # Where nothing returned, any range within the limits stands in: its likelihood is not used.
         range_m = torch.where(returned, at_phases(images.range_m, phases), self.sensor.range_min_m)
-        mixture = self.range.mixture(phases, output, candidates, guide)
+        mixture = self.range.mixture(output, candidates)
         if steps is None:
             likelihood = mixture.log_density(range_m)
         else:
@@ -178,7 +184,7 @@ class PixelDecoder(nn.Module):
 
     def sample(
         self,
-        decoded: Decoded,
+        decoded: Decoded | None,
         rngs: Sequence[torch.Generator],
         sampling: PixelSampling | None = None,
         condition: Condition | None = None,
@@ -186,13 +192,13 @@ class PixelDecoder(nn.Module):
         """Return one scan for each random generator; a scan does not depend on the others of its batch.
 
         Args:
-            decoded: output of the tokenizer's decoder for as many scans.
+            decoded: output of the tokenizer's decoder for as many scans; None without a tokenizer.
             rngs: random generators on the CPU, one for each scan.
             sampling: settings of the sampling of ranges.
             condition: observed part of the scans; nothing if not given. Observed returns and ranges are kept as they
                 are when their phase comes: later phases know of them, earlier ones do not.
         """
-        guide, size = Guide.of(decoded), (3, self.sensor.height, self.sensor.width)
+        guide, size = self.guide(decoded, len(rngs)), (3, self.sensor.height, self.sensor.width)
         uniform = torch.stack([torch.rand(size, generator=rng) for rng in rngs]).to(guide.v.device)
         condition = (condition or Condition.nothing(self.sensor, len(rngs))).to(guide.v.device)
         # One scan after the other on a CPU: with other batch sizes its sums have other rounding errors.
@@ -203,7 +209,7 @@ class PixelDecoder(nn.Module):
             some = guide.part(part)
             mask = self.mask.sample(some, uniform[part, 0], condition[part])
             range_m = self._sample_range(some, uniform[part, 1:], mask, condition[part], sampling)
-            reflectance = None if decoded.reflectance is None else decoded.reflectance[part]
+            reflectance = None if decoded is None or decoded.reflectance is None else decoded.reflectance[part]
             images.append(RangeImage.masked(range_m, mask, self.sensor, reflectance))
         return RangeImage.cat(images)
 
@@ -222,7 +228,7 @@ class PixelDecoder(nn.Module):
             pixels = (..., *phase.pixels)
             candidates = self.range.candidates([phase], guide, mask, v)
             output = self.range.outputs([phase], guided, guide, mask, v)
-            mixture = self.range.mixture([phase], output, candidates, guide)
+            mixture = self.range.mixture(output, candidates)
             component, within = uniform[pixels].unbind(1)
             sampled = mixture.sample(component[None], within[None], choices.temperature, choices.noise)[0]
             sampled = torch.where(condition.range_observed[pixels], condition.range_m[pixels], sampled)

@@ -16,7 +16,7 @@ from lidargrit.conditions import Condition
 from lidargrit.errors import ConfigError
 from lidargrit.nn.blocks import Block, Network
 from lidargrit.nn.convolution import Convolution
-from lidargrit.nn.pixel_phases import Phase, at_phases, cells_of, generated_before, neighbours_of, phases_of
+from lidargrit.nn.pixel_phases import Lattice, Phase, at_phases, cells_of, generated_before, neighbours_of, phases_of
 from lidargrit.nn.precision import at_least_32_bits
 from lidargrit.nn.range_mixture import RangeMixture
 from lidargrit.sensors import SensorModel
@@ -36,8 +36,10 @@ class PixelDecoderConfig:
     Args:
         coarsest_cell: rows and columns of the cells of which the first phase generates one pixel each; a power of 2
             that divides both sides of the image.
-        mask_features: number of channels of the tokenizer's features that the mask network sees.
-        range_features: number of channels of the tokenizer's features that the range network sees.
+        column_halvings: number of halvings of the distance between columns alone, which come last, so that pixels know
+            of others in their own row; cells have as many columns as rows, times 2 for each.
+        mask_features: number of channels of the tokenizer's features that the mask network sees, if any.
+        range_features: number of channels of the tokenizer's features that the range network sees, if any.
         row_channels: number of learned values of every row.
         mask_width: number of channels of the mask network's layers.
         range_width: number of channels of the range network's layers.
@@ -47,6 +49,7 @@ class PixelDecoderConfig:
     """
 
     coarsest_cell: int = 8
+    column_halvings: int = 0
     mask_features: int = 12
     range_features: int = 12
     row_channels: int = 4
@@ -58,15 +61,16 @@ class PixelDecoderConfig:
     def __post_init__(self) -> None:
         phases_of(self.coarsest_cell)
         for name, value in vars(self).items():
-            if value < 1:
-                raise ConfigError(f"{name}={value}", "at least 1", "raise it")
+            least = 0 if name == "column_halvings" else 1
+            if value < least:
+                raise ConfigError(f"{name}={value}", f"at least {least}", "raise it")
 
 
 class Guide(NamedTuple):
-    """Output of a tokenizer's decoder for every pixel.
+    """Output of a tokenizer's decoder for every pixel; without a tokenizer, the same numbers for all pixels.
 
     Args:
-        features: features of the decoder's last layer.
+        features: features of the decoder's last layer; none without a tokenizer.
         v: ln(1 + decoded range in metres).
         return_logits: logits of the probability of a return, bounded.
         observed: True where it was observed whether there is a return; None if nothing was observed.
@@ -98,6 +102,12 @@ class Guide(NamedTuple):
         logits = at_least_32_bits(decoded.return_logits).clamp(-_LOGIT_BOUND, _LOGIT_BOUND)
         return cls(at_least_32_bits(decoded.features), at_least_32_bits(decoded.range_m).log1p(), logits)
 
+    @classmethod
+    def nothing(cls, like: Tensor, count: int, sensor: SensorModel) -> Guide:
+        """Return the guide of scans of which no token tells anything, as numbers of the type of another tensor."""
+        size = (count, sensor.height, sensor.width)
+        return cls(like.new_zeros(count, 0, *size[1:]), like.new_full(size, _TYPICAL_V), like.new_zeros(size))
+
 
 class Residual(Block):
     """Two convolutions whose sum with the input is the input at first."""
@@ -114,8 +124,8 @@ class Residual(Block):
         return x + self.conv2(F.silu(self.conv1(F.silu(x))))
 
 
-class _SpacingNetwork(Network):
-    """The network of all phases of one spacing, over cells of 2x2 pixels of the lattice.
+class _LatticeNetwork(Network):
+    """The network of all phases of one lattice, over cells of 2x2 pixels of the lattice.
 
     The part of the first layer that sees the guide is computed once for all phases.
     """
@@ -143,23 +153,28 @@ class _SpacingNetwork(Network):
 
 
 class PhaseNetwork(nn.Module, ABC):
-    """Base of the mask's and the range's network: a small network for each spacing, run anew for every phase."""
+    """Base of the mask's and the range's network: a small network for each lattice, run anew for every phase."""
 
     def __init__(
         self, config: PixelDecoderConfig, sensor: SensorModel, features: int, kept: int, width: int, outputs: int
     ) -> None:
         super().__init__()
-        self.phases, self.sensor = phases_of(config.coarsest_cell), sensor
-        self.features = nn.Conv2d(features, kept, 1)
+        self.phases, self.sensor = phases_of(config.coarsest_cell, config.column_halvings), sensor
+        self.guided_by_tokens = features > 0
+        kept = kept if features else 0
+        self.features = nn.Conv2d(features, kept, 1) if features else nn.Identity()
         self.rows = nn.Parameter(torch.zeros(config.row_channels, sensor.height))
         guide = 4 * (kept + config.row_channels + 2)
         self.networks = nn.ModuleDict()
-        for spacing in dict.fromkeys(phase.spacing for phase in self.phases):
-            count = len([phase for phase in self.phases if phase.spacing == spacing])
-            network = _SpacingNetwork(guide, self.context_channels, width, config.blocks, count, outputs)
-            self.networks[str(spacing)] = network
+        for phases in self.by_lattice():
+            context = self.context_channels(features > 0)
+            network = _LatticeNetwork(guide, context, width, config.blocks, len(phases), outputs)
+            self.networks[phases[0].lattice.name] = network
 
-    context_channels: int
+    @staticmethod
+    @abstractmethod
+    def context_channels(guided_by_tokens: bool) -> int:
+        """Return the number of channels of :meth:`context`."""
 
     @abstractmethod
     def context(
@@ -167,55 +182,59 @@ class PhaseNetwork(nn.Module, ABC):
     ) -> Float[Tensor, "B D h w"]:
         """Return the inputs that are known before a phase, on its cells; later pixels have no influence."""
 
-    def guided(self, guide: Guide) -> dict[int, Tensor]:
-        """Return the first layer's output for the guide, (B, C, h, w), by spacing, the same for all phases."""
+    def guided(self, guide: Guide) -> dict[Lattice, Tensor]:
+        """Return the first layer's output for the guide, (B, C, h, w), by lattice, the same for all phases."""
         rows = self.rows[None, :, :, None].expand(len(guide.v), -1, -1, guide.v.shape[-1])
         decoded = torch.stack((guide.v - _TYPICAL_V, guide.return_logits / 4), 1)
         maps = torch.cat((self.features(guide.features), rows, decoded), 1)
-        return {int(name): network.guide(cells_of(maps, int(name))) for name, network in self._networks()}
+        return {lattice: network.guide(cells_of(maps, lattice)) for lattice, network in self._networks()}
 
     def outputs(
         self,
         phases: list[Phase],
-        guided: dict[int, Tensor],
+        guided: dict[Lattice, Tensor],
         guide: Guide,
         return_mask: Bool[Tensor, "B H W"],
         v: Float[Tensor, "B H W"],
     ) -> Float[Tensor, "P B O h w"]:
-        """Return the network's outputs for consecutive phases of one spacing."""
-        spacing = phases[0].spacing
+        """Return the network's outputs for consecutive phases of one lattice."""
+        lattice = phases[0].lattice
         contexts = torch.stack([self.context(phase, guide, return_mask, v) for phase in phases])
-        first = [phase for phase in self.phases if phase.spacing == spacing].index(phases[0])
-        return self.networks[str(spacing)](guided[spacing], contexts, first)
+        first = [phase for phase in self.phases if phase.lattice == lattice].index(phases[0])
+        return self.networks[lattice.name](guided[lattice], contexts, first)
 
     def flops(self) -> int:
         """Return the floating-point operations of all phases of one scan: two for each multiplication and addition."""
         pixels = self.sensor.height * self.sensor.width
-        total = 2 * pixels * self.features.weight.numel()
-        for name, network in self._networks():
+        total = 2 * pixels * sum(weight.numel() for weight in self.features.parameters() if weight.ndim == 4)
+        for lattice, network in self._networks():
             once = network.guide.weight.numel() + sum(layer.get_parameter("weight").numel() for layer in network.out)
             each = sum(weight.numel() for weight in network.blocks.parameters() if weight.ndim == 4)
             each += network.context.weight.numel()
-            total += 2 * (pixels // (2 * int(name)) ** 2) * (once + len(network.out) * each)
+            total += 2 * (pixels // (4 * lattice.rows * lattice.columns)) * (once + len(network.out) * each)
         return total
 
-    def by_spacing(self) -> list[list[Phase]]:
-        """Return the phases, those of one spacing together."""
-        spacings = dict.fromkeys(phase.spacing for phase in self.phases)
-        return [[phase for phase in self.phases if phase.spacing == spacing] for spacing in spacings]
+    def by_lattice(self) -> list[list[Phase]]:
+        """Return the phases, those of one lattice together."""
+        lattices = dict.fromkeys(phase.lattice for phase in self.phases)
+        return [[phase for phase in self.phases if phase.lattice == lattice] for lattice in lattices]
 
-    def _networks(self) -> list[tuple[str, _SpacingNetwork]]:
-        return [(name, network) for name, network in self.networks.items() if isinstance(network, _SpacingNetwork)]
+    def _networks(self) -> list[tuple[Lattice, _LatticeNetwork]]:
+        networks = [(phases[0].lattice, self.networks[phases[0].lattice.name]) for phases in self.by_lattice()]
+        return [(lattice, network) for lattice, network in networks if isinstance(network, _LatticeNetwork)]
 
 
 class MaskNetwork(PhaseNetwork):
     """The logits of P(return), given which of the earlier pixels returned: a correction of the decoder's logits."""
 
-    context_channels = 4 * 2
-
     def __init__(self, config: PixelDecoderConfig, sensor: SensorModel, features: int) -> None:
         super().__init__(config, sensor, features, config.mask_features, config.mask_width, 1)
         self.row_bias = nn.Parameter(torch.zeros(sensor.height))
+
+    @staticmethod
+    def context_channels(guided_by_tokens: bool) -> int:
+        """Return 8: two maps of the four pixels of a cell."""
+        return 4 * 2
 
     @classmethod
     def behind(cls, features: int, width: int, sensor: SensorModel) -> MaskNetwork:
@@ -233,10 +252,10 @@ class MaskNetwork(PhaseNetwork):
         self, phase: Phase, guide: Guide, return_mask: Bool[Tensor, "B H W"], v: Float[Tensor, "B H W"]
     ) -> Float[Tensor, "B D h w"]:
         """Return for each pixel of a cell whether it is known to have returned, and whether it is known not to."""
-        returned = cells_of(return_mask[:, None].to(v.dtype), phase.spacing)
+        returned = cells_of(return_mask[:, None].to(v.dtype), phase.lattice)
         certain = generated_before(phase).to(returned)[:, None, None]
         if guide.observed is not None:
-            certain = torch.maximum(certain, cells_of(guide.observed[:, None].to(v.dtype), phase.spacing))
+            certain = torch.maximum(certain, cells_of(guide.observed[:, None].to(v.dtype), phase.lattice))
         return torch.cat((certain * returned, certain * (1 - returned)), 1)
 
     def sample(self, guide: Guide, uniform: Float[Tensor, "B H W"], condition: Condition) -> Bool[Tensor, "B H W"]:
@@ -257,7 +276,7 @@ class MaskNetwork(PhaseNetwork):
         return mask
 
     def logits(self, phases: list[Phase], output: Float[Tensor, "P B 1 h w"], guide: Guide) -> Float[Tensor, "P B h w"]:
-        """Return the logits of the pixels of phases of one spacing."""
+        """Return the logits of the pixels of phases of one lattice."""
         decoded = guide.return_logits + self.row_bias[:, None]
         return output[:, :, 0] + at_phases(decoded, phases)
 
@@ -269,10 +288,10 @@ class MaskNetwork(PhaseNetwork):
         Args:
             guide: output of a decoder for every pixel, and what is known before the first phase.
             returned: true masks.
-            rng: chooses one phase of each spacing, which stands for all; every phase is counted without it.
+            rng: chooses one phase of each lattice, which stands for all; every phase is counted without it.
         """
         guided, total = self.guided(guide), guide.v.new_zeros(len(returned))
-        for phases in self.by_spacing():
+        for phases in self.by_lattice():
             chosen = phases
             if rng is not None:
                 index = torch.randint(len(phases), (), generator=rng, device=rng.device)
@@ -289,9 +308,8 @@ class RangeNetwork(PhaseNetwork):
     """The distribution of a range, given the whole mask and the ranges of earlier pixels.
 
     Its components are free, or begin at what the neighbours suggest: at an edge the range may be that of either side.
+    Where no tokens tell what to expect of a pixel, the mean of its neighbours stands in.
     """
-
-    context_channels = 4 * 3 + _NEIGHBOURS + 3
 
     def __init__(self, config: PixelDecoderConfig, sensor: SensorModel, features: int) -> None:
         components = config.free_components + _NEIGHBOURS
@@ -309,56 +327,67 @@ class RangeNetwork(PhaseNetwork):
     begin_scale: Tensor
     elevation_rad: Tensor
 
+    @staticmethod
+    def context_channels(guided_by_tokens: bool) -> int:
+        """Return how many maps of the mask, of known ranges and of candidates there are, and of what is expected."""
+        return 4 * 3 + _NEIGHBOURS + 3 + (0 if guided_by_tokens else 1)
+
     def context(
         self, phase: Phase, guide: Guide, return_mask: Bool[Tensor, "B H W"], v: Float[Tensor, "B H W"]
     ) -> Float[Tensor, "B D h w"]:
         """Return the mask, the known ranges beside the decoded ones, and how far the candidates are apart."""
-        returned, beside = cells_of(torch.stack((return_mask.to(v.dtype), v - guide.v), 1), phase.spacing).chunk(2, 1)
-        generated = generated_before(phase).to(returned)[:, None, None] * returned
         candidates = self.candidates([phase], guide, return_mask, v)[0]
-        decoded = guide.v[(..., *phase.pixels)][:, None]
+        candidates, expected = candidates[:, :-1], candidates[:, -1:]
+        returned, beside = cells_of(torch.stack((return_mask.to(v.dtype), v - guide.v), 1), phase.lattice).chunk(2, 1)
+        generated = generated_before(phase).to(returned)[:, None, None] * returned
         first, second = candidates[:, 1:3], candidates[:, 4:6]
         apart = torch.cat((first.diff(dim=1), second.diff(dim=1), candidates[:, :1] - candidates[:, 3:4]), 1).abs()
         apart = ((apart + _SAME_SURFACE_V).log() + 5) / 2
-        return torch.cat((generated, 1 - returned, generated * beside, (candidates - decoded).clamp(-2, 2), apart), 1)
+        maps = [generated, 1 - returned, generated * beside, (candidates - expected).clamp(-2, 2), apart]
+        if not self.guided_by_tokens:
+            maps[2] = generated * (beside - (expected - _TYPICAL_V)).clamp(-2, 2)
+            maps.append(expected - _TYPICAL_V)
+        return torch.cat(maps, 1)
 
     def candidates(
         self, phases: list[Phase], guide: Guide, return_mask: Bool[Tensor, "B H W"], v: Float[Tensor, "B H W"]
-    ) -> Float[Tensor, "P B 6 h w"]:
+    ) -> Float[Tensor, "P B 7 h w"]:
         """Return ranges that the neighbours suggest, as ln(1 + range): for both pairs an interpolation, then the two.
 
-        One missing of a pair is taken to be as far as the other; where both are missing, as far as decoded.
+        The last is what is expected: the decoded range, or without tokens the mean of the neighbours. One missing of a
+        pair is taken to be as far as the other; where both are missing, as far as expected.
         """
         return torch.stack([self._candidates(phase, guide, return_mask, v) for phase in phases])
 
     def _candidates(
         self, phase: Phase, guide: Guide, return_mask: Bool[Tensor, "B H W"], v: Float[Tensor, "B H W"]
-    ) -> Float[Tensor, "B 6 h w"]:
+    ) -> Float[Tensor, "B 7 h w"]:
         near = neighbours_of(phase, v, return_mask)
-        decoded = guide.v[(..., *phase.pixels)]
+        expected = guide.v[(..., *phase.pixels)]
+        if not self.guided_by_tokens:
+            count, total = near.known.sum((1, 2)), torch.where(near.known, near.values, 0.0).sum((1, 2))
+            expected = torch.where(count > 0, total / count.clamp(min=1), expected)
         weights = self._weights(phase)
         found = []
         for pair, rows_apart in enumerate(near.rows_apart):
             (one, other), (has_one, has_other) = near.values[:, pair].unbind(1), near.known[:, pair].unbind(1)
-            one_or_other = torch.where(has_one, one, torch.where(has_other, other, decoded))
-            other_or_one = torch.where(has_other, other, torch.where(has_one, one, decoded))
+            one_or_other = torch.where(has_one, one, torch.where(has_other, other, expected))
+            other_or_one = torch.where(has_other, other, torch.where(has_one, one, expected))
             weight = weights if rows_apart else torch.full_like(weights, 0.5)
             # On a plane 1 / range is linear in the sines of the angles between the rays.
             inverse = weight[..., 0] / one_or_other.expm1() + weight[..., 1] / other_or_one.expm1()
             found += [inverse.reciprocal().log1p(), one_or_other, other_or_one]
-        return torch.stack(found, 1)
+        return torch.stack([*found, expected], 1)
 
     def mixture(
         self,
-        phases: list[Phase],
         output: Float[Tensor, "P B O h w"],
-        candidates: Float[Tensor, "P B 6 h w"],
-        guide: Guide,
+        candidates: Float[Tensor, "P B 7 h w"],
     ) -> RangeMixture:
-        """Return the distributions of the ranges of the pixels of phases of one spacing."""
+        """Return the distributions of the ranges of the pixels of phases of one lattice."""
         logits, moved, scales = output.chunk(3, 2)
-        free = at_phases(guide.v, phases)[:, :, None] + 2 * (moved + self.begin)[:, :, : self.free]
-        centres = torch.cat((free, candidates + 0.1 * moved[:, :, self.free :]), 2)
+        free = candidates[:, :, -1:] + 2 * (moved + self.begin)[:, :, : self.free]
+        centres = torch.cat((free, candidates[:, :, :-1] + 0.1 * moved[:, :, self.free :]), 2)
         low, high = (math.log1p(limit) for limit in self.limits_m)
         centres = centres.clamp(low, high)
         log_scales_m = (1.5 * (scales + self.begin_scale)).clamp(math.log(_FINEST_M), math.log(_COARSEST_M))
@@ -369,7 +398,7 @@ class RangeNetwork(PhaseNetwork):
     def _weights(self, phase: Phase) -> Float[Tensor, "h 1 2"]:
         """Return for each row of a phase the weights of 1 / range in the row above and in the row below."""
         rows = torch.arange(self.sensor.height, device=self.elevation_rad.device)[phase.pixels[0]]
-        above, below = rows - phase.spacing, rows + phase.spacing
+        above, below = rows - phase.lattice.rows, rows + phase.lattice.rows
         inside = (above >= 0) & (below < self.sensor.height)
         here = self.elevation_rad[rows]
         up, down = (self.elevation_rad[row.clamp(0, self.sensor.height - 1)] for row in (above, below))

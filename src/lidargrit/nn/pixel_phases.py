@@ -11,62 +11,101 @@ from torch import Tensor
 
 from lidargrit.errors import ConfigError
 
-_ORDER = ((0, 0), (1, 1), (0, 1), (1, 0))  # within 2x2 pixels of a lattice: a corner, its opposite, then the others
-_PLUS, _DIAGONAL = ((-1, 0), (0, -1)), ((-1, -1), (-1, 1))  # one neighbour of each pair; the other lies opposite
+_BOTH = ((0, 0), (1, 1), (0, 1), (1, 0))  # of 2x2 pixels of a lattice: a corner, its opposite, then the others
+_COLUMNS = ((0, 0), (1, 0), (0, 1), (1, 1))  # where whole columns are known: the next column, its even rows first
+_VERTICAL, _HORIZONTAL, _FALLING, _RISING = (-1, 0), (0, -1), (-1, -1), (-1, 1)  # one neighbour; the other is opposite
+
+
+class Lattice(NamedTuple):
+    """Pixels at equal distances, of which some are known; phases generate the others.
+
+    Args:
+        rows: distance between two pixels of the lattice, in rows of the image.
+        columns: distance between two pixels of the lattice, in columns of the image.
+        whole_columns: whether every second column is known as a whole, and not one of every 2x2 pixels.
+    """
+
+    rows: int
+    columns: int
+    whole_columns: bool = False
+
+    @property
+    def order(self) -> tuple[tuple[int, int], ...]:
+        """Rows and columns within 2x2 pixels, in the order in which they are generated."""
+        return _COLUMNS if self.whole_columns else _BOTH
+
+    @property
+    def name(self) -> str:
+        """Name of the lattice's network."""
+        return str(self.rows) if self.rows == self.columns and not self.whole_columns else f"{self.rows}x{self.columns}"
 
 
 class Phase(NamedTuple):
     """Pixels that are generated together: one of every 2x2 pixels of a lattice.
 
     Args:
-        spacing: distance between two pixels of the lattice, in rows and in columns of the image.
+        lattice: lattice whose pixels they are.
         row: row of the pixel within its 2x2 pixels, 0 or 1.
         column: column of the pixel within its 2x2 pixels, 0 or 1.
     """
 
-    spacing: int
+    lattice: Lattice
     row: int
     column: int
 
     @property
     def rank(self) -> int:
         """Number of pixels of the 2x2 that are generated before this one."""
-        return _ORDER.index((self.row, self.column))
+        return self.lattice.order.index((self.row, self.column))
 
     @property
     def pixels(self) -> tuple[slice, slice]:
         """Rows and columns of the phase's pixels in the image."""
-        step = 2 * self.spacing
-        return slice(self.row * self.spacing, None, step), slice(self.column * self.spacing, None, step)
+        rows, columns = self.lattice.rows, self.lattice.columns
+        return slice(self.row * rows, None, 2 * rows), slice(self.column * columns, None, 2 * columns)
+
+    @property
+    def pairs(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """Rows and columns, from a pixel to one neighbour of each of two pairs that are generated before it."""
+        if self.lattice.whole_columns:
+            return (_HORIZONTAL, _FALLING) if self.rank == 2 else (_HORIZONTAL, _VERTICAL)
+        return (_FALLING, _RISING) if self.rank == 1 else (_VERTICAL, _HORIZONTAL)
 
 
-def phases_of(coarsest_cell: int) -> list[Phase]:
+def phases_of(coarsest_cell: int, column_halvings: int = 0) -> list[Phase]:
     """Return every phase in order: one pixel of each coarsest cell, then three phases for each halving of the distance.
 
     Args:
-        coarsest_cell: rows and columns of the cells of which the first phase generates one pixel each; a power of 2.
+        coarsest_cell: rows of the cells of which the first phase generates one pixel each; a power of 2.
+        column_halvings: number of halvings of the distance between columns alone, in two phases each, that come last;
+            the cells have as many columns as rows, times 2 for each.
     """
     if coarsest_cell < 2 or coarsest_cell & (coarsest_cell - 1):
         raise ConfigError(f"coarsest_cell={coarsest_cell}", "a power of 2, at least 2", "e.g. 8")
-    phases = [Phase(coarsest_cell // 2, 0, 0)]
-    spacing = coarsest_cell // 2
+    spacing, stretch = coarsest_cell // 2, 2**column_halvings
+    phases = [Phase(Lattice(spacing, spacing * stretch), 0, 0)]
     while spacing:
-        phases += [Phase(spacing, row, column) for row, column in _ORDER[1:]]
+        lattice = Lattice(spacing, spacing * stretch)
+        phases += [Phase(lattice, row, column) for row, column in lattice.order[1:]]
         spacing //= 2
+    while stretch > 1:
+        stretch //= 2
+        lattice = Lattice(1, stretch, whole_columns=True)
+        phases += [Phase(lattice, row, column) for row, column in lattice.order[2:]]
     return phases
 
 
 def generated_before(phase: Phase) -> Bool[Tensor, "4"]:
     """Return which of the 2x2 pixels, row by row, are generated before a phase's."""
     before = torch.zeros(2, 2, dtype=torch.bool)
-    for row, column in _ORDER[: phase.rank]:
+    for row, column in phase.lattice.order[: phase.rank]:
         before[row, column] = True
     return before.flatten()
 
 
-def cells_of(maps: Float[Tensor, "B C H W"], spacing: int) -> Float[Tensor, "B C*4 h w"]:
+def cells_of(maps: Float[Tensor, "B C H W"], lattice: Lattice) -> Float[Tensor, "B C*4 h w"]:
     """Return a lattice of the image with every 2x2 of its pixels as channels of one cell."""
-    return F.pixel_unshuffle(maps[..., ::spacing, ::spacing], 2)
+    return F.pixel_unshuffle(maps[..., :: lattice.rows, :: lattice.columns], 2)
 
 
 class Neighbours(NamedTuple):
@@ -88,36 +127,38 @@ def neighbours_of(phase: Phase, values: Float[Tensor, "B H W"], known: Bool[Tens
 
     The first phase has none. Columns wrap around; rows beyond the image are not known.
     """
-    step = slice(None, None, phase.spacing)
-    values, known = values[..., step, step], known[..., step, step]
+    lattice = phase.lattice
+    values, known = (maps[..., :: lattice.rows, :: lattice.columns] for maps in (values, known))
     values = F.pad(torch.cat((values[..., -1:], values, values[..., :1]), -1), (0, 0, 1, 1))
     known = F.pad(torch.cat((known[..., -1:], known, known[..., :1]), -1), (0, 0, 1, 1))
     height, width = (known.shape[-2] - 2) // 2, (known.shape[-1] - 2) // 2
-    pairs = _DIAGONAL if phase.rank == 1 else _PLUS
     found_values, found_known = [], []
-    for down, right in pairs:
+    for down, right in phase.pairs:
         for sign in (1, -1):
             top, left = 1 + phase.row + sign * down, 1 + phase.column + sign * right
             part = (..., slice(top, top + 2 * height, 2), slice(left, left + 2 * width, 2))
             found_values.append(values[part])
             found_known.append(known[part] if phase.rank else torch.zeros_like(known[part]))
-    rows_apart = (pairs[0][0] != 0, pairs[1][0] != 0)
+    rows_apart = (phase.pairs[0][0] != 0, phase.pairs[1][0] != 0)
     stacked = torch.stack(found_values, 1).unflatten(1, (2, 2)), torch.stack(found_known, 1).unflatten(1, (2, 2))
     return Neighbours(*stacked, rows_apart)
 
 
 def at_phases(values: Shaped[Tensor, "B H W"], phases: list[Phase]) -> Shaped[Tensor, "P B h w"]:
-    """Return the pixels of phases of one spacing."""
+    """Return the pixels of phases of one lattice."""
     return torch.stack([values[(..., *phase.pixels)] for phase in phases])
 
 
-def join_phases(coarser: Float[Tensor, "B h w"] | None, values: Float[Tensor, "P B h w"]) -> Float[Tensor, "B H W"]:
-    """Return a lattice's values, from those of the coarser lattice and those of all phases of its own spacing.
+def join_phases(coarser: Float[Tensor, "B h w"] | None, values: Float[Tensor, "P B k l"]) -> Float[Tensor, "B H W"]:
+    """Return a lattice's values, from those of the coarser lattice and those of all phases of its own.
 
     Args:
-        coarser: values of the next coarser lattice; None for the coarsest spacing, which has four phases.
-        values: values of three phases, or of four, in their order.
+        coarser: values of the next coarser lattice; None for the coarsest lattice, which has four phases.
+        values: values of two phases where whole columns are known, else of three, or of four, in their order.
     """
+    if coarser is not None and coarser.shape[-2] == 2 * values.shape[-2]:  # every second column
+        between = torch.stack(tuple(values), 2).flatten(1, 2)
+        return torch.stack((coarser, between), -1).flatten(-2)
     corner = values[0] if coarser is None else coarser
     opposite, right, below = values[-3:]
     return F.pixel_shuffle(torch.stack((corner, right, below, opposite), 1), 2)[:, 0]

@@ -24,7 +24,7 @@ from lidargrit.errors import ConfigError
 from lidargrit.files import write_text
 from lidargrit.projection import points_of_pixels
 from lidargrit.viewer.classes import name_and_colour
-from lidargrit.viewer.scan_sets import ScanSet
+from lidargrit.viewer.scan_sets import SURPRISED_BITS, ScanSet
 
 PAGE_SCANS_AT_MOST = 100  # of each source: about 15 MB of a KITTI-360 size image, which browsers still open at once
 SOURCES_AT_MOST = 8  # browsers keep 8 to 16 WebGL canvases alive
@@ -40,12 +40,14 @@ _RAMPS = {
         "range": ("viridis_r", 0.0, 0.85),
         "height": ("plasma", 0.12, 1.0),
         "reflectance": ("inferno", 0.25, 1.0),
+        "surprise": ("inferno", 0.25, 1.0),
         "ring": ("turbo", 0.1, 0.95),
     },
     "light": {
         "range": ("viridis_r", 0.12, 1.0),
         "height": ("plasma", 0.0, 0.88),
         "reflectance": ("inferno_r", 0.18, 1.0),
+        "surprise": ("inferno_r", 0.18, 1.0),
         "ring": ("turbo", 0.03, 0.95),
     },
 }
@@ -168,6 +170,9 @@ def _source(scan_set: ScanSet, numbers: list[int]) -> dict[str, Any]:
         scan = {"name": name, "range": _packed(steps[index].numpy().astype("<u2"))}
         if reflectance is not None:
             scan["reflectance"] = _packed((255 * reflectance[index].detach()).round().numpy().astype(np.uint8))
+        if scan_set.surprise is not None:
+            share = (scan_set.surprise[index] / SURPRISED_BITS).clamp(0, 1)
+            scan["surprise"] = _packed((255 * share).round().numpy().astype(np.uint8))
         if label is not None:
             scan["label"] = _packed(np.searchsorted(numbers, label[index].numpy()).astype(np.uint8))
         scans.append(scan)
@@ -206,6 +211,7 @@ def _scales(sets: Sequence[ScanSet]) -> dict[str, tuple[float, float]]:
         "range": (near, max(far, 1.01 * near)),
         "height": (low, max(high, low + 0.1)),
         "reflectance": (0.0, 1.0),
+        "surprise": (0.0, SURPRISED_BITS),
         "ring": (0.0, 1.0),
     }
 

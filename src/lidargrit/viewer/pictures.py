@@ -19,12 +19,12 @@ from lidargrit.errors import ConfigError
 from lidargrit.files import atomic_path
 from lidargrit.projection import points_of_pixels
 from lidargrit.structures import RangeImage
+from lidargrit.viewer.scan_sets import SURPRISED_BITS
 
 SCANS_AT_MOST = 8  # scans of a group; more make a picture that no viewer shows well
 _DOTS_PER_INCH = 100  # 1400 pixels across: a laptop shows the picture without shrinking it
 _WIDTH, _ROW, _HEAD, _FOOT = 14.0, 2.95, 0.75, 0.95  # inches: the picture, one scan of one group, title, colour bars
-_SURPRISED_BITS = 12.0  # beyond those expected: what happens to one pixel in some thousands
-_SURPRISE_NOTE = f"\nsurprise: black = as expected or less,\nyellow = {_SURPRISED_BITS:g} bits more or beyond"
+_SURPRISE_NOTE = f"\nsurprise: black = as expected or less,\nyellow = {SURPRISED_BITS:g} bits more or beyond"
 _NO_RETURN = "#e4e4e4"  # near white: no colour of the range scale comes near it
 
 
@@ -170,7 +170,7 @@ def _plot_row(figure: Figure, height: float, bottom: float, panel: _Panel, scale
     if panel.surprise is None:
         mask.imshow(panel.return_mask, cmap=ListedColormap([_NO_RETURN, "#26323c"]), vmin=0, vmax=1, **shape)
     else:
-        mask.imshow(panel.surprise, cmap="inferno", vmin=0, vmax=_SURPRISED_BITS, **shape)
+        mask.imshow(panel.surprise, cmap="inferno", vmin=0, vmax=SURPRISED_BITS, **shape)
     mask.set_xlabel("azimuth, counter-clockwise from forward", fontsize=10, labelpad=0)
     mask.set_xticks(np.arange(180, -181, -45), [f"{d}°" for d in range(180, -181, -45)], fontsize=9)
     for axis, name in ((ranges, "range"), (mask, "return mask" if panel.surprise is None else "surprise")):

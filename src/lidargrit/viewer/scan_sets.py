@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from lidargrit.determinism import evenly_spaced
@@ -22,6 +22,7 @@ from lidargrit.structures import RangeImage, Scan
 _CLASS_BITS = 0xFFFF  # of a label; the instance stands above them
 _PIXELS_AT_MOST = 200_000  # of a scan on a page: what browsers still turn smoothly
 _BATCH = 8  # scans computed at once: what a laptop has memory for
+SURPRISED_BITS = 12.0  # beyond those expected: what happens to one pixel in some thousands
 _NAME_LETTERS = 40  # of a source's name: what fits above a picture
 
 
@@ -33,6 +34,8 @@ class ScanSet:
         name: name of the scans' source, or of what a model made of it.
         images: a batch of range images.
         scan_names: name of each image.
+        surprise: bits of every pixel beyond those expected, see :meth:`lidargrit.structures.ScanBits.surprise`; None if
+            no model was asked.
         label: class of every pixel by SemanticKITTI's numbers; 0 where it is not known or there is no return.
     """
 
@@ -40,6 +43,7 @@ class ScanSet:
     images: RangeImage
     scan_names: tuple[str, ...]
     label: Int[Tensor, "B H W"] | None = None
+    surprise: Float[Tensor, "B H W"] | None = None
 
 
 def load_scan_sets(

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
 from lidargrit.errors import ConfigError
-from lidargrit.generators import load
+from lidargrit.generators import Generator, load
 from lidargrit.loading.config import ScanSettings
 from lidargrit.reporting import Reporter
+from lidargrit.structures import RangeImage
 from lidargrit.viewer.interactive import PAGE_SCANS_AT_MOST, write_page
 from lidargrit.viewer.pictures import SCANS_AT_MOST, plot_comparison
 from lidargrit.viewer.scan_sets import load_scan_sets
@@ -32,8 +38,8 @@ def view(
         seed: seed of the first generated scan.
         settings: sensor that scans are imaged with, and settings of reading them.
         reporter: receiver of messages about scans that are left out.
-        surprise_by: folder of the run whose surprise at every pixel is plotted in place of the return mask; none if
-            empty.
+        surprise_by: folder of the run whose surprise at every pixel is a colour of the page, or is plotted in place of
+            the return mask; none if empty.
 
     Raises:
         ConfigError: too few or too many scans, or no source.
@@ -44,16 +50,19 @@ def view(
     at_most = PAGE_SCANS_AT_MOST if is_page else SCANS_AT_MOST
     if not 1 <= count <= at_most:
         raise ConfigError(f"{count} scans of each set", f"1 to {at_most}", "correct the number")
-    if surprise_by and is_page:
-        raise ConfigError(f"the colour surprise for {out}", "a picture", "name a file that ends in .png")
     model = load(surprise_by) if surprise_by else None
     rays = None if model is None else model.sensor
     sets = load_scan_sets(sources, count, seed, settings, reporter, rays, all_columns=is_page)
+    if model is not None:
+        sets = [replace(scans, surprise=_surprise(model, scans.images)) for scans in sets]
     groups = {scans.name: scans.images for scans in sets}
     if is_page:
         write_page(sets, out)
-    elif model is None:
-        plot_comparison(groups, out)
     else:
-        surprise = {name: model.bits(images, expected=True).surprise() for name, images in groups.items()}
-        plot_comparison(groups, out, surprise=surprise)
+        surprise = {scans.name: scans.surprise for scans in sets if scans.surprise is not None}
+        plot_comparison(groups, out, surprise=surprise or None)
+
+
+def _surprise(model: Generator, images: RangeImage) -> Float[Tensor, "B H W"]:
+    parts = (images[index : index + 1] for index in range(len(images)))
+    return torch.cat([model.bits(part, expected=True).surprise().cpu() for part in parts])

@@ -44,8 +44,12 @@ class Page {
   // Only what some scan has.
   offerModes() {
     const has = (name) => this.panes.some((pane) => pane.source.data.scans.some((scan) => scan[name]));
-    for (const name of ["reflectance", "label"]) {
+    for (const name of ["reflectance", "surprise", "label"]) {
       this.control.mode.querySelector(`[value=${name}]`).disabled = !has(name);
+    }
+    if (has("surprise") && !this.offeredSurprise) {
+      this.offeredSurprise = true;
+      this.control.mode.value = "surprise";
     }
     this.control.position.max = String(this.count);
     for (const name of ["previous", "next", "position"]) {
@@ -178,6 +182,7 @@ function legendOf(look) {
     range: [`${low} m`, `${high} m away`],
     height: [`${low} m`, `${high} m above the sensor`],
     reflectance: ["weak, 0", "1, strong"],
+    surprise: ["as expected or less", `${high} bits more than expected, or beyond`],
     ring: ["top row", "bottom row"],
   }[look.mode];
   return [text(ends[0]), ramp, text(ends[1]), chip(css(look.noReturn), "no return")];

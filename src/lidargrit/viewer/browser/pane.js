@@ -109,7 +109,7 @@ class Pane {
     this.drawer.setColours(colours);
     const picture = new ImageData(colours, this.source.width, this.source.height);
     this.part.image.getContext("2d").putImageData(picture, 0, 0);
-    const missing = (look.mode === "reflectance" && !this.scan.reflectance) || (look.mode === "label" && !this.scan.label);
+    const missing = ["reflectance", "surprise", "label"].includes(look.mode) && !this.scan[look.mode];
     this.part.missing.textContent = missing ? `No ${look.mode} is known here.` : "";
   }
 
@@ -168,6 +168,10 @@ class Pane {
     }
     if (scan.reflectance && scan.steps[pixel]) {
       facts.push(`reflectance ${(scan.reflectance[pixel] / 255).toFixed(2)}`);
+    }
+    if (scan.surprise && scan.steps[pixel]) {
+      const share = scan.surprise[pixel] / 255;
+      facts.push(`surprise ${(share * this.page.data.scales.surprise[1]).toFixed(1)} bits${share === 1 ? " or more" : ""}`);
     }
     return `${facts.join(", ")} (row ${Math.floor(pixel / source.width)}, column ${pixel % source.width})`;
   }

@@ -46,6 +46,7 @@ async function unpackScan(source, data) {
     steps,
     returns,
     reflectance: data.reflectance && new Uint8Array(await unpack(data.reflectance)),
+    surprise: data.surprise && new Uint8Array(await unpack(data.surprise)),
     label: data.label && new Uint8Array(await unpack(data.label)),
   };
 }
@@ -97,6 +98,7 @@ const POSITIONS = {
     Math.log(rangeM(source, scan, pixel) / near) / Math.log(far / near),
   height: (source, scan, points, [low, high]) => (pixel) => (points[4 * pixel + 2] - low) / (high - low),
   reflectance: (source, scan) => scan.reflectance && ((pixel) => scan.reflectance[pixel] / 255),
+  surprise: (source, scan) => scan.surprise && ((pixel) => scan.surprise[pixel] / 255),
   ring: (source) => (pixel) => Math.floor(pixel / source.width) / (source.height - 1),
 };
 

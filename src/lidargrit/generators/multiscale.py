@@ -1,0 +1,87 @@
+"""A pixel decoder without tokens: seeds → range images from coarse to fine, each phase given all earlier ones."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import torch
+
+from lidargrit.conditions import Condition
+from lidargrit.generators import Cost, Generator, SystemFacts
+from lidargrit.generators._batches import BatchSeeds
+from lidargrit.generators._tokens import PixelObjective
+from lidargrit.nn.objective import Objective
+from lidargrit.nn.pixel_decoder import PixelDecoder, PixelSampling
+from lidargrit.nn.pixel_networks import PixelDecoderConfig
+from lidargrit.nn.range_steps import RangeSteps
+from lidargrit.sensors import SensorModel
+from lidargrit.structures import RangeImage, ScanBits
+
+
+@dataclass(frozen=True)
+class MultiscaleConfig:
+    """The networks of the pixel decoder, which is the whole system.
+
+    Args:
+        pixels: sizes of the pixel decoder.
+    """
+
+    pixels: PixelDecoderConfig = field(default_factory=PixelDecoderConfig)
+
+
+class Multiscale(Generator[MultiscaleConfig, PixelSampling]):
+    """Mask and ranges with exact probabilities, in phases from coarse to fine, conditioned on nothing else.
+
+    It tells what tokens are worth beside LidarGRIT with a pixel decoder, and compresses scans without a tokenizer.
+
+    Source:
+        Reed et al., Parallel Multiscale Autoregressive Density Estimation, 2017: phases from coarse to fine.
+    """
+
+    Config = MultiscaleConfig
+    facts = SystemFacts(writes="range and raydrop, each pixel given all pixels of coarser phases")
+    Sampling = PixelSampling
+    capabilities = frozenset({"complete", "likelihood"})
+
+    def __init__(self, config: MultiscaleConfig, sensor: SensorModel) -> None:
+        super().__init__(config, sensor)
+        self.pixels = PixelDecoder(config.pixels, sensor, features=0)
+
+    @classmethod
+    def smallest_config(cls, sensor: SensorModel) -> MultiscaleConfig:
+        """Return networks of eight channels and one block."""
+        return MultiscaleConfig(PixelDecoderConfig(mask_width=8, range_width=8, blocks=1))
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """The pixel decoder alone."""
+        return ("pixels",)
+
+    def objective(self, stage: str) -> Objective:
+        """Return the negative log-likelihood of the pixels."""
+        return PixelObjective(self.pixels) if stage == "pixels" else super().objective(stage)
+
+    def load_stage(self, stage: str, objective: Objective) -> None:
+        """Take over the trained weights."""
+        self.pixels.load_state_dict(objective.get_submodule(stage).state_dict())
+
+    def _sample(self, seeds: BatchSeeds, sampling: PixelSampling) -> RangeImage:
+        rngs = [torch.Generator().manual_seed(seed) for seed in seeds]  # on the CPU: the same numbers on every device
+        return self.pixels.sample(None, rngs, sampling)
+
+    def _complete(self, condition: Condition, seeds: BatchSeeds, sampling: PixelSampling) -> RangeImage:
+        rngs = [torch.Generator().manual_seed(seed) for seed in seeds]
+        return self.pixels.sample(None, rngs, sampling, condition)
+
+    def _bits(self, images: RangeImage, steps: RangeSteps, expected: bool) -> ScanBits:
+        """Return the bits of mask and ranges; there are no tokens, which take none."""
+        mask, range_ = (nats / math.log(2) for nats in self.pixels(None, images, steps))
+        usual = None
+        if expected:
+            usual = sum(self.pixels.expected(None, images, steps), torch.zeros_like(mask)) / math.log(2)
+        return ScanBits(steps.step_mm, images.return_mask, mask.new_zeros(len(mask), 1, 1), mask, range_, usual)
+
+    def cost(self, sampling: PixelSampling | None = None) -> Cost:
+        """Return the cost of all phases."""
+        return Cost(self.pixels.num_evaluations, self.pixels.flops())

@@ -1,0 +1,14 @@
+"""The pixel decoder of the model in the package without tokens: what these are worth, and a codec that needs none."""
+
+from lidargrit.generators.multiscale import MultiscaleConfig
+from lidargrit.nn.pixel_networks import PixelDecoderConfig
+from lidargrit.recipes import compact_pixels
+from lidargrit.training import Recipe
+
+RECIPE = Recipe(
+    title="a pixel decoder without tokens, small: 64x256, for one CPU core and half an hour",
+    generator="multiscale",
+    model=MultiscaleConfig(PixelDecoderConfig(row_channels=2, range_width=36)),
+    data=compact_pixels.RECIPE.data,
+    training={"pixels": compact_pixels.RECIPE.training["pixels"]},
+)

@@ -1,0 +1,31 @@
+"""A pixel decoder without tokens at 64x1024, whose last phases halve the distance between columns alone."""
+
+from dataclasses import replace
+
+from lidargrit.generators.multiscale import MultiscaleConfig
+from lidargrit.nn.pixel_networks import PixelDecoderConfig
+from lidargrit.recipes import multiscale_small
+
+RECIPE = replace(
+    multiscale_small.RECIPE,
+    title="a pixel decoder without tokens: 64x1024, for one CPU core and an hour",
+    model=MultiscaleConfig(PixelDecoderConfig(column_halvings=2, row_channels=2, range_width=36)),
+    data=replace(
+        multiscale_small.RECIPE.data,
+        train=("simulated:1000:train",),
+        val=("simulated:24:val",),
+        columns=2048,
+        column_stride=2,
+    ),
+    training={
+        "pixels": replace(
+            multiscale_small.RECIPE.training["pixels"],
+            scans=3000,
+            batch_size=1,
+            average_over_scans=150,
+            validate_every=500,
+            validation_scans=12,
+            checkpoint_every=250,
+        )
+    },
+)
