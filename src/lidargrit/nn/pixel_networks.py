@@ -167,14 +167,12 @@ class PhaseNetwork(nn.Module, ABC):
         guide = 4 * (kept + config.row_channels + 2)
         self.networks = nn.ModuleDict()
         for phases in self.by_lattice():
-            context = self.context_channels(features > 0)
+            context = self.context_channels + (0 if features else self.added_without_tokens)
             network = _LatticeNetwork(guide, context, width, config.blocks, len(phases), outputs)
             self.networks[phases[0].lattice.name] = network
 
-    @staticmethod
-    @abstractmethod
-    def context_channels(guided_by_tokens: bool) -> int:
-        """Return the number of channels of :meth:`context`."""
+    context_channels: int
+    added_without_tokens = 0
 
     @abstractmethod
     def context(
@@ -227,14 +225,11 @@ class PhaseNetwork(nn.Module, ABC):
 class MaskNetwork(PhaseNetwork):
     """The logits of P(return), given which of the earlier pixels returned: a correction of the decoder's logits."""
 
+    context_channels = 4 * 2
+
     def __init__(self, config: PixelDecoderConfig, sensor: SensorModel, features: int) -> None:
         super().__init__(config, sensor, features, config.mask_features, config.mask_width, 1)
         self.row_bias = nn.Parameter(torch.zeros(sensor.height))
-
-    @staticmethod
-    def context_channels(guided_by_tokens: bool) -> int:
-        """Return 8: two maps of the four pixels of a cell."""
-        return 4 * 2
 
     @classmethod
     def behind(cls, features: int, width: int, sensor: SensorModel) -> MaskNetwork:
@@ -311,6 +306,9 @@ class RangeNetwork(PhaseNetwork):
     Where no tokens tell what to expect of a pixel, the mean of its neighbours stands in.
     """
 
+    context_channels = 4 * 3 + _NEIGHBOURS + 3
+    added_without_tokens = 1  # the expected range
+
     def __init__(self, config: PixelDecoderConfig, sensor: SensorModel, features: int) -> None:
         components = config.free_components + _NEIGHBOURS
         super().__init__(config, sensor, features, config.range_features, config.range_width, 3 * components)
@@ -326,11 +324,6 @@ class RangeNetwork(PhaseNetwork):
     begin: Tensor
     begin_scale: Tensor
     elevation_rad: Tensor
-
-    @staticmethod
-    def context_channels(guided_by_tokens: bool) -> int:
-        """Return how many maps of the mask, of known ranges and of candidates there are, and of what is expected."""
-        return 4 * 3 + _NEIGHBOURS + 3 + (0 if guided_by_tokens else 1)
 
     def context(
         self, phase: Phase, guide: Guide, return_mask: Bool[Tensor, "B H W"], v: Float[Tensor, "B H W"]
