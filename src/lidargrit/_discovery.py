@@ -33,8 +33,9 @@ def load_class(package: str, name: str, base: type[T]) -> type[T]:
     """
 
     def own_subclass(value: object, module: str) -> type[T] | None:
-        fits = isinstance(value, type) and issubclass(value, base) and value.__module__ == module
-        return value if fits else None
+        if isinstance(value, type) and issubclass(value, base) and value.__module__ == module:
+            return value
+        return None
 
     return _the_one(package, name, own_subclass)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 from torch import Tensor, nn
 
@@ -66,7 +66,7 @@ class SavedModel(nn.Module, Generic[ConfigT]):
 
     @classmethod
     def from_weights(
-        cls: type[ModelT], config: object, sensor: SensorModel, weights: dict[str, Tensor], source: Path
+        cls: type[ModelT], config: Any, sensor: SensorModel, weights: dict[str, Tensor], source: Path
     ) -> ModelT:
         """Make a generator with given weights.
 
