@@ -268,6 +268,30 @@ def test_only_the_pixel_decoder_is_trained_over_a_finished_run(tmp_path):
     assert torch.equal(first.sample([2]).range_m, second.sample([2], TokenSampling(mask="bernoulli")).range_m)
 
 
+def test_fine_tuning_starts_from_the_weights_of_the_other_run(tmp_path):
+    donor = made()
+    donor.save(tmp_path / "donor")
+    fit = FitConfig(scans=2, batch_size=2, learning_rate=1e-6, validation_scans=1)
+    recipe = recipe_of(PIXELS, stages_from=str(tmp_path / "donor"))
+    recipe = replace(recipe, training=dict.fromkeys(recipe.training, fit), fine_tune=("tokenizer", "pixels"))
+    tuned = train(recipe, tmp_path / "run").state_dict()
+    assert not (tmp_path / "run" / "transformer").exists()
+    for stage in ("transformer", "pixels"):
+        moved = [
+            float((tuned[name] - w).abs().max()) for name, w in donor.state_dict().items() if name.startswith(stage)
+        ]
+        assert max(moved) < 1e-4, "the weights are those of the donor, but for a step of the learning rate"
+        assert (max(moved) > 0) == (stage == "pixels")
+    for settings, message in (
+        ({"fine_tune": ("mask",)}, "fine_tune=mask; wanted one of tokenizer, transformer, pixels"),
+        ({"fine_tune": ("pixels",), "train_anew": ("pixels",)}, "fine_tune=pixels; wanted one of tokenizer, trans"),
+        ({"stages_from": None}, "fine_tune=tokenizer without stages_from"),
+    ):
+        wrong = replace(recipe, **settings)
+        with pytest.raises(ConfigError, match=message):
+            taken_stages(wrong, wrong.build_generator())
+
+
 def test_a_run_of_other_sizes_or_another_kind_gives_no_stages(tmp_path):
     train(recipe_of(None), tmp_path / "first")
     recipe = recipe_of(PIXELS, stages_from=str(tmp_path / "first"))

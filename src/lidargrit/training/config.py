@@ -103,7 +103,8 @@ class Recipe:
         tokenizer_from: folder of a finished run whose tokenizer is used as it is; if empty, a tokenizer is trained.
         stages_from: folder of a finished run whose stages are all used as they are; only stages that it lacks are
             trained, such as a pixel decoder over a finished model.
-        train_anew: names of stages that are trained although the run of ``stages_from`` has them.
+        train_anew: names of stages that are trained from new weights although the run of ``stages_from`` has them.
+        fine_tune: names of stages that start from the weights of the run of ``stages_from`` and are trained further.
     """
 
     title: str
@@ -116,6 +117,7 @@ class Recipe:
     tokenizer_from: str | None = None
     stages_from: str | None = None
     train_anew: tuple[str, ...] = ()
+    fine_tune: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.tokenizer_from is not None and self.stages_from is not None:

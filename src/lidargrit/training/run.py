@@ -81,10 +81,12 @@ def _train(recipe: Recipe, folder: Path, reporter: Reporter, plot: PlotProgress 
         generator.fit_statistics(train_images)
         built_on = ""
         for number, stage in enumerate(generator.stages):
-            if stage in taken:
+            if stage in taken and stage not in recipe.fine_tune:
                 trained = taken[stage]
             else:
                 seed, objective = derive_seed(recipe.seed, number), generator.objective(stage)
+                if stage in taken:
+                    objective.load_state_dict(taken[stage].state_dict())
                 picture = None if plot is None else partial(_plot, plot, generator, stage, val_images)
                 workers, config = recipe.data.workers, recipe.training[stage]
                 fit = Fit(objective, config, folder / stage, seed, reporter, built_on, workers, picture)

@@ -28,6 +28,8 @@ def check_donor(recipe: Recipe) -> None:
 def taken_stages(recipe: Recipe, generator: Generator) -> dict[str, Objective]:
     """Return the trained stages that a recipe takes from another run, once they are known to fit the generator.
 
+    Those that the recipe names in ``fine_tune`` are among them: their training starts from these weights.
+
     Raises:
         ConfigError: a stage of other sizes, a run of another sensor, or of another kind of generator.
         CheckpointError: no finished run.
@@ -37,6 +39,12 @@ def taken_stages(recipe: Recipe, generator: Generator) -> dict[str, Objective]:
         _check(f"tokenizer_from={recipe.tokenizer_from}", generator, donor, "tokenizer")
         return {"tokenizer": donor.get_tokenizer()}
     if recipe.stages_from is None:
+        if recipe.fine_tune:
+            raise ConfigError(
+                f"fine_tune={recipe.fine_tune[0]} without stages_from",
+                "the run whose weights are trained further",
+                "set stages_from as well",
+            )
         return {}
     donor = load(Path(recipe.stages_from))
     if type(donor) is not type(generator):
@@ -47,7 +55,11 @@ def taken_stages(recipe: Recipe, generator: Generator) -> dict[str, Objective]:
         )
     if unknown := sorted({*recipe.train_anew} - {*generator.stages}):
         raise ConfigError(f"train_anew={unknown[0]}", f"one of {', '.join(generator.stages)}", "name a stage")
-    stages = [stage for stage in generator.stages if stage in donor.stages and stage not in recipe.train_anew]
+    shared = [stage for stage in generator.stages if stage in donor.stages]
+    if unknown := sorted({*recipe.fine_tune} - {*shared} | {*recipe.fine_tune} & {*recipe.train_anew}):
+        names = ", ".join(stage for stage in shared if stage not in recipe.train_anew)
+        raise ConfigError(f"fine_tune={unknown[0]}", f"one of {names}", "name a stage that the run of stages_from has")
+    stages = [stage for stage in shared if stage not in recipe.train_anew]
     for stage in stages:
         _check(f"stages_from={recipe.stages_from}", generator, donor, stage)
     return {stage: donor.objective(stage) for stage in stages}
