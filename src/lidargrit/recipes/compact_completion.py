@@ -3,15 +3,15 @@
 from dataclasses import replace
 
 from lidargrit.nn.completion_network import CompletionNetworkConfig
-from lidargrit.recipes import compact
+from lidargrit.recipes import compact_pixels
 from lidargrit.training import FitConfig
 
 RECIPE = replace(
-    compact.RECIPE,
+    compact_pixels.RECIPE,
     title="LidarGRIT with a network that completes scans: 64x256, for one CPU core and two hours",
-    model=replace(compact.RECIPE.model, completion=CompletionNetworkConfig()),
+    model=replace(compact_pixels.RECIPE.model, completion=CompletionNetworkConfig()),
     training={
-        **compact.RECIPE.training,
+        **compact_pixels.RECIPE.training,
         "completion": FitConfig(
             scans=22_000,
             batch_size=4,
@@ -27,4 +27,6 @@ RECIPE = replace(
             checkpoint_every=500,
         ),
     },
+    stages_from="pretrained",
+    train_anew=("completion",),
 )
