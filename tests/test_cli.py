@@ -146,7 +146,7 @@ def test_every_recipe_has_a_plan(recipe, tmp_path, capsys, monkeypatch):
         told_at_once = lambda recipe: dict.fromkeys(recipe.training, 10**18)  # noqa: E731
         monkeypatch.setattr(sys.modules["lidargrit.training.plan"], "training_flops", told_at_once)
     monkeypatch.chdir(tmp_path)
-    is_simulated = load_recipe(recipe).data.train[0].startswith("simulated:")
+    is_simulated = load_recipe(recipe).data.train[0].startswith("simulated")
     assert main(["train", recipe, "none", "--dry-run"]) == (0 if is_simulated else 2)
     captured = capsys.readouterr()
     assert ("data/kitti" in captured.err) is not is_simulated, "where data sets are looked for"

@@ -33,7 +33,7 @@ def sensor_of(elevation_deg, width):
 
 SENSORS = {name: load_sensor(name) for name in _discovery.names("sensors")} | {
     "to the zenith": sensor_of([89.9, 60.0, 30.0, 0.0, -89.9], 360),
-    "dense": sensor_of(np.linspace(0.3, -0.3, 300).tolist(), 65536),
+    "dense": sensor_of(np.linspace(0.3, -0.3, 256).tolist(), 65536),
     "one row": sensor_of([3.0], 1),
     "three columns": sensor_of([10.0, -10.0], 3),
 }
