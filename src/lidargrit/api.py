@@ -47,9 +47,8 @@ def evaluate(
         max_scans: largest number of scans of each set; 0 for the protocol's.
 
     Returns:
-        scores with intervals and, beside them, the scores of real scans against real scans; ``print(card.as_table())``,
-            or
-        each of ``card.scores``.
+        scores with intervals, beside those of real scans against real scans: ``card.scores``, or
+        ``print(card.as_table())`` for all of them.
     """
     settings = EvalConfig(protocol=protocol, metrics=tuple(metrics), max_scans=max_scans)
     return compare_sources(generated, reference, settings)[0]

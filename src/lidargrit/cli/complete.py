@@ -42,4 +42,4 @@ def run(options: argparse.Namespace) -> None:
     output = OutputConfig(options.count, options.seed, options.format, options.bad_scans == "skip")
     config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points)
     count = complete_scans(options.scans, options.out, completer, pattern, output, config, TerminalReporter())
-    print(f"done: {count} completed scans in {options.out}; how they were made is told by completed.json")
+    print(f"done: {count} completed scans in {options.out}; completed.json says how they were made")

@@ -91,9 +91,9 @@ def writing(path: Path, header: dict[str, Any]) -> Iterator[ArchiveWriter]:
                     scans.unlink()
                     index.unlink()
     except OSError as error:
-        told = f"'{error.strerror or error}' while writing {path}"
+        got = f"'{error.strerror or error}' while writing {path}"
         cure = "free some space; the same command goes on"
-        raise OutputError(told, "a folder with room that may be written to", cure) from error
+        raise OutputError(got, "a folder with room that may be written to", cure) from error
     finally:
         with suppress(OSError):
             folder.rmdir()  # unless it holds what the next command goes on with

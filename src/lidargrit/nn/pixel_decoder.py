@@ -113,7 +113,7 @@ class PixelDecoder(nn.Module):
         return PixelNll(mask_nll, range_nll)
 
     def guide(self, decoded: Decoded | None, count: int) -> Guide:
-        """Return what the networks are told of every pixel of a number of scans before the first phase."""
+        """Return the inputs of the networks for every pixel of a number of scans before the first phase."""
         return Guide.nothing(self.mask.rows, count, self.sensor) if decoded is None else Guide.of(decoded)
 
     def expected(self, decoded: Decoded | None, images: RangeImage, steps: RangeSteps) -> PixelNll:
