@@ -154,6 +154,19 @@ def test_every_recipe_has_a_plan(recipe, tmp_path, capsys, monkeypatch):
     assert (" parameters, " in captured.out) == bool(load_recipe(recipe).training)
 
 
+def test_a_plan_tells_which_stages_are_taken_and_not_trained(tmp_path, capsys):
+    assert main(["train", "compact_raydrop", str(tmp_path / "none"), "--dry-run", "--json"]) == 0
+    stages = {stage["name"]: stage for stage in json.loads(capsys.readouterr().out)["stages"]}
+    assert {name for name, stage in stages.items() if not stage["taken_from"]} == {"raydrop"}
+    assert stages["pixels"]["taken_from"] == "pretrained"
+    assert stages["pixels"]["flops"] == 0 < stages["raydrop"]["flops"]
+    words = ["--dry-run", "--set", "fine_tune=[pixels]"]
+    assert main(["train", "compact_raydrop", str(tmp_path / "none"), *words]) == 0
+    text = capsys.readouterr().out
+    assert "transformer: 4,539,136 parameters, taken from pretrained and not trained" in text
+    assert "pixels: 365,374 parameters, 16,000 scans" in text
+
+
 def test_sample_writes_one_file_a_seed_and_draws_no_seed_twice(run_folder, samples, typed, monkeypatch):
     before = contents(samples)
     assert set(before) == {"samples.json", "trained_on.json", "00000000.npz", "00000001.npz", "00000002.npz"}

@@ -13,6 +13,7 @@ from lidargrit.sources import PreparedSource, open_to_train
 from lidargrit.training.compute import computing_time, training_flops
 from lidargrit.training.config import Recipe
 from lidargrit.training.optimiser import memory_of_weights
+from lidargrit.training.taken_stages import donors_of_stages
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,7 @@ class StagePlan:
         memory: size of weights, their average, gradients and the optimiser's moments, in bytes, without activations.
         flops: number of floating-point operations of all steps.
         precision: precision of the operations.
+        taken_from: run whose trained stage is used as it is, so that nothing is computed; "" if the stage is trained.
     """
 
     name: str
@@ -36,6 +38,7 @@ class StagePlan:
     memory: int
     flops: int
     precision: Precision
+    taken_from: str = ""
 
 
 @dataclass(frozen=True)
@@ -66,12 +69,18 @@ class TrainingPlan:
         lines += [f"  {name} = {value}" for name, value in self.settings.items()]
         near_m, far_m = self.range_m
         lines += ["", f"range images of {self.rows}x{self.columns}, {near_m:g} to {far_m:g} m"]
+        trained = [stage for stage in self.stages if not stage.taken_from]
+        lines += [
+            f"{stage.name}: {stage.parameters:,} parameters, taken from {stage.taken_from} and not trained"
+            for stage in self.stages
+            if stage.taken_from
+        ]
         lines += [
             f"{stage.name}: {stage.parameters:,} parameters, {stage.scans:,} scans in batches of {stage.batch_size}, "
             f"{stage.memory / 2**20:,.0f} MiB of memory besides activations"
-            for stage in self.stages
+            for stage in trained
         ]
-        lines += [f"{stage.name}: {computing_time(stage.flops, stage.precision)}" for stage in self.stages]
+        lines += [f"{stage.name}: {computing_time(stage.flops, stage.precision)}" for stage in trained]
         return "\n".join(lines)
 
     def to_json(self) -> dict[str, Any]:
@@ -92,15 +101,19 @@ def check_data(recipe: Recipe) -> None:
 
 
 def plan_training(recipe: Recipe) -> TrainingPlan:
-    """Return the plan of a recipe's training; nothing is read or written."""
+    """Return the plan of a recipe's training; no scan is read, and nothing is written."""
     sensor = recipe.data.load_sensor()
     stages, flops = [], training_flops(recipe)
     with torch.device("meta"):  # sizes alone, without values, so that wide networks take no time
         generator = recipe.build_generator(sensor).to("meta")
         objectives = {name: generator.objective(name) for name in generator.stages}
+    donors = donors_of_stages(recipe, generator.stages)
     for name, objective in objectives.items():
         budget = recipe.training[name]
         parameters = sum(weight.numel() for weight in objective.parameters())
+        if name in donors:
+            stages.append(StagePlan(name, parameters, 0, 0, 0, 0, budget.precision, donors[name]))
+            continue
         size = (parameters, budget.scans, budget.batch_size, memory_of_weights(objective))
         stages.append(StagePlan(name, *size, flops[name], budget.precision))
     return TrainingPlan(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,25 @@ def check_donor(recipe: Recipe) -> None:
     for donor in (recipe.tokenizer_from, recipe.stages_from):
         if donor is not None and not is_run(locate(donor)):
             load(donor)  # which says what is wrong
+
+
+def donors_of_stages(recipe: Recipe, stages: Sequence[str]) -> dict[str, str]:
+    """Return the run from which each stage is taken as it is, by the name of the stage; others are trained.
+
+    Args:
+        recipe: recipe whose stages they are.
+        stages: names of the stages of the recipe's generator.
+
+    Raises:
+        CheckpointError: no finished run to take stages from.
+    """
+    if recipe.tokenizer_from is not None:
+        return {"tokenizer": recipe.tokenizer_from}
+    if recipe.stages_from is None:
+        return {}
+    theirs = load(Path(recipe.stages_from)).stages
+    trained = {*recipe.train_anew, *recipe.fine_tune}
+    return {stage: recipe.stages_from for stage in stages if stage in theirs and stage not in trained}
 
 
 def taken_stages(recipe: Recipe, generator: Generator) -> dict[str, Objective]:
