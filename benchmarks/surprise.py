@@ -7,7 +7,8 @@ simulated; a ball that floats; dirt on the window; rain-like returns; and a sens
 first three are found by cells of 8x8 pixels, rain by pixels, a turned sensor by whole scans: the area is the
 probability that what was changed has a higher score than what was not. The scores are the bits of a cell's token, the
 bits of its pixels beyond those expected, all bits, and the error of reconstruction: how far a return is from the
-decoded range, in ln(1 + range), and how unlikely its mask was by the tokenizer's decoder.
+decoded range, in ln(1 + range), and how unlikely its mask was by the tokenizer's decoder. `--diffusion RUN` adds the
+residual of an R2DM without reflectance: how far its clean image lies from the scan to which noise was added.
 """
 
 from __future__ import annotations
@@ -27,7 +28,10 @@ from torch import Tensor
 from lidargrit.evaluation.estimates import Estimate
 from lidargrit.files import write_json
 from lidargrit.generators import Generator, load
+from lidargrit.generators._log_range import encode
+from lidargrit.generators.r2dm import R2dm
 from lidargrit.loading import DataConfig
+from lidargrit.nn.diffusion import SeededNoise, alpha_sigma, log_snr_at, noised
 from lidargrit.sensors import SensorModel
 from lidargrit.simulator.mesh import Mesh
 from lidargrit.simulator.observation import ObservationConfig, observe_scene
@@ -38,6 +42,7 @@ from lidargrit.structures import RangeImage
 
 CELL = 8
 _BLOCK = "a block askew in the street"
+_NOISE_TIMES, _NOISE_DRAWS = (0.3, 0.5, 0.7), 2  # of 0, clean, to 1, noise; and how often each, for the residual
 _OTHER_OBJECT = 99  # SemanticKITTI's number; no street has any
 Changed = tuple[RangeImage, Bool[Tensor, "1 H W"]]
 
@@ -131,7 +136,7 @@ def _with(image: RangeImage, range_m: Tensor, mask: Tensor) -> RangeImage:
     return RangeImage.masked(range_m.float(), mask, image.sensor)
 
 
-def scores(generator: Generator, image: RangeImage) -> dict[str, Float[Tensor, "1 H W"]]:
+def scores(generator: Generator, diffusion: R2dm | None, image: RangeImage) -> dict[str, Float[Tensor, "1 H W"]]:
     """Return what each way gives a pixel: the higher, the less it belongs there."""
     decoded = generator.get_tokenizer().decode(generator.get_tokenizer().encode(image))
     error = (decoded.range_m.log1p() - image.range_m.log1p()).abs() * image.return_mask
@@ -143,7 +148,20 @@ def scores(generator: Generator, image: RangeImage) -> dict[str, Float[Tensor, "
         "bits of pixels beyond those expected": bits.surprise(),
         "all bits": bits.per_pixel(),
         "error of reconstruction": error + missed,
+        **({} if diffusion is None else {"residual of R2DM": residual(diffusion, image)}),
     }
+
+
+def residual(diffusion: R2dm, image: RangeImage) -> Float[Tensor, "1 H W"]:
+    """Return how far what R2DM makes of noisy copies lies from the scan, in its log ranges: the mean over copies."""
+    clean, noise = encode(image, with_reflectance=False), SeededNoise([0], diffusion.shape, diffusion.device)
+    errors = []
+    for time in _NOISE_TIMES * _NOISE_DRAWS:
+        log_snr = log_snr_at(torch.tensor([time]))
+        alpha, sigma = alpha_sigma(log_snr)
+        noisy = noised(clean, log_snr, noise())
+        errors.append((((noisy - sigma * diffusion.network(noisy, log_snr)) / alpha).clamp(-1, 1) - clean).abs())
+    return torch.stack(errors).mean(0)[:, 0]
 
 
 def by_unit(score: Tensor, unit: str) -> Tensor:
@@ -170,14 +188,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scans", default="simulated:24:test")
     parser.add_argument("--model", default="pretrained")
+    parser.add_argument("--diffusion", metavar="RUN", help="finished run of R2DM without reflectance")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
-    generator = load(options.model).eval()
+    generator, diffusion = load(options.model).eval(), load(options.diffusion).eval() if options.diffusion else None
+    assert diffusion is None or (isinstance(diffusion, R2dm) and not diffusion.config.reflectance), options.diffusion
     images = open_images(options.scans, generator.sensor, DataConfig())
     found: dict[tuple[str, str], tuple[list[Tensor], list[Tensor]]] = {}
     for index in range(len(images)):
         whole = images.batch([index])
-        before = scores(generator, whole)
+        before = scores(generator, diffusion, whole)
         changes = dict(CHANGES)
         if options.scans.startswith("simulated:"):
             seed = int(images.provenance.names[index].rpartition("_")[2])
@@ -185,7 +205,7 @@ def main() -> None:
         for name, change in changes.items():
             image, pixels = change.make(whole, torch.Generator().manual_seed(index))
             at = by_unit(pixels, change.unit) >= (0.25 if change.unit == "cells" else 1)
-            for way, score in scores(generator, image).items():
+            for way, score in scores(generator, diffusion, image).items():
                 changed, others = found.setdefault((name, way), ([], []))
                 changed.append(by_unit(score, change.unit)[at])
                 others.append(by_unit(before[way], change.unit))
