@@ -1,0 +1,103 @@
+"""What every system costs at its small and at its published size → a Markdown table.
+
+    OMP_NUM_THREADS=1 python benchmarks/systems.py [lidm r2flow ...] [--json systems.json]
+
+Parameters are those of the networks that sample. Operations are counted: of one scan in training, all stages together,
+forward and backward, and of one sampled scan, by the defaults of the system. At the small size both are also timed, in
+processor seconds: a training step by the least of three for each stage, and one scan, seed to range image, by networks
+that are not trained. The published sizes are not timed: some take minutes a scan on a processor.
+"""
+
+import argparse
+import time
+from pathlib import Path
+
+import torch
+
+from lidargrit.files import write_json
+from lidargrit.nn.blocks import prepare_for_training
+from lidargrit.recipes import load_recipe
+from lidargrit.training import Recipe, training_flops
+from lidargrit.training.compute import uniform_images
+from lidargrit.training.engine import Engine
+from lidargrit.training.optimiser import make_optimiser
+
+PAIRS = {  # system → its small recipe, and that of the published size
+    "lidargrit": ("small", "lidargrit_kitti_360"),
+    "lidargan": ("lidargan_small", "lidargan_kitti_odometry"),
+    "lidarvae": ("lidarvae_small", "lidarvae_kitti_odometry"),
+    "dusty": ("dusty_small", "dusty_kitti_odometry"),
+    "lidargen": ("lidargen_small", "lidargen_kitti_360"),
+    "ultralidar": ("ultralidar_small", "ultralidar_kitti_360"),
+    "r2dm": ("r2dm_small", "r2dm_kitti_360"),
+    "r2flow": ("r2flow_small", "r2flow_kitti_360"),
+    "lidm": ("lidm_small", "lidm_kitti_360"),
+    "lidm_shared": ("lidm_shared_small", "lidm_shared_kitti_360"),
+}
+
+
+def counted(recipe: Recipe) -> dict[str, float]:
+    """Return parameters, operations of a training scan and of a sampled one."""
+    flops, generator = training_flops(recipe), recipe.build_generator()
+    parameters = sum(weight.numel() for weight in generator.parameters())
+    a_scan = sum(flops[stage] / recipe.training[stage].scans for stage in flops)
+    return {"parameters": parameters, "training": a_scan, "sampling": generator.cost().flops}
+
+
+def seconds_a_step(recipe: Recipe) -> dict[str, float]:
+    """Return the processor time of a training step, by stage."""
+    torch.manual_seed(0)
+    generator, found = recipe.build_generator(), {}
+    for stage in generator.stages:
+        config, objective = recipe.training[stage], generator.objective(stage)
+        prepare_for_training(objective, config.recompute, config.compile)
+        engine = Engine(config.precision, bool(objective.players))
+        engine.set_up(objective, make_optimiser(objective, config))
+        images, times = uniform_images(recipe.data.load_sensor(), config.batch_size), []
+        for step in range(4):  # the first allocates and chooses kernels
+            begun = time.process_time()
+            float(engine.step(images, step, config.gradient_clip, config.accumulate)["loss"])
+            times.append(time.process_time() - begun)
+        found[f"{stage} ({config.batch_size})"] = min(times[1:])
+    return found
+
+
+def seconds_a_scan(recipe: Recipe) -> float:
+    """Return the processor time of sampling one scan by the defaults."""
+    torch.manual_seed(0)
+    generator = recipe.build_generator().eval()
+    begun = time.process_time()
+    generator.sample([0])
+    return time.process_time() - begun
+
+
+def main() -> None:
+    """Measure every system and print its line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("systems", nargs="*", help="default: all")
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    rows = {}
+    heads = (
+        "parameters",
+        "operations a training scan",
+        "seconds a step (scans)",
+        "operations a scan",
+        "seconds a scan",
+    )
+    print(f"| system | size | {' | '.join(heads)} |\n|---|---|{'---|' * len(heads)}")
+    for name in options.systems or PAIRS:
+        for size, recipe in zip(("small", "published"), map(load_recipe, PAIRS[name]), strict=True):
+            row = counted(recipe)
+            steps = seconds_a_step(recipe) if size == "small" else {}
+            scan_s = seconds_a_scan(recipe) if size == "small" else None
+            rows[f"{name} {size}"] = {**row, "seconds_a_step": steps, "seconds_a_scan": scan_s}
+            told = ", ".join(f"{stage} {seconds:.2g}" for stage, seconds in steps.items())
+            cells = f"{row['parameters']:,.0f} | {row['training']:.1e} | {told} | {row['sampling']:.1e}"
+            print(f"| {name} | {size} | {cells} | {'' if scan_s is None else f'{scan_s:.2g}'} |", flush=True)
+    if options.json:
+        write_json(options.json, rows)
+
+
+if __name__ == "__main__":
+    main()
