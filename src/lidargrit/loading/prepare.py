@@ -219,8 +219,8 @@ def _claim(folder: Path, spec: PreparedSpec, scans: list[tuple[str, str, int, in
             )
         return
     listing, path = json.dumps(scans), folder / SCANS_FILE
-    half_claimed = path.is_file() and path.read_bytes() == listing.encode()
-    if is_taken(folder) and not half_claimed:
+    # In this order: another process may be claiming the folder for the same scans at this moment.
+    if is_taken(folder) and not (path.is_file() and path.read_bytes() == listing.encode()):
         raise OutputError(f"{folder}, which holds something else", "an empty folder", "choose another one")
     write_text(path, listing)
     write_json(folder / PLAN_FILE, asdict(spec))  # last: it says that the folder is ours
