@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from lidargrit.evaluation.intervals import blocks
 
@@ -61,5 +61,5 @@ class Estimate:
         means = np.asarray([group[~np.isnan(group)].mean() for group in groups if not np.isnan(group).all()])
         if len(means) < 2:
             return cls(estimate, math.nan, math.nan)
-        reach = float(student.ppf(0.975, len(means) - 1) * means.std(ddof=1) / math.sqrt(len(means)))
+        reach = float(stdtrit(len(means) - 1, 0.975) * means.std(ddof=1) / math.sqrt(len(means)))
         return cls(estimate, estimate - reach, estimate + reach)

@@ -22,7 +22,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from lidargrit.errors import ConfigError, DataError
 from lidargrit.metrics import Metric
@@ -201,7 +201,7 @@ def around(value: float, half_values: Sequence[float], groups: int, bounds: tupl
         bounds: least and greatest value that the metric can have.
     """
     error = float(np.std(half_values, ddof=1))
-    reach = error * float(student.ppf(0.975, min(groups, len(half_values)) - 1))
+    reach = error * float(stdtrit(min(groups, len(half_values)) - 1, 0.975))
     least = max(bounds[0], 0.0) if min(value, *half_values) >= 0 else bounds[0]
     return Interval(max(value - reach, least), min(value + reach, bounds[1]), error, len(half_values))
 
