@@ -1,11 +1,10 @@
 """Prepared range images: pixels of projecting, found again, never stale, never half, whoever made which part."""
 
 import os
-import signal
+import shutil
 import subprocess
 import sys
 import threading
-import time
 
 import fsspec
 import numpy as np
@@ -51,10 +50,17 @@ def cache(tmp_path, monkeypatch):
     return tmp_path / "cache"
 
 
+@pytest.fixture(scope="module")
+def whole_tree(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("whole") / "tree"
+    KittiOdometry.write_example(folder, 5)
+    return folder
+
+
 @pytest.fixture
-def tree(tmp_path):
-    KittiOdometry.write_example(tmp_path / "tree", 5)
-    return tmp_path / "tree"
+def tree(whole_tree, tmp_path):
+    """Return a copy of five scans, to be damaged."""
+    return shutil.copytree(whole_tree, tmp_path / "tree")
 
 
 @pytest.fixture
@@ -141,7 +147,7 @@ def test_a_folder_prepared_from_what_has_changed_is_called_stale(tree, tmp_path)
     with pytest.raises(OutputError, match=r"which is stale: prepared with another digest"):
         prepare(str(tree), config, folder)
     with pytest.raises(OutputError, match="which is stale: prepared with another sensor"):
-        prepare("simulated:5", DataConfig(columns=512), prepare("simulated:5", config, tmp_path / "other"))
+        prepare("simulated:1", DataConfig(columns=512), prepare("simulated:1", config, tmp_path / "other"))
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("dear")
     with pytest.raises(OutputError, match="holds something else"):
@@ -179,29 +185,28 @@ def test_a_sensor_with_fewer_lasers_than_the_scans_show_is_warned_of(tree):
         load_range_images((), config)
 
 
-@pytest.mark.parametrize("count", [1, 3])
-def test_processes_make_the_same_shards_and_count_every_scan(tmp_path, small_shards, count):
-    alone = prepare("simulated:7", SIMULATED, tmp_path / "alone")
-    together = prepare("simulated:7", DataConfig(workers=count), tmp_path / "together")
-    names = sorted(path.name for path in alone.glob("*.shard"))
-    assert len(names) == 4
-    assert names == sorted(path.name for path in together.glob("*.shard"))
+def test_processes_make_the_same_shards_and_count_every_scan(tree, tmp_path, small_shards):
+    alone = prepare(str(tree), SIMULATED, tmp_path / "alone")
+    together = prepare(str(tree), DataConfig(workers=2), tmp_path / "together")
+    names, theirs = (sorted(path.name for path in folder.glob("*.shard")) for folder in (alone, together))
+    assert len(names) == 3, "of which one process makes two"
+    assert names == theirs
     assert same(alone, together)
 
 
-def test_machines_share_the_work_and_wait_for_one_another(tmp_path, small_shards):
+def test_machines_share_the_work_and_wait_for_one_another(tree, tmp_path, small_shards):
     def machine(rank: int) -> None:
-        prepare("simulated:7", SIMULATED, tmp_path / "shared_disk", rank=rank, world_size=2)
+        prepare(str(tree), SIMULATED, tmp_path / "shared_disk", rank=rank, world_size=2)
 
     threads = [threading.Thread(target=machine, args=(rank,)) for rank in (0, 1)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    ours, alone = (pixels_of(folder) for folder in (tmp_path / "shared_disk", prepare("simulated:7", SIMULATED)))
+    ours, alone = (pixels_of(folder) for folder in (tmp_path / "shared_disk", prepare(str(tree), SIMULATED)))
     assert all(np.array_equal(one[0], other[0]) for one, other in zip(ours, alone, strict=True))
     with pytest.raises(ConfigError, match="rank 2 of 2"):
-        prepare("simulated:7", SIMULATED, rank=2, world_size=2)
+        prepare(str(tree), SIMULATED, rank=2, world_size=2)
 
 
 def test_a_bad_scan_met_by_another_process_is_told_here(tree, small_shards):
@@ -210,26 +215,38 @@ def test_a_bad_scan_met_by_another_process_is_told_here(tree, small_shards):
         load(tree, workers=2)
 
 
-def test_killed_at_any_moment_it_goes_on_and_ends_the_same(tmp_path):
-    script = (
-        "import sys, lidargrit.loading as l; from pathlib import Path;"
-        "sys.modules[l.prepare.__module__]._SHARD_SCANS = 2;"
-        "l.prepare('simulated:16', l.DataConfig(workers=1), Path(sys.argv[1]))"
-    )
-    killed = 0
-    for delay_s in (0.1, 0.4, 0.7, 1.0):
-        process = subprocess.Popen([sys.executable, "-c", script, str(tmp_path / "killed")])
-        started = time.monotonic()
-        while time.monotonic() - started < 30 and not (tmp_path / "killed" / "plan.json").exists():
-            time.sleep(0.01)
-        time.sleep(delay_s)
-        process.send_signal(signal.SIGKILL)
-        killed += process.wait() == -signal.SIGKILL
-    assert killed > 0
-    subprocess.run([sys.executable, "-c", script, str(tmp_path / "killed")], check=True)
-    subprocess.run([sys.executable, "-c", script, str(tmp_path / "whole")], check=True)
-    shard_files = sorted(path.name for path in (tmp_path / "whole").glob("*.shard"))
-    assert len(shard_files) == 8
+KILLED_AND_FINISHED = """
+import os, signal, sys, time
+from pathlib import Path
+import lidargrit.loading as loading
+folder = Path(sys.argv[1])
+sys.modules[loading.prepare.__module__]._SHARD_SCANS = 2
+
+def begun():
+    if child := os.fork():
+        return child
+    try:
+        loading.prepare("simulated:12", loading.DataConfig(workers=1), folder)
+        os._exit(0)
+    finally:
+        os._exit(1)
+
+killed = 0
+for delay_s in (0.1, 0.4, 0.7):
+    child, until = begun(), time.monotonic() + 30
+    while time.monotonic() < until and not (folder / "plan.json").exists():
+        time.sleep(0.01)
+    time.sleep(delay_s)
+    os.kill(child, signal.SIGKILL)
+    killed += os.waitpid(child, 0)[1] == signal.SIGKILL
+sys.exit(os.waitpid(begun(), 0)[1] != 0 or not killed)
+"""
+
+
+def test_killed_at_any_moment_it_goes_on_and_ends_the_same(tmp_path, small_shards):
+    subprocess.run([sys.executable, "-c", KILLED_AND_FINISHED, str(tmp_path / "killed")], check=True)
+    prepare("simulated:12", SIMULATED, tmp_path / "whole")
+    assert len(list((tmp_path / "whole").glob("*.shard"))) == 6
     assert same(tmp_path / "killed", tmp_path / "whole")
 
 
@@ -246,23 +263,23 @@ class StopsAfter:
         return project(*arguments, **settings)
 
 
-def test_a_shard_is_taken_up_where_a_process_was_stopped(tmp_path, monkeypatch):
+def test_a_shard_is_taken_up_where_a_process_was_stopped(tree, tmp_path, monkeypatch):
     monkeypatch.setattr(workers, "_KEEP_EVERY_S", -1.0)  # after every scan
     folder = tmp_path / "stopped"
-    monkeypatch.setattr(workers, "project", StopsAfter(4))
+    monkeypatch.setattr(workers, "project", StopsAfter(3))
     with pytest.raises(KeyboardInterrupt):
-        prepare("simulated:6", SIMULATED, folder)
+        prepare(str(tree), SIMULATED, folder)
     assert sorted(path.name for path in folder.glob("0*")) == ["000000.unfinished"]
-    monkeypatch.setattr(workers, "project", rest := StopsAfter(6))
-    prepare("simulated:6", SIMULATED, folder)
+    monkeypatch.setattr(workers, "project", rest := StopsAfter(5))
+    prepare(str(tree), SIMULATED, folder)
     assert rest.asked == 2, "only the scans that were not done"
     monkeypatch.setattr(workers, "project", project)
-    assert same(folder, prepare("simulated:6", SIMULATED, tmp_path / "whole"))
+    assert same(folder, prepare(str(tree), SIMULATED, tmp_path / "whole"))
     assert sorted(path.name for path in folder.iterdir()) == ["000000.shard", "plan.json", "scans.json"]
 
 
-def test_prepared_images_are_a_source_here_and_by_url(tmp_path):
-    folder = prepare("simulated:4", SIMULATED, tmp_path / "out")
+def test_prepared_images_are_a_source_here_and_by_url(tree, tmp_path):
+    folder = prepare(str(tree), SIMULATED, tmp_path / "out")
     here = load_range_images((str(folder),), SIMULATED)
     memory = fsspec.filesystem("memory")
     memory.put(str(folder), "/bucket/scans", recursive=True)
@@ -318,9 +335,9 @@ class Bucket(LocalFileSystem):
         return super().cat_file(path, start, end)
 
 
-def test_prepared_images_are_read_from_a_bucket(tmp_path, monkeypatch):
+def test_prepared_images_are_read_from_a_bucket(tree, tmp_path, monkeypatch):
     fsspec.register_implementation("bucket", Bucket, clobber=True)
-    folder = prepare("simulated:4", SIMULATED, tmp_path / "out")
+    folder = prepare(str(tree), SIMULATED, tmp_path / "out")
     images = load_range_images((f"bucket://{folder}",), SIMULATED)
     assert torch.equal(images.batch([3, 0]).range_m, load_range_images((str(folder),), SIMULATED).batch([3, 0]).range_m)
     monkeypatch.setattr(Bucket, "down", True)
@@ -332,8 +349,8 @@ def test_prepared_images_are_read_from_a_bucket(tmp_path, monkeypatch):
         load_range_images((f"bucket://{folder}",), SIMULATED)
 
 
-def test_batches_come_in_one_order_whatever_reads_them():
-    images = load_range_images(("simulated:9",), SIMULATED)
+def test_batches_come_in_one_order_whatever_reads_them(tree):
+    images, _ = load(tree)
 
     def stream(workers_count, first=0, **process):
         batches = Batches(images, 4, ("flip", "roll"), True, 3, workers=workers_count, **process)
@@ -353,8 +370,6 @@ def test_batches_come_in_one_order_whatever_reads_them():
 
 
 def test_an_error_while_reading_ahead_reaches_the_reader():
-    images = load_range_images(("simulated:2",), SIMULATED)
-
     class Broken:
         provenance = Provenance()
 
@@ -364,7 +379,7 @@ def test_an_error_while_reading_ahead_reaches_the_reader():
         def read(self, index):
             raise ScanError("a broken file", "a whole one", "mend it")
 
-    broken = Batches(RangeImages(images.sensor, [Broken()]), 2, (), False, 0, workers=2)
+    broken = Batches(RangeImages(load_sensor("vlp16"), [Broken()]), 2, (), False, 0, workers=2)
     with pytest.raises(ScanError, match="a broken file"):
         list(broken.stream(0, 8))
 
@@ -373,16 +388,13 @@ def overlap_of(one, other):
     return one.provenance.overlap(other.provenance)
 
 
-def test_overlap_is_told_by_file_by_pixels_and_by_drive(tmp_path):
-    KittiOdometry.write_example(tmp_path / "tree", 6)
-    everything, first, last = (
-        load_range_images((f"{tmp_path / 'tree'}:{split}",), SIMULATED) for split in ("all", "00", "08")
-    )
+def test_overlap_is_told_by_file_by_pixels_and_by_drive(tree, tmp_path):
+    everything, first, last = (load_range_images((f"{tree}:{split}",), SIMULATED) for split in ("all", "00", "08"))
     assert overlap_of(everything, first) == "3 scans are in both"
     assert overlap_of(first, last) == ""
     copied = tmp_path / "copied.bin"
-    copied.write_bytes(KittiOdometry(tmp_path / "tree").path(0).read_bytes())
+    copied.write_bytes(KittiOdometry(tree).path(0).read_bytes())
     assert overlap_of(load_range_images((str(copied),), SIMULATED), first) == "1 scan is in both"
-    halves = [load_range_images((f"{tmp_path / 'tree'}:00{share}",), SIMULATED) for share in ("[:50%]", "[50%:]")]
-    assert overlap_of(*halves) == f"both have scans of {open_dataset(f'{tmp_path}/tree:00').recording(0)}"
-    assert overlap_of(*(load_range_images((f"simulated:3:{split}",), SIMULATED) for split in ("train", "val"))) == ""
+    halves = [load_range_images((f"{tree}:00{share}",), SIMULATED) for share in ("[:50%]", "[50%:]")]
+    assert overlap_of(*halves) == f"both have scans of {open_dataset(f'{tree}:00').recording(0)}"
+    assert overlap_of(*(load_range_images((f"simulated:1:{split}",), SIMULATED) for split in ("train", "val"))) == ""
