@@ -18,6 +18,14 @@ os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
 torch.set_num_threads(1)  # two threads while another process runs can be many times slower
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _cache(tmp_path_factory):
+    """Project scans once for all tests, and leave the user's own cache alone."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("LIDARGRIT_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
 @pytest.fixture(scope="session")
 def shared() -> Path:
     if not SHARED.is_dir():

@@ -27,13 +27,6 @@ CHEAP = ("return_rate_per_ring", "bev_occupancy")
 PROTOCOLS = _discovery.names("evaluation.protocols")
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _cache(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("LIDARGRIT_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield
-
-
 def write_scans(folder, count, seed, variant=""):
     """Write range images as another program would, or with a manifest as this one does."""
     rng = torch.Generator().manual_seed(seed)

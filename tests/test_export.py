@@ -23,13 +23,6 @@ from tiny_runs import contents
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(512, 8)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _cache(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("LIDARGRIT_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield
-
-
 @pytest.fixture(scope="module")
 def samples(tmp_path_factory):
     """Return a folder as ``lidargrit sample`` writes it, of two scans with reflectance."""

@@ -85,8 +85,7 @@ def test_imported_networks_give_the_programs_numbers(golden, tmp_path):
         assert np.allclose(model.transformer(tokens[:, :-1]).numpy(), gpt["logits"], atol=1e-4)
 
 
-def test_an_import_is_a_run_that_all_verbs_take(files, tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv("LIDARGRIT_CACHE", str(tmp_path / "cache"))
+def test_an_import_is_a_run_that_all_verbs_take(files, tmp_path, capsys):
     run, samples = str(tmp_path / "run"), str(tmp_path / "samples")
     assert imported(run, files) == 0
     assert "weights of lidargrit for hdl64e_kitti_odometry lie in" in capsys.readouterr().out

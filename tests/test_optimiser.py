@@ -113,8 +113,7 @@ def test_muon_is_refused_where_no_block_has_a_matrix():
 
 
 @pytest.fixture
-def images(tmp_path_factory, monkeypatch):
-    monkeypatch.setenv("LIDARGRIT_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
+def images():
     data = DataConfig(train=("simulated:2:train",), columns=256, column_stride=8)
     return load_range_images(data.train, data).batch([0, 1])
 

@@ -31,7 +31,6 @@ def code(tmp_path, monkeypatch):
     find = _discovery._folder
     monkeypatch.setattr(_discovery, "_folder", lambda package: folder if package == "generators" else find(package))
     monkeypatch.setattr(lidargrit.generators, "__path__", [*lidargrit.generators.__path__, str(folder)])
-    monkeypatch.setenv("LIDARGRIT_CACHE", str(tmp_path / "cache"))
     path = folder / "mean_street.py"
     path.write_text(re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)[0], encoding="utf-8")
     return path

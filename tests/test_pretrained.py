@@ -62,8 +62,7 @@ def test_a_word_gives_scans(tmp_path, monkeypatch, capsys):
     assert ground > 0.35
 
 
-def test_its_networks_compute_what_they_did_when_they_were_scored(model, tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("LIDARGRIT_CACHE", str(tmp_path / "cache"))
+def test_its_networks_compute_what_they_did_when_they_were_scored(model, capsys):
     assert main(["evaluate", "pretrained", "simulated:8:test", "--json"]) == 0
     errors = json.loads(capsys.readouterr().out)["reconstruction"]
     assert errors["range_mae_m"] == pytest.approx(1.128, rel=0.02)
@@ -91,12 +90,12 @@ def test_what_a_user_calls_so_goes_first(model, tmp_path, monkeypatch):
 
 def test_every_verb_that_takes_a_run_takes_the_word(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("LIDARGRIT_CACHE", str(tmp_path / "cache"))
     assert main(["view", "pretrained", "-n", "1", "-o", "page.html"]) == 0
     few = ["--against", "simulated:2:test", "-n", "2", "--metrics", "bev_jsd"]
     assert main(["compare", "table", "pretrained", "marginal", *few, "--set", "data.train=simulated:2:train"]) == 0
     words = ["data.train=simulated:2:train", "data.val=simulated:1:val", "tokenizer_from=pretrained"]
-    words += ["training.transformer.scans=8", "training.transformer.warmup_scans=0", "model.transformer.layers=1"]
+    words += [f"training.transformer.{setting}" for setting in ("scans=2", "batch_size=2", "warmup_scans=0")]
+    words.append("model.transformer.layers=1")
     assert main(["train", "compact", "run", "--set", *words]) == 0
     assert main(["publish", "run", "to_share"]) == 0
     assert json.loads((tmp_path / "to_share" / "run.json").read_text())["recipe"]["tokenizer_from"] is None

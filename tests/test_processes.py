@@ -34,7 +34,7 @@ STEADY = [  # no random numbers of a process, only of a scan; codes that restart
     *[f"model.transformer.{part}_dropout=0" for part in ("embedding", "attention", "residual")],
     "training.tokenizer.augmentations=[flip,roll]",
     *[f"training.{stage}.precision=fp32" for stage in ("tokenizer", "transformer")],
-    "training.tokenizer.scans=96",
+    "training.tokenizer.scans=48",
     "training.tokenizer.validate_every=4",
     "training.transformer.scans=64",
     "training.transformer.validate_every=8",
@@ -59,11 +59,6 @@ with contextlib.redirect_stderr(io.StringIO()) as told:
 assert "got no answer from another of 2 processes; wanted all of them" in told.getvalue(), told.getvalue()
 assert "Traceback" not in told.getvalue()
 """
-
-
-@pytest.fixture(autouse=True)
-def cache(tmp_path_factory, monkeypatch):
-    monkeypatch.setenv("LIDARGRIT_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
 
 
 class Game(Objective):
