@@ -23,29 +23,33 @@ from tiny_runs import LONG, contents, the_one_line, train_words
 
 
 class Interrupted(reporting.TerminalReporter):
-    """Presses Ctrl-C after some steps of training."""
+    """Presses Ctrl-C after some steps of training, or terminates."""
 
-    steps = 0
+    steps, terminates = 0, False
 
     @contextmanager
     def progress(self, what: str, total: int, done: int = 0) -> Iterator[reporting.Progress]:
         left = iter(range(self.steps - 1)) if what.startswith("training") else iter(range(1 << 30))
+        terminates = self.terminates
 
-        class Pressed(reporting.Progress):
+        class Stopped(reporting.Progress):
             def advance(self, amount: int, note: str = "") -> None:
                 if next(left, None) is None:
-                    raise KeyboardInterrupt
+                    if not terminates:
+                        raise KeyboardInterrupt
+                    signal.raise_signal(signal.SIGTERM)
 
-        yield Pressed()
+        yield Stopped()
 
 
 @pytest.fixture
 def interrupt(monkeypatch):
     """Return a function that runs a command and interrupts it at a step of its training."""
 
-    def run(steps: int, words: list[str]) -> int:
+    def run(steps: int, words: list[str], terminates: bool = False) -> int:
         with monkeypatch.context() as patch:
             patch.setattr(Interrupted, "steps", steps)
+            patch.setattr(Interrupted, "terminates", terminates)
             patch.setattr(reporting, "TerminalReporter", Interrupted)
             return main(words)
 
@@ -101,14 +105,16 @@ def lidargrit(words: list[str], **options) -> subprocess.Popen[str]:
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
 
 
-def limited_to(size: int):
-    """Return what a new process does first: files may not grow beyond a size, as on a disk that is full."""
-
-    def limit() -> None:
-        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
-
-    return limit
+@contextmanager
+def files_limited_to(size: int) -> Iterator[None]:
+    """Let files not grow beyond a size, as on a disk that is full."""
+    before, handler = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
 
 
 def test_a_real_interrupt_from_the_keyboard(interrupt, tmp_path):
@@ -130,36 +136,13 @@ def test_a_real_interrupt_from_the_keyboard(interrupt, tmp_path):
     assert read_tensors(checkpoint)[1]["scans_seen"] == seen + 8, "two more steps, and the third not to its end"
 
 
-TERMINATED = """
-import os, signal, sys
-from contextlib import contextmanager
-from lidargrit import reporting
-from lidargrit.cli import main
-
-class Terminated(reporting.TerminalReporter):
-    @contextmanager
-    def progress(self, what, total, done=0):
-        left = iter(range(1 if what.startswith("training") else 1 << 30))
-        class Signalled(reporting.Progress):
-            def advance(self, amount, note=""):
-                if next(left, None) is None:
-                    os.kill(os.getpid(), signal.SIGTERM)
-        yield Signalled()
-
-reporting.TerminalReporter = Terminated
-sys.exit(main(sys.argv[1:]))
-"""
-
-
-def test_termination_saves_the_step_and_goes_on_to_the_same_weights(uninterrupted, tmp_path):
+def test_termination_saves_the_step_and_goes_on_to_the_same_weights(interrupt, uninterrupted, tmp_path, capsys):
     """As a batch scheduler does it, here at the second step; no checkpoint is due before the end of the stage."""
     words = train_words(tmp_path / "run", *LONG, "training.tokenizer.checkpoint_every=1000000")
-    done = subprocess.run(
-        [sys.executable, "-c", TERMINATED, *words], capture_output=True, text=True, timeout=200, check=False
-    )
-    assert done.returncode == 143, done.stderr
-    assert done.stderr.endswith("\nlidargrit train: terminated; the same command goes on\n")
-    assert "Traceback" not in done.stderr
+    assert interrupt(2, words, terminates=True) == 143
+    output = capsys.readouterr().err
+    assert output.endswith("\nlidargrit train: terminated; the same command goes on\n")
+    assert "Traceback" not in output
     seen = read_tensors(tmp_path / "run" / "tokenizer" / "checkpoint.safetensors")[1]["scans_seen"]
     assert 8 <= seen < 48
     assert hidden(tmp_path) == []
@@ -183,14 +166,14 @@ def test_termination_before_the_first_step(tmp_path):
     assert not folder.exists()
 
 
-def test_a_full_disk_during_a_save(interrupt, uninterrupted, tmp_path):
+def test_a_full_disk_during_a_save(interrupt, uninterrupted, tmp_path, capsys):
     words = train_words(tmp_path / "run", *LONG)
     assert interrupt(4, words) == 130
     before = contents(tmp_path)
-    process = lidargrit(words, preexec_fn=limited_to(100_000))
-    _, output = process.communicate(timeout=60)
-    assert process.returncode == 2, output
-    line = the_one_line(output, "train")
+    capsys.readouterr()
+    with files_limited_to(100_000):
+        assert main(words) == 2
+    line = the_one_line(capsys.readouterr().err, "train")
     assert re.search(r"got '.*' while writing .*checkpoint\.safetensors; .*free some space", line)
     name = "run/tokenizer/checkpoint.safetensors"
     assert contents(tmp_path)[name] == before[name]
@@ -199,39 +182,37 @@ def test_a_full_disk_during_a_save(interrupt, uninterrupted, tmp_path):
     assert (tmp_path / "run" / "model.safetensors").read_bytes() == uninterrupted
 
 
-def test_a_full_disk_while_sampling(run_folder, samples, tmp_path):
+def test_a_full_disk_while_sampling(run_folder, samples, tmp_path, capsys):
     before = contents(tmp_path)
-    process = lidargrit(["sample", str(run_folder), str(samples), "-n", "3"], preexec_fn=limited_to(1000))
-    _, output = process.communicate(timeout=60)
-    assert process.returncode == 2, output
+    capsys.readouterr()
+    with files_limited_to(1000):
+        assert main(["sample", str(run_folder), str(samples), "-n", "3"]) == 2
+    output = capsys.readouterr().err
     assert re.search(r"got '.*' while writing .*00000002\.npz; .*free some space", the_one_line(output, "sample"))
     assert contents(tmp_path) == before
 
 
-def test_a_full_disk_before_the_first_step_and_while_projecting(tmp_path):
+def test_a_full_disk_before_the_first_step_and_while_projecting(tmp_path, monkeypatch, capsys):
     assert main(train_words(tmp_path / "warm")) == 0  # so that the scans are in the cache
     for size, wanted in ((0, "run.json"), (8_000, "plan.json")):
-        process = lidargrit(
-            train_words(tmp_path / "run"),
-            preexec_fn=limited_to(size),
-            env=os.environ | {"LIDARGRIT_CACHE": str(tmp_path / "cache")} if size else None,
-        )
-        _, output = process.communicate(timeout=60)
-        assert process.returncode == 2, output
-        assert re.search(rf"got '.*' while writing .*{wanted}; ", the_one_line(output, "train"))
+        capsys.readouterr()
+        with monkeypatch.context() as patch, files_limited_to(size):
+            if size:
+                patch.setenv("LIDARGRIT_CACHE", str(tmp_path / "cache"))
+            assert main(train_words(tmp_path / "run")) == 2
+        assert re.search(rf"got '.*' while writing .*{wanted}; ", the_one_line(capsys.readouterr().err, "train"))
         assert hidden(tmp_path) == []
     assert main(train_words(tmp_path / "run")) == 0
 
 
-def test_a_full_disk_while_logging(tmp_path, interrupt):
+def test_a_full_disk_while_logging(tmp_path, interrupt, capsys):
     words = train_words(tmp_path / "run", *LONG)
     assert interrupt(4, words) == 130
     log = tmp_path / "run" / "tokenizer" / "log.jsonl"
     log.mkdir()  # stands for anything that keeps the file from being opened
-    process = lidargrit(words)
-    _, output = process.communicate(timeout=60)
-    assert process.returncode == 2, output
-    assert "log.jsonl" in the_one_line(output, "train")
+    capsys.readouterr()
+    assert main(words) == 2
+    assert "log.jsonl" in the_one_line(capsys.readouterr().err, "train")
 
 
 KILLER = """
