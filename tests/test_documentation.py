@@ -2,8 +2,10 @@
 
 import ast
 import importlib.util
+import inspect
 import re
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,6 +14,9 @@ from PIL import Image
 
 from lidargrit import _discovery
 from lidargrit.cli import build_parser
+from lidargrit.generators.lidargrit import LidarGrit
+from lidargrit.nn.pixel_networks import PixelDecoderConfig
+from lidargrit.sensors import load_sensor
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([*(ROOT / "docs").rglob("*.md"), *ROOT.glob("*.md")])
@@ -129,8 +134,18 @@ def test_pictures_are_small_and_shown():
     assert sum(path.stat().st_size for path in pictures) < 4_000_000
 
 
+@pytest.fixture(scope="module")
+def tiny_run(tmp_path_factory):
+    """Return a run of random weights, for examples that take the packaged one if they are told no other."""
+    sensor = load_sensor("hdl64e_kitti_odometry").with_columns(256)
+    pixels = PixelDecoderConfig(mask_features=2, range_features=2, mask_width=4, range_width=4, blocks=1)
+    model = LidarGrit(replace(LidarGrit.smallest_config(sensor), pixels=pixels), sensor)
+    model.save(folder := tmp_path_factory.mktemp("run"))
+    return folder
+
+
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
-def test_examples_run_and_draw_what_is_shown(path, tmp_path, capsys):
+def test_examples_run_and_draw_what_is_shown(path, tiny_run, tmp_path, capsys):
     spec = importlib.util.spec_from_file_location(path.stem, path)
     assert spec is not None
     assert spec.loader is not None
@@ -138,7 +153,8 @@ def test_examples_run_and_draw_what_is_shown(path, tmp_path, capsys):
     spec.loader.exec_module(module)
     for name in {"STEPS", "COUNT"} & vars(module).keys():
         setattr(module, name, 3)  # what is shown takes seconds more
-    module.main(tmp_path)
+    runs = [str(tiny_run)] if "run" in inspect.signature(module.main).parameters else []
+    module.main(tmp_path, *runs)
     assert capsys.readouterr().out
     drawn = re.findall(r"→ (\w+\.(?:png|webp))\.", module.__doc__ or "")
     assert {file.name for file in tmp_path.iterdir()} == set(drawn)

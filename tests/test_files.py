@@ -5,7 +5,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -175,28 +174,52 @@ def test_a_name_as_long_as_the_disk_allows_is_written(tmp_path):
         write_text(tmp_path / f"x{name}", "whole")
 
 
-@pytest.mark.parametrize(
-    "call",
-    [
-        "from lidargrit.simulator.drives import DriveConfig, write_drives; from lidargrit.sensors import load_sensor;"
-        "write_drives(out, 6, DriveConfig(load_sensor('vlp16')))",
-        "from lidargrit.export import export_scans; export_scans('simulated:6', out, 'pcd')",
-        "from lidargrit.loading import DataConfig, prepare; prepare('simulated:6', DataConfig(workers=1), out)",
-    ],
-    ids=["simulate", "export", "prepare"],
-)
-def test_the_command_that_finishes_a_killed_one_leaves_whole_files_alone(tmp_path, call):
-    script = f"import sys; from pathlib import Path; out = Path(sys.argv[1]); {call}"
+KILLED_AND_FINISHED = """
+import os, signal, sys, time
+from pathlib import Path
+from lidargrit.export import export_scans
+from lidargrit.loading import DataConfig, prepare
+from lidargrit.sensors import load_sensor
+from lidargrit.simulator.drives import DriveConfig, write_drives
+
+COMMANDS = {
+    "simulate": lambda out: write_drives(out, 6, DriveConfig(load_sensor("vlp16"))),
+    "export": lambda out: export_scans("simulated:6", out, "pcd"),
+    "prepare": lambda out: prepare("simulated:6", DataConfig(workers=1), out),
+}
+
+def begun(command, out):
+    child = os.fork()
+    if child:
+        return child
+    try:
+        command(out)
+        os._exit(0)
+    finally:
+        os._exit(1)
+
+for name, command in COMMANDS.items():
+    out = Path(sys.argv[1]) / name
     for delay_s in (0.0, 0.15, 0.3):
-        process = subprocess.Popen([sys.executable, "-c", script, str(tmp_path / "out")])
-        began = time.monotonic()
-        while not (tmp_path / "out").exists() and process.poll() is None and time.monotonic() - began < 60:
+        child, until = begun(command, out), time.monotonic() + 60
+        while not out.exists() and time.monotonic() < until:
             time.sleep(0.005)
         time.sleep(delay_s)
-        process.kill()
-        process.wait()
-    subprocess.run([sys.executable, "-c", script, str(tmp_path / "out")], check=True)
-    assert not [name for name in everything_in(tmp_path / "out") if name.startswith(".") or "/." in name]
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+    if os.waitpid(begun(command, out), 0)[1]:
+        sys.exit(f"{name} did not end well")
+"""
+
+
+def test_the_command_that_finishes_a_killed_one_leaves_whole_files_alone(tmp_path):
+    """All commands are forks of one process, so that modules are imported once."""
+    done = subprocess.run(
+        [sys.executable, "-c", KILLED_AND_FINISHED, str(tmp_path)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["export", "prepare", "simulate"]
+    assert not [name for name in everything_in(tmp_path) if name.startswith(".") or "/." in name]
 
 
 def test_a_folder_is_never_taken_for_a_file_to_replace(tmp_path):
