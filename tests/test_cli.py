@@ -17,9 +17,13 @@ import lidargrit
 from lidargrit import _discovery
 from lidargrit.cli import build_parser, main
 from lidargrit.datasets import load
+from lidargrit.demo import divided
+from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.evaluation.scorecard import format_value
 from lidargrit.formats import read_scan as read_bin
 from lidargrit.recipes import load_recipe
+from lidargrit.reporting import TerminalReporter
+from lidargrit.sources import load_range_images
 from lidargrit.sources.samples import read_samples
 from tiny_runs import MODEL, the_one_line
 
@@ -30,17 +34,9 @@ TINY = [
     "training.tokenizer.scans=8",
     "training.transformer.scans=8",
 ]
-COUNTED = ("lidargen_kitti_360", "lidargrit_kitti_360", "r2flow_kitti_360")  # counting takes seconds for each recipe
-
-
+ONE_METRIC = ("lidargrit.demo.EvalConfig", lambda: EvalConfig(metrics=("bev_jsd",)))
+COUNTED = ("lidargen_kitti_360", "r2flow_kitti_360")  # counting takes seconds for each recipe
 PIXELS = ["training.pixels.scans=2", "model.pixels.mask_width=4", "model.pixels.range_width=4", "model.pixels.blocks=1"]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _cache(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("LIDARGRIT_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield
 
 
 @pytest.fixture
@@ -140,10 +136,13 @@ def test_dry_run_finds_prepared_scans_of_another_sensor(tmp_path, capsys):
     assert "(64x64); wanted the rays of " in the_one_line(capsys.readouterr().err, "train")
 
 
+def told_at_once(recipe):
+    return dict.fromkeys(recipe.training, 10**18)
+
+
 @pytest.mark.parametrize("recipe", _discovery.names("recipes"))
 def test_every_recipe_has_a_plan(recipe, tmp_path, capsys, monkeypatch):
     if recipe not in COUNTED:
-        told_at_once = lambda recipe: dict.fromkeys(recipe.training, 10**18)  # noqa: E731
         monkeypatch.setattr(sys.modules["lidargrit.training.plan"], "training_flops", told_at_once)
     monkeypatch.chdir(tmp_path)
     is_simulated = load_recipe(recipe).data.train[0].startswith("simulated")
@@ -154,12 +153,13 @@ def test_every_recipe_has_a_plan(recipe, tmp_path, capsys, monkeypatch):
     assert (" parameters, " in captured.out) == bool(load_recipe(recipe).training)
 
 
-def test_a_plan_tells_which_stages_are_taken_and_not_trained(tmp_path, capsys):
+def test_a_plan_tells_which_stages_are_taken_and_not_trained(tmp_path, capsys, monkeypatch):
     assert main(["train", "compact_raydrop", str(tmp_path / "none"), "--dry-run", "--json"]) == 0
     stages = {stage["name"]: stage for stage in json.loads(capsys.readouterr().out)["stages"]}
     assert {name for name, stage in stages.items() if not stage["taken_from"]} == {"raydrop"}
     assert stages["pixels"]["taken_from"] == "pretrained"
     assert stages["pixels"]["flops"] == 0 < stages["raydrop"]["flops"]
+    monkeypatch.setattr(sys.modules["lidargrit.training.plan"], "training_flops", told_at_once)
     words = ["--dry-run", "--set", "fine_tune=[pixels]"]
     assert main(["train", "compact_raydrop", str(tmp_path / "none"), *words]) == 0
     text = capsys.readouterr().out
@@ -277,10 +277,11 @@ def test_processes_share_the_seeds(run_folder, tmp_path, typed):
 def test_list_names_everything_there_is(typed):
     output = typed("list")
     for kind in ("datasets", "formats", "sensors", "tokenizers", "generators", "metrics", "recipes"):
-        assert typed("list", kind).splitlines()[0] == kind
+        in_full = typed("list", kind)
+        assert in_full.splitlines()[0] == kind
         for name in _discovery.names(kind):
             assert f"  {name} " in output
-            assert f"  {name} " in typed("list", kind)
+            assert f"  {name} " in in_full
     assert "sample --set: temperature=1.0, top_k=0, top_p=1.0, mask=auto" in typed("list", "generators")
     assert "licence: " in typed("list", "datasets")
     assert "  lidargrit-kitti-360 " in typed("list", "protocols")
@@ -296,7 +297,9 @@ def test_doctor_tells_versions_and_room(typed):
 
 
 def test_demo_writes_its_page_and_writes_it_again(tmp_path, typed, monkeypatch):
+    monkeypatch.setattr(*ONE_METRIC)
     monkeypatch.setattr("lidargrit.demo._PACKAGED_SCANS", 1)
+    monkeypatch.setattr("lidargrit.demo._NUM_SAMPLES", 11)  # as many as its pictures show
     words = ("demo", "--out", tmp_path / "demo", "--set", *TINY, *PIXELS)
     assert f"done: look at {tmp_path / 'demo'}" in typed(*words)
     before = contents(tmp_path / "demo")
@@ -305,7 +308,7 @@ def test_demo_writes_its_page_and_writes_it_again(tmp_path, typed, monkeypatch):
         "timings.json",
         "scans_reconstructed_generated.png",
         "generated.png",
-        "samples/00000015.npz",
+        "samples/00000010.npz",
         "samples_of_packaged_model/00000000.npz",
         "model.safetensors",
     ):
@@ -321,6 +324,7 @@ def test_demo_writes_its_page_and_writes_it_again(tmp_path, typed, monkeypatch):
 
 
 def test_demo_on_a_users_own_drives(tmp_path, typed, monkeypatch):
+    monkeypatch.setattr(*ONE_METRIC)
     load("kitti_odometry").write_example(tmp_path / "own scans", 4)
     monkeypatch.chdir(tmp_path)
     typed("demo", "--data", tmp_path / "own scans", "--set", *TINY[2:], *PIXELS)
@@ -332,11 +336,10 @@ def test_demo_on_a_users_own_drives(tmp_path, typed, monkeypatch):
 
 def test_demo_on_one_drive_holds_its_last_scans_out_and_warns(tmp_path, capsys):
     load("kitti_odometry").write_example(tmp_path / "tree", 8)
-    words = ["demo", "--data", str(tmp_path / "tree" / "sequences" / "00"), "--out", str(tmp_path / "run")]
-    assert main([*words, "--set", *TINY[2:], *PIXELS]) == 0
+    data = divided(str(tmp_path / "tree" / "sequences" / "00"), TerminalReporter())
     assert "WARNING: the last scans are held out" in capsys.readouterr().err
-    recipe = json.loads((tmp_path / "run" / "run.json").read_text())["recipe"]
-    assert recipe["data"]["val"][0].endswith("[85%:]")
+    assert (data.train[0][-6:], data.val[0][-6:]) == ("[:85%]", "[85%:]")
+    assert [len(load_range_images(sources, data)) for sources in (data.train, data.val)] == [3, 1]
 
 
 def test_python_and_the_command_line_do_the_same(run_folder, samples):
