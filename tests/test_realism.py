@@ -22,13 +22,6 @@ SENSOR = load_sensor("hdl64e_kitti_odometry")
 COUNT = 3
 
 
-@pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("LIDARGRIT_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield
-
-
 @pytest.fixture(scope="module")
 def simulated():
     pairs = [simulate_pair(seed, SENSOR) for seed in range(COUNT)]

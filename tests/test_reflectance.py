@@ -83,8 +83,7 @@ def test_samples_and_completions_have_it():
     assert bool((completed[..., 16:] > 0).any())
 
 
-def test_a_run_with_it_from_training_to_scores(tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("LIDARGRIT_CACHE", str(tmp_path / "cache"))
+def test_a_run_with_it_from_training_to_scores(tmp_path, capsys):
     assert main(train_words(tmp_path / "run", "model.tokenizer.reflectance=true")) == 0
     run, samples = str(tmp_path / "run"), str(tmp_path / "samples")
     assert main(["sample", run, samples, "-n", "2"]) == 0

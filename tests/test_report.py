@@ -21,13 +21,6 @@ VOID = {"meta", "img", "br", "line", "circle"}
 EVIL = "<script>alert('x')</script>\"'&"
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _cache(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("LIDARGRIT_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield
-
-
 @pytest.fixture(scope="module")
 def evaluated():
     # Of real streets only a few: simulating them takes most of the time.

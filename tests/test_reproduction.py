@@ -27,11 +27,6 @@ STEPS = [  # 4 and 2 of them, a checkpoint after each
 ]
 
 
-@pytest.fixture(autouse=True)
-def cache(tmp_path_factory, monkeypatch):
-    monkeypatch.setenv("LIDARGRIT_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
-
-
 def words_for(folder: Path, *more: str) -> list[str]:
     few = ["-n", "4", "--flops", "0"]
     return ["reproduce", "3", "simulated", str(folder), "--small", *few, *more, "--set", *MODEL, *SIMULATED, *STEPS]

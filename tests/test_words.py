@@ -48,8 +48,7 @@ FACTS = {
 
 
 @pytest.fixture(autouse=True)
-def _elsewhere(tmp_path_factory, tmp_path, monkeypatch):
-    monkeypatch.setenv("LIDARGRIT_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
+def _elsewhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 

@@ -11,13 +11,6 @@ from lidargrit.datasets import load
 from tiny_runs import contents, the_one_line, train_words
 
 
-@pytest.fixture(scope="session", autouse=True)
-def _cache(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("LIDARGRIT_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield
-
-
 @pytest.fixture(scope="session")
 def finished(tmp_path_factory) -> dict[str, Path]:
     """Return finished runs that differ in their sizes."""
