@@ -323,17 +323,6 @@ def test_demo_writes_its_page_and_writes_it_again(tmp_path, typed, monkeypatch):
     assert again == before
 
 
-def test_demo_on_a_users_own_drives(tmp_path, typed, monkeypatch):
-    monkeypatch.setattr(*ONE_METRIC)
-    load("kitti_odometry").write_example(tmp_path / "own scans", 4)
-    monkeypatch.chdir(tmp_path)
-    typed("demo", "--data", tmp_path / "own scans", "--set", *TINY[2:], *PIXELS)
-    recipe = json.loads((tmp_path / "runs" / "demo-own scans" / "run.json").read_text())["recipe"]
-    assert recipe["data"]["train"] == [f"kitti_odometry:{tmp_path / 'own scans'}:00"]
-    assert recipe["data"]["val"] == [f"kitti_odometry:{tmp_path / 'own scans'}:08"]
-    assert recipe["data"]["sensor"] == "hdl64e_kitti_odometry"
-
-
 def test_demo_on_one_drive_holds_its_last_scans_out_and_warns(tmp_path, capsys):
     load("kitti_odometry").write_example(tmp_path / "tree", 8)
     data = divided(str(tmp_path / "tree" / "sequences" / "00"), TerminalReporter())

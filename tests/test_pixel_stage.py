@@ -285,11 +285,12 @@ def test_fine_tuning_starts_from_the_weights_of_the_other_run(tmp_path):
     for settings, message in (
         ({"fine_tune": ("mask",)}, "fine_tune=mask; wanted one of tokenizer, transformer, pixels"),
         ({"fine_tune": ("pixels",), "train_anew": ("pixels",)}, "fine_tune=pixels; wanted one of tokenizer, trans"),
-        ({"stages_from": None}, "fine_tune=tokenizer without stages_from"),
     ):
         wrong = replace(recipe, **settings)
         with pytest.raises(ConfigError, match=message):
             taken_stages(wrong, wrong.build_generator())
+    with pytest.raises(ConfigError, match="fine_tune=tokenizer without stages_from"):
+        replace(recipe, stages_from=None)
 
 
 def test_a_run_of_other_sizes_or_another_kind_gives_no_stages(tmp_path):

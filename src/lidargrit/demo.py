@@ -29,6 +29,7 @@ from lidargrit.sources.samples import read_samples, write_samples
 from lidargrit.structures import RangeImage
 from lidargrit.training import Recipe, check_folder, train
 from lidargrit.training.log import LOG_FILE, read_log
+from lidargrit.training.taken_stages import donors_of_stages
 from lidargrit.viewer import plot_comparison
 from lidargrit.viewer.demo_page import DemoPage, write_demo_page
 from lidargrit.viewer.scan_sets import ScanSet
@@ -38,32 +39,38 @@ _NUM_SAMPLES = 16
 _MAX_SCANS = 400  # of the user's: more would not be seen in the demo's few minutes
 # Seconds on two cores, to estimate the time left before anything was measured.
 _SIMULATED_S, _READ_S, _SAMPLED_S, _SCORED_S = 58.0, 20.0, 30.0, 25.0
-_TRAINED_S = {"tokenizer": 0.38, "transformer": 0.08, "pixels": 0.16}  # for each scan seen
+_TRAINED_S = {"tokenizer": 0.38, "pixels": 0.16}  # for each scan seen, of 64x256 pixels
+_TRANSFORMER_S = 0.045, 0.026e-6  # for each scan seen, and for each of these and each weight of the blocks
 # A pixel decoder that was trained for a minute is unsure of every range: sharper than by default, the ground is smooth.
 _SHARPER = TokenSampling(range_temperature=0.1, range_noise=0.2)
+_DEFAULT = TokenSampling()
 _PACKAGED_SCANS = 6  # sampled by the model in the package, which was trained for three hours
+_STAGES = {"tokenizer": "the tokenizer", "transformer": "the transformer", "pixels": "the pixel decoder"}
 _SCANS_OF_A_SET = 6  # of each set on the page: enough to step through, and half a megabyte each
 
 
-def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter) -> Path:
+def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter, anew: bool = False) -> Path:
     """Run everything on simulated or on the user's scans, and return the folder of the results.
+
+    On simulated scans, a transformer is trained anew over the other networks of the model in the package. On the user's
+    scans, all of that model's networks are trained further. Where its rays are not those of the scans, all are trained
+    anew.
 
     Args:
         data: a folder of scans or another source; None for simulated scans.
         folder: run folder, which also gets ``demo.html``, ``samples``, ``evaluation.json`` and two pictures.
         settings: changed settings of the recipe, as ``--set`` takes them.
         reporter: receiver of progress and messages.
+        anew: whether all networks are trained anew, instead of beginning with those of the model in the package.
     """
-    recipe = load_recipe("demo_pixels")
-    if data is not None:
-        recipe = replace(recipe, data=divided(data, reporter))
-    recipe = override(recipe, settings)
+    recipe = _recipe(data, settings, reporter, anew)
     check_folder(folder, recipe)
     expected_s = _expected_s(recipe, simulates=data is None)
     minutes = max(1, round(sum(expected_s.values()) / 60))
     reporter.message(
         f"lidargrit demo: about {minutes} minutes on two cores; stop it at any time, the same command goes on"
     )
+    reporter.message(how_trained(recipe))
     reporter.expect(expected_s)
     clock = _Clock(folder / TIMINGS)
     with clock.stage("read the scans and project them" if data else "simulate scans and project them"):
@@ -71,10 +78,11 @@ def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter
         val = load_range_images(recipe.data.val, recipe.data, reporter)
     generator = train(recipe, folder, reporter)
     clock.keep()
-    for stage in generator.stages:
+    for stage in _trained_stages(recipe):
         clock.add(f"train the {stage}", _trained_s(folder / stage / LOG_FILE))
+    sampling = _sampling(recipe)
     with clock.stage(f"sample {_NUM_SAMPLES} new scans"):
-        write_samples(generator, folder, folder / "samples", range(_NUM_SAMPLES), _SHARPER, reporter)
+        write_samples(generator, folder, folder / "samples", range(_NUM_SAMPLES), sampling, reporter)
     samples = read_samples(folder / "samples", _NUM_SAMPLES)
     packaged = _packaged_samples(folder / "samples_of_packaged_model", clock, reporter) if data is None else None
     with clock.stage("score reconstruction and new scans"):
@@ -94,16 +102,42 @@ def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter
         "(scores after a few minutes of training on little data; they cannot be compared with published tables)"
     )
     kind = "real" if data else "simulated"
-    _plot_pictures(generator, kind, val, samples, folder)
+    _plot_pictures(generator, kind, val, samples, sampling, folder)
     weights = sum(weight.numel() for weight in generator.parameters()) / 1e6
-    facts = (
+    facts = [
+        how_trained(recipe),
         f"LidarGRIT at a small size: {weights:.1f} million weights",
         f"{len(real):,} {kind} scans to learn from and {len(val):,} held out, of the sensor {generator.sensor.name}",
-        f"ranges sampled sharper than by default (range_temperature={_SHARPER.range_temperature}, "
-        f"range_noise={_SHARPER.range_noise}), because so little training leaves them uncertain",
-    )
-    write_results_page(generator, kind, val, samples, reconstruction, card, clock.seconds, facts, folder, packaged)
+    ]
+    if sampling == _SHARPER:
+        facts.append(
+            f"ranges sampled sharper than by default (range_temperature={_SHARPER.range_temperature}, "
+            f"range_noise={_SHARPER.range_noise}), because so little training leaves them uncertain"
+        )
+    results = reconstruction, card, clock.seconds, tuple(facts), folder
+    write_results_page(generator, kind, val, samples, *results, packaged, sampling)
     return folder
+
+
+def how_trained(recipe: Recipe) -> str:
+    """Return which networks the demo trains anew, trains further and takes as they are, in a sentence for each."""
+    stages = _trained_stages(recipe)
+    further = [stage for stage in stages if stage in recipe.fine_tune]
+    sentences = (
+        ([stage for stage in _STAGES if stage not in stages], "comes", "come", "as trained, from {package}"),
+        (further, "learns", "learn", "further here, from the weights of {package}"),
+        ([stage for stage in stages if stage not in further], "learns", "learn", "anew here"),
+    )
+    package = "the model in the package, which learned from simulated streets for three hours of one core"
+    said = []
+    for which, one, several, what in sentences:
+        if which:
+            *others, last = [_STAGES[stage] for stage in which]
+            subject = f"{', '.join(others)} and {last}" if others else last
+            verb = several if others else one
+            said.append(f"{subject[0].upper()}{subject[1:]} {verb} {what.format(package=package)}.")
+            package = "that model"
+    return " ".join(said)
 
 
 def write_results_page(
@@ -117,6 +151,7 @@ def write_results_page(
     facts: tuple[str, ...],
     folder: Path,
     packaged: RangeImages | None = None,
+    sampling: TokenSampling = _DEFAULT,
 ) -> None:
     """Write the page ``demo.html`` into a run's folder.
 
@@ -132,6 +167,7 @@ def write_results_page(
         folder: folder of the run.
         packaged: scans sampled by the model in the package, which show what longer training gives; None to leave them
             out.
+        sampling: settings by which pixels of reconstructed scans are sampled, as those of ``samples`` were.
     """
     tokenizer, held_out = generator.get_tokenizer(), val.batch(evenly_spaced(_SCANS_OF_A_SET, len(val)))
     new = samples.batch(range(min(_SCANS_OF_A_SET, len(samples))))
@@ -140,7 +176,7 @@ def write_results_page(
         tokens = tokenizer.encode(held_out[:1])
         decoded = tokenizer.decode(tokens)
         sampled = tokenizer.sample(tokens, [torch.Generator().manual_seed(0)])
-        reconstructed = _reconstructed(generator, held_out)
+        reconstructed = _reconstructed(generator, held_out, sampling)
     by_phases, coarsest_cell = None, 1
     if isinstance(generator, LidarGrit) and generator.pixels is not None:
         by_phases, coarsest_cell = reconstructed[:1], generator.pixels.config.coarsest_cell
@@ -159,12 +195,12 @@ def write_results_page(
     )
 
 
-def _reconstructed(generator: Generator, images: RangeImage) -> RangeImage:
+def _reconstructed(generator: Generator, images: RangeImage, sampling: TokenSampling) -> RangeImage:
     """Return scans decoded from the tokens of others just as those of new scans are, with sampled return masks."""
     tokenizer = generator.get_tokenizer()
     tokens, rngs = tokenizer.encode(images), [torch.Generator().manual_seed(seed) for seed in range(len(images))]
     if isinstance(generator, LidarGrit) and generator.pixels is not None:
-        return generator.pixels.sample(tokenizer.decode(tokens), rngs, _SHARPER.pixels())
+        return generator.pixels.sample(tokenizer.decode(tokens), rngs, sampling.pixels())
     return tokenizer.sample(tokens, rngs)
 
 
@@ -203,9 +239,42 @@ def divided(data: str, reporter: Reporter) -> DataConfig:
     return DataConfig(train=(train,), val=(val,), sensor=dataset.sensor, max_scans=_MAX_SCANS)
 
 
+def _recipe(data: str | None, settings: list[str], reporter: Reporter, anew: bool) -> Recipe:
+    """Return the recipe that suits the scans: from the model in the package, if that is wanted and has their rays."""
+    config = None if data is None else divided(data, reporter)
+
+    def recipe_of(name: str) -> Recipe:
+        recipe = load_recipe(name)
+        return override(recipe if config is None else replace(recipe, data=config), settings)
+
+    if not anew:
+        recipe = recipe_of("demo_transformer" if config is None else "demo_fine_tuned")
+        if recipe.data.load_sensor().same_rays(load(PRETRAINED).sensor):
+            return recipe
+        reporter.message("the model in the package is of another sensor or image size, so all is trained anew")
+    return recipe_of("demo_pixels")
+
+
+def _trained_stages(recipe: Recipe) -> list[str]:
+    """Return the stages that a recipe trains, in their order."""
+    donors = donors_of_stages(recipe, tuple(_STAGES))
+    return [stage for stage in _STAGES if stage in recipe.training and stage not in donors]
+
+
+def _sampling(recipe: Recipe) -> TokenSampling:
+    """Return how new scans are sampled: sharper where the pixel decoder was trained anew."""
+    begun_anew = "pixels" in _trained_stages(recipe) and "pixels" not in recipe.fine_tune
+    return _SHARPER if begun_anew else _DEFAULT
+
+
 def _expected_s(recipe: Recipe, simulates: bool) -> dict[str, float]:
     """Return the expected time of each long step of the demo on two cores, in seconds."""
-    training_s = {f"training {name}": fit.scans * _TRAINED_S.get(name, 0.2) for name, fit in recipe.training.items()}
+    sensor, sizes = recipe.data.load_sensor(), recipe.model.transformer
+    each_s, (encoded_s, weight_s) = dict(_TRAINED_S), _TRANSFORMER_S
+    each_s["transformer"] = encoded_s + weight_s * 12 * sizes.layers * sizes.width**2
+    share = sensor.height * sensor.width / (64 * 256)
+    stages = _trained_stages(recipe)
+    training_s = {f"training {stage}": recipe.training[stage].scans * share * each_s[stage] for stage in stages}
     return {
         "projecting scans": _SIMULATED_S if simulates else _READ_S,
         **training_s,
@@ -273,11 +342,13 @@ def _trained_s(log: Path) -> float:
     return total
 
 
-def _plot_pictures(generator: Generator, kind: str, val: RangeImages, samples: RangeImages, folder: Path) -> None:
+def _plot_pictures(
+    generator: Generator, kind: str, val: RangeImages, samples: RangeImages, sampling: TokenSampling, folder: Path
+) -> None:
     real = val.batch(evenly_spaced(3, len(val)))
     title = f"{kind} scans never trained on, what the tokens keep of them, and new scans"
     plot_comparison(
-        {kind: real, "reconstructed": _reconstructed(generator, real), "generated": samples.batch(range(3))},
+        {kind: real, "reconstructed": _reconstructed(generator, real, sampling), "generated": samples.batch(range(3))},
         folder / PICTURE,
         title=title,
     )

@@ -8,8 +8,9 @@ from pathlib import Path
 from lidargrit.cli._options import add_settings
 
 EXAMPLES = """\
-  lidargrit demo                                simulated streets, about ten minutes on two cores
+  lidargrit demo                                simulated streets, about five minutes on two cores
   lidargrit demo --data /data/kitti_odometry    your own scans: a KITTI tree, or any folder of .bin
+  lidargrit demo --anew --out runs/demo_anew    all networks trained anew, about ten minutes
 """
 
 
@@ -17,6 +18,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
     parser.add_argument("--data", metavar="SOURCE", help="folder of scans (default: simulated scans)")
     parser.add_argument("--out", type=Path, help="run folder (default: runs/demo, or runs/demo-FOLDER)")
+    anew = "train all networks anew (default: begin with those of the model in the package, if it has your sensor)"
+    parser.add_argument("--anew", action="store_true", help=anew)
     settings = "settings of the recipe to change"
     add_settings(parser, settings)
 
@@ -29,5 +32,5 @@ def run(options: argparse.Namespace) -> None:
     out = options.out or Path("runs") / (
         "demo" if not options.data else f"demo-{Path(options.data.rpartition(':')[0] or options.data).resolve().name}"
     )
-    folder = demo(options.data, out, options.set, TerminalReporter())
+    folder = demo(options.data, out, options.set, TerminalReporter(), options.anew)
     print(f"done: look at {folder / PAGE}; everything lies in {folder}")

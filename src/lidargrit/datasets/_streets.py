@@ -45,7 +45,9 @@ class Streets(ScanDataset):
         digits = str(root)
         count = int(digits) if digits.isdecimal() and len(digits) <= 7 else 0
         if not 1 <= count <= _SEEDS_APART:
-            raise DataError(f"{digits!r} where a count belongs", self.tree, "type for example simulated:1000")
+            raise DataError(
+                f"{digits!r} where a count belongs", self.tree, f"type for example {self.public_name()}:1000"
+            )
         wanted = Split.parse(split)
         first_seeds = {**self.splits(), "all": self.splits()["train"]}
         name = "+".join(wanted.parts)
@@ -53,7 +55,7 @@ class Streets(ScanDataset):
             raise DataError(
                 f"the split {split!r} of simulated scans",
                 f"one of {nearest_names(name, first_seeds)}",
-                "type for example simulated:1000:val",
+                f"type for example {self.public_name()}:1000:val",
             )
         first_seed = int(first_seeds[name][0])
         self.seeds = range(first_seed, first_seed + count)[wanted.block(count)]

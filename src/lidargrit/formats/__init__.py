@@ -79,7 +79,11 @@ class ScanFormat(ABC):
     @classmethod
     def write(cls, path: Path, scan: Scan) -> None:
         """Write a scan to a new file."""
-        raise OutputError(f"a scan to write as {cls.title}", "a format that can be written", "choose .bin or .ply")
+        raise OutputError(
+            f"a scan to write as {cls.title}",
+            "a format that can be written",
+            "choose another format, such as bin or ply",
+        )
 
 
 def load(name: str) -> type[ScanFormat]:

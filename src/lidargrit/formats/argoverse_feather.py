@@ -102,7 +102,7 @@ class ArgoverseFeather(ScanFormat):
             raise OutputError(
                 f"{scan.source}, whose points have {'no' if scan.ring is None else 'other'} rings",
                 "rings from 0 to 31, those of a VLP-32C",
-                "choose .bin or .ply",
+                "choose another format, such as bin or ply",
             )
         try:
             import pyarrow as pa  # noqa: PLC0415  an optional part

@@ -78,7 +78,7 @@ class NuscenesBin(ScanFormat):
             raise OutputError(
                 f"{scan.source}, whose points have {'no' if scan.ring is None else 'other'} rings",
                 "rings from 0 to 31, those of an HDL-32E",
-                "choose .bin or .ply",
+                "choose another format, such as bin or ply",
             )
         x, y, z = scan.points_xyz_m.unbind(1)
         reflectance = torch.zeros(len(scan)) if scan.reflectance is None else scan.reflectance

@@ -59,12 +59,6 @@ def taken_stages(recipe: Recipe, generator: Generator) -> dict[str, Objective]:
         _check(f"tokenizer_from={recipe.tokenizer_from}", generator, donor, "tokenizer")
         return {"tokenizer": donor.get_tokenizer()}
     if recipe.stages_from is None:
-        if recipe.fine_tune:
-            raise ConfigError(
-                f"fine_tune={recipe.fine_tune[0]} without stages_from",
-                "the run whose weights are trained further",
-                "set stages_from as well",
-            )
         return {}
     donor = load(Path(recipe.stages_from))
     if type(donor) is not type(generator):

@@ -134,8 +134,8 @@ def _lead(demo: DemoPage) -> str:
     facts = "".join(f"<li>{escape(fact)}</li>" for fact in demo.facts)
     return (
         "<h1>A LiDAR scan, its tokens, and new scans</h1>\n"
-        '<p class="lead">This page shows what <code>lidargrit demo</code> has just done. The networks were trained '
-        f"on {demo.kind} LiDAR scans for a few minutes. They now generate scans that no sensor recorded. A "
+        '<p class="lead">This page shows what <code>lidargrit demo</code> has just done. Networks learned from '
+        f"{demo.kind} LiDAR scans, in part for a few minutes only. They now generate scans that no sensor recorded. A "
         "model so small, trained for so short a time, is a demonstration and not a good model: its scores cannot be "
         "compared with published tables.</p>"
         f'<ul class="facts">{facts}</ul>'
@@ -314,8 +314,8 @@ def _new_scans(demo: DemoPage) -> _Step:
     )
     if len(demo.sets) > 3:
         text += (
-            " The last set comes from the model in the package, which is of the same kind and was trained for three "
-            "hours on one core instead of a few minutes."
+            " The last set comes from the model in the package as a whole, all of whose networks were trained for "
+            "long: three hours of one core."
         )
     buttons = button("bin", ".bin") + button("ply", ".ply")
     return _Step("New scans", text, interactive.viewer_html("", f"Save {buttons}", f"Made by lidargrit {__version__}."))
