@@ -136,6 +136,7 @@ def test_scans_that_cannot_be_used_are_refused_or_left_out(tmp_path):
     assert one.scan_names == ("0",)
     assert one.label is None
     assert scan_sets._short("x" * 99) == "..." + "x" * 37
+    assert scan_sets._short(f"/data/{'x' * 30}/other_sensors/vlp16") == ".../other_sensors/vlp16"
 
 
 def test_the_command_writes_a_page(tmp_path, capsys):

@@ -13,13 +13,14 @@ EXAMPLES = """\
   lidargrit simulate clean_and_dropped -n 500 --clean          to train and judge raydrop models
   lidargrit simulate vlp16 -n 100 --sensor vlp16 --theme city --wet 0.5
 """
+_SENSOR = "hdl64e_kitti_odometry"  # of the data set whose layout is written
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
     parser.add_argument("out", type=Path, help="folder for the scans: empty, or begun by the same command")
     parser.add_argument("-n", "--num-scans", type=int, required=True, help="number of scans in all")
-    parser.add_argument("--sensor", default="hdl64e_kitti_odometry", help="name or .json file of the sensor")
+    parser.add_argument("--sensor", default=_SENSOR, help="name or .json file of the sensor")
     parser.add_argument(
         "--seed", type=seed_number, default=0, help="seed of the first street; each next street has the next seed"
     )
@@ -53,4 +54,5 @@ def run(options: argparse.Namespace) -> None:
         clean=options.clean,
     )
     write_drives(options.out, options.num_scans, config, options.workers, TerminalReporter())
-    print(f"{options.num_scans} scans in {options.out}: read them as kitti_odometry:{options.out}")
+    theirs = f", with the sensor {options.sensor}" if options.sensor != _SENSOR else ""
+    print(f"{options.num_scans} scans in {options.out}: read them as kitti_odometry:{options.out}{theirs}")

@@ -27,6 +27,7 @@ _COLOURS = {
     "hidden": "#d7191c",
     "kept": "#1a9641",
 }
+_DOT = 2.0  # area of a point in a view, the same for all: larger ones would make losses look more than they are
 _DOTS_AT_MOST = 20_000  # of one kind in a view; more hide one another and take seconds to plot
 
 
@@ -89,9 +90,8 @@ def _plot_lost(above: Axes, side: Axes, inspection: Inspection) -> None:
         if len(those):
             shown = those[:: -(-len(those) // _DOTS_AT_MOST)]
             faint = {"color": _COLOURS[name], "linewidths": 0, "alpha": 0.25 if name in ("kept", "left_out") else 0.8}
-            size = 1.5 if name in ("kept", "left_out") else 4
-            above.scatter(y[shown], x[shown], s=size, **faint)
-            side.scatter(away[shown], z[shown], s=size, **faint)
+            above.scatter(y[shown], x[shown], s=_DOT, **faint)
+            side.scatter(away[shown], z[shown], s=_DOT, **faint)
             side.scatter([], [], color=_COLOURS[name], s=20, label=f"{FATES[name]}: {len(those)}")
     half, (low, high) = float(np.quantile(away, 0.99)), np.quantile(z, (0.001, 0.999))
     above.plot(0, 0, marker="+", color="black")

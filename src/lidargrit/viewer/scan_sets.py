@@ -164,4 +164,7 @@ def _label_of_pixels(scan: Scan, image: RangeImage, config: DataConfig) -> Int[T
 
 
 def _short(source: str) -> str:
-    return source if len(source) < _NAME_LETTERS else "..." + source[3 - _NAME_LETTERS :]
+    if len(source) < _NAME_LETTERS:
+        return source
+    end = source[3 - _NAME_LETTERS :]
+    return f"...{end[max(end.rstrip('/').find('/'), 0) :]}"
