@@ -136,7 +136,7 @@ def test_dry_run_finds_prepared_scans_of_another_sensor(tmp_path, capsys):
     assert "(64x64); wanted the rays of " in the_one_line(capsys.readouterr().err, "train")
 
 
-def told_at_once(recipe):
+def told_at_once(recipe, without=()):
     return dict.fromkeys(recipe.training, 10**18)
 
 

@@ -29,6 +29,8 @@ from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 from lidargrit.untrusted import STEPS_AT_MOST
 
+_NOT_ASKED = -100  # in the place of tokens that are shown, for torch's cross entropy
+
 
 @dataclass(frozen=True)
 class MaskedSampling:
@@ -150,8 +152,10 @@ class HiddenTokens(TokenObjective):
         rank = torch.rand(tokens.shape, generator=rng, device=rng.device).argsort(dim=1).argsort(dim=1)
         hidden = (rank < hidden_each[:, None]).to(tokens.device)
         logits = self.transformer(tokens.masked_fill(hidden, self.transformer.mask_token))
-        loss = F.cross_entropy(logits.float()[hidden], tokens[hidden])
-        return {"loss": loss, "unigram_nll": unigram_nll[hidden].mean()}
+        # Shown tokens are left out by a word for them, not by an index, whose shape would depend on values.
+        wanted = tokens.masked_fill(~hidden, _NOT_ASKED)
+        loss = F.cross_entropy(logits.float().flatten(0, 1), wanted.flatten(), ignore_index=_NOT_ASKED)
+        return {"loss": loss, "unigram_nll": (unigram_nll * hidden).sum() / hidden.sum()}
 
 
 def share_hidden(progress: Tensor) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from functools import cache
 from itertools import product
@@ -27,14 +27,19 @@ _SHARE = 0.25  # of a peak: a guess for networks as small as these; small batche
 _MATRIX, _REPETITIONS = 512, 8  # the first repetition chooses a kernel
 
 
-def training_flops(recipe: Recipe) -> dict[str, int]:
+def training_flops(recipe: Recipe, without: Collection[str] = ()) -> dict[str, int]:
     """Count the floating-point operations of a recipe's training, forward and backward, for each stage.
 
     Matrix products and convolutions are counted while a few steps run, on scans whose every pixel returns at 10 m. A
     multiplication with its addition counts as two operations. Validation and the optimiser are not counted.
 
     The steps run on tensors that have a shape and no values, so that nothing is computed, and networks of any width are
-    counted alike. Only where the operations of an objective depend on values, as MaskGIT's do, are the steps computed.
+    counted alike. Only where the operations of an objective depend on values, as those of a network that completes
+    scans do, are the steps computed.
+
+    Args:
+        recipe: recipe whose training it is.
+        without: names of stages that are not counted.
 
     Returns:
         number of operations, by the name of the stage.
@@ -45,7 +50,7 @@ def training_flops(recipe: Recipe) -> dict[str, int]:
         with torch.device("meta"):
             generator = recipe.build_generator(sensor).to("meta")
         total = {}
-        for stage in generator.stages:
+        for stage in (name for name in generator.stages if name not in without):
             scans = recipe.training[stage].scans
             try:
                 total[stage] = _flops_without_values(generator, stage, sensor, scans)

@@ -103,11 +103,12 @@ def check_data(recipe: Recipe) -> None:
 def plan_training(recipe: Recipe) -> TrainingPlan:
     """Return the plan of a recipe's training; no scan is read, and nothing is written."""
     sensor = recipe.data.load_sensor()
-    stages, flops = [], training_flops(recipe)
+    stages = []
     with torch.device("meta"):  # sizes alone, without values, so that wide networks take no time
         generator = recipe.build_generator(sensor).to("meta")
         objectives = {name: generator.objective(name) for name in generator.stages}
     donors = donors_of_stages(recipe, generator.stages)
+    flops = training_flops(recipe, without=donors)
     for name, objective in objectives.items():
         budget = recipe.training[name]
         parameters = sum(weight.numel() for weight in objective.parameters())
