@@ -49,7 +49,7 @@ main{display:block;max-width:1240px}
 #panes .about{font-size:.78rem;overflow:hidden;white-space:nowrap;text-overflow:ellipsis}
 figure img{max-height:170px}
 code{overflow-wrap:anywhere}
-@media (max-width:760px){.three,.phases{grid-template-columns:1fr}}
+@media (max-width:760px){.three,.phases{grid-template-columns:1fr}#panes .about{white-space:normal}}
 """
 
 
