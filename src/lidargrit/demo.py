@@ -103,20 +103,23 @@ def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter
     )
     kind = "real" if data else "simulated"
     _plot_pictures(generator, kind, val, samples, sampling, folder)
-    weights = sum(weight.numel() for weight in generator.parameters()) / 1e6
-    facts = [
-        how_trained(recipe),
-        f"LidarGRIT at a small size: {weights:.1f} million weights",
-        f"{len(real):,} {kind} scans to learn from and {len(val):,} held out, of the sensor {generator.sensor.name}",
-    ]
-    if sampling == _SHARPER:
-        facts.append(
-            f"ranges sampled sharper than by default (range_temperature={_SHARPER.range_temperature}, "
-            f"range_noise={_SHARPER.range_noise}), because so little training leaves them uncertain"
-        )
-    results = reconstruction, card, clock.seconds, tuple(facts), folder
+    scans = f"{len(real):,} {kind} scans to learn from and {len(val):,} held out, of the sensor {generator.sensor.name}"
+    results = reconstruction, card, clock.seconds, _facts(recipe, generator, scans), folder
     write_results_page(generator, kind, val, samples, *results, packaged, sampling)
     return folder
+
+
+def _facts(recipe: Recipe, generator: Generator, scans: str) -> tuple[str, ...]:
+    """Return short sentences about the model and its training, with one about the scans."""
+    weights = sum(weight.numel() for weight in generator.parameters()) / 1e6
+    facts = (how_trained(recipe), f"LidarGRIT at a small size: {weights:.1f} million weights", scans)
+    if _sampling(recipe) == _DEFAULT:
+        return facts
+    return (
+        *facts,
+        f"ranges sampled sharper than by default (range_temperature={_SHARPER.range_temperature}, "
+        f"range_noise={_SHARPER.range_noise}), because so little training leaves them uncertain",
+    )
 
 
 def how_trained(recipe: Recipe) -> str:
