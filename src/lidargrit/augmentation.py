@@ -1,9 +1,9 @@
-"""Range images → randomly changed ones for training; range, return mask and reflectance change together."""
+"""Range images → randomly changed ones for training; range, return mask, reflectance and label change together."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -51,14 +51,14 @@ def _coin(images: RangeImage, rng: torch.Generator) -> Tensor:
 
 def _flip(images: RangeImage, rng: torch.Generator) -> RangeImage:
     flipped = _coin(images, rng)
-    return _pick(flipped, _map(images, lambda pixels: pixels.flip(-1)), images)
+    return _pick(flipped, images.mapped(lambda pixels: pixels.flip(-1)), images)
 
 
 def _roll(images: RangeImage, rng: torch.Generator) -> RangeImage:
     width = images.range_m.shape[-1]
     shift = torch.randint(width, (len(images), 1, 1), generator=rng).to(images.range_m.device)
     column = ((torch.arange(width, device=shift.device) + shift) % width).expand_as(images.range_m)
-    return _map(images, lambda pixels: pixels.gather(-1, column))
+    return images.mapped(lambda pixels: pixels.gather(-1, column))
 
 
 def _geometric(images: RangeImage, rng: torch.Generator) -> RangeImage:
@@ -94,33 +94,27 @@ def _distort(images: RangeImage, rng: torch.Generator, extra_rotation_rad: float
 
     if fill_m:
         outside = warp(torch.ones_like(images.range_m)) == 0
-        warped = _map(images, lambda pixels: warp(pixels.float()).to(pixels.dtype))
+        warped = images.mapped(lambda pixels: warp(pixels.float()).to(pixels.dtype))
         warped = replace(
             warped,
             range_m=torch.where(outside, fill_m, warped.range_m),
             return_mask=warped.return_mask | outside,
         )
     else:
-        warped = _map(images, lambda pixels: warp(pixels.float()).to(pixels.dtype))
+        warped = images.mapped(lambda pixels: warp(pixels.float()).to(pixels.dtype))
     return _pick(_coin(images, rng), warped, images)
 
 
-def _map(images: RangeImage, change: Callable[[Tensor], Tensor]) -> RangeImage:
-    return replace(
-        images,
-        range_m=change(images.range_m),
-        return_mask=change(images.return_mask),
-        reflectance=None if images.reflectance is None else change(images.reflectance),
-    )
-
-
 def _pick(chosen: Tensor, changed: RangeImage, images: RangeImage) -> RangeImage:
-    reflectance = None
+    reflectance, label = None, None
     if changed.reflectance is not None and images.reflectance is not None:
         reflectance = torch.where(chosen, changed.reflectance, images.reflectance)
+    if changed.label is not None and images.label is not None:
+        label = torch.where(chosen, changed.label, images.label)
     return replace(
         images,
         range_m=torch.where(chosen, changed.range_m, images.range_m),
         return_mask=torch.where(chosen, changed.return_mask, images.return_mask),
         reflectance=reflectance,
+        label=label,
     )

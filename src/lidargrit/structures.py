@@ -17,6 +17,8 @@ from torch import Tensor
 from lidargrit.errors import ConfigError, ScanError
 from lidargrit.sensors import SensorModel
 
+CLASS_BITS = 0xFFFF  # of a label: its class; the bits above number the instance
+
 MaskDecoding = Literal["bernoulli", "threshold"]
 """How returns are decided from their probabilities: each at random, or wherever a return is likelier than none."""
 
@@ -91,6 +93,8 @@ class RangeImage:
         return_mask: whether the beam came back.
         sensor: sensor whose rays the pixels are.
         reflectance: reflectance of the return, in [0, 1]; 0 where there is none.
+        label: class of what returned by SemanticKITTI's numbers, without its instance; 0 where there is no return or
+            the class is not known.
 
     Raises:
         ScanError: a range that is not finite, not positive on a return, or not 0 elsewhere.
@@ -101,6 +105,7 @@ class RangeImage:
     return_mask: Bool[Tensor, "*batch H W"]
     sensor: SensorModel
     reflectance: Float[Tensor, "*batch H W"] | None = None
+    label: Int[Tensor, "*batch H W"] | None = None
 
     def __post_init__(self) -> None:
         size = tuple(self.range_m.shape[-2:])
@@ -110,7 +115,7 @@ class RangeImage:
                 f"the {self.sensor.height}x{self.sensor.width} of the sensor {self.sensor.name!r}",
                 "use the sensor's own size, or sensor.with_columns(...)",
             )
-        for name in ("return_mask", "reflectance"):
+        for name in ("return_mask", "reflectance", "label"):
             pixels: Tensor | None = getattr(self, name)
             if pixels is not None and pixels.shape != self.range_m.shape:
                 raise ConfigError(
@@ -140,29 +145,33 @@ class RangeImage:
         return_mask: Bool[Tensor, "*batch H W"],
         sensor: SensorModel,
         reflectance: Float[Tensor, "*batch H W"] | None = None,
+        label: Int[Tensor, "*batch H W"] | None = None,
     ) -> RangeImage:
-        """Make a range image of a clean range and a mask: range and reflectance are set to 0 where nothing returned."""
+        """Make a range image of a clean range and a mask: whatever else it has is set to 0 where nothing returned."""
         kept = None if reflectance is None else torch.where(return_mask, reflectance, 0.0)
-        return cls(torch.where(return_mask, range_m, 0.0), return_mask, sensor, kept)
+        classes = None if label is None else torch.where(return_mask, label, 0)
+        return cls(torch.where(return_mask, range_m, 0.0), return_mask, sensor, kept, classes)
 
     @classmethod
     def stack(cls, images: Sequence[RangeImage]) -> RangeImage:
-        """Make one batch of single images of one sensor; reflectance is kept if every image has it."""
+        """Make one batch of single images of one sensor; reflectance and label are kept if every image has them."""
         return cls._joined(images, torch.stack)
 
     @classmethod
     def cat(cls, batches: Sequence[RangeImage]) -> RangeImage:
-        """Make one batch of several batches of one sensor; reflectance is kept if every batch has it."""
+        """Make one batch of several batches of one sensor; reflectance and label are kept if every batch has them."""
         return cls._joined(batches, torch.cat)
 
     @classmethod
     def _joined(cls, images: Sequence[RangeImage], join: Callable[[list[Tensor]], Tensor]) -> RangeImage:
         reflectance = [image.reflectance for image in images if image.reflectance is not None]
+        label = [image.label for image in images if image.label is not None]
         return cls(
             join([image.range_m for image in images]),
             join([image.return_mask for image in images]),
             images[0].sensor,
             join(reflectance) if len(reflectance) == len(images) else None,
+            join(label) if len(label) == len(images) else None,
         )
 
     def __len__(self) -> int:
@@ -170,20 +179,20 @@ class RangeImage:
 
     def __getitem__(self, index: int | slice | list[int]) -> RangeImage:
         """Return one image of a batch, or a batch of some of its images."""
-        return replace(
-            self,
-            range_m=self.range_m[index],
-            return_mask=self.return_mask[index],
-            reflectance=None if self.reflectance is None else self.reflectance[index],
-        )
+        return self.mapped(lambda pixels: pixels[index])
 
     def to(self, device: torch.device | str) -> RangeImage:
         """Return the image with its pixels on another device."""
+        return self.mapped(lambda pixels: pixels.to(device))
+
+    def mapped(self, change: Callable[[Tensor], Tensor]) -> RangeImage:
+        """Return the image in which range, mask and whatever else it has are changed alike."""
         return replace(
             self,
-            range_m=self.range_m.to(device),
-            return_mask=self.return_mask.to(device),
-            reflectance=None if self.reflectance is None else self.reflectance.to(device),
+            range_m=change(self.range_m),
+            return_mask=change(self.return_mask),
+            reflectance=None if self.reflectance is None else change(self.reflectance),
+            label=None if self.label is None else change(self.label),
         )
 
 

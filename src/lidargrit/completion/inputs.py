@@ -46,7 +46,7 @@ class InputScan:
         """Return the points of a completed scan: its own where ranges were observed, elsewhere points on the pixels'
         rays.
 
-        Reflectance is kept where the whole completed scan has it.
+        Reflectance and label are kept where the whole completed scan has them; observed points keep their instances.
         """
         kept = condition.range_observed[0] & completed.return_mask
         if self.points is None or self.point_of_pixel is None or not bool(kept.any()):
@@ -54,10 +54,14 @@ class InputScan:
         own = self.points
         at = self.point_of_pixel[kept]
         added = completed.return_mask & ~kept
-        new = RangeImage.masked(completed.range_m, added, completed.sensor, completed.reflectance)
+        new = RangeImage.masked(completed.range_m, added, completed.sensor, completed.reflectance, completed.label)
         rows = torch.arange(completed.sensor.height)[:, None].expand_as(kept)
         whole = Scan(
-            own.points_xyz_m[at], None if own.reflectance is None else own.reflectance[at], rows[kept], None, own.source
+            own.points_xyz_m[at],
+            None if own.reflectance is None else own.reflectance[at],
+            rows[kept],
+            None if own.label is None else own.label[at],
+            own.source,
         )
         return _together(whole, unproject(new)) if bool(added.any()) else whole
 
@@ -185,8 +189,10 @@ def _name_of(image: Path) -> str:
 def _together(own: Scan, added: Scan) -> Scan:
     assert own.ring is not None
     assert added.ring is not None
-    reflectance = None
+    reflectance, label = None, None
     if own.reflectance is not None and added.reflectance is not None:
         reflectance = torch.cat((own.reflectance, added.reflectance))
+    if own.label is not None and added.label is not None:
+        label = torch.cat((own.label, added.label))
     points = torch.cat((own.points_xyz_m, added.points_xyz_m))
-    return Scan(points, reflectance, torch.cat((own.ring, added.ring)), None, own.source)
+    return Scan(points, reflectance, torch.cat((own.ring, added.ring)), label, own.source)

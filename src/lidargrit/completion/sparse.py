@@ -43,13 +43,16 @@ class SparseReader(ScanReader):
         range_m, on_grid = torch.zeros(size), torch.zeros(size, dtype=torch.bool)
         at = torch.full(size, -1, dtype=torch.int64)
         reflectance = None if seen.image.reflectance is None else torch.zeros(size)
+        label = None if seen.image.label is None else torch.zeros(size, dtype=torch.int64)
         rows = self._rows()
         own, target = (rows >= 0).nonzero()[:, 0], rows[rows >= 0]
         range_m[target], at[target], on_grid[target] = seen.image.range_m[own], seen.point_of_pixel[own], True
         if reflectance is not None and seen.image.reflectance is not None:
             reflectance[target] = seen.image.reflectance[own]
+        if label is not None and seen.image.label is not None:
+            label[target] = seen.image.label[own]
         within = (range_m >= wanted.range_min_m) & (range_m <= wanted.range_max_m)
-        return InputScan(RangeImage.masked(range_m, within, wanted, reflectance), scan, at, on_grid)
+        return InputScan(RangeImage.masked(range_m, within, wanted, reflectance, label), scan, at, on_grid)
 
     def _source_like_wanted(self) -> SensorModel:
         """Return the scans' sensor with as many columns as the wanted one."""

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidargrit.errors import ConfigError, ScanError
@@ -36,6 +36,8 @@ class Condition:
         return_observed: True where it is known whether the beam came back.
         sensor: sensor whose rays the pixels are.
         reflectance: reflectance in [0, 1] of the observed returns; None if it is not known.
+        label: class of the surface by SemanticKITTI's numbers, 0 where it is not known; None if it is not known
+            anywhere.
 
     Raises:
         ConfigError: masks of another size or type than the ranges, or no batch.
@@ -48,6 +50,7 @@ class Condition:
     return_observed: Bool[Tensor, "B H W"]
     sensor: SensorModel
     reflectance: Float[Tensor, "B H W"] | None = None
+    label: Int[Tensor, "B H W"] | None = None
 
     def __post_init__(self) -> None:
         check_observed(self.range_observed, self.range_m)
@@ -70,7 +73,8 @@ class Condition:
         returned = images.return_mask & observed
         range_m = torch.where(returned, images.range_m, 0.0)
         reflectance = None if images.reflectance is None else torch.where(returned, images.reflectance, 0.0)
-        return cls(range_m, returned, returned, observed, images.sensor, reflectance)
+        label = None if images.label is None else torch.where(returned, images.label, 0)
+        return cls(range_m, returned, returned, observed, images.sensor, reflectance, label)
 
     @classmethod
     def of_surfaces(cls, clean: RangeImage, unknown: Bool[Tensor, "B H W"] | None = None) -> Condition:
@@ -82,7 +86,8 @@ class Condition:
         """
         unknown = torch.zeros_like(clean.return_mask) if unknown is None else unknown
         hit = clean.return_mask & ~unknown
-        return cls(clean.range_m, hit, torch.zeros_like(hit), ~clean.return_mask & ~unknown, clean.sensor)
+        label = None if clean.label is None else torch.where(hit, clean.label, 0)
+        return cls(clean.range_m, hit, torch.zeros_like(hit), ~clean.return_mask & ~unknown, clean.sensor, label=label)
 
     @classmethod
     def nothing(cls, sensor: SensorModel, count: int) -> Condition:
@@ -92,8 +97,9 @@ class Condition:
 
     @classmethod
     def cat(cls, conditions: Sequence[Condition]) -> Condition:
-        """Return the conditions of several batches as one; reflectance is kept if every batch has it."""
+        """Return the conditions of several batches as one; reflectance and label are kept if every batch has them."""
         reflectance = [one.reflectance for one in conditions if one.reflectance is not None]
+        label = [one.label for one in conditions if one.label is not None]
         return cls(
             torch.cat([one.range_m for one in conditions]),
             torch.cat([one.range_observed for one in conditions]),
@@ -101,6 +107,7 @@ class Condition:
             torch.cat([one.return_observed for one in conditions]),
             conditions[0].sensor,
             torch.cat(reflectance) if len(reflectance) == len(conditions) else None,
+            torch.cat(label) if len(label) == len(conditions) else None,
         )
 
     def __len__(self) -> int:
@@ -108,24 +115,21 @@ class Condition:
 
     def __getitem__(self, index: slice | list[int]) -> Condition:
         """Return the conditions of some of the scans."""
-        return replace(
-            self,
-            range_m=self.range_m[index],
-            range_observed=self.range_observed[index],
-            return_mask=self.return_mask[index],
-            return_observed=self.return_observed[index],
-            reflectance=None if self.reflectance is None else self.reflectance[index],
-        )
+        return self._mapped(lambda pixels: pixels[index])
 
     def to(self, device: torch.device | str) -> Condition:
         """Return the condition with its pixels on another device."""
+        return self._mapped(lambda pixels: pixels.to(device))
+
+    def _mapped(self, change: Callable[[Tensor], Tensor]) -> Condition:
         return replace(
             self,
-            range_m=self.range_m.to(device),
-            range_observed=self.range_observed.to(device),
-            return_mask=self.return_mask.to(device),
-            return_observed=self.return_observed.to(device),
-            reflectance=None if self.reflectance is None else self.reflectance.to(device),
+            range_m=change(self.range_m),
+            range_observed=change(self.range_observed),
+            return_mask=change(self.return_mask),
+            return_observed=change(self.return_observed),
+            reflectance=None if self.reflectance is None else change(self.reflectance),
+            label=None if self.label is None else change(self.label),
         )
 
     @property
@@ -146,22 +150,27 @@ class Condition:
     def images(self) -> RangeImage:
         """The observed returns as range images, without a return in all other pixels."""
         kept = self.return_mask & self.return_observed
-        return RangeImage.masked(self.range_m, kept, self.sensor, self.reflectance)
+        return RangeImage.masked(self.range_m, kept, self.sensor, self.reflectance, self.label)
 
     @property
     def surfaces(self) -> RangeImage:
         """Range images in which every surface of known range returns."""
-        return RangeImage.masked(self.range_m, self.range_observed, self.sensor, self.reflectance)
+        return RangeImage.masked(self.range_m, self.range_observed, self.sensor, self.reflectance, self.label)
 
     def put_into(self, generated: RangeImage) -> RangeImage:
-        """Return generated scans in which all observed values are put in, bit for bit."""
+        """Return generated scans in which all observed values are put in, bit for bit.
+
+        Reflectance and label are kept where both have them.
+        """
         returned = torch.where(self.return_observed, self.return_mask, generated.return_mask)
         range_m = torch.where(self.range_observed, self.range_m, generated.range_m)
-        reflectance = None
+        reflectance, label = None, None
         if generated.reflectance is not None and self.reflectance is not None:
             observed = self.return_observed & self.return_mask
             reflectance = torch.where(observed, self.reflectance, generated.reflectance)
-        return RangeImage.masked(range_m, returned, self.sensor, reflectance)
+        if generated.label is not None and self.label is not None:
+            label = torch.where(self.range_observed, self.label, generated.label)
+        return RangeImage.masked(range_m, returned, self.sensor, reflectance, label)
 
 
 def check_observed(observed: Bool[Tensor, "..."], range_m: Float[Tensor, "..."]) -> None:

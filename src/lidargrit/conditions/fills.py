@@ -160,25 +160,27 @@ FILLS: dict[str, Callable[[Observed], Float64[np.ndarray, "H W"]]] = {
 
 
 def fill(method: str, condition: Condition) -> RangeImage:
-    """Fill ranges in by a classical method, and returns and reflectance from the nearest observed pixel.
+    """Fill ranges in by a classical method, returns from the nearest observed pixel, and reflectance and label from
+    the nearest observed return.
 
     Args:
         method: name of the method, one of :data:`FILLS`.
         condition: observed pixels of a batch of scans; a scan without any observed return is filled without returns.
     """
     sensor = condition.sensor
-    ranges, masks, reflectances = [], [], []
+    ranges, masks, reflectances, labels = [], [], [], []
     for index in range(len(condition)):
         seen = Observed.of(condition, index)
         mask = seen.returned[seen.nearest(seen.observed)]
         range_m = np.clip(FILLS[method](seen), sensor.range_min_m, sensor.range_max_m) if seen.returned.any() else None
         masks.append(torch.from_numpy(mask))
         ranges.append(torch.from_numpy(seen.range_m if range_m is None else range_m).float())
-        if condition.reflectance is not None:
-            rows, columns = (torch.from_numpy(part) for part in seen.nearest_return)
-            reflectances.append(condition.reflectance[index].cpu()[rows, columns])
-    reflectance = torch.stack(reflectances) if reflectances else None
-    filled = RangeImage.masked(torch.stack(ranges), torch.stack(masks), sensor, reflectance)
+        for pixels, filled in ((condition.reflectance, reflectances), (condition.label, labels)):
+            if pixels is not None:
+                rows, columns = (torch.from_numpy(part) for part in seen.nearest_return)
+                filled.append(pixels[index].cpu()[rows, columns])
+    reflectance, label = (torch.stack(found) if found else None for found in (reflectances, labels))
+    filled = RangeImage.masked(torch.stack(ranges), torch.stack(masks), sensor, reflectance, label)
     return condition.to("cpu").put_into(filled)
 
 

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Float64
+from jaxtyping import Bool, Float, Float32, Float64, Int, Int64
 from scipy.ndimage import uniform_filter1d
 from torch import Tensor
 
 from lidargrit.conditions import Condition
 from lidargrit.conditions.fills import Observed, linear, triangles
 
-NUM_MAPS, NUM_CANDIDATES = 19, 9
+NUM_MAPS, NUM_CANDIDATES, NUM_LABELS = 19, 9, 5
 _LEFT_RIGHT = {7: 8, 8: 7, 11: 12, 12: 11}  # maps that change places in the mirror, and so do candidates:
 _LEFT_RIGHT_CANDIDATES = {5: 6, 6: 5}
+_LEFT_RIGHT_LABELS = [0, 1, 2, 4, 3]
+_SIDES = ((-1, 0), (1, 0), (0, -1), (0, 1))  # rows down and columns to the right of each side
 _TYPICAL_V = 2.5  # ln(1 + 11 m), the middle of what scans hold, so that maps are near 0
 _FAR_PIXELS, _FARTHEST = 16.0, 4.0  # a distance is told in units of 16 pixels, up to 64 of them
 _WINDOW = 9  # rows and columns in which shares are counted
@@ -31,26 +34,52 @@ class Hints(NamedTuple):
             weights of those corners; shares of observed and of dropped pixels around it.
         candidates: candidates for ln(1 + range): by triangulation, by interpolation, of the nearest return, of the next
             return above, below, to the left and to the right, and of the triangle's second and third corner.
+        labels: classes of the nearest return, and of the next return above, below, to the left and to the right, by
+            SemanticKITTI's numbers; None without observed classes.
     """
 
     maps: Float[Tensor, "B 19 H W"]
     candidates: Float[Tensor, "B 9 H W"]
+    labels: Int[Tensor, "B 5 H W"] | None = None
 
     def mirrored(self) -> Hints:
         """Return the hints of the scans' mirror images, left and right exchanged."""
         maps = [_LEFT_RIGHT.get(index, index) for index in range(NUM_MAPS)]
         candidates = [_LEFT_RIGHT_CANDIDATES.get(index, index) for index in range(NUM_CANDIDATES)]
-        return Hints(self.maps[:, maps].flip(-1), self.candidates[:, candidates].flip(-1))
+        labels = None if self.labels is None else self.labels[:, _LEFT_RIGHT_LABELS].flip(-1)
+        return Hints(self.maps[:, maps].flip(-1), self.candidates[:, candidates].flip(-1), labels)
 
 
 def hints_of(condition: Condition) -> Hints:
     """Return the hints of a batch of scans, on the device of the condition."""
-    both = [_of_one(Observed.of(condition, index)) for index in range(len(condition))]
+    every = [Observed.of(condition, index) for index in range(len(condition))]
+    next_returns = [[_next_return(seen, *side) for side in _SIDES] for seen in every]
+    both = [_of_one(seen, nexts) for seen, nexts in zip(every, next_returns, strict=True)]
     maps, candidates = (torch.from_numpy(np.stack(part)).to(condition.range_m) for part in zip(*both, strict=True))
-    return Hints(maps, candidates)
+    if condition.label is None:
+        return Hints(maps, candidates)
+    labels = [
+        _labels_of_one(label, seen, nexts)
+        for label, seen, nexts in zip(condition.label.cpu().numpy(), every, next_returns, strict=True)
+    ]
+    return Hints(maps, candidates, torch.from_numpy(np.stack(labels)).to(condition.range_m.device))
 
 
-def _of_one(seen: Observed) -> tuple[Float32[np.ndarray, "19 H W"], Float32[np.ndarray, "9 H W"]]:
+class _NextReturn(NamedTuple):
+    """The next observed return on one side of every pixel.
+
+    Args:
+        pixel: its index among all pixels, row by row; -1 without one.
+        away: its distance, in units of 16 pixels.
+    """
+
+    pixel: Int64[np.ndarray, "H W"]
+    away: Float64[np.ndarray, "H W"]
+
+
+def _of_one(
+    seen: Observed, next_returns: Sequence[_NextReturn]
+) -> tuple[Float32[np.ndarray, "19 H W"], Float32[np.ndarray, "9 H W"]]:
     if not seen.returned.any():
         empty = np.zeros((NUM_MAPS, *seen.returned.shape), dtype=np.float32)
         empty[0] = seen.observed
@@ -58,10 +87,8 @@ def _of_one(seen: Observed) -> tuple[Float32[np.ndarray, "19 H W"], Float32[np.n
     tiling = triangles(seen)
     filled, lines, near = (np.log1p(part) for part in (tiling.range_m, linear(seen), seen.nearest_range_m))
     corners = np.log1p(tiling.corners_m[1:])
-    next_v, distances = zip(
-        *(_next_return(seen, down, right) for down, right in ((-1, 0), (1, 0), (0, -1), (0, 1))), strict=True
-    )
-    next_v = [np.where(np.isnan(v), filled, v) for v in next_v]
+    observed_v = np.log1p(seen.range_m).ravel()
+    next_v = [np.where(found.pixel < 0, filled, observed_v[found.pixel]) for found in next_returns]
     drops = seen.observed & ~seen.returned
     share_observed, share_dropped = _share_around(seen.observed), _share_around(drops)
     maps = [
@@ -71,7 +98,7 @@ def _of_one(seen: Observed) -> tuple[Float32[np.ndarray, "19 H W"], Float32[np.n
         near - filled,
         filled - _TYPICAL_V,
         *(v - filled for v in next_v),
-        *distances,
+        *(found.away for found in next_returns),
         share_dropped / np.maximum(share_observed, 1e-6),
         share_observed,
         *(corners - filled),
@@ -86,19 +113,30 @@ def _share_around(part: Bool[np.ndarray, "H W"]) -> Float64[np.ndarray, "H W"]:
     return uniform_filter1d(down, _WINDOW, 1, mode="wrap")
 
 
-def _next_return(
-    seen: Observed, down: int, right: int
-) -> tuple[Float64[np.ndarray, "H W"], Float64[np.ndarray, "H W"]]:
-    """Return ln(1 + range) of the next observed return on one side, NaN without one, and its distance."""
+def _labels_of_one(
+    label: Int64[np.ndarray, "H W"], seen: Observed, next_returns: Sequence[_NextReturn]
+) -> Int64[np.ndarray, "5 H W"]:
+    """Return the classes of the nearest return and of those on every side; of the nearest where there is none."""
+    if not seen.returned.any():
+        return np.zeros((NUM_LABELS, *label.shape), dtype=np.int64)
+    nearest = label[seen.nearest_return]
+    return np.stack([nearest, *(np.where(at < 0, nearest, label.ravel()[at]) for at, _ in next_returns)])
+
+
+def _next_return(seen: Observed, down: int, right: int) -> _NextReturn:
+    """Return the next observed return on one side of every pixel, not the pixel itself; columns wrap around."""
     lines = np.tile(seen.range_m, (1, 3)) if right else seen.range_m.T
     backwards = down + right < 0
     lines = lines if backwards else lines[:, ::-1]
     index = np.arange(lines.shape[1])
     last = np.maximum.accumulate(np.where(lines > 0, index, -1), axis=1)
     last = np.concatenate((np.full((len(lines), 1), -1), last[:, :-1]), axis=1)  # not the pixel itself
-    range_m = np.where(last >= 0, np.take_along_axis(lines, np.maximum(last, 0), axis=1), np.nan)
     away = np.where(last >= 0, np.minimum((index - last) / _FAR_PIXELS, _FARTHEST), _FARTHEST)
+    at = last if backwards else np.where(last >= 0, len(index) - 1 - last, -1)
+    at, away = (part if backwards else part[:, ::-1] for part in (at, away))
     width = seen.range_m.shape[1]
-    v, away = (part if backwards else part[:, ::-1] for part in (np.log1p(range_m), away))
+    line = np.arange(len(lines))[:, None]
+    if not right:
+        return _NextReturn(np.where(at >= 0, at * width + line, -1).T, away.T)
     middle = slice(width, 2 * width)
-    return (v[:, middle], away[:, middle]) if right else (v.T, away.T)
+    return _NextReturn(np.where(at >= 0, line * width + at % width, -1)[:, middle], away[:, middle])

@@ -80,4 +80,4 @@ class ImagesInMemory:
 
     def read(self, index: int) -> Pixels:
         """Return the ranges of one image; reflectance is not known."""
-        return self._range_m[index], None
+        return Pixels(self._range_m[index])

@@ -7,17 +7,28 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import Float32, UInt16
 
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
-Pixels = tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "H W"] | None]
-"""Range (H, W) in metres, 0 where there is no return; reflectance (H, W) in [0, 1], or None if it is not known."""
+
+class Pixels(NamedTuple):
+    """The pixels of one image.
+
+    Args:
+        range_m: range in metres, 0 where there is no return.
+        reflectance: reflectance in [0, 1]; None if it is not known.
+        label: class by SemanticKITTI's numbers, 0 where it is not known; None if it is not known anywhere.
+    """
+
+    range_m: Float32[np.ndarray, "H W"]
+    reflectance: Float32[np.ndarray, "H W"] | None = None
+    label: UInt16[np.ndarray, "H W"] | None = None
 
 
 @dataclass(frozen=True)
@@ -105,7 +116,11 @@ class RangeImages:
     @cached_property
     def _all_have_reflectance(self) -> bool:
         """Whether the first image of every store has reflectance; batches with it and without it would not mix."""
-        return all(store.read(0)[1] is not None for store in self._stores)
+        return all(store.read(0).reflectance is not None for store in self._stores)
+
+    @cached_property
+    def _all_have_label(self) -> bool:
+        return all(store.read(0).label is not None for store in self._stores)
 
     def batch(self, indices: Sequence[int], first_columns: Sequence[int] | None = None) -> RangeImage:
         """Return some images as one batch (B, H, W).
@@ -117,13 +132,19 @@ class RangeImages:
         """
         first_columns = first_columns or [0] * len(indices)
         pixels = [self._pixels(index, first) for index, first in zip(indices, first_columns, strict=True)]
-        range_m = torch.from_numpy(np.stack([one for one, _ in pixels]))
-        found = [reflectance for _, reflectance in pixels if reflectance is not None and self._all_have_reflectance]
-        reflectance = torch.from_numpy(np.stack(found)) if found and len(found) == len(pixels) else None
-        return RangeImage(range_m, range_m > 0, self.sensor, reflectance)
+        range_m = torch.from_numpy(np.stack([one.range_m for one in pixels]))
+        reflectance, label = (
+            torch.from_numpy(np.stack(found)) if found and len(found) == len(pixels) else None
+            for found in (
+                [one.reflectance for one in pixels if one.reflectance is not None and self._all_have_reflectance],
+                [one.label.astype(np.int64) for one in pixels if one.label is not None and self._all_have_label],
+            )
+        )
+        return RangeImage(range_m, range_m > 0, self.sensor, reflectance, label)
 
     def _pixels(self, index: int, first_column: int) -> Pixels:
         part = bisect_right(self._ends, index)
-        range_m, reflectance = self._stores[part].read(index - (self._ends[part - 1] if part else 0))
-        kept = slice(first_column, None, range_m.shape[1] // self.sensor.width)
-        return range_m[:, kept], None if reflectance is None else reflectance[:, kept]
+        whole = self._stores[part].read(index - (self._ends[part - 1] if part else 0))
+        kept = slice(first_column, None, whole.range_m.shape[1] // self.sensor.width)
+        reflectance, label = (None if one is None else one[:, kept] for one in whole[1:])
+        return Pixels(whole.range_m[:, kept], reflectance, label)

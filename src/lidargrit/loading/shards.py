@@ -1,4 +1,4 @@
-"""One file of many range images ⇄ pixels: range in whole steps, reflectance in bytes, each image compressed alone.
+"""One file of many range images ⇄ pixels: range in steps, reflectance in bytes, class in 16 bits, each image by itself.
 
 A shard is the magic, the compressed images one after another, an index in JSON, the index's length in 8 bytes, and the
 magic again. A file that was cut short is recognised by its end, and one image is read by one seek, here or far away.
@@ -44,6 +44,8 @@ class ShardEntry:
         fingerprint: hash of the pixels before compression.
         range_fingerprint: hash of the ranges alone, by which a scan without its reflectance is recognised; "" in older
             shards.
+        label_bytes: length of the compressed classes, in bytes, which come last; 0 if there are none.
+        label_fingerprint: hash of the classes; "" if there are none. A scan is the same with labels or without.
     """
 
     scan: int
@@ -52,6 +54,13 @@ class ShardEntry:
     reflectance_bytes: int
     fingerprint: str
     range_fingerprint: str = ""
+    label_bytes: int = 0
+    label_fingerprint: str = ""
+
+    @property
+    def end(self) -> int:
+        """Position after the image's last byte."""
+        return self.offset + self.range_bytes + self.reflectance_bytes + self.label_bytes
 
 
 @runtime_checkable
@@ -100,7 +109,7 @@ class ShardWriter:
     def __init__(self, step_m: float) -> None:
         self._step_m = step_m
         self._entries: list[ShardEntry] = []
-        self._blobs: list[bytes] = []  # of the same images, each its range and then its reflectance
+        self._blobs: list[bytes] = []  # of the same images, each its range, then its reflectance, then its classes
         self._left_out: dict[int, str] = {}
         self._end = len(_MAGIC)
 
@@ -114,11 +123,16 @@ class ShardWriter:
         steps = np.rint(image.range_m.numpy() / np.float32(self._step_m)).astype(np.uint16)
         steps[image.return_mask.numpy() & (steps == 0)] = 1  # a return stays one
         levels = None if image.reflectance is None else np.rint(image.reflectance.numpy() * 255).astype(np.uint8)
-        range_blob, reflectance_blob = _compress(steps), b"" if levels is None else _compress(levels)
-        lengths = len(range_blob), len(reflectance_blob)
-        of_ranges = _fingerprint(steps, None)
-        hashes = of_ranges if levels is None else _fingerprint(steps, levels), of_ranges
-        self._append(ShardEntry(scan, self._end, *lengths, *hashes), range_blob + reflectance_blob)
+        classes = None if image.label is None else image.label.numpy().astype(np.uint16)
+        blobs = [b"" if one is None else _compress(one) for one in (steps, levels, classes)]
+        of_ranges = _fingerprint(steps)
+        of_pixels = of_ranges if levels is None else _fingerprint(steps, levels)
+        of_classes = "" if classes is None else _fingerprint(classes)
+        of_range, of_reflectance, of_label = map(len, blobs)
+        self._append(
+            ShardEntry(scan, self._end, of_range, of_reflectance, of_pixels, of_ranges, of_label, of_classes),
+            b"".join(blobs),
+        )
 
     def add_from(self, file: Bytes, name: str) -> None:
         """Add all that another file of this class holds.
@@ -128,7 +142,7 @@ class ShardWriter:
         """
         entries, left_out = read_index(file, name)
         for entry in entries:
-            blob = file.read(entry.offset, entry.offset + entry.range_bytes + entry.reflectance_bytes)
+            blob = file.read(entry.offset, entry.end)
             self._append(replace(entry, offset=self._end), bytes(blob))
         self._left_out |= left_out
 
@@ -165,12 +179,13 @@ def read_index(file: Bytes, name: str) -> tuple[list[ShardEntry], dict[int, str]
         index = parse_json(data, "its index")
         entries = [ShardEntry(**entry) for entry in index["entries"]]
         for entry in entries:
-            numbers = entry.scan, entry.offset, entry.range_bytes, entry.reflectance_bytes
+            numbers = entry.scan, entry.offset, entry.range_bytes, entry.reflectance_bytes, entry.label_bytes
             if not all(type(number) is int and number >= 0 for number in numbers):
                 raise ValueError("lengths that are no whole numbers")
-            if not (isinstance(entry.fingerprint, str) and isinstance(entry.range_fingerprint, str)):
+            hashes = entry.fingerprint, entry.range_fingerprint, entry.label_fingerprint
+            if not all(isinstance(one, str) for one in hashes):
                 raise ValueError("a fingerprint that is none")
-            if entry.offset + entry.range_bytes + entry.reflectance_bytes > start:
+            if entry.end > start:
                 raise ValueError("an image beyond its end")
         return entries, {int(scan): str(why) for scan, why in index["left_out"].items()}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
@@ -185,21 +200,27 @@ def read_image(
     Raises:
         DataError: the image is damaged.
     """
-    blob = file.read(entry.offset, entry.offset + entry.range_bytes + entry.reflectance_bytes)
+    blob = file.read(entry.offset, entry.end)
+    of_range, of_reflectance = entry.range_bytes, entry.range_bytes + entry.reflectance_bytes
     try:
-        steps = _decompress(blob[: entry.range_bytes], shape, np.uint16)
-        levels = _decompress(blob[entry.range_bytes :], shape, np.uint8) if entry.reflectance_bytes else None
+        steps = _decompress(blob[:of_range], shape, np.uint16)
+        levels = _decompress(blob[of_range:of_reflectance], shape, np.uint8) if entry.reflectance_bytes else None
+        classes = _decompress(blob[of_reflectance:], shape, np.uint16) if entry.label_bytes else None
     except (ValueError, RuntimeError, TypeError) as error:
         raise _damaged(name, error) from None
-    if verify and _fingerprint(steps, levels) != entry.fingerprint:
-        raise _damaged(name, ValueError("pixels that differ from their fingerprint"))
+    if verify:
+        hashes = _fingerprint(steps, levels), "" if classes is None else _fingerprint(classes)
+        if hashes != (entry.fingerprint, entry.label_fingerprint):
+            raise _damaged(name, ValueError("pixels that differ from their fingerprint"))
     range_m = np.multiply(steps, np.float32(step_m), dtype=np.float32)
-    return range_m, None if levels is None else np.multiply(levels, np.float32(1 / 255), dtype=np.float32)
+    reflectance = None if levels is None else np.multiply(levels, np.float32(1 / 255), dtype=np.float32)
+    return Pixels(range_m, reflectance, classes)
 
 
-def _fingerprint(steps: np.ndarray, levels: np.ndarray | None) -> str:
-    digest = hashlib.blake2b(steps.tobytes(), digest_size=8)
-    digest.update(b"" if levels is None else levels.tobytes())
+def _fingerprint(*parts: np.ndarray | None) -> str:
+    digest = hashlib.blake2b(digest_size=8)
+    for part in parts:
+        digest.update(b"" if part is None else part.tobytes())
     return digest.hexdigest()
 
 

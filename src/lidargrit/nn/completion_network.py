@@ -1,4 +1,4 @@
-"""A network that completes scans: observed pixels and classical fills → a range and the chance of a return."""
+"""A network that completes scans: observed pixels and classical fills → range, chance of a return, class."""
 
 from __future__ import annotations
 
@@ -12,15 +12,18 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from lidargrit.conditions import Condition
-from lidargrit.conditions.hints import NUM_CANDIDATES, NUM_MAPS, Hints, hints_of
+from lidargrit.conditions.hints import NUM_CANDIDATES, NUM_LABELS, NUM_MAPS, Hints, hints_of
 from lidargrit.errors import ConfigError
 from lidargrit.nn.pixel_networks import Guide, MaskNetwork
+from lidargrit.nn.semantic_classes import NUM_CLASSES, ClassMaps, class_indices, labels_of, votes
 from lidargrit.nn.small_unet import SmallUnet, SmallUnetConfig, check_image
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
 _TRUST = 3.0  # logit by which triangulation is preferred to the other candidates at first
 _LOGIT_BOUND = 8.0
+_CLASS_CHANNELS = 4  # learned, of each label that the network sees
+_VOTE = 5.0  # logit of a class for which all observed labels around a pixel speak
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,8 @@ class CompletionNetworkConfig:
         features: number of channels that the phases of the mask see.
         mask_width: number of channels of the layers of the mask's phases.
         row_channels: number of learned values of every row.
+        labels: whether the network sees the classes of observed pixels, where scans have them, and estimates those of
+            the others: the 19 classes of SemanticKITTI's benchmark.
     """
 
     widths: tuple[int, int, int] = (48, 64, 128)
@@ -45,6 +50,7 @@ class CompletionNetworkConfig:
     features: int = 32
     mask_width: int = 24
     row_channels: int = 2
+    labels: bool = False
 
     def __post_init__(self) -> None:
         sizes = (*self.widths, self.blocks, self.heads, self.features, self.mask_width, self.row_channels)
@@ -65,11 +71,13 @@ class Point(NamedTuple):
         guide: inputs of the phases of the mask.
         v: ln(1 + range in metres), with its gradient.
         return_logits: logits of the probability of a return by itself, with their gradient.
+        class_logits: logits of the classes, with their gradient; None from a network without classes.
     """
 
     guide: Guide
     v: Float[Tensor, "B H W"]
     return_logits: Float[Tensor, "B H W"]
+    class_logits: Float[Tensor, "B 19 H W"] | None = None
 
 
 class CompletionNetwork(nn.Module):
@@ -91,12 +99,15 @@ class CompletionNetwork(nn.Module):
         azimuth_rad = sensor.azimuth_rad.double().mean(0).float()
         self.register_buffer("azimuth", torch.stack((azimuth_rad.sin(), azimuth_rad.cos())), persistent=False)
         sizes = SmallUnetConfig(config.widths, config.blocks, config.attention_layers, config.heads)
-        self.unet = SmallUnet(sizes, NUM_MAPS + config.row_channels + 2, config.features + NUM_CANDIDATES + 2)
+        self.classes = ClassMaps(_CLASS_CHANNELS) if config.labels else None
+        outputs = [config.features, NUM_CANDIDATES, 1, 1]
+        more = (NUM_LABELS * _CLASS_CHANNELS, NUM_CLASSES + NUM_LABELS) if config.labels else (0, 0)
+        self.unet = SmallUnet(sizes, NUM_MAPS + config.row_channels + 2, sum(outputs), *more)
+        self.outputs = outputs + ([NUM_CLASSES, NUM_LABELS] if config.labels else [])
         self.mask = MaskNetwork.behind(config.features, config.mask_width, sensor)
         preferred = torch.zeros(NUM_CANDIDATES)
         preferred[0] = _TRUST
         self.register_buffer("preferred", preferred[:, None, None], persistent=False)
-        self.num_features = config.features
 
     preferred: Tensor
     azimuth: Tensor
@@ -110,18 +121,32 @@ class CompletionNetwork(nn.Module):
         """
         rows = self.rows[None, :, :, None].expand(len(observed), -1, -1, observed.shape[-1])
         columns = self.azimuth[None, :, None].expand(len(observed), -1, observed.shape[-2], -1)
-        output = self.unet(torch.cat((hints.maps, rows, columns), 1)).float()
-        features, weights, moved, logits = output.split((self.num_features, NUM_CANDIDATES, 1, 1), 1)
+        indices, more = None, None
+        if self.classes is not None:
+            label = hints.labels
+            if label is None:
+                label = hints.maps.new_zeros((len(observed), NUM_LABELS, *observed.shape[1:]), dtype=torch.int64)
+            indices = class_indices(label)
+            more = self.classes(indices)
+        output = self.unet(torch.cat((hints.maps, rows, columns), 1), more).float()
+        features, weights, moved, logits, *of_classes = output.split(self.outputs, 1)
         shares = (4 * weights + self.preferred).softmax(1)
         v = (shares * hints.candidates).sum(1) + 0.3 * moved[:, 0]
         return_logits = (2 * logits[:, 0] + 1.5).clamp(-_LOGIT_BOUND, _LOGIT_BOUND)
         v = v.clamp(*self.limits_v)
-        return Point(Guide(features, v.detach(), return_logits.detach(), observed), v, return_logits)
+        class_logits = None
+        if indices is not None:
+            alone, trust = of_classes
+            # As for the range, the nearest return is preferred at first.
+            shares = (4 * trust + self.preferred[:NUM_LABELS]).softmax(1)
+            class_logits = 2 * alone + _VOTE * votes(indices, shares)
+        return Point(Guide(features, v.detach(), return_logits.detach(), observed), v, return_logits, class_logits)
 
     def sample(self, condition: Condition, rngs: Sequence[torch.Generator]) -> RangeImage:
         """Return completed scans: the range estimated, the mask sampled; a scan does not depend on the others.
 
-        The range is the mean of two estimates, of the scan and of its mirror image.
+        The range is the mean of two estimates, of the scan and of its mirror image, and so are the logits of classes.
+        Scans with labels are completed with labels by a network with classes.
 
         Args:
             condition: observed pixels of as many scans.
@@ -136,5 +161,8 @@ class CompletionNetwork(nn.Module):
             uniform = torch.rand(one.range_m.shape, generator=rng).to(one.range_m.device)
             mask = self.mask.sample(point.guide, uniform, one)
             low_m, high_m = condition.sensor.range_min_m, condition.sensor.range_max_m
-            images.append(RangeImage.masked(v.expm1().clamp(low_m, high_m), mask, condition.sensor))
+            label = None
+            if one.label is not None and point.class_logits is not None and mirrored.class_logits is not None:
+                label = labels_of((point.class_logits + mirrored.class_logits.flip(-1)).argmax(1) + 1)
+            images.append(RangeImage.masked(v.expm1().clamp(low_m, high_m), mask, condition.sensor, label=label))
         return RangeImage.cat(images)

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidargrit.conditions import Condition
 from lidargrit.conditions.hints import hints_of
 from lidargrit.nn.completion_network import CompletionNetwork
 from lidargrit.nn.objective import Objective
+from lidargrit.nn.semantic_classes import class_indices, hidden_in_some, labels_to_learn
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
@@ -21,6 +23,8 @@ _KINDS = (0.36, 0.74)  # up to these: rows, then sectors, then pixels
 _BOXES = 1 / 3  # of the sectors, hidden in some rows only
 _SECTORS = (24 / 256, 128 / 256)  # of the columns, hidden
 _SHARES = (0.03, 0.5)  # of the pixels, observed
+_WITHOUT_LABELS = 0.25  # of the scans, so that a network with classes completes scans without labels, too
+_CLASS_WEIGHT = 0.5
 _MASK_WEIGHT, _ALONE_WEIGHT, _LOG_WEIGHT, _METRE_WEIGHT = 3.0, 0.5, 1.5, 0.3
 
 
@@ -40,9 +44,19 @@ class CompletionObjective(Objective):
         self.completion = network
 
     def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
-        """Return the loss, and beside it the error in metres of hidden returns and the bits of a hidden return."""
+        """Return the loss, and beside it the error in metres of hidden returns and the bits of a hidden return.
+
+        A network with classes is told those of observed pixels in three of four scans; beside the loss then stands the
+        share of hidden returns whose class it finds.
+
+        Raises:
+            ConfigError: a network with classes, and scans without labels.
+        """
         observed = random_patterns(len(images), self.sensor.height, self.sensor.width, rng)
         condition = Condition.of_pixels(images, observed)
+        if self.completion.classes is not None:
+            seen = hidden_in_some(labels_to_learn(condition.label), _WITHOUT_LABELS, rng)
+            condition = replace(condition, label=seen)
         point = self.completion(hints_of(condition), observed)
         hidden = ~observed
         returns = (hidden & images.return_mask).float()
@@ -54,8 +68,25 @@ class CompletionObjective(Objective):
         error_m = ((point.v.expm1() - images.range_m).abs() * returns).sum((1, 2)) / num_returns
         of_mask = _MASK_WEIGHT * (nats + _ALONE_WEIGHT * alone)
         weight = hidden.float().mean((1, 2)).sqrt()
-        loss = (weight * (of_mask + _LOG_WEIGHT * log_error + _METRE_WEIGHT * error_m)).mean()
-        return {"loss": loss, "error_m": error_m.mean().detach(), "mask_bits": nats.mean().detach() / math.log(2)}
+        each = of_mask + _LOG_WEIGHT * log_error + _METRE_WEIGHT * error_m
+        beside = {"error_m": error_m.mean().detach(), "mask_bits": nats.mean().detach() / math.log(2)}
+        if point.class_logits is not None:
+            of_classes, beside["class_accuracy"] = _class_terms(
+                point.class_logits, labels_to_learn(images.label), hidden
+            )
+            each = each + _CLASS_WEIGHT * of_classes
+        return {"loss": (weight * each).mean(), **beside}
+
+
+def _class_terms(
+    logits: Float[Tensor, "B 19 H W"], label: Int[Tensor, "B H W"], hidden: Bool[Tensor, "B H W"]
+) -> tuple[Float[Tensor, " B"], Float[Tensor, ""]]:
+    """Return the cross-entropy of hidden pixels of each scan in nats, and the share of right classes, of known ones."""
+    wanted = class_indices(label)
+    counted = ((wanted > 0) & hidden).float()
+    nats = F.cross_entropy(logits, (wanted - 1).clamp(min=0), reduction="none")
+    right = (logits.detach().argmax(1) + 1 == wanted) * counted
+    return (nats * counted).sum((1, 2)) / counted.sum((1, 2)).clamp(min=1), right.sum() / counted.sum().clamp(min=1)
 
 
 def random_patterns(count: int, height: int, width: int, rng: torch.Generator) -> Bool[Tensor, "B H W"]:

@@ -8,12 +8,13 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from lidargrit.conditions import Condition
 from lidargrit.errors import ConfigError
 from lidargrit.nn.pixel_networks import Guide, MaskNetwork
+from lidargrit.nn.semantic_classes import ClassMaps, class_indices
 from lidargrit.nn.small_unet import SmallUnet, SmallUnetConfig, check_image
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
@@ -22,6 +23,7 @@ _TYPICAL_V = 2.5  # ln(1 + 11 m), the middle of what scans hold, so that inputs 
 _LOGIT_BOUND = 8.0
 _EDGE = 0.5  # of ln(range): neighbours further apart lie on two surfaces
 _NUM_MAPS = 8
+_CLASS_CHANNELS = 4  # learned, of the label of a surface
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,8 @@ class RaydropConfig:
         features: channels that the phases of the mask see.
         mask_width: channels of the layers of the mask's phases.
         row_channels: learned numbers of every row.
+        labels: whether the network sees the classes of the surfaces, where scans have them: the 19 classes of
+            SemanticKITTI's benchmark.
     """
 
     surfaces: Literal["known", "estimated"] = "known"
@@ -46,8 +50,15 @@ class RaydropConfig:
     features: int = 24
     mask_width: int = 24
     row_channels: int = 2
+    labels: bool = False
 
     def __post_init__(self) -> None:
+        if self.labels and self.surfaces == "estimated":
+            raise ConfigError(
+                "labels=true with surfaces=estimated, which has no label where nothing returned",
+                "surfaces that are known, or no labels",
+                "leave one of both out",
+            )
         if min(*self.widths, self.blocks, self.features, self.mask_width, self.row_channels) < 1:
             raise ConfigError(f"{self}", "sizes of at least 1", "raise the one that is lower")
 
@@ -82,24 +93,35 @@ class RaydropNetwork(nn.Module):
         elevation_rad = sensor.elevation_rad.double().mean(1).float()
         self.register_buffer("elevation_rad", elevation_rad, persistent=False)
         sizes = SmallUnetConfig(config.widths, config.blocks)
-        self.unet = SmallUnet(sizes, _NUM_MAPS + config.row_channels + 2, config.features + 1)
+        self.classes = ClassMaps(_CLASS_CHANNELS) if config.labels else None
+        more = _CLASS_CHANNELS if config.labels else 0
+        self.unet = SmallUnet(sizes, _NUM_MAPS + config.row_channels + 2, config.features + 1, more)
         self.mask = MaskNetwork.behind(config.features, config.mask_width, sensor)
 
     azimuth: Tensor
     elevation_rad: Tensor
 
-    def forward(self, range_m: Float[Tensor, "B H W"], surface: Bool[Tensor, "B H W"]) -> Returns:
+    def forward(
+        self,
+        range_m: Float[Tensor, "B H W"],
+        surface: Bool[Tensor, "B H W"],
+        label: Int[Tensor, "B H W"] | None = None,
+    ) -> Returns:
         """Return features and logits of every ray.
 
         Args:
             range_m: ranges of the surfaces, in metres.
             surface: True where a ray meets a surface; no other ray returns.
+            label: class of each surface, 0 where it is not known; of use to a network with classes.
         """
         count, width = len(range_m), range_m.shape[-1]
         rows = self.rows[None, :, :, None].expand(count, -1, -1, width)
         columns = self.azimuth[None, :, None].expand(count, -1, range_m.shape[-2], -1)
-        maps = torch.cat((self._maps(range_m, surface), rows, columns), 1)
-        features, logits = self.unet(maps).float().split((self.config.features, 1), 1)
+        maps, more = torch.cat((self._maps(range_m, surface), rows, columns), 1), None
+        if self.classes is not None:
+            label = torch.zeros_like(surface, dtype=torch.int64) if label is None else label
+            more = self.classes(class_indices(label)[:, None])
+        features, logits = self.unet(maps, more).float().split((self.config.features, 1), 1)
         v = torch.where(surface, range_m, 0.0).log1p()
         logits = (2 * logits[:, 0] + 1.5).clamp(-_LOGIT_BOUND, _LOGIT_BOUND)
         return Returns(Guide(features, v, logits.detach(), ~surface), logits)
@@ -115,9 +137,10 @@ class RaydropNetwork(nn.Module):
         images = []
         for index, rng in enumerate(rngs):
             one = condition[index : index + 1]
-            guide = self(one.range_m, one.range_observed).guide
+            guide = self(one.range_m, one.range_observed, one.label).guide
             uniform = torch.rand(one.range_m.shape, generator=rng).to(one.range_m.device)
-            images.append(RangeImage.masked(one.range_m, self.mask.sample(guide, uniform, one), condition.sensor))
+            returned = self.mask.sample(guide, uniform, one)
+            images.append(RangeImage.masked(one.range_m, returned, condition.sensor, label=one.label))
         return RangeImage.cat(images)
 
     def _maps(self, range_m: Float[Tensor, "B H W"], surface: Bool[Tensor, "B H W"]) -> Float[Tensor, "B 8 H W"]:

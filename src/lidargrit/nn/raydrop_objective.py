@@ -13,11 +13,13 @@ from lidargrit.conditions.fills import ranges_from_others
 from lidargrit.errors import ConfigError
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.raydrop_network import RaydropNetwork
+from lidargrit.nn.semantic_classes import hidden_in_some, labels_to_learn
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
 _NOISE_M = 0.03  # largest standard deviation of noise added in training: clean ranges may come with noise or not
 _ALONE_WEIGHT = 0.5
+_WITHOUT_LABELS = 0.25  # of the scans, so that a network with classes drops returns of scans without labels, too
 
 
 class RaydropObjective(Objective):
@@ -36,7 +38,8 @@ class RaydropObjective(Objective):
         """Return the loss, and beside it the bits of a surface's return.
 
         Raises:
-            ConfigError: scans whose surfaces are not marked, unless surfaces are to be estimated.
+            ConfigError: scans whose surfaces are not marked, unless surfaces are to be estimated; or scans without
+                labels, for a network with classes.
         """
         if self.raydrop.config.surfaces == "estimated":
             surfaces, returned = ranges_from_others(images, rng), images.return_mask
@@ -47,7 +50,10 @@ class RaydropObjective(Objective):
             noise = torch.randn(range_m.shape, generator=rng, device=rng.device)
             most = torch.rand((len(range_m), 1, 1), generator=rng, device=rng.device) * _NOISE_M
             range_m = (range_m + noise * most).clamp(min=self.sensor.range_min_m)
-        found = self.raydrop(range_m, surface)
+        label = None
+        if self.raydrop.classes is not None:
+            label = hidden_in_some(labels_to_learn(images.label), _WITHOUT_LABELS, rng)
+        found = self.raydrop(range_m, surface, label)
         count = surface.float().sum((1, 2)).clamp(min=1)
         nats = self.raydrop.mask.nats(found.guide, returned, rng if self.training else None) / count
         alone = F.binary_cross_entropy_with_logits(found.logits, returned.float(), reduction="none")

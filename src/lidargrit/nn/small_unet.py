@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -57,9 +58,14 @@ class SmallUnet(Network):
         config: sizes of the network.
         inputs: channels of the input.
         outputs: channels of the output.
+        more_inputs: channels of further inputs, without influence at first, so that a network without them can be
+            trained further with them.
+        more_outputs: channels of further outputs, which come last.
     """
 
-    def __init__(self, config: SmallUnetConfig, inputs: int, outputs: int) -> None:
+    def __init__(
+        self, config: SmallUnetConfig, inputs: int, outputs: int, more_inputs: int = 0, more_outputs: int = 0
+    ) -> None:
         super().__init__()
         first, second, third = config.widths
         self.enter, self.level1 = Convolution(4 * inputs, first, "wrap"), Residual(first)
@@ -76,15 +82,27 @@ class SmallUnet(Network):
         nn.init.normal_(self.out.weight, std=0.02)
         assert self.out.bias is not None
         nn.init.zeros_(self.out.bias)
+        self.more_in = nn.Conv2d(4 * more_inputs, first, 1, bias=False) if more_inputs else None
+        self.more_out = nn.Conv2d(first, 4 * more_outputs, 1) if more_outputs else None
+        if self.more_in is not None:
+            nn.init.zeros_(self.more_in.weight)
 
-    def forward(self, maps: Float[Tensor, "B C H W"]) -> Float[Tensor, "B D H W"]:
+    def forward(
+        self, maps: Float[Tensor, "B C H W"], more: Float[Tensor, "B E H W"] | None = None
+    ) -> Float[Tensor, "B D H W"]:
         """Return the output at full size."""
-        one = self.level1(self.enter(F.pixel_unshuffle(maps, 2)))
+        entered = self.enter(F.pixel_unshuffle(maps, 2))
+        if self.more_in is not None and more is not None:
+            entered = entered + self.more_in(F.pixel_unshuffle(more, 2))
+        one = self.level1(entered)
         two = self.level2(self.down1(F.pixel_unshuffle(one, 2)))
         three = self.level3(self.down2(F.pixel_unshuffle(two, 2)))
         two = self.after2(two + F.pixel_shuffle(self.up2(three), 2))
         one = self.after1(one + F.pixel_shuffle(self.up1(two), 2))
-        return F.pixel_shuffle(self.out(F.silu(one)), 2)
+        found = F.pixel_shuffle(self.out(F.silu(one)), 2)
+        if self.more_out is None:
+            return found
+        return torch.cat((found, F.pixel_shuffle(self.more_out(F.silu(one)), 2)), 1)
 
 
 class _Attention(nn.Module):

@@ -10,7 +10,7 @@ from lidargrit.errors import ScanError
 from lidargrit.projection.fit import fit_problems
 from lidargrit.projection.pixel_coordinates import ProjectionVariant, pixel_coordinates, within_limits
 from lidargrit.sensors import ProjectionName, SensorModel
-from lidargrit.structures import RangeImage, Scan
+from lidargrit.structures import CLASS_BITS, RangeImage, Scan
 
 
 def project(
@@ -38,7 +38,7 @@ def project(
             not mean a beam that did not return.
 
     Returns:
-        range_m (H, W) in metres and return_mask (H, W), with the reflectance if the scan has it.
+        range_m (H, W) in metres and return_mask (H, W), with reflectance and label if the scan has them.
 
     Raises:
         ScanError: the scan does not fit the sensor, or its points are not in firing order; names the sensors that
@@ -64,7 +64,11 @@ def project(
     if scan.reflectance is not None:
         of_point = np.append(scan.reflectance.numpy(), np.float32(0))  # that of no point, -1, is the last
         reflectance = torch.from_numpy(of_point.take(point_of_pixel))
-    return RangeImage(torch.from_numpy(range_m), torch.from_numpy(filled), sensor, reflectance)
+    label = None
+    if scan.label is not None:
+        of_point = np.append(scan.label.numpy() & CLASS_BITS, 0)
+        label = torch.from_numpy(of_point.take(point_of_pixel))
+    return RangeImage(torch.from_numpy(range_m), torch.from_numpy(filled), sensor, reflectance, label)
 
 
 def index_map(

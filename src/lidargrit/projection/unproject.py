@@ -19,7 +19,7 @@ def unproject(image: RangeImage) -> Scan:
     """Return the points of one range image, row by row from the top, each on the centre of its pixel's ray.
 
     Returns:
-        one point for each return, with its ring, and with its reflectance if the image has it.
+        one point for each return, with its ring, and with reflectance and label if the image has them.
 
     Raises:
         ScanError: a batch instead of one image, or an image without a return.
@@ -39,5 +39,6 @@ def unproject(image: RangeImage) -> Scan:
         points_of_pixels(image)[returned],
         None if image.reflectance is None else image.reflectance[returned],
         rows[returned],
+        None if image.label is None else image.label[returned],
         source="an unprojected range image",
     )

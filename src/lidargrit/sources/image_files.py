@@ -114,7 +114,7 @@ class _ImageFiles:
         within = (range_m >= sensor.range_min_m) & (range_m <= sensor.range_max_m)
         if not within.any():
             raise ScanError(f"no range within the sensor's limits in {path}", "ranges in metres", "check the unit")
-        return np.where(within, range_m, np.float32(0)), None
+        return Pixels(np.where(within, range_m, np.float32(0)))
 
 
 def _array(path: Path) -> np.ndarray:

@@ -135,7 +135,8 @@ def _scaled(config: FitConfig, share: float) -> FitConfig:
 def uniform_images(sensor: SensorModel, count: int) -> RangeImage:
     """Return range images whose every pixel returns at 10 m, for counting operations and measuring speed."""
     range_m = torch.full((count, sensor.height, sensor.width), 10.0).clamp(sensor.range_min_m, sensor.range_max_m)
-    return RangeImage(range_m, torch.ones_like(range_m, dtype=torch.bool), sensor, torch.full_like(range_m, 0.3))
+    mask, label = torch.ones_like(range_m, dtype=torch.bool), torch.full(range_m.shape, 40)
+    return RangeImage(range_m, mask, sensor, torch.full_like(range_m, 0.3), label)
 
 
 class _SeedOfNoValues(torch.Generator):

@@ -48,7 +48,8 @@ def donors_of_stages(recipe: Recipe, stages: Sequence[str]) -> dict[str, str]:
 def taken_stages(recipe: Recipe, generator: Generator) -> dict[str, Objective]:
     """Return the trained stages that a recipe takes from another run, once they are known to fit the generator.
 
-    Those that the recipe names in ``fine_tune`` are among them: their training starts from these weights.
+    Those that the recipe names in ``fine_tune`` are among them: their training starts from these weights. They may
+    lack the part that ``labels=true`` adds, which begins untrained.
 
     Raises:
         ConfigError: a stage of other sizes, a run of another sensor, or of another kind of generator.
@@ -75,14 +76,16 @@ def taken_stages(recipe: Recipe, generator: Generator) -> dict[str, Objective]:
         raise ConfigError(f"fine_tune={unknown[0]}", f"one of {names}", "name a stage that the run of stages_from has")
     stages = [stage for stage in shared if stage not in recipe.train_anew]
     for stage in stages:
-        _check(f"stages_from={recipe.stages_from}", generator, donor, stage)
+        _check(f"stages_from={recipe.stages_from}", generator, donor, stage, stage in recipe.fine_tune)
     return {stage: donor.objective(stage) for stage in stages}
 
 
-def _check(setting: str, generator: Generator, donor: Generator, stage: str) -> None:
-    """Refuse a stage whose sizes or sensor are not the generator's."""
+def _check(setting: str, generator: Generator, donor: Generator, stage: str, grows: bool = False) -> None:
+    """Refuse a stage whose sizes or sensor are not the generator's; one that grows may lack what labels add."""
     ours, theirs = _settings(generator, stage), _settings(donor, stage)
     differing = [name for name in ours if ours[name] != theirs.get(name)]
+    if grows and differing == ["labels"] and ours["labels"]:
+        differing = []
     if not ours and _shapes(generator, stage) != _shapes(donor, stage):  # its settings have no stage's name
         raise ConfigError(
             f"{setting}, whose {stage} has weights of other sizes",

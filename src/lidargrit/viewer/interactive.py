@@ -138,7 +138,7 @@ def _read(name: str) -> str:
 
 def page_data(sets: Sequence[ScanSet]) -> dict[str, Any]:
     """Return all that a page needs to show sets of scans, as JSON values."""
-    labels = [one.label[one.images.return_mask] for one in sets if one.label is not None]
+    labels = [one.label[one.return_mask] for one in (each.images for each in sets) if one.label is not None]
     numbers = sorted({int(number) for label in labels for number in label.unique()})
     if len(numbers) > _CLASSES_AT_MOST:
         raise ConfigError(f"{len(numbers)} classes of labels", f"at most {_CLASSES_AT_MOST}", "show fewer scans")
@@ -164,7 +164,7 @@ def _source(scan_set: ScanSet, numbers: list[int]) -> dict[str, Any]:
     images = scan_set.images.to("cpu")
     step_m = _far_m(scan_set) / _RANGE_STEPS
     steps = (images.range_m.detach() / step_m).round().clamp(1, _RANGE_STEPS) * images.return_mask
-    reflectance, label = images.reflectance, scan_set.label
+    reflectance, label = images.reflectance, images.label
     scans: list[dict[str, Any]] = []
     for index, name in enumerate(scan_set.scan_names):
         scan = {"name": name, "range": _packed(steps[index].numpy().astype("<u2"))}

@@ -1,25 +1,23 @@
-"""Sources of scans, and runs → sets of range images to look at, with the labels of their points if they have any."""
+"""Sources of scans, and runs → sets of range images to look at."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
-import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import ConfigError, DataError, ScanError
 from lidargrit.loading import DataConfig
 from lidargrit.loading.config import ScanSettings
-from lidargrit.projection import index_map, project
+from lidargrit.projection import project
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel
 from lidargrit.sources import DatasetSource, RunSource, Source, open_source
-from lidargrit.structures import RangeImage, Scan
+from lidargrit.structures import RangeImage
 
-_CLASS_BITS = 0xFFFF  # of a label; the instance stands above them
 _PIXELS_AT_MOST = 200_000  # of a scan on a page: what browsers still turn smoothly
 _BATCH = 8  # scans computed at once: what a laptop has memory for
 SURPRISED_BITS = 12.0  # beyond those expected: what happens to one pixel in some thousands
@@ -36,13 +34,11 @@ class ScanSet:
         scan_names: name of each image.
         surprise: bits of every pixel beyond those expected, see :meth:`lidargrit.structures.ScanBits.surprise`; None if
             no model was asked.
-        label: class of every pixel by SemanticKITTI's numbers; 0 where it is not known or there is no return.
     """
 
     name: str
     images: RangeImage
     scan_names: tuple[str, ...]
-    label: Int[Tensor, "B H W"] | None = None
     surprise: Float[Tensor, "B H W"] | None = None
 
 
@@ -136,31 +132,19 @@ def _of_scans(
     dataset, imaging = source.scans(), source.imaging(sensor, config)
     imaging.report(reporter)
     sensor, config = imaging.sensor, imaging.config
-    images, names, labels = [], [], []
+    images, names = [], []
     for index in evenly_spaced(count, len(dataset)):
         try:
-            scan = dataset.scan(index)
-            images.append(project(scan, sensor, variant=config.projection_variant))
+            images.append(project(dataset.scan(index), sensor, variant=config.projection_variant))
         except ScanError as error:
             if config.bad_scans == "refuse":
                 raise
             reporter.message(f"left out: {error}")
             continue
         names.append(dataset.name(index))
-        labels.append(_label_of_pixels(scan, images[-1], config))
     if not images:
         raise DataError(f"no usable scan in {source.text}", "at least one", "see the messages above")
-    labelled = [label for label in labels if label is not None]
-    label = torch.stack(labelled) if len(labelled) == len(images) else None
-    return ScanSet(source.text, RangeImage.stack(images), tuple(names), label)
-
-
-def _label_of_pixels(scan: Scan, image: RangeImage, config: DataConfig) -> Int[Tensor, "H W"] | None:
-    if scan.label is None:
-        return None
-    point_of_pixel = index_map(scan, image.sensor, variant=config.projection_variant)[:, :: image.sensor.column_stride]
-    label = scan.label[torch.from_numpy(point_of_pixel).long().clamp(min=0)] & _CLASS_BITS
-    return torch.where(image.return_mask, label, 0)
+    return ScanSet(source.text, RangeImage.stack(images), tuple(names))
 
 
 def _short(source: str) -> str:
