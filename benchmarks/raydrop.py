@@ -46,9 +46,8 @@ def main() -> None:
     measured = RangeImage.stack(true[: options.count])
     dropped = model.complete(Condition.of_surfaces(surfaces), range(options.count))
     with torch.no_grad():
-        logits = torch.cat(
-            [model.raydrop(one.range_m[None], one.return_mask[None]).logits for one in clean[: options.count]]
-        )
+        every = [surfaces[index : index + 1] for index in range(options.count)]
+        logits = torch.cat([model.raydrop(one.range_m, one.return_mask, one.label).logits for one in every])
     alone = surfaces.return_mask & (torch.rand(logits.shape, generator=rng) < logits.sigmoid())
     rows = {
         "true scans of the same streets": measured,

@@ -5,6 +5,7 @@ import gzip
 import json
 import re
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -52,7 +53,10 @@ def labels(images: RangeImage) -> torch.Tensor:
 def shown() -> list[ScanSet]:
     real, other = scans(), scans(seed=1)
     plain = RangeImage(other.range_m, other.return_mask, SENSOR)  # as a generator without reflectance draws
-    return [ScanSet("real </script>", real, NAMES, labels(real)), ScanSet("generated", plain[:2], ("seed 0", "seed 1"))]
+    return [
+        ScanSet("real </script>", replace(real, label=labels(real)), NAMES),
+        ScanSet("generated", plain[:2], ("seed 0", "seed 1")),
+    ]
 
 
 def page_data(text: str) -> dict:
@@ -83,7 +87,7 @@ def test_the_page_holds_all_pixels_and_nothing_foreign(shown):
     returned = shown[0].images.return_mask[1].numpy()
     assert set(named) == {40, 50}
     label = named[unpacked(scan["label"], "u1").reshape(64, 256)]
-    assert np.array_equal(label[returned], shown[0].label[1].numpy()[returned])
+    assert np.array_equal(label[returned], shown[0].images.label[1].numpy()[returned])
     reflectance = unpacked(scan["reflectance"], "u1").reshape(64, 256) / 255
     assert np.abs(reflectance - shown[0].images.reflectance[1].numpy()).max() < 0.002
     assert "label" not in data["sources"][1]["scans"][0]
@@ -115,11 +119,11 @@ def test_scripts_stay_short():
 def test_labels_stand_where_their_points_are():
     (one,) = load_scan_sets(["simulated:1:val"], 1)
     assert one.scan_names == ("seed_1000000",)
-    assert one.label is not None
-    assert not one.label[~one.images.return_mask].any()
+    assert one.images.label is not None
+    assert not one.images.label[~one.images.return_mask].any()
     down = SENSOR.with_columns(2048, 8).ray_directions()[:, :, 2] * one.images.range_m[0] < -1.2
     near = down & one.images.return_mask[0] & (one.images.range_m[0] < 12)
-    ground = torch.isin(one.label[0][near], torch.tensor([40, 44, 48, 49, 60, 72]))
+    ground = torch.isin(one.images.label[0][near], torch.tensor([40, 44, 48, 49, 60, 72]))
     assert ground.float().mean() > 0.8
 
 
@@ -134,7 +138,7 @@ def test_scans_that_cannot_be_used_are_refused_or_left_out(tmp_path):
         load_scan_sets([str(tmp_path)], 2)
     (one,) = load_scan_sets([str(tmp_path)], 2, settings=ScanSettings(DataConfig(bad_scans="skip")))
     assert one.scan_names == ("0",)
-    assert one.label is None
+    assert one.images.label is None
     assert scan_sets._short("x" * 99) == "..." + "x" * 37
     assert scan_sets._short(f"/data/{'x' * 30}/other_sensors/vlp16") == ".../other_sensors/vlp16"
 
@@ -319,7 +323,7 @@ def test_scans_are_saved_as_files_that_others_read(opened, shown, tmp_path):
         if name.endswith(".ply"):
             assert torch.equal(back.ring, wanted.ring)
         if name.startswith("real") and name.endswith(".ply"):
-            assert torch.equal(back.label, one.label[1][one.images.return_mask[1]])
+            assert torch.equal(back.label, one.images.label[1][one.images.return_mask[1]])
 
 
 def test_everything_is_reached_by_keys_and_has_a_name(opened):

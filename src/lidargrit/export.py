@@ -63,7 +63,7 @@ def export_scans(
         ScanError: a scan that cannot be used.
     """
     config, reporter = config or DataConfig(), reporter or Reporter()
-    layout = _Tree(out) if kind == TREE else _Flat(out, *writable_format(kind))
+    layout = KittiTree(out) if kind == TREE else _Flat(out, *writable_format(kind))
     scans = _open(source, config, sensor)
     files = layout.files([scans.name(index) for index in range(len(scans))])
     identities = [scans.identity(index) for index in range(len(scans))]
@@ -161,8 +161,12 @@ class _Flat:
         self._form.write(self._out / file, scan)
 
 
-class _Tree:
-    """The tree of KITTI odometry, with labels as SemanticKITTI has them."""
+class KittiTree:
+    """The tree of KITTI odometry, with labels as SemanticKITTI has them.
+
+    Args:
+        out: folder of the tree.
+    """
 
     def __init__(self, out: Path) -> None:
         self._out = out
@@ -181,9 +185,11 @@ class _Tree:
         return [f"sequences/{name[:-7]}/velodyne/{name[-6:]}.bin" for name in names]
 
     def is_there(self, file: str) -> bool:
+        """Return whether the file of a scan is written."""
         return (self._out / file).exists()
 
     def write(self, file: str, scan: Scan) -> None:
+        """Write a scan into its file, and its labels, if it has any, into another."""
         path = self._out / file
         if scan.label is not None:  # before the points, whose file says that the scan is complete
             with atomic_path(path.parents[1] / "labels" / f"{path.stem}.label") as temporary:

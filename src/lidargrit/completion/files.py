@@ -19,7 +19,7 @@ from lidargrit.completion.inputs import Inputs, InputScan
 from lidargrit.conditions import Condition
 from lidargrit.determinism import derive_seed
 from lidargrit.errors import ConfigError, DataError, ScanError
-from lidargrit.export import claim_scans, writable_format
+from lidargrit.export import TREE, KittiTree, claim_scans, writable_format
 from lidargrit.files import atomic_path, claim_folder
 from lidargrit.reporting import Reporter
 from lidargrit.sources.image_files import PROBABILITY
@@ -37,8 +37,9 @@ class OutputConfig:
     Args:
         count: number of completions of each scan.
         seed: seed of the first completion of a scan; each further completion has the next seed.
-        format: name or ending of a format, or ``image`` for range images (H, W) in metres as ``.npy``. If empty, each
-            file has the format of its scan where that can be written, and ``.npz`` elsewhere.
+        format: name or ending of a format, ``image`` for range images (H, W) in metres as ``.npy``, or
+            ``kitti_odometry`` for its tree, with SemanticKITTI's files of labels. If empty, each file has the format of
+            its scan where that can be written, and ``.npz`` elsewhere.
         skip_bad: whether a scan that cannot be used is left out; otherwise it ends the command.
         probability: number of samples of the mask from which ``NAME.probability.npy`` gives each pixel's share of
             returns; 0 for no such files.
@@ -99,7 +100,7 @@ def write_completions(
     if output.probability:
         manifest["probability"] = output.probability  # files of before it were written without these shares
     scans = {file: inputs.name(index) for (index, _), file in files.items()}
-    left_out: set[int] = set()
+    left_out, labels_lost = set[int](), False
     missing = [job for job, file in files.items() if not (out / file).exists()]
     remaining = _jobs(inputs, missing, condition_of, output, left_out, reporter)
     jobs = chain(
@@ -114,7 +115,9 @@ def write_completions(
                     if output.probability and job.turn == 0:
                         share = _return_share(completer, job, output)
                         _write_array(out / f"{file.removesuffix(Path(file).suffix)}{PROBABILITY}", share)
-                    _write(out / file, output.format, image, job)
+                    if not _write(out / file, output.format, image, job) and not labels_lost:
+                        labels_lost = True
+                        reporter.message(f"{Path(file).suffix} keeps no labels; --format {TREE} or npz keeps them")
                     progress.advance(1)
     if len(left_out) == len(inputs):
         raise DataError("no usable scan", "at least one", "see the messages above")
@@ -126,9 +129,14 @@ def _files(inputs: Inputs, output: OutputConfig) -> dict[tuple[int, int], str]:
     if len(inputs) * output.count > _FILES_AT_MOST:
         got = f"{output.count:,} completions of each of {len(inputs):,} scans"
         raise ConfigError(got, f"at most {_FILES_AT_MOST:,} files", "ask for fewer")
+    names = [inputs.name(index) for index in range(len(inputs))]
+    if output.format == TREE:
+        names = KittiTree(Path()).files(names)
+    else:
+        names = [name + _suffix(inputs.suffix(index), output.format) for index, name in enumerate(names)]
     return {
-        (index, turn): _folder(turn, output.count) + inputs.name(index) + _suffix(inputs.suffix(index), output.format)
-        for index in range(len(inputs))
+        (index, turn): _folder(turn, output.count) + name
+        for index, name in enumerate(names)
         for turn in range(output.count)
     }
 
@@ -194,14 +202,19 @@ def _suffix(of_input: str, kind: str) -> str:
     return of_input if any(one.can_write() and of_input in one.suffixes for one in known) else _UNWRITABLE
 
 
-def _write(path: Path, kind: str, image: RangeImage, job: _Job) -> None:
+def _write(path: Path, kind: str, image: RangeImage, job: _Job) -> bool:
+    """Write a completed scan, and return whether the file keeps its labels, if it has any."""
     if kind == IMAGE:
         _write_array(path, image.range_m)
-        return
+        return image.label is None
     scan = job.scan.joined(image, job.condition)
+    if kind == TREE:
+        KittiTree(path.parent).write(path.name, scan)
+        return True
     named = [one for one in formats.candidates(path) if one.can_write()]
     form = writable_format(kind)[0] if kind else named[0]
     form.write(path, scan)
+    return scan.label is None or "label" in form.keeps
 
 
 def _write_array(path: Path, pixels: Float[Tensor, "H W"]) -> None:

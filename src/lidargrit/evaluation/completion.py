@@ -10,7 +10,7 @@ from itertools import combinations
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidargrit.completion import Completer
@@ -21,6 +21,7 @@ from lidargrit.errors import ConfigError, DataError
 from lidargrit.evaluation.estimates import Estimate
 from lidargrit.loading import RangeImages
 from lidargrit.metrics import load_metric
+from lidargrit.nn.semantic_classes import NUM_CLASSES, class_indices
 from lidargrit.projection import points_of_pixels
 from lidargrit.reporting import Reporter
 from lidargrit.structures import RangeImage
@@ -49,6 +50,9 @@ class CompletionScore:
         seconds_per_scan: time in seconds that one completion took on this machine.
         beside_triangulation_m: difference of ``mae_m`` from that of triangulation on the same scans; negative if
             better.
+        class_accuracy: share of right classes, over the pixels of ``mae_m`` whose true class is one of the 19 of
+            SemanticKITTI's benchmark; None where the true or the completed scans have no labels.
+        class_iou: mean over the classes that these pixels hold, all scans together, of intersection over union.
     """
 
     model: str
@@ -61,6 +65,8 @@ class CompletionScore:
     diversity_m: Estimate | None
     seconds_per_scan: float
     beside_triangulation_m: Estimate | None = None
+    class_accuracy: Estimate | None = None
+    class_iou: float | None = None
 
 
 def compare_completion(
@@ -114,15 +120,21 @@ def as_table(scores: Sequence[CompletionScore]) -> str:
     for pattern in dict.fromkeys(score.observed for score in scores):
         lines.append(f"observed: {pattern}")
         head = f"{'error [m]':>24}{'beside triangles [m]':>24}{'found':>8}{'IoU':>8}{'drop runs':>11}"
-        lines.append(" " * width + head + f"{'diversity [m]':>15}{'s a scan':>10}")
+        labelled = any(score.class_accuracy is not None for score in scores)
+        of_classes = f"{'right classes':>15}{'mIoU':>7}" if labelled else ""
+        lines.append(" " * width + head + f"{'diversity [m]':>15}{'s a scan':>10}" + of_classes)
         for score in scores:
             if score.observed != pattern:
                 continue
             beside = "" if score.beside_triangulation_m is None else score.beside_triangulation_m.as_text("+.3f")
             diversity = "" if score.diversity_m is None else f"{score.diversity_m.value:.3f}"
+            of_classes = ""
+            if score.class_accuracy is not None and score.class_iou is not None:
+                of_classes = f"{score.class_accuracy.value:>15.3f}{score.class_iou:>7.3f}"
             lines.append(
                 f"{score.model:<{width}}{score.mae_m.as_text('.3f'):>24}{beside:>24}{score.found.value:>8.3f}"
                 f"{score.iou.value:>8.3f}{score.drop_run_lengths:>11.4f}{diversity:>15}{score.seconds_per_scan:>10.3f}"
+                + of_classes
             )
     return "\n".join(lines)
 
@@ -164,6 +176,8 @@ def _score(
         _mean([_error_m(one[i], other[i], hidden[i]) for one, other in combinations(filled, 2)])
         for i in range(len(whole))
     ]
+    classes = [_confusion(filled[0][i], whole[i], hidden[i]) for i in range(len(whole))]
+    confusions = [one for one in classes if one is not None]
     runs = load_metric("drop_run_lengths")()
     runs.update(filled[0], real=False)
     runs.update(whole, real=True)
@@ -177,6 +191,8 @@ def _score(
         runs.compute().value,
         Estimate.of(apart) if turns > 1 else None,
         seconds,
+        class_accuracy=Estimate.of([_accuracy(one) for one in confusions]) if confusions else None,
+        class_iou=_mean_iou(torch.stack(confusions).sum(0)) if confusions else None,
     )
     return _OfPattern(score, errors)
 
@@ -218,6 +234,29 @@ def _iou(filled: RangeImage, true: RangeImage, hidden: Bool[Tensor, "H W"]) -> f
     ours, theirs = (_voxels(points_of_pixels(image)[image.return_mask & hidden]) for image in (filled, true))
     union = len(ours | theirs)
     return len(ours & theirs) / union if union else math.nan
+
+
+def _confusion(filled: RangeImage, true: RangeImage, hidden: Bool[Tensor, "H W"]) -> Int[Tensor, "20 20"] | None:
+    """Return how many hidden pixels that return in both have a true class (row) and a filled one; None without labels.
+
+    The first row and column stand for labels of no class.
+    """
+    if filled.label is None or true.label is None:
+        return None
+    both = hidden & filled.return_mask & true.return_mask
+    pairs = class_indices(true.label[both]) * (NUM_CLASSES + 1) + class_indices(filled.label[both])
+    return pairs.bincount(minlength=(NUM_CLASSES + 1) ** 2).view(NUM_CLASSES + 1, NUM_CLASSES + 1)
+
+
+def _accuracy(confusion: Int[Tensor, "20 20"]) -> float:
+    known = int(confusion[1:].sum())
+    return int(confusion.diagonal()[1:].sum()) / known if known else math.nan
+
+
+def _mean_iou(confusion: Int[Tensor, "20 20"]) -> float:
+    right, true, ours = confusion.diagonal()[1:], confusion[1:].sum(1), confusion[1:, 1:].sum(0)
+    there = true > 0
+    return float((right / (true + ours - right))[there].double().mean())
 
 
 def _voxels(points_xyz_m: Float[Tensor, "n 3"]) -> set[tuple[int, int, int]]:

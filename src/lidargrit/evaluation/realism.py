@@ -169,10 +169,10 @@ def pair_of(seen: Observation, sensor: SensorModel) -> tuple[RangeImage, RangeIm
     """
     range_m = torch.from_numpy(np.where(seen.return_mask, seen.range_m, seen.clean_range_m))
     within = (range_m >= sensor.range_min_m) & (range_m <= sensor.range_max_m) & torch.from_numpy(~seen.blocked)
-    reflectance = torch.from_numpy(seen.reflectance)
+    reflectance, label = torch.from_numpy(seen.reflectance), torch.from_numpy(seen.label.astype(np.int64))
 
     def image(mask: torch.Tensor) -> RangeImage:
-        return RangeImage(torch.where(mask, range_m, 0), mask, sensor, torch.where(mask, reflectance, 0))
+        return RangeImage.masked(range_m, mask, sensor, reflectance, label)
 
     return image(within), image(within & torch.from_numpy(seen.return_mask))
 

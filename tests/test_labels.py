@@ -1,0 +1,235 @@
+"""Labels as one more channel: projected, prepared, hidden, completed, dropped, exported and scored."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from lidargrit.cli import main
+from lidargrit.conditions import Condition
+from lidargrit.conditions.hints import hints_of
+from lidargrit.datasets.kitti_odometry import KittiOdometry
+from lidargrit.errors import ConfigError
+from lidargrit.export import KittiTree
+from lidargrit.formats.numpy_array import NumpyArray
+from lidargrit.generators import load
+from lidargrit.generators.lidargrit import LidarGrit
+from lidargrit.loading import DataConfig, PreparedImages, damaged_shards, prepare
+from lidargrit.nn.completion_network import CompletionNetwork, CompletionNetworkConfig
+from lidargrit.nn.completion_objective import CompletionObjective
+from lidargrit.nn.raydrop_network import RaydropConfig, RaydropNetwork
+from lidargrit.nn.raydrop_objective import RaydropObjective
+from lidargrit.nn.semantic_classes import CLASSES, class_indices, labels_of
+from lidargrit.projection import project, unproject
+from lidargrit.sensors import load_sensor
+from lidargrit.simulator.labels import LABELS, OTHER_OBJECT, OTHER_STRUCTURE
+from lidargrit.structures import RangeImage
+
+SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
+SIZES = {"widths": (8, 8, 8), "blocks": 1, "features": 4, "mask_width": 4, "row_channels": 1}
+NETWORK = CompletionNetworkConfig(**SIZES, attention_layers=0, heads=1, labels=True)
+ROAD, BUILDING, MOVING_CAR = 40, 50, 252
+
+
+def streets(count: int) -> RangeImage:
+    """Return a road below and a wall above it, with drops."""
+    rng = torch.Generator().manual_seed(1)
+    angle = SENSOR.azimuth_rad + 6 * torch.rand(count, 1, 1, generator=rng)
+    range_m = (10 + 5 * angle.cos()).expand(count, 64, 32)
+    label = torch.where(torch.arange(64)[:, None] < 30, BUILDING, ROAD).expand(count, 64, 32)
+    returned = torch.rand(count, 64, 32, generator=rng) < 0.8
+    return RangeImage.masked(range_m, returned, SENSOR, label=label)
+
+
+def every_fourth_row(images: RangeImage) -> Condition:
+    observed = torch.zeros_like(images.return_mask)
+    observed[:, 2::4] = True
+    return Condition.of_pixels(images, observed)
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    """Write a KITTI tree of two labelled scans, and a run whose networks see classes."""
+    root = tmp_path_factory.mktemp("labels")
+    for number in (0, 1):
+        scan = unproject(streets(2)[number])
+        assert scan.label is not None
+        instance = torch.arange(len(scan)) % 7 << 16
+        KittiTree(root / "tree").write(
+            f"sequences/00/velodyne/{number:06d}.bin", replace(scan, label=scan.label | instance)
+        )
+    torch.manual_seed(0)
+    config = replace(LidarGrit.smallest_config(SENSOR), completion=NETWORK, raydrop=RaydropConfig(**SIZES, labels=True))
+    LidarGrit(config, SENSOR).eval().save(root / "run")
+    return root
+
+
+def test_the_simulator_has_no_label_that_is_forgotten():
+    unlearned = {number for number in LABELS if not int(class_indices(torch.tensor(number)))}
+    assert unlearned == {OTHER_STRUCTURE, OTHER_OBJECT}
+    numbers = [number for several in CLASSES.values() for number in several]
+    assert len(numbers) == len(set(numbers))
+    assert labels_of(class_indices(torch.tensor([0, 1, ROAD, MOVING_CAR, 9999]))).tolist() == [0, 0, ROAD, 10, 0]
+
+
+def test_a_pixel_has_the_class_of_its_point_through_projection_and_preparation(folders, tmp_path):
+    source = f"kitti_odometry:{folders / 'tree'}"
+    scan = KittiOdometry(folders / "tree").scan(0)
+    assert scan.label is not None
+    assert int(scan.label.max()) > 0xFFFF
+    image = project(scan, SENSOR, "spherical")
+    assert image.label is not None
+    back = unproject(image)
+    assert back.label is not None
+    assert set(back.label.tolist()) == {ROAD, BUILDING}
+    assert bool(((back.label == BUILDING) == (back.ring < 30)).all())
+    config = DataConfig(train=(source,), projection="spherical", workers=1)
+    folder = prepare(source, config, tmp_path / "prepared", sensor=replace(SENSOR, projection="spherical"))
+    store = PreparedImages(str(folder))
+    pixels = store.read(0, verify=True)
+    assert np.array_equal(pixels.label, image.label.numpy())
+    shard = folder / "000000.shard"
+    content = bytearray(shard.read_bytes())
+    content[store._entries[0][1].end - 1] ^= 255  # the last byte of the first image, of its classes
+    shard.write_bytes(content)
+    assert damaged_shards(folder) == [0]
+
+
+def test_a_flip_and_a_batch_keep_the_class_of_a_pixel():
+    images = streets(2)
+    joined = RangeImage.stack([images[1], images[0]]).mapped(lambda pixels: pixels.flip(-1))
+    assert joined.label is not None
+    assert images.label is not None
+    assert torch.equal(joined.label[0].flip(-1), images.label[1])
+    assert RangeImage.stack([images[0], replace(images[1], label=None)]).label is None
+
+
+def test_hints_tell_the_class_of_the_next_return_on_every_side():
+    range_m = torch.zeros(1, 64, 32)
+    range_m[0, 10, 4], range_m[0, 10, 30], range_m[0, 20, 6] = 5.0, 8.0, 11.0
+    label = torch.zeros(1, 64, 32, dtype=torch.int64)
+    label[0, 10, 4], label[0, 10, 30], label[0, 20, 6] = 40, 50, 70
+    image = RangeImage(range_m, range_m > 0, SENSOR, label=label)
+    found = hints_of(Condition.of_pixels(image, torch.ones_like(image.return_mask)))
+    assert found.labels is not None
+    assert found.labels[0, :, 10, 6].tolist() == [40, 40, 70, 40, 50]  # nothing above: as the nearest, the left one
+    mirrored = found.mirrored().labels
+    assert mirrored is not None
+    assert mirrored[0, :, 10, 25].tolist() == [40, 40, 70, 50, 40]
+
+
+def test_it_learns_classes_and_begins_with_those_of_neighbours():
+    torch.manual_seed(0)
+    objective, images = CompletionObjective(CompletionNetwork(NETWORK, SENSOR), SENSOR).train(), streets(4)
+    optimiser = torch.optim.Adam(objective.parameters(), lr=3e-3)
+    accuracies = []
+    for _ in range(12):
+        terms = objective(images, torch.Generator().manual_seed(0))
+        optimiser.zero_grad()
+        terms["loss"].backward()
+        optimiser.step()
+        accuracies.append(float(terms["class_accuracy"]))
+    assert 0.4 < accuracies[0] < 0.95
+    assert accuracies[-1] > accuracies[0]
+    with pytest.raises(ConfigError, match="training scans without labels"):
+        objective(replace(images, label=None), torch.Generator())
+
+
+def test_without_labels_in_the_model_nothing_grows_and_with_them_it_begins_the_same():
+    torch.manual_seed(0)
+    plain = CompletionNetwork(replace(NETWORK, labels=False), SENSOR).eval()
+    grown = CompletionNetwork(NETWORK, SENSOR).eval()
+    assert plain.state_dict().keys() < grown.state_dict().keys()
+    grown.load_state_dict({**grown.state_dict(), **plain.state_dict()})
+    known = every_fourth_row(streets(1))
+    with torch.no_grad():
+        one, other = (net.sample(known, [torch.Generator().manual_seed(3)]) for net in (plain, grown))
+    assert torch.equal(one.range_m, other.range_m)
+    assert one.label is None
+    assert other.label is not None
+
+
+def test_a_labelled_tree_is_completed_as_a_labelled_tree(folders, tmp_path, capsys):
+    words = ["complete", f"{folders}/tree", str(tmp_path / "out"), "--model", f"{folders}/run", "--observed", "rows:4"]
+    assert main([*words, "--format", "kitti_odometry", "--device", "cpu"]) == 0
+    before, after = (KittiOdometry(root).scan(0) for root in (folders / "tree", tmp_path / "out"))
+    assert before.label is not None
+    assert after.label is not None
+    assert len(after) > len(before) // 2
+    known = {tuple(point): int(label) for point, label in zip(before.points_xyz_m.tolist(), before.label, strict=True)}
+    same = [
+        known[tuple(point)] == int(label)
+        for point, label in zip(after.points_xyz_m.tolist(), after.label, strict=True)
+        if tuple(point) in known
+    ]
+    assert len(same) > 300
+    assert all(same)  # with their instances
+    assert set((after.label & 0xFFFF).tolist()) <= {0, *(numbers[0] for numbers in CLASSES.values())}
+    capsys.readouterr()
+    assert main([*words[:2], str(tmp_path / "bin"), *words[3:], "--device", "cpu"]) == 0
+    assert ".bin keeps no labels; --format kitti_odometry or npz keeps them" in capsys.readouterr().err
+
+
+def test_a_scan_without_labels_gets_none(folders):
+    model, images = load(folders / "run"), streets(1)
+    known = every_fourth_row(images)
+    with_labels = model.complete(known, [3]).label
+    assert with_labels is not None
+    observed = known.return_observed
+    assert images.label is not None
+    assert torch.equal(with_labels[observed], images.label[observed])
+    assert model.complete(every_fourth_row(replace(images, label=None)), [3]).label is None
+
+
+def test_raydrop_sees_classes_and_keeps_those_of_what_returns(folders, tmp_path):
+    model, images = load(folders / "run"), streets(1)
+    dropped = model.complete(Condition.of_surfaces(images), [0])
+    assert dropped.label is not None
+    assert images.label is not None
+    assert torch.equal(dropped.label[dropped.return_mask], images.label[dropped.return_mask])
+    NumpyArray.write(tmp_path / "clean/1.npz", unproject(images[0]))
+    words = ["raydrop", f"{tmp_path}/clean", f"{tmp_path}/out", "--model", f"{folders}/run", "--device", "cpu"]
+    assert main(words) == 0
+    written = NumpyArray.read(tmp_path / "out/1.npz")
+    assert written.label is not None
+    assert set(written.label.tolist()) == {ROAD, BUILDING}
+
+
+def test_raydrop_learns_what_a_class_does():
+    torch.manual_seed(0)
+    images = streets(3)
+    assert images.label is not None
+    marked = replace(images, reflectance=((images.label == ROAD) & images.return_mask).float())  # walls never return
+    found = {}
+    for labels in (False, True):
+        network = RaydropNetwork(RaydropConfig(**{**SIZES, "row_channels": 1}, labels=labels), SENSOR)
+        objective = RaydropObjective(network, SENSOR).train()
+        optimiser = torch.optim.Adam(objective.parameters(), lr=3e-3)
+        for step in range(8):
+            shuffled = marked.mapped(lambda pixels, by=step: pixels.roll(8 * by, -2))  # rows tell nothing
+            loss = objective(shuffled, torch.Generator().manual_seed(step))["loss"]
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+        found[labels] = network
+    with torch.no_grad():
+        surface, label = images.return_mask, images.label
+        blind = found[True](images.range_m, surface).logits
+        seeing = found[True](images.range_m, surface, label).logits
+    gap = [
+        float(x[surface & (label == ROAD)].mean() - x[surface & (label == BUILDING)].mean()) for x in (blind, seeing)
+    ]
+    assert gap[1] > gap[0] + 0.05
+    with pytest.raises(ConfigError, match="labels=true with surfaces=estimated"):
+        RaydropConfig(labels=True, surfaces="estimated")
+
+
+def test_right_classes_are_counted_where_both_scans_return(folders, tmp_path, capsys):
+    words = ["compare-completion", f"kitti_odometry:{folders / 'tree'}", "nearest", f"{folders}/run"]
+    assert main([*words, "--observed", "rows:4", "-n", "2", "--device", "cpu"]) == 0
+    table = capsys.readouterr().out
+    assert "right classes" in table
+    nearest = next(line for line in table.splitlines() if line.startswith("nearest")).split()
+    assert 0.9 < float(nearest[-2]) < 1  # wrong only where road and wall meet
+    assert 0.8 < float(nearest[-1]) < 1
