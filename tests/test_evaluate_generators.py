@@ -7,7 +7,7 @@ from lidargrit.errors import CheckpointError
 from lidargrit.generators import NoSampling, load
 from lidargrit.generators.marginal import Marginal, MarginalConfig
 from lidargrit.generators.memorised import Memorised, MemorisedConfig
-from lidargrit.loading import Provenance, RangeImages
+from lidargrit.loading import Pixels, Provenance, RangeImages
 from lidargrit.sensors import load_sensor
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
@@ -27,7 +27,7 @@ class Store:
         return len(self.range_m)
 
     def read(self, index):
-        return self.range_m[index].numpy(), None
+        return Pixels(self.range_m[index].numpy())
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from lidargrit import _discovery
 from lidargrit.conditions import Condition
 from lidargrit.errors import ConfigError
 from lidargrit.generators import CAPABILITIES, Generator, load, load_class
-from lidargrit.loading import Provenance, RangeImages
+from lidargrit.loading import Pixels, Provenance, RangeImages
 from lidargrit.sensors import load_sensor
 from lidargrit.structures import RangeImage
 
@@ -40,7 +40,7 @@ class Store:
         return 12
 
     def read(self, index):
-        return self.range_m[index].numpy(), self.reflectance[index].numpy()
+        return Pixels(self.range_m[index].numpy(), self.reflectance[index].numpy())
 
 
 IMAGES = RangeImages(SENSOR, [Store()])

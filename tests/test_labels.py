@@ -113,10 +113,10 @@ def test_hints_tell_the_class_of_the_next_return_on_every_side():
     image = RangeImage(range_m, range_m > 0, SENSOR, label=label)
     found = hints_of(Condition.of_pixels(image, torch.ones_like(image.return_mask)))
     assert found.labels is not None
-    assert found.labels[0, :, 10, 6].tolist() == [40, 40, 70, 40, 50]  # nothing above: as the nearest, the left one
+    assert found.labels[0, :, 10, 6].tolist() == [70, 70, 70, 40, 50]  # nothing above: as the nearest, that below
     mirrored = found.mirrored().labels
     assert mirrored is not None
-    assert mirrored[0, :, 10, 25].tolist() == [40, 40, 70, 50, 40]
+    assert mirrored[0, :, 10, 25].tolist() == [70, 70, 70, 50, 40]
 
 
 def test_it_learns_classes_and_begins_with_those_of_neighbours():

@@ -11,7 +11,7 @@ from lidargrit.conditions import Condition
 from lidargrit.errors import ConfigError, DataError
 from lidargrit.generators.lidargan import LidarGan, LidarGanConfig
 from lidargrit.generators.lidarvae import LidarVae, LidarVaeConfig, VaeSampling
-from lidargrit.loading import Provenance, RangeImages
+from lidargrit.loading import Pixels, Provenance, RangeImages
 from lidargrit.nn.filled_rows import FilledRows, distance_and_height, fill_holes, in_box
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.lidargan import Decoder, Encoder, discriminator_loss, generator_loss, kl_nats, vae_loss
@@ -209,7 +209,7 @@ def images_of(batch):
             return len(batch)
 
         def read(self, index):
-            return batch.range_m[index].numpy(), None
+            return Pixels(batch.range_m[index].numpy())
 
     return RangeImages(batch.sensor, [Store()])
 

@@ -12,7 +12,7 @@ from lidargrit.evaluation.intervals import Resampling, Score
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
 from lidargrit.evaluation.protocols import MetricChoice
 from lidargrit.evaluation.scoring import MetricFactory, score_metrics
-from lidargrit.loading import Provenance, RangeImages
+from lidargrit.loading import Pixels, Provenance, RangeImages
 from lidargrit.metrics import load_metric
 from lidargrit.metrics._networks.network import PretrainedNetwork
 from lidargrit.sensors import SensorModel, column_azimuths_rad
@@ -43,7 +43,7 @@ class Seeded:
     def read(self, index):
         rng = np.random.default_rng(self._first_seed + index)
         range_m = rng.uniform(2, 78, (SENSOR.height, SENSOR.width)).astype(np.float32)
-        return range_m * (rng.random(range_m.shape) < 0.8), None
+        return Pixels(range_m * (rng.random(range_m.shape) < 0.8))
 
 
 def pair_of(count):

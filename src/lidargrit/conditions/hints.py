@@ -69,8 +69,8 @@ class _NextReturn(NamedTuple):
     """The next observed return on one side of every pixel.
 
     Args:
-        pixel: its index among all pixels, row by row; -1 without one.
-        away: its distance, in units of 16 pixels.
+        pixel: index of the return among all pixels, row by row; -1 without one.
+        away: distance to the return, in units of 16 pixels.
     """
 
     pixel: Int64[np.ndarray, "H W"]

@@ -36,7 +36,8 @@ CLASSES: Final[dict[str, tuple[int, ...]]] = {  # numbers of the labels of each;
     "traffic sign": (81,),
 }
 NUM_CLASSES: Final = len(CLASSES)
-_INDEX = torch.zeros(260, dtype=torch.int64)  # 0 for labels of no class, such as those that are not known
+# 0 for labels of no class, such as those that are not known; the last stands for all numbers from there on.
+_INDEX = torch.zeros(max(number for numbers in CLASSES.values() for number in numbers) + 2, dtype=torch.int64)
 for _index, _numbers in enumerate(CLASSES.values()):
     _INDEX[list(_numbers)] = _index + 1
 _NUMBER = torch.tensor([0, *(numbers[0] for numbers in CLASSES.values())])
@@ -53,7 +54,7 @@ def labels_of(indices: Int[Tensor, "*B"]) -> Int[Tensor, "*B"]:
 
 
 class ClassMaps(nn.Module):
-    """Labels of pixels → a few learned channels for each, all of them 0 at first where the class is not known.
+    """Labels of pixels → a few learned channels for each, all of them 0 where the class is not known.
 
     Args:
         channels: number of channels of a label.
