@@ -15,6 +15,7 @@ from lidargrit.conditions import Condition
 from lidargrit.conditions.fills import Observed, linear, triangles
 
 NUM_MAPS, NUM_CANDIDATES, NUM_LABELS = 19, 9, 5
+LABELLED = slice(2, 7)  # candidates that are the range of one return, whose label is known, too
 _LEFT_RIGHT = {7: 8, 8: 7, 11: 12, 12: 11}  # maps that change places in the mirror, and so do candidates:
 _LEFT_RIGHT_CANDIDATES = {5: 6, 6: 5}
 _LEFT_RIGHT_LABELS = [0, 1, 2, 4, 3]

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from lidargrit.conditions import Condition
-from lidargrit.conditions.hints import NUM_CANDIDATES, NUM_LABELS, NUM_MAPS, Hints, hints_of
+from lidargrit.conditions.hints import LABELLED, NUM_CANDIDATES, NUM_LABELS, NUM_MAPS, Hints, hints_of
 from lidargrit.errors import ConfigError
 from lidargrit.nn.pixel_networks import Guide, MaskNetwork
 from lidargrit.nn.semantic_classes import NUM_CLASSES, ClassMaps, class_indices, labels_of, votes
@@ -24,6 +24,7 @@ _TRUST = 3.0  # logit by which triangulation is preferred to the other candidate
 _LOGIT_BOUND = 8.0
 _CLASS_CHANNELS = 4  # learned, of each label that the network sees
 _VOTE = 5.0  # logit of a class for which all observed labels around a pixel speak
+_ONE_SURFACE = 0.1  # of ln(1 + range): a return so much farther or nearer than a pixel has a logit lower by 1
 
 
 @dataclass(frozen=True)
@@ -137,8 +138,9 @@ class CompletionNetwork(nn.Module):
         class_logits = None
         if indices is not None:
             alone, trust = of_classes
-            # As for the range, the nearest return is preferred at first.
-            shares = (4 * trust + self.preferred[:NUM_LABELS]).softmax(1)
+            # At first the nearest return is preferred, and returns on the surface on which the range lies.
+            apart = (hints.candidates[:, LABELLED] - v.detach()[:, None]).abs()
+            shares = (4 * trust + self.preferred[:NUM_LABELS] - apart / _ONE_SURFACE).softmax(1)
             class_logits = 2 * alone + _VOTE * votes(indices, shares)
         return Point(Guide(features, v.detach(), return_logits.detach(), observed), v, return_logits, class_logits)
 

@@ -60,7 +60,7 @@ class SmallUnet(Network):
         outputs: channels of the output.
         more_inputs: channels of further inputs, without influence at first, so that a network without them can be
             trained further with them.
-        more_outputs: channels of further outputs, which come last.
+        more_outputs: channels of further outputs, which come last and are 0 at first.
     """
 
     def __init__(
@@ -86,6 +86,10 @@ class SmallUnet(Network):
         self.more_out = nn.Conv2d(first, 4 * more_outputs, 1) if more_outputs else None
         if self.more_in is not None:
             nn.init.zeros_(self.more_in.weight)
+        if self.more_out is not None:
+            nn.init.zeros_(self.more_out.weight)
+            assert self.more_out.bias is not None
+            nn.init.zeros_(self.more_out.bias)
 
     def forward(
         self, maps: Float[Tensor, "B C H W"], more: Float[Tensor, "B E H W"] | None = None
