@@ -27,8 +27,10 @@ from lidargrit.simulator.labels import LABELS, OTHER_OBJECT, OTHER_STRUCTURE
 from lidargrit.structures import RangeImage
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
-SIZES = {"widths": (8, 8, 8), "blocks": 1, "features": 4, "mask_width": 4, "row_channels": 1}
-NETWORK = CompletionNetworkConfig(**SIZES, attention_layers=0, heads=1, labels=True)
+NETWORK = CompletionNetworkConfig(
+    widths=(8, 8, 8), blocks=1, attention_layers=0, heads=1, features=4, mask_width=4, row_channels=1, labels=True
+)
+RAYDROP = RaydropConfig(widths=(8, 8, 8), blocks=1, features=4, mask_width=4, row_channels=1, labels=True)
 ROAD, BUILDING, MOVING_CAR = 40, 50, 252
 
 
@@ -60,7 +62,7 @@ def folders(tmp_path_factory):
             f"sequences/00/velodyne/{number:06d}.bin", replace(scan, label=scan.label | instance)
         )
     torch.manual_seed(0)
-    config = replace(LidarGrit.smallest_config(SENSOR), completion=NETWORK, raydrop=RaydropConfig(**SIZES, labels=True))
+    config = replace(LidarGrit.smallest_config(SENSOR), completion=NETWORK, raydrop=RAYDROP)
     LidarGrit(config, SENSOR).eval().save(root / "run")
     return root
 
@@ -82,12 +84,14 @@ def test_a_pixel_has_the_class_of_its_point_through_projection_and_preparation(f
     assert image.label is not None
     back = unproject(image)
     assert back.label is not None
+    assert back.ring is not None
     assert set(back.label.tolist()) == {ROAD, BUILDING}
     assert bool(((back.label == BUILDING) == (back.ring < 30)).all())
     config = DataConfig(train=(source,), projection="spherical", workers=1)
     folder = prepare(source, config, tmp_path / "prepared", sensor=replace(SENSOR, projection="spherical"))
     store = PreparedImages(str(folder))
     pixels = store.read(0, verify=True)
+    assert pixels.label is not None
     assert np.array_equal(pixels.label, image.label.numpy())
     shard = folder / "000000.shard"
     content = bytearray(shard.read_bytes())
@@ -203,7 +207,7 @@ def test_raydrop_learns_what_a_class_does():
     marked = replace(images, reflectance=((images.label == ROAD) & images.return_mask).float())  # walls never return
     found = {}
     for labels in (False, True):
-        network = RaydropNetwork(RaydropConfig(**{**SIZES, "row_channels": 1}, labels=labels), SENSOR)
+        network = RaydropNetwork(replace(RAYDROP, labels=labels), SENSOR)
         objective = RaydropObjective(network, SENSOR).train()
         optimiser = torch.optim.Adam(objective.parameters(), lr=3e-3)
         for step in range(8):
