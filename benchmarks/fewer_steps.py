@@ -83,9 +83,9 @@ def plot(rows: list[dict], path: Path, title: str, batch: int) -> None:
         axes.set(
             title=metric, xlabel=f"seconds a scan, {batch} at once, one thread", ylabel="distance, lower is better"
         )
-        axes.legend(fontsize=8, loc="lower right")
     figure.suptitle(title)
-    figure.tight_layout()
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), fontsize=9, loc="lower center", ncols=len(names) + 2)
+    figure.tight_layout(rect=(0, 0.06, 1, 1))
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
 
