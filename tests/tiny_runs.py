@@ -25,7 +25,7 @@ LONG = [  # 12 and 6 steps, a checkpoint after each
 ]
 PROGRESS = re.compile(
     r"(projecting scans|training \w+|sampling): \d+/\d+|  after \d+ scans|\s*WARNING: |left out: |lidargrit demo: "
-    r"about "
+    r"about |the model in the package is of another sensor|The tokenizer, .* learn anew here"
 )
 
 

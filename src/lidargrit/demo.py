@@ -67,9 +67,8 @@ def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter
     check_folder(folder, recipe)
     expected_s = _expected_s(recipe, simulates=data is None)
     minutes = max(1, round(sum(expected_s.values()) / 60))
-    reporter.message(
-        f"lidargrit demo: about {minutes} minutes on two cores; stop it at any time, the same command goes on"
-    )
+    about = f"about {minutes} minute{'s' if minutes > 1 else ''} on two cores"
+    reporter.message(f"lidargrit demo: {about}; stop it at any time, the same command goes on")
     reporter.message(how_trained(recipe))
     reporter.expect(expected_s)
     clock = _Clock(folder / TIMINGS)
