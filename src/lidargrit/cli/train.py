@@ -36,7 +36,6 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.recipes import load_recipe
     from lidargrit.reporting import TerminalReporter
     from lidargrit.training import check_data, measure, plan_training, tracked, train
-    from lidargrit.viewer import plot_progress
 
     recipe = load_recipe(options.recipe, options.set)
     if options.dry_run or options.measure:
@@ -50,6 +49,8 @@ def run(options: argparse.Namespace) -> None:
         raise ConfigError(
             "--json for a training", "--dry-run or --measure beside it", "read RUN/STAGE/log.jsonl instead"
         )
+    from lidargrit.viewer import plot_progress  # matplotlib, which a plan does not need
+
     with tracked(options.wandb, recipe, options.out):
         train(recipe, options.out, TerminalReporter(), plot_progress)
     print(f"done: the model lies in {options.out}; sample it with: lidargrit sample {options.out} samples -n 16")
