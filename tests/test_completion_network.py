@@ -15,6 +15,7 @@ from lidargrit.nn.completion_network import CompletionNetwork, CompletionNetwork
 from lidargrit.nn.completion_objective import CompletionObjective, random_patterns
 from lidargrit.sensors import load_sensor
 from lidargrit.structures import RangeImage
+from tiny_runs import learn
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
 TINY = CompletionNetworkConfig(
@@ -100,14 +101,7 @@ def test_it_learns():
     objective, images = CompletionObjective(made(), SENSOR).train(), scans(4)
     every = torch.ones_like(images.return_mask)
     images = RangeImage(torch.where(images.return_mask, images.range_m, 9.0), every, SENSOR)  # nothing drops
-    optimiser = torch.optim.Adam(objective.parameters(), lr=3e-3)
-    losses = []
-    for _ in range(12):
-        terms = objective(images, torch.Generator().manual_seed(0))
-        optimiser.zero_grad()
-        terms["loss"].backward()
-        optimiser.step()
-        losses.append(float(terms["loss"].detach()))
+    losses = [terms["loss"] for terms in learn(objective, images, [0] * 12, 3e-3)]
     assert losses[-1] < 0.8 * losses[0]
     assert all(weight.grad is not None for weight in objective.completion.unet.parameters())
 

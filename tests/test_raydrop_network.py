@@ -17,6 +17,7 @@ from lidargrit.nn.raydrop_objective import RaydropObjective
 from lidargrit.projection import project
 from lidargrit.sensors import load_sensor
 from lidargrit.structures import RangeImage
+from tiny_runs import learn
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
 TINY = RaydropConfig(widths=(8, 8, 8), blocks=1, features=4, mask_width=4, row_channels=1)
@@ -68,14 +69,7 @@ def test_a_scan_depends_on_its_seed_alone_and_only_surfaces_return():
 
 def test_it_learns_which_surfaces_return():
     objective, images = RaydropObjective(made(), SENSOR).train(), pairs(2)
-    optimiser = torch.optim.Adam(objective.parameters(), lr=1e-2)
-    bits = []
-    for step in range(16):
-        terms = objective(images, torch.Generator().manual_seed(step))
-        optimiser.zero_grad()
-        terms["loss"].backward()
-        optimiser.step()
-        bits.append(float(terms["mask_bits"]))
+    bits = [terms["mask_bits"] for terms in learn(objective, images, range(16), 1e-2)]
     assert sum(bits[-3:]) < 0.6 * sum(bits[:3])
 
 

@@ -1,7 +1,13 @@
 """Runs that train within a second, and what is read from a command's answer."""
 
 import re
+from collections.abc import Iterable
 from pathlib import Path
+
+import torch
+
+from lidargrit.nn.objective import Objective
+from lidargrit.structures import RangeImage
 
 MODEL = [  # 64x64 range images, 8x8 tokens
     "data.columns=512",
@@ -43,3 +49,16 @@ def the_one_line(stderr: str, verb: str) -> str:
     assert len(lines) == 1, stderr
     assert re.fullmatch(rf"lidargrit {verb}: got \S.*; wanted \S.*; \S.*", lines[0]), stderr
     return lines[0]
+
+
+def learn(objective: Objective, images: RangeImage, seeds: Iterable[int], learning_rate: float) -> list[dict]:
+    """Take a step of Adam on the same scans for each seed, and return the terms of every step."""
+    optimiser = torch.optim.Adam(objective.parameters(), lr=learning_rate)
+    found = []
+    for seed in seeds:
+        terms = objective(images, torch.Generator().manual_seed(seed))
+        optimiser.zero_grad()
+        terms["loss"].backward()
+        optimiser.step()
+        found.append({name: float(term.detach()) for name, term in terms.items()})
+    return found
