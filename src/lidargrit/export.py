@@ -189,12 +189,16 @@ class KittiTree:
         return (self._out / file).exists()
 
     def write(self, file: str, scan: Scan) -> None:
-        """Write a scan into its file, and its labels, if it has any, into another."""
-        path = self._out / file
-        if scan.label is not None:  # before the points, whose file says that the scan is complete
-            with atomic_path(path.parents[1] / "labels" / f"{path.stem}.label") as temporary:
-                temporary.write_bytes(scan.label.numpy().astype("<u4").tobytes())
-        KittiBin.write(path, scan)
+        """Write a scan; see :func:`write_with_labels`."""
+        write_with_labels(self._out / file, scan)
+
+
+def write_with_labels(path: Path, scan: Scan) -> None:
+    """Write a scan into a file of KITTI odometry's tree, and its labels, if it has any, into that beside it."""
+    if scan.label is not None:  # before the points, whose file says that the scan is complete
+        with atomic_path(path.parents[1] / "labels" / f"{path.stem}.label") as temporary:
+            temporary.write_bytes(scan.label.numpy().astype("<u4").tobytes())
+    KittiBin.write(path, scan)
 
 
 def writable_format(kind: str) -> tuple[type[ScanFormat], str]:

@@ -19,7 +19,7 @@ from lidargrit.completion.inputs import Inputs, InputScan
 from lidargrit.conditions import Condition
 from lidargrit.determinism import derive_seed
 from lidargrit.errors import ConfigError, DataError, ScanError
-from lidargrit.export import TREE, KittiTree, claim_scans, writable_format
+from lidargrit.export import TREE, KittiTree, claim_scans, writable_format, write_with_labels
 from lidargrit.files import atomic_path, claim_folder
 from lidargrit.reporting import Reporter
 from lidargrit.sources.image_files import PROBABILITY
@@ -209,7 +209,7 @@ def _write(path: Path, kind: str, image: RangeImage, job: _Job) -> bool:
         return image.label is None
     scan = job.scan.joined(image, job.condition)
     if kind == TREE:
-        KittiTree(path.parent).write(path.name, scan)
+        write_with_labels(path, scan)
         return True
     named = [one for one in formats.candidates(path) if one.can_write()]
     form = writable_format(kind)[0] if kind else named[0]

@@ -35,11 +35,12 @@ class FewerColumns:
         """Return the pixels of one image."""
         range_m, reflectance, label = self._images.read(index)
         nearest_m = np.minimum.reduceat(np.where(range_m > 0, range_m, np.inf), self._first, axis=1)
-        is_nearest = range_m == np.repeat(nearest_m, self._counts, axis=1)
-        if reflectance is not None:
-            reflectance = np.maximum.reduceat(np.where(is_nearest, reflectance, 0), self._first, axis=1)
-        if label is not None:
-            label = np.maximum.reduceat(np.where(is_nearest, label, 0), self._first, axis=1)
+        if reflectance is not None or label is not None:
+            is_nearest = range_m == np.repeat(nearest_m, self._counts, axis=1)
+            reflectance, label = (
+                None if pixels is None else np.maximum.reduceat(np.where(is_nearest, pixels, 0), self._first, axis=1)
+                for pixels in (reflectance, label)
+            )
         return Pixels(np.where(np.isfinite(nearest_m), nearest_m, 0).astype(np.float32), reflectance, label)
 
 
