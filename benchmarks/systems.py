@@ -3,9 +3,9 @@
     OMP_NUM_THREADS=1 python benchmarks/systems.py [lidm r2flow ...] [--json systems.json]
 
 Parameters are those of the networks that sample. Operations are counted: of one scan in training, all stages together,
-forward and backward, and of one sampled scan, by the defaults of the system. At the small size both are also timed, in
-processor seconds: a training step by the least of three for each stage, and one scan, seed to range image, by networks
-that are not trained. The published sizes are not timed: some take minutes a scan on a processor.
+forward and backward, and of one sampled scan, by the defaults of the system. At the small size both are also timed: a
+training step as `train --measure` does, by the clock, and one scan, seed to range image, in processor seconds, by
+networks that are not trained. The published sizes are not timed: some take minutes a scan on a processor.
 """
 
 import argparse
@@ -15,12 +15,8 @@ from pathlib import Path
 import torch
 
 from lidargrit.files import write_json
-from lidargrit.nn.blocks import prepare_for_training
 from lidargrit.recipes import load_recipe
-from lidargrit.training import Recipe, training_flops
-from lidargrit.training.compute import uniform_images
-from lidargrit.training.engine import Engine
-from lidargrit.training.optimiser import make_optimiser
+from lidargrit.training import Recipe, measure, training_flops
 
 PAIRS = {  # system → its small recipe, and that of the published size
     "lidargrit": ("small", "lidargrit_kitti_360"),
@@ -45,21 +41,9 @@ def counted(recipe: Recipe) -> dict[str, float]:
 
 
 def seconds_a_step(recipe: Recipe) -> dict[str, float]:
-    """Return the processor time of a training step, by stage."""
-    torch.manual_seed(0)
-    generator, found = recipe.build_generator(), {}
-    for stage in generator.stages:
-        config, objective = recipe.training[stage], generator.objective(stage)
-        prepare_for_training(objective, config.recompute, config.compile)
-        engine = Engine(config.precision, bool(objective.players))
-        engine.set_up(objective, make_optimiser(objective, config))
-        images, times = uniform_images(recipe.data.load_sensor(), config.batch_size), []
-        for step in range(4):  # the first allocates and chooses kernels
-            begun = time.process_time()
-            float(engine.step(images, step, config.gradient_clip, config.accumulate)["loss"])
-            times.append(time.process_time() - begun)
-        found[f"{stage} ({config.batch_size})"] = min(times[1:])
-    return found
+    """Return the time of a training step, by stage and number of scans."""
+    sizes = {stage: config.batch_size for stage, config in recipe.training.items()}
+    return {f"{each.stage} ({sizes[each.stage]})": sizes[each.stage] / each.scans_per_s for each in measure(recipe)}
 
 
 def seconds_a_scan(recipe: Recipe) -> float:
