@@ -7,6 +7,7 @@ import torch
 
 from lidargrit.conditions import Condition, fills
 from lidargrit.conditions.fills import ranges_from_others
+from lidargrit.conditions.marks import read_marks
 from lidargrit.datasets import open_dataset
 from lidargrit.errors import ConfigError
 from lidargrit.evaluation.realism import simulate_pair
@@ -44,7 +45,12 @@ def test_surfaces_of_a_simulated_scan_mark_what_it_returned():
     measured = project(open_dataset("simulated:1:test").scan(0), sensor)
     clean, returned = simulate_pair(2_000_000, sensor)
     assert surfaces.reflectance is not None
-    assert torch.equal(surfaces.reflectance > 0.5, measured.return_mask)
+    assert measured.reflectance is not None
+    marked = read_marks(surfaces.reflectance)
+    assert torch.equal(marked.returned, measured.return_mask)
+    assert torch.allclose(marked.reflectance, measured.reflectance, atol=1e-6)
+    assert marked.is_clear
+    assert marked.has_reflectance
     assert torch.equal(measured.return_mask, returned.return_mask)
     assert torch.equal(surfaces.return_mask, clean.return_mask)
     lost = surfaces.return_mask & ~measured.return_mask

@@ -47,6 +47,7 @@ class InputScan:
         rays.
 
         Reflectance and label are kept where the whole completed scan has them; observed points keep their instances.
+        Where a model gives reflectance to points whose ranges alone were observed, it takes the place of their own.
         """
         kept = condition.range_observed[0] & completed.return_mask
         if self.points is None or self.point_of_pixel is None or not bool(kept.any()):
@@ -56,9 +57,10 @@ class InputScan:
         added = completed.return_mask & ~kept
         new = RangeImage.masked(completed.range_m, added, completed.sensor, completed.reflectance, completed.label)
         rows = torch.arange(completed.sensor.height)[:, None].expand_as(kept)
+        reflectance = None if own.reflectance is None else own.reflectance[at]
         whole = Scan(
             own.points_xyz_m[at],
-            None if own.reflectance is None else own.reflectance[at],
+            reflectance if completed.reflectance is None else completed.reflectance[kept],
             rows[kept],
             None if own.label is None else own.label[at],
             own.source,

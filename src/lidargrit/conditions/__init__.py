@@ -160,14 +160,16 @@ class Condition:
     def put_into(self, generated: RangeImage) -> RangeImage:
         """Return generated scans in which all observed values are put in, bit for bit.
 
-        Reflectance and label are kept where both have them.
+        Labels are kept where both have them; reflectance as well, and where no return was observed.
         """
         returned = torch.where(self.return_observed, self.return_mask, generated.return_mask)
         range_m = torch.where(self.range_observed, self.range_m, generated.range_m)
         reflectance, label = None, None
+        observed = self.return_observed & self.return_mask
         if generated.reflectance is not None and self.reflectance is not None:
-            observed = self.return_observed & self.return_mask
             reflectance = torch.where(observed, self.reflectance, generated.reflectance)
+        elif not bool(observed.any()):
+            reflectance = generated.reflectance
         if generated.label is not None and self.label is not None:
             label = torch.where(self.range_observed, self.label, generated.label)
         return RangeImage.masked(range_m, returned, self.sensor, reflectance, label)

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int64
 from scipy.ndimage import distance_transform_edt, maximum_filter1d
 from scipy.spatial import Delaunay, QhullError
 from torch import Tensor
@@ -59,6 +60,11 @@ class Observed:
         """Row and column of the nearest observed return of every pixel."""
         return self.nearest(self.returned)
 
+    @cached_property
+    def triangles(self) -> Triangles:
+        """Triangulation of the observed returns."""
+        return triangulate(self)
+
     @property
     def nearest_range_m(self) -> Float64[np.ndarray, "H W"]:
         """Range of the nearest observed return of every pixel."""
@@ -94,21 +100,29 @@ class Triangles:
         corners_m: ranges of the three corners in metres, the corner of the largest weight first; the filled range where
             there is no triangle.
         weights: barycentric weights of the corners; 1, 0 and 0 where there is no triangle.
+        corner_pixels: indices of the three corners among all pixels, row by row; the nearest return three times where
+            there is no triangle, and where it spans an edge.
     """
 
     range_m: Float64[np.ndarray, "H W"]
     corners_m: Float64[np.ndarray, "3 H W"]
     weights: Float64[np.ndarray, "3 H W"]
+    corner_pixels: Int64[np.ndarray, "3 H W"]
 
     @classmethod
-    def none(cls, range_m: Float64[np.ndarray, "H W"]) -> Triangles:
+    def none(cls, seen: Observed, range_m: Float64[np.ndarray, "H W"]) -> Triangles:
         """Return the values for pixels without a triangle, from ranges that were filled in another way."""
         weights = np.zeros((3, *range_m.shape))
         weights[0] = 1
-        return cls(range_m.copy(), np.stack([range_m] * 3), weights)
+        nearest_pixel = np.ravel_multi_index(seen.nearest_return, range_m.shape)
+        return cls(range_m.copy(), np.stack([range_m] * 3), weights, np.stack([nearest_pixel] * 3))
+
+    def weighed(self, pixels: Float32[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
+        """Return for every pixel the weighted mean of a quantity of the returns at the corners."""
+        return (self.weights * pixels.ravel()[self.corner_pixels]).sum(0).astype(np.float32)
 
 
-def triangles(seen: Observed) -> Triangles:
+def triangulate(seen: Observed) -> Triangles:
     """Triangulate the observed returns by the angles of their rays, in which 1 / range of a plane is nearly linear."""
     width = len(seen.azimuth_rad)
     near = maximum_filter1d(maximum_filter1d(~seen.observed, _ROWS_NEAR, 0), _COLUMNS_NEAR, 1, mode="wrap")
@@ -119,48 +133,75 @@ def triangles(seen: Observed) -> Triangles:
     rows, at = np.nonzero(helpful[:, columns % width])
     azimuth_rad = seen.azimuth_rad[columns % width] - 2 * np.pi * (columns // width)
     corners = np.stack((seen.elevation_rad[rows], azimuth_rad[at]), axis=1)
-    range_m = seen.range_m[rows, columns[at] % width]
+    pixels = rows * width + columns[at] % width
+    range_m = seen.range_m.ravel()[pixels]
     try:
         # The corners of a grid's cell lie on one circle, a tie that Qhull breaks slowly; moved a little, they do not.
         tiling = Delaunay(corners + np.random.default_rng(0).normal(scale=_JITTER_RAD, size=corners.shape))
     except (QhullError, ValueError):  # too few returns, or all on one line
-        return Triangles.none(linear(seen))
+        return Triangles.none(seen, linear(seen))
     missing = np.nonzero(~seen.observed)
     points = np.stack((seen.elevation_rad[missing[0]], seen.azimuth_rad[missing[1]]), axis=1)
     triangle = tiling.find_simplex(points)
     transform = tiling.transform[triangle]
     first_two = np.einsum("nij,nj->ni", transform[:, :2], points - transform[:, 2])
     weights = np.concatenate((first_two, 1 - first_two.sum(1, keepdims=True)), axis=1)
-    of_corners_m = range_m[tiling.simplices[triangle]]
+    of_corners = tiling.simplices[triangle]
+    of_corners_m = range_m[of_corners]
     inside = (triangle >= 0) & np.isfinite(weights).all(1)  # triangles without an area have no weights
     log_m = np.log1p(of_corners_m)
     with np.errstate(invalid="ignore", divide="ignore"):
         filled_m = 1 / (weights / of_corners_m).sum(1)
         one_surface = inside & (np.ptp(log_m, axis=1) <= EDGE) & (filled_m > 0)
-    found = Triangles.none(seen.nearest_range_m)
+    found = Triangles.none(seen, seen.nearest_range_m)
     found.range_m[_part(missing, one_surface)] = filled_m[one_surface]
     order = np.argsort(-weights[inside], axis=1)
     chosen = (slice(None), *_part(missing, inside))
     found.corners_m[chosen] = np.take_along_axis(of_corners_m[inside], order, axis=1).T
     found.weights[chosen] = np.take_along_axis(weights[inside], order, axis=1).T
+    order = np.argsort(-weights[one_surface], axis=1)
+    chosen = (slice(None), *_part(missing, one_surface))
+    found.corner_pixels[chosen] = pixels[np.take_along_axis(of_corners[one_surface], order, axis=1)].T
     return found
 
 
 def triangulation(seen: Observed) -> Float64[np.ndarray, "H W"]:
     """Interpolate 1 / range linearly in a Delaunay triangulation of the observed returns, within surfaces."""
-    return triangles(seen).range_m
+    return seen.triangles.range_m
 
 
-FILLS: dict[str, Callable[[Observed], Float64[np.ndarray, "H W"]]] = {
-    "nearest": nearest,
-    "linear": linear,
-    "triangulation": triangulation,
+def of_nearest(seen: Observed, pixels: Float32[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
+    """Return for every pixel a quantity of the nearest observed return."""
+    return pixels[seen.nearest_return]
+
+
+def of_triangle(seen: Observed, pixels: Float32[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
+    """Interpolate a quantity of the observed returns in their triangulation, within surfaces."""
+    return seen.triangles.weighed(pixels)
+
+
+class Fill(NamedTuple):
+    """A classical method.
+
+    Args:
+        range_m: observed pixels → range of every pixel, in metres.
+        reflectance: observed pixels and their reflectance → reflectance of every pixel.
+    """
+
+    range_m: Callable[[Observed], Float64[np.ndarray, "H W"]]
+    reflectance: Callable[[Observed, Float32[np.ndarray, "H W"]], Float32[np.ndarray, "H W"]]
+
+
+FILLS: dict[str, Fill] = {
+    "nearest": Fill(nearest, of_nearest),
+    "linear": Fill(linear, of_nearest),
+    "triangulation": Fill(triangulation, of_triangle),
 }
 """Classical methods by the name that a user types."""
 
 
 def fill(method: str, condition: Condition) -> RangeImage:
-    """Fill ranges in by a classical method, returns from the nearest observed pixel, and reflectance and label from
+    """Fill ranges and reflectance in by a classical method, returns from the nearest observed pixel, and labels from
     the nearest observed return.
 
     Args:
@@ -172,13 +213,16 @@ def fill(method: str, condition: Condition) -> RangeImage:
     for index in range(len(condition)):
         seen = Observed.of(condition, index)
         mask = seen.returned[seen.nearest(seen.observed)]
-        range_m = np.clip(FILLS[method](seen), sensor.range_min_m, sensor.range_max_m) if seen.returned.any() else None
+        some, by = bool(seen.returned.any()), FILLS[method]
+        range_m = np.clip(by.range_m(seen), sensor.range_min_m, sensor.range_max_m) if some else seen.range_m
         masks.append(torch.from_numpy(mask))
-        ranges.append(torch.from_numpy(seen.range_m if range_m is None else range_m).float())
-        for pixels, filled in ((condition.reflectance, reflectances), (condition.label, labels)):
-            if pixels is not None:
-                rows, columns = (torch.from_numpy(part) for part in seen.nearest_return)
-                filled.append(pixels[index].cpu()[rows, columns])
+        ranges.append(torch.from_numpy(range_m).float())
+        if condition.reflectance is not None:
+            pixels = condition.reflectance[index].cpu().numpy()
+            reflectances.append(torch.from_numpy(by.reflectance(seen, pixels) if some else pixels).clamp(0, 1))
+        if condition.label is not None:
+            rows, columns = (torch.from_numpy(part) for part in seen.nearest_return)
+            labels.append(condition.label[index].cpu()[rows, columns])
     reflectance, label = (torch.stack(found) if found else None for found in (reflectances, labels))
     filled = RangeImage.masked(torch.stack(ranges), torch.stack(masks), sensor, reflectance, label)
     return condition.to("cpu").put_into(filled)

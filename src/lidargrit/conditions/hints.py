@@ -7,18 +7,20 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Float64, Int, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int, Int64, Shaped
 from scipy.ndimage import uniform_filter1d
 from torch import Tensor
 
 from lidargrit.conditions import Condition
-from lidargrit.conditions.fills import Observed, linear, triangles
+from lidargrit.conditions.fills import Observed, linear
 
-NUM_MAPS, NUM_CANDIDATES, NUM_LABELS = 19, 9, 5
+NUM_MAPS, NUM_CANDIDATES, NUM_LABELS, NUM_REFLECTANCES = 19, 9, 5, 6
 LABELLED = slice(2, 7)  # candidates that are the range of one return, whose label is known, too
+REFLECTING = [0, 2, 3, 4, 5, 6]  # candidates of which the reflectance is known, too: by triangulation, and those
 _LEFT_RIGHT = {7: 8, 8: 7, 11: 12, 12: 11}  # maps that change places in the mirror, and so do candidates:
 _LEFT_RIGHT_CANDIDATES = {5: 6, 6: 5}
 _LEFT_RIGHT_LABELS = [0, 1, 2, 4, 3]
+_LEFT_RIGHT_REFLECTANCES = [0, 1, 2, 3, 5, 4]
 _SIDES = ((-1, 0), (1, 0), (0, -1), (0, 1))  # rows down and columns to the right of each side
 _TYPICAL_V = 2.5  # ln(1 + 11 m), the middle of what scans hold, so that maps are near 0
 _FAR_PIXELS, _FARTHEST = 16.0, 4.0  # a distance is told in units of 16 pixels, up to 64 of them
@@ -37,18 +39,22 @@ class Hints(NamedTuple):
             return above, below, to the left and to the right, and of the triangle's second and third corner.
         labels: classes of the nearest return, and of the next return above, below, to the left and to the right, by
             SemanticKITTI's numbers; None without observed classes.
+        reflectances: reflectance by triangulation, then of the returns of which labels tells the class; None without
+            observed reflectance.
     """
 
     maps: Float[Tensor, "B 19 H W"]
     candidates: Float[Tensor, "B 9 H W"]
     labels: Int[Tensor, "B 5 H W"] | None = None
+    reflectances: Float[Tensor, "B 6 H W"] | None = None
 
     def mirrored(self) -> Hints:
         """Return the hints of the scans' mirror images, left and right exchanged."""
         maps = [_LEFT_RIGHT.get(index, index) for index in range(NUM_MAPS)]
         candidates = [_LEFT_RIGHT_CANDIDATES.get(index, index) for index in range(NUM_CANDIDATES)]
         labels = None if self.labels is None else self.labels[:, _LEFT_RIGHT_LABELS].flip(-1)
-        return Hints(self.maps[:, maps].flip(-1), self.candidates[:, candidates].flip(-1), labels)
+        bright = None if self.reflectances is None else self.reflectances[:, _LEFT_RIGHT_REFLECTANCES].flip(-1)
+        return Hints(self.maps[:, maps].flip(-1), self.candidates[:, candidates].flip(-1), labels, bright)
 
 
 def hints_of(condition: Condition) -> Hints:
@@ -57,13 +63,19 @@ def hints_of(condition: Condition) -> Hints:
     next_returns = [[_next_return(seen, *side) for side in _SIDES] for seen in every]
     both = [_of_one(seen, nexts) for seen, nexts in zip(every, next_returns, strict=True)]
     maps, candidates = (torch.from_numpy(np.stack(part)).to(condition.range_m) for part in zip(*both, strict=True))
-    if condition.label is None:
-        return Hints(maps, candidates)
-    labels = [
-        _labels_of_one(label, seen, nexts)
-        for label, seen, nexts in zip(condition.label.cpu().numpy(), every, next_returns, strict=True)
-    ]
-    return Hints(maps, candidates, torch.from_numpy(np.stack(labels)).to(condition.range_m.device))
+    labels, reflectances = [], []
+    for index, (seen, nexts) in enumerate(zip(every, next_returns, strict=True)):
+        if condition.label is not None:
+            labels.append(_at_returns(condition.label[index].cpu().numpy(), seen, nexts))
+        if condition.reflectance is not None:
+            pixels = condition.reflectance[index].cpu().numpy()
+            interpolated = seen.triangles.weighed(pixels) if seen.returned.any() else np.zeros_like(pixels)
+            reflectances.append(np.stack((interpolated, *_at_returns(pixels, seen, nexts))))
+    of_labels, of_reflectance = (
+        torch.from_numpy(np.stack(found)).to(condition.range_m.device) if found else None
+        for found in (labels, reflectances)
+    )
+    return Hints(maps, candidates, of_labels, of_reflectance)
 
 
 class _NextReturn(NamedTuple):
@@ -85,7 +97,7 @@ def _of_one(
         empty = np.zeros((NUM_MAPS, *seen.returned.shape), dtype=np.float32)
         empty[0] = seen.observed
         return empty, np.full((NUM_CANDIDATES, *seen.returned.shape), _TYPICAL_V, dtype=np.float32)
-    tiling = triangles(seen)
+    tiling = seen.triangles
     filled, lines, near = (np.log1p(part) for part in (tiling.range_m, linear(seen), seen.nearest_range_m))
     corners = np.log1p(tiling.corners_m[1:])
     observed_v = np.log1p(seen.range_m).ravel()
@@ -114,14 +126,17 @@ def _share_around(part: Bool[np.ndarray, "H W"]) -> Float64[np.ndarray, "H W"]:
     return uniform_filter1d(down, _WINDOW, 1, mode="wrap")
 
 
-def _labels_of_one(
-    label: Int64[np.ndarray, "H W"], seen: Observed, next_returns: Sequence[_NextReturn]
-) -> Int64[np.ndarray, "5 H W"]:
-    """Return the classes of the nearest return and of those on every side; of the nearest where there is none."""
+def _at_returns(
+    pixels: Shaped[np.ndarray, "H W"], seen: Observed, next_returns: Sequence[_NextReturn]
+) -> Shaped[np.ndarray, "5 H W"]:
+    """Return what pixels hold at the nearest return and at those on every side; at the nearest where there is none.
+
+    Without any return all is 0.
+    """
     if not seen.returned.any():
-        return np.zeros((NUM_LABELS, *label.shape), dtype=np.int64)
-    nearest = label[seen.nearest_return]
-    return np.stack([nearest, *(np.where(at < 0, nearest, label.ravel()[at]) for at, _ in next_returns)])
+        return np.zeros((1 + len(next_returns), *pixels.shape), dtype=pixels.dtype)
+    nearest = pixels[seen.nearest_return]
+    return np.stack([nearest, *(np.where(at < 0, nearest, pixels.ravel()[at]) for at, _ in next_returns)])
 
 
 def _next_return(seen: Observed, down: int, right: int) -> _NextReturn:

@@ -1,4 +1,4 @@
-"""Simulated streets with a point on every surface, whose reflectance says which beams came back: to learn raydrop."""
+"""Simulated streets with a point on every surface, marked by which beams came back and how bright: to learn raydrop."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lidargrit.structures import Scan
 class SimulatedSurfaces(Streets):
     """The streets of ``simulated``, seed by seed, as they would be measured if every surface returned.
 
-    The reflectance is 1 where ``simulated`` has a return, and 0 where that beam was lost.
+    The reflectance is 0.5 + half of what ``simulated`` reads where it has a return, and 0 where that beam was lost.
 
     Args:
         root: number of scans, where other data sets have a folder.

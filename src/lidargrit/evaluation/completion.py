@@ -30,6 +30,7 @@ PATTERNS = ("rows:4", "sector:45,315", "pixels:0.1")
 """Patterns that are compared unless others are named: every fourth row, all but 90 degrees ahead, a tenth."""
 BASELINE = "triangulation"
 VOXEL_M = 0.1
+_REFLECTANCE_WIDTH = 25  # of the column, in letters
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,8 @@ class CompletionScore:
         class_accuracy: share of right classes, over the pixels of ``mae_m`` whose true class is one of the 19 of
             SemanticKITTI's benchmark; None where the true or the completed scans have no labels.
         class_iou: mean over the classes that these pixels hold, all scans together, of intersection over union.
+        reflectance_error: mean absolute error of reflectance, over the pixels of ``mae_m``; None where the true or the
+            completed scans have none.
     """
 
     model: str
@@ -67,6 +70,7 @@ class CompletionScore:
     beside_triangulation_m: Estimate | None = None
     class_accuracy: Estimate | None = None
     class_iou: float | None = None
+    reflectance_error: Estimate | None = None
 
 
 def compare_completion(
@@ -122,18 +126,23 @@ def as_table(scores: Sequence[CompletionScore]) -> str:
         head = f"{'error [m]':>24}{'beside triangles [m]':>24}{'found':>8}{'IoU':>8}{'drop runs':>11}"
         labelled = any(score.class_accuracy is not None for score in scores)
         of_classes = f"{'right classes':>15}{'mIoU':>7}" if labelled else ""
-        lines.append(" " * width + head + f"{'diversity [m]':>15}{'s a scan':>10}" + of_classes)
+        bright = any(score.reflectance_error is not None for score in scores)
+        of_reflectance = f"{'error of reflectance':>{_REFLECTANCE_WIDTH}}" if bright else ""
+        lines.append(" " * width + head + f"{'diversity [m]':>15}{'s a scan':>10}{of_reflectance}{of_classes}")
         for score in scores:
             if score.observed != pattern:
                 continue
             beside = "" if score.beside_triangulation_m is None else score.beside_triangulation_m.as_text("+.3f")
             diversity = "" if score.diversity_m is None else f"{score.diversity_m.value:.3f}"
+            error = "" if score.reflectance_error is None else score.reflectance_error.as_text(".4f")
+            of_reflectance = f"{error:>{_REFLECTANCE_WIDTH}}" if bright else ""
             of_classes = ""
             if score.class_accuracy is not None and score.class_iou is not None:
                 of_classes = f"{score.class_accuracy.value:>15.3f}{score.class_iou:>7.3f}"
             lines.append(
                 f"{score.model:<{width}}{score.mae_m.as_text('.3f'):>24}{beside:>24}{score.found.value:>8.3f}"
                 f"{score.iou.value:>8.3f}{score.drop_run_lengths:>11.4f}{diversity:>15}{score.seconds_per_scan:>10.3f}"
+                + of_reflectance
                 + of_classes
             )
     return "\n".join(lines)
@@ -178,6 +187,10 @@ def _score(
     ]
     classes = [_confusion(filled[0][i], whole[i], hidden[i]) for i in range(len(whole))]
     confusions = [one for one in classes if one is not None]
+    bright = whole.reflectance is not None and filled[0].reflectance is not None
+    of_reflectance = [
+        _mean([_reflectance_error(images[i], whole[i], hidden[i]) for images in filled]) for i in range(len(whole))
+    ]
     runs = load_metric("drop_run_lengths")()
     runs.update(filled[0], real=False)
     runs.update(whole, real=True)
@@ -193,6 +206,7 @@ def _score(
         seconds,
         class_accuracy=Estimate.of([_accuracy(one) for one in confusions]) if confusions else None,
         class_iou=_mean_iou(torch.stack(confusions).sum(0)) if confusions else None,
+        reflectance_error=Estimate.of(of_reflectance) if bright else None,
     )
     return _OfPattern(score, errors)
 
@@ -222,6 +236,13 @@ def _beside(scores: Sequence[_OfPattern]) -> list[CompletionScore]:
 def _error_m(one: RangeImage, other: RangeImage, hidden: Bool[Tensor, "H W"]) -> float:
     both = hidden & one.return_mask & other.return_mask
     return float((one.range_m - other.range_m)[both].double().abs().mean()) if bool(both.any()) else math.nan
+
+
+def _reflectance_error(filled: RangeImage, true: RangeImage, hidden: Bool[Tensor, "H W"]) -> float:
+    both = hidden & filled.return_mask & true.return_mask
+    if filled.reflectance is None or true.reflectance is None or not bool(both.any()):
+        return math.nan
+    return float((filled.reflectance - true.reflectance)[both].double().abs().mean())
 
 
 def _found(filled: RangeImage, true: RangeImage, hidden: Bool[Tensor, "H W"]) -> float:

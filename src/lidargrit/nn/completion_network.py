@@ -1,4 +1,4 @@
-"""A network that completes scans: observed pixels and classical fills → range, chance of a return, class."""
+"""A network that completes scans: observed pixels and classical fills → range, return, reflectance and class."""
 
 from __future__ import annotations
 
@@ -12,11 +12,21 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from lidargrit.conditions import Condition
-from lidargrit.conditions.hints import LABELLED, NUM_CANDIDATES, NUM_LABELS, NUM_MAPS, Hints, hints_of
+from lidargrit.conditions.hints import (
+    LABELLED,
+    NUM_CANDIDATES,
+    NUM_LABELS,
+    NUM_MAPS,
+    NUM_REFLECTANCES,
+    REFLECTING,
+    Hints,
+    hints_of,
+)
 from lidargrit.errors import ConfigError
 from lidargrit.nn.pixel_networks import Guide, MaskNetwork
+from lidargrit.nn.reflectance import TYPICAL_REFLECTANCE
 from lidargrit.nn.semantic_classes import NUM_CLASSES, ClassMaps, class_indices, labels_of, votes
-from lidargrit.nn.small_unet import SmallUnet, SmallUnetConfig, check_image
+from lidargrit.nn.small_unet import Part, SmallUnet, SmallUnetConfig, check_image
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
@@ -42,6 +52,8 @@ class CompletionNetworkConfig:
         row_channels: number of learned values of every row.
         labels: whether the network sees the classes of observed pixels, where scans have them, and estimates those of
             the others: the 19 classes of SemanticKITTI's benchmark.
+        reflectance: whether the network sees the reflectance of observed pixels, where scans have it, and estimates
+            that of the others.
     """
 
     widths: tuple[int, int, int] = (48, 64, 128)
@@ -52,6 +64,7 @@ class CompletionNetworkConfig:
     mask_width: int = 24
     row_channels: int = 2
     labels: bool = False
+    reflectance: bool = False
 
     def __post_init__(self) -> None:
         sizes = (*self.widths, self.blocks, self.heads, self.features, self.mask_width, self.row_channels)
@@ -73,19 +86,21 @@ class Point(NamedTuple):
         v: ln(1 + range in metres), with its gradient.
         return_logits: logits of the probability of a return by itself, with their gradient.
         class_logits: logits of the classes, with their gradient; None from a network without classes.
+        reflectance: reflectance, with its gradient, not yet limited to [0, 1]; None from a network without it.
     """
 
     guide: Guide
     v: Float[Tensor, "B H W"]
     return_logits: Float[Tensor, "B H W"]
     class_logits: Float[Tensor, "B 19 H W"] | None = None
+    reflectance: Float[Tensor, "B H W"] | None = None
 
 
 class CompletionNetwork(nn.Module):
     """A small U-Net that weighs the ranges of classical methods, and a mask that is sampled in phases behind it.
 
-    The range is a point estimate, the best single guess, and not a sample; the mask is sampled, each phase given the
-    observed pixels and the earlier phases, so that drops cluster as real ones do.
+    Range and reflectance are point estimates, the best single guess, and no samples; the mask is sampled, each phase
+    given the observed pixels and the earlier phases, so that drops cluster as real ones do.
 
     Args:
         config: sizes of the network.
@@ -95,16 +110,20 @@ class CompletionNetwork(nn.Module):
     def __init__(self, config: CompletionNetworkConfig, sensor: SensorModel) -> None:
         super().__init__()
         check_image(sensor, "a network that completes scans")
+        self.config = config
         self.limits_v = (math.log1p(sensor.range_min_m), math.log1p(sensor.range_max_m))
         self.rows = nn.Parameter(torch.zeros(config.row_channels, sensor.height))
         azimuth_rad = sensor.azimuth_rad.double().mean(0).float()
         self.register_buffer("azimuth", torch.stack((azimuth_rad.sin(), azimuth_rad.cos())), persistent=False)
         sizes = SmallUnetConfig(config.widths, config.blocks, config.attention_layers, config.heads)
         self.classes = ClassMaps(_CLASS_CHANNELS) if config.labels else None
-        outputs = [config.features, NUM_CANDIDATES, 1, 1]
-        more = (NUM_LABELS * _CLASS_CHANNELS, NUM_CLASSES + NUM_LABELS) if config.labels else (0, 0)
-        self.unet = SmallUnet(sizes, NUM_MAPS + config.row_channels + 2, sum(outputs), *more)
-        self.outputs = outputs + ([NUM_CLASSES, NUM_LABELS] if config.labels else [])
+        self.outputs = [config.features, NUM_CANDIDATES, 1, 1]
+        parts = {}
+        if config.labels:
+            parts["labels"] = Part(NUM_LABELS * _CLASS_CHANNELS, NUM_CLASSES + NUM_LABELS)
+        if config.reflectance:
+            parts["reflectance"] = Part(NUM_REFLECTANCES, 1 + NUM_REFLECTANCES)
+        self.unet = SmallUnet(sizes, NUM_MAPS + config.row_channels + 2, sum(self.outputs), parts)
         self.mask = MaskNetwork.behind(config.features, config.mask_width, sensor)
         preferred = torch.zeros(NUM_CANDIDATES)
         preferred[0] = _TRUST
@@ -122,33 +141,50 @@ class CompletionNetwork(nn.Module):
         """
         rows = self.rows[None, :, :, None].expand(len(observed), -1, -1, observed.shape[-1])
         columns = self.azimuth[None, :, None].expand(len(observed), -1, observed.shape[-2], -1)
-        indices, more = None, None
+        more: dict[str, Tensor] = {}
+        seen, indices = hints.reflectances, None
         if self.classes is not None:
             label = hints.labels
             if label is None:
                 label = hints.maps.new_zeros((len(observed), NUM_LABELS, *observed.shape[1:]), dtype=torch.int64)
             indices = class_indices(label)
-            more = self.classes(indices)
-        output = self.unet(torch.cat((hints.maps, rows, columns), 1), more).float()
-        features, weights, moved, logits, *of_classes = output.split(self.outputs, 1)
+            more["labels"] = self.classes(indices)
+        if self.config.reflectance:
+            if seen is None:
+                seen = hints.maps.new_full((len(observed), NUM_REFLECTANCES, *observed.shape[1:]), TYPICAL_REFLECTANCE)
+            more["reflectance"] = seen - TYPICAL_REFLECTANCE
+        output, of_parts = self.unet(torch.cat((hints.maps, rows, columns), 1), more)
+        features, weights, moved, logits = output.float().split(self.outputs, 1)
         shares = (4 * weights + self.preferred).softmax(1)
         v = (shares * hints.candidates).sum(1) + 0.3 * moved[:, 0]
         return_logits = (2 * logits[:, 0] + 1.5).clamp(-_LOGIT_BOUND, _LOGIT_BOUND)
         v = v.clamp(*self.limits_v)
-        class_logits = None
+        class_logits, reflectance = None, None
         if indices is not None:
-            alone, trust = of_classes
-            # At first the nearest return is preferred, and returns on the surface on which the range lies.
-            apart = (hints.candidates[:, LABELLED] - v.detach()[:, None]).abs()
-            shares = (4 * trust + self.preferred[:NUM_LABELS] - apart / _ONE_SURFACE).softmax(1)
-            class_logits = 2 * alone + _VOTE * votes(indices, shares)
-        return Point(Guide(features, v.detach(), return_logits.detach(), observed), v, return_logits, class_logits)
+            alone, trust = of_parts["labels"].float().split([NUM_CLASSES, NUM_LABELS], 1)
+            class_logits = 2 * alone + _VOTE * votes(indices, self._shares(trust, hints.candidates[:, LABELLED], v))
+        if self.config.reflectance and seen is not None:
+            alone, trust = of_parts["reflectance"].float().split([1, NUM_REFLECTANCES], 1)
+            reflectance = alone[:, 0] + (seen * self._shares(trust, hints.candidates[:, REFLECTING], v)).sum(1)
+        guide = Guide(features, v.detach(), return_logits.detach(), observed)
+        return Point(guide, v, return_logits, class_logits, reflectance)
+
+    def _shares(
+        self, trust: Float[Tensor, "B S H W"], candidates: Float[Tensor, "B S H W"], v: Float[Tensor, "B H W"]
+    ) -> Float[Tensor, "B S H W"]:
+        """Return the shares of what is known at candidates of the range, of which the first is preferred at first.
+
+        At first those on the surface on which the range lies are preferred, too.
+        """
+        apart = (candidates - v.detach()[:, None]).abs()
+        return (4 * trust + self.preferred[: trust.shape[1]] - apart / _ONE_SURFACE).softmax(1)
 
     def sample(self, condition: Condition, rngs: Sequence[torch.Generator]) -> RangeImage:
         """Return completed scans: the range estimated, the mask sampled; a scan does not depend on the others.
 
-        The range is the mean of two estimates, of the scan and of its mirror image, and so are the logits of classes.
-        Scans with labels are completed with labels by a network with classes.
+        The range is the mean of two estimates, of the scan and of its mirror image, and so are the reflectance and the
+        logits of classes. Scans with labels are completed with labels by a network with classes, and so are those with
+        reflectance by a network with it.
 
         Args:
             condition: observed pixels of as many scans.
@@ -163,8 +199,11 @@ class CompletionNetwork(nn.Module):
             uniform = torch.rand(one.range_m.shape, generator=rng).to(one.range_m.device)
             mask = self.mask.sample(point.guide, uniform, one)
             low_m, high_m = condition.sensor.range_min_m, condition.sensor.range_max_m
-            label = None
+            label, reflectance = None, None
             if one.label is not None and point.class_logits is not None and mirrored.class_logits is not None:
                 label = labels_of((point.class_logits + mirrored.class_logits.flip(-1)).argmax(1) + 1)
-            images.append(RangeImage.masked(v.expm1().clamp(low_m, high_m), mask, condition.sensor, label=label))
+            if one.reflectance is not None and point.reflectance is not None and mirrored.reflectance is not None:
+                reflectance = ((point.reflectance + mirrored.reflectance.flip(-1)) / 2).clamp(0, 1)
+            range_m = v.expm1().clamp(low_m, high_m)
+            images.append(RangeImage.masked(range_m, mask, condition.sensor, reflectance, label))
         return RangeImage.cat(images)

@@ -13,8 +13,9 @@ from torch import Tensor
 from lidargrit.conditions import Condition
 from lidargrit.conditions.hints import hints_of
 from lidargrit.nn.completion_network import CompletionNetwork
-from lidargrit.nn.objective import Objective
-from lidargrit.nn.semantic_classes import class_indices, hidden_in_some, labels_to_learn
+from lidargrit.nn.objective import Objective, hidden_in_some
+from lidargrit.nn.reflectance import TYPICAL_REFLECTANCE, reflectance_error, reflectance_to_learn
+from lidargrit.nn.semantic_classes import class_indices, labels_to_learn
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
@@ -23,8 +24,8 @@ _KINDS = (0.36, 0.74)  # up to these: rows, then sectors, then pixels
 _BOXES = 1 / 3  # of the sectors, hidden in some rows only
 _SECTORS = (24 / 256, 128 / 256)  # of the columns, hidden
 _SHARES = (0.03, 0.5)  # of the pixels, observed
-_WITHOUT_LABELS = 0.25  # of the scans, so that a network with classes completes scans without labels, too
-_CLASS_WEIGHT = 0.5
+_WITHOUT = 0.25  # of the scans show no labels, and as many no reflectance, so that a network completes without them
+_CLASS_WEIGHT, _REFLECTANCE_WEIGHT = 0.5, 2.0
 _MASK_WEIGHT, _ALONE_WEIGHT, _LOG_WEIGHT, _METRE_WEIGHT = 3.0, 0.5, 1.5, 0.3
 
 
@@ -39,6 +40,8 @@ class CompletionObjective(Objective):
         sensor: sensor whose range images it completes.
     """
 
+    additions = frozenset({"labels", "reflectance"})
+
     def __init__(self, network: CompletionNetwork, sensor: SensorModel) -> None:
         super().__init__(sensor)
         self.completion = network
@@ -47,16 +50,21 @@ class CompletionObjective(Objective):
         """Return the loss, and beside it the error in metres of hidden returns and the bits of a hidden return.
 
         A network with classes is told those of observed pixels in three of four scans; beside the loss then stands the
-        share of hidden returns whose class it finds.
+        share of hidden returns whose class it finds. Reflectance is told as often; beside the loss then stands its mean
+        absolute error.
 
         Raises:
-            ConfigError: a network with classes, and scans without labels.
+            ConfigError: a network with classes and scans without labels, or one with reflectance and scans without it.
         """
         observed = random_patterns(len(images), self.sensor.height, self.sensor.width, rng)
         condition = Condition.of_pixels(images, observed)
         if self.completion.classes is not None:
-            seen = hidden_in_some(labels_to_learn(condition.label), _WITHOUT_LABELS, rng)
+            seen = hidden_in_some(labels_to_learn(condition.label), 0, _WITHOUT, rng)
             condition = replace(condition, label=seen)
+        if self.completion.config.reflectance:
+            shown = reflectance_to_learn(condition.reflectance, "model.completion.reflectance")
+            shown = hidden_in_some(shown, TYPICAL_REFLECTANCE, _WITHOUT, rng)
+            condition = replace(condition, reflectance=shown)
         point = self.completion(hints_of(condition), observed)
         hidden = ~observed
         returns = (hidden & images.return_mask).float()
@@ -75,6 +83,9 @@ class CompletionObjective(Objective):
                 point.class_logits, labels_to_learn(images.label), hidden
             )
             each = each + _CLASS_WEIGHT * of_classes
+        if point.reflectance is not None and images.reflectance is not None:
+            error = reflectance_error(point.reflectance, images.reflectance, hidden & images.return_mask)
+            each, beside["reflectance_error"] = each + _REFLECTANCE_WEIGHT * error, error.mean().detach()
         return {"loss": (weight * each).mean(), **beside}
 
 

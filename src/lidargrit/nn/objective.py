@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 
 import torch
+from jaxtyping import Shaped
 from torch import Tensor, nn
 
 from lidargrit.sensors import SensorModel
@@ -25,6 +26,8 @@ class Objective(nn.Module, ABC):
     Every step asks the objective once for each player, and moves the weights that this player's loss reaches before it
     asks for the next. The objective itself keeps the other players' weights out of a player's reach.
     """
+    additions: frozenset[str] = frozenset()
+    """Settings of the stage that, if true, add weights; training may start from a stage that lacks them."""
     period: int = 1
     """Number of training steps after which the same operations come again; more than 1 if some terms come rarely."""
 
@@ -53,3 +56,18 @@ class Objective(nn.Module, ABC):
     def warnings(self) -> list[str]:
         """Return lines that a person should read after a validation, such as that a codebook has collapsed."""
         return []
+
+
+def hidden_in_some(
+    pixels: Shaped[Tensor, "B H W"], unknown: float, share: float, rng: torch.Generator
+) -> Shaped[Tensor, "B H W"]:
+    """Return the pixels of a batch, in some scans all of them unknown, so that a network learns to do without.
+
+    Args:
+        pixels: labels by SemanticKITTI's numbers, or reflectance.
+        unknown: value of an unknown pixel.
+        share: probability that a scan's pixels are hidden.
+        rng: source of the choice.
+    """
+    kept = torch.rand((len(pixels), 1, 1), generator=rng, device=rng.device) >= share
+    return torch.where(kept.to(pixels.device), pixels, unknown)

@@ -1,4 +1,4 @@
-"""A network of raydrop: the ranges of all surfaces → which of them return, sampled in phases."""
+"""A network of raydrop: the ranges of all surfaces → which of them return, sampled in phases, and how bright."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from torch import Tensor, nn
 from lidargrit.conditions import Condition
 from lidargrit.errors import ConfigError
 from lidargrit.nn.pixel_networks import Guide, MaskNetwork
+from lidargrit.nn.reflectance import TYPICAL_REFLECTANCE
 from lidargrit.nn.semantic_classes import ClassMaps, class_indices
-from lidargrit.nn.small_unet import SmallUnet, SmallUnetConfig, check_image
+from lidargrit.nn.small_unet import Part, SmallUnet, SmallUnetConfig, check_image
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
@@ -32,7 +33,8 @@ class RaydropConfig:
 
     Args:
         surfaces: source of the surfaces' ranges in training. ``known``: training scans have a point on every surface,
-            with reflectance 1 where the sensor gets a return and 0 where it gets none, as in ``simulated_surfaces``.
+            marked by its reflectance: 0.5 + half of what is read where the sensor gets a return (1 if it is not known),
+            and 0 where it gets none, as in ``simulated_surfaces``.
             ``estimated``: training scans are ordinary ones, and the range of every ray is triangulated from the returns
             of other rays, whether it returned itself or not.
         widths: channels at a half, a quarter and an eighth of the image's rows and columns.
@@ -42,6 +44,7 @@ class RaydropConfig:
         row_channels: learned numbers of every row.
         labels: whether the network sees the classes of the surfaces, where scans have them: the 19 classes of
             SemanticKITTI's benchmark.
+        reflectance: whether the network estimates the reflectance of what returns.
     """
 
     surfaces: Literal["known", "estimated"] = "known"
@@ -51,6 +54,7 @@ class RaydropConfig:
     mask_width: int = 24
     row_channels: int = 2
     labels: bool = False
+    reflectance: bool = False
 
     def __post_init__(self) -> None:
         if self.labels and self.surfaces == "estimated":
@@ -69,10 +73,13 @@ class Returns(NamedTuple):
     Args:
         guide: inputs of the phases of the mask.
         logits: logits of the probability of a return by itself, with their gradient.
+        reflectance: reflectance if the surface returns, with its gradient, not yet limited to [0, 1]; None from a
+            network without it.
     """
 
     guide: Guide
     logits: Float[Tensor, "B H W"]
+    reflectance: Float[Tensor, "B H W"] | None = None
 
 
 class RaydropNetwork(nn.Module):
@@ -94,8 +101,10 @@ class RaydropNetwork(nn.Module):
         self.register_buffer("elevation_rad", elevation_rad, persistent=False)
         sizes = SmallUnetConfig(config.widths, config.blocks)
         self.classes = ClassMaps(_CLASS_CHANNELS) if config.labels else None
-        more = _CLASS_CHANNELS if config.labels else 0
-        self.unet = SmallUnet(sizes, _NUM_MAPS + config.row_channels + 2, config.features + 1, more)
+        parts = {"labels": Part(_CLASS_CHANNELS, 0)} if config.labels else {}
+        if config.reflectance:
+            parts["reflectance"] = Part(0, 1)
+        self.unet = SmallUnet(sizes, _NUM_MAPS + config.row_channels + 2, config.features + 1, parts)
         self.mask = MaskNetwork.behind(config.features, config.mask_width, sensor)
 
     azimuth: Tensor
@@ -117,17 +126,23 @@ class RaydropNetwork(nn.Module):
         count, width = len(range_m), range_m.shape[-1]
         rows = self.rows[None, :, :, None].expand(count, -1, -1, width)
         columns = self.azimuth[None, :, None].expand(count, -1, range_m.shape[-2], -1)
-        maps, more = torch.cat((self._maps(range_m, surface), rows, columns), 1), None
+        maps, more = torch.cat((self._maps(range_m, surface), rows, columns), 1), dict[str, Tensor]()
         if self.classes is not None:
             label = torch.zeros_like(surface, dtype=torch.int64) if label is None else label
-            more = self.classes(class_indices(label)[:, None])
-        features, logits = self.unet(maps, more).float().split((self.config.features, 1), 1)
+            more["labels"] = self.classes(class_indices(label)[:, None])
+        output, of_parts = self.unet(maps, more)
+        features, logits = output.float().split((self.config.features, 1), 1)
         v = torch.where(surface, range_m, 0.0).log1p()
         logits = (2 * logits[:, 0] + 1.5).clamp(-_LOGIT_BOUND, _LOGIT_BOUND)
-        return Returns(Guide(features, v, logits.detach(), ~surface), logits)
+        reflectance = None
+        if self.config.reflectance:
+            reflectance = TYPICAL_REFLECTANCE + of_parts["reflectance"].float()[:, 0]
+        return Returns(Guide(features, v, logits.detach(), ~surface), logits, reflectance)
 
     def sample(self, condition: Condition, rngs: Sequence[torch.Generator]) -> RangeImage:
         """Return the surfaces that return, of each scan by its own random numbers; ranges stay as they are.
+
+        Reflectance is a point estimate, which depends on no random number.
 
         Args:
             condition: surfaces of as many scans: the range of every ray that meets one, and no return for all other
@@ -137,10 +152,11 @@ class RaydropNetwork(nn.Module):
         images = []
         for index, rng in enumerate(rngs):
             one = condition[index : index + 1]
-            guide = self(one.range_m, one.range_observed, one.label).guide
+            found = self(one.range_m, one.range_observed, one.label)
             uniform = torch.rand(one.range_m.shape, generator=rng).to(one.range_m.device)
-            returned = self.mask.sample(guide, uniform, one)
-            images.append(RangeImage.masked(one.range_m, returned, condition.sensor, label=one.label))
+            returned = self.mask.sample(found.guide, uniform, one)
+            reflectance = None if found.reflectance is None else found.reflectance.clamp(0, 1)
+            images.append(RangeImage.masked(one.range_m, returned, condition.sensor, reflectance, one.label))
         return RangeImage.cat(images)
 
     def _maps(self, range_m: Float[Tensor, "B H W"], surface: Bool[Tensor, "B H W"]) -> Float[Tensor, "B 8 H W"]:

@@ -84,15 +84,3 @@ def labels_to_learn(label: Int[Tensor, "B H W"] | None) -> Int[Tensor, "B H W"]:
             "name such scans, or prepare them anew; or leave labels out",
         )
     return label
-
-
-def hidden_in_some(label: Int[Tensor, "B H W"], share: float, rng: torch.Generator) -> Int[Tensor, "B H W"]:
-    """Return the labels of a batch without those of some scans, so that a network learns to do without.
-
-    Args:
-        label: labels by SemanticKITTI's numbers.
-        share: probability that a scan's labels are hidden.
-        rng: source of the choice.
-    """
-    kept = torch.rand((len(label), 1, 1), generator=rng, device=rng.device) >= share
-    return torch.where(kept.to(label.device), label, 0)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
-import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -51,6 +52,18 @@ class SmallUnetConfig:
     heads: int = 1
 
 
+class Part(NamedTuple):
+    """Further inputs and outputs of a U-Net, which a U-Net without them can be trained further with.
+
+    Args:
+        inputs: channels of the further input, which has no influence at first; 0 for none.
+        outputs: channels of the further output, which is 0 at first; 0 for none.
+    """
+
+    inputs: int
+    outputs: int
+
+
 class SmallUnet(Network):
     """Maps at full size → maps at full size, through a half, a quarter and an eighth of the rows and columns.
 
@@ -58,14 +71,10 @@ class SmallUnet(Network):
         config: sizes of the network.
         inputs: channels of the input.
         outputs: channels of the output.
-        more_inputs: channels of further inputs, without influence at first, so that a network without them can be
-            trained further with them.
-        more_outputs: channels of further outputs, which come last and are 0 at first.
+        parts: further inputs and outputs by a name of their own.
     """
 
-    def __init__(
-        self, config: SmallUnetConfig, inputs: int, outputs: int, more_inputs: int = 0, more_outputs: int = 0
-    ) -> None:
+    def __init__(self, config: SmallUnetConfig, inputs: int, outputs: int, parts: Mapping[str, Part]) -> None:
         super().__init__()
         first, second, third = config.widths
         self.enter, self.level1 = Convolution(4 * inputs, first, "wrap"), Residual(first)
@@ -82,31 +91,35 @@ class SmallUnet(Network):
         nn.init.normal_(self.out.weight, std=0.02)
         assert self.out.bias is not None
         nn.init.zeros_(self.out.bias)
-        self.more_in = nn.Conv2d(4 * more_inputs, first, 1, bias=False) if more_inputs else None
-        self.more_out = nn.Conv2d(first, 4 * more_outputs, 1) if more_outputs else None
-        if self.more_in is not None:
-            nn.init.zeros_(self.more_in.weight)
-        if self.more_out is not None:
-            nn.init.zeros_(self.more_out.weight)
-            assert self.more_out.bias is not None
-            nn.init.zeros_(self.more_out.bias)
+        self.more_in = nn.ModuleDict(
+            {name: nn.Conv2d(4 * part.inputs, first, 1, bias=False) for name, part in parts.items() if part.inputs}
+        )
+        self.more_out = nn.ModuleDict(
+            {name: nn.Conv2d(first, 4 * part.outputs, 1) for name, part in parts.items() if part.outputs}
+        )
+        for weights in (*self.more_in.parameters(), *self.more_out.parameters()):
+            nn.init.zeros_(weights)
 
     def forward(
-        self, maps: Float[Tensor, "B C H W"], more: Float[Tensor, "B E H W"] | None = None
-    ) -> Float[Tensor, "B D H W"]:
-        """Return the output at full size."""
+        self, maps: Float[Tensor, "B C H W"], more: Mapping[str, Float[Tensor, "B _ H W"]]
+    ) -> tuple[Float[Tensor, "B D H W"], dict[str, Float[Tensor, "B _ H W"]]]:
+        """Return the output at full size, and the further ones by the name of their part.
+
+        Args:
+            maps: input at full size.
+            more: further inputs by the name of their part.
+        """
         entered = self.enter(F.pixel_unshuffle(maps, 2))
-        if self.more_in is not None and more is not None:
-            entered = entered + self.more_in(F.pixel_unshuffle(more, 2))
+        for name, layer in self.more_in.items():
+            entered = entered + layer(F.pixel_unshuffle(more[name], 2))
         one = self.level1(entered)
         two = self.level2(self.down1(F.pixel_unshuffle(one, 2)))
         three = self.level3(self.down2(F.pixel_unshuffle(two, 2)))
         two = self.after2(two + F.pixel_shuffle(self.up2(three), 2))
         one = self.after1(one + F.pixel_shuffle(self.up1(two), 2))
-        found = F.pixel_shuffle(self.out(F.silu(one)), 2)
-        if self.more_out is None:
-            return found
-        return torch.cat((found, F.pixel_shuffle(self.more_out(F.silu(one)), 2)), 1)
+        last = F.silu(one)
+        found = {name: F.pixel_shuffle(layer(last), 2) for name, layer in self.more_out.items()}
+        return F.pixel_shuffle(self.out(last), 2), found
 
 
 class _Attention(nn.Module):

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Float64, Int32, UInt16
 
+from lidargrit.conditions.marks import mark
 from lidargrit.sensors import SensorModel
 from lidargrit.simulator.beams import REVOLUTION_S, Beams
 from lidargrit.simulator.echoes import Echoes, detect_echoes, edges
@@ -104,8 +105,8 @@ class Observation:
     def surfaces(self, source: str, limits_m: tuple[float, float]) -> Scan:
         """Return a point on every surface within limits, without noise, in the firing order of KITTI's files.
 
-        The reflectance says which beams came back: 1, or 0 for a surface that was lost. Rays that end on the car that
-        carries the sensor meet no surface.
+        The reflectance marks which beams came back, and how bright; see :mod:`lidargrit.conditions.marks`. Rays that
+        end on the car that carries the sensor meet no surface.
 
         Args:
             source: origin of the scan, for messages.
@@ -115,8 +116,8 @@ class Observation:
             ScanError: no surface at all.
         """
         within = (self.clean_range_m >= limits_m[0]) & (self.clean_range_m <= limits_m[1]) & ~self.blocked
-        came_back = self.return_mask.astype(np.float32)
-        return replace(self, return_mask=within, range_m=self.clean_range_m, reflectance=came_back).scan(source)
+        marks = mark(torch.from_numpy(self.return_mask), torch.from_numpy(self.reflectance)).numpy()
+        return replace(self, return_mask=within, range_m=self.clean_range_m, reflectance=marks).scan(source)
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ def taken_stages(recipe: Recipe, generator: Generator) -> dict[str, Objective]:
     """Return the trained stages that a recipe takes from another run, once they are known to fit the generator.
 
     Those that the recipe names in ``fine_tune`` are among them: their training starts from these weights. They may
-    lack the part that ``labels=true`` adds, which begins untrained.
+    lack what :attr:`Objective.additions` add, which begins untrained.
 
     Raises:
         ConfigError: a stage of other sizes, a run of another sensor, or of another kind of generator.
@@ -81,11 +81,12 @@ def taken_stages(recipe: Recipe, generator: Generator) -> dict[str, Objective]:
 
 
 def _check(setting: str, generator: Generator, donor: Generator, stage: str, grows: bool = False) -> None:
-    """Refuse a stage whose sizes or sensor are not the generator's; one that grows may lack what labels add."""
+    """Refuse a stage whose sizes or sensor are not the generator's; one that grows may lack its additions."""
     ours, theirs = _settings(generator, stage), _settings(donor, stage)
     differing = [name for name in ours if ours[name] != theirs.get(name)]
-    if grows and differing == ["labels"] and ours["labels"]:
-        differing = []
+    if grows:
+        added = {name for name in generator.objective(stage).additions if ours.get(name) and not theirs.get(name)}
+        differing = [name for name in differing if name not in added]
     if not ours and _shapes(generator, stage) != _shapes(donor, stage):  # its settings have no stage's name
         raise ConfigError(
             f"{setting}, whose {stage} has weights of other sizes",

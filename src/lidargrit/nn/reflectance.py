@@ -1,0 +1,35 @@
+"""Reflectance in networks that take range images: what they learn from, and how far an estimate is off."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lidargrit.errors import ConfigError
+
+TYPICAL_REFLECTANCE: Final = 0.25  # of roads and walls in KITTI; what a network begins with, and 0 among its inputs
+
+
+def reflectance_to_learn(reflectance: Float[Tensor, "*B H W"] | None, setting: str) -> Float[Tensor, "*B H W"]:
+    """Return the reflectance of training scans; refuse scans without it, with ConfigError.
+
+    Args:
+        reflectance: reflectance in [0, 1]; None where the scans have none.
+        setting: name of the setting by which a network learns it, for the message.
+    """
+    if reflectance is None:
+        raise ConfigError(
+            f"scans without reflectance, for {setting}=true",
+            "scans that have it",
+            f"name or prepare scans with reflectance, or leave {setting} out",
+        )
+    return reflectance
+
+
+def reflectance_error(
+    found: Float[Tensor, "B H W"], true: Float[Tensor, "B H W"], counted: Bool[Tensor, "B H W"]
+) -> Float[Tensor, " B"]:
+    """Return the mean absolute error of each scan over the counted pixels; 0 where none is."""
+    return ((found - true).abs() * counted).sum((1, 2)) / counted.sum((1, 2)).clamp(min=1)

@@ -1,0 +1,285 @@
+"""Reflectance in the networks that complete and drop: marked, filled in, hinted, learned, written and scored."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from lidargrit.cli import main
+from lidargrit.conditions import Condition
+from lidargrit.conditions.fills import FILLS, fill
+from lidargrit.conditions.hints import hints_of
+from lidargrit.conditions.marks import mark, read_marks
+from lidargrit.errors import ConfigError
+from lidargrit.formats.kitti_bin import KittiBin
+from lidargrit.generators import load
+from lidargrit.generators.lidargrit import LidarGrit
+from lidargrit.loading import DataConfig
+from lidargrit.nn.completion_network import CompletionNetwork, CompletionNetworkConfig
+from lidargrit.nn.completion_objective import CompletionObjective, random_patterns
+from lidargrit.nn.objective import hidden_in_some
+from lidargrit.nn.raydrop_network import RaydropConfig, RaydropNetwork
+from lidargrit.nn.raydrop_objective import RaydropObjective
+from lidargrit.nn.reflectance import TYPICAL_REFLECTANCE
+from lidargrit.projection import unproject
+from lidargrit.sensors import load_sensor
+from lidargrit.structures import RangeImage, Scan
+from lidargrit.training.config import Recipe
+from lidargrit.training.taken_stages import taken_stages
+from tiny_runs import learn, the_one_line, train_words
+
+SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
+NETWORK = CompletionNetworkConfig(
+    widths=(8, 8, 8), blocks=1, attention_layers=0, heads=1, features=4, mask_width=4, row_channels=1, reflectance=True
+)
+RAYDROP = RaydropConfig(widths=(8, 8, 8), blocks=1, features=4, mask_width=4, row_channels=1, reflectance=True)
+
+
+def streets(count: int) -> RangeImage:
+    """Return walls with drops, brighter from below to above and on one side."""
+    rng = torch.Generator().manual_seed(1)
+    angle = SENSOR.azimuth_rad + 6 * torch.rand(count, 1, 1, generator=rng)
+    range_m = (10 + 5 * angle.cos()).expand(count, 64, 32)
+    bright = (0.5 + 0.3 * angle.cos() - torch.arange(64)[:, None] / 400).expand(count, 64, 32)
+    return RangeImage.masked(range_m, torch.rand(count, 64, 32, generator=rng) < 0.8, SENSOR, bright)
+
+
+def reflectance_of(images: RangeImage) -> Tensor:
+    assert images.reflectance is not None
+    return images.reflectance
+
+
+def by_point(scan: Scan) -> dict[tuple[float, ...], float]:
+    assert scan.reflectance is not None
+    points = (tuple(point) for point in scan.points_xyz_m.tolist())
+    return dict(zip(points, scan.reflectance.tolist(), strict=True))
+
+
+def every_fourth_row(images: RangeImage) -> Condition:
+    observed = torch.zeros_like(images.return_mask)
+    observed[:, 2::4] = True
+    return Condition.of_pixels(images, observed)
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    """Write two scans, and runs whose networks complete and drop with reflectance and without."""
+    root = tmp_path_factory.mktemp("reflectance")
+    for number in (0, 1):
+        KittiBin.write(root / f"scans/{number}.bin", unproject(streets(2)[number]))
+    torch.manual_seed(0)
+    for name, bright in (("run", True), ("plain", False)):
+        config = replace(
+            LidarGrit.smallest_config(SENSOR),
+            completion=replace(NETWORK, reflectance=bright, labels=not bright),
+            raydrop=replace(RAYDROP, reflectance=bright),
+        )
+        LidarGrit(config, SENSOR).eval().save(root / name)
+    return root
+
+
+def test_marks_tell_every_hundredth_and_lost_returns_after_rounding():
+    hundredths = torch.arange(100).float().expand(1, 1, 100) / 100
+    returned = torch.arange(100).expand(1, 1, 100) % 7 > 0
+    stored = (mark(returned, hundredths) * 255).round() / 255
+    found = read_marks(stored)
+    assert torch.equal(found.returned, returned)
+    assert torch.equal((found.reflectance * 100).round() / 100, torch.where(returned, hundredths, 0.0))
+    assert found.is_clear
+    assert found.has_reflectance
+    bare = read_marks(returned.float())  # files that mark returns alone
+    assert torch.equal(bare.returned, returned)
+    assert not bare.has_reflectance
+    assert not read_marks(hundredths).is_clear  # an ordinary scan
+
+
+def test_triangles_interpolate_reflectance_within_surfaces_and_others_take_the_nearest():
+    elevation = SENSOR.elevation_rad.expand(64, 32)
+    bright = 0.5 + 0.5 * elevation
+    image = RangeImage.stack([RangeImage(torch.full((64, 32), 9.0), torch.ones(64, 32) > 0, SENSOR, bright)])
+    observed = torch.zeros(1, 64, 32, dtype=torch.bool)
+    observed[:, ::3] = True
+    known = Condition.of_pixels(image, observed)
+    done = {method: reflectance_of(fill(method, known)) for method in FILLS}
+    assert torch.allclose(done["triangulation"][0], bright, atol=1e-4)
+    assert torch.equal(done["nearest"], done["linear"])
+    assert set(done["nearest"].unique().tolist()) == set(bright[::3].unique().tolist())
+    range_m = torch.full((64, 32), 5.0)
+    range_m[:, 16:] = 40.0
+    edge = RangeImage.stack([RangeImage(range_m, range_m > 0, SENSOR, range_m / 50)])
+    columns = torch.zeros(1, 64, 32, dtype=torch.bool)
+    columns[:, :, ::3] = True
+    filled = reflectance_of(fill("triangulation", Condition.of_pixels(edge, columns)))
+    assert filled.unique().tolist() == pytest.approx([0.1, 0.8])
+
+
+def test_hints_tell_the_reflectance_of_the_next_return_on_every_side():
+    range_m, bright = torch.zeros(1, 64, 32), torch.zeros(1, 64, 32)
+    range_m[0, 10, 4], range_m[0, 10, 30], range_m[0, 20, 6] = 5.0, 8.0, 11.0
+    bright[0, 10, 4], bright[0, 10, 30], bright[0, 20, 6] = 0.2, 0.4, 0.8
+    image = RangeImage(range_m, range_m > 0, SENSOR, bright)
+    found = hints_of(Condition.of_pixels(image, torch.ones_like(image.return_mask)))
+    assert found.reflectances is not None
+    assert found.reflectances[0, 1:, 10, 6].tolist() == pytest.approx([0.8, 0.8, 0.8, 0.2, 0.4])
+    mirrored = found.mirrored().reflectances
+    assert mirrored is not None
+    assert mirrored[0, 1:, 10, 25].tolist() == pytest.approx([0.8, 0.8, 0.8, 0.4, 0.2])
+    assert hints_of(Condition.nothing(SENSOR, 1)).reflectances is None
+
+
+@torch.no_grad()
+def test_the_loss_counts_hidden_returns_alone():
+    torch.manual_seed(0)
+    network, images = CompletionNetwork(NETWORK, SENSOR), streets(2)
+    terms = CompletionObjective(network, SENSOR).eval()(images, torch.Generator().manual_seed(4))
+    rng = torch.Generator().manual_seed(4)
+    observed = random_patterns(2, 64, 32, rng)
+    known = Condition.of_pixels(images, observed)
+    assert known.reflectance is not None
+    known = replace(known, reflectance=hidden_in_some(known.reflectance, TYPICAL_REFLECTANCE, 0.25, rng))
+    found = network(hints_of(known), observed).reflectance
+    assert found is not None
+    true, errors = reflectance_of(images), []
+    for scan in range(2):
+        of_scan = []
+        for row, column in np.ndindex(64, 32):
+            if images.return_mask[scan, row, column] and not observed[scan, row, column]:
+                of_scan.append(abs(float(found[scan, row, column]) - float(true[scan, row, column])))
+        errors.append(sum(of_scan) / len(of_scan))
+    assert float(terms["reflectance_error"]) == pytest.approx(sum(errors) / 2, rel=1e-4)
+
+
+def test_it_learns_reflectance_and_begins_near_triangulation():
+    torch.manual_seed(0)
+    network, images = CompletionNetwork(NETWORK, SENSOR), streets(4)
+    known = every_fourth_row(images)
+    both = ~known.return_observed & images.return_mask
+    with torch.no_grad():
+        begun = network(hints_of(known), known.return_observed).reflectance
+    triangulated = fill("triangulation", known).reflectance
+    assert triangulated is not None
+    assert images.reflectance is not None
+    assert float((begun - images.reflectance)[both].abs().mean()) < 0.04
+    assert float((triangulated - images.reflectance)[both].abs().mean()) < 0.04
+    objective = CompletionObjective(network, SENSOR).train()
+    errors = [terms["reflectance_error"] for terms in learn(objective, images, [0] * 12, 3e-3)]
+    assert errors[-1] < 0.9 * errors[0]
+    with pytest.raises(ConfigError, match=r"without reflectance, for model\.completion\.reflectance=true"):
+        objective(replace(images, reflectance=None), torch.Generator())
+
+
+@torch.no_grad()
+def test_without_it_nothing_grows_and_with_it_ranges_begin_the_same():
+    torch.manual_seed(0)
+    plain = CompletionNetwork(replace(NETWORK, reflectance=False), SENSOR).eval()
+    grown = CompletionNetwork(NETWORK, SENSOR).eval()
+    assert plain.state_dict().keys() < grown.state_dict().keys()
+    grown.load_state_dict({**grown.state_dict(), **plain.state_dict()})
+    known = every_fourth_row(streets(1))
+    one, other = (net.sample(known, [torch.Generator().manual_seed(3)]) for net in (plain, grown))
+    assert torch.equal(one.range_m, other.range_m)
+    assert one.reflectance is None
+    assert other.reflectance is not None
+
+
+def test_observed_reflectance_is_kept_bit_for_bit_and_scans_without_it_get_none(folders):
+    model, images = load(folders / "run"), streets(2)
+    known = every_fourth_row(images)
+    done = model.complete(known, [3, 4]).reflectance
+    assert done is not None
+    assert images.reflectance is not None
+    observed = known.return_observed
+    assert torch.equal(done[observed], images.reflectance[observed])
+    assert 0 <= float(done.min()) <= float(done.max()) <= 1
+    assert bool((done[~observed] > 0).any())
+    assert model.complete(every_fourth_row(replace(images, reflectance=None)), [3, 4]).reflectance is None
+    assert load(folders / "plain").complete(known, [3, 4]).reflectance is None
+
+
+def test_raydrop_learns_reflectance_from_marks():
+    torch.manual_seed(0)
+    images = streets(3)
+    assert images.reflectance is not None
+    returned = images.return_mask & (torch.arange(32) % 3 > 0)
+    marked = replace(images, reflectance=mark(returned, images.reflectance))
+    objective = RaydropObjective(RaydropNetwork(RAYDROP, SENSOR), SENSOR).eval()
+    rng = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        found = objective.raydrop(images.range_m, images.return_mask).reflectance
+        terms = objective(marked, rng)
+    errors = [float((found - images.reflectance)[scan][returned[scan]].abs().mean()) for scan in range(3)]
+    assert float(terms["reflectance_error"]) == pytest.approx(sum(errors) / 3, rel=1e-4)
+    learned = [terms["reflectance_error"] for terms in learn(objective.train(), marked, range(12), 1e-2)]
+    assert learned[-1] < 0.8 * learned[0]
+    with pytest.raises(ConfigError, match=r"without their reflectance, for model\.raydrop\.reflectance=true"):
+        objective(replace(images, reflectance=returned.float()), rng)
+    plain = RaydropObjective(RaydropNetwork(replace(RAYDROP, reflectance=False), SENSOR), SENSOR).eval()
+    with torch.no_grad():  # files that mark returns alone are the same to a network without reflectance
+        by_marks, bare = (
+            plain(replace(images, reflectance=marks), torch.Generator().manual_seed(0))
+            for marks in (marked.reflectance, returned.float())
+        )
+    assert by_marks["loss"] == bare["loss"]
+    real = RaydropObjective(RaydropNetwork(replace(RAYDROP, surfaces="estimated"), SENSOR), SENSOR).eval()
+    assert float(real(images, rng)["reflectance_error"]) > 0
+
+
+def test_raydrop_writes_the_reflectance_of_the_network_and_not_that_of_the_simulator(folders, tmp_path):
+    words = ["raydrop", f"{folders}/scans", "--device", "cpu", "--seed", "2"]
+    for name in ("run", "plain"):
+        assert main([*words[:2], f"{tmp_path}/{name}", "--model", f"{folders}/{name}", *words[2:]]) == 0
+    clean, bright, plain = (
+        KittiBin.read(folder / "1.bin") for folder in (folders / "scans", tmp_path / "run", tmp_path / "plain")
+    )
+    own = by_point(clean)
+    read = [(value, own[point]) for point, value in by_point(bright).items()]
+    assert len(read) > 100
+    assert sum(found == before for found, before in read) < 0.1 * len(read)
+    assert all(own[point] == value for point, value in by_point(plain).items())
+
+
+def test_complete_writes_it_and_its_error_is_told_where_both_have_it(folders, tmp_path, capsys):
+    words = ["complete", f"{folders}/scans", f"{tmp_path}/out", "--observed", "rows:4", "--device", "cpu"]
+    assert main([*words, "--model", f"{folders}/run"]) == 0
+    before, after = (KittiBin.read(root / "0.bin") for root in (folders / "scans", tmp_path / "out"))
+    own, values = by_point(before), by_point(after)
+    kept = own.keys() & values.keys()
+    assert len(kept) > 300
+    assert all(own[point] == values[point] for point in kept)
+    assert any(values[point] > 0 for point in values.keys() - kept)
+    capsys.readouterr()
+    compare = ["compare-completion", f"{folders}/scans", "--observed", "rows:4", "-n", "2", "--device", "cpu"]
+    assert main([*compare, f"{folders}/run", f"{folders}/plain", "triangulation"]) == 0
+    _, head, run, plain, triangles = capsys.readouterr().out.splitlines()
+    assert "error of reflectance" in head
+    column = slice(head.index("error of reflectance") - 6, head.index("error of reflectance") + 20)
+    errors = [line[column].split() for line in (run, plain, triangles)]
+    assert 0 < float(errors[2][0]) < float(errors[0][0]) + 0.05
+    assert not errors[1]
+    assert main([*compare, f"{folders}/plain"]) == 0
+    assert "reflectance" not in capsys.readouterr().out
+
+
+def test_a_stage_may_start_from_weights_that_lack_it_but_not_lose_it(folders):
+    def recipe(run: str, model: LidarGrit) -> Recipe:
+        settings = {"stages_from": str(folders / run), "fine_tune": ("raydrop",)}
+        return Recipe("grown", "lidargrit", model.config, DataConfig(), {}, **settings)
+
+    bright, plain = (load(folders / name) for name in ("run", "plain"))
+    assert isinstance(bright, LidarGrit)
+    assert isinstance(plain, LidarGrit)
+    grown = LidarGrit(replace(plain.config, raydrop=replace(RAYDROP, labels=True)), SENSOR)
+    taken = taken_stages(recipe("plain", grown), grown)["raydrop"]
+    assert taken.state_dict().keys() < grown.objective("raydrop").state_dict().keys()
+    with pytest.raises(ConfigError, match=r"whose completion is another \(model\.completion\.labels=True\)"):
+        taken_stages(recipe("plain", bright), bright)  # the completion stage is not fine-tuned
+    less = LidarGrit(replace(bright.config, raydrop=replace(RAYDROP, reflectance=False)), SENSOR)
+    with pytest.raises(ConfigError, match=r"whose raydrop is another \(model\.raydrop\.reflectance=True\)"):
+        taken_stages(recipe("run", less), less)
+
+
+def test_a_wrong_setting_is_refused_in_one_line(tmp_path, capsys):
+    assert main(train_words(tmp_path / "no", "model.completion.reflectance=perhaps")) == 2
+    the_one_line(capsys.readouterr().err, "train")
