@@ -59,7 +59,7 @@ class Objective(nn.Module, ABC):
 
 
 def hidden_in_some(
-    pixels: Shaped[Tensor, "B H W"], unknown: float, share: float, rng: torch.Generator
+    pixels: Shaped[Tensor, "B H W"], unknown: int | float, share: float, rng: torch.Generator
 ) -> Shaped[Tensor, "B H W"]:
     """Return the pixels of a batch, in some scans all of them unknown, so that a network learns to do without.
 
