@@ -1,0 +1,46 @@
+"""Scores of a table of ``lidargrit compare`` → files small enough to keep: the same without points of curves and paths.
+
+    python docs/results/keep_scores.py TABLE docs/results/fair/1e13
+
+``lidargrit evaluate --tables docs/results/fair/1e13/*.json`` prints the files side by side. Under ``costs`` stand the
+operations, parameters and seconds that ``compare`` measured.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+
+def kept(scores: dict, costs: dict, system: str) -> dict:
+    """Return the scores of a system without what only plots need, and without the folders of the machine."""
+    inputs = {name: dict(each) for name, each in scores["inputs"].items()}
+    inputs["samples"]["source"] = system
+    without_points = [{name: value for name, value in score.items() if name != "details"} for score in scores["scores"]]
+    return scores | {
+        "samples": system,
+        "inputs": inputs,
+        "scores": [score | {"details": {}} for score in without_points],
+        "costs": costs,
+    }
+
+
+def main() -> None:
+    """Write one file for each system."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("table", type=Path, help="folder of compare")
+    parser.add_argument("out", type=Path, help="folder to write to")
+    choices = parser.parse_args()
+    choices.out.mkdir(parents=True, exist_ok=True)
+    for file in sorted(choices.table.glob("*/costs.json")):
+        system = file.parent.name
+        scores_file = file.with_name(f"{system}.json")
+        if not scores_file.exists():
+            continue  # sampled, not yet scored
+        scores, costs = (json.loads(path.read_text(encoding="utf-8")) for path in (scores_file, file))
+        name = system.replace(":", ".").replace("=", "")  # names that every file system takes
+        text = json.dumps(kept(scores, costs, system), indent=1) + "\n"
+        (choices.out / f"{name}.json").write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
