@@ -5,10 +5,11 @@ from lidargrit.nn.pixel_networks import PixelDecoderConfig
 from lidargrit.recipes import compact_pixels
 from lidargrit.training import Recipe
 
+# One pixel of each 64x64 comes first, so that coarse pixels know of one another: without tokens nothing else tells them.
 RECIPE = Recipe(
     title="a pixel decoder without tokens, small: 64x256, for one CPU core and half an hour",
     generator="multiscale",
-    model=MultiscaleConfig(PixelDecoderConfig(row_channels=2, range_width=36)),
+    model=MultiscaleConfig(PixelDecoderConfig(coarsest_cell=64, row_channels=2, range_width=36)),
     data=compact_pixels.RECIPE.data,
     training={"pixels": compact_pixels.RECIPE.training["pixels"]},
 )
