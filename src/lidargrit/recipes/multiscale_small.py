@@ -5,7 +5,7 @@ from lidargrit.nn.pixel_networks import PixelDecoderConfig
 from lidargrit.recipes import compact_pixels
 from lidargrit.training import Recipe
 
-# One pixel of each 64x64 comes first, so that coarse pixels know of one another: without tokens nothing else tells them.
+# One pixel of each 64x64 comes first, so that coarse pixels know of one another, which no token tells them here.
 RECIPE = Recipe(
     title="a pixel decoder without tokens, small: 64x256, for one CPU core and half an hour",
     generator="multiscale",
