@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from lidargrit.cli._options import add_bad_scans, add_device
+from lidargrit.cli._options import add_device, add_scans, scan_settings
 from lidargrit.cli._results import add_json, print_result, refuse_taken
 from lidargrit.untrusted import seed_number
 
@@ -13,6 +13,7 @@ EXAMPLES = """\
   lidargrit compare-completion /data/kitti_odometry pretrained runs/r2dm linear triangulation -n 32
   lidargrit compare-completion /data/held_out runs/mine runs/mine:completion=tokens      by two methods of one run
   lidargrit compare-completion /data/held_out --observed rows:8 pixels:0.05 --json table.json
+  lidargrit compare-completion /data/held_out linear triangulation --set data.columns=2048 data.column_stride=2
 """
 
 
@@ -27,8 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     each = "number of completions of each scan by a model that is random"
     parser.add_argument("--completions", type=int, default=2, help=each)
     parser.add_argument("--seed", type=seed_number, default=0, help="seed of the completions and of random pixels")
-    parser.add_argument("--sensor", default="", help="sensor of the scans, if only classical methods are compared")
-    add_bad_scans(parser)
+    add_scans(parser)
     add_device(parser)
     add_json(parser)
 
@@ -40,17 +40,16 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.conditions.fills import FILLS
     from lidargrit.conditions.patterns import Pattern
     from lidargrit.evaluation.completion import PATTERNS, as_json, as_table, compare_completion
-    from lidargrit.loading import DataConfig
     from lidargrit.reporting import TerminalReporter
     from lidargrit.sources import open_images
 
     refuse_taken(options)
     patterns = [Pattern(text) for text in options.observed or PATTERNS]
     words = options.models or ["pretrained", *FILLS]
-    named = options.sensor or all(is_classical(word) for word in words)
-    sensor = sensor_of(options.scans, options.sensor) if named else None
+    settings = scan_settings(options, max_scans=options.count)
+    named = settings.sensor or settings.data.columns or all(is_classical(word) for word in words)
+    sensor = settings.data.imaged(sensor_of(options.scans, settings.sensor)) if named else None
     completers = open_completers(words, sensor, options.device)
-    config = DataConfig(max_scans=options.count, bad_points=options.bad_points, bad_scans=options.bad_scans)
-    images = open_images(options.scans, completers[0].sensor, config, TerminalReporter())
+    images = open_images(options.scans, completers[0].sensor, settings.data, TerminalReporter())
     scores = compare_completion(images, completers, patterns, options.completions, options.seed, TerminalReporter())
     print_result(options, as_table(scores), {"scans": options.scans, "scores": as_json(scores)})

@@ -123,7 +123,7 @@ def as_table(scores: Sequence[CompletionScore]) -> str:
     width = max(len(score.model) for score in scores) + 2
     for pattern in dict.fromkeys(score.observed for score in scores):
         lines.append(f"observed: {pattern}")
-        head = f"{'error [m]':>24}{'beside triangles [m]':>24}{'found':>8}{'IoU':>8}{'drop runs':>11}"
+        head = f"{'error [m]':>24}{'beside triangles [m]':>25}{'found':>8}{'IoU':>8}{'drop runs':>11}"
         labelled = any(score.class_accuracy is not None for score in scores)
         of_classes = f"{'right classes':>15}{'mIoU':>7}" if labelled else ""
         bright = any(score.reflectance_error is not None for score in scores)
@@ -140,7 +140,7 @@ def as_table(scores: Sequence[CompletionScore]) -> str:
             if score.class_accuracy is not None and score.class_iou is not None:
                 of_classes = f"{score.class_accuracy.value:>15.3f}{score.class_iou:>7.3f}"
             lines.append(
-                f"{score.model:<{width}}{score.mae_m.as_text('.3f'):>24}{beside:>24}{score.found.value:>8.3f}"
+                f"{score.model:<{width}}{score.mae_m.as_text('.3f'):>24}{beside:>25}{score.found.value:>8.3f}"
                 f"{score.iou.value:>8.3f}{score.drop_run_lengths:>11.4f}{diversity:>15}{score.seconds_per_scan:>10.3f}"
                 + of_reflectance
                 + of_classes
