@@ -10,11 +10,16 @@ from lidargrit.conditions.fills import fill
 from lidargrit.conditions.hints import hints_of
 from lidargrit.errors import ConfigError
 from lidargrit.generators import load
+from lidargrit.generators.completion_only import CompletionOnlyConfig
 from lidargrit.generators.lidargrit import LidarGrit, TokenSampling
+from lidargrit.generators.multiscale import MultiscaleConfig
+from lidargrit.loading import DataConfig
 from lidargrit.nn.completion_network import CompletionNetwork, CompletionNetworkConfig
 from lidargrit.nn.completion_objective import CompletionObjective, random_patterns
 from lidargrit.sensors import load_sensor
 from lidargrit.structures import RangeImage
+from lidargrit.training import Recipe
+from lidargrit.training.taken_stages import taken_stages
 from tiny_runs import learn
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
@@ -141,3 +146,23 @@ def test_a_model_with_the_stage_completes_by_it_and_survives_saving(tmp_path):
     plain = LidarGrit(LidarGrit.smallest_config(SENSOR), SENSOR)
     with pytest.raises(ConfigError, match="completion=network for a model without a network"):
         plain.complete(known, [1, 2], TokenSampling(completion="network"))
+
+
+def test_the_network_alone_starts_from_that_of_a_whole_model_of_other_columns(tmp_path):
+    torch.manual_seed(0)
+    whole = LidarGrit(replace(LidarGrit.smallest_config(SENSOR), completion=TINY), SENSOR)
+    whole.save(tmp_path)
+    wide = DataConfig(columns=64)
+    recipe = Recipe("a test", "completion_only", CompletionOnlyConfig(TINY), wide, {}, stages_from=str(tmp_path))
+    tuned = replace(recipe, fine_tune=("completion",))
+    taken = taken_stages(tuned, tuned.build_generator())["completion"]
+    for name, weight in whole.objective("completion").state_dict().items():
+        assert torch.equal(taken.state_dict()[name], weight), name
+    with pytest.raises(ConfigError, match=r"whose completion is another \(data.sensor\)"):
+        taken_stages(recipe, recipe.build_generator())
+    fewer_rows = replace(tuned, data=replace(wide, sensor="vlp16"))
+    with pytest.raises(ConfigError, match=r"whose completion is another \(data.sensor\)"):
+        taken_stages(fewer_rows, fewer_rows.build_generator())
+    other = replace(recipe, generator="multiscale", model=MultiscaleConfig())
+    with pytest.raises(ConfigError, match="a run of the generator 'lidargrit'; wanted a run of 'multiscale'"):
+        taken_stages(other, other.build_generator())

@@ -49,10 +49,12 @@ def taken_stages(recipe: Recipe, generator: Generator) -> dict[str, Objective]:
     """Return the trained stages that a recipe takes from another run, once they are known to fit the generator.
 
     Those that the recipe names in ``fine_tune`` are among them: their training starts from these weights. They may
-    lack what :attr:`Objective.additions` add, which begins untrained.
+    lack what :attr:`Objective.additions` add, which begins untrained, and may be of another sensor if its weights fit.
+    The run may be of another generator if what they share learns by the same objective.
 
     Raises:
-        ConfigError: a stage of other sizes, a run of another sensor, or of another kind of generator.
+        ConfigError: a stage of other sizes or another objective, a stage that is not trained of another sensor, or a
+            run of a generator without any of the recipe's stages.
         CheckpointError: no finished run.
     """
     if recipe.tokenizer_from is not None:
@@ -62,7 +64,8 @@ def taken_stages(recipe: Recipe, generator: Generator) -> dict[str, Objective]:
     if recipe.stages_from is None:
         return {}
     donor = load(Path(recipe.stages_from))
-    if type(donor) is not type(generator):
+    shared = [stage for stage in generator.stages if stage in donor.stages]
+    if type(donor) is not type(generator) and not _learn_alike(generator, donor, shared):
         raise ConfigError(
             f"stages_from={recipe.stages_from}, a run of the generator {donor.public_name()!r}",
             f"a run of {generator.public_name()!r}",
@@ -70,7 +73,6 @@ def taken_stages(recipe: Recipe, generator: Generator) -> dict[str, Objective]:
         )
     if unknown := sorted({*recipe.train_anew} - {*generator.stages}):
         raise ConfigError(f"train_anew={unknown[0]}", f"one of {', '.join(generator.stages)}", "name a stage")
-    shared = [stage for stage in generator.stages if stage in donor.stages]
     if unknown := sorted({*recipe.fine_tune} - {*shared} | {*recipe.fine_tune} & {*recipe.train_anew}):
         names = ", ".join(stage for stage in shared if stage not in recipe.train_anew)
         raise ConfigError(f"fine_tune={unknown[0]}", f"one of {names}", "name a stage that the run of stages_from has")
@@ -80,20 +82,30 @@ def taken_stages(recipe: Recipe, generator: Generator) -> dict[str, Objective]:
     return {stage: donor.objective(stage) for stage in stages}
 
 
-def _check(setting: str, generator: Generator, donor: Generator, stage: str, grows: bool = False) -> None:
-    """Refuse a stage whose sizes or sensor are not the generator's; one that grows may lack its additions."""
+def _learn_alike(generator: Generator, donor: Generator, stages: Sequence[str]) -> bool:
+    """Tell whether two kinds of generators share stages, and each of them is trained by the same objective."""
+    return bool(stages) and all(type(generator.objective(one)) is type(donor.objective(one)) for one in stages)
+
+
+def _check(setting: str, generator: Generator, donor: Generator, stage: str, trained: bool = False) -> None:
+    """Refuse a stage whose sizes or sensor are not the generator's.
+
+    One that is trained further may lack its additions, and may be of another sensor if its weights fit this one.
+    """
     ours, theirs = _settings(generator, stage), _settings(donor, stage)
     differing = [name for name in ours if ours[name] != theirs.get(name)]
-    if grows:
+    same_sensor = generator.sensor.same_rays(donor.sensor)
+    if trained:
         added = {name for name in generator.objective(stage).additions if ours.get(name) and not theirs.get(name)}
         differing = [name for name in differing if name not in added]
+        same_sensor |= _shapes(generator, stage).items() >= _shapes(donor, stage).items()
     if not ours and _shapes(generator, stage) != _shapes(donor, stage):  # its settings have no stage's name
         raise ConfigError(
             f"{setting}, whose {stage} has weights of other sizes",
             "one of this recipe's model and sensor",
             "set them as there, or choose another run",
         )
-    if differing or not generator.sensor.same_rays(donor.sensor):
+    if differing or not same_sensor:
         other = f"model.{stage}.{differing[0]}={theirs.get(differing[0])}" if differing else "data.sensor"
         raise ConfigError(
             f"{setting}, whose {stage} is another ({other})",

@@ -1,0 +1,76 @@
+"""A network that completes scans and nothing else: observed pixels → range images, by triangulation and a U-Net."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+
+from lidargrit.conditions import Condition
+from lidargrit.generators import Cost, Generator, NoSampling, SystemFacts
+from lidargrit.generators._batches import BatchSeeds
+from lidargrit.nn.completion_network import CompletionNetwork, CompletionNetworkConfig
+from lidargrit.nn.completion_objective import CompletionObjective
+from lidargrit.nn.flops import flops_of
+from lidargrit.nn.objective import Objective
+from lidargrit.sensors import SensorModel
+from lidargrit.structures import RangeImage
+
+
+@dataclass(frozen=True)
+class CompletionOnlyConfig:
+    """The network, which is the whole system.
+
+    Args:
+        completion: sizes of the network that completes scans.
+    """
+
+    completion: CompletionNetworkConfig = field(default_factory=CompletionNetworkConfig)
+
+
+class CompletionOnly(Generator[CompletionOnlyConfig, NoSampling]):
+    """The completion network of LidarGRIT by itself, for a sensor or a size for which there is no whole model.
+
+    Its range is a best guess and its mask is sampled. A scan of which nothing is observed is completed, too, but it
+    never learned that: such scans all have the same ranges, so that it is no model of scans.
+    """
+
+    Config = CompletionOnlyConfig
+    facts = SystemFacts(writes="range as a best guess and raydrop around observed pixels; no scans worth sampling")
+    capabilities = frozenset({"complete"})
+
+    def __init__(self, config: CompletionOnlyConfig, sensor: SensorModel) -> None:
+        super().__init__(config, sensor)
+        self.completion = CompletionNetwork(config.completion, sensor)
+
+    @classmethod
+    def smallest_config(cls, sensor: SensorModel) -> CompletionOnlyConfig:
+        """Return networks of eight channels and one block."""
+        sizes = CompletionNetworkConfig((8, 8, 8), blocks=1, attention_layers=1, heads=2, features=4, mask_width=4)
+        return CompletionOnlyConfig(sizes)
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """The network alone."""
+        return ("completion",)
+
+    def objective(self, stage: str) -> Objective:
+        """Return the errors of hidden pixels."""
+        return CompletionObjective(self.completion, self.sensor)
+
+    def load_stage(self, stage: str, objective: Objective) -> None:
+        """Take over the trained weights."""
+        self.completion.load_state_dict(objective.get_submodule(stage).state_dict())
+
+    def _sample(self, seeds: BatchSeeds, sampling: NoSampling) -> RangeImage:
+        return self._complete(Condition.nothing(self.sensor, len(seeds)).to(self.device), seeds, sampling)
+
+    def _complete(self, condition: Condition, seeds: BatchSeeds, sampling: NoSampling) -> RangeImage:
+        rngs = [torch.Generator().manual_seed(seed) for seed in seeds]  # on the CPU: the same numbers on every device
+        return self.completion.sample(condition, rngs)
+
+    def cost(self, sampling: NoSampling | None = None) -> Cost:
+        """Return the cost of two estimates of the range and all phases of the mask."""
+        mask, unet = self.completion.mask, self.completion.unet
+        inputs = (1, unet.enter.in_channels // 4, self.sensor.height, self.sensor.width)
+        return Cost(2 + len(mask.phases), 2 * flops_of(unet, inputs) + mask.flops())

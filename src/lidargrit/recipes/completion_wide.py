@@ -1,0 +1,29 @@
+"""A network that completes scans of 64x1024, trained further from that of the model in the package."""
+
+from dataclasses import replace
+
+from lidargrit.generators.completion_only import CompletionOnlyConfig
+from lidargrit.recipes import compact_completion, multiscale_wide
+from lidargrit.training import Recipe
+
+RECIPE = Recipe(
+    title="a network that completes scans: 64x1024, for one CPU core and an hour",
+    generator="completion_only",
+    model=CompletionOnlyConfig(compact_completion.RECIPE.model.completion),
+    data=multiscale_wide.RECIPE.data,
+    training={
+        "completion": replace(
+            compact_completion.RECIPE.training["completion"],
+            scans=2500,
+            batch_size=2,
+            learning_rate=8e-4,
+            warmup_scans=100,
+            average_over_scans=150,
+            validate_every=500,
+            validation_scans=12,
+            checkpoint_every=250,
+        )
+    },
+    stages_from="pretrained",
+    fine_tune=("completion",),
+)
