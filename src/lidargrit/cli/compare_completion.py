@@ -50,6 +50,6 @@ def run(options: argparse.Namespace) -> None:
     named = settings.sensor or settings.data.columns or all(is_classical(word) for word in words)
     sensor = settings.data.imaged(sensor_of(options.scans, settings.sensor)) if named else None
     completers = open_completers(words, sensor, options.device)
-    images = open_images(options.scans, completers[0].sensor, settings.data, TerminalReporter())
+    images = open_images(options.scans, settings.data.imaged(completers[0].sensor), settings.data, TerminalReporter())
     scores = compare_completion(images, completers, patterns, options.completions, options.seed, TerminalReporter())
     print_result(options, as_table(scores), {"scans": options.scans, "scores": as_json(scores)})

@@ -7,7 +7,7 @@ from lidargrit.recipes import compact_completion, multiscale_wide
 from lidargrit.training import Recipe
 
 RECIPE = Recipe(
-    title="a network that completes scans: 64x1024, for one CPU core and an hour",
+    title="a network that completes scans: 64x1024, for one CPU core and half an hour",
     generator="completion_only",
     model=CompletionOnlyConfig(compact_completion.RECIPE.model.completion),
     data=multiscale_wide.RECIPE.data,
