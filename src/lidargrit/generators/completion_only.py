@@ -11,7 +11,7 @@ from lidargrit.generators import Cost, Generator, NoSampling, SystemFacts
 from lidargrit.generators._batches import BatchSeeds
 from lidargrit.nn.completion_network import CompletionNetwork, CompletionNetworkConfig
 from lidargrit.nn.completion_objective import CompletionObjective
-from lidargrit.nn.flops import flops_of
+from lidargrit.nn.flops import FlopCounter
 from lidargrit.nn.objective import Objective
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
@@ -70,7 +70,8 @@ class CompletionOnly(Generator[CompletionOnlyConfig, NoSampling]):
         return self.completion.sample(condition, rngs)
 
     def cost(self, sampling: NoSampling | None = None) -> Cost:
-        """Return the cost of two estimates of the range and all phases of the mask."""
-        mask, unet = self.completion.mask, self.completion.unet
-        inputs = (1, unet.enter.in_channels // 4, self.sensor.height, self.sensor.width)
-        return Cost(2 + len(mask.phases), 2 * flops_of(unet, inputs) + mask.flops())
+        """Return the cost of two estimates of the range and all phases of the mask, counted while it is computed."""
+        nothing = Condition.nothing(self.sensor, 1).to(self.device)
+        with torch.no_grad(), FlopCounter() as counter:
+            self.completion.sample(nothing, [torch.Generator()])
+        return Cost(2 + len(self.completion.mask.phases), counter.total)
