@@ -26,7 +26,7 @@ from lidargrit.projection import project, unproject
 from lidargrit.sensors import load_sensor
 from lidargrit.simulator.labels import LABELS, OTHER_OBJECT, OTHER_STRUCTURE
 from lidargrit.structures import RangeImage
-from tiny_runs import learn
+from tiny_runs import every_fourth_row, learn
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
 NETWORK = CompletionNetworkConfig(
@@ -44,12 +44,6 @@ def streets(count: int) -> RangeImage:
     label = torch.where(torch.arange(64)[:, None] < 30, BUILDING, ROAD).expand(count, 64, 32)
     returned = torch.rand(count, 64, 32, generator=rng) < 0.8
     return RangeImage.masked(range_m, returned, SENSOR, label=label)
-
-
-def every_fourth_row(images: RangeImage) -> Condition:
-    observed = torch.zeros_like(images.return_mask)
-    observed[:, 2::4] = True
-    return Condition.of_pixels(images, observed)
 
 
 @pytest.fixture(scope="module")

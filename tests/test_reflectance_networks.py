@@ -28,7 +28,7 @@ from lidargrit.sensors import load_sensor
 from lidargrit.structures import RangeImage, Scan
 from lidargrit.training.config import Recipe
 from lidargrit.training.taken_stages import taken_stages
-from tiny_runs import learn, the_one_line, train_words
+from tiny_runs import every_fourth_row, learn, the_one_line, train_words
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
 NETWORK = CompletionNetworkConfig(
@@ -55,12 +55,6 @@ def by_point(scan: Scan) -> dict[tuple[float, ...], float]:
     assert scan.reflectance is not None
     points = (tuple(point) for point in scan.points_xyz_m.tolist())
     return dict(zip(points, scan.reflectance.tolist(), strict=True))
-
-
-def every_fourth_row(images: RangeImage) -> Condition:
-    observed = torch.zeros_like(images.return_mask)
-    observed[:, 2::4] = True
-    return Condition.of_pixels(images, observed)
 
 
 @pytest.fixture(scope="module")

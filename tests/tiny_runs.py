@@ -6,6 +6,7 @@ from pathlib import Path
 
 import torch
 
+from lidargrit.conditions import Condition
 from lidargrit.nn.objective import Objective
 from lidargrit.structures import RangeImage
 
@@ -62,3 +63,10 @@ def learn(objective: Objective, images: RangeImage, seeds: Iterable[int], learni
         optimiser.step()
         found.append({name: float(term.detach()) for name, term in terms.items()})
     return found
+
+
+def every_fourth_row(images: RangeImage) -> Condition:
+    """Return what is known of scans whose every fourth row is observed."""
+    observed = torch.zeros_like(images.return_mask)
+    observed[:, 2::4] = True
+    return Condition.of_pixels(images, observed)

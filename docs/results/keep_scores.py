@@ -15,11 +15,10 @@ def kept(scores: dict, costs: dict, system: str) -> dict:
     """Return the scores of a system without what only plots need, and without the folders of the machine."""
     inputs = {name: dict(each) for name, each in scores["inputs"].items()}
     inputs["samples"]["source"] = system
-    without_points = [{name: value for name, value in score.items() if name != "details"} for score in scores["scores"]]
     return scores | {
         "samples": system,
         "inputs": inputs,
-        "scores": [score | {"details": {}} for score in without_points],
+        "scores": [score | {"details": {}} for score in scores["scores"]],
         "costs": costs,
     }
 

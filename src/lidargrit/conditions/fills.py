@@ -155,13 +155,12 @@ def triangulate(seen: Observed) -> Triangles:
         one_surface = inside & (np.ptp(log_m, axis=1) <= EDGE) & (filled_m > 0)
     found = Triangles.none(seen, seen.nearest_range_m)
     found.range_m[_part(missing, one_surface)] = filled_m[one_surface]
-    order = np.argsort(-weights[inside], axis=1)
+    order = np.argsort(-weights, axis=1)
     chosen = (slice(None), *_part(missing, inside))
-    found.corners_m[chosen] = np.take_along_axis(of_corners_m[inside], order, axis=1).T
-    found.weights[chosen] = np.take_along_axis(weights[inside], order, axis=1).T
-    order = np.argsort(-weights[one_surface], axis=1)
+    found.corners_m[chosen] = np.take_along_axis(of_corners_m, order, axis=1)[inside].T
+    found.weights[chosen] = np.take_along_axis(weights, order, axis=1)[inside].T
     chosen = (slice(None), *_part(missing, one_surface))
-    found.corner_pixels[chosen] = pixels[np.take_along_axis(of_corners[one_surface], order, axis=1)].T
+    found.corner_pixels[chosen] = pixels[np.take_along_axis(of_corners, order, axis=1)[one_surface]].T
     return found
 
 

@@ -57,14 +57,14 @@ class CompletionObjective(Objective):
             ConfigError: a network with classes and scans without labels, or one with reflectance and scans without it.
         """
         observed = random_patterns(len(images), self.sensor.height, self.sensor.width, rng)
-        condition = Condition.of_pixels(images, observed)
-        if self.completion.classes is not None:
-            seen = hidden_in_some(labels_to_learn(condition.label), 0, _WITHOUT, rng)
-            condition = replace(condition, label=seen)
-        if self.completion.config.reflectance:
+        condition, learned = Condition.of_pixels(images, observed), self.completion.config
+        label, reflectance = None, None  # no hints are computed of what the network does not see
+        if learned.labels:
+            label = hidden_in_some(labels_to_learn(condition.label), 0, _WITHOUT, rng)
+        if learned.reflectance:
             shown = reflectance_to_learn(condition.reflectance, "model.completion.reflectance")
-            shown = hidden_in_some(shown, TYPICAL_REFLECTANCE, _WITHOUT, rng)
-            condition = replace(condition, reflectance=shown)
+            reflectance = hidden_in_some(shown, TYPICAL_REFLECTANCE, _WITHOUT, rng)
+        condition = replace(condition, label=label, reflectance=reflectance)
         point = self.completion(hints_of(condition), observed)
         hidden = ~observed
         returns = (hidden & images.return_mask).float()
