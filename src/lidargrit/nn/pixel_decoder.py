@@ -24,6 +24,8 @@ _Guided = tuple[
     dict[Lattice, Tensor], dict[Lattice, Tensor]
 ]  # by lattice: the guide's part of the first layers, of both
 
+_ALL_PHASES_ROWS = 4  # training counts all phases of lattices from this distance on: a tenth of the pixels
+
 BITS_STEP_M = 0.01  # bits of a return are those of naming its range to a centimetre
 
 
@@ -137,21 +139,26 @@ class PixelDecoder(nn.Module):
     def estimate(
         self, decoded: Decoded | None, images: RangeImage, rng: torch.Generator
     ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-        """Return the mean nats of the mask a pixel and of the range a return, estimated by one phase of each lattice.
+        """Return the mean nats of the mask a pixel and of the range a return, estimated by some of the phases.
 
-        A step of training costs a third, and so there are three times as many. The estimate of the mask is unbiased.
+        Of a fine lattice one phase counts for all: a step of training costs a third, and so there are three times as
+        many. Coarse lattices have few pixels to learn from, and all their phases count. The estimate of the mask is
+        unbiased.
         """
         guide = self.guide(decoded, len(images))
         guided = self.mask.guided(guide), self.range.guided(guide)
         mask_nats, range_nats = guide.v.new_zeros(()), guide.v.new_zeros(())
         returns = guide.v.new_zeros(())
         for phases in self.mask.by_lattice():
-            index = torch.randint(len(phases), (), generator=rng, device=rng.device)
-            chosen = [phases[0 if index.is_meta else int(index)]]  # all take as many operations, if these are counted
+            chosen = phases
+            if phases[0].lattice.rows < _ALL_PHASES_ROWS:
+                index = torch.randint(len(phases), (), generator=rng, device=rng.device)
+                chosen = [phases[0 if index.is_meta else int(index)]]  # all take as many operations, if counted
             of_mask, of_range = self._nll(chosen, guided, guide, images)
-            mask_nats = mask_nats + len(phases) * of_mask.sum()
-            range_nats = range_nats + len(phases) * of_range.sum()
-            returns = returns + len(phases) * at_phases(images.return_mask, chosen).sum()
+            share = len(phases) / len(chosen)
+            mask_nats = mask_nats + share * of_mask.sum()
+            range_nats = range_nats + share * of_range.sum()
+            returns = returns + share * at_phases(images.return_mask, chosen).sum()
         return mask_nats / guide.v.numel(), range_nats / returns.clamp(min=1)
 
     @property

@@ -26,6 +26,7 @@ _TYPICAL_V = 2.5  # ln(1 + 11 m), the middle of what scans hold, so that inputs 
 _LOGIT_BOUND = 8.0  # of the decoder's return logits, beyond which it is as good as sure
 _SAME_SURFACE_V = 3e-4  # two ranges nearer than this, 6 mm at 20 m, are on one surface
 _NEIGHBOURS = 6  # candidates of a range: an interpolation and two neighbours, of each of two pairs
+_COARSE_ROWS = 8  # lattices from this distance on are coarse
 _FINEST_M, _COARSEST_M = math.exp(-6), math.exp(4)  # scales of a component: 2.5 mm to 55 m
 
 
@@ -43,6 +44,8 @@ class PixelDecoderConfig:
         row_channels: number of learned values of every row.
         mask_width: number of channels of the mask network's layers.
         range_width: number of channels of the range network's layers.
+        coarse_range_width: the same where pixels are 8 rows or more apart, which hardly costs time and is where walls
+            become straight; 0 for ``range_width``.
         blocks: number of residual blocks of each network.
         free_components: number of components of a range's distribution that do not begin at a neighbour's range; 6 more
             do.
@@ -55,13 +58,14 @@ class PixelDecoderConfig:
     row_channels: int = 4
     mask_width: int = 32
     range_width: int = 48
+    coarse_range_width: int = 0
     blocks: int = 2
     free_components: int = 4
 
     def __post_init__(self) -> None:
         phases_of(self.coarsest_cell)
         for name, value in vars(self).items():
-            least = 0 if name == "column_halvings" else 1
+            least = 0 if name in ("column_halvings", "coarse_range_width") else 1
             if value < least:
                 raise ConfigError(f"{name}={value}", f"at least {least}", "raise it")
 
@@ -156,7 +160,13 @@ class PhaseNetwork(nn.Module, ABC):
     """Base of the mask's and the range's network: a small network for each lattice, run anew for every phase."""
 
     def __init__(
-        self, config: PixelDecoderConfig, sensor: SensorModel, features: int, kept: int, width: int, outputs: int
+        self,
+        config: PixelDecoderConfig,
+        sensor: SensorModel,
+        features: int,
+        kept: int,
+        widths: tuple[int, int],
+        outputs: int,
     ) -> None:
         super().__init__()
         self.phases, self.sensor = phases_of(config.coarsest_cell, config.column_halvings), sensor
@@ -168,8 +178,10 @@ class PhaseNetwork(nn.Module, ABC):
         self.networks = nn.ModuleDict()
         for phases in self.by_lattice():
             context = self.context_channels + (0 if features else self.added_without_tokens)
+            lattice = phases[0].lattice
+            width = widths[lattice.rows >= _COARSE_ROWS]
             network = _LatticeNetwork(guide, context, width, config.blocks, len(phases), outputs)
-            self.networks[phases[0].lattice.name] = network
+            self.networks[lattice.name] = network
 
     context_channels: int
     added_without_tokens = 0
@@ -228,7 +240,7 @@ class MaskNetwork(PhaseNetwork):
     context_channels = 4 * 2
 
     def __init__(self, config: PixelDecoderConfig, sensor: SensorModel, features: int) -> None:
-        super().__init__(config, sensor, features, config.mask_features, config.mask_width, 1)
+        super().__init__(config, sensor, features, config.mask_features, (config.mask_width,) * 2, 1)
         self.row_bias = nn.Parameter(torch.zeros(sensor.height))
 
     @classmethod
@@ -311,7 +323,8 @@ class RangeNetwork(PhaseNetwork):
 
     def __init__(self, config: PixelDecoderConfig, sensor: SensorModel, features: int) -> None:
         components = config.free_components + _NEIGHBOURS
-        super().__init__(config, sensor, features, config.range_features, config.range_width, 3 * components)
+        widths = (config.range_width, config.coarse_range_width or config.range_width)
+        super().__init__(config, sensor, features, config.range_features, widths, 3 * components)
         self.limits_m = (sensor.range_min_m, sensor.range_max_m)
         self.free = config.free_components
         begin = torch.cat((torch.linspace(-0.2, 0.2, self.free), torch.zeros(_NEIGHBOURS)))

@@ -50,7 +50,8 @@ def taken_stages(recipe: Recipe, generator: Generator) -> dict[str, Objective]:
     """Return the trained stages that a recipe takes from another run, once they are known to fit the generator.
 
     Those that the recipe names in ``fine_tune`` are among them: their training starts from these weights. They may
-    lack what :attr:`Objective.additions` add, which begins untrained, and may be of another sensor if its weights fit.
+    lack what :attr:`Objective.additions` add, which begins untrained, may have had another dropout, and may be of
+    another sensor if its weights fit.
     The run may be of another generator if what they share learns by the same objective.
 
     Raises:
@@ -92,14 +93,15 @@ def _learn_alike(generator: Generator, donor: Generator, stages: Sequence[str]) 
 def _check(setting: str, generator: Generator, donor: Generator, stage: str, trained: bool = False) -> None:
     """Refuse a stage whose sizes or sensor are not the generator's.
 
-    One that is trained further may lack its additions, and may be of another sensor if its weights fit this one.
+    One that is trained further may lack its additions, may have had another dropout, and may be of another sensor if
+    its weights fit this one.
     """
     ours, theirs = _settings(generator, stage), _settings(donor, stage)
     differing = [name for name in ours if ours[name] != theirs.get(name)]
     same_sensor = generator.sensor.same_rays(donor.sensor)
     if trained:
         added = {name for name in generator.objective(stage).additions if ours.get(name) and not theirs.get(name)}
-        differing = [name for name in differing if name not in added]
+        differing = [name for name in differing if name not in added and not name.endswith("dropout")]
         same_sensor |= _shapes(generator, stage).items() >= _shapes(donor, stage).items()
     if not ours and _shapes(generator, stage) != _shapes(donor, stage):  # its settings have no stage's name
         raise ConfigError(
