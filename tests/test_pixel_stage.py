@@ -293,6 +293,25 @@ def test_fine_tuning_starts_from_the_weights_of_the_other_run(tmp_path):
         replace(recipe, stages_from=None)
 
 
+def test_fine_tuning_takes_a_run_of_fewer_columns_and_another_dropout(tmp_path):
+    made().save(tmp_path / "donor")
+    recipe = recipe_of(PIXELS, stages_from=str(tmp_path / "donor"))
+    wide = replace(recipe, data=replace(recipe.data, columns=512, column_stride=4))
+    wide = replace(wide, model=replace(wide.model, transformer=replace(TRANSFORMER, residual_dropout=0.0)))
+    with pytest.raises(ConfigError, match="whose tokenizer is another"):
+        taken_stages(wide, wide.build_generator())
+    wide = replace(wide, fine_tune=("tokenizer", "transformer", "pixels"))
+    generator = wide.build_generator()
+    objective = generator.objective("transformer")
+    weights = objective.weights_from(taken_stages(wide, generator)["transformer"])
+    objective.load_state_dict(weights)
+    fine = generator.transformer.pos_emb.unflatten(1, generator.tokenizer.grid_size)
+    coarse = made().transformer.pos_emb.unflatten(1, (8, 8))
+    assert fine.shape[2] == 2 * coarse.shape[2]
+    # Two new columns lie in each old one, a quarter of its width to either side of its centre.
+    assert torch.allclose(fine[:, :, 2], 0.75 * coarse[:, :, 1] + 0.25 * coarse[:, :, 0])
+
+
 def test_a_run_of_other_sizes_or_another_kind_gives_no_stages(tmp_path):
     train(recipe_of(None), tmp_path / "first")
     recipe = recipe_of(PIXELS, stages_from=str(tmp_path / "first"))

@@ -9,7 +9,7 @@ from scipy import stats
 
 from lidargrit.generators.lidargrit import START_TOKEN, TokenSampling, after_start, sample_token
 from lidargrit.nn.decoding import CachedDecoder
-from lidargrit.nn.transformer import CausalTransformer, TransformerConfig
+from lidargrit.nn.transformer import CausalTransformer, TransformerConfig, resample_positions
 from reference_weights import seeded_weights
 
 GREEDY = TokenSampling(temperature=0.0)
@@ -196,3 +196,14 @@ def test_a_changed_weight_is_noticed_and_token_bits_are_those_of_the_transformer
             assert float(bits.tokens.flatten()[position]) == pytest.approx(-np.log2(float(share)), abs=1e-4)
         generator.transformer.head.weight.mul_(-30)
     assert not torch.equal(generator.sample([0]).range_m, first.range_m)
+
+
+def test_positions_are_interpolated_around_the_azimuth():
+    rows, old, new = 3, 8, 32
+    centres = (np.arange(old) + 0.5) * 360 / old
+    learned = torch.arange(rows)[:, None, None] * 10 + torch.from_numpy(np.cos(np.deg2rad(centres)))[None, :, None]
+    found = resample_positions(learned.flatten(0, 1)[None], (rows, old), new)[0].unflatten(0, (rows, new))
+    wanted = np.interp((np.arange(new) + 0.5) * 360 / new, centres, np.cos(np.deg2rad(centres)), period=360)
+    for row in range(rows):
+        assert np.allclose(found[row, :, 0].numpy(), 10 * row + wanted)
+    assert torch.equal(resample_positions(learned.flatten(0, 1)[None], (rows, old), old)[0], learned.flatten(0, 1))

@@ -22,7 +22,7 @@ from lidargrit.nn.pixel_networks import PixelDecoderConfig
 from lidargrit.nn.precision import without_autocast
 from lidargrit.nn.processes import sum_over_processes
 from lidargrit.nn.range_steps import RangeSteps
-from lidargrit.nn.transformer import Transformer, TransformerConfig
+from lidargrit.nn.transformer import Transformer, TransformerConfig, resample_positions
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage, ScanBits, TokenGrid
 from lidargrit.tokenizers import Tokenizer, TokenizerConfig, make_tokenizer
@@ -200,6 +200,16 @@ class TokenObjective(Objective):
         self.transformer = transformer
         self._frozen = [tokenizer.eval().requires_grad_(False)]  # in a list: its weights are not this stage's
         self.register_buffer("token_counts", torch.ones(transformer.num_tokens))
+
+    def weights_from(self, trained: Objective) -> dict[str, Tensor]:
+        """Return the weights of a trained transformer, with its positions resampled to this one's columns of tokens."""
+        weights = super().weights_from(trained)
+        if isinstance(trained, TokenObjective):
+            ours, theirs = self._frozen[0].grid_size, trained._frozen[0].grid_size
+            if ours[0] == theirs[0] and ours != theirs:
+                name = "transformer.pos_emb"
+                weights[name] = resample_positions(weights[name], theirs, ours[1])
+        return weights
 
     @torch.no_grad()
     def encode(self, images: RangeImage) -> tuple[Int[Tensor, "B T"], Float[Tensor, "B T"]]:

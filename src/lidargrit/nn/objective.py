@@ -53,6 +53,13 @@ class Objective(nn.Module, ABC):
         """
         return 0
 
+    def weights_from(self, trained: Objective) -> dict[str, Tensor]:
+        """Return the weights of a trained objective of this kind in the shapes of this one's, where that is possible.
+
+        Training goes on from them; weights that the trained one lacks keep the values that they have.
+        """
+        return dict(trained.state_dict())
+
     def warnings(self) -> list[str]:
         """Return lines that a person should read after a validation, such as that a codebook has collapsed."""
         return []

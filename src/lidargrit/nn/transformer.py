@@ -139,6 +139,27 @@ class TransformerBlock(Block):
         return x + self.drop(self.mlp(self.ln2(x)))
 
 
+def resample_positions(
+    positions: Float[Tensor, "1 T C"], grid: tuple[int, int], columns: int
+) -> Float[Tensor, "1 T_new C"]:
+    """Return positions learned for one token grid for a grid of as many rows and another number of columns.
+
+    Every column of the new grid takes the linear interpolation of the two old ones around its azimuth, which wraps.
+
+    Args:
+        positions: learned positions, row by row.
+        grid: rows and columns of the grid that they were learned for.
+        columns: columns of the new grid.
+    """
+    rows, old = grid
+    at = (torch.arange(columns, dtype=torch.float64) + 0.5) * old / columns - 0.5  # centres of the new columns
+    left = at.floor().long()
+    weight = (at - left).to(positions)[:, None]
+    by_column = positions.unflatten(1, (rows, old))
+    mixed = by_column[:, :, left % old] * (1 - weight) + by_column[:, :, (left + 1) % old] * weight
+    return mixed.flatten(1, 2)
+
+
 def _initialise(module: nn.Module) -> None:
     if isinstance(module, nn.Linear | nn.Embedding):
         nn.init.normal_(module.weight, std=0.02)

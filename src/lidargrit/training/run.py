@@ -86,7 +86,7 @@ def _train(recipe: Recipe, folder: Path, reporter: Reporter, plot: PlotProgress 
             else:
                 seed, objective = derive_seed(recipe.seed, number), generator.objective(stage)
                 if stage in taken:
-                    objective.load_state_dict({**objective.state_dict(), **taken[stage].state_dict()})
+                    objective.load_state_dict({**objective.state_dict(), **objective.weights_from(taken[stage])})
                 picture = None if plot is None else partial(_plot, plot, generator, stage, val_images)
                 workers, config = recipe.data.workers, recipe.training[stage]
                 fit = Fit(objective, config, folder / stage, seed, reporter, built_on, workers, picture)

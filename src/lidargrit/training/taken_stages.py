@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from lidargrit import configuration
 from lidargrit.errors import ConfigError
@@ -102,8 +103,11 @@ def _check(setting: str, generator: Generator, donor: Generator, stage: str, tra
     if trained:
         added = {name for name in generator.objective(stage).additions if ours.get(name) and not theirs.get(name)}
         differing = [name for name in differing if name not in added and not name.endswith("dropout")]
-        same_sensor |= _shapes(generator, stage).items() >= _shapes(donor, stage).items()
-    if not ours and _shapes(generator, stage) != _shapes(donor, stage):  # its settings have no stage's name
+        objective = generator.objective(stage)
+        taken = objective.weights_from(donor.objective(stage))
+        same_sensor |= _shapes(objective.state_dict()).items() >= _shapes(taken).items()
+    states = generator.objective(stage).state_dict(), donor.objective(stage).state_dict()
+    if not ours and _shapes(states[0]) != _shapes(states[1]):  # its settings have no stage's name
         raise ConfigError(
             f"{setting}, whose {stage} has weights of other sizes",
             "one of this recipe's model and sensor",
@@ -118,8 +122,8 @@ def _check(setting: str, generator: Generator, donor: Generator, stage: str, tra
         )
 
 
-def _shapes(generator: Generator, stage: str) -> dict[str, torch.Size]:
-    return {name: weight.shape for name, weight in generator.objective(stage).state_dict().items()}
+def _shapes(weights: Mapping[str, Tensor]) -> dict[str, torch.Size]:
+    return {name: weight.shape for name, weight in weights.items()}
 
 
 def _settings(generator: Generator, stage: str) -> dict[str, Any]:
