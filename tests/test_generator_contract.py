@@ -234,7 +234,8 @@ def test_an_objective_has_a_finite_loss_and_gradients(name):
         assert gradients
         assert all(bool(gradient.isfinite().all()) for gradient in gradients)
         objective.zero_grad()
-    generator.eval().requires_grad_(True)  # a stage may have frozen another's weights
+    assert all(weight.requires_grad for weight in generator.parameters()), "an objective froze weights"
+    generator.eval()
 
 
 def test_tells_what_it_writes_and_where_it_comes_from(name):

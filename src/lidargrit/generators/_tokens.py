@@ -16,10 +16,10 @@ from lidargrit.conditions import Condition
 from lidargrit.conditions.fills import fill_from_nearest
 from lidargrit.errors import ConfigError
 from lidargrit.generators import Cost, Generator
+from lidargrit.nn.encoding_cache import EncodingCache
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.pixel_decoder import PixelDecoder, PixelSampling, nats_to_range_bits
 from lidargrit.nn.pixel_networks import PixelDecoderConfig
-from lidargrit.nn.precision import without_autocast
 from lidargrit.nn.processes import sum_over_processes
 from lidargrit.nn.range_steps import RangeSteps
 from lidargrit.nn.transformer import Transformer, TransformerConfig, resample_positions
@@ -197,15 +197,15 @@ class TokenObjective(Objective):
 
     def __init__(self, tokenizer: Tokenizer, transformer: Transformer) -> None:
         super().__init__(tokenizer.sensor)
-        self.transformer = transformer
-        self._frozen = [tokenizer.eval().requires_grad_(False)]  # in a list: its weights are not this stage's
+        self.transformer, self._grid_size = transformer, tokenizer.grid_size
+        self._tokens = EncodingCache(tokenizer, _tokens)
         self.register_buffer("token_counts", torch.ones(transformer.num_tokens))
 
     def weights_from(self, trained: Objective) -> dict[str, Tensor]:
         """Return the weights of a trained transformer, with its positions resampled to this one's columns of tokens."""
         weights = super().weights_from(trained)
         if isinstance(trained, TokenObjective):
-            ours, theirs = self._frozen[0].grid_size, trained._frozen[0].grid_size
+            ours, theirs = self._grid_size, trained._grid_size
             if ours[0] == theirs[0] and ours != theirs:
                 name = "transformer.pos_emb"
                 weights[name] = resample_positions(weights[name], theirs, ours[1])
@@ -214,10 +214,7 @@ class TokenObjective(Objective):
     @torch.no_grad()
     def encode(self, images: RangeImage) -> tuple[Int[Tensor, "B T"], Float[Tensor, "B T"]]:
         """Return the tokens, and their negative log-likelihood in nats by a model that knows only token frequencies."""
-        # Tokens are computed in full precision, as when a scan is encoded outside of training.
-        with without_autocast(images.range_m.device):
-            self._frozen[0].to(images.range_m.device)
-            tokens = self._frozen[0].encode(images).tokens.flatten(1)
+        tokens = self._tokens(images).long().flatten(1)
         if self.training:
             ones = torch.ones_like(tokens, dtype=self.token_counts.dtype).flatten()
             self.token_counts += sum_over_processes(
@@ -237,8 +234,7 @@ class PixelObjective(Objective):
     def __init__(self, pixels: PixelDecoder, tokenizer: Tokenizer | None = None) -> None:
         super().__init__(pixels.sensor)
         self.pixels = pixels
-        # in a list: its weights are not this stage's
-        self._frozen = [] if tokenizer is None else [tokenizer.eval().requires_grad_(False)]
+        self._tokens = None if tokenizer is None else EncodingCache(tokenizer, _tokens)
 
     def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the nats of the mask a pixel and of the range a return, together and apart, the latter in bits.
@@ -246,9 +242,10 @@ class PixelObjective(Objective):
         In training some phases of each scan stand for all; in validation all are counted.
         """
         decoded = None
-        for tokenizer in self._frozen:
+        if self._tokens is not None:
+            tokenizer = self._tokens.network(images.range_m.device)
             with torch.no_grad():
-                decoded = tokenizer.to(images.range_m.device).decode(tokenizer.encode(images))
+                decoded = tokenizer.decode(TokenGrid(self._tokens(images).long(), tokenizer.num_codes))
         if self.training:
             mask_nats, range_nats = self.pixels.estimate(decoded, images, rng)
         else:
@@ -256,6 +253,10 @@ class PixelObjective(Objective):
             mask_nats, range_nats = nll.mask.mean(), nll.range.sum() / images.return_mask.sum().clamp(min=1)
         bits = {"mask_bits": mask_nats / math.log(2), "range_bits": nats_to_range_bits(range_nats)}
         return {"loss": mask_nats + range_nats, **{name: value.detach() for name, value in bits.items()}}
+
+
+def _tokens(tokenizer: Tokenizer, images: RangeImage) -> Int[Tensor, "B h w"]:
+    return tokenizer.encode(images).tokens.int()  # half as many bytes to keep
 
 
 def sample_tokens(logits: Float[Tensor, "*B K"], uniform: Float[Tensor, "*B"]) -> Int[Tensor, "*B"]:

@@ -252,7 +252,7 @@ class HiddenVoxelTokens(Objective):
     def __init__(self, autoencoder: VoxelAutoencoder, prior: VoxelPrior, sensor: SensorModel, flips: bool) -> None:
         super().__init__(sensor)
         self.prior, self._flips = prior, flips
-        self._frozen = [autoencoder.eval().requires_grad_(False)]  # in a list: its weights are not this stage's
+        self._frozen = [autoencoder.eval()]  # in a list: its weights are not this stage's
 
     def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the error in nats for each hidden token, of which a batch hides one share, and how many are right."""

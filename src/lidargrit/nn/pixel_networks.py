@@ -240,7 +240,7 @@ class MaskNetwork(PhaseNetwork):
     context_channels = 4 * 2
 
     def __init__(self, config: PixelDecoderConfig, sensor: SensorModel, features: int) -> None:
-        super().__init__(config, sensor, features, config.mask_features, (config.mask_width,) * 2, 1)
+        super().__init__(config, sensor, features, config.mask_features, (config.mask_width, config.mask_width), 1)
         self.row_bias = nn.Parameter(torch.zeros(sensor.height))
 
     @classmethod

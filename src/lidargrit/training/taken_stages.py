@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -67,7 +66,6 @@ def taken_stages(recipe: Recipe, generator: Generator) -> dict[str, Objective]:
     if recipe.stages_from is None:
         return {}
     donor = load(Path(recipe.stages_from))
-    generator = copy.deepcopy(generator)  # making an objective freezes the weights of earlier stages
     shared = [stage for stage in generator.stages if stage in donor.stages]
     if type(donor) is not type(generator) and not _learn_alike(generator, donor, shared):
         raise ConfigError(
