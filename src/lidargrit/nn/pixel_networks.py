@@ -14,8 +14,7 @@ from torch import Tensor, nn
 
 from lidargrit.conditions import Condition
 from lidargrit.errors import ConfigError
-from lidargrit.nn.blocks import Block, Network
-from lidargrit.nn.convolution import Convolution
+from lidargrit.nn.lattice_network import LatticeNetwork
 from lidargrit.nn.pixel_phases import Lattice, Phase, at_phases, cells_of, generated_before, neighbours_of, phases_of
 from lidargrit.nn.precision import at_least_32_bits
 from lidargrit.nn.range_mixture import RangeMixture
@@ -44,8 +43,8 @@ class PixelDecoderConfig:
         row_channels: number of learned values of every row.
         mask_width: number of channels of the mask network's layers.
         range_width: number of channels of the range network's layers.
-        coarse_range_width: the same where pixels are 8 rows or more apart, which hardly costs time and is where walls
-            become straight; 0 for ``range_width``.
+        coarse_range_width: number of channels of the range network's layers where pixels are 8 rows or more apart; 0
+            for ``range_width``. Channels cost little there, and coarse ranges decide how straight walls are.
         blocks: number of residual blocks of each network.
         free_components: number of components of a range's distribution that do not begin at a neighbour's range; 6 more
             do.
@@ -113,49 +112,6 @@ class Guide(NamedTuple):
         return cls(like.new_zeros(count, 0, *size[1:]), like.new_full(size, _TYPICAL_V), like.new_zeros(size))
 
 
-class Residual(Block):
-    """Two convolutions whose sum with the input is the input at first."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.conv1, self.conv2 = Convolution(width, width, "wrap"), Convolution(width, width, "wrap")
-        nn.init.zeros_(self.conv2.weight)
-        assert self.conv2.bias is not None
-        nn.init.zeros_(self.conv2.bias)
-
-    def forward(self, x: Float[Tensor, "B C h w"]) -> Float[Tensor, "B C h w"]:
-        """Add what the two convolutions find to the input."""
-        return x + self.conv2(F.silu(self.conv1(F.silu(x))))
-
-
-class _LatticeNetwork(Network):
-    """The network of all phases of one lattice, over cells of 2x2 pixels of the lattice.
-
-    The part of the first layer that sees the guide is computed once for all phases.
-    """
-
-    def __init__(self, guide: int, context: int, width: int, blocks: int, phases: int, outputs: int) -> None:
-        super().__init__()
-        self.guide, self.context = Convolution(guide, width, "wrap"), Convolution(context, width, "wrap")
-        self.phase_bias = nn.Parameter(torch.zeros(phases, width))
-        self.blocks = nn.Sequential(*(Residual(width) for _ in range(blocks)))
-        self.out = nn.ModuleList(nn.Conv2d(width, outputs, 1) for _ in range(phases))
-        for layer in self.out:
-            nn.init.zeros_(layer.get_parameter("weight"))
-            nn.init.zeros_(layer.get_parameter("bias"))
-
-    def forward(
-        self, guided: Float[Tensor, "B C h w"], contexts: Float[Tensor, "P B D h w"], first: int
-    ) -> Float[Tensor, "P B O h w"]:
-        """Return the outputs of as many phases as there are contexts, from the phase ``first`` on."""
-        size = contexts.shape[:2]
-        x = self.context(contexts.flatten(0, 1)).unflatten(0, size)
-        x = x + guided + self.phase_bias[first : first + size[0], None, :, None, None]
-        x = F.silu(self.blocks(x.flatten(0, 1))).unflatten(0, size)
-        outputs = [layer(part) for layer, part in zip(self.out[first:], x, strict=False)]
-        return at_least_32_bits(torch.stack(outputs))
-
-
 class PhaseNetwork(nn.Module, ABC):
     """Base of the mask's and the range's network: a small network for each lattice, run anew for every phase."""
 
@@ -180,7 +136,7 @@ class PhaseNetwork(nn.Module, ABC):
             context = self.context_channels + (0 if features else self.added_without_tokens)
             lattice = phases[0].lattice
             width = widths[lattice.rows >= _COARSE_ROWS]
-            network = _LatticeNetwork(guide, context, width, config.blocks, len(phases), outputs)
+            network = LatticeNetwork(guide, context, width, config.blocks, len(phases), outputs)
             self.networks[lattice.name] = network
 
     context_channels: int
@@ -229,9 +185,9 @@ class PhaseNetwork(nn.Module, ABC):
         lattices = dict.fromkeys(phase.lattice for phase in self.phases)
         return [[phase for phase in self.phases if phase.lattice == lattice] for lattice in lattices]
 
-    def _networks(self) -> list[tuple[Lattice, _LatticeNetwork]]:
+    def _networks(self) -> list[tuple[Lattice, LatticeNetwork]]:
         networks = [(phases[0].lattice, self.networks[phases[0].lattice.name]) for phases in self.by_lattice()]
-        return [(lattice, network) for lattice, network in networks if isinstance(network, _LatticeNetwork)]
+        return [(lattice, network) for lattice, network in networks if isinstance(network, LatticeNetwork)]
 
 
 class MaskNetwork(PhaseNetwork):

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from lidargrit.errors import ConfigError
 from lidargrit.nn.blocks import Network
 from lidargrit.nn.convolution import Convolution
-from lidargrit.nn.pixel_networks import Residual
+from lidargrit.nn.lattice_network import Residual
 from lidargrit.nn.transformer import TransformerBlock, TransformerConfig
 from lidargrit.sensors import SensorModel
 

@@ -1,0 +1,87 @@
+"""Stages that a recipe takes from another run: as they are, trained further, or not at all."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from lidargrit.errors import ConfigError
+from lidargrit.generators.lidargrit import TokenSampling
+from lidargrit.generators.maskgit import MaskGitConfig
+from lidargrit.training import FitConfig, train
+from lidargrit.training.taken_stages import taken_stages
+from test_pixel_stage import PIXELS, TOKENIZER, TRANSFORMER, made, recipe_of
+
+
+def test_only_the_pixel_decoder_is_trained_over_a_finished_run(tmp_path):
+    first = train(recipe_of(None), tmp_path / "first")
+    second = train(recipe_of(PIXELS, stages_from=str(tmp_path / "first")), tmp_path / "second")
+    assert not (tmp_path / "second" / "tokenizer").exists()
+    assert not (tmp_path / "second" / "transformer").exists()
+    for name, weight in first.state_dict().items():
+        assert torch.equal(weight, second.state_dict()[name]), name
+    assert torch.equal(first.sample([2]).range_m, second.sample([2], TokenSampling(mask="bernoulli")).range_m)
+
+
+def test_fine_tuning_starts_from_the_weights_of_the_other_run(tmp_path):
+    donor = made()
+    donor.save(tmp_path / "donor")
+    fit = FitConfig(scans=2, batch_size=2, learning_rate=1e-6, validation_scans=1)
+    recipe = recipe_of(PIXELS, stages_from=str(tmp_path / "donor"))
+    recipe = replace(recipe, training=dict.fromkeys(recipe.training, fit), fine_tune=("tokenizer", "pixels"))
+    tuned = train(recipe, tmp_path / "run").state_dict()
+    assert not (tmp_path / "run" / "transformer").exists()
+    for stage in ("transformer", "pixels"):
+        moved = [
+            float((tuned[name] - w).abs().max()) for name, w in donor.state_dict().items() if name.startswith(stage)
+        ]
+        assert max(moved) < 1e-4, "the weights are those of the donor, but for a step of the learning rate"
+        assert (max(moved) > 0) == (stage == "pixels")
+    for settings, message in (
+        ({"fine_tune": ("mask",)}, "fine_tune=mask; wanted one of tokenizer, transformer, pixels"),
+        ({"fine_tune": ("pixels",), "train_anew": ("pixels",)}, "fine_tune=pixels; wanted one of tokenizer, trans"),
+    ):
+        wrong = replace(recipe, **settings)
+        with pytest.raises(ConfigError, match=message):
+            taken_stages(wrong, wrong.build_generator())
+    with pytest.raises(ConfigError, match="fine_tune=tokenizer without stages_from"):
+        replace(recipe, stages_from=None)
+
+
+def test_fine_tuning_takes_a_run_of_fewer_columns_and_another_dropout(tmp_path):
+    made().save(tmp_path / "donor")
+    recipe = recipe_of(PIXELS, stages_from=str(tmp_path / "donor"))
+    wide = replace(recipe, data=replace(recipe.data, columns=512, column_stride=4))
+    wide = replace(wide, model=replace(wide.model, transformer=replace(TRANSFORMER, residual_dropout=0.0)))
+    with pytest.raises(ConfigError, match="whose tokenizer is another"):
+        taken_stages(wide, wide.build_generator())
+    wide = replace(wide, fine_tune=("tokenizer", "transformer", "pixels"))
+    generator = wide.build_generator()
+    objective = generator.objective("transformer")
+    weights = objective.weights_from(taken_stages(wide, generator)["transformer"])
+    objective.load_state_dict(weights)
+    fine = generator.transformer.pos_emb.unflatten(1, generator.tokenizer.grid_size)
+    coarse = made().transformer.pos_emb.unflatten(1, (8, 8))
+    assert fine.shape[2] == 2 * coarse.shape[2]
+    # Two new columns lie in each old one, a quarter of its width to either side of its centre.
+    assert torch.allclose(fine[:, :, 2], 0.75 * coarse[:, :, 1] + 0.25 * coarse[:, :, 0])
+
+
+def test_a_run_of_other_sizes_or_another_kind_gives_no_stages(tmp_path):
+    train(recipe_of(None), tmp_path / "first")
+    recipe = recipe_of(PIXELS, stages_from=str(tmp_path / "first"))
+    wider = replace(recipe, model=replace(recipe.model, transformer=replace(TRANSFORMER, width=32)))
+    with pytest.raises(ConfigError, match=r"whose transformer is another \(model.transformer.width=16\)"):
+        train(wider, tmp_path / "second")
+    other = replace(recipe, generator="maskgit", model=MaskGitConfig(TOKENIZER, TRANSFORMER, PIXELS))
+    with pytest.raises(ConfigError, match="a run of the generator 'lidargrit'"):
+        train(other, tmp_path / "third")
+    anew = replace(recipe, train_anew=("transformer",))
+    assert taken_stages(anew, anew.build_generator()).keys() == {"tokenizer"}
+    unknown = replace(recipe, train_anew=("mask",))
+    with pytest.raises(ConfigError, match="train_anew=mask; wanted one of tokenizer, transformer, pixels"):
+        taken_stages(unknown, unknown.build_generator())
+    with pytest.raises(ConfigError, match="tokenizer_from and stages_from together"):
+        replace(recipe, tokenizer_from="pretrained")
