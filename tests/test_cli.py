@@ -183,7 +183,7 @@ def test_sample_writes_one_file_a_seed_and_draws_no_seed_twice(run_folder, sampl
 
 
 def test_a_seed_gives_the_same_sample_whatever_is_drawn_beside_it(run_folder, samples, tmp_path, typed):
-    typed("sample", run_folder, tmp_path / "later", "--seed", 1, "-n", 3, "--batch-size", 2)
+    typed("sample", run_folder, tmp_path / "later", "--seed", 1, "-n", 3)
     earlier, later = read_samples(samples), read_samples(tmp_path / "later")
     assert later.provenance.names[:2] == earlier.provenance.names[1:]
     assert later.provenance.names[2].endswith("/sample 00000003")

@@ -35,7 +35,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_settings(parser, settings)
     budget = "training budget of each system in floating-point operations (default: each recipe's own)"
     parser.add_argument("--flops", type=float, default=DEFAULTS["flops"], help=budget)
-    parser.add_argument("--batch-size", type=int, help="no effect any more: each generator has a batch size of its own")
     parser.add_argument("--format", choices=["text", "markdown", "latex"], default="text", help="format of the table")
     add_json(parser)
 

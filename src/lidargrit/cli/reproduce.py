@@ -30,7 +30,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--flops", type=float, help=budget)
     settings = "settings to change in every recipe, such as data.workers=16"
     add_settings(parser, settings)
-    parser.add_argument("--batch-size", type=int, help="no effect any more: each generator has a batch size of its own")
     parser.add_argument("--format", choices=["text", "markdown", "latex"], default="text", help="format of the table")
     parser.add_argument("--dry-run", action="store_true", help="print what would be done and what it costs, and stop")
     add_json(parser)

@@ -24,7 +24,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("out", type=Path, help="folder for the samples; the same command continues there")
     parser.add_argument("-n", "--count", type=int, default=16, help="number of scans")
     parser.add_argument("--seed", type=seed_number, default=0, help="seed of the first scan; the next has the next")
-    parser.add_argument("--batch-size", type=int, help="no effect any more: each generator has a batch size of its own")
     add_settings(parser, "sampling settings to change, such as temperature=1.1; see: lidargrit list generators")
     add_rank(parser, "process")
     add_device(parser)
