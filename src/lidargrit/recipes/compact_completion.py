@@ -10,6 +10,7 @@ RECIPE = replace(
     compact_pixels.RECIPE,
     title="LidarGRIT with a network that completes scans: 64x256, for one CPU core and two hours",
     model=replace(compact_pixels.RECIPE.model, completion=CompletionNetworkConfig()),
+    data=replace(compact_pixels.RECIPE.data, train=("simulated:4352:train",)),
     training={
         **compact_pixels.RECIPE.training,
         "completion": FitConfig(

@@ -1,5 +1,7 @@
 """The pixel decoder of the model in the package without tokens: what these are worth, and a codec that needs none."""
 
+from dataclasses import replace
+
 from lidargrit.generators.multiscale import MultiscaleConfig
 from lidargrit.nn.pixel_networks import PixelDecoderConfig
 from lidargrit.recipes import compact_pixels
@@ -10,6 +12,6 @@ RECIPE = Recipe(
     title="a pixel decoder without tokens, small: 64x256, for one CPU core and half an hour",
     generator="multiscale",
     model=MultiscaleConfig(PixelDecoderConfig(coarsest_cell=64, row_channels=2, range_width=36)),
-    data=compact_pixels.RECIPE.data,
-    training={"pixels": compact_pixels.RECIPE.training["pixels"]},
+    data=replace(compact_pixels.RECIPE.data, train=("simulated:4352:train",)),
+    training={"pixels": replace(compact_pixels.RECIPE.training["pixels"], scans=16_000, average_over_scans=700)},
 )
