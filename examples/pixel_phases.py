@@ -1,5 +1,6 @@
 """One scan after some phases of a pixel decoder, and the same tokens without it → pixel_phases.png."""
 
+import math
 import sys
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from lidargrit.generators.lidargrit import LidarGrit, TokenSampling
 from lidargrit.nn.pixel_decoder import PixelDecoder
 
 SEED = 3
-SHOWN = {1: 8, 4: 4, 7: 2, 10: 1}  # number of phases → distance of the pixels that are sampled then
+SHOWN = (8, 4, 2, 1)  # distances of sampled pixels, each halved by three phases
 
 
 def main(folder: Path, run: str = "pretrained") -> None:
@@ -22,7 +23,10 @@ def main(folder: Path, run: str = "pretrained") -> None:
         raise ConfigError(f"{run}, which has no pixel decoder", "a run with one", "train the recipe compact_pixels")
     scan, plain = model.sample([SEED])[0], model.sample([SEED], TokenSampling(mask="bernoulli"))[0]
     count = len(model.pixels.mask.phases)
-    panels = [(f"after {number} of {count} phases", scan.range_m[::cell, ::cell]) for number, cell in SHOWN.items()]
+    panels = []
+    for cell in SHOWN:
+        number = count - 3 * int(math.log2(cell))
+        panels.append((f"after {number} of {count} phases", scan.range_m[::cell, ::cell]))
     panels.append(("the same tokens without a pixel decoder", plain.range_m))
     figure, axes = plt.subplots(len(panels), figsize=(8, 7.5), layout="constrained")
     for axis, (title, range_m) in zip(axes, panels, strict=True):

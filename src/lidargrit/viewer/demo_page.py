@@ -28,6 +28,7 @@ from lidargrit.viewer.report_style import STYLE
 from lidargrit.viewer.scan_sets import ScanSet
 from lidargrit.viewer.score_table import score_table
 
+_LATTICES_SHOWN = 4  # the finest: of coarser ones a picture has a handful of pixels
 _PIECE = 6, 16  # rows and columns of tokens that are shown as numbers: as many as can be read
 _CELL = 44, 24  # width and height of the cell of a token on the page, in pixels
 _STYLE = """
@@ -291,7 +292,7 @@ def _its_phases(demo: DemoPage) -> _Step:
         "edge lies on the near surface or on the far one, not between them."
     )
     masks, ranges = [], []
-    for halved, spacing in enumerate(spacings):
+    for halved, spacing in list(enumerate(spacings))[-_LATTICES_SHOWN:]:
         after = f"after {3 * halved + 1} phase" + ("s" if halved else "")
         mask = whole.return_mask[0, ::spacing, ::spacing].float().numpy()
         masks.append(_figure(rate_picture(mask), f"return mask {after}"))
