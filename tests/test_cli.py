@@ -164,7 +164,7 @@ def test_a_plan_tells_which_stages_are_taken_and_not_trained(tmp_path, capsys, m
     assert main(["train", "compact_raydrop", str(tmp_path / "none"), *words]) == 0
     text = capsys.readouterr().out
     assert "transformer: 4,539,136 parameters, taken from pretrained and not trained" in text
-    assert "pixels: 365,374 parameters, 16,000 scans" in text
+    assert "pixels: 916,015 parameters, 17,000 scans" in text
 
 
 def test_sample_writes_one_file_a_seed_and_draws_no_seed_twice(run_folder, samples, typed, monkeypatch):
