@@ -23,6 +23,7 @@ from lidargrit.training.config import FitConfig, Recipe
 _SCANS = 2  # in a counted batch: some objectives compare the scans of a batch
 _STEPS_AT_MOST = 64  # that are counted; rarer terms hardly cost
 _A100_FP32_FLOPS_PER_S, _A100_BF16_FLOPS_PER_S = 19.5e12, 312e12
+_CORRECTIONS, _OVERSPENT_AT_MOST = 20, 0.02  # of a budget
 _SHARE = 0.25  # of a peak: a guess for networks as small as these; small batches reach less
 _MATRIX, _REPETITIONS = 512, 8  # the first repetition chooses a kernel
 
@@ -111,8 +112,14 @@ def with_budget(recipe: Recipe, flops: float) -> Recipe:
     """
     if not recipe.training:
         return recipe
-    share = flops / sum(training_flops(recipe).values())
-    return replace(recipe, training={name: _scaled(stage, share) for name, stage in recipe.training.items()})
+    share, scaled = flops / sum(training_flops(recipe).values()), recipe
+    for _ in range(_CORRECTIONS):
+        scaled = replace(recipe, training={name: _scaled(stage, share) for name, stage in recipe.training.items()})
+        cost = sum(training_flops(scaled).values())
+        if cost <= flops * (1 + _OVERSPENT_AT_MOST):
+            break
+        share *= flops / cost  # what is prepared once, such as a reflow's pairs, does not shrink in proportion
+    return scaled
 
 
 def _scaled(config: FitConfig, share: float) -> FitConfig:
