@@ -11,9 +11,10 @@ import lidargrit
 from lidargrit.cli import main
 from lidargrit.errors import CheckpointError, ConfigError
 from lidargrit.generators.lidargrit import LidarGrit
-from lidargrit.generators.lidm import Lidm, LidmConfig, LidmSampling
+from lidargrit.generators.lidm import Lidm, LidmConfig, LidmSampling, _latents
 from lidargrit.loading import DataConfig
 from lidargrit.nn import latent_diffusion
+from lidargrit.nn.encoding_cache import EncodingCache
 from lidargrit.nn.latent_unet import LatentUnet, LatentUnetConfig
 from lidargrit.recipes import load_recipe
 from lidargrit.sensors import load_sensor
@@ -244,6 +245,23 @@ def test_noise_of_no_step_and_steps_without_sense_are_refused():
         made(LidmConfig(SMALL.tokenizer, LatentUnetConfig(32, (1,) * 6, 1, ())))
     with pytest.raises(ConfigError, match=r"64x10; wanted rows divisible by 4, columns by 8"):
         CurveVqvae(TINY, load_sensor("hdl64e_kitti_360").with_columns(10))
+
+
+def test_latents_are_computed_once_and_do_not_depend_on_the_batch(monkeypatch):
+    tokenizer, images = made().tokenizer, walls(4)
+    cache, computed = EncodingCache(tokenizer, _latents, bytes_at_most=3 * 4 * 32 * 16 * 4), []
+    encode = tokenizer.latents
+    monkeypatch.setattr(tokenizer, "latents", lambda batch: computed.append(len(batch)) or encode(batch))
+    together = cache(images)
+    assert computed == [1, 1, 1, 1]
+    assert torch.equal(cache(images[2:3]), together[2:3])
+    assert len(computed) == 4
+    assert torch.equal(cache(images[[3, 0]]), together[[3, 0]])
+    assert len(computed) == 5, "the bound has room for three; the fourth is computed anew"
+    assert torch.equal(EncodingCache(tokenizer, _latents)(images[[1, 3]]), together[[1, 3]])
+    other = RangeImage(images.range_m.flip(-1), images.return_mask.flip(-1), SENSOR)
+    assert not torch.equal(cache(other[:1]), together[:1]), "an augmented image is another"
+    agree(together, encode(images).detach())
 
 
 def test_shared_latents_are_scaled_and_come_back_as_tokens():
