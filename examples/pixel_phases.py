@@ -1,6 +1,5 @@
 """One scan after some phases of a pixel decoder, and the same tokens without it → pixel_phases.png."""
 
-import math
 import sys
 from pathlib import Path
 
@@ -11,9 +10,10 @@ import lidargrit
 from lidargrit.errors import ConfigError, LidarGritError
 from lidargrit.generators.lidargrit import LidarGrit, TokenSampling
 from lidargrit.nn.pixel_decoder import PixelDecoder
+from lidargrit.nn.pixel_phases import complete_after
 
 SEED = 3
-SHOWN = (8, 4, 2, 1)  # distances of sampled pixels, each halved by three phases
+SHOWN = 4  # finest lattices of sampled pixels
 
 
 def main(folder: Path, run: str = "pretrained") -> None:
@@ -22,11 +22,10 @@ def main(folder: Path, run: str = "pretrained") -> None:
     if not isinstance(model, LidarGrit) or not isinstance(model.pixels, PixelDecoder):
         raise ConfigError(f"{run}, which has no pixel decoder", "a run with one", "train the recipe compact_pixels")
     scan, plain = model.sample([SEED])[0], model.sample([SEED], TokenSampling(mask="bernoulli"))[0]
-    count = len(model.pixels.mask.phases)
+    phases = model.pixels.mask.phases
     panels = []
-    for cell in SHOWN:
-        number = count - 3 * int(math.log2(cell))
-        panels.append((f"after {number} of {count} phases", scan.range_m[::cell, ::cell]))
+    for lattice, count in complete_after(phases)[-SHOWN:]:
+        panels.append((f"after {count} of {len(phases)} phases", scan.range_m[:: lattice.rows, :: lattice.columns]))
     panels.append(("the same tokens without a pixel decoder", plain.range_m))
     figure, axes = plt.subplots(len(panels), figsize=(8, 7.5), layout="constrained")
     for axis, (title, range_m) in zip(axes, panels, strict=True):
@@ -37,7 +36,7 @@ def main(folder: Path, run: str = "pretrained") -> None:
         axis.set(xticks=[], yticks=[])
     figure.savefig(folder / "pixel_phases.png", dpi=100, metadata={"Software": None})
     plt.close(figure)
-    print(f"seed {SEED} of {run}: {count} phases in {folder / 'pixel_phases.png'}")
+    print(f"seed {SEED} of {run}: {len(phases)} phases in {folder / 'pixel_phases.png'}")
 
 
 if __name__ == "__main__":

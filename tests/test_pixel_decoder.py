@@ -13,7 +13,7 @@ from lidargrit.conditions import Condition
 from lidargrit.errors import ConfigError
 from lidargrit.nn.pixel_decoder import PixelDecoder, PixelSampling, nats_to_range_bits
 from lidargrit.nn.pixel_networks import Guide, PixelDecoderConfig
-from lidargrit.nn.pixel_phases import at_phases, generated_before, join_phases, phases_of
+from lidargrit.nn.pixel_phases import at_phases, complete_after, generated_before, join_phases, phases_of
 from lidargrit.nn.range_mixture import RangeMixture
 from lidargrit.sensors import SensorModel, load_sensor
 from lidargrit.structures import Decoded, RangeImage
@@ -28,12 +28,12 @@ def tiny_sensor(rows: int, columns: int) -> SensorModel:
 
 
 def random_decoder(
-    sensor: SensorModel, cell: int, spread: float = 0.3, halvings: int = 0, features: int = FEATURES
+    sensor: SensorModel, cell: int, spread: float = 0.3, halvings: tuple[int, int] = (0, 0), features: int = FEATURES
 ) -> PixelDecoder:
     """Return a decoder none of whose weights are zero, so that everything depends on everything it may."""
     torch.manual_seed(0)
     config = PixelDecoderConfig(
-        cell, halvings, mask_features=3, range_features=3, mask_width=6, range_width=6, blocks=1
+        cell, *halvings, mask_features=3, range_features=3, mask_width=6, range_width=6, blocks=1
     )
     decoder = PixelDecoder(config, sensor, features)
     for weight in decoder.parameters():
@@ -65,20 +65,44 @@ def repeated(decoded: Decoded, times: int) -> Decoded:
     return Decoded(range_m, logits, decoded.sensor, features=features)
 
 
-@pytest.mark.parametrize(("cell", "halvings"), [(2, 0), (4, 0), (8, 0), (4, 2)])
-def test_phases_cover_every_pixel_once(cell: int, halvings: int) -> None:
-    phases, count = phases_of(cell, halvings), torch.zeros(1, 16, 32)
+@pytest.mark.parametrize(("cell", "halvings"), [(2, (0, 0)), (4, (0, 0)), (8, (0, 0)), (4, (2, 0)), (4, (0, 2))])
+def test_phases_cover_every_pixel_once(cell: int, halvings: tuple[int, int]) -> None:
+    phases, count = phases_of(cell, *halvings), torch.zeros(1, 16, 32)
     for phase in phases:
         count[(..., *phase.pixels)] += 1
     assert torch.equal(count, torch.ones_like(count))
-    assert len(phases) == 1 + 3 * int(math.log2(cell)) + 2 * halvings
+    last = sum(halvings)
+    assert len(phases) == 1 + 3 * int(math.log2(cell)) + 2 * last
     assert [int(generated_before(phase).sum()) for phase in phases[:4]] == [0, 1, 2, 3]
-    assert [int(generated_before(phase).sum()) for phase in phases[len(phases) - 2 * halvings :]] == [2, 3] * halvings
+    assert [int(generated_before(phase).sum()) for phase in phases[len(phases) - 2 * last :]] == [2, 3] * last
 
 
-@pytest.mark.parametrize("halvings", [0, 2])
-def test_joining_phases_undoes_taking_them_apart(halvings: int) -> None:
-    image, joined, phases = torch.randn(3, 16, 64), None, phases_of(8, halvings)
+@pytest.mark.parametrize("halvings", [(0, 0), (2, 0), (0, 2)])
+def test_a_lattice_is_complete_after_its_number_of_phases(halvings: tuple[int, int]) -> None:
+    phases, generated = phases_of(4, *halvings), torch.zeros(16, 32, dtype=torch.bool)
+    ends = {count: lattice for lattice, count in complete_after(phases)}
+    for number, phase in enumerate(phases, start=1):
+        generated[phase.pixels] = True
+        if number in ends:
+            rows, columns = ends[number].rows, ends[number].columns
+            assert generated[::rows, ::columns].all()
+            assert int(generated.sum()) == generated[::rows, ::columns].numel()
+    assert generated.all()
+
+
+@pytest.mark.parametrize("halvings", [(2, 0), (0, 2)])
+def test_the_last_halvings_are_of_one_side_alone(halvings: tuple[int, int]) -> None:
+    phases = phases_of(4, *halvings)[-4:]
+    sides = [phase.lattice.rows if halvings[0] else phase.lattice.columns for phase in phases]
+    assert sides == [1] * 4
+    for phase in phases:  # above and below, or left and right, are known in every phase
+        (down, right), _ = phase.pairs
+        assert (down, right) == ((0, -1) if halvings[0] else (-1, 0))
+
+
+@pytest.mark.parametrize(("cell", "halvings"), [(8, (0, 0)), (8, (2, 0)), (4, (0, 2))])
+def test_joining_phases_undoes_taking_them_apart(cell: int, halvings: tuple[int, int]) -> None:
+    image, joined, phases = torch.randn(3, 16, 64), None, phases_of(cell, *halvings)
     for lattice in dict.fromkeys(phase.lattice for phase in phases):
         joined = join_phases(joined, at_phases(image, [phase for phase in phases if phase.lattice == lattice]))
     assert joined is not None
@@ -127,14 +151,17 @@ def independent_masks(probability: Tensor, masks: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-@pytest.mark.parametrize(("cell", "halvings", "features"), [(2, 0, FEATURES), (8, 0, FEATURES), (4, 2, 0)])
-def test_a_phase_knows_of_earlier_pixels_only(cell: int, halvings: int, features: int) -> None:
+@pytest.mark.parametrize(
+    ("cell", "halvings", "features"),
+    [(2, (0, 0), FEATURES), (8, (0, 0), FEATURES), (4, (2, 0), 0), (4, (0, 1), FEATURES), (4, (0, 1), 0)],
+)
+def test_a_phase_knows_of_earlier_pixels_only(cell: int, halvings: tuple[int, int], features: int) -> None:
     sensor = tiny_sensor(8, 16)
     decoder = random_decoder(sensor, cell, halvings=halvings, features=features)
     decoded = random_decoded(sensor, 2) if features else None
     truth, other = random_images(sensor, 2), random_images(sensor, 2, seed=3)
     nll = decoder(decoded, truth)
-    phases = phases_of(cell, halvings)
+    phases = phases_of(cell, *halvings)
     for number, phase in enumerate(phases):
         later = torch.ones(8, 16, dtype=torch.bool)
         for earlier in phases[: number + 1]:
@@ -328,6 +355,8 @@ def test_an_image_that_cells_do_not_divide_is_refused() -> None:
         PixelDecoder(PixelDecoderConfig(), tiny_sensor(12, 16), FEATURES)
     with pytest.raises(ConfigError, match="a power of 2"):
         PixelDecoderConfig(coarsest_cell=6)
+    with pytest.raises(ConfigError, match="column_halvings=1, row_halvings=2"):
+        PixelDecoderConfig(column_halvings=1, row_halvings=2)
     with pytest.raises(ConfigError, match="mask_width=0"):
         PixelDecoderConfig(mask_width=0)
 

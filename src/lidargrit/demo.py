@@ -22,6 +22,7 @@ from lidargrit.files import read_json, write_json
 from lidargrit.generators import PRETRAINED, RUN_FILE, Generator, load
 from lidargrit.generators.lidargrit import LidarGrit, TokenSampling
 from lidargrit.loading import DataConfig, RangeImages
+from lidargrit.nn.pixel_phases import complete_after
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
 from lidargrit.sources import load_range_images, open_source
@@ -179,9 +180,9 @@ def write_results_page(
         decoded = tokenizer.decode(tokens)
         sampled = tokenizer.sample(tokens, [torch.Generator().manual_seed(0)])
         reconstructed = _reconstructed(generator, held_out, sampling)
-    by_phases, coarsest_cell = None, 1
+    by_phases, lattices = None, []
     if isinstance(generator, LidarGrit) and generator.pixels is not None:
-        by_phases, coarsest_cell = reconstructed[:1], generator.pixels.config.coarsest_cell
+        by_phases, lattices = reconstructed[:1], complete_after(generator.pixels.mask.phases)
     seeds = tuple(f"seed {seed}" for seed in range(len(new)))
     sets = [
         ScanSet(f"{kind}, held out", held_out, names),
@@ -192,7 +193,7 @@ def write_results_page(
         sets.append(ScanSet("new, by the packaged model", packaged.batch(range(len(packaged))), seeds[: len(packaged)]))
     results = errors, card, seconds, facts, folder
     write_demo_page(
-        DemoPage(kind, names[0], held_out[:1], tokens, decoded, sampled, by_phases, coarsest_cell, sets, *results),
+        DemoPage(kind, names[0], held_out[:1], tokens, decoded, sampled, by_phases, lattices, sets, *results),
         folder / PAGE,
     )
 

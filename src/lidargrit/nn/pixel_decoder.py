@@ -24,7 +24,7 @@ _Guided = tuple[
     dict[Lattice, Tensor], dict[Lattice, Tensor]
 ]  # by lattice: the guide's part of the first layers, of both
 
-_ALL_PHASES_ROWS = 4  # training counts all phases of lattices from this distance on: a tenth of the pixels
+_ALL_PHASES_AREA = 16  # training counts all phases of lattices with one in so many pixels, or fewer
 
 BITS_STEP_M = 0.01  # bits of a return are those of naming its range to a centimetre
 
@@ -86,12 +86,14 @@ class PixelDecoder(nn.Module):
 
     def __init__(self, config: PixelDecoderConfig, sensor: SensorModel, features: int) -> None:
         super().__init__()
-        rows, columns = config.coarsest_cell, config.coarsest_cell * 2**config.column_halvings
+        rows, columns = (
+            config.coarsest_cell * 2**halvings for halvings in (config.row_halvings, config.column_halvings)
+        )
         if sensor.height % rows or sensor.width % columns:
             raise ConfigError(
                 f"range images of {sensor.height}x{sensor.width} for a pixel decoder of cells of {rows}x{columns}",
                 "cells that divide both sides",
-                "lower coarsest_cell or column_halvings, or choose another number of columns",
+                "lower coarsest_cell, column_halvings or row_halvings, or choose another number of columns",
             )
         self.config, self.sensor = config, sensor
         self.mask, self.range = MaskNetwork(config, sensor, features), RangeNetwork(config, sensor, features)
@@ -151,7 +153,7 @@ class PixelDecoder(nn.Module):
         returns = guide.v.new_zeros(())
         for phases in self.mask.by_lattice():
             chosen = phases
-            if phases[0].lattice.rows < _ALL_PHASES_ROWS:
+            if phases[0].lattice.area < _ALL_PHASES_AREA:
                 index = torch.randint(len(phases), (), generator=rng, device=rng.device)
                 chosen = [phases[0 if index.is_meta else int(index)]]  # all take as many operations, if counted
             of_mask, of_range = self._nll(chosen, guided, guide, images)

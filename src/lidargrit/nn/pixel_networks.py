@@ -25,7 +25,7 @@ _TYPICAL_V = 2.5  # ln(1 + 11 m), the middle of what scans hold, so that inputs 
 _LOGIT_BOUND = 8.0  # of the decoder's return logits, beyond which it is as good as sure
 _SAME_SURFACE_V = 3e-4  # two ranges nearer than this, 6 mm at 20 m, are on one surface
 _NEIGHBOURS = 6  # candidates of a range: an interpolation and two neighbours, of each of two pairs
-_COARSE_ROWS = 8  # lattices from this distance on are coarse
+_COARSE_AREA = 64  # lattices with one in so many pixels, or fewer, are coarse
 _FINEST_M, _COARSEST_M = math.exp(-6), math.exp(4)  # scales of a component: 2.5 mm to 55 m
 
 
@@ -34,17 +34,18 @@ class PixelDecoderConfig:
     """Sizes of the pixel decoder.
 
     Args:
-        coarsest_cell: rows and columns of the cells of which the first phase generates one pixel each; a power of 2
-            that divides both sides of the image.
+        coarsest_cell: shorter side of the cells of which the first phase generates one pixel each; a power of 2.
         column_halvings: number of halvings of the distance between columns alone, which come last, so that pixels know
             of others in their own row; cells have as many columns as rows, times 2 for each.
+        row_halvings: the same of the distance between rows, so that pixels know of others in their own column: for
+            images whose columns are farther apart than their rows. One of the two is 0.
         mask_features: number of channels of the tokenizer's features that the mask network sees, if any.
         range_features: number of channels of the tokenizer's features that the range network sees, if any.
         row_channels: number of learned values of every row.
         mask_width: number of channels of the mask network's layers.
         range_width: number of channels of the range network's layers.
-        coarse_range_width: number of channels of the range network's layers where pixels are 8 rows or more apart; 0
-            for ``range_width``. Channels cost little there, and coarse ranges decide how straight walls are.
+        coarse_range_width: number of channels of the range network's layers of lattices with one in 64 pixels or
+            fewer; 0 for ``range_width``. Channels cost little there, and coarse ranges decide how straight walls are.
         blocks: number of residual blocks of each network.
         free_components: number of components of a range's distribution that do not begin at a neighbour's range; 6 more
             do.
@@ -52,6 +53,7 @@ class PixelDecoderConfig:
 
     coarsest_cell: int = 8
     column_halvings: int = 0
+    row_halvings: int = 0
     mask_features: int = 12
     range_features: int = 12
     row_channels: int = 4
@@ -62,9 +64,9 @@ class PixelDecoderConfig:
     free_components: int = 4
 
     def __post_init__(self) -> None:
-        phases_of(self.coarsest_cell)
+        phases_of(self.coarsest_cell, max(self.column_halvings, 0), max(self.row_halvings, 0))
         for name, value in vars(self).items():
-            least = 0 if name in ("column_halvings", "coarse_range_width") else 1
+            least = 0 if name in ("column_halvings", "row_halvings", "coarse_range_width") else 1
             if value < least:
                 raise ConfigError(f"{name}={value}", f"at least {least}", "raise it")
 
@@ -125,7 +127,8 @@ class PhaseNetwork(nn.Module, ABC):
         outputs: int,
     ) -> None:
         super().__init__()
-        self.phases, self.sensor = phases_of(config.coarsest_cell, config.column_halvings), sensor
+        self.phases = phases_of(config.coarsest_cell, config.column_halvings, config.row_halvings)
+        self.sensor = sensor
         self.guided_by_tokens = features > 0
         kept = kept if features else 0
         self.features = nn.Conv2d(features, kept, 1) if features else nn.Identity()
@@ -135,7 +138,7 @@ class PhaseNetwork(nn.Module, ABC):
         for phases in self.by_lattice():
             context = self.context_channels + (0 if features else self.added_without_tokens)
             lattice = phases[0].lattice
-            width = widths[lattice.rows >= _COARSE_ROWS]
+            width = widths[lattice.area >= _COARSE_AREA]
             network = LatticeNetwork(guide, context, width, config.blocks, len(phases), outputs)
             self.networks[lattice.name] = network
 
@@ -177,7 +180,7 @@ class PhaseNetwork(nn.Module, ABC):
             once = network.guide.weight.numel() + sum(layer.get_parameter("weight").numel() for layer in network.out)
             each = sum(weight.numel() for weight in network.blocks.parameters() if weight.ndim == 4)
             each += network.context.weight.numel()
-            total += 2 * (pixels // (4 * lattice.rows * lattice.columns)) * (once + len(network.out) * each)
+            total += 2 * (pixels // (4 * lattice.area)) * (once + len(network.out) * each)
         return total
 
     def by_lattice(self) -> list[list[Phase]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -13,6 +13,7 @@ from lidargrit.errors import ConfigError
 
 _BOTH = ((0, 0), (1, 1), (0, 1), (1, 0))  # of 2x2 pixels of a lattice: a corner, its opposite, then the others
 _COLUMNS = ((0, 0), (1, 0), (0, 1), (1, 1))  # where whole columns are known: the next column, its even rows first
+_ROWS = ((0, 0), (0, 1), (1, 0), (1, 1))  # where whole rows are known: the next row, its even columns first
 _VERTICAL, _HORIZONTAL, _FALLING, _RISING = (-1, 0), (0, -1), (-1, -1), (-1, 1)  # one neighbour; the other is opposite
 
 
@@ -22,22 +23,28 @@ class Lattice(NamedTuple):
     Args:
         rows: distance between two pixels of the lattice, in rows of the image.
         columns: distance between two pixels of the lattice, in columns of the image.
-        whole_columns: whether every second column is known as a whole, and not one of every 2x2 pixels.
+        known: what is known before its phases: one corner of every 2x2 pixels, or every second column or row.
     """
 
     rows: int
     columns: int
-    whole_columns: bool = False
+    known: Literal["corners", "columns", "rows"] = "corners"
 
     @property
     def order(self) -> tuple[tuple[int, int], ...]:
         """Rows and columns within 2x2 pixels, in the order in which they are generated."""
-        return _COLUMNS if self.whole_columns else _BOTH
+        return {"corners": _BOTH, "columns": _COLUMNS, "rows": _ROWS}[self.known]
+
+    @property
+    def area(self) -> int:
+        """Pixels of the image for each of the lattice."""
+        return self.rows * self.columns
 
     @property
     def name(self) -> str:
         """Name of the lattice's network."""
-        return str(self.rows) if self.rows == self.columns and not self.whole_columns else f"{self.rows}x{self.columns}"
+        square = self.rows == self.columns and self.known == "corners"
+        return str(self.rows) if square else f"{self.rows}x{self.columns}"
 
 
 class Phase(NamedTuple):
@@ -67,32 +74,54 @@ class Phase(NamedTuple):
     @property
     def pairs(self) -> tuple[tuple[int, int], tuple[int, int]]:
         """Rows and columns, from a pixel to one neighbour of each of two pairs that are generated before it."""
-        if self.lattice.whole_columns:
-            return (_HORIZONTAL, _FALLING) if self.rank == 2 else (_HORIZONTAL, _VERTICAL)
+        if self.lattice.known != "corners":
+            across, along = _HORIZONTAL, _VERTICAL
+            if self.lattice.known == "rows":
+                across, along = along, across
+            return across, _FALLING if self.rank == 2 else along
         return (_FALLING, _RISING) if self.rank == 1 else (_VERTICAL, _HORIZONTAL)
 
 
-def phases_of(coarsest_cell: int, column_halvings: int = 0) -> list[Phase]:
+def phases_of(coarsest_cell: int, column_halvings: int = 0, row_halvings: int = 0) -> list[Phase]:
     """Return every phase in order: one pixel of each coarsest cell, then three phases for each halving of the distance.
 
     Args:
-        coarsest_cell: rows of the cells of which the first phase generates one pixel each; a power of 2.
+        coarsest_cell: shorter side of the cells of which the first phase generates one pixel each; a power of 2.
         column_halvings: number of halvings of the distance between columns alone, in two phases each, that come last;
             the cells have as many columns as rows, times 2 for each.
+        row_halvings: the same of the distance between rows; one of the two is 0.
+
+    Raises:
+        ConfigError: a cell of another size, or halvings of both.
     """
     if coarsest_cell < 2 or coarsest_cell & (coarsest_cell - 1):
         raise ConfigError(f"coarsest_cell={coarsest_cell}", "a power of 2, at least 2", "e.g. 8")
-    spacing, stretch = coarsest_cell // 2, 2**column_halvings
-    phases = [Phase(Lattice(spacing, spacing * stretch), 0, 0)]
+    if column_halvings and row_halvings:
+        raise ConfigError(
+            f"column_halvings={column_halvings}, row_halvings={row_halvings}", "one of them 0", "set one of them to 0"
+        )
+    spacing, higher, wider = coarsest_cell // 2, 2**row_halvings, 2**column_halvings
+    phases = [Phase(Lattice(spacing * higher, spacing * wider), 0, 0)]
     while spacing:
-        lattice = Lattice(spacing, spacing * stretch)
+        lattice = Lattice(spacing * higher, spacing * wider)
         phases += [Phase(lattice, row, column) for row, column in lattice.order[1:]]
         spacing //= 2
-    while stretch > 1:
-        stretch //= 2
-        lattice = Lattice(1, stretch, whole_columns=True)
+    known: Literal["columns", "rows"] = "columns" if wider > 1 else "rows"
+    while wider > 1 or higher > 1:
+        higher, wider = max(higher // 2, 1), max(wider // 2, 1)
+        lattice = Lattice(higher, wider, known)
         phases += [Phase(lattice, row, column) for row, column in lattice.order[2:]]
     return phases
+
+
+def complete_after(phases: list[Phase]) -> list[tuple[Lattice, int]]:
+    """Return the lattices from coarse to fine, each with the number of phases after which all its pixels are generated.
+
+    The first is of one pixel in every coarsest cell, which is the first phase.
+    """
+    coarsest = phases[0].lattice
+    ends = {phase.lattice: number for number, phase in enumerate(phases, start=1)}
+    return [(Lattice(2 * coarsest.rows, 2 * coarsest.columns), 1), *ends.items()]
 
 
 def generated_before(phase: Phase) -> Bool[Tensor, "4"]:
@@ -154,11 +183,14 @@ def join_phases(coarser: Float[Tensor, "B h w"] | None, values: Float[Tensor, "P
 
     Args:
         coarser: values of the next coarser lattice; None for the coarsest lattice, which has four phases.
-        values: values of two phases where whole columns are known, else of three, or of four, in their order.
+        values: values of two phases where whole columns or rows are known, else of three, or of four, in their order.
     """
     if coarser is not None and coarser.shape[-2] == 2 * values.shape[-2]:  # every second column
         between = torch.stack(tuple(values), 2).flatten(1, 2)
         return torch.stack((coarser, between), -1).flatten(-2)
+    if coarser is not None and coarser.shape[-1] == 2 * values.shape[-1]:  # every second row
+        between = torch.stack(tuple(values), 3).flatten(2, 3)
+        return torch.stack((coarser, between), 2).flatten(1, 2)
     corner = values[0] if coarser is None else coarser
     opposite, right, below = values[-3:]
     return F.pixel_shuffle(torch.stack((corner, right, below, opposite), 1), 2)[:, 0]

@@ -19,6 +19,7 @@ from lidargrit import __version__
 from lidargrit.evaluation.reconstruction import ReconstructionErrors
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.files import write_text
+from lidargrit.nn.pixel_phases import Lattice
 from lidargrit.structures import Decoded, RangeImage, TokenGrid
 from lidargrit.viewer import interactive
 from lidargrit.viewer.interactive import button
@@ -66,7 +67,7 @@ class DemoPage:
         decoded: ranges and probabilities of a return, decoded from the tokens.
         sampled: range image decoded from the tokens, with a sampled return mask.
         by_phases: range image that a pixel decoder sampled from the same tokens; None for a model without one.
-        coarsest_cell: distance between the pixels of the pixel decoder's first phase.
+        lattices: lattices of the pixel decoder, each with the number of phases after which it is complete.
         sets: sets of scans to turn side by side.
         errors: errors of reconstruction over all held-out scans.
         card: scores of new scans against training scans, with those of held-out scans and of pixel statistics.
@@ -82,7 +83,7 @@ class DemoPage:
     decoded: Decoded
     sampled: RangeImage
     by_phases: RangeImage | None
-    coarsest_cell: int
+    lattices: Sequence[tuple[Lattice, int]]
     sets: Sequence[ScanSet]
     errors: ReconstructionErrors
     card: Scorecard
@@ -157,9 +158,10 @@ def _limits_m(demo: DemoPage) -> tuple[float, float]:
     return near, max(far, 2 * near)
 
 
-def _ranges(demo: DemoPage, image: RangeImage, caption: str, every: int = 1) -> str:
-    """Render a range image, or the pixels of every n-th row and column of it."""
-    range_m, returned = image.range_m[0, ::every, ::every].numpy(), image.return_mask[0, ::every, ::every].numpy()
+def _ranges(demo: DemoPage, image: RangeImage, caption: str, every: tuple[int, int] = (1, 1)) -> str:
+    """Render a range image, or its pixels at a distance of so many rows and columns."""
+    pixels = (0, slice(None, None, every[0]), slice(None, None, every[1]))
+    range_m, returned = image.range_m[pixels].numpy(), image.return_mask[pixels].numpy()
     return _figure(
         range_picture(range_m, returned, _limits_m(demo)), f"{caption}; {returned.mean():.0%} of rays returned"
     )
@@ -283,20 +285,19 @@ def _its_raydrop(demo: DemoPage) -> _Step:
 def _its_phases(demo: DemoPage) -> _Step:
     whole = demo.by_phases
     assert whole is not None
-    spacings = [demo.coarsest_cell >> halved for halved in range(demo.coarsest_cell.bit_length())]
     text = (
         "So far every ray is dropped by itself and every edge is blurred, because the decoder gives each pixel one "
         "distance and one probability. A third network, the pixel decoder, samples the pixels of the same tokens in "
-        f"{3 * len(spacings) - 2} phases from coarse to fine: first the return mask, then the distances. Each pixel is "
+        f"{demo.lattices[-1][1]} phases from coarse to fine: first the return mask, then the distances. Each pixel is "
         "sampled given all pixels of the phases before it. So dropped rays cluster as real ones do, and a point at an "
         "edge lies on the near surface or on the far one, not between them."
     )
     masks, ranges = [], []
-    for halved, spacing in list(enumerate(spacings))[-_LATTICES_SHOWN:]:
-        after = f"after {3 * halved + 1} phase" + ("s" if halved else "")
-        mask = whole.return_mask[0, ::spacing, ::spacing].float().numpy()
+    for lattice, count in demo.lattices[-_LATTICES_SHOWN:]:
+        after = f"after {count} phase" + ("s" if count > 1 else "")
+        mask = whole.return_mask[0, :: lattice.rows, :: lattice.columns].float().numpy()
         masks.append(_figure(rate_picture(mask), f"return mask {after}"))
-        ranges.append(_ranges(demo, whole, after, spacing))
+        ranges.append(_ranges(demo, whole, after, (lattice.rows, lattice.columns)))
     before_and_after = (
         _ranges(demo, demo.scan, "the scan itself")
         + _ranges(demo, demo.sampled, "its tokens, without the pixel decoder")
