@@ -13,7 +13,7 @@ from lidargrit.sources import PreparedSource, open_to_train
 from lidargrit.training.compute import computing_time, training_flops
 from lidargrit.training.config import Recipe
 from lidargrit.training.optimiser import memory_of_weights
-from lidargrit.training.taken_stages import donors_of_stages
+from lidargrit.training.taken_stages import donors_of_stages, taken_stages
 
 
 @dataclass(frozen=True)
@@ -101,12 +101,18 @@ def check_data(recipe: Recipe) -> None:
 
 
 def plan_training(recipe: Recipe) -> TrainingPlan:
-    """Return the plan of a recipe's training; no scan is read, and nothing is written."""
+    """Return the plan of a recipe's training; no scan is read, and nothing is written.
+
+    Raises:
+        ConfigError: a stage to take from another run that does not fit.
+        CheckpointError: no finished run to take stages from.
+    """
     sensor = recipe.data.load_sensor()
     stages = []
     with torch.device("meta"):  # sizes alone, without values, so that wide networks take no time
         generator = recipe.build_generator(sensor).to("meta")
         objectives = {name: generator.objective(name) for name in generator.stages}
+    taken_stages(recipe, generator)  # for what it refuses
     donors = donors_of_stages(recipe, generator.stages)
     flops = training_flops(recipe, without=donors)
     for name, objective in objectives.items():
