@@ -8,7 +8,7 @@ import torch
 
 from lidargrit.cli import main
 from lidargrit.conditions import Condition
-from lidargrit.conditions.fills import fill
+from lidargrit.conditions.fills import fill, fill_lacking
 from lidargrit.conditions.hints import hints_of
 from lidargrit.datasets.kitti_odometry import KittiOdometry
 from lidargrit.errors import ConfigError
@@ -139,7 +139,8 @@ def test_without_labels_in_the_model_nothing_grows_and_with_them_it_begins_the_s
     with torch.no_grad():
         one, other = (net.sample(known, [torch.Generator().manual_seed(3)]) for net in (plain, grown))
     assert torch.equal(one.range_m, other.range_m)
-    nearest = fill("nearest", known)  # whose class a network takes over that has not learned classes
+    assert one.label is None
+    nearest, one = fill("nearest", known), fill_lacking(one, known)
     both = one.return_mask & nearest.return_mask
     assert one.label is not None
     assert nearest.label is not None

@@ -9,13 +9,13 @@ from torch import Tensor
 
 from lidargrit.cli import main
 from lidargrit.conditions import Condition
-from lidargrit.conditions.fills import FILLS, fill
+from lidargrit.conditions.fills import FILLS, fill, fill_lacking
 from lidargrit.conditions.hints import hints_of
 from lidargrit.conditions.marks import mark, read_marks
 from lidargrit.errors import ConfigError
 from lidargrit.formats.kitti_bin import KittiBin
 from lidargrit.generators import load
-from lidargrit.generators.lidargrit import LidarGrit
+from lidargrit.generators.lidargrit import LidarGrit, TokenSampling
 from lidargrit.loading import DataConfig
 from lidargrit.nn.completion_network import CompletionNetwork, CompletionNetworkConfig
 from lidargrit.nn.completion_objective import CompletionObjective, random_patterns
@@ -175,7 +175,8 @@ def test_without_it_nothing_grows_and_with_it_ranges_begin_the_same():
     known = every_fourth_row(streets(1))
     one, other = (net.sample(known, [torch.Generator().manual_seed(3)]) for net in (plain, grown))
     assert torch.equal(one.range_m, other.range_m)
-    by_triangulation = fill("triangulation", known)  # which a network takes over that has not learned reflectance
+    assert one.reflectance is None
+    by_triangulation, one = fill("triangulation", known), fill_lacking(one, known)
     both = one.return_mask & by_triangulation.return_mask
     assert both.any()
     assert one.reflectance is not None
@@ -264,8 +265,34 @@ def test_complete_writes_it_and_its_error_is_told_where_both_have_it(folders, tm
     errors = [line[column].split() for line in (run, plain, triangles)]
     assert 0 < float(errors[2][0]) < float(errors[0][0]) + 0.05
     assert 0 < float(errors[1][0]) < 1
-    assert main([*compare, f"{folders}/plain:completion=tokens", *settings]) == 0  # which writes none
-    assert "error of reflectance" not in capsys.readouterr().out
+    assert main([*compare, f"{folders}/plain:completion=tokens", *settings]) == 0  # it has learned none
+    assert "error of reflectance" in capsys.readouterr().out
+
+
+def test_what_a_generator_does_not_write_is_filled_in_from_observed_returns(folders):
+    model, scans = load(folders / "plain"), streets(2)
+    label = torch.where(scans.return_mask, torch.where(torch.arange(64)[:, None] < 32, 40, 50), 0)
+    scans, observed = replace(scans, label=label), torch.zeros(2, 64, 32, dtype=torch.bool)
+    observed[:, ::4] = True
+    known = Condition.of_pixels(scans, observed)
+    done = model.complete(known, [3, 4], TokenSampling(completion="tokens"))
+    assert done.label is not None
+    assert known.label is not None
+    assert torch.equal(reflectance_of(done)[observed], reflectance_of(scans)[observed])
+    assert torch.equal(done.label[observed], known.label[observed])
+    new, classical = done.return_mask & ~observed, fill("triangulation", known)
+    both = new & classical.return_mask
+    assert classical.label is not None
+    assert int(both.sum()) > 100
+    assert torch.equal(reflectance_of(done)[both], reflectance_of(classical)[both])
+    assert torch.equal(done.label[both], classical.label[both])
+    assert not bool(reflectance_of(done)[~done.return_mask].any())
+    bare = model.complete(replace(known, reflectance=None, label=None), [3, 4], TokenSampling(completion="tokens"))
+    assert bare.reflectance is None
+    assert bare.label is None
+    assert torch.equal(bare.range_m, done.range_m)
+    dark = model.complete(Condition.of_pixels(scans, torch.zeros_like(observed)), [3, 4])
+    assert dark.reflectance is None, "nothing tells the reflectance where no return was observed"
 
 
 def test_a_stage_may_start_from_weights_that_lack_it_but_not_lose_it(folders):

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int, Int64
 from scipy.ndimage import distance_transform_edt, maximum_filter1d
 from scipy.spatial import Delaunay, QhullError
 from torch import Tensor
@@ -199,6 +199,33 @@ FILLS: dict[str, Fill] = {
 """Classical methods by the name that a user types."""
 
 
+def fill_lacking(completed: RangeImage, condition: Condition) -> RangeImage:
+    """Return completed scans with the reflectance and the labels that their observed parts have and they lack.
+
+    Reflectance is that of :data:`FILLS` ``["triangulation"]``, none where no return was observed in any scan; a label
+    is that of the nearest observed return.
+
+    Args:
+        completed: completed scans, on any device.
+        condition: observed part of each scan.
+    """
+    some = bool((condition.return_mask & condition.return_observed).any())
+    bright = condition.reflectance is not None and completed.reflectance is None and some
+    labelled = condition.label is not None and completed.label is None
+    if not (bright or labelled):
+        return completed
+    scans = [Observed.of(condition, index) for index in range(len(condition))]
+    device = completed.range_m.device
+    if bright:
+        found = [_reflectance_of(condition, index, seen, of_triangle) for index, seen in enumerate(scans)]
+        reflectance = torch.where(completed.return_mask, torch.stack(found).to(device), 0.0)
+        completed = replace(completed, reflectance=reflectance)
+    if labelled:
+        label = torch.stack([_label_of(condition, index, seen) for index, seen in enumerate(scans)]).to(device)
+        completed = replace(completed, label=torch.where(completed.return_mask, label, 0))
+    return completed
+
+
 def fill(method: str, condition: Condition) -> RangeImage:
     """Fill ranges and reflectance in by a classical method, returns from the nearest observed pixel, and labels from
     the nearest observed return.
@@ -217,14 +244,31 @@ def fill(method: str, condition: Condition) -> RangeImage:
         masks.append(torch.from_numpy(mask))
         ranges.append(torch.from_numpy(range_m).float())
         if condition.reflectance is not None:
-            pixels = condition.reflectance[index].cpu().numpy()
-            reflectances.append(torch.from_numpy(by.reflectance(seen, pixels) if some else pixels).clamp(0, 1))
+            reflectances.append(_reflectance_of(condition, index, seen, by.reflectance))
         if condition.label is not None:
-            rows, columns = (torch.from_numpy(part) for part in seen.nearest_return)
-            labels.append(condition.label[index].cpu()[rows, columns])
+            labels.append(_label_of(condition, index, seen))
     reflectance, label = (torch.stack(found) if found else None for found in (reflectances, labels))
     filled = RangeImage.masked(torch.stack(ranges), torch.stack(masks), sensor, reflectance, label)
     return condition.to("cpu").put_into(filled)
+
+
+def _reflectance_of(
+    condition: Condition,
+    index: int,
+    seen: Observed,
+    method: Callable[[Observed, Float32[np.ndarray, "H W"]], Float32[np.ndarray, "H W"]],
+) -> Float[Tensor, "H W"]:
+    """Return the reflectance of every pixel of a scan by a method; as it is where no return was observed."""
+    assert condition.reflectance is not None
+    pixels = condition.reflectance[index].cpu().numpy()
+    return torch.from_numpy(method(seen, pixels) if seen.returned.any() else pixels).clamp(0, 1)
+
+
+def _label_of(condition: Condition, index: int, seen: Observed) -> Int[Tensor, "H W"]:
+    """Return for every pixel of a scan the label of the nearest observed return."""
+    assert condition.label is not None
+    rows, columns = (torch.from_numpy(part) for part in seen.nearest_return)
+    return condition.label[index].cpu()[rows, columns]
 
 
 def fill_from_nearest(images: RangeImage, observed: Bool[Tensor, "B H W"]) -> RangeImage:

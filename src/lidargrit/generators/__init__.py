@@ -13,6 +13,7 @@ import torch
 
 from lidargrit import _discovery, configuration
 from lidargrit.conditions import Condition, ConditionKind
+from lidargrit.conditions.fills import fill_lacking
 from lidargrit.errors import CheckpointError, ConfigError, LidarGritError
 from lidargrit.files import is_taken, read_json, read_tensors
 from lidargrit.generators._batches import BatchSeeds, in_batches
@@ -194,6 +195,8 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     ) -> RangeImage:
         """Return scans that keep all observed values, bit for bit, and generate the rest (capability ``complete``).
 
+        Reflectance and labels that the generator does not write are filled in from the observed returns.
+
         Args:
             condition: observed part of each scan, such as ``Condition.of_pixels(images, observed)``, of the kinds in
                 :attr:`conditions`.
@@ -212,7 +215,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         generated = in_batches(
             seeds, self.compute_batch, lambda at, some: self._complete(condition[at], some, settings)
         )
-        return condition.put_into(generated)
+        return condition.put_into(fill_lacking(generated, condition))
 
     @final
     @torch.no_grad()

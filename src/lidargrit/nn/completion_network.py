@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -183,8 +183,7 @@ class CompletionNetwork(nn.Module):
         """Return completed scans: the range estimated, the mask sampled; a scan does not depend on the others.
 
         The range is the mean of two estimates, of the scan and of its mirror image, and so are the reflectance and the
-        logits of classes. Scans with reflectance are completed with reflectance, and those with labels with labels: a
-        network that has not learned them takes reflectance by triangulation, and the class of the nearest return.
+        logits of classes. A scan gets reflectance and labels if it has some and the network has learned them.
 
         Args:
             condition: observed pixels of as many scans.
@@ -193,19 +192,22 @@ class CompletionNetwork(nn.Module):
         images = []
         for index, rng in enumerate(rngs):
             one = condition[index : index + 1]
-            hints = hints_of(one)
+            shown = replace(  # what the network has not learned needs no hints
+                one,
+                label=one.label if self.config.labels else None,
+                reflectance=one.reflectance if self.config.reflectance else None,
+            )
+            hints = hints_of(shown)
             point, mirrored = self(hints, one.return_observed), self(hints.mirrored(), one.return_observed.flip(-1))
             v = (point.v + mirrored.v.flip(-1)) / 2
             uniform = torch.rand(one.range_m.shape, generator=rng).to(one.range_m.device)
             mask = self.mask.sample(point.guide, uniform, one)
             low_m, high_m = condition.sensor.range_min_m, condition.sensor.range_max_m
-            label = None if hints.labels is None else hints.labels[:, 0]
-            if label is not None and point.class_logits is not None and mirrored.class_logits is not None:
+            label, reflectance = None, None
+            if hints.labels is not None and point.class_logits is not None and mirrored.class_logits is not None:
                 label = labels_of((point.class_logits + mirrored.class_logits.flip(-1)).argmax(1) + 1)
-            reflectance = None if hints.reflectances is None else hints.reflectances[:, 0]
-            if reflectance is not None and point.reflectance is not None and mirrored.reflectance is not None:
-                reflectance = (point.reflectance + mirrored.reflectance.flip(-1)) / 2
-            reflectance = None if reflectance is None else reflectance.clamp(0, 1)
+            if hints.reflectances is not None and point.reflectance is not None and mirrored.reflectance is not None:
+                reflectance = ((point.reflectance + mirrored.reflectance.flip(-1)) / 2).clamp(0, 1)
             range_m = v.expm1().clamp(low_m, high_m)
             images.append(RangeImage.masked(range_m, mask, condition.sensor, reflectance, label))
         return RangeImage.cat(images)
