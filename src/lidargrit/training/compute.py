@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Collection
-from dataclasses import replace
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
 
@@ -28,6 +28,23 @@ _SHARE = 0.25  # of a peak: a guess for networks as small as these; small batche
 _MATRIX, _REPETITIONS = 512, 8  # the first repetition chooses a kernel
 
 
+@dataclass(frozen=True)
+class StageCost:
+    """Operations of a stage's training.
+
+    Args:
+        per_scan: operations of a step for each scan that it sees.
+        preparation: operations of what is prepared once for a training of so many scans.
+    """
+
+    per_scan: float
+    preparation: Callable[[int], int]
+
+    def of(self, scans: int) -> int:
+        """Return the operations of a training of so many scans."""
+        return round(self.per_scan * scans) + self.preparation(scans)
+
+
 def training_flops(recipe: Recipe, without: Collection[str] = ()) -> dict[str, int]:
     """Count the floating-point operations of a recipe's training, forward and backward, for each stage.
 
@@ -45,19 +62,23 @@ def training_flops(recipe: Recipe, without: Collection[str] = ()) -> dict[str, i
     Returns:
         number of operations, by the name of the stage.
     """
+    return {name: cost.of(recipe.training[name].scans) for name, cost in stage_costs(recipe, without).items()}
+
+
+def stage_costs(recipe: Recipe, without: Collection[str] = ()) -> dict[str, StageCost]:
+    """Count the operations of every stage by its name, whatever number of scans it is trained on."""
     with torch.random.fork_rng(range(torch.cuda.device_count())):
         torch.manual_seed(0)
         sensor = recipe.data.load_sensor()
         with torch.device("meta"):
             generator = recipe.build_generator(sensor).to("meta")
-        total = {}
+        costs = {}
         for stage in (name for name in generator.stages if name not in without):
-            scans = recipe.training[stage].scans
             try:
-                total[stage] = _flops_without_values(generator, stage, sensor, scans)
+                costs[stage] = _cost_without_values(generator, stage, sensor)
             except (RuntimeError, NotImplementedError):  # torch's for a value that was asked for, and for two devices
-                total[stage] = _flops_with_values(recipe.build_generator(sensor), stage, sensor, scans)
-    return total
+                costs[stage] = _cost_with_values(recipe.build_generator(sensor), stage, sensor)
+    return costs
 
 
 def computing_time(flops: int, precision: Precision) -> str:
@@ -112,14 +133,18 @@ def with_budget(recipe: Recipe, flops: float) -> Recipe:
     """
     if not recipe.training:
         return recipe
-    share, scaled = flops / sum(training_flops(recipe).values()), recipe
+    costs, share, scaled = stage_costs(recipe), 1.0, recipe
     for _ in range(_CORRECTIONS):
+        # What is prepared once, such as a reflow's pairs, does not shrink in proportion.
+        share *= flops / _spent(costs, scaled)
         scaled = replace(recipe, training={name: _scaled(stage, share) for name, stage in recipe.training.items()})
-        cost = sum(training_flops(scaled).values())
-        if cost <= flops * (1 + _OVERSPENT_AT_MOST):
+        if _spent(costs, scaled) <= flops * (1 + _OVERSPENT_AT_MOST):
             break
-        share *= flops / cost  # what is prepared once, such as a reflow's pairs, does not shrink in proportion
     return scaled
+
+
+def _spent(costs: Mapping[str, StageCost], recipe: Recipe) -> int:
+    return sum(cost.of(recipe.training[name].scans) for name, cost in costs.items())
 
 
 def _scaled(config: FitConfig, share: float) -> FitConfig:
@@ -152,7 +177,7 @@ class _SeedOfNoValues(torch.Generator):
     device = torch.device("meta")
 
 
-def _flops_without_values(generator: Generator, stage: str, sensor: SensorModel, scans: int) -> int:
+def _cost_without_values(generator: Generator, stage: str, sensor: SensorModel) -> StageCost:
     """Count the operations of a stage's training, of a generator whose weights have no values."""
     with torch.device("meta"):
         objective = generator.objective(stage)
@@ -161,16 +186,16 @@ def _flops_without_values(generator: Generator, stage: str, sensor: SensorModel,
         for name, buffer in module.named_buffers(recurse=False):
             if buffer.ndim == 0 and not buffer.is_floating_point():  # a counter, by which steps differ
                 module.register_buffer(name, torch.zeros_like(buffer, device="cpu"))
-    return _total(objective, uniform_images(sensor, _SCANS).to("meta"), _SeedOfNoValues, scans)
+    return _cost(objective, uniform_images(sensor, _SCANS).to("meta"), _SeedOfNoValues)
 
 
-def _flops_with_values(generator: Generator, stage: str, sensor: SensorModel, scans: int) -> int:
+def _cost_with_values(generator: Generator, stage: str, sensor: SensorModel) -> StageCost:
     """Count the operations of a stage's training by computing some of its steps."""
-    return _total(generator.objective(stage), uniform_images(sensor, _SCANS), torch.Generator, scans)
+    return _cost(generator.objective(stage), uniform_images(sensor, _SCANS), torch.Generator)
 
 
-def _total(objective: Objective, images: RangeImage, make_rng: Callable[[], torch.Generator], scans: int) -> int:
-    """Count the operations of some steps of all players, and return those of a training of so many scans."""
+def _cost(objective: Objective, images: RangeImage, make_rng: Callable[[], torch.Generator]) -> StageCost:
+    """Count the operations of some steps of all players."""
     steps = min(objective.period, _STEPS_AT_MOST)
     objective.train()
     with FlopCounter() as counter, warnings.catch_warnings():
@@ -178,4 +203,4 @@ def _total(objective: Objective, images: RangeImage, make_rng: Callable[[], torc
         warnings.filterwarnings("ignore", "The .grad attribute of a Tensor")
         for step, player in product(range(steps), objective.players or ("",)):
             objective(images, make_rng().manual_seed(step), player)["loss"].backward()
-    return round(counter.total / (steps * len(images)) * scans) + objective.preparation_flops(scans)
+    return StageCost(counter.total / (steps * len(images)), objective.preparation_flops)
