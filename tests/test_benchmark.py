@@ -160,7 +160,7 @@ def test_counted_operations_are_those_of_a_step_that_is_computed(recipe, stage):
 )
 def test_operations_are_counted_without_computing_them(recipe, monkeypatch):
     """Else a dry run of a wide network takes minutes: frozen networks, caches and counters count, too."""
-    monkeypatch.delattr(compute, "_flops_with_values")
+    monkeypatch.delattr(compute, "_cost_with_values")
     recipe = load_recipe(recipe)
     assert training_flops(recipe).keys() == recipe.training.keys()
 
