@@ -99,7 +99,7 @@ def test_a_budget_scales_all_stages_alike():
 def test_a_budget_counts_what_is_prepared_once(monkeypatch):
     """As a reflow's pairs: one for each training image, however many scans are seen."""
 
-    cost = compute.StageCost(100, lambda scans: 900 * min(scans, 50))
+    cost = compute.StageCost(100.0, lambda scans: 900 * min(scans, 50))
     monkeypatch.setattr(compute, "stage_costs", lambda recipe: {"tokenizer": cost})
     recipe = load_recipe("demo", ["training.tokenizer.scans=4000", "training.tokenizer.batch_size=1"])
     recipe = replace(recipe, training={"tokenizer": recipe.training["tokenizer"]})
