@@ -2,9 +2,9 @@
 
     python benchmarks/coarse_phases.py pretrained -n 96
 
-Scans are encoded, and their pixels sampled from the true tokens, around none or some of their true pixels: one in 8 x 8
-is the first phase, one in 4 x 4 or 2 x 2 are the phases of a lattice more or two more. What a score gains from one line
-to the next is what those phases cost. Scans are compared with others than those that are encoded.
+Scans are encoded, and their pixels sampled from the true tokens, around none or some of their true pixels: those of the
+first so many phases. What a score gains from one line to the next is what those phases cost. Scans are compared with
+others than those that are encoded.
 """
 
 from __future__ import annotations
@@ -19,24 +19,30 @@ from lidargrit.generators import load
 from lidargrit.generators.lidargrit import LidarGrit
 from lidargrit.metrics import load_metric, update_together
 from lidargrit.nn.pixel_decoder import PixelDecoder, PixelSampling
+from lidargrit.nn.pixel_phases import Lattice, completed_lattices
 from lidargrit.sources import open_images
 from lidargrit.structures import RangeImage
 from lidargrit.tokenizers import Tokenizer
 
 METRICS = ("wall_straightness", "flying_points", "drop_run_lengths", "drop_correlation", "point_cloud_jsd")
-_AT_ONCE = 8
+_AT_ONCE, _LATTICES = 8, 4
 
 
 def around_true_pixels(
-    tokenizer: Tokenizer, pixels: PixelDecoder, images: RangeImage, spacing: int, sampling: PixelSampling, seed: int
+    tokenizer: Tokenizer,
+    pixels: PixelDecoder,
+    images: RangeImage,
+    given: Lattice | None,
+    sampling: PixelSampling,
+    seed: int,
 ) -> RangeImage:
-    """Return scans sampled from the tokens of others, with every so many rows' and columns' true pixels given."""
+    """Return scans sampled from the tokens of others, with the true pixels of a lattice given."""
     found = []
     for first in range(0, len(images), _AT_ONCE):
         some = images[first : first + _AT_ONCE]
         observed = torch.zeros_like(some.return_mask)
-        if spacing:
-            observed[:, ::spacing, ::spacing] = True
+        if given is not None:
+            observed[:, :: given.rows, :: given.columns] = True
         rngs = [torch.Generator().manual_seed(seed + first + index) for index in range(len(some))]
         decoded = tokenizer.decode(tokenizer.encode(some))
         found.append(pixels.sample(decoded, rngs, sampling, Condition.of_pixels(some, observed)))
@@ -54,7 +60,7 @@ def scores(images: RangeImage, others: RangeImage) -> list[float]:
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Print one line for each spacing of given pixels."""
+    """Print one line for each of the finest lattices of given pixels."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("model", help="a run with tokens and a pixel decoder")
     parser.add_argument("--scans", default="simulated:256:val", help="source of scans (default: %(default)s)")
@@ -70,12 +76,13 @@ def main(words: Sequence[str] | None = None) -> None:
         parser.error(f"{choices.scans} has {len(images)} scans, wanted twice {choices.n}, choose a lower -n")
     others, scored = images.batch(range(choices.n)), images.batch(range(choices.n, 2 * choices.n))
     sampling = PixelSampling(choices.range_temperature, choices.range_noise)
-    print(f"{'true pixels given':24}", *(f"{name:>18}" for name in (*METRICS, "> 2 m apart, %")))
-    for spacing in (0, 8, 4, 2, 1):
+    print(f"{'true pixels given':28}", *(f"{name:>18}" for name in (*METRICS, "> 2 m apart, %")))
+    lattices = completed_lattices(model.pixels.mask.phases)[-_LATTICES:]
+    for lattice, phases in [(None, 0), *lattices]:
         with torch.inference_mode():
-            sampled = around_true_pixels(model.tokenizer, model.pixels, scored, spacing, sampling, seed=900_000)
-        title = {0: "none", 1: "all of them"}.get(spacing, f"one in {spacing} x {spacing}")
-        print(f"{title:24}", *(f"{value:18.4f}" for value in scores(sampled, others)), flush=True)
+            sampled = around_true_pixels(model.tokenizer, model.pixels, scored, lattice, sampling, seed=900_000)
+        title = "none" if lattice is None else f"one in {lattice.rows} x {lattice.columns}: {phases} phases"
+        print(f"{title:28}", *(f"{value:18.4f}" for value in scores(sampled, others)), flush=True)
 
 
 if __name__ == "__main__":

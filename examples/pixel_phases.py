@@ -10,7 +10,7 @@ import lidargrit
 from lidargrit.errors import ConfigError, LidarGritError
 from lidargrit.generators.lidargrit import LidarGrit, TokenSampling
 from lidargrit.nn.pixel_decoder import PixelDecoder
-from lidargrit.nn.pixel_phases import complete_after
+from lidargrit.nn.pixel_phases import completed_lattices
 
 SEED = 3
 SHOWN = 4  # finest lattices of sampled pixels
@@ -24,7 +24,7 @@ def main(folder: Path, run: str = "pretrained") -> None:
     scan, plain = model.sample([SEED])[0], model.sample([SEED], TokenSampling(mask="bernoulli"))[0]
     phases = model.pixels.mask.phases
     panels = []
-    for lattice, count in complete_after(phases)[-SHOWN:]:
+    for lattice, count in completed_lattices(phases)[-SHOWN:]:
         panels.append((f"after {count} of {len(phases)} phases", scan.range_m[:: lattice.rows, :: lattice.columns]))
     panels.append(("the same tokens without a pixel decoder", plain.range_m))
     figure, axes = plt.subplots(len(panels), figsize=(8, 7.5), layout="constrained")

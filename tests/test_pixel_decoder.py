@@ -13,7 +13,7 @@ from lidargrit.conditions import Condition
 from lidargrit.errors import ConfigError
 from lidargrit.nn.pixel_decoder import PixelDecoder, PixelSampling, nats_to_range_bits
 from lidargrit.nn.pixel_networks import Guide, PixelDecoderConfig
-from lidargrit.nn.pixel_phases import at_phases, complete_after, generated_before, join_phases, phases_of
+from lidargrit.nn.pixel_phases import at_phases, completed_lattices, generated_before, join_phases, phases_of
 from lidargrit.nn.range_mixture import RangeMixture
 from lidargrit.sensors import SensorModel, load_sensor
 from lidargrit.structures import Decoded, RangeImage
@@ -78,9 +78,10 @@ def test_phases_cover_every_pixel_once(cell: int, halvings: tuple[int, int]) -> 
 
 
 @pytest.mark.parametrize("halvings", [(0, 0), (2, 0), (0, 2)])
-def test_a_lattice_is_complete_after_its_number_of_phases(halvings: tuple[int, int]) -> None:
+def test_a_lattice_is_completed_lattices_its_number_of_phases(halvings: tuple[int, int]) -> None:
     phases, generated = phases_of(4, *halvings), torch.zeros(16, 32, dtype=torch.bool)
-    ends = {count: lattice for lattice, count in complete_after(phases)}
+    ends = {count: lattice for lattice, count in completed_lattices(phases)}
+    assert list(ends) == [1, 4, 7, 9, 11][: 3 + sum(halvings)]
     for number, phase in enumerate(phases, start=1):
         generated[phase.pixels] = True
         if number in ends:
@@ -355,6 +356,10 @@ def test_an_image_that_cells_do_not_divide_is_refused() -> None:
         PixelDecoder(PixelDecoderConfig(), tiny_sensor(12, 16), FEATURES)
     with pytest.raises(ConfigError, match="a power of 2"):
         PixelDecoderConfig(coarsest_cell=6)
+    with pytest.raises(ConfigError, match="row_halvings=1000000; wanted at most 8"):
+        PixelDecoderConfig(row_halvings=1_000_000)
+    with pytest.raises(ConfigError, match="cells of 32x8"):
+        PixelDecoder(PixelDecoderConfig(8, row_halvings=2), tiny_sensor(16, 32), FEATURES)
     with pytest.raises(ConfigError, match="column_halvings=1, row_halvings=2"):
         PixelDecoderConfig(column_halvings=1, row_halvings=2)
     with pytest.raises(ConfigError, match="mask_width=0"):

@@ -22,7 +22,7 @@ from lidargrit.files import read_json, write_json
 from lidargrit.generators import PRETRAINED, RUN_FILE, Generator, load
 from lidargrit.generators.lidargrit import LidarGrit, TokenSampling
 from lidargrit.loading import DataConfig, RangeImages
-from lidargrit.nn.pixel_phases import complete_after
+from lidargrit.nn.pixel_phases import completed_lattices
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
 from lidargrit.sources import load_range_images, open_source
@@ -182,7 +182,7 @@ def write_results_page(
         reconstructed = _reconstructed(generator, held_out, sampling)
     by_phases, lattices = None, []
     if isinstance(generator, LidarGrit) and generator.pixels is not None:
-        by_phases, lattices = reconstructed[:1], complete_after(generator.pixels.mask.phases)
+        by_phases, lattices = reconstructed[:1], completed_lattices(generator.pixels.mask.phases)
     seeds = tuple(f"seed {seed}" for seed in range(len(new)))
     sets = [
         ScanSet(f"{kind}, held out", held_out, names),

@@ -202,25 +202,26 @@ FILLS: dict[str, Fill] = {
 def fill_lacking(completed: RangeImage, condition: Condition) -> RangeImage:
     """Return completed scans with the reflectance and the labels that their observed parts have and they lack.
 
-    Reflectance is that of :data:`FILLS` ``["triangulation"]``, none where no return was observed in any scan; a label
-    is that of the nearest observed return.
+    Reflectance is that of :data:`FILLS` ``["triangulation"]``, 0 in scans none of whose observed pixels returned, and
+    stays unknown where no pixel tells of a return, as for the surfaces of clean scans. A label is that of the nearest
+    observed return.
 
     Args:
         completed: completed scans, on any device.
         condition: observed part of each scan.
     """
-    some = bool((condition.return_mask & condition.return_observed).any())
-    bright = condition.reflectance is not None and completed.reflectance is None and some
-    labelled = condition.label is not None and completed.label is None
-    if not (bright or labelled):
+    tells = condition.reflectance is not None and bool(condition.return_observed.any())
+    lacks_reflectance = tells and completed.reflectance is None
+    lacks_labels = condition.label is not None and completed.label is None
+    if not (lacks_reflectance or lacks_labels):
         return completed
     scans = [Observed.of(condition, index) for index in range(len(condition))]
     device = completed.range_m.device
-    if bright:
+    if lacks_reflectance:
         found = [_reflectance_of(condition, index, seen, of_triangle) for index, seen in enumerate(scans)]
         reflectance = torch.where(completed.return_mask, torch.stack(found).to(device), 0.0)
         completed = replace(completed, reflectance=reflectance)
-    if labelled:
+    if lacks_labels:
         label = torch.stack([_label_of(condition, index, seen) for index, seen in enumerate(scans)]).to(device)
         completed = replace(completed, label=torch.where(completed.return_mask, label, 0))
     return completed
@@ -258,7 +259,7 @@ def _reflectance_of(
     seen: Observed,
     method: Callable[[Observed, Float32[np.ndarray, "H W"]], Float32[np.ndarray, "H W"]],
 ) -> Float[Tensor, "H W"]:
-    """Return the reflectance of every pixel of a scan by a method; as it is where no return was observed."""
+    """Return the reflectance of every pixel of a scan by a method; unchanged where no return was observed."""
     assert condition.reflectance is not None
     pixels = condition.reflectance[index].cpu().numpy()
     return torch.from_numpy(method(seen, pixels) if seen.returned.any() else pixels).clamp(0, 1)

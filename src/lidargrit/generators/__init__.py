@@ -13,7 +13,6 @@ import torch
 
 from lidargrit import _discovery, configuration
 from lidargrit.conditions import Condition, ConditionKind
-from lidargrit.conditions.fills import fill_lacking
 from lidargrit.errors import CheckpointError, ConfigError, LidarGritError
 from lidargrit.files import is_taken, read_json, read_tensors
 from lidargrit.generators._batches import BatchSeeds, in_batches
@@ -207,6 +206,8 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
             ConfigError: images of other rays, a condition of a kind that the generator does not take, seeds that are
                 too many, too few or out of bounds, settings of another generator, or one without the capability.
         """
+        from lidargrit.conditions.fills import fill_lacking  # noqa: PLC0415  loads scipy, and only this needs it
+
         self._require("complete")
         check_condition(condition, self.conditions, self.sensor, self.public_name())
         check_seeds(seeds, len(condition))

@@ -143,9 +143,8 @@ class PixelDecoder(nn.Module):
     ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
         """Return the mean nats of the mask a pixel and of the range a return, estimated by some of the phases.
 
-        Of a fine lattice one phase counts for all: a step of training costs a third, and so there are three times as
-        many. Coarse lattices have few pixels to learn from, and all their phases count. The estimate of the mask is
-        unbiased.
+        Of a fine lattice one phase counts for all: a step costs a third to a half, and there are as many more steps.
+        Coarse lattices have few pixels to learn from, and all their phases count. The estimate of the mask is unbiased.
         """
         guide = self.guide(decoded, len(images))
         guided = self.mask.guided(guide), self.range.guided(guide)

@@ -25,6 +25,7 @@ _TYPICAL_V = 2.5  # ln(1 + 11 m), the middle of what scans hold, so that inputs 
 _LOGIT_BOUND = 8.0  # of the decoder's return logits, beyond which it is as good as sure
 _SAME_SURFACE_V = 3e-4  # two ranges nearer than this, 6 mm at 20 m, are on one surface
 _NEIGHBOURS = 6  # candidates of a range: an interpolation and two neighbours, of each of two pairs
+_HALVINGS_AT_MOST = 8  # of one side alone
 _COARSE_AREA = 64  # lattices with one in so many pixels, or fewer, are coarse
 _FINEST_M, _COARSEST_M = math.exp(-6), math.exp(4)  # scales of a component: 2.5 mm to 55 m
 
@@ -34,11 +35,13 @@ class PixelDecoderConfig:
     """Sizes of the pixel decoder.
 
     Args:
-        coarsest_cell: shorter side of the cells of which the first phase generates one pixel each; a power of 2.
+        coarsest_cell: shorter side of the cells of which the first phase generates one pixel each; a power of 2. Cells
+            divide both sides of the image.
         column_halvings: number of halvings of the distance between columns alone, which come last, so that pixels know
             of others in their own row; cells have as many columns as rows, times 2 for each.
-        row_halvings: the same of the distance between rows, so that pixels know of others in their own column: for
-            images whose columns are farther apart than their rows. One of the two is 0.
+        row_halvings: the same of the distance between rows, so that pixels know of others in their own column, for
+            images whose columns are farther apart than their rows; cells have as many rows as columns, times 2 for
+            each. One of the two is 0.
         mask_features: number of channels of the tokenizer's features that the mask network sees, if any.
         range_features: number of channels of the tokenizer's features that the range network sees, if any.
         row_channels: number of learned values of every row.
@@ -64,11 +67,13 @@ class PixelDecoderConfig:
     free_components: int = 4
 
     def __post_init__(self) -> None:
-        phases_of(self.coarsest_cell, max(self.column_halvings, 0), max(self.row_halvings, 0))
         for name, value in vars(self).items():
             least = 0 if name in ("column_halvings", "row_halvings", "coarse_range_width") else 1
             if value < least:
                 raise ConfigError(f"{name}={value}", f"at least {least}", "raise it")
+            if name.endswith("halvings") and value > _HALVINGS_AT_MOST:
+                raise ConfigError(f"{name}={value}", f"at most {_HALVINGS_AT_MOST}", "lower it")
+        phases_of(self.coarsest_cell, self.column_halvings, self.row_halvings)
 
 
 class Guide(NamedTuple):

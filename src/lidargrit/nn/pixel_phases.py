@@ -75,21 +75,23 @@ class Phase(NamedTuple):
     def pairs(self) -> tuple[tuple[int, int], tuple[int, int]]:
         """Rows and columns, from a pixel to one neighbour of each of two pairs that are generated before it."""
         if self.lattice.known != "corners":
-            across, along = _HORIZONTAL, _VERTICAL
-            if self.lattice.known == "rows":
-                across, along = along, across
-            return across, _FALLING if self.rank == 2 else along
+            both = (_HORIZONTAL, _VERTICAL) if self.lattice.known == "columns" else (_VERTICAL, _HORIZONTAL)
+            return (both[0], _FALLING) if self.rank == 2 else both
         return (_FALLING, _RISING) if self.rank == 1 else (_VERTICAL, _HORIZONTAL)
 
 
 def phases_of(coarsest_cell: int, column_halvings: int = 0, row_halvings: int = 0) -> list[Phase]:
-    """Return every phase in order: one pixel of each coarsest cell, then three phases for each halving of the distance.
+    """Return every phase in order.
+
+    First comes one pixel of each coarsest cell, then three phases for each halving of both distances, and at last two
+    for each halving of one of them alone.
 
     Args:
         coarsest_cell: shorter side of the cells of which the first phase generates one pixel each; a power of 2.
         column_halvings: number of halvings of the distance between columns alone, in two phases each, that come last;
             the cells have as many columns as rows, times 2 for each.
-        row_halvings: the same of the distance between rows; one of the two is 0.
+        row_halvings: the same of the distance between rows: the cells have as many rows as columns, times 2 for each.
+            One of the two is 0.
 
     Raises:
         ConfigError: a cell of another size, or halvings of both.
@@ -114,10 +116,10 @@ def phases_of(coarsest_cell: int, column_halvings: int = 0, row_halvings: int = 
     return phases
 
 
-def complete_after(phases: list[Phase]) -> list[tuple[Lattice, int]]:
+def completed_lattices(phases: list[Phase]) -> list[tuple[Lattice, int]]:
     """Return the lattices from coarse to fine, each with the number of phases after which all its pixels are generated.
 
-    The first is of one pixel in every coarsest cell, which is the first phase.
+    The first one has a pixel in every coarsest cell, those of the first phase; it is the lattice of no phase.
     """
     coarsest = phases[0].lattice
     ends = {phase.lattice: number for number, phase in enumerate(phases, start=1)}

@@ -23,14 +23,7 @@ RECIPE = replace(
         transformer=replace(compact.RECIPE.model.transformer, embedding_dropout=0.0, residual_dropout=0.0),
         # Sizes that leave these three networks, rounded to 16 bits, below 16 MiB.
         pixels=PixelDecoderConfig(
-            # Columns are 1.4 degrees apart and rows 0.4, so rows come closer last.
-            coarsest_cell=16,
-            row_halvings=2,
-            mask_features=6,
-            range_features=12,
-            row_channels=2,
-            range_width=36,
-            coarse_range_width=48,
+            coarsest_cell=64, mask_features=6, range_features=12, row_channels=2, range_width=36, coarse_range_width=48
         ),
     ),
     data=replace(compact.RECIPE.data, train=("simulated:10000:train",)),

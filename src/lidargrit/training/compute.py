@@ -33,16 +33,16 @@ class StageCost:
     """Operations of a stage's training.
 
     Args:
-        per_scan: operations of a step for each scan that it sees.
-        preparation: operations of what is prepared once for a training of so many scans.
+        flops_per_scan: floating-point operations of a step for each scan that it sees.
+        preparation_flops: number of scans that a training sees → operations of what is prepared once for it.
     """
 
-    per_scan: float
-    preparation: Callable[[int], int]
+    flops_per_scan: float
+    preparation_flops: Callable[[int], int]
 
-    def of(self, scans: int) -> int:
+    def flops(self, scans: int) -> int:
         """Return the operations of a training of so many scans."""
-        return round(self.per_scan * scans) + self.preparation(scans)
+        return round(self.flops_per_scan * scans) + self.preparation_flops(scans)
 
 
 def training_flops(recipe: Recipe, without: Collection[str] = ()) -> dict[str, int]:
@@ -62,7 +62,7 @@ def training_flops(recipe: Recipe, without: Collection[str] = ()) -> dict[str, i
     Returns:
         number of operations, by the name of the stage.
     """
-    return {name: cost.of(recipe.training[name].scans) for name, cost in stage_costs(recipe, without).items()}
+    return {name: cost.flops(recipe.training[name].scans) for name, cost in stage_costs(recipe, without).items()}
 
 
 def stage_costs(recipe: Recipe, without: Collection[str] = ()) -> dict[str, StageCost]:
@@ -136,15 +136,15 @@ def with_budget(recipe: Recipe, flops: float) -> Recipe:
     costs, share, scaled = stage_costs(recipe), 1.0, recipe
     for _ in range(_CORRECTIONS):
         # What is prepared once, such as a reflow's pairs, does not shrink in proportion.
-        share *= flops / _spent(costs, scaled)
+        share *= flops / _flops_of(costs, scaled)
         scaled = replace(recipe, training={name: _scaled(stage, share) for name, stage in recipe.training.items()})
-        if _spent(costs, scaled) <= flops * (1 + _OVERSPENT_AT_MOST):
+        if _flops_of(costs, scaled) <= flops * (1 + _OVERSPENT_AT_MOST):
             break
     return scaled
 
 
-def _spent(costs: Mapping[str, StageCost], recipe: Recipe) -> int:
-    return sum(cost.of(recipe.training[name].scans) for name, cost in costs.items())
+def _flops_of(costs: Mapping[str, StageCost], recipe: Recipe) -> int:
+    return sum(cost.flops(recipe.training[name].scans) for name, cost in costs.items())
 
 
 def _scaled(config: FitConfig, share: float) -> FitConfig:

@@ -112,7 +112,7 @@ def plan_training(recipe: Recipe) -> TrainingPlan:
     with torch.device("meta"):  # sizes alone, without values, so that wide networks take no time
         generator = recipe.build_generator(sensor).to("meta")
         objectives = {name: generator.objective(name) for name in generator.stages}
-    taken_stages(recipe, generator)  # for what it refuses
+    taken_stages(recipe, generator)  # raises where a stage does not fit
     donors = donors_of_stages(recipe, generator.stages)
     flops = training_flops(recipe, without=donors)
     for name, objective in objectives.items():
