@@ -165,6 +165,9 @@ def test_a_plan_tells_which_stages_are_taken_and_not_trained(tmp_path, capsys, m
     text = capsys.readouterr().out
     assert "transformer: 4,539,136 parameters, taken from pretrained and not trained" in text
     assert "pixels: 916,015 parameters, 17,000 scans" in text
+    words = ["--dry-run", "--set", "model.pixels.coarsest_cell=8"]
+    assert main(["train", "compact_raydrop", str(tmp_path / "none"), *words]) == 2
+    assert "whose pixels is another (model.pixels.coarsest_cell=64)" in the_one_line(capsys.readouterr().err, "train")
 
 
 def test_sample_writes_one_file_a_seed_and_draws_no_seed_twice(run_folder, samples, typed, monkeypatch):

@@ -71,8 +71,9 @@ def test_pixels_come_back_rounded_to_the_step(codec, compressed):
     assert float((back.range_m - image.range_m[0]).abs().max()) <= 0.01 + 1e-6
 
 
-def test_a_model_without_tokens_compresses_too():
-    generator = Multiscale(MultiscaleConfig(replace(PIXELS, coarsest_cell=4, column_halvings=1)), SENSOR)
+@pytest.mark.parametrize("halvings", [{"column_halvings": 1}, {"row_halvings": 1}])
+def test_a_model_without_tokens_compresses_too(halvings):
+    generator = Multiscale(MultiscaleConfig(replace(PIXELS, coarsest_cell=4, **halvings)), SENSOR)
     rng = torch.Generator().manual_seed(3)
     for weight in generator.parameters():
         weight.data = torch.empty_like(weight).normal_(std=0.1, generator=rng)

@@ -78,7 +78,7 @@ def test_phases_cover_every_pixel_once(cell: int, halvings: tuple[int, int]) -> 
 
 
 @pytest.mark.parametrize("halvings", [(0, 0), (2, 0), (0, 2)])
-def test_a_lattice_is_completed_lattices_its_number_of_phases(halvings: tuple[int, int]) -> None:
+def test_a_lattice_is_complete_after_its_number_of_phases(halvings: tuple[int, int]) -> None:
     phases, generated = phases_of(4, *halvings), torch.zeros(16, 32, dtype=torch.bool)
     ends = {count: lattice for lattice, count in completed_lattices(phases)}
     assert list(ends) == [1, 4, 7, 9, 11][: 3 + sum(halvings)]
@@ -323,27 +323,29 @@ def test_observed_pixels_come_back_as_they_are_and_move_their_neighbours() -> No
     assert torch.equal(sample(torch.ones_like(observed)).range_m, images.range_m)
 
 
-def test_the_row_between_two_of_a_plane_is_interpolated_exactly() -> None:
+@pytest.mark.parametrize(("halvings", "number"), [((0, 0), 3), ((0, 1), 4)])
+def test_the_row_between_two_of_a_plane_is_interpolated_exactly(halvings: tuple[int, int], number: int) -> None:
     sensor = tiny_sensor(8, 8)
-    decoder, decoded = random_decoder(sensor, 2), random_decoded(sensor, 1)
+    decoder, decoded = random_decoder(sensor, 2, halvings=halvings), random_decoded(sensor, 1)
     # Ranges of the ground 1.7 m below the sensor, which every second of the lower rows sees.
     elevation_rad = sensor.elevation_rad.expand(8, 8)
     range_m = torch.where(elevation_rad < -0.03, 1.7 / -elevation_rad.sin().clamp(max=-0.03), 10.0)[None]
     mask = (elevation_rad < -0.03)[None]
-    phase = decoder.range.phases[3]  # below a pixel of the first phase, above another
+    phase = decoder.range.phases[number]  # below a known pixel, above another
     candidates = decoder.range.candidates([phase], Guide.of(decoded), mask, torch.where(mask, range_m, 0.0).log1p())
     inner = candidates[0, 0, 0, 1:3, :].expm1()
     assert torch.allclose(inner, range_m[0][phase.pixels][1:3], rtol=1e-4)
 
 
 @torch.no_grad()
-def test_the_estimate_of_a_training_step_is_right_on_average() -> None:
+@pytest.mark.parametrize(("halvings", "choices"), [((0, 0), 4), ((0, 1), 4 * 2)])
+def test_the_estimate_of_a_training_step_is_right_on_average(halvings: tuple[int, int], choices: int) -> None:
     sensor = tiny_sensor(4, 8)
-    decoder, decoded, images = random_decoder(sensor, 2), random_decoded(sensor, 2), random_images(sensor, 2)
-    rng = torch.Generator().manual_seed(0)
-    found = {round(float(decoder.estimate(decoded, images, rng)[0]), 5) for _ in range(40)}
-    assert len(found) == 4  # one for each phase
-    assert sum(found) / 4 == pytest.approx(float(decoder(decoded, images).mask.mean()), abs=1e-4)
+    decoder, decoded = random_decoder(sensor, 2, halvings=halvings), random_decoded(sensor, 2)
+    images, rng = random_images(sensor, 2), torch.Generator().manual_seed(0)
+    found = {round(float(decoder.estimate(decoded, images, rng)[0]), 5) for _ in range(20 * choices)}
+    assert len(found) == choices  # one phase of each lattice
+    assert sum(found) / choices == pytest.approx(float(decoder(decoded, images).mask.mean()), abs=1e-4)
 
 
 def test_bits_of_a_return_are_those_of_a_centimetre() -> None:

@@ -291,6 +291,12 @@ def test_what_a_generator_does_not_write_is_filled_in_from_observed_returns(fold
     assert bare.reflectance is None
     assert bare.label is None
     assert torch.equal(bare.range_m, done.range_m)
+    none = torch.zeros_like(scans.return_mask[1:])
+    lost = RangeImage.masked(scans.range_m[1:], none, SENSOR, reflectance_of(scans)[1:], scans.label[1:])
+    mixed = Condition.of_pixels(RangeImage.cat([scans[:1], lost]), observed)
+    alone, together = model.complete(mixed[1:2], [4]), model.complete(mixed, [3, 4])
+    assert not bool(reflectance_of(alone).any()), "no observed pixel returned"
+    assert torch.equal(reflectance_of(together)[1:], reflectance_of(alone)), "whatever else is completed"
     dark = model.complete(Condition.of_pixels(scans, torch.zeros_like(observed)), [3, 4])
     assert dark.reflectance is None, "nothing tells the reflectance where no return was observed"
 
