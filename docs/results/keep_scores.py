@@ -3,7 +3,8 @@
     python docs/results/keep_scores.py TABLE docs/results/fair/1e13
 
 ``lidargrit evaluate --tables docs/results/fair/1e13/*.json`` prints the files side by side. Under ``costs`` stand the
-operations, parameters and seconds that ``compare`` measured.
+operations, parameters and seconds that ``compare`` measured. Scores by further metrics, which ``lidargrit evaluate
+TABLE/SYSTEM/samples ... --json TABLE/SYSTEM.extra.json`` wrote, are kept with them.
 """
 
 import argparse
@@ -11,14 +12,14 @@ import json
 from pathlib import Path
 
 
-def kept(scores: dict, costs: dict, system: str) -> dict:
+def kept(scores: dict, further: list[dict], costs: dict, system: str) -> dict:
     """Return the scores of a system without what only plots need, and without the folders of the machine."""
     inputs = {name: dict(each) for name, each in scores["inputs"].items()}
     inputs["samples"]["source"] = system
     return scores | {
         "samples": system,
         "inputs": inputs,
-        "scores": [score | {"details": {}} for score in scores["scores"]],
+        "scores": [score | {"details": {}} for score in [*scores["scores"], *further]],
         "costs": costs,
     }
 
@@ -36,8 +37,10 @@ def main() -> None:
         if not scores_file.exists():
             continue  # sampled, not yet scored
         scores, costs = (json.loads(path.read_text(encoding="utf-8")) for path in (scores_file, file))
+        extra = choices.table / f"{system}.extra.json"
+        further = json.loads(extra.read_text(encoding="utf-8"))["scores"] if extra.exists() else []
         name = system.replace(":", ".").replace("=", "")  # names that every file system takes
-        text = json.dumps(kept(scores, costs, system), indent=1) + "\n"
+        text = json.dumps(kept(scores, further, costs, system), indent=1) + "\n"
         (choices.out / f"{name}.json").write_text(text, encoding="utf-8")
 
 

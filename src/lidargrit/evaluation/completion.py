@@ -52,10 +52,10 @@ class CompletionScore:
         beside_triangulation_m: difference of ``mae_m`` from that of triangulation on the same scans; negative if
             better.
         class_accuracy: share of right classes, over the pixels of ``mae_m`` whose true class is one of the 19 of
-            SemanticKITTI's benchmark; None where the true or the completed scans have no labels.
+            SemanticKITTI's benchmark; None where the true scans have no labels.
         class_iou: mean over the classes that these pixels hold, all scans together, of intersection over union.
-        reflectance_error: mean absolute error of reflectance, over the pixels of ``mae_m``; None where the true or the
-            completed scans have none.
+        reflectance_error: mean absolute error of reflectance, over the pixels of ``mae_m``; None where the true scans
+            have none.
     """
 
     model: str
