@@ -39,9 +39,9 @@ class PixelDecoderConfig:
             divide both sides of the image.
         column_halvings: number of halvings of the distance between columns alone, which come last, so that pixels know
             of others in their own row; cells have as many columns as rows, times 2 for each.
-        row_halvings: the same of the distance between rows, so that pixels know of others in their own column, for
-            images whose columns are farther apart than their rows; cells have as many rows as columns, times 2 for
-            each. One of the two is 0.
+        row_halvings: number of halvings of the distance between rows alone, which come last, so that pixels know of
+            others in their own column, for images whose columns are farther apart than their rows; cells have as many
+            rows as columns, times 2 for each. It is 0 if column_halvings is not.
         mask_features: number of channels of the tokenizer's features that the mask network sees, if any.
         range_features: number of channels of the tokenizer's features that the range network sees, if any.
         row_channels: number of learned values of every row.

@@ -23,7 +23,7 @@ class Lattice(NamedTuple):
     Args:
         rows: distance between two pixels of the lattice, in rows of the image.
         columns: distance between two pixels of the lattice, in columns of the image.
-        known: what is known before its phases: one corner of every 2x2 pixels, or every second column or row.
+        known: pixels that are generated before its phases: one corner of every 2x2, or every second column or row.
     """
 
     rows: int
@@ -90,8 +90,8 @@ def phases_of(coarsest_cell: int, column_halvings: int = 0, row_halvings: int = 
         coarsest_cell: shorter side of the cells of which the first phase generates one pixel each; a power of 2.
         column_halvings: number of halvings of the distance between columns alone, in two phases each, that come last;
             the cells have as many columns as rows, times 2 for each.
-        row_halvings: the same of the distance between rows: the cells have as many rows as columns, times 2 for each.
-            One of the two is 0.
+        row_halvings: number of halvings of the distance between rows alone, likewise: the cells have as many rows as
+            columns, times 2 for each. It is 0 if ``column_halvings`` is not.
 
     Raises:
         ConfigError: a cell of another size, or halvings of both.
