@@ -131,7 +131,7 @@ def how_trained(recipe: Recipe) -> str:
         (further, "learns", "learn", "further here, from the weights of {package}"),
         ([stage for stage in stages if stage not in further], "learns", "learn", "anew here"),
     )
-    package = "the model in the package, which learned from simulated streets for three hours of one core"
+    package = "the model in the package, which learned from simulated streets for hours of one core"
     said = []
     for which, one, several, what in sentences:
         if which:

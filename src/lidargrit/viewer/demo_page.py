@@ -317,7 +317,7 @@ def _new_scans(demo: DemoPage) -> _Step:
     if len(demo.sets) > 3:
         text += (
             " The last set comes from the model in the package as a whole, all of whose networks were trained for "
-            "long: three hours of one core."
+            "long: hours of one core."
         )
     buttons = button("bin", ".bin") + button("ply", ".ply")
     return _Step("New scans", text, interactive.viewer_html("", f"Save {buttons}", f"Made by lidargrit {__version__}."))
