@@ -42,7 +42,7 @@ def around_true_pixels(
         some = images[first : first + _AT_ONCE]
         observed = torch.zeros_like(some.return_mask)
         if given is not None:
-            observed[:, :: given.rows, :: given.columns] = True
+            observed[(..., *given.pixels)] = True
         rngs = [torch.Generator().manual_seed(seed + first + index) for index in range(len(some))]
         decoded = tokenizer.decode(tokenizer.encode(some))
         found.append(pixels.sample(decoded, rngs, sampling, Condition.of_pixels(some, observed)))

@@ -25,7 +25,7 @@ def main(folder: Path, run: str = "pretrained") -> None:
     phases = model.pixels.mask.phases
     panels = []
     for lattice, count in completed_lattices(phases)[-SHOWN:]:
-        panels.append((f"after {count} of {len(phases)} phases", scan.range_m[:: lattice.rows, :: lattice.columns]))
+        panels.append((f"after {count} of {len(phases)} phases", scan.range_m[lattice.pixels]))
     panels.append(("the same tokens without a pixel decoder", plain.range_m))
     figure, axes = plt.subplots(len(panels), figsize=(8, 7.5), layout="constrained")
     for axis, (title, range_m) in zip(axes, panels, strict=True):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -216,15 +216,13 @@ def fill_lacking(completed: RangeImage, condition: Condition) -> RangeImage:
     if not (lacks_reflectance or lacks_labels):
         return completed
     scans = [Observed.of(condition, index) for index in range(len(condition))]
-    device = completed.range_m.device
+    range_m, reflectance, label = completed.range_m, completed.reflectance, completed.label
     if lacks_reflectance:
         found = [_reflectance_of(condition, index, seen, of_triangle) for index, seen in enumerate(scans)]
-        reflectance = torch.where(completed.return_mask, torch.stack(found).to(device), 0.0)
-        completed = replace(completed, reflectance=reflectance)
+        reflectance = torch.stack(found).to(range_m.device)
     if lacks_labels:
-        label = torch.stack([_label_of(condition, index, seen) for index, seen in enumerate(scans)]).to(device)
-        completed = replace(completed, label=torch.where(completed.return_mask, label, 0))
-    return completed
+        label = torch.stack([_label_of(condition, index, seen) for index, seen in enumerate(scans)]).to(range_m.device)
+    return RangeImage.masked(range_m, completed.return_mask, completed.sensor, reflectance, label)
 
 
 def fill(method: str, condition: Condition) -> RangeImage:

@@ -126,7 +126,7 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
     Config = LidarGritConfig
     facts = SystemFacts(
         writes="range and raydrop, decoded apart from each other; reflectance if model.tokenizer.reflectance is set "
-        "(completed scans: see Generator.complete)",
+        "(completed scans: that of model.completion or model.raydrop, or filled in)",
         paper="Haghighi et al., Taming Transformers for Realistic Lidar Point Cloud Generation, 2024",
         program="hamedhaghighi/LidarGRIT@a3f86e7 (no licence)",
         weights_licence="no licence stated",

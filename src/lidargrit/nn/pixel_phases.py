@@ -41,6 +41,11 @@ class Lattice(NamedTuple):
         return self.rows * self.columns
 
     @property
+    def pixels(self) -> tuple[slice, slice]:
+        """Rows and columns of the lattice's pixels in the image."""
+        return slice(None, None, self.rows), slice(None, None, self.columns)
+
+    @property
     def name(self) -> str:
         """Name of the lattice's network."""
         square = self.rows == self.columns and self.known == "corners"
@@ -136,7 +141,7 @@ def generated_before(phase: Phase) -> Bool[Tensor, "4"]:
 
 def cells_of(maps: Float[Tensor, "B C H W"], lattice: Lattice) -> Float[Tensor, "B C*4 h w"]:
     """Return a lattice of the image with every 2x2 of its pixels as channels of one cell."""
-    return F.pixel_unshuffle(maps[..., :: lattice.rows, :: lattice.columns], 2)
+    return F.pixel_unshuffle(maps[(..., *lattice.pixels)], 2)
 
 
 class Neighbours(NamedTuple):
@@ -159,7 +164,7 @@ def neighbours_of(phase: Phase, values: Float[Tensor, "B H W"], known: Bool[Tens
     The first phase has none. Columns wrap around; rows beyond the image are not known.
     """
     lattice = phase.lattice
-    values, known = (maps[..., :: lattice.rows, :: lattice.columns] for maps in (values, known))
+    values, known = (maps[(..., *lattice.pixels)] for maps in (values, known))
     values = F.pad(torch.cat((values[..., -1:], values, values[..., :1]), -1), (0, 0, 1, 1))
     known = F.pad(torch.cat((known[..., -1:], known, known[..., :1]), -1), (0, 0, 1, 1))
     height, width = (known.shape[-2] - 2) // 2, (known.shape[-1] - 2) // 2

@@ -30,6 +30,7 @@ from lidargrit.viewer.scan_sets import ScanSet
 from lidargrit.viewer.score_table import score_table
 
 _LATTICES_SHOWN = 4  # the finest: of coarser ones a picture has a handful of pixels
+_EVERY_PIXEL = Lattice(1, 1)
 _PIECE = 6, 16  # rows and columns of tokens that are shown as numbers: as many as can be read
 _CELL = 44, 24  # width and height of the cell of a token on the page, in pixels
 _STYLE = """
@@ -158,9 +159,9 @@ def _limits_m(demo: DemoPage) -> tuple[float, float]:
     return near, max(far, 2 * near)
 
 
-def _ranges(demo: DemoPage, image: RangeImage, caption: str, every: tuple[int, int] = (1, 1)) -> str:
-    """Render a range image, or its pixels at a distance of so many rows and columns."""
-    pixels = (0, slice(None, None, every[0]), slice(None, None, every[1]))
+def _ranges(demo: DemoPage, image: RangeImage, caption: str, lattice: Lattice = _EVERY_PIXEL) -> str:
+    """Render a range image, or a lattice of its pixels."""
+    pixels = (0, *lattice.pixels)
     range_m, returned = image.range_m[pixels].numpy(), image.return_mask[pixels].numpy()
     return _figure(
         range_picture(range_m, returned, _limits_m(demo)), f"{caption}; {returned.mean():.0%} of rays returned"
@@ -295,9 +296,9 @@ def _its_phases(demo: DemoPage) -> _Step:
     masks, ranges = [], []
     for lattice, count in demo.lattices[-_LATTICES_SHOWN:]:
         after = f"after {count} phase" + ("s" if count > 1 else "")
-        mask = whole.return_mask[0, :: lattice.rows, :: lattice.columns].float().numpy()
+        mask = whole.return_mask[(0, *lattice.pixels)].float().numpy()
         masks.append(_figure(rate_picture(mask), f"return mask {after}"))
-        ranges.append(_ranges(demo, whole, after, (lattice.rows, lattice.columns)))
+        ranges.append(_ranges(demo, whole, after, lattice))
     before_and_after = (
         _ranges(demo, demo.scan, "the scan itself")
         + _ranges(demo, demo.sampled, "its tokens, without the pixel decoder")
