@@ -20,7 +20,7 @@ EXAMPLES = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
-    parser.add_argument("run_folder", type=Path, metavar="RUN", help="folder of a finished run, or: pretrained")
+    parser.add_argument("run_folder", type=Path, metavar="RUN", help="a finished run, pretrained or pretrained_wide")
     parser.add_argument("out", type=Path, help="folder for the samples; the same command continues there")
     parser.add_argument("-n", "--count", type=int, default=16, help="number of scans")
     parser.add_argument("--seed", type=seed_number, default=0, help="seed of the first scan; the next has the next")

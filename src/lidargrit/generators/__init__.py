@@ -31,7 +31,8 @@ from lidargrit.tokenizers import Tokenizer
 
 RUN_FILE = "run.json"  # ``origin`` in it says that the weights beside it were not trained in this folder
 TRAINED_ON_FILE = "trained_on.json"  # in a run's folder and beside its samples: which drives, which pixels
-PRETRAINED = Path(__file__).parents[1] / "pretrained"  # the run in the package; its name goes wherever a run is wanted
+PRETRAINED = Path(__file__).parents[1] / "pretrained"
+PACKAGED = (PRETRAINED, PRETRAINED.with_name("pretrained_wide"))  # their names go wherever a run is wanted
 
 
 @dataclass(frozen=True)
@@ -343,8 +344,9 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
 
 
 def locate(run: str | Path) -> Path:
-    """Return the folder of a run; for the word ``pretrained`` that of the package, unless you have one."""
-    return PRETRAINED if str(run) == PRETRAINED.name and not is_taken(Path(run)) else Path(run)
+    """Return the folder of a run; the package has ``pretrained`` and ``pretrained_wide``, unless you have your own."""
+    packaged = {folder.name: folder for folder in PACKAGED}
+    return Path(run) if is_taken(Path(run)) else packaged.get(str(run), Path(run))
 
 
 def is_run(folder: Path) -> bool:
@@ -358,7 +360,7 @@ def recipe_settings(about: Any) -> dict[str, Any]:
 
 
 def load(folder: str | Path) -> Generator:
-    """Read a trained generator from a run's folder; ``pretrained`` is the one that comes with the package.
+    """Read a trained generator from a run's folder; ``pretrained`` and ``pretrained_wide`` come with the package.
 
     Raises:
         CheckpointError: no finished model in the folder, a damaged file, or weights of another configuration.

@@ -13,7 +13,7 @@ from typing import NamedTuple
 from waitress.server import create_server
 
 from lidargrit.errors import ConfigError, OutputError
-from lidargrit.generators import PRETRAINED, is_run
+from lidargrit.generators import PACKAGED, is_run
 from lidargrit.serving.application import LOOPBACK_NAMES, Application
 from lidargrit.serving.jobs import JobQueue
 from lidargrit.serving.limits import Limits
@@ -105,8 +105,8 @@ def open_server(
 
 
 def finished_runs(folder: Path) -> list[Path]:
-    """Return the finished runs in a folder, sorted by name, and then the model in the package."""
-    return [*sorted(path for path in folder.glob("*") if is_run(path)), PRETRAINED]
+    """Return the finished runs in a folder, sorted by name, and then the models in the package."""
+    return [*sorted(path for path in folder.glob("*") if is_run(path)), *PACKAGED]
 
 
 def _temporary_folder() -> tempfile.TemporaryDirectory[str]:

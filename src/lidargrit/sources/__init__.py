@@ -223,9 +223,9 @@ def open_source(text: str, bad_points: BadPoints = "refuse", samples_format: str
     """Recognise the kind of a source, and open it.
 
     Args:
-        text: folder of a finished run or the word ``pretrained``; folder of samples, of ours or of another program
-            (``.pth``); folder or URL of prepared scans; range images as ``.npy``, one file or a folder of nothing else;
-            or a data set as in :func:`lidargrit.datasets.open_dataset` ("kitti_raw:ROOT:SPLIT", "FOLDER",
+        text: folder of a finished run, ``pretrained`` or ``pretrained_wide``; folder of samples, of ours or of another
+            program (``.pth``); folder or URL of prepared scans; range images as ``.npy``, one file or a folder of
+            nothing else; or a data set as in :func:`lidargrit.datasets.open_dataset` ("kitti_raw:ROOT:SPLIT", "FOLDER",
             "simulated:COUNT", ...).
         bad_points: treatment of NaN, infinite and origin points in scans.
         samples_format: program that wrote a folder of ``.pth`` files; recognised from the first file if empty.
