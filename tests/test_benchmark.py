@@ -187,7 +187,10 @@ def test_processes_make_a_table_that_can_be_extended(tmp_path, capfd):
     assert "1 of 2 systems are done; left, for about" in output
     assert "marginal: marginal:" in output, "lines of processes begin with the run"
     run = str(tmp_path / "runs" / "marginal")
+    capfd.readouterr()
     assert main(["compare", str(tmp_path), "--add", run]) == 0
+    output = capfd.readouterr().err
+    assert "1 of 3 systems are done; left: memorised" in output, "no time, by systems that were there already"
     table = json.loads((tmp_path / "table.json").read_text())
     assert table["systems"] == ["marginal", "memorised", run]
     first, _, again = ([score["value"] for score in cell["scores"]["scores"]] for cell in table["cells"])

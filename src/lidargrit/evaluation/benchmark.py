@@ -103,8 +103,8 @@ def run(
     with claim_folder(folder):
         if processes == 1:
             for plan in chain.from_iterable(by_run.values()):
-                _finish([plan], folder, benchmark, reporter, reference)
-                remaining.without([plan.system])
+                sampled = _finish([plan], folder, benchmark, reporter, reference)
+                remaining.without([plan.system], sampled)
         else:
             with process_pool(processes, partial(_share, processes)) as pool:
                 begun = {
@@ -112,15 +112,15 @@ def run(
                     for run, some in by_run.items()
                 }
                 for done in as_completed(begun):
-                    done.result()
-                    remaining.without([plan.system for plan in begun[done]])
+                    remaining.without([plan.system for plan in begun[done]], done.result())
     return [folder / name / f"{name}.json" for name in names]
 
 
 def _finish(
     plans: Sequence[_Plan], folder: Path, benchmark: Benchmark, reporter: Reporter, reference: Source | None = None
-) -> None:
-    """Train or load the systems of one run, sample from each, and score the samples."""
+) -> int:
+    """Train or load the systems of one run, sample from each, score the samples, and return how many were sampled."""
+    sampled = 0
     settings = replace(benchmark.settings, max_scans=benchmark.num_samples)
     reference = reference or open_source(benchmark.reference, settings.data.bad_points)
     for plan in plans:
@@ -131,11 +131,13 @@ def _finish(
         )
         generator.to("cuda" if torch.cuda.is_available() else "cpu")
         seconds = _sample(generator, plan.run, folder / name / "samples", plan.sampling, benchmark, reporter)
+        sampled += seconds is not None
         _write_costs(folder / name / COSTS, plan.recipe, generator, plan.sampling, seconds, benchmark.num_samples)
         scores = folder / name / f"{name}.json"
         card = _score(str(folder / name / "samples"), reference, settings, scores, reporter)
         if card.samples.scans_used < benchmark.num_samples:
             reporter.message(f"WARNING: {benchmark.reference} has but {card.samples.scans_used} scans to compare with")
+    return sampled
 
 
 def _folder_name(system: str) -> str:
@@ -148,20 +150,22 @@ def _share(processes: int) -> None:
 
 
 class _Remaining:
-    """Estimates how long the remaining systems take, each as long as the mean of those that are done."""
+    """Estimates how long the remaining systems take, each as long as the mean of those that were sampled just now."""
 
     def __init__(self, systems: list[str], reporter: Reporter) -> None:
         self._left, self._count, self._reporter = systems, len(systems), reporter
-        self._begun = time.monotonic()
+        self._begun, self._sampled = time.monotonic(), 0
 
-    def without(self, done: Sequence[str]) -> None:
-        """Return a message about the remaining systems after some more are done."""
+    def without(self, done: Sequence[str], sampled: int) -> None:
+        """Report the remaining systems after some more are done, of which some were sampled and not there before."""
+        self._sampled += sampled
         self._left = [system for system in self._left if system not in done]
         if self._left:
-            each_s = (time.monotonic() - self._begun) / (self._count - len(self._left))
+            each_s = (time.monotonic() - self._begun) / self._sampled if self._sampled else None
+            time_left = f", for about {duration(each_s * len(self._left))}" if each_s is not None else ""
             self._reporter.message(
-                f"{self._count - len(self._left)} of {self._count} systems are done; left, for about "
-                f"{duration(each_s * len(self._left))}: {', '.join(self._left)}"
+                f"{self._count - len(self._left)} of {self._count} systems are done; left{time_left}: "
+                f"{', '.join(self._left)}"
             )
 
 
