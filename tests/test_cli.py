@@ -99,7 +99,8 @@ def test_train_leaves_a_run_that_says_what_it_is(run_folder):
 
 def test_the_same_train_command_again_changes_nothing(run_folder, typed):
     before = contents(run_folder)
-    assert "done: the model lies in" in typed("train", "demo", run_folder, "--set", *TINY)
+    done = f"done: the model lies in {run_folder}; try it with: lidargrit sample {run_folder} samples -n 16"
+    assert done in typed("train", "demo", run_folder, "--set", *TINY)
     assert contents(run_folder) == before
 
 

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from lidargrit import _discovery
+from lidargrit.cli import build_parser
 from lidargrit.conditions import Condition
 from lidargrit.errors import ConfigError
 from lidargrit.generators import CAPABILITIES, Generator, load, load_class
@@ -236,6 +237,12 @@ def test_an_objective_has_a_finite_loss_and_gradients(name):
         objective.zero_grad()
     assert all(weight.requires_grad for weight in generator.parameters()), "an objective froze weights"
     generator.eval()
+
+
+def test_names_a_command_that_shows_what_a_run_has_learned(name):
+    words = load_class(name).facts.first_command.split()
+    assert "RUN" in words
+    assert build_parser().parse_args(words).verb == words[0]
 
 
 def test_tells_what_it_writes_and_where_it_comes_from(name):

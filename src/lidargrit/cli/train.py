@@ -33,6 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Train, or print the plan."""
     from lidargrit.errors import ConfigError
+    from lidargrit.generators import load_class
     from lidargrit.recipes import load_recipe
     from lidargrit.reporting import TerminalReporter
     from lidargrit.training import check_data, measure, plan_training, tracked, train
@@ -53,4 +54,5 @@ def run(options: argparse.Namespace) -> None:
 
     with tracked(options.wandb, recipe, options.out):
         train(recipe, options.out, TerminalReporter(), plot_progress)
-    print(f"done: the model lies in {options.out}; sample it with: lidargrit sample {options.out} samples -n 16")
+    command = load_class(recipe.generator).facts.first_command.replace("RUN", str(options.out))
+    print(f"done: the model lies in {options.out}; try it with: lidargrit {command}")

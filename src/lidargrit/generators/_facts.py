@@ -23,12 +23,14 @@ class SystemFacts:
         paper: authors, title, conference and year; empty for a method of this project.
         program: program of the authors, ``OWNER/REPOSITORY@COMMIT``, with its licence; empty where there is none.
         weights_licence: licence of the weights that the authors published; empty where they published none.
+        first_command: command of ``lidargrit`` by which a trained run shows what it learned; ``RUN`` is its folder.
     """
 
     writes: str
     paper: str = ""
     program: str = ""
     weights_licence: str = ""
+    first_command: str = "sample RUN samples -n 16"
 
     def lines(self, capabilities: Iterable[str]) -> list[str]:
         """Return the facts as lines for a person, and between them what a generator with these capabilities can do."""

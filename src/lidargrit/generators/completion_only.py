@@ -36,7 +36,10 @@ class CompletionOnly(Generator[CompletionOnlyConfig, NoSampling]):
     """
 
     Config = CompletionOnlyConfig
-    facts = SystemFacts(writes="range as a best guess and raydrop around observed pixels; no scans worth sampling")
+    facts = SystemFacts(
+        writes="range as a best guess and raydrop around observed pixels; no scans worth sampling",
+        first_command="complete SCANS completed --observed rows:4 --model RUN",
+    )
     capabilities = frozenset({"complete"})
 
     def __init__(self, config: CompletionOnlyConfig, sensor: SensorModel) -> None:
