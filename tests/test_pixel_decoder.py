@@ -14,6 +14,7 @@ from lidargrit.errors import ConfigError
 from lidargrit.nn.pixel_decoder import PixelDecoder, PixelSampling, nats_to_range_bits
 from lidargrit.nn.pixel_networks import Guide, PixelDecoderConfig
 from lidargrit.nn.pixel_phases import at_phases, completed_lattices, generated_before, join_phases, phases_of
+from lidargrit.nn.precision import Precision
 from lidargrit.nn.range_mixture import RangeMixture
 from lidargrit.sensors import SensorModel, load_sensor
 from lidargrit.structures import Decoded, RangeImage
@@ -303,6 +304,24 @@ def test_a_seed_gives_the_same_bits_whatever_its_batch() -> None:
     assert torch.equal(together.range_m[4], apart[0].range_m[0])
     assert torch.equal(together.range_m[2], apart[1].range_m[0])
     assert torch.equal(together.return_mask, together.range_m > 0)
+
+
+@torch.no_grad()
+def test_16_bits_move_few_pixels_and_leave_32_bits_as_they_were() -> None:
+    sensor = tiny_sensor(32, 64)
+    decoder, decoded = random_decoder(sensor, 8, spread=0.1), random_decoded(sensor, 4)
+
+    def sample(precision: Precision) -> RangeImage:
+        rngs = [torch.Generator().manual_seed(seed) for seed in range(4)]
+        return decoder.sample(decoded, rngs, PixelSampling(precision=precision))
+
+    exact, quick = sample("fp32"), sample("bf16")
+    assert quick.range_m.dtype == torch.float32
+    assert not torch.equal(quick.range_m, exact.range_m)
+    assert (quick.return_mask != exact.return_mask).float().mean() < 0.02
+    both = quick.return_mask & exact.return_mask
+    assert ((quick.range_m - exact.range_m).abs() < 0.3)[both].float().mean() > 0.9
+    assert torch.equal(sample("fp32").range_m, exact.range_m)
 
 
 @torch.no_grad()

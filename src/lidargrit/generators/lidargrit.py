@@ -75,8 +75,9 @@ class TokenSampling:
             ``network`` where a model has one.
         weights: number type of the transformer's weights. ``fp32`` is exact; ``bf16`` and ``int8`` (CPUs only) read
             less memory for a token and change probabilities a little, see docs/performance.md.
-        decoder: number type of the decoder. ``fp32`` is exact; ``bf16`` is quicker and moves ranges a little; ``auto``
-            is ``bf16`` where the machine has instructions for it.
+        decoder: number type of the tokenizer's decoder and of the pixel decoder. ``fp32`` is exact; ``bf16`` is
+            quicker, moves ranges a little and a few pixels to another surface; ``auto`` is ``bf16`` where the machine
+            has instructions for it.
     """
 
     temperature: float = 1.0
@@ -100,7 +101,7 @@ class TokenSampling:
 
     def pixels(self) -> PixelSampling:
         """Return the settings of the pixel decoder."""
-        return PixelSampling(self.range_temperature, self.range_noise)
+        return PixelSampling(self.range_temperature, self.range_noise, self.decoder)
 
 
 @dataclass(frozen=True)

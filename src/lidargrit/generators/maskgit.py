@@ -23,7 +23,7 @@ from lidargrit.generators._tokens import (
 )
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.pixel_decoder import PixelSampling
-from lidargrit.nn.precision import Precision, dtype_of
+from lidargrit.nn.precision import Precision, autocast_to
 from lidargrit.nn.transformer import MaskedTransformer
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
@@ -52,7 +52,7 @@ class MaskedSampling:
         range_noise: multiplier of the pixel decoder's spread of ranges about a surface.
         weights: number type of the transformer's products. ``fp32`` is exact; ``bf16`` computes them in 16 bits, as
             training does where that is quicker; ``auto`` is ``bf16`` where the machine has instructions for it.
-        decoder: number type of the decoder, with the same choices.
+        decoder: number type of the tokenizer's decoder and of the pixel decoder, with the same choices.
     """
 
     steps: int = 16
@@ -75,7 +75,7 @@ class MaskedSampling:
 
     def pixels(self) -> PixelSampling:
         """Return the settings of the pixel decoder."""
-        return PixelSampling(self.range_temperature, self.range_noise)
+        return PixelSampling(self.range_temperature, self.range_noise, self.decoder)
 
 
 @dataclass(frozen=True)
@@ -187,10 +187,9 @@ def generate_tokens(
     device, length = transformer.head.weight.device, transformer.context_length
     tokens = torch.full((len(rngs), length), transformer.mask_token, device=device)
     schedule = numbers_hidden(length, sampling.steps)
-    short = dtype_of(sampling.weights) == torch.bfloat16
     for done, left in enumerate(schedule, start=1):
         uniform = torch.stack([torch.rand(2, length, generator=rng) for rng in rngs], dim=1).to(device)
-        with torch.autocast(device.type, torch.bfloat16, enabled=short):
+        with autocast_to(sampling.weights, device):
             logits = transformer(tokens).float()
         sampled = _sample(logits, uniform[0], sampling.temperature)
         confidence = logits.log_softmax(dim=-1).gather(-1, sampled[..., None])[..., 0]

@@ -16,6 +16,7 @@ from lidargrit.conditions import Condition
 from lidargrit.errors import ConfigError
 from lidargrit.nn.pixel_networks import Guide, MaskNetwork, PixelDecoderConfig, RangeNetwork
 from lidargrit.nn.pixel_phases import Lattice, Phase, at_phases, join_phases
+from lidargrit.nn.precision import Precision, autocast_to
 from lidargrit.nn.range_steps import RangeSteps
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import Decoded, RangeImage
@@ -40,10 +41,13 @@ class PixelSampling:
         temperature: temperature of the components' weights; 1 leaves them unchanged, below 1 prefers the likelier
             surface.
         noise: multiplier of the components' scales; 1 takes them as they are.
+        precision: number type of the networks' products. ``fp32`` is exact; ``bf16`` is quicker and moves some pixels;
+            ``auto`` is ``bf16`` where the machine has instructions for it.
     """
 
     temperature: float = 0.6
     noise: float = 0.7
+    precision: Precision = "fp32"
 
     def __post_init__(self) -> None:
         if not (self.temperature > 0 and self.noise > 0):
@@ -211,12 +215,13 @@ class PixelDecoder(nn.Module):
         condition = (condition or Condition.nothing(self.sensor, len(rngs))).to(guide.v.device)
         # One scan after the other on a CPU: with other batch sizes its sums have other rounding errors.
         step = 1 if guide.v.device.type == "cpu" else len(uniform)
-        images = []
+        images, choices = [], sampling or PixelSampling()
         for first in range(0, len(uniform), step):
             part = slice(first, first + step)
             some = guide.part(part)
-            mask = self.mask.sample(some, uniform[part, 0], condition[part])
-            range_m = self._sample_range(some, uniform[part, 1:], mask, condition[part], sampling)
+            with autocast_to(choices.precision, guide.v.device):
+                mask = self.mask.sample(some, uniform[part, 0], condition[part])
+                range_m = self._sample_range(some, uniform[part, 1:], mask, condition[part], choices)
             reflectance = None if decoded is None or decoded.reflectance is None else decoded.reflectance[part]
             images.append(RangeImage.masked(range_m, mask, self.sensor, reflectance))
         return RangeImage.cat(images)
@@ -227,10 +232,10 @@ class PixelDecoder(nn.Module):
         uniform: Float[Tensor, "B 2 H W"],
         mask: Bool[Tensor, "B H W"],
         condition: Condition,
-        sampling: PixelSampling | None,
+        sampling: PixelSampling,
     ) -> Float[Tensor, "B H W"]:
         """Return the ranges of a whole mask, sampled phase by phase around the observed ones."""
-        guided, choices = self.range.guided(guide), sampling or PixelSampling()
+        guided = self.range.guided(guide)
         range_m, v = torch.zeros_like(guide.v), torch.zeros_like(guide.v)
         for phase in self.range.phases:
             pixels = (..., *phase.pixels)
@@ -238,7 +243,7 @@ class PixelDecoder(nn.Module):
             output = self.range.outputs([phase], guided, guide, mask, v)
             mixture = self.range.mixture(output, candidates)
             component, within = uniform[pixels].unbind(1)
-            sampled = mixture.sample(component[None], within[None], choices.temperature, choices.noise)[0]
+            sampled = mixture.sample(component[None], within[None], sampling.temperature, sampling.noise)[0]
             sampled = torch.where(condition.range_observed[pixels], condition.range_m[pixels], sampled)
             range_m[pixels] = torch.where(mask[pixels], sampled, 0.0)
             v[pixels] = range_m[pixels].log1p()

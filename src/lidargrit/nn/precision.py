@@ -30,6 +30,11 @@ def without_autocast(device: torch.device) -> AbstractContextManager[object]:
     return torch.autocast("cpu" if device.type == "meta" else device.type, enabled=False)
 
 
+def autocast_to(precision: Precision, device: torch.device) -> AbstractContextManager[object]:
+    """Compute products and convolutions within the ``with`` block in a precision; outputs may have 16 bits."""
+    return torch.autocast(device.type, torch.bfloat16, enabled=dtype_of(precision) == torch.bfloat16)
+
+
 def dtype_of(precision: Precision) -> torch.dtype:
     """Return the type of a precision's numbers; ``auto`` is bf16 where the machine has instructions for it."""
     return torch.bfloat16 if precision == "bf16" or (precision == "auto" and has_bf16()) else torch.float32
