@@ -1,4 +1,4 @@
-"""The model in the package: it is there, it is small, it draws at once, and it is what its card says."""
+"""The models in the package: they are there, they are small, they sample at once, and they are what their cards say."""
 
 import json
 import resource
@@ -24,6 +24,7 @@ from lidargrit.training.compute import uniform_images
 from tiny_runs import the_one_line
 
 FOLDER = Path(lidargrit.__file__).parent / "pretrained"
+WIDE = FOLDER.with_name("pretrained_wide")
 
 
 @pytest.fixture(scope="module")
@@ -31,10 +32,11 @@ def model():
     return load("pretrained")
 
 
-def test_all_of_it_is_small_and_its_card_is_whole():
-    assert (FOLDER / "model.safetensors").stat().st_size < 22_200_000
-    assert sum(path.stat().st_size for path in FOLDER.iterdir()) < 23_000_000, "with which scans it learned from"
-    card = (FOLDER / "README.md").read_text(encoding="utf-8")
+@pytest.mark.parametrize(("folder", "megabytes"), [(FOLDER, 22.2), (WIDE, 16.7)])
+def test_all_of_it_is_small_and_its_card_is_whole(folder, megabytes):
+    assert (folder / "model.safetensors").stat().st_size < megabytes * 1e6
+    assert sum(path.stat().st_size for path in folder.iterdir()) < (megabytes + 0.8) * 1e6, "with what it learned from"
+    card = (folder / "README.md").read_text(encoding="utf-8")
     for part in ("## How to sample", "## Data", "## Licence", "## Training", "## Scores", "## Where it fails"):
         assert part in card
     assert "| sliced_wasserstein |" in card
@@ -47,6 +49,18 @@ def test_it_is_what_its_recipe_makes(model):
     seen = {stage: fit["scans"] for stage, fit in trained["training"].items()}
     seen["transformer"] += 18_000  # before it was trained further, as the card says
     assert seen == {stage: fit.scans for stage, fit in {**completing.training, **recipe.training}.items()}
+
+
+def test_the_wide_one_is_what_its_recipe_makes():
+    recipe, wide = load_recipe("compact_wide"), load("pretrained_wide")
+    assert wide.config == recipe.model
+    assert wide.sensor.same_rays(recipe.data.load_sensor())
+    assert (wide.sensor.height, wide.sensor.width) == (64, 1024)
+    trained = json.loads((WIDE / "run.json").read_text(encoding="utf-8"))["recipe"]
+    seen = {stage: fit["scans"] for stage, fit in trained["training"].items()}
+    seen["transformer"] += 3600  # before they were trained further, as the card says
+    seen["pixels"] += 2000
+    assert seen == {stage: fit.scans for stage, fit in recipe.training.items()}
 
 
 def test_a_word_gives_scans(tmp_path, monkeypatch, capsys):
@@ -76,9 +90,23 @@ def test_its_networks_compute_what_they_did_when_they_were_scored(model, capsys)
     assert found["range"] / returns == pytest.approx(4.833, abs=0.02)
 
 
+def test_the_wide_one_computes_what_it_did_when_it_was_scored():
+    wide = load("pretrained_wide")
+    one = RangeImage.stack([project(simulate(seed=0), wide.sensor)])
+    found = {name: value.item() for name, value in wide.bits(one).per_scan().items()}
+    pixels, returns = 64 * 1024, int(one.return_mask.sum())
+    assert found["tokens"] / pixels == pytest.approx(TOKENS, abs=0.001)
+    assert found["mask"] / pixels == pytest.approx(MASK, abs=0.003)
+    assert found["range"] / returns == pytest.approx(RANGE, abs=0.02)
+    (scan,) = wide.sample(seeds=[0])
+    assert scan.range_m.shape == (64, 1024)
+    assert 0.75 < scan.return_mask.float().mean() < 0.95  # simulated streets: 0.86
+
+
 def test_what_a_user_calls_so_goes_first(model, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert locate("pretrained") == locate(Path("pretrained")) == FOLDER
+    assert locate("pretrained_wide") == WIDE
     (tmp_path / "pretrained").mkdir()
     assert locate("pretrained") == FOLDER  # an empty folder is nothing
     (tmp_path / "pretrained" / "samples.json").write_text("{}")
@@ -106,13 +134,13 @@ def test_every_verb_that_takes_a_run_takes_the_word(tmp_path, monkeypatch, capsy
     capsys.readouterr()
 
 
-def test_it_is_served_after_the_users_own(model, tmp_path, monkeypatch):
-    assert finished_runs(tmp_path) == [FOLDER]
+def test_they_are_served_after_the_users_own(model, tmp_path, monkeypatch):
+    assert finished_runs(tmp_path) == [FOLDER, WIDE]
     model.save(tmp_path / "zebra")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "pretrained").mkdir()
     (tmp_path / "pretrained" / "samples.json").write_text("{}")  # what a user calls so is no run
-    assert finished_runs(tmp_path) == [tmp_path / "zebra", FOLDER]
+    assert finished_runs(tmp_path) == [tmp_path / "zebra", FOLDER, WIDE]
 
 
 def test_half_as_many_bytes_keep_what_networks_compute(model, tmp_path):

@@ -160,7 +160,7 @@ def test_a_sensor_that_does_not_fit_the_scan(refused, tmp_path):
         ),
         (["train", "demo", "OUT", "--set", "data.sensor=hdl64"], r"'hdl64', which is not among the sensors; .*hdl64e_"),
         (["train", "demo", "OUT", "--set", "data.sensor=no.json"], r"no\.json, which cannot be read"),
-        (["train", "demo", "OUT", "--set", "data.columns=100", "data.column_stride=8"], r"100 columns, every 8th kept"),
+        (["train", "demo", "OUT", "--set", "data.columns=100", "data.column_stride=8"], r"100 columns, one in 8 kept"),
         (["train", "demo", "OUT", "--set", "data.columns=80"], r"range images of 64x10; .*divisible by 8"),
         (["train", "demo", "OUT", "--set", "generator=lidargri"], r"'lidargri', which is not among the generators"),
         (["train", "demo", "OUT", "--set", "model.tokenizer.channels=40"], r"channels=40; .* multiple of 32"),

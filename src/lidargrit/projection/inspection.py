@@ -137,7 +137,7 @@ def as_table(inspection: Inspection) -> str:
 def _lines(inspection: Inspection) -> Iterator[str]:
     sensor, filled, total = inspection.sensor, inspection.filled(), len(inspection.scan)
     yield inspection.scan.source
-    stride = f", every {sensor.column_stride}th of its columns" if sensor.column_stride > 1 else ""
+    stride = f", one in {sensor.column_stride} of its columns" if sensor.column_stride > 1 else ""
     yield f"{inspection.method}, {inspection.variant}, to {sensor.height}x{sensor.width} of {sensor.name}{stride}"
     yield from (f"problem: {problem}" for problem in inspection.problems)
     if inspection.rings is not None:

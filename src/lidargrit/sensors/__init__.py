@@ -85,7 +85,7 @@ class SensorModel:
         """
         if not 1 <= columns <= FINE_COLUMNS_AT_MOST or stride < 1 or columns % stride:
             raise ConfigError(
-                f"{columns} columns, every {stride}th kept",
+                f"{columns} columns, one in {stride} kept",
                 f"a multiple of the stride from 1 to {FINE_COLUMNS_AT_MOST}",
                 "change one of the two",
             )

@@ -46,7 +46,7 @@ def check_tables(name: str, elevation: Tensor, azimuth: Tensor, offset: Tensor |
     fits = 1 <= height <= _ROWS_AT_MOST and column_stride >= 1 <= columns <= FINE_COLUMNS_AT_MOST
     if not fits or height * columns > _PIXELS_AT_MOST:
         raise ConfigError(
-            f"{height} rows, {width} columns and every {column_stride}th kept for {name!r}",
+            f"{height} rows, {width} columns and one in {column_stride} kept for {name!r}",
             f"1 to {_ROWS_AT_MOST} rows, 1 to {FINE_COLUMNS_AT_MOST} columns before any is left out, and at most "
             f"{_PIXELS_AT_MOST:,} pixels",
             "correct the sensor's tables",
