@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("scans", help="scans: a file, a folder, NAME:ROOT:SPLIT, samples, prepared scans, or range images as .npy")
     add("out", type=Path, metavar="OUT.lgz", help="file to write")
-    add("--model", default="pretrained", help="run with a pixel decoder (default: the one in the package)")
+    add("--model", default="pretrained", help="run with a pixel decoder (default: pretrained)")
     add("--step-mm", type=int, default=10, metavar="MM", help="step in millimetres that ranges are rounded to first")
     add("-n", "--max-scans", type=int, default=0, help="largest number of scans, evenly spaced; 0 for all")
     add_bad_scans(parser)

@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
     parser.add_argument("--data", metavar="SOURCE", help="folder of scans (default: simulated scans)")
     parser.add_argument("--out", type=Path, help="run folder (default: runs/demo, or runs/demo-FOLDER)")
-    anew = "train all networks anew (default: begin with those of the model in the package, if it has your sensor)"
+    anew = "train all networks anew (default: begin with those of the model pretrained, if it has your sensor)"
     parser.add_argument("--anew", action="store_true", help=anew)
     settings = "settings of the recipe to change"
     add_settings(parser, settings)

@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
     add = parser.add_argument
     add("scans", help="source of scans: a file's folder, NAME:ROOT:SPLIT, samples, or prepared scans")
-    add("--model", default="pretrained", help="run whose probabilities count (default: the one in the package)")
+    add("--model", default="pretrained", help="run whose probabilities count (default: pretrained)")
     add("--step-mm", type=int, default=10, metavar="MM", help="step in millimetres that ranges are rounded to first")
     add("-n", "--max-scans", type=int, default=0, help="largest number of scans, evenly spaced; 0 for all")
     add(

@@ -10,7 +10,8 @@ from lidargrit.cli._options import add_device, add_rank, add_settings
 from lidargrit.untrusted import seed_number
 
 EXAMPLES = """\
-  lidargrit sample pretrained samples                     by the model that comes with the package
+  lidargrit sample pretrained samples                     by a model that comes with the package, 64x256
+  lidargrit sample pretrained_wide samples -n 8           by another, 64x1024
   lidargrit sample runs/demo samples -n 100
   lidargrit sample runs/demo bolder -n 100 --set temperature=1.1 mask=threshold
   lidargrit sample runs/demo as_released -n 100 --set top_k=100

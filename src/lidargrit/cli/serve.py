@@ -8,7 +8,7 @@ from pathlib import Path
 from lidargrit.cli._options import add_device
 
 EXAMPLES = """\
-  lidargrit serve                          all runs in runs/ and the model in the package
+  lidargrit serve                          all runs in runs/ and the models in the package
   lidargrit serve runs/demo runs/mine --port 8080
   ssh -L 8000:localhost:8000 MACHINE       and then here: a far machine's page in a browser here
 """
@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="*",
         type=Path,
         metavar="RUN",
-        help="folders of finished runs (default: all in runs/, and the model in the package)",
+        help="folders of finished runs (default: all in runs/, and the models in the package)",
     )
     others = "address to listen at; 0.0.0.0 lets other machines in (default: 127.0.0.1, this machine only)"
     parser.add_argument("--host", default="127.0.0.1", help=others)

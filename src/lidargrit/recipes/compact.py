@@ -1,4 +1,4 @@
-"""LidarGRIT as it comes with the package: an image an eighth as high and wide in tokens, trained on the simulator."""
+"""LidarGRIT with an image an eighth as high and wide in tokens, trained on the simulator."""
 
 from dataclasses import replace
 
@@ -11,5 +11,5 @@ _TRANSFORMER = ("model.transformer.layers=5", "model.transformer.width=256")
 
 RECIPE = replace(
     override(small.RECIPE, [*_FEWER_TOKENS, *_TRANSFORMER, "training.tokenizer.scans=8000"]),
-    title="the model in the package: 64x256 in 256 tokens, for one CPU core and an hour",
+    title="LidarGRIT: 64x256 in 256 tokens, for one CPU core and an hour",
 )

@@ -1,4 +1,4 @@
-"""The model in the package with a network that completes scans, fed by triangulation."""
+"""``pretrained`` with a network that completes scans, fed by triangulation."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ from lidargrit.training import FitConfig
 
 RECIPE = replace(
     compact_pixels.RECIPE,
-    title="LidarGRIT with a network that completes scans: 64x256, for one CPU core and two hours",
+    title="LidarGRIT with a network that completes scans: 64x256, for one CPU core and an hour",
     model=replace(compact_pixels.RECIPE.model, completion=CompletionNetworkConfig()),
     data=replace(compact_pixels.RECIPE.data, train=("simulated:4352:train",)),
     training={

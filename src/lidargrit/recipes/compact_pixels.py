@@ -1,4 +1,4 @@
-"""The model in the package with a pixel decoder, which samples returns and ranges in phases from coarse to fine."""
+"""LidarGRIT with a pixel decoder (``pretrained``), which samples returns and ranges in phases from coarse to fine."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ TRANSFORMER = replace(
 
 RECIPE = replace(
     compact.RECIPE,
-    title="LidarGRIT with a pixel decoder: 64x256 in 256 tokens, for one CPU core and five hours",
+    title="LidarGRIT with a pixel decoder: 64x256 in 256 tokens, for one CPU core and four hours",
     model=replace(
         compact.RECIPE.model,
         # No image comes often enough that dropout would prevent anything.

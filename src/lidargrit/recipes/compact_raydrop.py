@@ -1,4 +1,4 @@
-"""The model in the package with a network of raydrop, trained on simulated streets of which all surfaces are known."""
+"""``pretrained`` with a network of raydrop, trained on simulated streets of which all surfaces are known."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""A network that completes scans of 64x1024, trained further from that of the model in the package."""
+"""A network that completes scans of 64x1024, trained further from that of ``pretrained``."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The model in the package, trained further for some minutes on scans of a user: ``lidargrit demo --data SCANS``."""
+"""``pretrained``, trained further for some minutes on scans of a user: ``lidargrit demo --data SCANS``."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The model in the package at a still smaller size, trained in ten minutes on two CPU cores, for ``lidargrit demo``."""
+"""``pretrained`` at a still smaller size, trained in ten minutes on two CPU cores, for ``lidargrit demo``."""
 
 from dataclasses import replace
 

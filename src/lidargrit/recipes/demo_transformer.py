@@ -1,4 +1,4 @@
-"""Tokenizer and pixel decoder of the packaged model, and a transformer trained anew in minutes: ``lidargrit demo``."""
+"""Tokenizer and pixel decoder of ``pretrained``, and a transformer trained anew in minutes: ``lidargrit demo``."""
 
 from dataclasses import replace
 

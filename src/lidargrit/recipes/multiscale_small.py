@@ -1,4 +1,4 @@
-"""The pixel decoder of the model in the package without tokens: what these are worth, and a codec that needs none."""
+"""The pixel decoder of ``pretrained`` without tokens: what these are worth, and a codec that needs none."""
 
 from dataclasses import replace
 
