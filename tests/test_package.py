@@ -28,7 +28,7 @@ def test_the_wheel_has_every_file(tmp_path):
     subprocess.run([sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", tmp_path], cwd=ROOT, check=True)
     (wheel,) = tmp_path.glob("*.whl")
     assert try_wheel().missing(wheel) == []
-    assert wheel.stat().st_size < 22_000_000
+    assert wheel.stat().st_size < 40_000_000, "beyond that, weights would be a file to fetch"
 
 
 def test_the_container_gets_what_its_recipe_names():
