@@ -24,6 +24,7 @@ from lidargrit.nn.pixel_networks import PixelDecoderConfig
 from lidargrit.projection import unproject
 from lidargrit.sensors import SensorModel, load_sensor
 from lidargrit.sources import open_images
+from lidargrit.sources.samples import write_samples
 from lidargrit.structures import RangeImage
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
@@ -42,7 +43,7 @@ def street(sensor: SensorModel) -> RangeImage:
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory):
-    """Write two scans, their sensor, scans of another sensor, and a small run with a pixel decoder."""
+    """Write two scans, their sensor, scans and samples of other sensors, and a small run with a pixel decoder."""
     root = tmp_path_factory.mktemp("completion")
     for name, sensor in (("scans", SENSOR), ("sparse", SIXTEEN)):
         for number in (1, 2):
@@ -52,6 +53,9 @@ def folders(tmp_path_factory):
     pixels = PixelDecoderConfig(mask_features=2, range_features=2, mask_width=4, range_width=4, blocks=1)
     model = LidarGrit(replace(LidarGrit.smallest_config(SENSOR), pixels=pixels), SENSOR).eval()
     model.save(root / "run")
+    wide = LidarGrit(LidarGrit.smallest_config(SENSOR), SENSOR.with_columns(64)).eval()
+    wide.save(root / "wide_run")
+    write_samples(wide, root / "wide_run", root / "wide_samples", range(1))
     return root
 
 
@@ -219,6 +223,7 @@ def test_the_drops_of_a_model_are_scored_beside_those_of_a_coin(folders):
         (["complete", "{}/empty.npz", "--model", "{}/run"], "an empty file"),
         (["complete", "", "--model", "{}/run"], "an empty source"),
         (["complete", "{}/wide.npy", "--model", "{}/run"], "a range image of 64x33; wanted 64x32"),
+        (["complete", "{}/wide_samples", "--model", "{}/run"], "range images of 64x64 of the sensor"),
         (["complete", "{}/scans", "--model", "nothing"], "nothing, which holds no finished model"),
         (["complete", "{}/scans", "--model", "linear", "-n", "2"], "-n 2 for linear; wanted 1"),
         (["complete", "{}/scans", "--model", "{}/run", "-n", "0"], "-n 0; wanted at least 1"),

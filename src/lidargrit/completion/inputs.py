@@ -17,7 +17,7 @@ from lidargrit import formats
 from lidargrit.conditions import Condition
 from lidargrit.datasets import ScanDataset
 from lidargrit.determinism import evenly_spaced
-from lidargrit.errors import ScanError
+from lidargrit.errors import ConfigError, ScanError
 from lidargrit.loading import DataConfig, RangeImages
 from lidargrit.projection import ProjectionVariant, index_map, project, unproject
 from lidargrit.sensors import ProjectionName, SensorModel, load_sensor
@@ -168,12 +168,22 @@ def open_inputs(source: str, reader: ScanReader, config: DataConfig) -> Inputs:
         source: a file, a folder or another source of scans, samples, prepared scans, or range images as ``.npy``.
         reader: projection of points to range images.
         config: number of scans, and what to do with unusable points.
+
+    Raises:
+        ConfigError: range images of other rays than the reader's sensor.
     """
     opened = open_source(source, config.bad_points)
     if isinstance(opened, DatasetSource):
         dataset = opened.scans()
         return _OfDataset(dataset, evenly_spaced(config.max_scans or len(dataset), len(dataset)), reader)
     images = opened.images(reader.sensor, config)
+    of, wanted = images.sensor, reader.sensor
+    if not of.same_rays(wanted):
+        raise ConfigError(
+            f"range images of {of.height}x{of.width} of the sensor {of.name!r} in {source}",
+            f"images of the model's {wanted.height}x{wanted.width} of {wanted.name!r}, with the same rays",
+            "name a model for such images with --model, or give the scans as points",
+        )
     if isinstance(opened, ImageFileSource):
         return _OfImages(images, [_name_of(Path(name)) for name in images.provenance.names])
     return _OfImages(images, [f"{index:06d}" for index in range(len(images))])
