@@ -100,6 +100,16 @@ def ours(generator: Generator, stage: str, recipe: Recipe, images: RangeImages, 
     return steps * config.batch_size / (heard.times[-1] - heard.times[UNTIMED - 1])
 
 
+@contextmanager
+def on_simulated_scans(recipe: Recipe) -> Iterator[tuple[RangeImages, Generator, dict[str, int], Path]]:
+    """Yield a recipe's scans, an untrained generator, the operations of its stages, and a folder removed at the end."""
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["LIDARGRIT_CACHE"] = folder
+        images = load_range_images(recipe.data.train, recipe.data)
+        torch.manual_seed(0)
+        yield images, recipe.build_generator(), training_flops(recipe), Path(folder)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--full", action="store_true", help="the paper's KITTI-360 networks, two steps of one scan")
@@ -117,17 +127,12 @@ def main() -> None:
     batch = options.batch or (1 if options.full else 0)
     if batch:
         recipe = replace(recipe, training={k: replace(v, batch_size=batch) for k, v in recipe.training.items()})
-    with tempfile.TemporaryDirectory() as folder:
-        os.environ["LIDARGRIT_CACHE"] = folder
-        images = load_range_images(recipe.data.train, recipe.data)
-        torch.manual_seed(0)
-        generator = recipe.build_generator()
-        flops = training_flops(recipe)
+    with on_simulated_scans(recipe) as (images, generator, flops, folder):
         for stage in generator.stages:
             best = {"plain": 0.0, "ours": 0.0}
             for number in range(options.rounds):
                 best["plain"] = max(best["plain"], plain(copy.deepcopy(generator), stage, recipe, images, steps))
-                run_folder = Path(folder, f"{stage}{number}")
+                run_folder = folder / f"{stage}{number}"
                 best["ours"] = max(
                     best["ours"], ours(copy.deepcopy(generator), stage, recipe, images, steps, run_folder)
                 )

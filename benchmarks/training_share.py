@@ -12,7 +12,6 @@ reading, augmentation, moving averages and the log) took no time. Times are thos
 import argparse
 import copy
 import os
-import tempfile
 import time
 from collections import Counter, defaultdict
 from collections.abc import Mapping
@@ -22,23 +21,15 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
-from training import SCANS, ours
+from training import SCANS, on_simulated_scans, ours
 
 from lidargrit.generators import Generator
 from lidargrit.loading import RangeImages
 from lidargrit.recipes import load_recipe
-from lidargrit.sources import load_range_images
-from lidargrit.training import Recipe, training_flops
+from lidargrit.training import Recipe
 
-PRODUCTS = torch.ops.aten
-COUNTED = {
-    PRODUCTS.mm,
-    PRODUCTS.addmm,
-    PRODUCTS.bmm,
-    PRODUCTS.baddbmm,
-    PRODUCTS.convolution,
-    PRODUCTS.convolution_backward,
-}
+ATEN = torch.ops.aten
+COUNTED = {ATEN.mm, ATEN.addmm, ATEN.bmm, ATEN.baddbmm, ATEN.convolution, ATEN.convolution_backward}
 REPEATS, ROUNDS = 3, 4
 LISTED = 4  # steps
 
@@ -124,16 +115,11 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
     recipe = load_recipe(options.recipe, [f"data.train=simulated:{SCANS}:train", "data.workers=1", *options.set])
-    with tempfile.TemporaryDirectory() as folder:
-        os.environ["LIDARGRIT_CACHE"] = folder
-        images = load_range_images(recipe.data.train, recipe.data)
-        torch.manual_seed(0)
-        generator = recipe.build_generator()
-        flops = training_flops(recipe)
+    with on_simulated_scans(recipe) as (images, generator, flops, folder):
         for stage in generator.stages:
             fit = recipe.training[stage]
-            rate = ours(copy.deepcopy(generator), stage, recipe, images, options.steps, Path(folder, stage))
-            counts = calls_of_steps(generator, stage, recipe, images, Path(folder, f"{stage}_listed"))
+            rate = ours(copy.deepcopy(generator), stage, recipe, images, options.steps, folder / stage)
+            counts = calls_of_steps(generator, stage, recipe, images, folder / f"{stage}_listed")
             kinds, step = by_kind(counts), fit.batch_size / rate
             speed = rate * flops[stage] / fit.scans / 1e9
             print(f"{stage}, batches of {fit.batch_size}: {step:.3f} s a step, {speed:.0f} GFLOP/s")

@@ -161,8 +161,10 @@ class _Remaining:
         self._sampled += sampled
         self._left = [system for system in self._left if system not in done]
         if self._left:
-            each_s = (time.monotonic() - self._begun) / self._sampled if self._sampled else None
-            time_left = f", for about {duration(each_s * len(self._left))}" if each_s is not None else ""
+            time_left = ""
+            if self._sampled:
+                each_s = (time.monotonic() - self._begun) / self._sampled
+                time_left = f", for about {duration(each_s * len(self._left))}"
             self._reporter.message(
                 f"{self._count - len(self._left)} of {self._count} systems are done; left{time_left}: "
                 f"{', '.join(self._left)}"
