@@ -115,7 +115,7 @@ def main() -> None:
     figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False)
     drawn = io.BytesIO()
     figure.savefig(drawn)
-    Image.open(drawn).convert("RGB").quantize(48).save(options.png, optimize=True)
+    Image.open(drawn).convert("RGB").quantize(128).save(options.png, optimize=True)
 
 
 if __name__ == "__main__":
