@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from functools import partial
 
 import numpy as np
@@ -289,6 +290,25 @@ def test_the_likelihood_of_a_source_is_told_and_its_map_written(tmp_path, capsys
     assert "--overwrite" in capsys.readouterr().err
     assert main([*words[:4], "--step-mm", "0"]) == 2
     assert "got a step of 0 mm; wanted a whole number of millimetres" in capsys.readouterr().err
+
+
+def test_compare_tells_the_bits_of_whole_scans_where_a_system_has_them(tmp_path, capsys):
+    made().save(tmp_path / "with_pixels")
+    made(None).save(tmp_path / "tokens_alone")
+    systems = [str(tmp_path / "with_pixels"), str(tmp_path / "tokens_alone")]
+    words = ["compare", str(tmp_path / "table"), *systems, "--against", "simulated:2:test", "-n", "2"]
+    words += ["--metrics", "bev_jsd"]
+    assert main([*words, "--json"]) == 0
+    with_pixels, tokens_alone = (cell["costs"] for cell in json.loads(capsys.readouterr().out))
+    config = DataConfig(train=("simulated:2:test",), val=("simulated:2:test",), columns=512, column_stride=8)
+    expected = made().bits(load_range_images(config.train, config).batch([0, 1]))
+    by_hand = sum(float(bits.double().sum()) for bits in (expected.tokens, expected.mask, expected.range))
+    assert with_pixels["bits_per_return"] == pytest.approx(by_hand / int(expected.return_mask.sum()), rel=1e-6)
+    assert tokens_alone["bits_per_return"] is None
+    assert main(words) == 0
+    table = capsys.readouterr().out
+    assert re.search(rf"with_pixels .* {with_pixels['bits_per_return']:.3f}\n", table)
+    assert re.search(r"tokens_alone .* none\n", table)
 
 
 def test_a_map_takes_room_on_the_disk_only_as_it_is_written(tmp_path):

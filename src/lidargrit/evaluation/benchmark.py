@@ -18,6 +18,8 @@ from lidargrit import __version__
 from lidargrit.configuration import override
 from lidargrit.errors import CheckpointError, ConfigError
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair, open_pair
+from lidargrit.evaluation.likelihood import bits_per_return
+from lidargrit.evaluation.pairs import EvalPair
 from lidargrit.evaluation.protocols import public_name
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.evaluation.tables import Format, side_by_side
@@ -32,6 +34,14 @@ from lidargrit.training import Recipe, check_folder, train, training_flops, with
 from lidargrit.training.compute import duration
 
 COSTS = "costs.json"
+_COSTS = {  # each with whether a system may lack it
+    "parameters": False,
+    "training_flops": True,
+    "network_evaluations": False,
+    "flops_per_scan": False,
+    "seconds_per_scan": True,
+    "bits_per_return": True,
+}
 _SAMPLES_AT_MOST = 10**8  # names of files have eight digits
 
 
@@ -130,13 +140,15 @@ def _finish(
             load(plan.run) if plan.recipe is None or is_run(plan.run) else train(plan.recipe, plan.run, reporter)
         )
         generator.to("cuda" if torch.cuda.is_available() else "cpu")
-        seconds = _sample(generator, plan.run, folder / name / "samples", plan.sampling, benchmark, reporter)
+        samples = folder / name / "samples"
+        seconds = _sample(generator, plan.run, samples, plan.sampling, benchmark, reporter)
         sampled += seconds is not None
-        _write_costs(folder / name / COSTS, plan.recipe, generator, plan.sampling, seconds, benchmark.num_samples)
-        scores = folder / name / f"{name}.json"
-        card = _score(str(folder / name / "samples"), reference, settings, scores, reporter)
-        if card.samples.scans_used < benchmark.num_samples:
-            reporter.message(f"WARNING: {benchmark.reference} has but {card.samples.scans_used} scans to compare with")
+        pair = open_pair(open_source(str(samples)), reference, settings, reporter)
+        if seconds is not None or not (folder / name / COSTS).exists():  # a later call has measured no time
+            _write_costs(folder / name / COSTS, plan, generator, seconds, pair)
+        _score(pair, settings, folder / name / f"{name}.json", reporter)
+        if len(pair.samples) < benchmark.num_samples:
+            reporter.message(f"WARNING: {benchmark.reference} has but {len(pair.samples)} scans to compare with")
     return sampled
 
 
@@ -173,15 +185,18 @@ class _Remaining:
 
 def as_table(scores: Sequence[Path], form: Format = "text") -> str:
     """Return the scores side by side, and below them what each system costs."""
-    lines = [f"{'system':<32}{'parameters':>12}{'training':>11}{'evaluations':>13}{'a scan':>11}{'seconds':>9}"]
+    heads = f"{'parameters':>12}{'training':>11}{'evaluations':>13}{'a scan':>11}{'seconds':>9}{'bits a return':>15}"
+    lines = [f"{'system':<32}{heads}"]
     for path in scores:
         of = _read_costs(path.parent / COSTS)
-        training, flops = of["training_flops"], of["flops_per_scan"]
+        training, flops, bits = of["training_flops"], of["flops_per_scan"], of["bits_per_return"]
         lines.append(
             f"{path.stem:<32}{of['parameters']:>12,}{f'{training:.2g}' if training is not None else '-':>11}"
             f"{of['network_evaluations']:>13,}{f'{flops:.2g}':>11}{of['seconds_per_scan'] or math.nan:>9.3g}"
+            f"{'none' if bits is None else f'{bits:.3f}':>15}"
         )
-    lines.append("(training and a scan: floating-point operations; seconds: for one scan, on this machine, in batches)")
+    lines.append("(training and a scan: floating-point operations; seconds: for one scan, on this machine, in batches;")
+    lines.append(" bits a return: exact likelihood of the reference, ranges in steps of 10 mm, where a system has one)")
     return f"{side_by_side(scores, form)}\n\n" + "\n".join(lines)
 
 
@@ -198,9 +213,8 @@ def _read_costs(path: Path) -> dict[str, Any]:
     Raises:
         CheckpointError: the file cannot be read, or an entry lacks or is no number.
     """
-    of = read_json(path)
-    for name in ("parameters", "training_flops", "network_evaluations", "flops_per_scan", "seconds_per_scan"):
-        may_lack = name in ("training_flops", "seconds_per_scan")
+    of = {"bits_per_return": None} | read_json(path)  # files of before lack it
+    for name, may_lack in _COSTS.items():
         if name not in of or not (type(of[name]) in (int, float) or (may_lack and of[name] is None)):
             cure = "remove the folder of this system, and compare again"
             raise CheckpointError(f"{path}, whose {name} is no number", "what lidargrit compare wrote", cure)
@@ -250,36 +264,30 @@ def _sample(
     return (time.perf_counter() - begun) / sampled if sampled > 0 else None
 
 
-def _score(samples: str, reference: Source, settings: EvalConfig, path: Path, reporter: Reporter) -> Scorecard:
-    """Return the scores in a file if they belong to the same images and settings; else score, and write the file."""
-    pair = open_pair(open_source(samples), reference, settings, reporter)
+def _score(pair: EvalPair, settings: EvalConfig, path: Path, reporter: Reporter) -> None:
+    """Score two sets and write the file, unless it holds the scores of the same images by the same settings."""
     facts = (settings.facts(), pair.samples.record(), pair.reference.record(), __version__)
     wanted = (public_name(settings.protocol), *facts)
     if path.is_file():
         there = Scorecard.read(path)
         if (there.protocol, there.settings, there.samples, there.reference, there.versions.get("lidargrit")) == wanted:
             reporter.message(f"scores are there already; remove {path} to score again")
-            return there
-    card = compare_pair(pair, settings, reporter)
-    write_json(path, card.to_json())
-    return card
+            return
+    write_json(path, compare_pair(pair, settings, reporter).to_json())
 
 
-def _write_costs(
-    path: Path, recipe: Recipe | None, generator: Generator, sampling: object, seconds: float | None, num_samples: int
-) -> None:
-    """Write what a system costs, once: a later call that samples nothing has measured no time."""
-    if seconds is None and path.exists():
-        return
-    cost = generator.cost(sampling)
+def _write_costs(path: Path, plan: _Plan, generator: Generator, seconds: float | None, pair: EvalPair) -> None:
+    """Write what a system costs: to train, to sample from, and in bits to encode the scans that it is compared with."""
+    cost = generator.cost(plan.sampling)
     write_json(
         path,
         {
             "parameters": sum(weight.numel() for weight in generator.parameters()),
-            "training_flops": None if recipe is None else sum(training_flops(recipe).values()),
+            "training_flops": None if plan.recipe is None else sum(training_flops(plan.recipe).values()),
             "network_evaluations": cost.network_evaluations,
             "flops_per_scan": cost.flops,
             "seconds_per_scan": seconds,
-            "scans": num_samples,
+            "bits_per_return": bits_per_return(generator, pair.reference),
+            "scans": len(pair.samples.images),
         },
     )

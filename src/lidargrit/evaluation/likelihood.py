@@ -11,7 +11,9 @@ from typing import Any, BinaryIO
 import numpy as np
 import torch
 
+from lidargrit.determinism import evenly_spaced
 from lidargrit.evaluation.estimates import Estimate
+from lidargrit.evaluation.pairs import EvalSet
 from lidargrit.files import atomic_path
 from lidargrit.generators import Generator, locate
 from lidargrit.loading import DataConfig, RangeImages
@@ -20,6 +22,7 @@ from lidargrit.reporting import Reporter
 from lidargrit.sources import RunSource, open_source, overlap
 
 _BATCH = 4
+_COMPARED_AT_MOST = 64  # scans: enough to tell systems apart, and seconds where all would take minutes
 _ALL = "all"
 _UNITS = {"scan": "a scan", "return": "a return", "pixel": "a pixel"}
 
@@ -128,6 +131,27 @@ def score_likelihood(
                 pixels.write(bits.per_pixel().cpu().numpy().astype("<f4").tobytes())
             progress.advance(len(some))
     return Likelihood(step_mm, whole, images.provenance.names, parts, returns, sensor.height * sensor.width)
+
+
+def bits_per_return(generator: Generator, scans: EvalSet, step_mm: int = 10) -> float | None:
+    """Return the bits that the model needs for a return of whole scans; None if it has no such likelihood.
+
+    Args:
+        generator: any model; without the capability ``likelihood``, or with tokens alone, it gets None.
+        scans: scans of its sensor, of which at most 64 are taken, evenly spaced.
+        step_mm: step in millimetres that ranges are rounded to.
+    """
+    if "likelihood" not in generator.capabilities:
+        return None
+    bits, returns = 0.0, 0
+    chosen = evenly_spaced(_COMPARED_AT_MOST, len(scans))
+    for first in range(0, len(chosen), _BATCH):
+        found = generator.bits(scans.batch(chosen[first : first + _BATCH]), step_mm)
+        if not found.is_whole:
+            return None
+        bits += float(found.total().sum())
+        returns += int(found.return_mask.sum())
+    return bits / returns if returns else None
 
 
 @contextmanager

@@ -13,7 +13,7 @@ import torch
 
 from lidargrit import _discovery, configuration
 from lidargrit.conditions import Condition, ConditionKind
-from lidargrit.errors import CheckpointError, ConfigError, LidarGritError
+from lidargrit.errors import CheckpointError, ConfigError, LidarGritError, one_of
 from lidargrit.files import is_taken, read_json, read_tensors
 from lidargrit.generators._batches import BatchSeeds, in_batches
 from lidargrit.generators._checks import check_condition, check_images, check_seeds
@@ -369,7 +369,7 @@ def load(folder: str | Path) -> Generator:
     if not is_run(folder):
         raise CheckpointError(
             f"{folder}, which holds no finished model",
-            f"a run's folder with {CONFIG_FILE} and {WEIGHTS_FILE}",
+            f"a run's folder with {CONFIG_FILE} and {WEIGHTS_FILE}, or {one_of([each.name for each in PACKAGED])}",
             "finish the training (the same command goes on), or check the path",
         )
     about = read_json(folder / CONFIG_FILE)

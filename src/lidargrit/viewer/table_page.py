@@ -18,6 +18,7 @@ _COSTS = {
     "flops_per_scan": "operations a scan",
     "network_evaluations": "network evaluations a scan",
     "seconds_per_scan": "seconds a scan",
+    "bits_per_return": "bits a return",
 }
 _SCRIPT = """
 for (const button of document.querySelectorAll("th button")) button.addEventListener("click", () => {

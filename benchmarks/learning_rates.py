@@ -1,0 +1,53 @@
+"""Systems trained at several learning rates with equally many operations → scores on validation streets, side by side.
+
+    OMP_NUM_THREADS=1 python benchmarks/learning_rates.py OUT r2dm_small:steps=32 dusty_small small_pixels --flops 3e12
+
+Every system gets the same search: the rates of all its stages times each factor, one training each, the same budget and
+seed, and as many samples against as many validation streets. Test streets are not touched, so that a rate may be chosen
+here and its figures taken from there. OUT keeps runs, samples and scores, and the same command goes on there.
+"""
+
+import argparse
+from pathlib import Path
+
+from lidargrit.configuration import override
+from lidargrit.evaluation.benchmark import Benchmark, as_table
+from lidargrit.evaluation.benchmark import run as run_benchmark
+from lidargrit.evaluation.comparison import EvalConfig
+from lidargrit.generators import is_run
+from lidargrit.recipes import load_recipe
+from lidargrit.reporting import TerminalReporter
+from lidargrit.training import train, with_budget
+
+METRICS = ("sliced_wasserstein", "point_cloud_jsd", "range_histogram_per_ring", "return_rate_per_ring")
+
+
+def main() -> None:
+    """Train what is not there yet, and compare."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path, help="folder for runs, samples and scores")
+    parser.add_argument("systems", nargs="+", metavar="SYSTEM", help="recipe, with sampling settings after a colon")
+    parser.add_argument("--factors", nargs="+", type=float, default=[1 / 3, 1, 3], help="of the recipe's own rates")
+    parser.add_argument("--flops", type=float, default=3e12, help="operations of each training")
+    parser.add_argument("--against", default="simulated:64:val", metavar="SOURCE", help="validation scans")
+    parser.add_argument("-n", "--count", type=int, default=64, help="number of samples of each")
+    parser.add_argument("--set", nargs="+", default=[], metavar="NAME=VALUE", help="settings of every recipe")
+    options = parser.parse_args()
+    reporter, rows = TerminalReporter(), []
+    for system in options.systems:
+        name, _, sampling = system.partition(":")
+        recipe = with_budget(load_recipe(name, options.set), options.flops)
+        for factor in options.factors:
+            rates = {stage: fit.learning_rate * factor for stage, fit in recipe.training.items()}
+            run = options.out / "runs" / f"{name}.rate{factor:.2g}"
+            reporter.message(f"{run.name}: {', '.join(f'{stage} {rate:.2g}' for stage, rate in rates.items())}")
+            if not is_run(run):
+                settings = [f"training.{stage}.learning_rate={rate!r}" for stage, rate in rates.items()]
+                train(override(recipe, settings), run, reporter)
+            rows.append(f"{run}:{sampling}" if sampling else str(run))
+    benchmark = Benchmark(options.against, options.count, EvalConfig(metrics=METRICS))
+    print(as_table(run_benchmark(rows, options.out, benchmark, reporter)))
+
+
+if __name__ == "__main__":
+    main()
