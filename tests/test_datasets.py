@@ -10,13 +10,15 @@ from PIL import Image
 from format_examples import NAMES, can_write, written
 from lidargrit import formats
 from lidargrit.datasets import ScanDataset, load, open_dataset
-from lidargrit.errors import DataError, OutputError, ScanError
+from lidargrit.errors import DataError, OutputError, ScanError, UnknownNameError
+from lidargrit.files import write_json
 from lidargrit.loading import DataConfig
 from lidargrit.projection import project
 from lidargrit.projection.unfolding import rings_from_firing_order
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import load_sensor
-from lidargrit.sources import load_range_images
+from lidargrit.simulator import simulate
+from lidargrit.sources import load_range_images, open_source
 
 ROWS = np.array([[1, 2, 3, 0.5], [4, 5, 6, 0.25], [7, 8, 9, 1]], dtype="<f4")
 
@@ -183,6 +185,26 @@ def test_simulated_splits_share_no_seed():
     for count in ("0", "-1", "1e3", "1000001", "９" * 5000, "/data"):
         with pytest.raises(DataError, match=r"where a count belongs; wanted COUNT|a path of 15,000 bytes"):
             open_dataset(f"simulated:{count}")
+
+
+def test_simulated_streets_are_scanned_by_the_sensor_behind_the_at_sign(tmp_path):
+    file = tmp_path / "mine.json"
+    write_json(file, load_sensor("vlp16").to_json())
+    expected = simulate(seed=2_000_001, sensor=load_sensor("vlp16"))
+    for sensor in ("vlp16", str(file)):
+        streets = open_dataset(f"simulated:2@{sensor}:test")
+        assert streets.sensor == sensor
+        assert torch.equal(streets.scan(1).points_xyz_m, expected.points_xyz_m)
+    assert open_dataset("simulated:2:test").sensor == "hdl64e_kitti_odometry"
+    images = open_source("simulated:1@vlp16:test").images(config=DataConfig(columns=1800, column_stride=1))
+    assert images.sensor.height == 16
+    rings_with_returns = images.batch([0]).return_mask.any(2)
+    assert rings_with_returns.float().mean() > 0.5
+    with pytest.raises(UnknownNameError, match=r"'vlp15'.*vlp16"):
+        open_dataset("simulated:2@vlp15")
+    for wrong in ("2@", "@vlp16"):
+        with pytest.raises(DataError, match=rf"'{wrong}' where a count belongs.*COUNT@SENSOR"):
+            open_dataset(f"simulated:{wrong}")
 
 
 def names_of(dataset: ScanDataset) -> list[str]:

@@ -124,7 +124,8 @@ def open_dataset(source: str, bad_points: BadPoints = "refuse") -> ScanDataset:
 
     Args:
         source: "NAME:ROOT" or "NAME:ROOT:SPLIT"; "ROOT" or "ROOT:SPLIT" to have the layout recognised;
-            "simulated:COUNT" or "simulated:COUNT:SPLIT" for scans of procedural streets.
+            "simulated:COUNT" or "simulated:COUNT:SPLIT" for scans of procedural streets, "simulated:COUNT@SENSOR" for
+            those that another sensor makes of them.
         bad_points: see :class:`ScanDataset`.
 
     Raises:

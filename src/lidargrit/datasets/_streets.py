@@ -9,6 +9,7 @@ from lidargrit.datasets import ScanDataset, SplitScheme
 from lidargrit.datasets._splits import Split
 from lidargrit.errors import DataError, nearest_names
 from lidargrit.formats import BadPoints
+from lidargrit.sensors import load_sensor
 
 _SEEDS_APART = 1_000_000  # distance between the splits' first seeds, and so the largest count
 
@@ -17,7 +18,8 @@ class Streets(ScanDataset):
     """Simulated streets; a split is a range of seeds, so that no scene is in two. ``all`` is ``train``.
 
     Args:
-        root: the number of scans, where other data sets have a folder.
+        root: the number of scans, where other data sets have a folder; behind an @, the name or ``.json`` file of the
+            sensor that scans the streets.
         split: ``train``, ``val`` or ``test``.
         bad_points: without effect; the simulator makes none.
 
@@ -26,11 +28,13 @@ class Streets(ScanDataset):
 
     Raises:
         DataError: no count, or an unknown split.
+        UnknownNameError: no sensor of that name.
+        ConfigError: a file that holds no sensor.
     """
 
     licence = "none needed: made by this program"
     citation = "none needed: made by this program"
-    tree = "COUNT, a number of scans from 1 to 1000000, not a folder"
+    tree = "COUNT, a number of scans from 1 to 1000000, not a folder, or COUNT@SENSOR"
     sensor = "hdl64e_kitti_odometry"
     schemes: ClassVar[dict[str, SplitScheme]] = {
         "seeds": SplitScheme(
@@ -42,12 +46,15 @@ class Streets(ScanDataset):
 
     def __init__(self, root: Path, split: str = "all", bad_points: BadPoints = "refuse") -> None:
         super().__init__(root, split, bad_points)
-        digits = str(root)
-        count = int(digits) if digits.isdecimal() and len(digits) <= 7 else 0
+        digits, at, sensor = str(root).partition("@")
+        count = int(digits) if digits.isdecimal() and len(digits) <= 7 and bool(at) == bool(sensor) else 0
         if not 1 <= count <= _SEEDS_APART:
             raise DataError(
-                f"{digits!r} where a count belongs", self.tree, f"type for example {self.public_name()}:1000"
+                f"{str(root)!r} where a count belongs", self.tree, f"type for example {self.public_name()}:1000"
             )
+        if sensor:
+            load_sensor(sensor)  # refuses an unknown one before the first street is made
+            self.sensor = sensor
         wanted = Split.parse(split)
         first_seeds = {**self.splits(), "all": self.splits()["train"]}
         name = "+".join(wanted.parts)

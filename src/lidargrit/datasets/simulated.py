@@ -11,7 +11,7 @@ class Simulated(Streets):
     """Scans of simulated streets.
 
     Args:
-        root: number of scans, where other data sets have a folder.
+        root: number of scans, where other data sets have a folder, or ``COUNT@SENSOR``.
         split: ``train``, ``val`` or ``test``.
         bad_points: without effect; the simulator makes none.
     """

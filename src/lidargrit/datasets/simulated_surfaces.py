@@ -13,7 +13,7 @@ class SimulatedSurfaces(Streets):
     The reflectance is 0.5 + half of what ``simulated`` reads where it has a return, and 0 where that beam was lost.
 
     Args:
-        root: number of scans, where other data sets have a folder.
+        root: number of scans, where other data sets have a folder, or ``COUNT@SENSOR``.
         split: ``train``, ``val`` or ``test``.
         bad_points: without effect; the simulator makes none.
     """
