@@ -1,4 +1,4 @@
-"""A model's raydrop of clean test streets beside the simulator's own, drawn anew, and a coin → a Markdown table.
+"""A model's raydrop of clean test streets beside the simulator's own and independent drops → a Markdown table.
 
     python benchmarks/raydrop.py runs/dropping -n 128
     python benchmarks/raydrop.py runs/dropping -n 32 --real /data/kitti_odometry
@@ -20,7 +20,7 @@ import torch
 
 from lidargrit.conditions import Condition
 from lidargrit.evaluation.raydrop import RAYDROP_CURVES
-from lidargrit.evaluation.realism import distance, drop_by_coin, pair_of
+from lidargrit.evaluation.realism import distance, drop_independently, pair_of
 from lidargrit.generators import load, locate
 from lidargrit.generators.lidargrit import LidarGrit
 from lidargrit.loading import DataConfig
@@ -62,7 +62,7 @@ def main() -> None:
         "the simulator, drawn anew": RangeImage.stack(redrawn[: options.count]),
         "model": dropped,
         "its probabilities, pixel by pixel": RangeImage.masked(surfaces.range_m, alone, model.sensor),
-        "coin": drop_by_coin(surfaces, float(measured.return_mask.float().mean())),
+        "Bernoulli": drop_independently(surfaces, float(measured.return_mask.float().mean())),
     }
     print("| drops by | " + " | ".join(RAYDROP_CURVES) + " |\n|---" + "|---" * len(RAYDROP_CURVES) + "|")
     for name, images in rows.items():

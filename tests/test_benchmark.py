@@ -10,6 +10,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from lidargrit.cli import main
 from lidargrit.errors import CheckpointError, ConfigError, LidarGritError, OutputError
+from lidargrit.evaluation import benchmark
 from lidargrit.evaluation.benchmark import Benchmark, as_table
 from lidargrit.evaluation.benchmark import run as run_benchmark
 from lidargrit.evaluation.comparison import EvalConfig
@@ -46,6 +47,20 @@ def test_systems_are_made_once_and_set_side_by_side(tmp_path):
     assert json.loads(again[0].read_text())["scores"][0]["value"] == pytest.approx(
         json.loads(scores[0].read_text())["scores"][0]["value"]
     )
+
+
+def test_bits_are_of_the_reference_of_today_and_a_time_once_measured_stays(tmp_path, monkeypatch):
+    measured = iter((1.5, 2.5))
+    monkeypatch.setattr(benchmark, "bits_per_return", lambda generator, scans: next(measured))
+    run_benchmark(["marginal"], tmp_path, BENCHMARK)
+    first = json.loads((tmp_path / "marginal" / "costs.json").read_text())
+    run_benchmark(["marginal"], tmp_path, BENCHMARK)  # nothing new
+    assert json.loads((tmp_path / "marginal" / "costs.json").read_text()) == first
+    scores = run_benchmark(["marginal"], tmp_path, replace(BENCHMARK, reference="simulated:8:val"))
+    second = json.loads((tmp_path / "marginal" / "costs.json").read_text())
+    assert (first["bits_per_return"], second["bits_per_return"]) == (1.5, 2.5)
+    assert first["seconds_per_scan"] == second["seconds_per_scan"]
+    assert r"& 2.5 \\" in as_table(scores, "latex")
 
 
 def test_a_recipe_is_trained_once_in_how_many_ways_ever_it_is_drawn_from(tmp_path, capsys):
@@ -94,6 +109,14 @@ def test_a_budget_scales_all_stages_alike():
     assert with_budget(load_recipe("marginal"), 1.0) == load_recipe("marginal")
     with pytest.raises(ConfigError, match="at least one batch"):
         with_budget(recipe, 1e6)
+
+
+def test_stages_that_are_taken_from_another_run_are_not_counted():
+    recipe = load_recipe("compact_completion")  # over the packaged model
+    assert list(training_flops(recipe)) == ["completion"]
+    scaled = with_budget(recipe, training_flops(recipe)["completion"] / 4)
+    assert sum(training_flops(scaled).values()) == pytest.approx(training_flops(recipe)["completion"] / 4, rel=0.01)
+    assert {**scaled.training, "completion": None} == {**recipe.training, "completion": None}
 
 
 def test_a_budget_counts_what_is_prepared_once(monkeypatch):

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 import torch
 
+from lidargrit import formats
 from lidargrit.cli import main
 from lidargrit.completion.inputs import ScanReader, open_inputs
 from lidargrit.conditions import Condition
 from lidargrit.conditions.fills import FILLS, fill
-from lidargrit.errors import ConfigError, DataError
+from lidargrit.errors import ConfigError, DataError, ScanError
 from lidargrit.evaluation.raydrop import RAYDROP_CURVES, decoded_surfaces, raydrop_table, score_raydrop
+from lidargrit.formats import read_scan
 from lidargrit.formats.numpy_array import NumpyArray
 from lidargrit.formats.ply import Ply
 from lidargrit.generators import load, load_class
@@ -23,9 +25,10 @@ from lidargrit.loading import DataConfig
 from lidargrit.nn.pixel_networks import PixelDecoderConfig
 from lidargrit.projection import unproject
 from lidargrit.sensors import SensorModel, load_sensor
+from lidargrit.simulator import simulate
 from lidargrit.sources import open_images
 from lidargrit.sources.samples import write_samples
-from lidargrit.structures import RangeImage
+from lidargrit.structures import RangeImage, Scan
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
 SIXTEEN = load_sensor("vlp16")
@@ -177,6 +180,23 @@ def test_upsample_adds_the_rows_that_lack(folders, tmp_path):
     assert float((ground[:, 2] + 1.7).abs().median()) < 0.2
 
 
+def test_a_file_that_was_cut_off_is_refused_and_bare_coordinates_stay_bare(tmp_path):
+    sensor = load_sensor("hdl64e_kitti_odometry")
+    scan = simulate(seed=3)
+    rows = torch.cat([scan.points_xyz_m, scan.reflectance[:, None]], 1).numpy()
+    (tmp_path / "cut.bin").write_bytes(rows[scan.ring.numpy() < 40].tobytes())
+    with pytest.raises(ScanError, match="40 rings"):
+        ScanReader(sensor).read(read_scan(tmp_path / "cut.bin"))
+    shuffled = Scan(scan.points_xyz_m[torch.randperm(len(scan), generator=torch.Generator().manual_seed(0))])
+    assert ScanReader(sensor).read(shuffled).image.return_mask.float().mean() > 0.5  # by elevation
+    (tmp_path / "bare").mkdir()
+    (tmp_path / "bare" / "0.bin").write_bytes(np.ascontiguousarray(rows[:, :3]).tobytes())
+    words = ["complete", str(tmp_path / "bare"), str(tmp_path / "out"), "--model", "linear", "--observed", "rows:2"]
+    assert main(words) == 0
+    (written,) = (tmp_path / "out").glob("*.bin")
+    assert formats.recognise(written).public_name() == "xyz_bin"
+
+
 def test_models_and_settings_are_compared_on_hidden_parts(folders, tmp_path, capsys):
     table = tmp_path / "table.json"
     words = ["compare-completion", f"{folders}/scans", f"{folders}/run", f"{folders}/run:mask=threshold"]
@@ -201,7 +221,7 @@ def test_the_drops_of_a_model_are_scored_beside_those_of_a_coin(folders):
     clean = RangeImage.masked(torch.where(true.return_mask, true.range_m, 30.0), every, SENSOR)
     scores = score_raydrop(model, "simulated", clean, true)
     assert [score.model.metric for score in scores] == list(RAYDROP_CURVES)
-    assert all(score.floor.value < 1e-3 < min(score.model.value, score.coin.value) for score in scores)
+    assert all(score.real_against_real.value < 1e-3 < min(score.model.value, score.bernoulli.value) for score in scores)
     assert raydrop_table(scores).count("\n") == 5
     decoded, same = decoded_surfaces(model, open_images(f"{folders}/scans", SENSOR))
     returns = same.return_mask.any(0)
@@ -227,12 +247,16 @@ def test_the_drops_of_a_model_are_scored_beside_those_of_a_coin(folders):
         (["complete", "{}/scans", "--model", "nothing"], "nothing, which holds no finished model"),
         (["complete", "{}/scans", "--model", "linear", "-n", "2"], "-n 2 for linear; wanted 1"),
         (["complete", "{}/scans", "--model", "{}/run", "-n", "0"], "-n 0; wanted at least 1"),
+        (["raydrop", "{}/scans", "--model", "{}/run", "--probability", "-1"], "--probability -1; wanted 0 or more"),
         (["complete", "{}/scans", "--model", "{}/run", "-n", "9999999"], "9,999,999 completions of each of 2 scans"),
         (["complete", "{}/scans", "--model", "{}/run", "--format", "las2"], "the format 'las2' to write"),
         (["raydrop", "{}/scans", "--model", "linear"], "--model linear for a task for a model"),
         (["upsample", "{}/scans", "--model", "{}/run", "--sensor", "hdl64e_kitti_odometry"], "with 64 rows from"),
         (["upsample", "{}/flat.npy", "--model", "{}/run", "--sensor", "vlp16"], "a range image, which has no rows"),
-        (["upsample", "{}/scans", "--model", "linear", "--sensor", "vlp16", "--to", "{}/row.json"], "some of the 1 "),
+        (
+            ["upsample", "{}/scans", "--model", "linear", "--sensor", "vlp16", "--to", "{}/row.json"],
+            "all of the 1 ",
+        ),
         (
             ["upsample", "{}/sparse", "--model", "{}/run", "--sensor", "vlp16", "--to", "os1_64"],
             "the sensor 'os1_64', 64x1024, for",

@@ -22,6 +22,7 @@ from lidargrit.generators.lidargrit import LidarGrit, LidarGritConfig, TokenSamp
 from lidargrit.generators.multiscale import Multiscale, MultiscaleConfig
 from lidargrit.nn.pixel_decoder import PixelSampling
 from lidargrit.nn.pixel_networks import PixelDecoderConfig
+from lidargrit.nn.range_steps import RangeSteps
 from lidargrit.nn.transformer import TransformerConfig
 from lidargrit.sensors import load_sensor
 from lidargrit.structures import RangeImage
@@ -98,6 +99,23 @@ def test_scans_at_the_limits_come_back(codec, kind):
     back = codec.decompress(codec.compress(image))
     assert torch.equal(back.return_mask, mask)
     assert float((back.range_m - image.range_m).abs().max()) <= 0.01
+
+
+@pytest.mark.parametrize("name", ["hdl64e_kitti_odometry", "hdl64e_kitti_360", "os1_64", "vlp16"])
+def test_every_step_has_intervals_of_some_width(name):
+    """Halves rounded to even would leave the first or the last without any, and a return there without probability."""
+    for step_mm in range(1, 1001):
+        steps = RangeSteps(load_sensor(name), step_mm)
+        near_m, far_m = steps.edges_m(torch.tensor([steps.first, steps.last]))
+        assert (near_m < far_m).all(), step_mm
+
+
+def test_returns_beyond_the_limits_are_refused(codec):
+    mask = torch.ones(SENSOR.height, SENSOR.width, dtype=torch.bool)
+    for range_m in (SENSOR.range_min_m / 2, SENSOR.range_max_m + 1):
+        image = RangeImage(torch.full(mask.shape, range_m), mask, SENSOR)
+        with pytest.raises(ConfigError, match="beyond the limits of the sensor"):
+            codec.compress(image)
 
 
 def test_another_machine_within_the_margins_decodes_the_same(codec, compressed, monkeypatch):

@@ -11,20 +11,39 @@ import torch
 from lidargrit import _discovery
 from lidargrit.cli import main
 from lidargrit.errors import ConfigError, DataError, LidarGritError, UnknownNameError
-from lidargrit.evaluation.comparison import EvalConfig, compare_sources
+from lidargrit.evaluation.command import read_config
+from lidargrit.evaluation.comparison import EvalConfig, compare_pair, compare_sources
 from lidargrit.evaluation.intervals import Resampling
-from lidargrit.evaluation.pairs import pair_for_protocol
+from lidargrit.evaluation.pairs import EvalPair, EvalSet, pair_for_protocol
 from lidargrit.evaluation.protocols import MetricChoice, Protocol, load_protocol
+from lidargrit.evaluation.reference_rows import with_pixel_statistics
 from lidargrit.evaluation.scorecard import Scorecard, format_value
-from lidargrit.evaluation.tables import published, side_by_side
+from lidargrit.evaluation.tables import published, read_tables, side_by_side
 from lidargrit.files import write_json
-from lidargrit.loading import DataConfig
+from lidargrit.loading import DataConfig, Pixels, Provenance, RangeImages
+from lidargrit.loading.config import ScanSettings
 from lidargrit.metrics import load_metric
 from lidargrit.sensors import load_sensor
 from lidargrit.sources import open_source
+from tiny_runs import the_one_line
 
 CHEAP = ("return_rate_per_ring", "bev_occupancy")
+SENSOR = load_sensor("hdl64e_kitti_odometry")
 PROTOCOLS = _discovery.names("evaluation.protocols")
+
+
+class WithReflectance:
+    """Eight seeded range images with reflectance."""
+
+    provenance = Provenance()
+
+    def __len__(self) -> int:
+        return 8
+
+    def read(self, index: int) -> Pixels:
+        rng = np.random.default_rng(index)
+        size = (SENSOR.height, SENSOR.width * SENSOR.column_stride)
+        return Pixels(rng.uniform(2, 60, size).astype(np.float32), rng.uniform(0, 1, size).astype(np.float32))
 
 
 def write_scans(folder, count, seed, variant=""):
@@ -157,15 +176,52 @@ def test_returns_outside_the_window_are_none(sets):
     assert float(returned.max()) < 20
 
 
-def test_sets_that_overlap_and_roads_that_differ_are_told(sets, tmp_path):
+def test_words_of_reading_scans_are_obeyed_or_refused(tmp_path, capsys):
+    former = read_config(ScanSettings.read(["data.variant=reference", "data.max_scans=7"]))
+    assert former.projection_variant == "reference"
+    assert former.max_scans == 7
+    assert read_config(ScanSettings.read(["data.max_scans=7"]), max_scans=3).max_scans == 3
+    for option in (["--report", str(tmp_path / "r.html")], ["--pixel-statistics"], ["--metrics", "bev_jsd"]):
+        assert main(["evaluate", "pretrained", "simulated:2:test", *option]) == 2
+        error = the_one_line(capsys.readouterr().err, "evaluate")
+        assert f"got {option[0]} for the run pretrained, of which only reconstructions are measured" in error
+    assert not (tmp_path / "r.html").exists()
+
+
+def test_files_of_one_name_are_told_apart_and_rows_complete_each_other(card, tmp_path):
+    paths = [tmp_path / folder / "scores.json" for folder in ("a", "b")]
+    for path, scores in zip(paths, (card.scores[:1], card.scores), strict=True):
+        path.parent.mkdir()
+        write_json(path, replace(card, scores=scores).to_json())
+    table, of = read_tables(paths)
+    assert list(of) == [str(path.with_suffix("")) for path in paths]
+    assert all(str(path.with_suffix("")) in table for path in paths)
+    (real,) = (line for line in table.splitlines() if line.startswith("(real against real"))
+    assert all(format_value(score.real_against_real.value) in real for score in card.scores)
+
+
+def test_pixel_statistics_without_reflectance_leave_its_scores_alone():
+    images = RangeImages(SENSOR, [WithReflectance()])
+    pair = EvalPair(EvalSet("a", images, range(4)), EvalSet("b", images, range(4, 8)))
+    settings = EvalConfig(metrics=("reflectance_histogram",), resampling=Resampling(halves=0))
+    scored = compare_pair(pair, settings)
+    (score,) = with_pixel_statistics(scored, pair, images, settings).scores
+    assert score.result.value == scored.scores[0].result.value
+    assert score.pixel_statistics is None
+
+
+def test_sets_that_overlap_and_projections_that_differ_are_told(sets, tmp_path):
     plain = EvalConfig(metrics=CHEAP, resampling=Resampling(halves=0))
+    samples = write_scans(tmp_path / "samples", 3, 7, variant="exact")
+    twice, _ = compare_sources(samples, samples, plain)
+    assert any("overlap (3 scans are in both)" in warning for warning in twice.warnings)
     same, _ = compare_sources(sets[0], sets[0], plain)
     assert any("overlap (12 scans are in both)" in warning for warning in same.warnings)
     assert [score.result.value for score in same.scores] == [0.0, 0.0]
     ours = [write_scans(tmp_path / name, 4, 5, variant=name) for name in ("exact", "reference")]
     for samples, differs in zip(ours, (True, False), strict=True):
         card, pair = compare_sources(samples, sets[1], plain)
-        assert any("different roads" in warning for warning in card.warnings) == differs
+        assert any("projections differ" in warning for warning in card.warnings) == differs
         assert pair.samples.record().projection == f"unfolding, {'exact' if differs else 'reference'}"
 
 

@@ -227,7 +227,7 @@ def test_right_classes_are_counted_where_both_scans_return(folders, tmp_path, ca
     words = ["compare-completion", f"kitti_odometry:{folders / 'tree'}", "nearest", f"{folders}/run"]
     assert main([*words, "--observed", "rows:4", "-n", "2", "--device", "cpu"]) == 0
     table = capsys.readouterr().out
-    assert "right classes" in table
+    assert "class accuracy" in table
     nearest = next(line for line in table.splitlines() if line.startswith("nearest")).split()
     assert 0.9 < float(nearest[-2]) < 1  # wrong only where road and wall meet
     assert 0.8 < float(nearest[-1]) < 1

@@ -307,8 +307,8 @@ def test_compare_tells_the_bits_of_whole_scans_where_a_system_has_them(tmp_path,
     assert tokens_alone["bits_per_return"] is None
     assert main(words) == 0
     table = capsys.readouterr().out
-    assert re.search(rf"with_pixels .* {with_pixels['bits_per_return']:.3f}\n", table)
-    assert re.search(r"tokens_alone .* none\n", table)
+    assert re.search(rf"with_pixels .* {with_pixels['bits_per_return']:.4g}\n", table)
+    assert re.search(r"tokens_alone .* -\n", table)
 
 
 def test_a_map_takes_room_on_the_disk_only_as_it_is_written(tmp_path):

@@ -140,7 +140,7 @@ def test_a_sensor_that_does_not_fit_is_told_with_those_that_would():
         [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], 1
     )
     scan = Scan(torch.from_numpy(points.astype(np.float32)))
-    with pytest.raises(ScanError, match=r"outside the sensor's elevations .* none of ours fits"):
+    with pytest.raises(ScanError, match=r"outside the sensor's elevations .* no sensor in the package spans"):
         project(scan, load_sensor("hdl64e_kitti_360"))
     with pytest.raises(ScanError, match=r"\d+ rings"):
         project(scan, load_sensor("hdl64e_kitti_odometry"))
@@ -158,3 +158,13 @@ def test_images_that_contradict_themselves_are_refused():
         RangeImage(good[:, :3], good[:, :3] > 0, sensor)
     with pytest.raises(ScanError, match="one by one"):
         unproject(RangeImage.stack([RangeImage(good, good > 0, sensor)]))
+
+
+def test_points_of_64_bits_are_those_of_32():
+    """NumPy's own floats have 64 bits, and comparing them with rounded ones would find no nearest point."""
+    scan, sensor = simulate(seed=5), load_sensor("hdl64e_kitti_odometry")
+    wide = Scan(scan.points_xyz_m.double(), scan.reflectance.double(), scan.ring)
+    ours, theirs = project(wide, sensor), project(scan, sensor)
+    assert torch.equal(ours.range_m, theirs.range_m)
+    assert torch.equal(ours.reflectance, theirs.reflectance)
+    assert ours.return_mask.float().mean() > 0.5

@@ -10,13 +10,15 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 import yaml
+from PIL import Image
 
 import lidargrit
 from lidargrit.cli import main
-from lidargrit.datasets import _files, data_set_and_split, load
+from lidargrit.datasets import _files, data_set_and_split, load, open_dataset
 from lidargrit.datasets import folder as folder_of_scans
 from lidargrit.datasets.kitti_odometry import KittiOdometry
 from lidargrit.errors import CheckpointError
@@ -24,6 +26,7 @@ from lidargrit.generators import Generator
 from lidargrit.generators.lidargrit import LidarGrit
 from lidargrit.generators.marginal import Marginal
 from lidargrit.loading import Provenance
+from lidargrit.publishing import publish
 from lidargrit.publishing.card import model_card
 from lidargrit.sources import data_set_of
 from tiny_runs import MODEL, SHORT, contents, the_one_line
@@ -77,6 +80,22 @@ def test_what_is_published_is_a_run_without_the_users_places(run, tmp_path, caps
     assert contents(again) == files
     assert main(["train", "demo", str(public), "--set", *MODEL]) == 2
     assert "whose weights were published" in capsys.readouterr().err
+
+
+def test_recordings_that_are_paths_are_not_published(run, tmp_path):
+    copy = tmp_path / "run"
+    shutil.copytree(run, copy)
+    about = json.loads((copy / "trained_on.json").read_text())
+    about["recordings"] = ["/home/anna/secret/drive.pcap", "#0123456789ab/secret", "drive_9005"]
+    (copy / "trained_on.json").write_text(json.dumps(about))
+    publish(copy, tmp_path / "public")
+    assert json.loads((tmp_path / "public" / "trained_on.json").read_text())["recordings"] == ["drive_9005"]
+    image = tmp_path / "secret_place" / "drive" / "0.png"
+    image.parent.mkdir(parents=True)
+    Image.fromarray(np.full((64, 870), 5000, np.uint16)).save(image)
+    name = open_dataset(f"range_images:{tmp_path / 'secret_place'}").recording(0)
+    assert name.startswith("#")
+    assert "secret_place" not in name
 
 
 def test_the_card_tells_the_facts(run, tmp_path):

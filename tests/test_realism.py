@@ -1,4 +1,4 @@
-"""Simulated scans against real ones and a coin: the comparison, its table, its picture and its verb."""
+"""Simulated scans against real ones and independent drops: the comparison, its table, its picture and its verb."""
 
 import json
 import math
@@ -9,7 +9,7 @@ import torch
 
 from lidargrit.cli import main
 from lidargrit.errors import ConfigError, DataError
-from lidargrit.evaluation.realism import CURVES, SimulatedScans, as_table, compare, drop_by_coin, simulate_pair
+from lidargrit.evaluation.realism import CURVES, SimulatedScans, as_table, compare, drop_independently, simulate_pair
 from lidargrit.generators.lidargrit import LidarGrit
 from lidargrit.loading import DataConfig
 from lidargrit.metrics import load_metric
@@ -48,15 +48,15 @@ def test_what_is_measured_is_part_of_what_is_clean(simulated):
 
 def test_the_coin_keeps_a_share_whatever_it_meets(simulated):
     for share in (0.3, 0.8):
-        dropped = drop_by_coin(simulated.clean, share)
+        dropped = drop_independently(simulated.clean, share)
         assert math.isclose(dropped.return_mask.float().mean(), share, abs_tol=0.01)
         near = simulated.clean.return_mask & (simulated.clean.range_m < 8)
         far = simulated.clean.return_mask & (simulated.clean.range_m > 20)
         kept = [float(dropped.return_mask[some].float().mean()) for some in (near, far)]
         assert math.isclose(*kept, abs_tol=0.02)
         assert (dropped.reflectance[~dropped.return_mask] == 0).all()
-    assert torch.equal(drop_by_coin(simulated.clean, 1.0).return_mask, simulated.clean.return_mask)
-    assert torch.equal(dropped.return_mask, drop_by_coin(simulated.clean, 0.8).return_mask)
+    assert torch.equal(drop_independently(simulated.clean, 1.0).return_mask, simulated.clean.return_mask)
+    assert torch.equal(dropped.return_mask, drop_independently(simulated.clean, 0.8).return_mask)
 
 
 def test_scans_are_nearer_to_the_simulator_that_made_them_than_to_a_coin(simulated, recorded, scores):
@@ -78,9 +78,9 @@ def test_scans_are_nearer_to_the_simulator_that_made_them_than_to_a_coin(simulat
 
 def test_distances_are_those_of_the_metrics(simulated, recorded, scores):
     real = recorded.batch(range(COUNT))
-    coin = drop_by_coin(simulated.clean, float(real.return_mask.float().mean()))
+    independent = drop_independently(simulated.clean, float(real.return_mask.float().mean()))
     metric = load_metric("drop_run_lengths")()
-    metric.update(coin, real=False)
+    metric.update(independent, real=False)
     metric.update(real, real=True)
     score = next(score for score in scores if score.simulated.metric == "drop_run_lengths")
     assert np.isclose(score.bernoulli.value, metric.compute().value)

@@ -74,6 +74,17 @@ def test_score_is_that_of_a_slow_loop():
     assert errors.drop_recall == common / dropped
     assert errors.drop_iou == common / (claimed + dropped - common)
     assert errors.num_scans == 2
+    of_scans = {"abs_rel": [], "sq_rel_m": [], "scan_rmse_m": [], "rmse_log": [], "accuracy_1_25": []}
+    for index in range(2):
+        r, c = (x[index][real.return_mask[index]].double().numpy() for x in (real.range_m, clean_range_m))
+        of_scans["abs_rel"].append(np.mean(abs(r - c) / r))
+        of_scans["sq_rel_m"].append(np.mean((r - c) ** 2 / r))
+        of_scans["scan_rmse_m"].append(np.mean((r - c) ** 2) ** 0.5)
+        above = np.maximum(c, 1e-3)
+        of_scans["rmse_log"].append(np.mean(np.log(r / above) ** 2) ** 0.5)
+        of_scans["accuracy_1_25"].append(np.mean(np.maximum(r / above, above / r) < 1.25))
+    for name, values in of_scans.items():
+        assert getattr(errors, name) == pytest.approx(np.mean(values), rel=1e-5)
 
 
 def test_a_perfect_decoder():

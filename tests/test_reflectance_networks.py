@@ -260,13 +260,13 @@ def test_complete_writes_it_and_its_error_is_told_where_both_have_it(folders, tm
     )
     assert main([*compare, f"{folders}/run", f"{folders}/plain", "triangulation", *settings]) == 0
     _, head, run, plain, triangles = capsys.readouterr().out.splitlines()
-    assert "error of reflectance" in head
-    column = slice(head.index("error of reflectance") - 5, head.index("error of reflectance") + 20)
+    assert "reflectance MAE" in head
+    column = slice(head.index("reflectance MAE") - 10, head.index("reflectance MAE") + 15)
     errors = [line[column].split() for line in (run, plain, triangles)]
     assert 0 < float(errors[2][0]) < float(errors[0][0]) + 0.05
     assert 0 < float(errors[1][0]) < 1
     assert main([*compare, f"{folders}/plain:completion=tokens", *settings]) == 0  # it has learned none
-    assert "error of reflectance" in capsys.readouterr().out
+    assert "reflectance MAE" in capsys.readouterr().out
 
 
 def test_what_a_generator_does_not_write_is_filled_in_from_observed_returns(folders):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from lidargrit.cli import main
 from lidargrit.errors import ConfigError
 from lidargrit.projection import project, unproject
 from lidargrit.projection.unfolding import rings_from_firing_order
@@ -189,3 +190,10 @@ def test_reflectance_is_a_share_and_differs_by_material():
     assert float(reflectance.max()) <= 1
     assert float(reflectance.std()) > 0.05
     assert torch.allclose(reflectance * 100, (reflectance * 100).round(), atol=1e-4)
+
+
+def test_settings_that_cannot_be_simulated_leave_no_folder_behind(tmp_path, capsys):
+    for words, message in ((["--wet", "2"], "wet 2.0"), (["--frames", "1000000"], "the frame 999999")):
+        assert main(["simulate", str(tmp_path / "out"), "-n", "2", *words]) == 2
+        assert f"got {message}; " in capsys.readouterr().err
+        assert not (tmp_path / "out").exists()

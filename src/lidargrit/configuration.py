@@ -101,7 +101,7 @@ def override(config: T, settings: Iterable[str], owner: str = "this recipe", cur
         path, equals, text = setting.partition("=")
         if not equals:
             raise ConfigError(f"the setting {setting!r}", "NAME=VALUE", f"e.g. --set {next(iter(known), 'name')}=...")
-        values[_RENAMED.get(path.strip(), path.strip())] = text
+        values[setting_name(path)] = text
     unknown = [path for path in values if path not in known]
     if unknown:
         raise ConfigError(
@@ -112,13 +112,18 @@ def override(config: T, settings: Iterable[str], owner: str = "this recipe", cur
     return _replaced(config, "", values)
 
 
+def setting_name(path: str) -> str:
+    """Return a setting's dotted name of today for one that a user typed or a file holds."""
+    return _RENAMED.get(path.strip(), path.strip())
+
+
 def leaves(config: Any, prefix: str = "") -> dict[str, Any]:
     """Return every setting of a configuration, or of its JSON, by its dotted name."""
     found: dict[str, Any] = {}
     for name, value in _children(config).items():
         nested = dataclasses.is_dataclass(value) or isinstance(value, dict)
         path = f"{prefix}{name}"
-        found |= leaves(value, f"{path}.") if nested else {_RENAMED.get(path, path): value}
+        found |= leaves(value, f"{path}.") if nested else {setting_name(path): value}
     return found
 
 

@@ -28,8 +28,8 @@ class Scan:
     """The points of one revolution, in the sensor's frame (x forward, y left, z up).
 
     Args:
-        points_xyz_m: coordinates in metres.
-        reflectance: reflectance of every point, in [0, 1].
+        points_xyz_m: coordinates in metres, kept in 32 bits.
+        reflectance: reflectance of every point, in [0, 1], kept in 32 bits.
         ring: index of the laser of every point, 0 = the highest.
         label: class of every point by SemanticKITTI's numbers, with its instance in the upper 16 of 32 bits.
         source: file or other origin of the scan, for messages.
@@ -47,6 +47,9 @@ class Scan:
     def __post_init__(self) -> None:
         if len(self) == 0:
             raise ScanError(f"no point in {self.source}", "a full revolution", "remove the file")
+        object.__setattr__(self, "points_xyz_m", self.points_xyz_m.float())  # those of NumPy often have 64 bits
+        if self.reflectance is not None:
+            object.__setattr__(self, "reflectance", self.reflectance.float())
         for name in ("reflectance", "ring", "label"):
             values: Tensor | None = getattr(self, name)
             if values is not None and values.shape != (len(self),):

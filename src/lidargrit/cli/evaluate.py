@@ -1,4 +1,4 @@
-"""Score any scans against any others, or what a run keeps of scans; or set scores side by side."""
+"""Score samples against real scans, measure a run's reconstruction errors, or print saved scores side by side."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("-n", "--max-scans", type=int, default=0, help="largest number of scans of each; 0 for the protocol's")
     add("--intervals", type=int, default=20, metavar="B", help="number of half-samples for 95 %% intervals; 0 for none")
     add("--pixel-statistics", action="store_true", help="also score pixel statistics, which any model has to beat")
-    add("--groups", type=int, default=16, metavar="G", help="number of groups of neighbours kept together in them")
+    groups = "number of blocks of consecutive scans that --intervals halves; an odd number is lowered by one"
+    add("--groups", type=int, default=16, metavar="G", help=groups)
     add("--seed", type=seed_number, default=0, help="seed of all random choices")
     add("--device", default="cpu", help="device for feature networks: cpu or cuda")
     add_scans(parser)

@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Print every name with its summary; with --kind, all facts of each name of that kind."""
+    """Print every name with its summary; of one kind, all facts of each name."""
     from lidargrit.catalogue import entries, lines
 
     refuse_taken(options)

@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=seed_number, default=0, help="seed of the first generated scan")
     colour = "colour of pixels: range, or surprise for the bits beyond those expected"
     parser.add_argument("--color", choices=["range", "surprise"], default="range", help=colour)
-    model = "run that is surprised, with a pixel decoder (default: pretrained)"
+    model = "run whose likelihood gives the surprise; needs a pixel decoder (default: pretrained)"
     parser.add_argument("--model", default="pretrained", help=model)
     add_scans(parser)
     parser.add_argument("--overwrite", action="store_true", help="replace the file if it exists")

@@ -21,6 +21,7 @@ from lidargrit.determinism import derive_seed
 from lidargrit.errors import ConfigError, DataError, ScanError
 from lidargrit.export import TREE, KittiTree, claim_scans, writable_format, write_with_labels
 from lidargrit.files import atomic_path, claim_folder
+from lidargrit.formats import ScanFormat
 from lidargrit.reporting import Reporter
 from lidargrit.sources.image_files import PROBABILITY
 from lidargrit.structures import RangeImage
@@ -54,6 +55,8 @@ class OutputConfig:
     def __post_init__(self) -> None:
         if self.count < 1:
             raise ConfigError(f"-n {self.count}", "at least 1 completion of each scan", "raise it")
+        if self.probability < 0:
+            raise ConfigError(f"--probability {self.probability}", "0 or more samples", "raise it")
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +65,7 @@ class _Job:
     turn: int
     scan: InputScan
     condition: Condition
+    form: type[ScanFormat] | None
 
 
 def write_completions(
@@ -164,7 +168,7 @@ def _jobs(
                 left_out.add(index)
                 scan = None
         if scan is not None and condition is not None:
-            yield _Job(index, turn, scan, condition)
+            yield _Job(index, turn, scan, condition, inputs.form(index))
 
 
 def _completed(completer: Completer, jobs: Sequence[_Job], seed: int) -> list[RangeImage]:
@@ -212,7 +216,7 @@ def _write(path: Path, kind: str, image: RangeImage, job: _Job) -> bool:
         write_with_labels(path, scan)
         return True
     named = [one for one in formats.candidates(path) if one.can_write()]
-    form = writable_format(kind)[0] if kind else named[0]
+    form = writable_format(kind)[0] if kind else job.form if job.form in named else named[0]
     form.write(path, scan)
     return scan.label is None or "label" in form.keeps
 

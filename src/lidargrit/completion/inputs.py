@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,9 +17,11 @@ from lidargrit.conditions import Condition
 from lidargrit.datasets import ScanDataset
 from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import ConfigError, ScanError
+from lidargrit.formats import ScanFormat
 from lidargrit.loading import DataConfig, RangeImages
 from lidargrit.projection import ProjectionVariant, index_map, project, unproject
-from lidargrit.sensors import ProjectionName, SensorModel, load_sensor
+from lidargrit.projection.fit import projection_that_fits
+from lidargrit.sensors import SensorModel, load_sensor
 from lidargrit.sources import DatasetSource, open_source
 from lidargrit.sources.image_files import ImageFileSource
 from lidargrit.structures import RangeImage, Scan
@@ -82,6 +83,10 @@ class Inputs(ABC):
         """Return the ending of its file; "" where it has none that can be written."""
         return ""
 
+    def form(self, index: int) -> type[ScanFormat] | None:
+        """Return the format of its file; None where it has none."""
+        return None
+
     @abstractmethod
     def read(self, index: int) -> InputScan:
         """Read one scan.
@@ -104,6 +109,10 @@ class _OfDataset(Inputs):
     def suffix(self, index: int) -> str:
         path = self._dataset.path(self._indices[index])
         return "" if path is None else path.name[len(formats.stem(path)) :]
+
+    def form(self, index: int) -> type[ScanFormat] | None:
+        path = self._dataset.path(self._indices[index])
+        return None if path is None or not formats.candidates(path) else formats.recognise(path)
 
     def read(self, index: int) -> InputScan:
         return self._reader.read(self._dataset.scan(self._indices[index]))
@@ -138,7 +147,7 @@ class ScanReader:
     partial: bool = False
 
     def read(self, scan: Scan) -> InputScan:
-        """Project a scan; one without rings, for a sensor that needs them, by elevation."""
+        """Project a scan; one without rings and firing order, for a sensor that needs them, by elevation."""
         rings = self.sensor.height if scan.ring is None else int(scan.ring.max()) + 1
         if 2 * rings <= self.sensor.height:
             raise ScanError(
@@ -146,18 +155,11 @@ class ScanReader:
                 f"the {self.sensor.height} of the sensor {self.sensor.name!r}",
                 "add the missing rows with: lidargrit upsample",
             )
-        try:
-            return self._read(scan, self.sensor.projection)
-        except ScanError:
-            if self.sensor.projection == "spherical":
-                raise
-            with contextlib.suppress(ScanError):
-                return self._read(scan, "spherical")
-            raise
-
-    def _read(self, scan: Scan, method: ProjectionName) -> InputScan:
-        image = project(scan, self.sensor, method, self.variant, self.partial)
-        at = index_map(scan, self.sensor, method, self.variant, self.partial)[:, :: self.sensor.column_stride]
+        method = projection_that_fits(scan, self.sensor)
+        # The reference variant of a projection by elevation knows no sensor.
+        variant = self.variant if method == self.sensor.projection else "exact"
+        image = project(scan, self.sensor, method, variant, self.partial)
+        at = index_map(scan, self.sensor, method, variant, self.partial)[:, :: self.sensor.column_stride]
         return InputScan(image, scan, torch.from_numpy(at.astype(np.int64)))
 
 

@@ -61,18 +61,19 @@ class SparseReader(ScanReader):
         return self.source.with_columns(self.sensor.width * stride, stride)
 
     def _rows(self) -> Int64[Tensor, " rows"]:
-        """Return for each row of the scans' sensor the wanted row; -1 where none lies within half a step.
+        """Return for each row of the scans' sensor the wanted row; -1 where none lies within three quarters of
+        the step between wanted rows.
 
         Of several that fall on one wanted row, the nearest has it.
         """
         assert self.source is not None
         own = self.source.elevation_rad.double().mean(1).numpy()
         wanted = self.sensor.elevation_rad.double().mean(1).numpy()
-        half_step = np.gradient(wanted) if len(wanted) > 1 else np.zeros(1)
+        step_rad = np.gradient(wanted) if len(wanted) > 1 else np.zeros(1)
         distance = np.abs(own[:, None] - wanted[None, :])
         rows = distance.argmin(1)
         away = distance.min(1)
-        rows = np.where(away <= np.abs(half_step[rows]) * 0.75, rows, -1)
+        rows = np.where(away <= np.abs(step_rad[rows]) * 0.75, rows, -1)
         for row in set(rows.tolist()) - {-1}:
             rivals = np.nonzero(rows == row)[0]
             rows[rivals[rivals != rivals[away[rivals].argmin()]]] = -1
@@ -80,7 +81,8 @@ class SparseReader(ScanReader):
             span = [f"{math.degrees(edge):.1f}" for edge in (own[-1], own[0], wanted[-1], wanted[0])]
             raise ConfigError(
                 f"scans of {self.source.name!r} with {len(own)} rows from {span[0]} to {span[1]} degrees",
-                f"some of the {len(wanted)} rows of {self.sensor.name!r} from {span[2]} to {span[3]} degrees, not all",
+                f"at least {_ROWS_AT_LEAST}, but not all of the {len(wanted)} rows of {self.sensor.name!r}, from "
+                f"{span[2]} to {span[3]} degrees",
                 "name the scans' sensor with --sensor, or complete them with: lidargrit complete",
             )
         return torch.from_numpy(rows.astype(np.int64))

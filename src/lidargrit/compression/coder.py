@@ -138,7 +138,11 @@ class Encoder(Coder):
             if self.decisions(_SHIFTED, np.array([attempt > 0]))[0]:
                 self.uniform(1, ATTEMPTS, np.array([attempt]))
             return found
-        raise ScanError("a scan whose numbers lie at borders in every attempt", "another", "report it as a fault")
+        raise ScanError(
+            f"a scan whose probabilities cannot be rounded alike on all machines ({ATTEMPTS} ways tried)",
+            "one whose can",
+            "leave it out, and report it with the file",
+        )
 
     def _pass(self, family: Any, outcome: Bool[np.ndarray, " n"] | None, share: np.ndarray) -> Bool[np.ndarray, " n"]:
         assert outcome is not None

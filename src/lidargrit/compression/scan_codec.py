@@ -98,12 +98,12 @@ class ScanCodec:
                 f"one image ({self.sensor.height}, {self.sensor.width}) of {self.sensor.name!r}",
                 "project the scan with the sensor of the model",
             )
-        rounded = self.steps.round(RangeImage.stack([image]))
+        rounded = self.steps.round(RangeImage.stack([image]).to("cpu"))
         tokens = None
         if self._encoder is not None:
             device = next(self._encoder.parameters()).device
             tokens = self._encoder.encode(rounded.to(device)).tokens.flatten().cpu().numpy()
-        pixels = self.steps.indices(rounded.range_m[0]).where(rounded.return_mask[0].cpu(), 0).cpu().numpy()
+        pixels = self.steps.indices(rounded.range_m[0]).where(rounded.return_mask[0], 0).numpy()
         coder = Encoder()
         self._code(coder, Known(tokens, pixels))
         compressed = _hash(pixels) + coder.words()

@@ -31,10 +31,11 @@ class Hints(NamedTuple):
     """Inputs of a completion network from classical methods, for every pixel; ranges are ln(1 + range in metres).
 
     Args:
-        maps: inputs of a network for every pixel: whether it was observed, returned or dropped; ln(1 + range) by
-            triangulation, and the differences from it of the nearest return, of the next return above, below, to the
-            left and to the right, and of the triangle's second and third corner; distances to those next returns;
-            weights of those corners; shares of observed and of dropped pixels around it.
+        maps: inputs of a network for every pixel, in this order: whether it was observed, returned, dropped; the
+            nearest return minus triangulation; triangulation minus 2.5; the next returns above, below, to the left and
+            to the right minus triangulation; distances to those four; the share of drops among observed pixels around
+            it, and the share of observed ones; the triangle's second and third corner minus triangulation; their
+            weights.
         candidates: candidates for ln(1 + range): by triangulation, by interpolation, of the nearest return, of the next
             return above, below, to the left and to the right, and of the triangle's second and third corner.
         labels: classes of the nearest return, and of the next return above, below, to the left and to the right, by

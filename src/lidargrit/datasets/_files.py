@@ -214,5 +214,9 @@ def scans_below(root: Path) -> Iterator[Path]:
 
 def unnamed_recording(path: Path) -> str:
     """Name the recording of a file by a hash of its folder, which does not reveal the path."""
-    folder = path.resolve().parent
-    return f"#{hashlib.sha256(str(folder).encode()).hexdigest()[:12]}/{folder.name}"
+    return hashed_name(path.resolve().parent)
+
+
+def hashed_name(place: Path) -> str:
+    """Name a recording by a hash of its file or folder, which does not reveal the path."""
+    return f"#{hashlib.sha256(str(place).encode()).hexdigest()[:12]}/{place.name}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import suppress
 from pathlib import Path
 
-from lidargrit.datasets._files import FileDataset
+from lidargrit.datasets._files import FileDataset, hashed_name
 from lidargrit.errors import OutputError, ScanError
 from lidargrit.formats import BadPoints, stem
 from lidargrit.formats.ouster_pcap import sensor_of
@@ -45,7 +45,7 @@ class Ouster(FileDataset):
 
     def recording_of(self, path: Path) -> str:
         """Name a recording by its file."""
-        return str(path.resolve())
+        return hashed_name(path.resolve())
 
     @classmethod
     def write_example(cls, root: Path, num_scans: int) -> None:

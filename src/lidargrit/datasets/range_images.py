@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from lidargrit.datasets._files import FileDataset
+from lidargrit.datasets._files import FileDataset, unnamed_recording
 
 
 class RangeImageFiles(FileDataset):
@@ -30,4 +30,4 @@ class RangeImageFiles(FileDataset):
 
     def recording_of(self, path: Path) -> str:
         """Name a recording by its folder."""
-        return str(path.resolve().parent)
+        return unnamed_recording(path)

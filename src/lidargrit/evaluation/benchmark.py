@@ -22,7 +22,7 @@ from lidargrit.evaluation.likelihood import bits_per_return
 from lidargrit.evaluation.pairs import EvalPair
 from lidargrit.evaluation.protocols import public_name
 from lidargrit.evaluation.scorecard import Scorecard
-from lidargrit.evaluation.tables import Format, side_by_side
+from lidargrit.evaluation.tables import Format, TableBlock, render, side_by_side
 from lidargrit.files import claim_folder, read_json, write_json
 from lidargrit.generators import Generator, is_run, load, load_class, locate
 from lidargrit.processes import process_pool
@@ -34,14 +34,18 @@ from lidargrit.training import Recipe, check_folder, train, training_flops, with
 from lidargrit.training.compute import duration
 
 COSTS = "costs.json"
-_COSTS = {  # each with whether a system may lack it
-    "parameters": False,
-    "training_flops": True,
-    "network_evaluations": False,
-    "flops_per_scan": False,
-    "seconds_per_scan": True,
-    "bits_per_return": True,
+_COSTS = {  # entry of the file → name and unit in the table, and whether a system may lack it
+    "parameters": (("parameters", "all networks"), False),
+    "training_flops": (("training", "FLOPs"), True),
+    "flops_per_scan": (("sampling", "FLOPs/scan"), False),
+    "network_evaluations": (("network evaluations", "per scan"), False),
+    "seconds_per_scan": (("time", "s/scan"), True),
+    "bits_per_return": (("likelihood", "bits/return"), True),
 }
+_NOTES = (
+    "time: on this machine, in batches; likelihood: exact, of the reference, with ranges in steps of 10 mm, "
+    "and - where a system has none",
+)
 _SAMPLES_AT_MOST = 10**8  # names of files have eight digits
 
 
@@ -109,6 +113,7 @@ def run(
     by_run: dict[Path, list[_Plan]] = {}  # systems of one run one after the other: it is trained once
     for plan in plans:
         by_run.setdefault(plan.run, []).append(plan)
+    processes = min(processes, len(by_run))  # more would only take cores from one another
     remaining = _Remaining(list(systems), reporter)
     with claim_folder(folder):
         if processes == 1:
@@ -144,11 +149,10 @@ def _finish(
         seconds = _sample(generator, plan.run, samples, plan.sampling, benchmark, reporter)
         sampled += seconds is not None
         pair = open_pair(open_source(str(samples)), reference, settings, reporter)
-        if seconds is not None or not (folder / name / COSTS).exists():  # a later call has measured no time
-            _write_costs(folder / name / COSTS, plan, generator, seconds, pair)
+        _write_costs(folder / name / COSTS, plan, generator, seconds, pair)
         _score(pair, settings, folder / name / f"{name}.json", reporter)
         if len(pair.samples) < benchmark.num_samples:
-            reporter.message(f"WARNING: {benchmark.reference} has but {len(pair.samples)} scans to compare with")
+            reporter.message(f"WARNING: {benchmark.reference} has {len(pair.samples)} scans, so as many are compared")
     return sampled
 
 
@@ -183,21 +187,20 @@ class _Remaining:
             )
 
 
-def as_table(scores: Sequence[Path], form: Format = "text") -> str:
-    """Return the scores side by side, and below them what each system costs."""
-    heads = f"{'parameters':>12}{'training':>11}{'evaluations':>13}{'a scan':>11}{'seconds':>9}{'bits a return':>15}"
-    lines = [f"{'system':<32}{heads}"]
+def as_table(scores: Sequence[Path], form: Format = "text", remarks: Sequence[str] = ()) -> str:
+    """Return the scores side by side, below them what each system costs, and remarks."""
+    rows = []
     for path in scores:
         of = _read_costs(path.parent / COSTS)
-        training, flops, bits = of["training_flops"], of["flops_per_scan"], of["bits_per_return"]
-        lines.append(
-            f"{path.stem:<32}{of['parameters']:>12,}{f'{training:.2g}' if training is not None else '-':>11}"
-            f"{of['network_evaluations']:>13,}{f'{flops:.2g}':>11}{of['seconds_per_scan'] or math.nan:>9.3g}"
-            f"{'none' if bits is None else f'{bits:.3f}':>15}"
-        )
-    lines.append("(training and a scan: floating-point operations; seconds: for one scan, on this machine, in batches;")
-    lines.append(" bits a return: exact likelihood of the reference, ranges in steps of 10 mm, where a system has one)")
-    return f"{side_by_side(scores, form)}\n\n" + "\n".join(lines)
+        numbers = [of[name] for name in _COSTS]
+        rows.append((path.stem, tuple("" if number is None else _as_text(number) for number in numbers)))
+    columns = tuple(column for column, _ in _COSTS.values())
+    costs = TableBlock("Costs", columns, tuple(rows), (*_NOTES, *remarks))
+    return f"{side_by_side(scores, form)}\n\n{render([costs], form)}"
+
+
+def _as_text(number: int | float) -> str:
+    return f"{number:,}" if isinstance(number, int) and number < 1e9 else f"{number:.4g}"
 
 
 def as_json(scores: Sequence[Path]) -> list[dict[str, Any]]:
@@ -214,7 +217,7 @@ def _read_costs(path: Path) -> dict[str, Any]:
         CheckpointError: the file cannot be read, or an entry lacks or is no number.
     """
     of = {"bits_per_return": None} | read_json(path)  # files of before lack it
-    for name, may_lack in _COSTS.items():
+    for name, (_, may_lack) in _COSTS.items():
         if name not in of or not (type(of[name]) in (int, float) or (may_lack and of[name] is None)):
             cure = "remove the folder of this system, and compare again"
             raise CheckpointError(f"{path}, whose {name} is no number", "what lidargrit compare wrote", cure)
@@ -277,7 +280,14 @@ def _score(pair: EvalPair, settings: EvalConfig, path: Path, reporter: Reporter)
 
 
 def _write_costs(path: Path, plan: _Plan, generator: Generator, seconds: float | None, pair: EvalPair) -> None:
-    """Write what a system costs: to train, to sample from, and in bits to encode the scans that it is compared with."""
+    """Write what a system costs; a time and bits that were measured before, of the same scans, are kept."""
+    before = _read_costs(path) if path.is_file() else {}
+    near_far_m = list(pair.reference.range_m or ())
+    reference = {"sha256": pair.reference.record().sha256, "range_m": near_far_m}
+    is_known = before.get("reference") == reference
+    if is_known and seconds is None:
+        return
+    bits = before["bits_per_return"] if is_known else bits_per_return(generator, pair.reference)
     cost = generator.cost(plan.sampling)
     write_json(
         path,
@@ -286,8 +296,9 @@ def _write_costs(path: Path, plan: _Plan, generator: Generator, seconds: float |
             "training_flops": None if plan.recipe is None else sum(training_flops(plan.recipe).values()),
             "network_evaluations": cost.network_evaluations,
             "flops_per_scan": cost.flops,
-            "seconds_per_scan": seconds,
-            "bits_per_return": bits_per_return(generator, pair.reference),
+            "seconds_per_scan": before.get("seconds_per_scan") if seconds is None else seconds,
+            "bits_per_return": bits,
+            "reference": reference,
             "scans": len(pair.samples.images),
         },
     )

@@ -55,6 +55,7 @@ def evaluate(
     first = open_source(samples, config.data.bad_points, config.samples_format)
     second = open_source(reference, config.data.bad_points)
     if isinstance(first, RunSource):
+        _require_plain(samples, config, report)
         return _reconstruction(first, second, config, reporter)
     pair = open_pair(first, second, config, reporter)
     card = compare_pair(pair, config, reporter)
@@ -90,6 +91,7 @@ def read_config(
         ConfigError: a setting out of its bounds, or weights of a network that no metric uses.
     """
     scans = scans or ScanSettings()
+    settings["max_scans"] = settings.get("max_scans") or scans.data.max_scans
     return EvalConfig(
         metrics=tuple(metrics),
         resampling=Resampling(groups, intervals, max(settings.get("seed", 0), 0)),
@@ -116,12 +118,33 @@ def _weights(words: Sequence[str]) -> dict[str, Path]:
     return files
 
 
+def _require_plain(run: str, config: EvalConfig, report: Path | None) -> None:
+    """Refuse options that have no meaning for the reconstructions of a run.
+
+    Raises:
+        ConfigError: one of them is given.
+    """
+    given = {
+        "--report": report is not None,
+        "--metrics": bool(config.metrics),
+        "--variant": bool(config.variant),
+        "--pixel-statistics": config.pixel_statistics,
+        "--sensor": bool(config.sensor),
+    }
+    if wrong := [option for option, is_given in given.items() if is_given]:
+        raise ConfigError(
+            f"{wrong[0]} for the run {run}, of which only reconstructions are measured",
+            "samples, or none of these options",
+            f"generate samples first with: lidargrit sample {run} FOLDER",
+        )
+
+
 def _reconstruction(
     run: RunSource, reference: Source, config: EvalConfig, reporter: Reporter
 ) -> tuple[str, dict[str, Any]]:
-    variant = config.projection_variant or "exact"
+    variant = config.projection_variant or run.projection_variant(config.data) or "exact"
     data = replace(config.data, max_scans=config.max_scans, projection_variant=variant)
-    errors = score_run(run, reference, data, reporter)
+    errors = score_run(run, reference, data, reporter, config.device)
     about = {"samples": run.text, "reference": reference.text, "projection_variant": variant}
     table = "\n".join(f"{name:<22}{value:>10.4g}" for name, value in errors.items())
     return table, {**about, "reconstruction": errors}

@@ -9,7 +9,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from lidargrit import __version__, _discovery
+from lidargrit import __version__
 from lidargrit.errors import ConfigError, LidarGritError, nearest_names
 from lidargrit.evaluation.intervals import Resampling, Score
 from lidargrit.evaluation.pairs import EvalPair, pair_for_protocol
@@ -139,7 +139,8 @@ def open_pair(samples: Source, reference: Source, settings: EvalConfig, reporter
     protocol = load_protocol(settings.protocol)
     variant = settings.projection_variant or protocol.variant
     config = replace(settings.data, projection_variant=variant, max_scans=settings.max_scans)
-    sensor = config.imaged(load_sensor(settings.sensor)) if settings.sensor else protocol.load_sensor()
+    sensor = load_sensor(settings.sensor) if settings.sensor else protocol.load_sensor()
+    sensor = sensor and config.imaged(sensor)
     pair = pair_for_protocol(samples, reference, protocol, config, reporter, sensor)
     for warning in pair.warnings:
         if warning not in (*samples.doubts, *reference.doubts):  # which were told when the scans were opened
@@ -198,8 +199,8 @@ def _applicable(wanted: Sequence[MetricChoice], pair: EvalPair) -> tuple[list[Me
     kept: list[MetricChoice] = []
     others: list[LeftOut] = []
     for choice in wanted:
-        cls = load_metric(choice.metric) if choice.metric in _discovery.names("metrics") else None
-        if why and cls is not None and cls.measures_raydrop:
+        cls = load_metric(choice.metric)
+        if why and cls.measures_raydrop:
             others.append(LeftOut(choice.metric, choice.variant or cls.variants[0], why, NOT_APPLICABLE))
         else:
             kept.append(choice)
@@ -214,8 +215,7 @@ def _require_known(variant: str, wanted: Sequence[MetricChoice]) -> None:
 
 
 def _factory(choice: MetricChoice, settings: EvalConfig, reporter: Reporter) -> MetricFactory:
-    known = choice.metric in _discovery.names("metrics")
-    weights = settings.weights.get(load_metric(choice.metric).needs_weights) if known else None
+    weights = settings.weights.get(load_metric(choice.metric).needs_weights)
     return MetricFactory(choice, settings.seed, weights, settings.device, reporter)
 
 

@@ -123,12 +123,12 @@ def as_table(scores: Sequence[CompletionScore]) -> str:
     width = max(len(score.model) for score in scores) + 2
     for pattern in dict.fromkeys(score.observed for score in scores):
         lines.append(f"observed: {pattern}")
-        head = f"{'error [m]':>24}{'beside triangles [m]':>25}{'found':>8}{'IoU':>8}{'drop runs':>11}"
+        head = f"{'MAE [m]':>24}{'MAE - triangulation [m]':>25}{'found':>8}{'IoU':>8}{'drop runs':>11}"
         labelled = any(score.class_accuracy is not None for score in scores)
-        of_classes = f"{'right classes':>15}{'mIoU':>7}" if labelled else ""
+        of_classes = f"{'class accuracy':>16}{'mIoU':>7}" if labelled else ""
         bright = any(score.reflectance_error is not None for score in scores)
-        of_reflectance = f"{'error of reflectance':>{_REFLECTANCE_WIDTH}}" if bright else ""
-        lines.append(" " * width + head + f"{'diversity [m]':>15}{'s a scan':>10}{of_reflectance}{of_classes}")
+        of_reflectance = f"{'reflectance MAE':>{_REFLECTANCE_WIDTH}}" if bright else ""
+        lines.append(" " * width + head + f"{'diversity [m]':>15}{'s/scan':>10}{of_reflectance}{of_classes}")
         for score in scores:
             if score.observed != pattern:
                 continue
@@ -138,7 +138,7 @@ def as_table(scores: Sequence[CompletionScore]) -> str:
             of_reflectance = f"{error:>{_REFLECTANCE_WIDTH}}" if bright else ""
             of_classes = ""
             if score.class_accuracy is not None and score.class_iou is not None:
-                of_classes = f"{score.class_accuracy.value:>15.3f}{score.class_iou:>7.3f}"
+                of_classes = f"{score.class_accuracy.value:>16.3f}{score.class_iou:>7.3f}"
             lines.append(
                 f"{score.model:<{width}}{score.mae_m.as_text('.3f'):>24}{beside:>25}{score.found.value:>8.3f}"
                 f"{score.iou.value:>8.3f}{score.drop_run_lengths:>11.4f}{diversity:>15}{score.seconds_per_scan:>10.3f}"

@@ -63,7 +63,7 @@ class EvalSet:
         return kept if reflectance is None else replace(kept, reflectance=torch.where(mask, reflectance, 0))
 
     def record(self) -> EvalSetRecord:
-        """Return the entry of the set in a score file, with the hash of the compared pixels."""
+        """Return the entry of the set in a score file; its hash is of the ranges before limits are applied."""
         sensor = self.images.sensor
         return EvalSetRecord(
             self.source,
@@ -205,8 +205,7 @@ def _warnings(pair: EvalPair, shared: str) -> tuple[str, ...]:
         if rows[0] != rows[1]:
             theirs, ours = (f"{variant} {row}" for variant, row in ((theirs, rows[0]), (ours, rows[1])))
         found.append(
-            f"the two sets took different roads: the samples' scans were projected by {theirs!r}, those of the "
-            f"reference by {ours!r}; scores mix this with what the model does"
+            f"the projections differ: samples {theirs!r}, reference {ours!r}; the scores include this difference"
         )
     return tuple(found)
 

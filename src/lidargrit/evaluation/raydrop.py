@@ -1,4 +1,4 @@
-"""Drops of a model on clean scans → distances of their curves from those of true drops, beside a coin's."""
+"""Drops of a model on clean scans, and independent drops → distances of their curves from those of true drops."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from lidargrit.conditions import Condition
 from lidargrit.conditions.fills import ranges_from_others
 from lidargrit.errors import ConfigError
-from lidargrit.evaluation.realism import SimulatedScans, distance, drop_by_coin
+from lidargrit.evaluation.realism import SimulatedScans, distance, drop_independently
 from lidargrit.generators import Generator, load, locate
 from lidargrit.loading import RangeImages
 from lidargrit.structures import MetricResult, RangeImage
@@ -41,27 +41,27 @@ class RaydropScore:
         scans: kind of the scans to which drops are added: ``simulated``; ``real``, with ranges that a tokenizer
             decodes; or ``real_triangulated``, with ranges that are interpolated from other rays' returns.
         model: distance between the model's drops and the true ones.
-        coin: distance between the true drops and drops of one constant probability, on the same clean ranges.
-        floor: distance between the two halves of the true scans.
+        bernoulli: distance between the true drops and independent drops of one probability, on the same clean ranges.
+        real_against_real: distance between the two halves of the true scans.
     """
 
     scans: str
     model: MetricResult
-    coin: MetricResult
-    floor: MetricResult
+    bernoulli: MetricResult
+    real_against_real: MetricResult
 
 
 def score_raydrop(
     generator: Generator, scans: str, clean: RangeImage, true: RangeImage, seed: int = 0
 ) -> list[RaydropScore]:
-    """Let a model and a coin drop returns of clean scans, and compare either with the true scans.
+    """Drop returns of clean scans by a model, and independently of one another, and compare both with the true scans.
 
     Args:
         generator: model that takes clean surfaces.
         scans: kind of the scans; see :class:`RaydropScore`.
         clean: batch of range images in which every surface returns.
         true: measured range images of the same scans, with true drops.
-        seed: seed of the first scan's drops, and of the coin.
+        seed: seed of the first scan's drops, and of the independent ones.
 
     Raises:
         ConfigError: a model that does not take clean surfaces.
@@ -74,13 +74,13 @@ def score_raydrop(
         seeds = range(seed + first, seed + first + len(some))
         dropped.append(generator.complete(Condition.of_surfaces(some).to(device), seeds).to("cpu"))
     by_model = RangeImage.cat(dropped)
-    by_coin = drop_by_coin(clean, float(true.return_mask.float().mean()), seed)
+    independent = drop_independently(clean, float(true.return_mask.float().mean()), seed)
     half = len(true) // 2
     return [
         RaydropScore(
             scans,
             distance(name, [by_model], _only(true)),
-            distance(name, [by_coin], _only(true)),
+            distance(name, [independent], _only(true)),
             distance(name, [true[:half]], _only(true[half:])),
         )
         for name in RAYDROP_CURVES
@@ -160,10 +160,12 @@ def raydrop_table(scores: Sequence[RaydropScore]) -> str:
     """Return scores as lines for a terminal."""
     lines = []
     for scans in dict.fromkeys(score.scans for score in scores):
-        lines.append(f"{_TITLES[scans]:<28}{'model':>10}{'coin':>10}{'halves':>10}")
+        lines.append(f"{_TITLES[scans]:<28}{'model':>10}{'Bernoulli':>11}{'real v real':>13}")
         for score in scores:
             if score.scans == scans:
-                values = f"{score.model.value:>10.4f}{score.coin.value:>10.4f}{score.floor.value:>10.4f}"
+                values = (
+                    f"{score.model.value:>10.4f}{score.bernoulli.value:>11.4f}{score.real_against_real.value:>13.4f}"
+                )
                 lines.append(f"{score.model.metric:<28}{values}")
     return "\n".join(lines)
 

@@ -1,4 +1,4 @@
-"""Real scans, simulated scans, and drops by a coin → distances between their curves."""
+"""Real scans, simulated scans, and independent drops of one rate → distances between their curves."""
 
 from __future__ import annotations
 
@@ -63,12 +63,12 @@ class CurveScore:
 
     @property
     def ratio(self) -> float:
-        """Distance of the simulator over that of the coin: below 1 the simulator is nearer to real scans."""
+        """Distance of the simulator over that of independent drops: below 1 the simulator is nearer to real scans."""
         return self.simulated.value / self.bernoulli.value if self.bernoulli.value > 0 else float("nan")
 
 
 def compare(simulated: SimulatedScans, real: RangeImages, curves: Sequence[str] = CURVES) -> list[CurveScore]:
-    """Compare real scans with simulated ones, and with drops by a coin, curve by curve.
+    """Compare real scans with simulated ones, and with independent drops of one rate, curve by curve.
 
     Args:
         simulated: scans of the real ones' sensor, as many as wanted.
@@ -89,7 +89,7 @@ def compare(simulated: SimulatedScans, real: RangeImages, curves: Sequence[str] 
     for batch in _batches(real, 0, len(real)):
         pixels, returned = pixels + batch.return_mask.numel(), returned + int(batch.return_mask.sum())
         reflects &= batch.reflectance is not None
-    coin = drop_by_coin(simulated.clean, returned / pixels)
+    independent = drop_independently(simulated.clean, returned / pixels)
     scores = []
     for name in curves:
         if name == "reflectance_histogram" and not reflects:
@@ -97,15 +97,15 @@ def compare(simulated: SimulatedScans, real: RangeImages, curves: Sequence[str] 
         scores.append(
             CurveScore(
                 distance(name, [simulated.measured], _batches(real, 0, len(real))),
-                distance(name, [coin], _batches(real, 0, len(real))),
+                distance(name, [independent], _batches(real, 0, len(real))),
                 distance(name, _batches(real, 0, half), _batches(real, half, len(real))),
             )
         )
     return scores
 
 
-def drop_by_coin(clean: RangeImage, return_share: float, seed: int = 0) -> RangeImage:
-    """Drop returns by an independent coin of one rate, so that a given share of all pixels returns.
+def drop_independently(clean: RangeImage, return_share: float, seed: int = 0) -> RangeImage:
+    """Drop returns independently of one another (Bernoulli) at one rate, so that a given share of all pixels returns.
 
     Args:
         clean: a batch where all surfaces return.
@@ -207,8 +207,8 @@ def as_json(scores: Sequence[CurveScore]) -> list[dict[str, Any]]:
 
 def as_table(scores: Sequence[CurveScore]) -> str:
     """Return scores as lines for a terminal."""
-    lines = [f"{'distance of real scans from':<28}{'simulated':>10}{'coin':>10}{'ratio':>8}{'real':>10}"]
+    lines = [f"{'distance of real scans from':<28}{'simulated':>10}{'Bernoulli':>11}{'ratio':>8}{'real v real':>13}"]
     for score in scores:
-        values = f"{score.simulated.value:>10.4f}{score.bernoulli.value:>10.4f}{score.ratio:>8.2f}"
-        lines.append(f"{score.simulated.metric:<28}{values}{score.real_against_real.value:>10.4f}")
+        values = f"{score.simulated.value:>10.4f}{score.bernoulli.value:>11.4f}{score.ratio:>8.2f}"
+        lines.append(f"{score.simulated.metric:<28}{values}{score.real_against_real.value:>13.4f}")
     return "\n".join(lines)

@@ -17,6 +17,61 @@ from lidargrit.structures import RangeImage
 from lidargrit.tokenizers import Tokenizer
 
 _BATCH = 16
+_LEAST_M = 1e-3  # of a decoded range in a logarithm or a ratio: ours are longer, others' may be 0 or negative
+
+
+# The measures of monocular depth estimation (Eigen et al., Depth map prediction from a single image, NeurIPS 2014,
+# section 4), as LidarGRIT reports them for its first stage: in metres, and image by image.
+
+
+def abs_rel(
+    real_range_m: Float[Tensor, "B H W"], decoded_range_m: Float[Tensor, "B H W"], return_mask: Bool[Tensor, "B H W"]
+) -> Float64[Tensor, " B"]:
+    """Return the mean of |decoded - real| / real over the returns of each image; NaN where it has none."""
+    return _mean_over_returns((decoded_range_m.double() - real_range_m).abs() / real_range_m, return_mask)
+
+
+def sq_rel(
+    real_range_m: Float[Tensor, "B H W"], decoded_range_m: Float[Tensor, "B H W"], return_mask: Bool[Tensor, "B H W"]
+) -> Float64[Tensor, " B"]:
+    """Return the mean of (decoded - real)^2 / real (metres) over the returns of each image; NaN where it has none."""
+    return _mean_over_returns((decoded_range_m.double() - real_range_m).square() / real_range_m, return_mask)
+
+
+def rmse(
+    real_range_m: Float[Tensor, "B H W"], decoded_range_m: Float[Tensor, "B H W"], return_mask: Bool[Tensor, "B H W"]
+) -> Float64[Tensor, " B"]:
+    """Return the root of the mean squared error, in metres, over the returns of each image; NaN where it has none."""
+    return _mean_over_returns((decoded_range_m.double() - real_range_m).square(), return_mask).sqrt()
+
+
+def rmse_log(
+    real_range_m: Float[Tensor, "B H W"], decoded_range_m: Float[Tensor, "B H W"], return_mask: Bool[Tensor, "B H W"]
+) -> Float64[Tensor, " B"]:
+    """Return the root of the mean squared error of ln(range) over the returns of each image; NaN where it has none."""
+    log_ratio = decoded_range_m.double().clamp(min=_LEAST_M).log() - real_range_m.double().log()
+    return _mean_over_returns(log_ratio.square(), return_mask).sqrt()
+
+
+def accuracy(
+    real_range_m: Float[Tensor, "B H W"],
+    decoded_range_m: Float[Tensor, "B H W"],
+    return_mask: Bool[Tensor, "B H W"],
+    power: int = 1,
+) -> Float64[Tensor, " B"]:
+    """Return the share of returns with max(decoded / real, real / decoded) < 1.25^power; NaN where there are none.
+
+    The program counts all pixels while it trains and, as here, returns only when it reports.
+    """
+    ratio = decoded_range_m.double().clamp(min=_LEAST_M) / real_range_m
+    return _mean_over_returns((torch.maximum(ratio, 1 / ratio) < 1.25**power).double(), return_mask)
+
+
+def _mean_over_returns(value: Float64[Tensor, "B H W"], return_mask: Bool[Tensor, "B H W"]) -> Float64[Tensor, " B"]:
+    return torch.where(return_mask, value, 0.0).sum((1, 2)) / return_mask.sum((1, 2))
+
+
+_OF_SCANS = (abs_rel, sq_rel, rmse, rmse_log, accuracy)
 
 
 @dataclass(frozen=True)
@@ -35,6 +90,12 @@ class ReconstructionErrors:
         drop_precision: share of the decoded ray drops that are true.
         drop_recall: share of the true ray drops that are decoded.
         drop_iou: intersection over union of decoded and true ray drops.
+        abs_rel: mean of |decoded - real| / real over the returns of a scan, as a mean over scans, like the next four;
+            lower is better. LidarGRIT reports these five of its first stage.
+        sq_rel_m: mean of (decoded - real)^2 / real in metres; lower is better.
+        scan_rmse_m: root of the mean squared range error of a scan in metres; lower is better.
+        rmse_log: root of the mean squared error of ln(range); lower is better.
+        accuracy_1_25: share of returns with max(decoded / real, real / decoded) < 1.25; higher is better.
         num_scans: number of pairs.
     """
 
@@ -44,6 +105,11 @@ class ReconstructionErrors:
     drop_precision: float
     drop_recall: float
     drop_iou: float
+    abs_rel: float
+    sq_rel_m: float
+    scan_rmse_m: float
+    rmse_log: float
+    accuracy_1_25: float
     num_scans: int
 
 
@@ -55,6 +121,7 @@ class ReconstructionScore:
         # Counts of pixels: real and decoded ray drops as (real, decoded) = TT, FT, TF, FF.
         self._both = self._only_decoded = self._only_real = self._neither = 0
         self._absolute_m, self._squared_m2 = 0.0, 0.0
+        self._of_scans, self._scans_with_returns = torch.zeros(len(_OF_SCANS), dtype=torch.float64), 0
 
     def update(
         self, real: RangeImage, clean_range_m: Float[Tensor, "B H W"], return_mask: Bool[Tensor, "B H W"]
@@ -91,6 +158,10 @@ class ReconstructionScore:
         self._only_real += int((~returned & return_mask).sum())
         self._neither += int((returned & return_mask).sum())
         self._num_scans += len(real)
+        has_returns = returned.any((1, 2))
+        pairs = real.range_m[has_returns], clean_range_m.detach()[has_returns], returned[has_returns]
+        self._of_scans = self._of_scans + torch.stack([measure(*pairs).sum() for measure in _OF_SCANS])
+        self._scans_with_returns += int(has_returns.sum())
 
     def merge(self, other: ReconstructionScore) -> None:
         """Take in what another process has gathered."""
@@ -111,6 +182,7 @@ class ReconstructionScore:
                 "check the folder of real scans",
             )
         num_pixels = num_returns + self._both + self._only_real
+        of_scans = (self._of_scans / self._scans_with_returns).tolist()
         return ReconstructionErrors(
             range_mae_m=self._absolute_m / num_returns,
             range_rmse_m=(self._squared_m2 / num_returns) ** 0.5,
@@ -118,6 +190,7 @@ class ReconstructionScore:
             drop_precision=_share(self._both, self._both + self._only_decoded),
             drop_recall=_share(self._both, self._both + self._only_real),
             drop_iou=_share(self._both, self._both + self._only_decoded + self._only_real),
+            **dict(zip(("abs_rel", "sq_rel_m", "scan_rmse_m", "rmse_log", "accuracy_1_25"), of_scans, strict=True)),
             num_scans=self._num_scans,
         )
 
@@ -129,15 +202,17 @@ def _share(part: int, whole: int) -> float:
 @torch.no_grad()
 def score_reconstruction(tokenizer: Tokenizer, images: RangeImages) -> ReconstructionErrors:
     """Return how well a tokenizer reconstructs all images of a set; a pixel returns where its logit is 0 or more."""
-    score = ReconstructionScore()
+    score, device = ReconstructionScore(), next(tokenizer.parameters()).device
     for first in range(0, len(images), _BATCH):
         batch = images.batch(range(first, min(first + _BATCH, len(images))))
-        clean = tokenizer.decode(tokenizer.encode(batch))
-        score.update(batch, clean.range_m, clean.return_logits >= 0)
+        clean = tokenizer.decode(tokenizer.encode(batch.to(device)))
+        score.update(batch, clean.range_m.cpu(), clean.return_logits.cpu() >= 0)
     return score.compute()
 
 
-def score_run(run: RunSource, source: Source, config: DataConfig, reporter: Reporter) -> dict[str, float]:
+def score_run(
+    run: RunSource, source: Source, config: DataConfig, reporter: Reporter, device: str = "cpu"
+) -> dict[str, float]:
     """Return how well the tokenizer of a finished run reconstructs scans, by the name of each error.
 
     Args:
@@ -145,66 +220,17 @@ def score_run(run: RunSource, source: Source, config: DataConfig, reporter: Repo
         source: scans that the tokenizer encodes and decodes.
         config: settings of reading and projecting scans.
         reporter: receiver of progress, and of a warning if the model has learned from these scans.
+        device: device that the networks compute on.
 
     Raises:
         ConfigError: a run whose generator has no tokenizer.
     """
-    tokenizer = run.generator.get_tokenizer()
+    generator = run.generator.to(device)
+    tokenizer = generator.get_tokenizer()
     images = source.images(run.sensor, config, reporter)
     if shared := overlap(run, None, images):
         reporter.message(f"WARNING: {run.text} and the reference overlap ({shared}): the scores flatter it")
     errors = asdict(score_reconstruction(tokenizer, images))
-    if "likelihood" not in run.generator.capabilities:
+    if "likelihood" not in generator.capabilities:
         return errors
-    return {**errors, **score_likelihood(run.generator, images).by_natural_unit()}
-
-
-# The measures of monocular depth estimation (Eigen et al., Depth map prediction from a single image, NeurIPS 2014,
-# section 4), as LidarGRIT reports them for its first stage: in metres, and image by image.
-
-
-def abs_rel(
-    real_range_m: Float[Tensor, "B H W"], decoded_range_m: Float[Tensor, "B H W"], return_mask: Bool[Tensor, "B H W"]
-) -> Float64[Tensor, " B"]:
-    """Return the mean of |decoded - real| / real over the returns of each image; NaN where it has none."""
-    return _mean_over_returns((decoded_range_m.double() - real_range_m).abs() / real_range_m, return_mask)
-
-
-def sq_rel(
-    real_range_m: Float[Tensor, "B H W"], decoded_range_m: Float[Tensor, "B H W"], return_mask: Bool[Tensor, "B H W"]
-) -> Float64[Tensor, " B"]:
-    """Return the mean of (decoded - real)^2 / real (metres) over the returns of each image; NaN where it has none."""
-    return _mean_over_returns((decoded_range_m.double() - real_range_m).square() / real_range_m, return_mask)
-
-
-def rmse(
-    real_range_m: Float[Tensor, "B H W"], decoded_range_m: Float[Tensor, "B H W"], return_mask: Bool[Tensor, "B H W"]
-) -> Float64[Tensor, " B"]:
-    """Return the root of the mean squared error, in metres, over the returns of each image; NaN where it has none."""
-    return _mean_over_returns((decoded_range_m.double() - real_range_m).square(), return_mask).sqrt()
-
-
-def rmse_log(
-    real_range_m: Float[Tensor, "B H W"], decoded_range_m: Float[Tensor, "B H W"], return_mask: Bool[Tensor, "B H W"]
-) -> Float64[Tensor, " B"]:
-    """Return the root of the mean squared error of ln(range) over the returns of each image; NaN where it has none."""
-    log_ratio = decoded_range_m.double().log() - real_range_m.double().log()
-    return _mean_over_returns(log_ratio.square(), return_mask).sqrt()
-
-
-def accuracy(
-    real_range_m: Float[Tensor, "B H W"],
-    decoded_range_m: Float[Tensor, "B H W"],
-    return_mask: Bool[Tensor, "B H W"],
-    power: int = 1,
-) -> Float64[Tensor, " B"]:
-    """Return the share of returns with max(decoded / real, real / decoded) < 1.25^power; NaN where there are none.
-
-    The program counts all pixels while it trains and, as here, returns only when it reports.
-    """
-    ratio = decoded_range_m.double() / real_range_m
-    return _mean_over_returns((torch.maximum(ratio, 1 / ratio) < 1.25**power).double(), return_mask)
-
-
-def _mean_over_returns(value: Float64[Tensor, "B H W"], return_mask: Bool[Tensor, "B H W"]) -> Float64[Tensor, " B"]:
-    return torch.where(return_mask, value, 0.0).sum((1, 2)) / return_mask.sum((1, 2))
+    return {**errors, **score_likelihood(generator, images).by_natural_unit()}

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
+from lidargrit.errors import DataError
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair
 from lidargrit.evaluation.intervals import RealAgainstReal, Resampling
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
@@ -30,7 +30,7 @@ def with_pixel_statistics(card: Scorecard, pair: EvalPair, real: RangeImages, se
     count = len(pair.samples)
     images = RangeImages(real.sensor, [ImagesInMemory(statistics.sample(range(count)))])
     scans = EvalSet("pixel statistics", images, range(count), pair.samples.range_m)
-    values = _values(_plain(EvalPair(scans, pair.reference), settings, card))
+    values = _values_of(EvalPair(scans, pair.reference), settings, card)
     scores = (replace(s, pixel_statistics=values.get((s.result.metric, s.result.variant))) for s in card.scores)
     return replace(card, scores=tuple(scores))
 
@@ -44,7 +44,7 @@ def with_held_out(card: Scorecard, held_out: EvalSet, reference: EvalSet, settin
         reference: scans of the samples' reference, as many as are held out.
         settings: protocol and its changes, as for the samples.
     """
-    values = _values(_plain(EvalPair(held_out, reference), settings, card))
+    values = _values_of(EvalPair(held_out, reference), settings, card)
     scores = []
     for score in card.scores:
         value = values.get((score.result.metric, score.result.variant))
@@ -53,14 +53,14 @@ def with_held_out(card: Scorecard, held_out: EvalSet, reference: EvalSet, settin
     return replace(card, scores=tuple(scores))
 
 
-def _plain(pair: EvalPair, settings: EvalConfig, card: Scorecard) -> Scorecard:
-    """Score the metrics that a scorecard has, without intervals."""
-    metrics: Sequence[str] = list(dict.fromkeys(score.result.metric for score in card.scores))
-    return compare_pair(pair, replace(settings, metrics=tuple(metrics), resampling=Resampling(halves=0)))
-
-
-def _values(card: Scorecard) -> dict[tuple[str, str], float]:
-    return {(score.result.metric, score.result.variant): score.result.value for score in card.scores}
+def _values_of(pair: EvalPair, settings: EvalConfig, card: Scorecard) -> dict[tuple[str, str], float]:
+    """Score the metrics that a scorecard has, without intervals; those that the pair cannot have are left out."""
+    metrics = tuple(dict.fromkeys(score.result.metric for score in card.scores))
+    try:
+        found = compare_pair(pair, replace(settings, metrics=metrics, resampling=Resampling(halves=0)))
+    except DataError:  # not one of them, as metrics of reflectance of scans without any
+        return {}
+    return {(score.result.metric, score.result.variant): score.result.value for score in found.scores}
 
 
 class ImagesInMemory:

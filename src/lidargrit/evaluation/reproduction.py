@@ -180,7 +180,7 @@ def reproduce(wanted: Reproduction, folder: Path, reporter: Reporter | None = No
 
 def table_of(wanted: Reproduction, scores: list[Path], form: Format = "text") -> str:
     """Return the scores side by side, the paper's rows apart, and which row is which."""
-    return "\n\n".join((as_table(scores, form), _words(wanted)))
+    return as_table(scores, form, _remarks(wanted))
 
 
 def plan(wanted: Reproduction, folder: Path) -> dict[str, Any]:
@@ -213,7 +213,7 @@ def plan_as_text(wanted: Reproduction, facts: dict[str, Any]) -> str:
                 f"  {stage['name']}: {stage['scans']:,} scans, {computing_time(stage['flops'], stage['precision'])}"
             )
         lines.append(f"  sample {facts['samples']:,} scans: {of['sampling_flops']:.2g} floating-point operations")
-    return "\n".join([*lines, "", _words(wanted)])
+    return "\n".join([*lines, "", *_remarks(wanted)])
 
 
 def _recipe(system: str, benchmark: Benchmark) -> Recipe:
@@ -234,7 +234,7 @@ def _prepare(benchmark: Benchmark, systems: list[str], reporter: Reporter) -> No
         reference.images(data.load_sensor(), config, reporter)
 
 
-def _words(wanted: Reproduction) -> str:
+def _remarks(wanted: Reproduction) -> list[str]:
     """Return a legend of the rows, and remarks that a reader must know."""
-    lines = [f"the paper's row {row!r} is measured by {system}" for row, system in wanted.systems().items()]
-    return "\n".join([*lines, *wanted.table.remarks])
+    rows = [f"the paper's row {row!r} is measured by {system}" for row, system in wanted.systems().items()]
+    return [*rows, *wanted.table.remarks]

@@ -67,14 +67,14 @@ class Scorecard:
 
     Args:
         protocol: name of the protocol.
-        about: title, source and departures of the protocol.
+        about: title, source, limits of range, number of scans, data set and departures of the protocol.
         samples: record of the first set, usually generated.
         reference: record of the second set, usually real.
         scores: scores in the protocol's order.
         left_out: metrics that could not be computed.
         deviations: differences of this evaluation from the protocol.
         warnings: sentences that a reader must know before trusting a score.
-        settings: seeds, groups, halves.
+        settings: settings of the evaluation, as :meth:`EvalConfig.facts` returns them.
         versions: versions of this program and of the libraries that it uses.
     """
 

@@ -58,17 +58,28 @@ def side_by_side(paths: Sequence[Path], form: Format = "text") -> str:
     if not paths:
         raise DataError("no file of scores", "at least one", "write some with: lidargrit evaluate ... --json FILE")
     measured: dict[tuple[str, str, int], list[tuple[str, Scorecard]]] = {}
-    for path in paths:
+    for path, name in zip(paths, _names(paths), strict=True):
         card = Scorecard.read(path)
         key = (card.protocol, card.reference.sha256, card.reference.scans_used)
-        measured.setdefault(key, []).append((path.stem, card))
+        measured.setdefault(key, []).append((name, card))
     blocks = [block for cards in measured.values() for block in (_measured(cards), *_published(cards))]
+    return render(blocks, form)
+
+
+def render(blocks: Sequence[TableBlock], form: Format = "text") -> str:
+    """Return blocks of a table, one below the other."""
     return "\n\n".join(_RENDERERS[form](block) for block in blocks)
 
 
 def read_tables(paths: Sequence[Path], form: Format = "text") -> tuple[str, dict[str, Any]]:
     """Return the scores of several files side by side, and the content of each file by its name."""
-    return side_by_side(paths, form), {path.stem: read_json(path) for path in paths}
+    return side_by_side(paths, form), {name: read_json(path) for path, name in zip(paths, _names(paths), strict=True)}
+
+
+def _names(paths: Sequence[Path]) -> list[str]:
+    """Return the name of the system of each file: that of the file, with its folder where several have one name."""
+    stems = [path.stem for path in paths]
+    return [path.stem if stems.count(path.stem) == 1 else str(path.with_suffix("")) for path in paths]
 
 
 def _measured(cards: Sequence[tuple[str, Scorecard]]) -> TableBlock:
@@ -82,7 +93,12 @@ def _measured(cards: Sequence[tuple[str, Scorecard]]) -> TableBlock:
         rows.append((f"{name}{_BOUNDS.get(name, '')}", tuple(cells.get(column, "") for column in columns)))
         notes += [f"{name}: {text}" for text in (*card.deviations, *card.warnings)]
     card = cards[0][1]
-    reference_row = {_column(score): score.real_against_real for score in card.scores if score.real_against_real}
+    reference_row = {
+        _column(score): score.real_against_real
+        for _, of in reversed(cards)  # of the first that has it
+        for score in of.scores
+        if score.real_against_real
+    }
     if reference_row:
         count = next(iter(reference_row.values())).num_scans
         cells = tuple(

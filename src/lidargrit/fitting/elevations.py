@@ -67,9 +67,9 @@ def rows_of_rings(
     usual_m = np.array([np.median(range_m[group]) for group in groups])
     seen_deg = fit[:, 0] + fit[:, 1] / usual_m
     top_down = np.argsort(-seen_deg, kind="stable")
-    half_gap = _quarter_gap_deg(seen_deg[top_down])[np.argsort(top_down)]
+    quarter_gap_deg = _quarter_gap_deg(seen_deg[top_down])[np.argsort(top_down)]
     near = [
-        np.abs(elevation_deg[group] - fit[i, 0] - fit[i, 1] / range_m[group]) < half_gap[i]
+        np.abs(elevation_deg[group] - fit[i, 0] - fit[i, 1] / range_m[group]) < quarter_gap_deg[i]
         for i, group in enumerate(groups)
     ]
     return FittedRows(

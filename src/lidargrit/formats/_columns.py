@@ -133,7 +133,9 @@ def _whole(values: np.ndarray, good: Tensor, at_most: int, what: str, path: Path
     with np.errstate(over="ignore", invalid="ignore"):
         whole = bool(((values >= 0) & (values <= at_most) & (values % 1 == 0)).all())
     if not whole:
-        raise ScanError(f"a {what} that is none in {path}", f"whole numbers from 0 to {at_most}", "correct them")
+        raise ScanError(
+            f"a {what} that is not whole or out of bounds in {path}", f"0 to {at_most:,}", "correct the file"
+        )
     return torch.from_numpy(values.astype(np.int64))
 
 

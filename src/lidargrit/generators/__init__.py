@@ -70,7 +70,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
 
     Sampling: ClassVar[type] = NoSampling
     capabilities: ClassVar[frozenset[str]] = frozenset()
-    facts: ClassVar[SystemFacts] = SystemFacts(writes="range images")
+    facts: ClassVar[SystemFacts] = SystemFacts(generates="range images")
     published_files: ClassVar[tuple[str, ...]] = ()
     """Contents of the files in which the system's authors published weights, in order; empty if we read none."""
 

@@ -65,11 +65,11 @@ def check_condition(condition: Condition, kinds: Collection[ConditionKind], sens
 
 
 def reflectance_to_learn(images: RangeImage) -> Float[Tensor, "*B H W"]:
-    """Return the reflectance of training scans, in [0, 1]; refuse scans without it."""
+    """Return the reflectance of scans, in [0, 1]; refuse scans without it."""
     if images.reflectance is None:
         raise ConfigError(
             "range images without reflectance",
-            "images with it, for model.reflectance=true",
-            "use --set model.reflectance=false, or prepare scans that have it",
+            "images with it, for a model of range and reflectance (model.reflectance=true)",
+            "take scans that have it, or train with --set model.reflectance=false",
         )
     return images.reflectance

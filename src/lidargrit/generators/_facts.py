@@ -19,14 +19,14 @@ class SystemFacts:
     """What a generator writes and where its method comes from; ``lidargrit list generators`` prints it.
 
     Args:
-        writes: values of a generated scan, and the rule by which a ray has no return.
+        generates: values of a generated scan, and the rule by which a ray has no return.
         paper: authors, title, conference and year; empty for a method of this project.
         program: program of the authors, ``OWNER/REPOSITORY@COMMIT``, with its licence; empty where there is none.
         weights_licence: licence of the weights that the authors published; empty where they published none.
         first_command: command of ``lidargrit`` by which a trained run shows what it learned; ``RUN`` is its folder.
     """
 
-    writes: str
+    generates: str
     paper: str = ""
     program: str = ""
     weights_licence: str = ""
@@ -36,7 +36,7 @@ class SystemFacts:
         """Return the facts as lines for a person, and between them what a generator with these capabilities can do."""
         origin = "; ".join(part for part in (self.paper, self.program) if part) or "this project"
         return [
-            f"writes {self.writes}",
+            f"generates {self.generates}",
             *(f"can {what} ({name})" for name, what in CAPABILITIES.items() if name in capabilities),
             f"from: {origin}",
             f"published weights: {self.weights_licence or 'none'}",

@@ -237,7 +237,7 @@ class PixelObjective(Objective):
         self._tokens = None if tokenizer is None else EncodingCache(tokenizer, _tokens)
 
     def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
-        """Return the nats of the mask a pixel and of the range a return, together and apart, the latter in bits.
+        """Return the nats of the mask a pixel plus those of the range a return as ``loss``, and each of them in bits.
 
         In training some phases of each scan stand for all; in validation all are counted.
         """

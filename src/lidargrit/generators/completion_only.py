@@ -37,7 +37,7 @@ class CompletionOnly(Generator[CompletionOnlyConfig, NoSampling]):
 
     Config = CompletionOnlyConfig
     facts = SystemFacts(
-        writes="range as a best guess and raydrop around observed pixels; no scans worth sampling",
+        generates="range as a best guess and raydrop around observed pixels; no scans worth sampling",
         first_command="complete SCANS completed --observed rows:4 --model RUN",
     )
     capabilities = frozenset({"complete"})

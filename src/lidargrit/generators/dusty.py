@@ -127,7 +127,7 @@ class Dusty(Generator[DustyConfig, DustySampling]):
 
     Config = DustyConfig
     facts = SystemFacts(
-        writes="range and raydrop, sampled over a scan without holes",
+        generates="range and raydrop, sampled over a scan without holes",
         paper="Nakashima and Kurazume, Learning to Drop Points for LiDAR Scan Synthesis, IROS 2021",
         program="kazuto1011/dusty-gan@0374a5e (MIT)",
         weights_licence="MIT, as the program",
@@ -289,7 +289,7 @@ class AdversarialObjective(Objective):
         of_real = self.discriminator(seen).float()
         of_generated = self.discriminator(self._augment(generated, rng)).float()
         loss = F.softplus(-of_real).mean() + F.softplus(of_generated).mean()
-        terms = {"loss": loss, "real_logit": of_real.mean(), "drawn_logit": of_generated.mean()}
+        terms = {"loss": loss, "real_logit": of_real.mean(), "generated_logit": of_generated.mean()}
         if takes_penalty:
             (gradient,) = torch.autograd.grad(of_real.sum(), seen, create_graph=True)
             penalty = gradient.float().square().sum((1, 2, 3)).mean()

@@ -77,7 +77,7 @@ class LidarGan(Generator[LidarGanConfig, NoSampling]):
 
     Config = LidarGanConfig
     facts = SystemFacts(
-        writes="range; every ray of 40 rows returns, and no ray of the others",
+        generates="range; every ray of 40 rows returns, and no ray of the others",
         paper="Caccia et al., Deep Generative Modeling of LiDAR Data, IROS 2019",
         program="pclucas14/lidar_generation@2a2c8bc (no licence)",
         weights_licence="no licence stated",

@@ -109,7 +109,7 @@ class LidarGen(Generator[LidarGenConfig, LangevinSampling]):
 
     Config = LidarGenConfig
     facts = SystemFacts(
-        writes="range and reflectance; a range outside a window is no return",
+        generates="range and reflectance; a range outside a window is no return",
         paper="Zyrianov, Zhu and Wang, Learning to Generate Realistic LiDAR Point Clouds, ECCV 2022",
         program="vzyrianov/lidargen@4c3226c (MIT)",
         weights_licence="MIT, as the program",

@@ -126,7 +126,7 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
 
     Config = LidarGritConfig
     facts = SystemFacts(
-        writes="range and raydrop, decoded apart from each other; reflectance if model.tokenizer.reflectance is set "
+        generates="range and raydrop, decoded apart from each other; reflectance if model.tokenizer.reflectance is set "
         "(completed scans: that of model.completion or model.raydrop, or filled in)",
         paper="Haghighi et al., Taming Transformers for Realistic Lidar Point Cloud Generation, 2024",
         program="hamedhaghighi/LidarGRIT@a3f86e7 (no licence)",
@@ -180,7 +180,7 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
 
     @property
     def conditions(self) -> frozenset[ConditionKind]:
-        """Observed pixels, and with a pixel decoder ranges of surfaces whose returns are sampled."""
+        """Observed pixels, and ranges of surfaces whose returns are sampled."""
         return frozenset({"pixels", "surfaces"})
 
     def _complete(self, condition: Condition, seeds: BatchSeeds, sampling: TokenSampling) -> RangeImage:

@@ -107,7 +107,7 @@ class LidarVae(Generator[LidarVaeConfig, VaeSampling]):
     Config = LidarVaeConfig
     Sampling = VaeSampling
     facts = SystemFacts(
-        writes="range; every ray of 40 rows returns, and no ray of the others",
+        generates="range; every ray of 40 rows returns, and no ray of the others",
         paper="Caccia et al., Deep Generative Modeling of LiDAR Data, IROS 2019",
         program="pclucas14/lidar_generation@2a2c8bc (no licence)",
         weights_licence="no licence stated",

@@ -88,7 +88,7 @@ class Lidm(Generator[LidmConfig, LidmSampling]):
 
     Config = LidmConfig
     facts = SystemFacts(
-        writes="range and raydrop, the latter as its tokenizer decodes it",
+        generates="range and raydrop, the latter as its tokenizer decodes it",
         paper="Ran et al., Towards Realistic Scene Generation with LiDAR Diffusion Models, CVPR 2024",
         program="hancyran/LiDAR-Diffusion@8416ddb (MIT)",
         weights_licence="MIT, as the program",

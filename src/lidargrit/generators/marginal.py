@@ -41,7 +41,7 @@ class Marginal(Generator[MarginalConfig, NoSampling]):
     """
 
     Config = MarginalConfig
-    facts = SystemFacts(writes="range and raydrop, every pixel by itself")
+    facts = SystemFacts(generates="range and raydrop, every pixel by itself")
     scans: Tensor
     counts: Tensor
 

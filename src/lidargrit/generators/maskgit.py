@@ -96,7 +96,7 @@ class MaskGit(TokenGenerator[MaskGitConfig, MaskedSampling]):
 
     Config = MaskGitConfig
     facts = SystemFacts(
-        writes="range and raydrop, decoded apart from each other; reflectance if model.tokenizer.reflectance is set",
+        generates="range and raydrop, decoded apart from each other; reflectance if model.tokenizer.reflectance is set",
         paper="Chang et al., MaskGIT: Masked Generative Image Transformer, CVPR 2022, over LidarGRIT's tokens",
         program="google-research/maskgit (Apache 2.0)",
     )

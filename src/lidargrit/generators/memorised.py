@@ -34,14 +34,14 @@ class MemorisedConfig:
 
 
 class Memorised(Generator[MemorisedConfig, NoSampling]):
-    """Returns training scans: the best score of a generator that learns nothing.
+    """Returns the ranges of training scans: the best score of a generator that learns nothing.
 
     A generator that scores better on held-out scans has learned something; one that scores the same may have learned
     them by heart. It has no stage to train by an objective: it keeps scans, see :meth:`fit_statistics`.
     """
 
     Config = MemorisedConfig
-    facts = SystemFacts(writes="scans of the training set, unchanged")
+    facts = SystemFacts(generates="ranges of training scans, unchanged; no reflectance")
     scans: Tensor
     range_m: Tensor
 

@@ -40,7 +40,7 @@ class Multiscale(Generator[MultiscaleConfig, PixelSampling]):
     """
 
     Config = MultiscaleConfig
-    facts = SystemFacts(writes="range and raydrop, each pixel given all pixels of coarser phases")
+    facts = SystemFacts(generates="range and raydrop, each pixel given all pixels of coarser phases")
     Sampling = PixelSampling
     capabilities = frozenset({"complete", "likelihood"})
 

@@ -93,7 +93,7 @@ class R2dm(Generator[R2dmConfig, DiffusionSampling]):
 
     Config = R2dmConfig
     facts = SystemFacts(
-        writes="range and reflectance; a range outside the sensor's limits is no return",
+        generates="range and reflectance; a range outside the sensor's limits is no return",
         paper="Nakashima and Kurazume, LiDAR Data Synthesis with Denoising Diffusion Probabilistic Models, ICRA 2024",
         program="kazuto1011/r2dm@1c5963d (MIT)",
         weights_licence="MIT, as the program",

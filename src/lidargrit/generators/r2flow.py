@@ -53,7 +53,7 @@ class R2flow(Generator[R2flowConfig, FlowSampling]):
 
     Config = R2flowConfig
     facts = SystemFacts(
-        writes="range and reflectance; a range outside the sensor's limits is no return",
+        generates="range and reflectance; a range outside the sensor's limits is no return",
         paper="Nakashima et al., Fast LiDAR Data Generation with Rectified Flows, ICRA 2025",
         program="kazuto1011/r2flow@3f5afeb (MIT)",
         weights_licence="MIT, as the program",

@@ -83,7 +83,7 @@ class UltraLidar(Generator[UltraLidarConfig, VoxelSampling]):
 
     Config = UltraLidarConfig
     facts = SystemFacts(
-        writes="occupied voxels; as range images, the first on each ray, with no return where a ray meets none",
+        generates="occupied voxels; as range images, the first on each ray, with no return where a ray meets none",
         paper="Xiong et al., UltraLiDAR: Learning Compact Representations for LiDAR Completion and Generation, "
         "CVPR 2023",
         program="myc634/UltraLiDAR_nusc_waymo@eb65fe0 (MIT), not by the authors",

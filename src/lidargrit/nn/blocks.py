@@ -51,6 +51,8 @@ def _parts(objective: nn.Module, kind: type[ModuleT], setting: str) -> list[Modu
     found = [module for module in objective.modules() if isinstance(module, kind)]
     if not found:
         raise ConfigError(
-            f"{setting}=true for {type(objective).__name__}, which cannot", "false", f"leave {setting} out"
+            f"{setting}=true for {type(objective).__name__}, which has no {kind.__name__}",
+            "false",
+            f"leave {setting} out",
         )
     return found

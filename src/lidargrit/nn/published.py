@@ -47,7 +47,9 @@ def read_checkpoint(
         return float_tensors(found, bytes_at_most)
     except (RefusedFileError, OSError) as why:
         raise CheckpointError(
-            f"{path}, {why}", f"a checkpoint with weights at {'.'.join(names)!r}", "check the path"
+            f"{path}, {why}",
+            f"a checkpoint with weights {f'at {chr(39)}{chr(46).join(names)}{chr(39)}' if names else 'by name'}",
+            "check the path",
         ) from None
 
 

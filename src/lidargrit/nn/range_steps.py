@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -44,12 +45,12 @@ class RangeSteps:
     @property
     def first(self) -> int:
         """Multiple that the shortest range of the sensor is rounded to; at least 1, since 0 is no return."""
-        return max(1, round(self.sensor.range_min_m * 1000 / self.step_mm))
+        return max(1, math.floor(self.sensor.range_min_m * 1000 / self.step_mm + 0.5))  # its interval has a width
 
     @property
     def last(self) -> int:
         """Multiple that the longest range of the sensor is rounded to."""
-        return max(self.first, round(self.sensor.range_max_m * 1000 / self.step_mm))
+        return max(self.first, math.ceil(self.sensor.range_max_m * 1000 / self.step_mm - 0.5))
 
     def indices(self, range_m: Float[Tensor, "*P"]) -> Int[Tensor, "*P"]:
         """Return the multiple that each range is rounded to; a range beyond the limits is taken to be at them."""
@@ -66,6 +67,18 @@ class RangeSteps:
         return low, torch.where(indices >= self.last, self.sensor.range_max_m, high)
 
     def round(self, images: RangeImage) -> RangeImage:
-        """Return images whose ranges are whole multiples of the step."""
+        """Return images whose ranges are whole multiples of the step.
+
+        Raises:
+            ConfigError: a return nearer or farther than the sensor's limits, by more than half a step.
+        """
+        slack_m = self.step_mm / 2000
+        near_m, far_m = self.sensor.range_min_m - slack_m, self.sensor.range_max_m + slack_m
+        if bool((images.return_mask & ((images.range_m < near_m) | (images.range_m > far_m))).any()):
+            raise ConfigError(
+                "returns beyond the limits of the sensor",
+                f"ranges from {self.sensor.range_min_m:g} to {self.sensor.range_max_m:g} m",
+                "project the scans with the sensor of the model",
+            )
         rounded = self.range_m(self.indices(images.range_m))
         return replace(images, range_m=torch.where(images.return_mask, rounded, 0.0))

@@ -198,12 +198,11 @@ def _misplaced(
         return None  # rows by elevation are right by themselves
     if method == "unfolding" and scan.ring is None:
         return _no_firing_order(scan)
-    fitting = " or ".join(sensors_that_fit(scan)) or "none of ours fits"
     what = "rings" if method == "unfolding" else "rows of LidarGRIT's fixed field of view"
     return ScanError(
         f"{what} that lie elsewhere than those of {sensor.name!r}, in {scan.source}",
         "a scan of this sensor",
-        f"name the sensor that made it ({fitting}), {FIT_SENSOR}"
+        _name_sensor(scan)
         if method == "unfolding"
         else "project with --set data.projection_variant=exact (in Python: variant='exact')",
     )
@@ -241,13 +240,18 @@ def _is_ring_by_ring(scan: Scan, ring: Int[np.ndarray, "n"]) -> bool:
 def _wrong_elevations(scan: Scan, sensor: SensorModel, outside: float) -> ScanError:
     low_deg, high_deg = elevation_span_deg(scan)
     bottom_deg, top_deg = _span_of_rows_deg(sensor)
-    fitting = " or ".join(sensors_that_fit(scan)) or "none of ours fits"
     return ScanError(
         f"{outside:.0%} of the points of {scan.source} outside the sensor's elevations (the scan spans "
         f"{low_deg:.1f} to {high_deg:.1f} degrees)",
         f"{bottom_deg:.1f} to {top_deg:.1f} degrees for {sensor.name!r}",
-        f"name the sensor that made the scan: {fitting}, {FIT_SENSOR}",
+        _name_sensor(scan),
     )
+
+
+def _name_sensor(scan: Scan) -> str:
+    if fitting := " or ".join(sensors_that_fit(scan)):
+        return f"name the sensor that made the scan: {fitting}, {FIT_SENSOR}"
+    return f"no sensor in the package spans its elevations: {FIT_SENSOR.removeprefix('or ')}"
 
 
 def _span_of_rows_deg(sensor: SensorModel) -> tuple[float, float]:

@@ -115,8 +115,10 @@ def publish(run: Path, folder: Path, scores: Path | None = None, notes: str = ""
         _refuse_taken(folder, public)
         write_json(folder / RUN_FILE, public)
         if learned.recordings or learned.fingerprints:
-            # A recording that has no name of its own is named by its folder, which is the user's.
-            drives = [recording for recording in learned.recordings if not recording.startswith("#")]
+            # A recording that has no name of its own is named by its folder, which is the user's; by its path, in runs
+            # of an earlier version.
+            named = (each for each in learned.recordings if not each.startswith("#"))
+            drives = [recording for recording in named if not Path(recording).is_absolute()]
             found = {"fingerprints": learned.fingerprints, "range_fingerprints": learned.range_fingerprints}
             hashes = {name: list(of) for name, of in found.items()}
             write_json(folder / TRAINED_ON_FILE, {"recordings": drives, **hashes})

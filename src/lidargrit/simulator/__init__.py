@@ -92,11 +92,7 @@ def observe(
     Returns:
         arrays of one value for each pixel of ``sensor.fine()``, or of ``sensor`` if ``kept_columns_only``.
     """
-    _check(seed, theme)
-    if not 0 <= frame <= _FRAMES_AT_MOST:
-        raise ConfigError(f"the frame {frame}", f"a frame from 0 to {_FRAMES_AT_MOST}", "choose another frame")
-    if not 0 <= wet <= 1:  # also refuses NaN
-        raise ConfigError(f"wet {wet}", "a wetness from 0 (dry) to 1 (soaked)", "choose a number between")
+    check_settings(seed, theme, frame, wet)
     sensor = sensor or load_sensor("hdl64e_kitti_odometry")
     root = np.random.default_rng(seed)
     street_rng, beam_rng = root.spawn(2)
@@ -113,11 +109,20 @@ def scene_of(seed: int, theme: Theme = "mixed") -> Scene:
     Raises:
         ConfigError: a negative seed, or an unknown theme.
     """
-    _check(seed, theme)
+    check_settings(seed, theme)
     return sample_scene(np.random.default_rng(seed).spawn(2)[0], theme)
 
 
-def _check(seed: int, theme: str) -> None:
+def check_settings(seed: int, theme: str, frame: int = 0, wet: float = 0.0) -> None:
+    """Refuse what cannot be simulated.
+
+    Raises:
+        ConfigError: a negative seed, an unknown theme, or a frame or a wetness out of its bounds.
+    """
+    if not 0 <= frame <= _FRAMES_AT_MOST:
+        raise ConfigError(f"the frame {frame}", f"a frame from 0 to {_FRAMES_AT_MOST}", "choose another frame")
+    if not 0 <= wet <= 1:  # also refuses NaN
+        raise ConfigError(f"wet {wet}", "a wetness from 0 (dry) to 1 (soaked)", "choose a number between")
     if seed < 0:
         raise ConfigError(f"the seed {seed}", "a seed of 0 or more", "choose another seed")
     if theme not in get_args(Theme):

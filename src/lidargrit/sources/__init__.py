@@ -309,14 +309,13 @@ def overlap(source: Source, images: RangeImages | None, reference: RangeImages) 
     """Return in a few words which scans a source, or the model behind it, shares with the reference; "" for none.
 
     Args:
-        source: source of the set; for samples and runs, the training scans of the model count as its scans.
+        source: source of the set; of samples and runs, the training scans of the model count, too.
         images: images of the set, where it holds any.
         reference: set that it is compared with.
     """
-    seen = source.learned_from()
-    if seen is None:
-        seen = Provenance() if images is None else images.provenance
-    return seen.overlap(reference.provenance)
+    own = Provenance() if images is None else images.provenance
+    learned_from = source.learned_from() or Provenance()
+    return own.overlap(reference.provenance) or learned_from.overlap(reference.provenance)
 
 
 def data_set_of(text: str) -> tuple[str, str]:

@@ -125,7 +125,8 @@ def read_samples(folder: Path, count: int | None = None) -> RangeImages:
         raise CheckpointError(
             f"{folder / MANIFEST}, in which {reason}", "what lidargrit wrote", "sample anew"
         ) from None
-    paths = sorted(folder.glob("[!.]*.npz"))[:count]  # not what a killed process left half-written
+    files = folder.glob("[!.]*.npz")  # not what a killed process left half-written
+    paths = sorted(files, key=lambda path: (len(path.stem), path.stem))[:count]  # seeds above eight digits come last
     if not paths:
         raise DataError(
             f"no sample in {folder}", "at least one", "generate some with: lidargrit sample RUN " + str(folder)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
@@ -19,6 +19,7 @@ from lidargrit.nn.precision import Precision
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 from lidargrit.training.config import FitConfig, Recipe
+from lidargrit.training.taken_stages import donors_of_stages
 
 _SCANS = 2  # in a counted batch: some objectives compare the scans of a batch
 _STEPS_AT_MOST = 64  # that are counted; rarer terms hardly cost
@@ -45,7 +46,7 @@ class StageCost:
         return round(self.flops_per_scan * scans) + self.preparation_flops(scans)
 
 
-def training_flops(recipe: Recipe, without: Collection[str] = ()) -> dict[str, int]:
+def training_flops(recipe: Recipe) -> dict[str, int]:
     """Count the floating-point operations of a recipe's training, forward and backward, for each stage.
 
     Matrix products and convolutions are counted while a few steps run, on scans whose every pixel returns at 10 m. A
@@ -57,23 +58,26 @@ def training_flops(recipe: Recipe, without: Collection[str] = ()) -> dict[str, i
 
     Args:
         recipe: recipe whose training it is.
-        without: names of stages that are not counted.
 
     Returns:
-        number of operations, by the name of the stage.
+        number of operations, by the name of the stage; none for stages that are taken from another run.
+
+    Raises:
+        CheckpointError: no finished run to take stages from.
     """
-    return {name: cost.flops(recipe.training[name].scans) for name, cost in stage_costs(recipe, without).items()}
+    return {name: cost.flops(recipe.training[name].scans) for name, cost in stage_costs(recipe).items()}
 
 
-def stage_costs(recipe: Recipe, without: Collection[str] = ()) -> dict[str, StageCost]:
-    """Count the operations of every stage by its name, whatever number of scans it is trained on."""
+def stage_costs(recipe: Recipe) -> dict[str, StageCost]:
+    """Count the operations of every stage that is trained by its name, whatever number of scans it is trained on."""
     with torch.random.fork_rng(range(torch.cuda.device_count())):
         torch.manual_seed(0)
         sensor = recipe.data.load_sensor()
         with torch.device("meta"):
             generator = recipe.build_generator(sensor).to("meta")
         costs = {}
-        for stage in (name for name in generator.stages if name not in without):
+        taken = donors_of_stages(recipe, generator.stages)
+        for stage in (name for name in generator.stages if name not in taken):
             try:
                 costs[stage] = _cost_without_values(generator, stage, sensor)
             except (RuntimeError, NotImplementedError):  # torch's for a value that was asked for, and for two devices
@@ -122,6 +126,8 @@ def duration(seconds: float) -> str:
 def with_budget(recipe: Recipe, flops: float) -> Recipe:
     """Return the recipe with more or fewer scans, by one factor for all stages, so that its training takes ``flops``.
 
+    Stages that are taken from another run stay as they are: they are not trained.
+
     Warm-up and the distance between validations are scaled by the same factor; the half-life of averages only falls.
 
     Args:
@@ -134,10 +140,13 @@ def with_budget(recipe: Recipe, flops: float) -> Recipe:
     if not recipe.training:
         return recipe
     costs, share, scaled = stage_costs(recipe), 1.0, recipe
+    if not costs:
+        return recipe
     for _ in range(_CORRECTIONS):
         # What is prepared once, such as a reflow's pairs, does not shrink in proportion.
         share *= flops / _flops_of(costs, scaled)
-        scaled = replace(recipe, training={name: _scaled(stage, share) for name, stage in recipe.training.items()})
+        trained = {name: _scaled(recipe.training[name], share) for name in costs}
+        scaled = replace(recipe, training={**recipe.training, **trained})
         if _flops_of(costs, scaled) <= flops * (1 + _OVERSPENT_AT_MOST):
             break
     return scaled

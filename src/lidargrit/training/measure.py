@@ -45,13 +45,13 @@ class Measured:
 
 
 def measure(recipe: Recipe) -> list[Measured]:
-    """Take a few steps of every stage and predict the time of its whole training, without reading and validation."""
+    """Take a few steps of every stage that is trained; predict the time of all, without reading and validation."""
     with torch.random.fork_rng(range(torch.cuda.device_count())):
         torch.manual_seed(0)
         flops = training_flops(recipe)
         generator = recipe.build_generator()
         found = []
-        for stage in generator.stages:
+        for stage in flops:  # those that are trained
             config, objective = recipe.training[stage], generator.objective(stage)
             prepare_for_training(objective, config.recompute, config.compile)
             engine = Engine(config.precision, bool(objective.players))

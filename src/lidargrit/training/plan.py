@@ -114,7 +114,7 @@ def plan_training(recipe: Recipe) -> TrainingPlan:
         objectives = {name: generator.objective(name) for name in generator.stages}
     taken_stages(recipe, generator)  # raises where a stage does not fit
     donors = donors_of_stages(recipe, generator.stages)
-    flops = training_flops(recipe, without=donors)
+    flops = training_flops(recipe)
     for name, objective in objectives.items():
         budget = recipe.training[name]
         parameters = sum(weight.numel() for weight in objective.parameters())

@@ -1,4 +1,4 @@
-"""Curves of real scans, of simulated ones, and of scans whose rays are dropped by a coin: scores → PNG."""
+"""Curves of real scans, of simulated ones, and of scans whose rays are dropped independently: scores → PNG."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ _DOTS_PER_INCH = 100  # 1400 pixels across: a laptop shows the picture without s
 _SIDES = {
     "real": "#26323c",
     "simulated": "#d1495b",
-    "coin": "#2a8fbd",
+    "Bernoulli": "#2a8fbd",
 }  # dark, warm, cold: told apart when printed grey
 _TICKS_M = (1, 2, 5, 10, 20, 50, 100)
 
 
 def plot_curves(scores: Sequence[CurveScore], path: Path, title: str = "") -> None:
-    """Plot the curves of real scans, of simulated ones, and of scans whose rays a coin drops: a panel for each score.
+    """Plot the curves of real scans, of simulated ones, and of independent drops: a panel for each score.
 
     Curves with two axes, such as a histogram for every row, get one image for each of the three, and the mean over
     rows where rows are of one kind.
@@ -65,13 +65,13 @@ def plot_curves(scores: Sequence[CurveScore], path: Path, title: str = "") -> No
 
 
 def _curve(score: CurveScore, which: str) -> Float64[np.ndarray, "*rows n"]:
-    result = score.bernoulli if which == "coin" else score.simulated
+    result = score.bernoulli if which == "Bernoulli" else score.simulated
     return np.array(result.details["real" if which == "real" else "generated"], dtype=float)
 
 
 def _title(score: CurveScore) -> str:
     name = score.simulated.metric.replace("_", " ")
-    distances = f"simulated {score.simulated.value:.3f}, coin {score.bernoulli.value:.3f}"
+    distances = f"simulated {score.simulated.value:.3f}, Bernoulli {score.bernoulli.value:.3f}"
     return f"{name}\ndistance of real from {distances}, real {score.real_against_real.value:.3f}"
 
 

@@ -24,7 +24,7 @@ from lidargrit.viewer.report_pictures import (
     rate_picture,
 )
 from lidargrit.viewer.report_style import STYLE
-from lidargrit.viewer.score_table import metric_title, score_table
+from lidargrit.viewer.score_table import score_table
 
 _MATCHES = 3  # best, and as many worst
 _SHEET = 12  # samples on the sheet
@@ -109,11 +109,7 @@ def _notes(title: str, lines: Sequence[str], kind: str) -> str:
 
 
 def _scores(card: Scorecard) -> str:
-    not_applicable = "".join(
-        f'<tr><th scope="row">{metric_title(each.metric, each.variant)}</th><td colspan="6">{NOT_APPLICABLE}</td></tr>'
-        for each in card.left_out
-        if each.verdict == NOT_APPLICABLE
-    )
+    not_applicable = [each for each in card.left_out if each.verdict == NOT_APPLICABLE]
     left_out = "".join(f"<li><b>{escape(each.metric)}</b>: {_escaped(each.why)}</li>" for each in card.left_out)
     return (
         f"<section><h2>Scores</h2>{score_table(card.scores, not_applicable)}<p>The dot is the score and the bar its "

@@ -55,7 +55,7 @@ def load_scan_sets(
 
     Scans are projected to the sensor that is named, else that of the first run, else that of the first samples or
     prepared scans; where there is none of these, each set to its own. A run gives a set of generated scans and, if
-    its generator has tokens, a set of reconstructions of the first source of scans.
+    its generator has tokens and the first source of scans lies on its rays, a set of reconstructions of these.
 
     Args:
         sources: sources of scans, folders of samples, prepared folders, and folders of runs.
@@ -92,15 +92,27 @@ def load_scan_sets(
     for name, generator in generators.items():
         if scans is not None and "encode" in generator.capabilities:
             images = scans.images
-            reconstructed = _joined(generator.reconstruct(images[part]) for part in _parts(len(images)))
-            sets.append(ScanSet(f"{_short(name)}: reconstructed", reconstructed, scans.scan_names))
+            if generator.sensor.same_rays(images.sensor):
+                reconstructed = _joined(generator.reconstruct(images[part]) for part in _parts(len(images)))
+                sets.append(ScanSet(f"{_short(name)}: reconstructed", reconstructed, scans.scan_names))
+            else:
+                reporter.message(f"{name}: no reconstructions, for its sensor has other rays than {scans.name}")
         seeds = range(seed, seed + count)
         names = tuple(f"seed {one}" for one in seeds)
         generated = _joined(generator.sample(seeds[part]) for part in _parts(count))
         sets.append(ScanSet(f"{_short(name)}: generated", generated, names))
     if not sets:
         raise ConfigError("no source", "a scan, a folder or a run", "name at least one")
-    return sets
+    return _told_apart(sets)
+
+
+def _told_apart(sets: Sequence[ScanSet]) -> list[ScanSet]:
+    """Return the sets with numbers behind names that several of them have: viewers find a set by its name."""
+    names = [one.name for one in sets]
+    return [
+        replace(one, name=f"{one.name} ({names[: index + 1].count(one.name)})") if names.count(one.name) > 1 else one
+        for index, one in enumerate(sets)
+    ]
 
 
 def _fine(sensor: SensorModel) -> SensorModel:

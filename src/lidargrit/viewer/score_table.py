@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from html import escape
 
 from lidargrit.evaluation.intervals import Score
-from lidargrit.evaluation.scorecard import format_value
+from lidargrit.evaluation.scorecard import NOT_APPLICABLE, LeftOut, format_value
 from lidargrit.evaluation.verdict import counted_first, verdict
 from lidargrit.metrics import load_metric
 from lidargrit.viewer.report_charts import score_chart
@@ -14,16 +14,21 @@ from lidargrit.viewer.report_charts import score_chart
 _HEADS = ("metric", "score", "95 % interval", "real against real", "pixel statistics", "chart", "better")
 
 
-def score_table(scores: Sequence[Score], more_rows: str = "") -> str:
+def score_table(scores: Sequence[Score], not_applicable: Sequence[LeftOut] = ()) -> str:
     """Return the verdict of some scores in words, then their table; metrics that are set apart come last.
 
     Args:
         scores: scores with their intervals and reference rows, as far as these are known.
-        more_rows: HTML of rows below the scores that count.
+        not_applicable: metrics that do not apply to these sets, which get rows without numbers.
     """
     counted, apart = counted_first(scores)
     heads = [head for head in _HEADS if head != "pixel statistics" or _has_pixel_statistics(scores)]
-    rows = "".join(_row(score, len(heads)) for score in counted) + more_rows
+    rows = "".join(_row(score, len(heads)) for score in counted)
+    rows += "".join(
+        f'<tr><th scope="row">{metric_title(each.metric, each.variant)}</th>'
+        f'<td colspan="{len(heads) - 1}">{NOT_APPLICABLE}</td></tr>'
+        for each in not_applicable
+    )
     if apart:
         rows += (
             f'<tr><td class="apart" colspan="{len(heads)}">Set apart: these metrics do not tell pixel statistics from '

@@ -61,7 +61,7 @@ def table_page(cells: Sequence[dict[str, Any]], flops: float) -> str:
     body = "".join(_row(cell, columns) for cell in cells)
     foot = _real_against_real(cells, columns)
     reference = cells[0]["scores"]["inputs"]["reference"] if cells else {"scans_used": 0}
-    budget = f"{flops:.2g} floating-point operations to learn with each" if flops else "each with a budget of its own"
+    budget = f"each trained with {flops:.2g} floating-point operations" if flops else "each trained with its own budget"
     checked = base64.b64encode(hashlib.sha256(_SCRIPT.encode()).digest()).decode()
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
