@@ -204,7 +204,7 @@ class Archive:
         lengths, crc32s = array("Q"), array("Q")
         with open_file(path, _WANTED) as file:
             size = file.seek(0, 2)
-            start, header, begins = self._header(file, size)
+            header, begins = self._header(file, size)
             self.header = parse_json(header, str(path), dict, ScanError)
             index, scans_end = self._index(file, size)
         for entry in self._entries(index):
@@ -216,7 +216,7 @@ class Archive:
             raise self._damaged()
         self._ends = begins + np.cumsum(np.frombuffer(lengths, dtype=np.uint64), dtype=np.uint64)
         self._begins, self._crc32s = begins, crc32s
-        if (int(self._ends[-1]) if len(self) else begins) != scans_end or start != _MAGIC:
+        if (int(self._ends[-1]) if len(self) else begins) != scans_end:
             raise self._damaged()
 
     def __len__(self) -> int:
@@ -241,17 +241,17 @@ class Archive:
         for index in range(len(self)):
             self.read(index)
 
-    def _header(self, file: BinaryIO, size: int) -> tuple[bytes, bytes, int]:
+    def _header(self, file: BinaryIO, size: int) -> tuple[bytes, int]:
         file.seek(0)
         start = file.read(_START.size)
         if size < _START.size + _TAIL.size or start[:4] != _MAGIC:
             got = f"{self.path}, which does not begin as a file of compressed scans"
             raise ScanError(got, _WANTED, "check the path")
-        magic, length, crc32 = _START.unpack(start)
+        _, length, crc32 = _START.unpack(start)
         header = file.read(min(length, size, JSON_BYTES_AT_MOST))
         if len(header) != length or zlib.crc32(header) != crc32:
             raise self._damaged()
-        return magic, header, _START.size + length
+        return header, _START.size + length
 
     def _index(self, file: BinaryIO, size: int) -> tuple[bytes, int]:
         """Return the compressed index, and where in the file it begins."""

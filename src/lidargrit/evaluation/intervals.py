@@ -17,9 +17,8 @@ from __future__ import annotations
 import pickle
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from scipy.special import stdtrit
@@ -100,7 +99,6 @@ class Score:
         result: value of the metric.
         interval: 95 % interval; None if it was not wanted or cannot be computed.
         real_against_real: score of real scans in place of the samples; None if it was not computed.
-        options: options of the metric, besides variant and seed.
         seconds: time that the metric, its interval and real against real took.
         pixel_statistics: score of the generator ``marginal`` in place of the samples; None if it was not computed.
     """
@@ -108,7 +106,6 @@ class Score:
     result: MetricResult
     interval: Interval | None = None
     real_against_real: RealAgainstReal | None = None
-    options: dict[str, Any] = field(default_factory=dict)
     seconds: float = 0.0
     pixel_statistics: float | None = None
 

@@ -104,7 +104,6 @@ class Scorecard:
             "scores": [
                 {
                     **asdict(score.result),
-                    "options": score.options,
                     "interval": score.interval and asdict(score.interval),
                     "real_against_real": score.real_against_real and asdict(score.real_against_real),
                     "pixel_statistics": score.pixel_statistics,
@@ -224,7 +223,6 @@ def _score(data: dict[str, Any]) -> Score:
             int(interval["halves"]),
         ),
         None if real is None else RealAgainstReal(float(real["value"]), int(real["num_scans"]), int(real["halvings"])),
-        dict(data["options"]),
         float(data["seconds"]),
         None if pixels is None else float(pixels),
     )

@@ -24,7 +24,7 @@ class MetricFactory:
     """Makes empty metrics of one definition.
 
     Args:
-        choice: the metric with its variant and options.
+        choice: the metric with its variant.
         seed: seed of all random numbers of the metric.
         weights: file with the weights of its network; found or fetched if not given.
         device: device on which its network computes.
@@ -48,7 +48,7 @@ class MetricFactory:
         if name not in _discovery.names("metrics"):
             raise ConfigError(f"the metric {name!r}", "one that this version has", "see: lidargrit list metrics")
         cls = load_metric(name)
-        options: dict[str, Any] = {"variant": self.choice.variant or None, "seed": self.seed, **self.choice.options}
+        options: dict[str, Any] = {"variant": self.choice.variant or None, "seed": self.seed}
         if cls.needs_weights:
             options |= {"weights": self.weights, "device": self.device, "reporter": self.reporter}
         return cls(**options)
@@ -81,7 +81,7 @@ class _FedMetric:
             interval = interval_of(result, self.generated, self.real, resampling, metric.bounds)
             reference_row = real_against_real(self.real, self.real_as_generated, group_sizes, resampling)
         seconds = time.perf_counter() - begun_s
-        return Score(result, interval, reference_row, dict(self.factory.choice.options), seconds)
+        return Score(result, interval, reference_row, seconds)
 
 
 def score_metrics(

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
 from lidargrit import _discovery
 from lidargrit.errors import UnknownNameError, nearest_names
@@ -21,12 +19,10 @@ class MetricChoice:
     Args:
         metric: name of the metric.
         variant: published definition of the metric; its first one if empty.
-        options: keyword options of the metric besides variant and seed.
     """
 
     metric: str
     variant: str = ""
-    options: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

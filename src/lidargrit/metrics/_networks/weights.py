@@ -106,7 +106,6 @@ def read_weights(published: PublishedWeights, path: Path) -> tuple[dict[str, Ten
             prefix + name: tensor
             for prefix, part in parts.items()
             for name, tensor in float_tensors(unpickle(part), published.bytes_at_most).items()
-            if not name.endswith("num_batches_tracked")
         }
     except RefusedFileError as why:
         raise _unfit(published, f"{path}, {why}") from None
