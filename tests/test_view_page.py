@@ -16,14 +16,10 @@ from browser import CHROMIUM, Browser
 from lidargrit.cli import main
 from lidargrit.errors import ConfigError, ScanError
 from lidargrit.formats import read_scan
-from lidargrit.generators import load_class
 from lidargrit.loading import DataConfig
 from lidargrit.loading.config import ScanSettings
 from lidargrit.projection import unproject
-from lidargrit.reporting import Reporter
 from lidargrit.sensors import load_sensor
-from lidargrit.sources import open_source
-from lidargrit.sources.samples import write_samples
 from lidargrit.structures import RangeImage
 from lidargrit.viewer import interactive, scan_sets
 from lidargrit.viewer.interactive import page, write_page
@@ -45,31 +41,6 @@ def scans(sensor=SENSOR, count=3, seed=0) -> RangeImage:
         reflectance = torch.rand(range_m.shape, generator=rng) * returned
         images.append(RangeImage(range_m * returned, returned, sensor, reflectance))
     return RangeImage.stack(images)
-
-
-def test_sets_of_one_name_are_told_apart_and_runs_of_other_rays_reconstruct_nothing(tmp_path):
-    samples = [tmp_path / f"a_run_{word}_reflectance_and_a_long_name" / "samples" for word in ("with", "without")]
-    model = load_class("memorised")(load_class("memorised").smallest_config(SENSOR), SENSOR)
-    model.fit_statistics(open_source("simulated:2:val").images(SENSOR))
-    model.save(tmp_path / "run")
-    for folder in samples:
-        write_samples(model, tmp_path / "run", folder, range(2))
-    sets = load_scan_sets([str(folder) for folder in samples], 1)
-    assert [one.name[-12:] for one in sets] == ["/samples (1)", "/samples (2)"]
-    told = []
-    sets = load_scan_sets([str(samples[0]), "pretrained"], 1, reporter=Listener(told))
-    assert [one.name for one in sets][1:] == ["pretrained: generated"]
-    assert any("pretrained: no reconstructions, for its sensor has other rays" in text for text in told)
-
-
-class Listener(Reporter):
-    """Keeps what it is told."""
-
-    def __init__(self, lines: list[str]) -> None:
-        self.lines = lines
-
-    def message(self, text: str) -> None:
-        self.lines.append(text)
 
 
 def labels(images: RangeImage) -> torch.Tensor:

@@ -10,9 +10,14 @@ import pytest
 import torch
 
 from lidargrit.errors import ConfigError, OutputError
+from lidargrit.generators import load_class
+from lidargrit.reporting import Reporter
 from lidargrit.sensors import load_sensor
+from lidargrit.sources import open_source
+from lidargrit.sources.samples import write_samples
 from lidargrit.structures import RangeImage
 from lidargrit.viewer import pictures, plot_comparison
+from lidargrit.viewer.scan_sets import load_scan_sets
 
 
 @pytest.fixture(scope="module")
@@ -103,3 +108,29 @@ def test_what_cannot_be_drawn_is_refused(images, tmp_path):
     with pytest.raises(ConfigError, match="1 labels"):
         plot_comparison({"real": images}, path, labels=["only one"])
     assert not path.exists()
+
+
+class Listener(Reporter):
+    """Keeps what it is told."""
+
+    def __init__(self, lines: list[str]) -> None:
+        self.lines = lines
+
+    def message(self, text: str) -> None:
+        self.lines.append(text)
+
+
+def test_sets_of_one_name_are_told_apart_and_runs_of_other_rays_reconstruct_nothing(tmp_path):
+    samples = [tmp_path / f"a_run_{word}_reflectance_and_a_long_name" / "samples" for word in ("with", "without")]
+    sensor = load_sensor("hdl64e_kitti_odometry").with_columns(128)
+    model = load_class("memorised")(load_class("memorised").smallest_config(sensor), sensor)
+    model.fit_statistics(open_source("simulated:2:val").images(sensor))
+    model.save(tmp_path / "run")
+    for folder in samples:
+        write_samples(model, tmp_path / "run", folder, range(2))
+    sets = load_scan_sets([str(folder) for folder in samples], 1)
+    assert [one.name[-12:] for one in sets] == ["/samples (1)", "/samples (2)"]
+    told = []
+    sets = load_scan_sets([str(samples[0]), "pretrained"], 1, reporter=Listener(told))
+    assert [one.name for one in sets][1:] == ["pretrained: generated"]
+    assert any("pretrained: no reconstructions, for its sensor has other rays" in text for text in told)

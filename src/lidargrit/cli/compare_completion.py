@@ -35,15 +35,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Complete, measure and print a table."""
-    from dataclasses import replace
-
     from lidargrit.completion import is_classical, open_completers
-    from lidargrit.completion.inputs import sensor_of
+    from lidargrit.completion.inputs import images_for, sensor_of
     from lidargrit.conditions.fills import FILLS
     from lidargrit.conditions.patterns import Pattern
     from lidargrit.evaluation.completion import PATTERNS, as_json, as_table, compare_completion
     from lidargrit.reporting import TerminalReporter
-    from lidargrit.sources import open_images
 
     refuse_taken(options)
     patterns = [Pattern(text) for text in options.observed or PATTERNS]
@@ -53,11 +50,6 @@ def run(options: argparse.Namespace) -> None:
     sensor = settings.data.imaged(sensor_of(options.scans, settings.sensor)) if named else None
     completers = open_completers(words, sensor, options.device)
     reporter = TerminalReporter()
-    trained = [one.projection_variant for one, word in zip(completers, words, strict=True) if not is_classical(word)]
-    variant = settings.projection_variant or next(iter(trained), "exact")
-    if {*trained} - {variant}:
-        reporter.message(f"WARNING: scans are projected by {variant!r}, some of the models learned from other images")
-    data = replace(settings.data, projection_variant=variant)
-    images = open_images(options.scans, data.imaged(completers[0].sensor), data, reporter)
+    images = images_for(completers, options.scans, settings, reporter)
     scores = compare_completion(images, completers, patterns, options.completions, options.seed, reporter)
     print_result(options, as_table(scores), {"scans": options.scans, "scores": as_json(scores)})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,16 +13,19 @@ from jaxtyping import Bool, Int64
 from torch import Tensor
 
 from lidargrit import formats
+from lidargrit.completion import Completer, LearnedCompleter
 from lidargrit.conditions import Condition
 from lidargrit.datasets import ScanDataset
 from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import ConfigError, ScanError
 from lidargrit.formats import ScanFormat
 from lidargrit.loading import DataConfig, RangeImages
+from lidargrit.loading.config import ScanSettings
 from lidargrit.projection import ProjectionVariant, index_map, project, unproject
 from lidargrit.projection.fit import projection_that_fits
+from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel, load_sensor
-from lidargrit.sources import DatasetSource, open_source
+from lidargrit.sources import DatasetSource, open_images, open_source
 from lidargrit.sources.image_files import ImageFileSource
 from lidargrit.structures import RangeImage, Scan
 
@@ -161,6 +164,26 @@ class ScanReader:
         image = project(scan, self.sensor, method, variant, self.partial)
         at = index_map(scan, self.sensor, method, variant, self.partial)[:, :: self.sensor.column_stride]
         return InputScan(image, scan, torch.from_numpy(at.astype(np.int64)))
+
+
+def images_for(completers: Sequence[Completer], source: str, settings: ScanSettings, reporter: Reporter) -> RangeImages:
+    """Return whole scans as range images that all completers are compared on.
+
+    They are projected as the first model's training scans were, unless a variant is named, with a warning if another
+    model learned from images of another variant.
+
+    Args:
+        completers: models and classical methods.
+        source: name of the scans.
+        settings: settings of reading and projecting them.
+        reporter: receiver of progress and of the warning.
+    """
+    learned = [one.projection_variant for one in completers if isinstance(one, LearnedCompleter)]
+    variant = settings.projection_variant or next(iter(learned), "exact")
+    if {*learned} - {variant}:
+        reporter.message(f"WARNING: scans are projected by {variant!r}, and some models learned from other images")
+    data = replace(settings.data, projection_variant=variant)
+    return open_images(source, data.imaged(completers[0].sensor), data, reporter)
 
 
 def open_inputs(source: str, reader: ScanReader, config: DataConfig) -> Inputs:

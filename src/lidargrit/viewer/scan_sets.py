@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from jaxtyping import Float
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import ConfigError, DataError, ScanError
+from lidargrit.generators import Generator
 from lidargrit.loading import DataConfig
 from lidargrit.loading.config import ScanSettings
 from lidargrit.projection import project
@@ -90,17 +91,7 @@ def load_scan_sets(
             sets.append(replace(read, name=_short(source.text)))
     scans = sets[0] if sets else None
     for name, generator in generators.items():
-        if scans is not None and "encode" in generator.capabilities:
-            images = scans.images
-            if generator.sensor.same_rays(images.sensor):
-                reconstructed = _joined(generator.reconstruct(images[part]) for part in _parts(len(images)))
-                sets.append(ScanSet(f"{_short(name)}: reconstructed", reconstructed, scans.scan_names))
-            else:
-                reporter.message(f"{name}: no reconstructions, for its sensor has other rays than {scans.name}")
-        seeds = range(seed, seed + count)
-        names = tuple(f"seed {one}" for one in seeds)
-        generated = _joined(generator.sample(seeds[part]) for part in _parts(count))
-        sets.append(ScanSet(f"{_short(name)}: generated", generated, names))
+        sets += _of_generator(name, generator, range(seed, seed + count), scans, reporter)
     if not sets:
         raise ConfigError("no source", "a scan, a folder or a run", "name at least one")
     return _told_apart(sets)
@@ -113,6 +104,21 @@ def _told_apart(sets: Sequence[ScanSet]) -> list[ScanSet]:
         replace(one, name=f"{one.name} ({names[: index + 1].count(one.name)})") if names.count(one.name) > 1 else one
         for index, one in enumerate(sets)
     ]
+
+
+def _of_generator(
+    name: str, generator: Generator, seeds: range, scans: ScanSet | None, reporter: Reporter
+) -> Iterator[ScanSet]:
+    """Yield the reconstructions of some scans, if there are any on its rays, and generated scans."""
+    if scans is not None and "encode" in generator.capabilities:
+        images = scans.images
+        if generator.sensor.same_rays(images.sensor):
+            reconstructed = _joined(generator.reconstruct(images[part]) for part in _parts(len(images)))
+            yield ScanSet(f"{_short(name)}: reconstructed", reconstructed, scans.scan_names)
+        else:
+            reporter.message(f"{name}: no reconstructions, for its sensor has other rays than {scans.name}")
+    generated = _joined(generator.sample(seeds[part]) for part in _parts(len(seeds)))
+    yield ScanSet(f"{_short(name)}: generated", generated, tuple(f"seed {one}" for one in seeds))
 
 
 def _fine(sensor: SensorModel) -> SensorModel:
