@@ -61,7 +61,9 @@ def test_it_is_learned(raydrop):
 def test_scans_without_it_are_refused():
     vqvae, without = Vqvae(BOTH, SENSOR).eval(), replace(scans(1), reflectance=None)
     for work in (lambda: vqvae.encode(without), lambda: vqvae(without, torch.Generator())):
-        with pytest.raises(ConfigError, match=r"without reflectance; wanted .*tokenizer\.reflectance=true"):
+        with pytest.raises(
+            ConfigError, match=r"without reflectance, for a model of model\.tokenizer\.reflectance=true"
+        ):
             work()
 
 

@@ -161,7 +161,7 @@ def test_it_learns_reflectance_and_begins_near_triangulation():
     objective = CompletionObjective(network, SENSOR).train()
     errors = [terms["reflectance_error"] for terms in learn(objective, images, [0] * 12, 3e-3)]
     assert errors[-1] < 0.9 * errors[0]
-    with pytest.raises(ConfigError, match=r"without reflectance, for model\.completion\.reflectance=true"):
+    with pytest.raises(ConfigError, match=r"without reflectance, for a model of model\.completion\.reflectance=true"):
         objective(replace(images, reflectance=None), torch.Generator())
 
 

@@ -9,6 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+
 from lidargrit import _discovery, formats
 from lidargrit.datasets import ScanDataset
 from lidargrit.determinism import evenly_spaced
@@ -27,6 +31,7 @@ from lidargrit.untrusted import user_path
 
 MANIFEST = "export.json"
 TREE = "kitti_odometry"  # the data set that reads such a tree back
+IMAGE = "image"  # the word for range images as .npy, in place of a format
 _KITTI_NAME = re.compile(r"\d{2}/\d{6}")  # sequence and number
 
 
@@ -86,6 +91,12 @@ def export_scans(
         if left_out == len(files):
             raise DataError(f"no usable scan in {source}", "at least one", "see the messages above")
         return len(files) - left_out
+
+
+def write_array(path: Path, pixels: Float[Tensor, "H W"]) -> None:
+    """Write one value for each pixel as ``.npy``."""
+    with atomic_path(path) as unfinished, unfinished.open("wb") as file:
+        np.save(file, pixels.cpu().numpy())
 
 
 def kinds() -> list[str]:

@@ -8,7 +8,6 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -19,14 +18,13 @@ from lidargrit.completion.inputs import Inputs, InputScan
 from lidargrit.conditions import Condition
 from lidargrit.determinism import derive_seed
 from lidargrit.errors import ConfigError, DataError, ScanError
-from lidargrit.export import TREE, KittiTree, claim_scans, writable_format, write_with_labels
-from lidargrit.files import atomic_path, claim_folder
+from lidargrit.export import IMAGE, TREE, KittiTree, claim_scans, writable_format, write_array, write_with_labels
+from lidargrit.files import claim_folder
 from lidargrit.formats import ScanFormat
 from lidargrit.reporting import Reporter
 from lidargrit.sources.image_files import PROBABILITY
 from lidargrit.structures import RangeImage
 
-IMAGE = "image"  # the word for range images as .npy
 _FILES_AT_MOST = 400_000  # as many as the largest data set has scans; the manifest names each
 _UNWRITABLE = ".npz"  # for scans whose own format cannot be written, and for range images
 
@@ -118,7 +116,7 @@ def write_completions(
                     file = files[job.index, job.turn]
                     if output.probability and job.turn == 0:
                         share = _return_share(completer, job, output)
-                        _write_array(out / f"{file.removesuffix(Path(file).suffix)}{PROBABILITY}", share)
+                        write_array(out / f"{file.removesuffix(Path(file).suffix)}{PROBABILITY}", share)
                     if not _write(out / file, output.format, image, job) and not labels_lost:
                         labels_lost = True
                         reporter.message(f"{Path(file).suffix} keeps no labels; --format {TREE} or npz keeps them")
@@ -209,7 +207,7 @@ def _suffix(of_input: str, kind: str) -> str:
 def _write(path: Path, kind: str, image: RangeImage, job: _Job) -> bool:
     """Write a completed scan, and return whether the file keeps its labels, if it has any."""
     if kind == IMAGE:
-        _write_array(path, image.range_m)
+        write_array(path, image.range_m)
         return image.label is None
     scan = job.scan.joined(image, job.condition)
     if kind == TREE:
@@ -219,8 +217,3 @@ def _write(path: Path, kind: str, image: RangeImage, job: _Job) -> bool:
     form = writable_format(kind)[0] if kind else job.form if job.form in named else named[0]
     form.write(path, scan)
     return scan.label is None or "label" in form.keeps
-
-
-def _write_array(path: Path, pixels: Float[Tensor, "H W"]) -> None:
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
-        np.save(file, pixels.cpu().numpy())

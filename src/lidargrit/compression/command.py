@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from lidargrit import __version__
@@ -16,16 +15,13 @@ from lidargrit.compression.archive import Archive, writing
 from lidargrit.compression.coder import not_reproduced
 from lidargrit.compression.scan_codec import ScanCodec
 from lidargrit.errors import CheckpointError, DataError, ScanError, UsageError
-from lidargrit.export import claim_scans, writable_format
-from lidargrit.files import atomic_path, claim_folder
+from lidargrit.export import IMAGE, claim_scans, writable_format, write_array
+from lidargrit.files import claim_folder
 from lidargrit.generators import load, locate
 from lidargrit.loading import DataConfig
 from lidargrit.projection import unproject
 from lidargrit.reporting import Reporter
 from lidargrit.sources.samples import projection_of
-from lidargrit.structures import RangeImage
-
-IMAGE = "image"  # the word for range images as .npy
 
 
 @dataclass(frozen=True)
@@ -124,16 +120,11 @@ def decompress_scans(path: Path, out: Path, model: str, kind: str, chosen: Seque
             for index in missing:
                 image = codec.decompress(archive.read(index))
                 if form is None:
-                    _write_array(out / files[index], image)
+                    write_array(out / files[index], image.range_m)
                 else:
                     form.write(out / files[index], unproject(image))
                 progress.advance(1)
     return len(files)
-
-
-def _write_array(path: Path, image: RangeImage) -> None:
-    with atomic_path(path) as unfinished, unfinished.open("wb") as file:
-        np.save(file, image.range_m.numpy())
 
 
 def _header(codec: ScanCodec, model: str) -> dict[str, Any]:

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
-from jaxtyping import Float
-from torch import Tensor
-
 from lidargrit.conditions import KINDS, Condition, ConditionKind
 from lidargrit.errors import ConfigError
 from lidargrit.sensors import SensorModel
@@ -62,14 +59,3 @@ def check_condition(condition: Condition, kinds: Collection[ConditionKind], sens
             " or ".join(KINDS[kind] for kind in sorted(kinds)) + f", which is what this {name!r} takes",
             "choose a model of lidargrit, such as pretrained",
         )
-
-
-def reflectance_to_learn(images: RangeImage) -> Float[Tensor, "*B H W"]:
-    """Return the reflectance of scans, in [0, 1]; refuse scans without it."""
-    if images.reflectance is None:
-        raise ConfigError(
-            "range images without reflectance",
-            "images with it, for a model of range and reflectance (model.reflectance=true)",
-            "take scans that have it, or train with --set model.reflectance=false",
-        )
-    return images.reflectance

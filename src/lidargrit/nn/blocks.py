@@ -47,6 +47,13 @@ def prepare_for_training(objective: nn.Module, recompute: bool, compiled: bool) 
         network.compile()
 
 
+def zeroed(layer: ModuleT) -> ModuleT:
+    """Set the weights of a layer to zero, so that a new block adds nothing, and return it."""
+    for parameter in layer.parameters():
+        nn.init.zeros_(parameter)
+    return layer
+
+
 def _parts(objective: nn.Module, kind: type[ModuleT], setting: str) -> list[ModuleT]:
     found = [module for module in objective.modules() if isinstance(module, kind)]
     if not found:

@@ -14,7 +14,7 @@ from lidargrit.conditions import Condition
 from lidargrit.conditions.hints import hints_of
 from lidargrit.nn.completion_network import CompletionNetwork
 from lidargrit.nn.objective import Objective, hidden_in_some
-from lidargrit.nn.reflectance import TYPICAL_REFLECTANCE, reflectance_error, reflectance_to_learn
+from lidargrit.nn.reflectance import TYPICAL_REFLECTANCE, reflectance_error, required_reflectance
 from lidargrit.nn.semantic_classes import class_indices, labels_to_learn
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
@@ -62,7 +62,7 @@ class CompletionObjective(Objective):
         if learned.labels:
             label = hidden_in_some(labels_to_learn(condition.label), 0, _WITHOUT, rng)
         if learned.reflectance:
-            shown = reflectance_to_learn(condition.reflectance, "model.completion.reflectance")
+            shown = required_reflectance(condition.reflectance, "model.completion.reflectance")
             reflectance = hidden_in_some(shown, TYPICAL_REFLECTANCE, _WITHOUT, rng)
         condition = replace(condition, label=label, reflectance=reflectance)
         point = self.completion(hints_of(condition), observed)

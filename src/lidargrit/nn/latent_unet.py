@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from lidargrit.errors import ConfigError
-from lidargrit.nn.blocks import Block, Network
+from lidargrit.nn.blocks import Block, Network, zeroed
 from lidargrit.nn.convolution import Convolution
 
 _GROUPS = 32  # of every norm, as in the reference; so channels are multiples of it
@@ -118,7 +118,7 @@ class LatentUnet(Network):
                     steps.append(_Double(width))
                 self.output_blocks.append(steps)
         self.out = nn.Sequential(
-            nn.GroupNorm(_GROUPS, width), nn.SiLU(), _silenced(Convolution(width, latent_channels, "wrap"))
+            nn.GroupNorm(_GROUPS, width), nn.SiLU(), zeroed(Convolution(width, latent_channels, "wrap"))
         )
 
     def forward(self, noisy: Float[Tensor, "B D h w"], step: Float[Tensor, "B"]) -> Float[Tensor, "B D h w"]:
@@ -160,7 +160,7 @@ class _Residual(Block):
         self.in_layers = nn.Sequential(nn.GroupNorm(_GROUPS, inputs), nn.SiLU(), Convolution(inputs, outputs, "wrap"))
         self.emb_layers = nn.Sequential(nn.SiLU(), nn.Linear(embedding, outputs))
         # The program has dropout of 0 before the last convolution, which counts in the names of weights.
-        last = _silenced(Convolution(outputs, outputs, "wrap"))
+        last = zeroed(Convolution(outputs, outputs, "wrap"))
         self.out_layers = nn.Sequential(nn.GroupNorm(_GROUPS, outputs), nn.SiLU(), nn.Identity(), last)
         self.skip_connection = nn.Conv2d(inputs, outputs, 1) if inputs != outputs else nn.Identity()
 
@@ -177,7 +177,7 @@ class _Attention(Block):
         self.heads = channels // config.head_channels
         self.norm = nn.GroupNorm(_GROUPS, channels)
         self.qkv = nn.Conv1d(channels, 3 * channels, 1)
-        self.proj_out = _silenced(nn.Conv1d(channels, channels, 1))
+        self.proj_out = zeroed(nn.Conv1d(channels, channels, 1))
 
     def forward(self, x: Tensor) -> Tensor:
         joint = self.qkv(self.norm(x).flatten(2))  # (B, heads * 3 * d, h w): each head has its own q, k and v in a row
@@ -214,10 +214,3 @@ def _waves(step: Float[Tensor, "B"], channels: int) -> Float[Tensor, "B C"]:
     exponents = torch.arange(half, device=step.device, dtype=torch.float32) / half
     phases = step[:, None] * torch.exp(-math.log(_LONGEST_PERIOD) * exponents)
     return torch.cat((phases.cos(), phases.sin()), dim=1)
-
-
-def _silenced(layer: nn.Module) -> nn.Module:
-    """Set the weights to zero, so that a new block adds nothing."""
-    for parameter in layer.parameters():
-        nn.init.zeros_(parameter)
-    return layer

@@ -14,7 +14,7 @@ from lidargrit.conditions.fills import ranges_from_others
 from lidargrit.errors import ConfigError
 from lidargrit.nn.objective import Objective, hidden_in_some
 from lidargrit.nn.raydrop_network import RaydropNetwork
-from lidargrit.nn.reflectance import reflectance_error, reflectance_to_learn
+from lidargrit.nn.reflectance import reflectance_error, required_reflectance
 from lidargrit.nn.semantic_classes import labels_to_learn
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
@@ -66,7 +66,7 @@ class RaydropObjective(Objective):
         bits = {"mask_bits": nats.mean().detach() / math.log(2), "alone_bits": alone.mean().detach() / math.log(2)}
         each = nats + _ALONE_WEIGHT * alone
         if found.reflectance is not None:
-            true = reflectance_to_learn(reflectance, _SETTING)
+            true = required_reflectance(reflectance, _SETTING)
             error = reflectance_error(found.reflectance, true, returned & surface)
             each, bits["reflectance_error"] = each + _REFLECTANCE_WEIGHT * error, error.mean().detach()
         return {"loss": each.mean(), **bits}

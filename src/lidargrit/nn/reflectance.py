@@ -12,18 +12,18 @@ from lidargrit.errors import ConfigError
 TYPICAL_REFLECTANCE: Final = 0.25  # of roads and walls in KITTI; what a network begins with, and 0 among its inputs
 
 
-def reflectance_to_learn(reflectance: Float[Tensor, "*B H W"] | None, setting: str) -> Float[Tensor, "*B H W"]:
-    """Return the reflectance of training scans; refuse scans without it, with ConfigError.
+def required_reflectance(reflectance: Float[Tensor, "*B H W"] | None, setting: str) -> Float[Tensor, "*B H W"]:
+    """Return the reflectance of scans; refuse scans without it, with ConfigError.
 
     Args:
         reflectance: reflectance in [0, 1]; None where the scans have none.
-        setting: name of the setting by which a network learns it, for the message.
+        setting: name of the setting by which a network takes it, for the message.
     """
     if reflectance is None:
         raise ConfigError(
-            f"scans without reflectance, for {setting}=true",
+            f"scans without reflectance, for a model of {setting}=true",
             "scans that have it",
-            f"name or prepare scans with reflectance, or leave {setting} out",
+            f"name or prepare scans with reflectance, or train with --set {setting}=false",
         )
     return reflectance
 

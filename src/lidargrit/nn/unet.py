@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from lidargrit.errors import ConfigError
-from lidargrit.nn.blocks import Block, Network
+from lidargrit.nn.blocks import Block, Network, zeroed
 from lidargrit.nn.convolution import Convolution
 
 Layer = TypeVar("Layer", bound=nn.Module)
@@ -126,7 +126,7 @@ class EfficientUnet(Network):
             up = _Level(config, joined, above, config.residual_blocks[level - 1], double=level > 1, attend=deepest)
             self.add_module(f"d_block{level}", down)
             self.add_module(f"u_block{level}", up)
-        self.out_conv = _silenced(Convolution(widths[0], images, "wrap"))
+        self.out_conv = zeroed(Convolution(widths[0], images, "wrap"))
 
     def forward(self, noisy: Float[Tensor, "B C H W"], log_snr: Float[Tensor, "B"]) -> Float[Tensor, "B C H W"]:
         """Return the predicted noise in images of these signal-to-noise ratios."""
@@ -191,7 +191,7 @@ class _Residual(Block):
         self.norm1 = nn.GroupNorm(config.norm_groups, inputs, _EPSILON)
         self.conv1 = Convolution(inputs, outputs, "wrap")
         self.norm2 = _AdaptiveNorm(config, outputs)
-        self.conv2 = _silenced(Convolution(outputs, outputs, "wrap"))
+        self.conv2 = zeroed(Convolution(outputs, outputs, "wrap"))
         self.skip = nn.Conv2d(inputs, outputs, 1) if inputs != outputs else nn.Identity()
 
     def forward(self, x: Tensor, embedding: Tensor) -> Tensor:
@@ -237,7 +237,7 @@ class _Projections(nn.Module):
         super().__init__()
         self.in_proj_weight = nn.Parameter(nn.init.xavier_uniform_(torch.empty(3 * channels, channels)))
         self.in_proj_bias = nn.Parameter(torch.zeros(3 * channels))
-        self.out_proj = _silenced(nn.Linear(channels, channels))
+        self.out_proj = zeroed(nn.Linear(channels, channels))
 
 
 class _Sinusoids(nn.Module):
@@ -279,10 +279,3 @@ def _down(x: Tensor) -> Tensor:
 def _up(x: Tensor) -> Tensor:
     """Move every row one up; zeros come in."""
     return F.pad(x[:, :, 1:], (0, 0, 0, 1))
-
-
-def _silenced(layer: Layer) -> Layer:
-    """Set the weights to zero, so that a new block adds nothing."""
-    for parameter in layer.parameters():
-        nn.init.zeros_(parameter)
-    return layer

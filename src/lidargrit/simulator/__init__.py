@@ -8,6 +8,7 @@ import numpy as np
 
 from lidargrit.errors import ConfigError
 from lidargrit.sensors import SensorModel, load_sensor
+from lidargrit.simulator.beams import REVOLUTION_S
 from lidargrit.simulator.observation import Observation, ObservationConfig, observe_scene
 from lidargrit.simulator.power import RaydropModel
 from lidargrit.simulator.scene import Scene, Theme, sample_scene
@@ -15,7 +16,7 @@ from lidargrit.structures import Scan
 
 __all__ = ["Observation", "RaydropModel", "Scene", "Theme", "observe", "scene_of", "simulate"]
 
-FRAME_S = 0.1  # from one frame to the next: KITTI's sensor turns at 10 Hz
+FRAME_S = REVOLUTION_S  # from one frame to the next
 _FRAMES_AT_MOST = 100_000  # each has a random stream of its own, and they are set up one after the other
 _HDL64E_OF_KITTI = RaydropModel()
 

@@ -16,11 +16,10 @@ from lidargrit.formats.kitti_bin import KittiBin
 from lidargrit.processes import process_pool
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel
-from lidargrit.simulator import Theme, check_settings, observe, scene_of
+from lidargrit.simulator import FRAME_S, Theme, check_settings, observe, scene_of
 
 MANIFEST = "simulated.json"
 _SCANS_PER_SEQUENCE = 10_000  # of streets seen once each: a folder that any file browser still opens
-_FRAME_S = 0.1  # Velodyne and KITTI: ten revolutions a second
 # KITTI's poses are those of its left camera: x right, y down, z forward. Ours sits in the sensor itself.
 _CAMERA_FROM_SENSOR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 
@@ -155,7 +154,7 @@ def _write_sequence_files(out: Path, config: DriveConfig, num_scans: int) -> Non
         for scan in range(first, min(first + config.frames, num_scans)):
             relative = np.eye(4)
             if scene is not None:
-                moved = np.linalg.inv(scene.sensor_pose()) @ scene.sensor_pose(_FRAME_S * (scan - first))
+                moved = np.linalg.inv(scene.sensor_pose()) @ scene.sensor_pose(FRAME_S * (scan - first))
                 relative = _CAMERA_FROM_SENSOR @ moved @ np.linalg.inv(_CAMERA_FROM_SENSOR)
             poses.setdefault(config.sequence_and_number(scan)[0], []).append(relative)
     projection = _numbers(np.eye(3, 4))
@@ -165,7 +164,7 @@ def _write_sequence_files(out: Path, config: DriveConfig, num_scans: int) -> Non
         lines = "".join(f"{_numbers(pose[:3])}\n" for pose in relative)
         write_text(out / "poses" / f"{sequence}.txt", lines)
         write_text(folder / "poses.txt", lines)
-        write_text(folder / "times.txt", "".join(f"{number * _FRAME_S:e}\n" for number in range(len(relative))))
+        write_text(folder / "times.txt", "".join(f"{number * FRAME_S:e}\n" for number in range(len(relative))))
         write_text(folder / "calib.txt", "".join(f"{line}\n" for line in calibration))
 
 

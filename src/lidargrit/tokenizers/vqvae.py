@@ -27,6 +27,7 @@ from lidargrit.nn.convolution import (
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.precision import Precision, at_least_32_bits, dtype_of
 from lidargrit.nn.quantiser import CodebookLoss
+from lidargrit.nn.reflectance import required_reflectance
 from lidargrit.projection import RangeEncoding
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import Decoded, RangeImage, TokenGrid
@@ -41,6 +42,8 @@ from lidargrit.tokenizers._convolutional import (
 
 _LEVELS_AT_MOST = 16  # each further one halves both axes; after these 65,536 columns are two
 _NO_RETURN_BELOW = -0.9  # without a raydrop head, an encoded range below this is read as no return (the program's rule)
+
+_SETTING = "model.tokenizer.reflectance"
 
 
 @dataclass(frozen=True)
@@ -206,7 +209,9 @@ class Vqvae(ConvolutionalTokenizer[VqvaeConfig]):
         encoded = self.range_encoding.encode(images.range_m, images.return_mask)
         if not self.config.reflectance:
             return encoded[:, None]
-        return torch.stack((encoded, 2 * _reflectance_of(images) * images.return_mask - 1), 1)
+        return torch.stack(
+            (encoded, 2 * required_reflectance(images.reflectance, _SETTING) * images.return_mask - 1), 1
+        )
 
     def decode(self, tokens: TokenGrid) -> Decoded:
         """Return clean range, return logits, perhaps reflectance, and the last feature maps of a batch of tokens."""
@@ -247,7 +252,9 @@ class Vqvae(ConvolutionalTokenizer[VqvaeConfig]):
             terms["reconstruction"] = (pair[0] - pair[1]).abs().mean()  # holes are learned as the range -1
             loss = terms["reconstruction"] + z.loss
         if reflectance is not None:
-            error = reconstruction_loss(2 * reflectance - 1, 2 * _reflectance_of(images) - 1, mask, mask, "returns")
+            error = reconstruction_loss(
+                2 * reflectance - 1, 2 * required_reflectance(images.reflectance, _SETTING) - 1, mask, mask, "returns"
+            )
             loss = loss + self.config.reflectance_weight * error
             terms["reflectance_mae"] = error.detach() / 2
         with torch.no_grad():
@@ -287,17 +294,6 @@ def reconstruction_loss(
     if kind == "paper":
         return error.mean()
     return (error.sum((1, 2)) / return_mask.sum((1, 2)).clamp(min=1)).mean()
-
-
-def _reflectance_of(images: RangeImage) -> Float[Tensor, "B H W"]:
-    """Return the reflectance of scans, in [0, 1]; refuse scans without it."""
-    if images.reflectance is None:
-        raise ConfigError(
-            "range images without reflectance",
-            "images with it, for a tokenizer of range and reflectance (model.tokenizer.reflectance=true)",
-            "take scans that have it, or a model without it",
-        )
-    return images.reflectance
 
 
 def _widths(config: VqvaeConfig) -> list[int]:
