@@ -11,13 +11,14 @@ import argparse
 from pathlib import Path
 
 from lidargrit.configuration import override
+from lidargrit.errors import TrainingError
 from lidargrit.evaluation.benchmark import Benchmark, as_table
 from lidargrit.evaluation.benchmark import run as run_benchmark
 from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.generators import is_run
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import TerminalReporter
-from lidargrit.training import train, with_budget
+from lidargrit.training import check_folder, train, training_flops, with_budget
 
 METRICS = ("sliced_wasserstein", "point_cloud_jsd", "range_histogram_per_ring", "return_rate_per_ring")
 
@@ -36,14 +37,21 @@ def main() -> None:
     reporter, rows = TerminalReporter(), []
     for system in options.systems:
         name, _, sampling = system.partition(":")
-        recipe = with_budget(load_recipe(name, options.set), options.flops)
+        scaled = with_budget(load_recipe(name, options.set), options.flops)
+        flops = sum(training_flops(scaled).values())
         for factor in options.factors:
-            rates = {stage: fit.learning_rate * factor for stage, fit in recipe.training.items()}
-            run = options.out / "runs" / f"{name}.rate{factor:.2g}"
-            reporter.message(f"{run.name}: {', '.join(f'{stage} {rate:.2g}' for stage, rate in rates.items())}")
-            if not is_run(run):
-                settings = [f"training.{stage}.learning_rate={rate!r}" for stage, rate in rates.items()]
-                train(override(recipe, settings), run, reporter)
+            rates = {stage: fit.learning_rate * factor for stage, fit in scaled.training.items()}
+            recipe = override(scaled, [f"training.{stage}.learning_rate={rate!r}" for stage, rate in rates.items()])
+            run = options.out / "runs" / f"{name}.rate{factor:g}"
+            told = ", ".join(f"{stage} {rate:.2g}" for stage, rate in rates.items())
+            reporter.message(f"{run.name}: {flops:.3g} floating-point operations, learning rates {told}")
+            check_folder(run, recipe)
+            try:
+                if not is_run(run):
+                    train(recipe, run, reporter)
+            except TrainingError as error:  # it diverged
+                reporter.message(f"{run.name} is left out: {error}")
+                continue
             rows.append(f"{run}:{sampling}" if sampling else str(run))
     benchmark = Benchmark(options.against, options.count, EvalConfig(metrics=METRICS))
     print(as_table(run_benchmark(rows, options.out, benchmark, reporter)))

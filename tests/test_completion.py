@@ -189,6 +189,9 @@ def test_a_file_that_was_cut_off_is_refused_and_bare_coordinates_stay_bare(tmp_p
         ScanReader(sensor).read(read_scan(tmp_path / "cut.bin"))
     shuffled = Scan(scan.points_xyz_m[torch.randperm(len(scan), generator=torch.Generator().manual_seed(0))])
     assert ScanReader(sensor).read(shuffled).image.return_mask.float().mean() > 0.5  # by elevation
+    kept = scan.ring < 40
+    told = Scan(scan.points_xyz_m[kept], ring=scan.ring[kept])  # a crop, or a sensor of forty lasers
+    assert ScanReader(sensor).read(told).image.return_mask.any()
     (tmp_path / "bare").mkdir()
     (tmp_path / "bare" / "0.bin").write_bytes(np.ascontiguousarray(rows[:, :3]).tobytes())
     words = ["complete", str(tmp_path / "bare"), str(tmp_path / "out"), "--model", "linear", "--observed", "rows:2"]
@@ -215,7 +218,7 @@ def test_models_and_settings_are_compared_on_hidden_parts(folders, tmp_path, cap
     assert "completion=guess" in capsys.readouterr().err
 
 
-def test_the_drops_of_a_model_are_scored_beside_those_of_a_coin(folders):
+def test_the_drops_of_a_model_are_scored_beside_independent_ones(folders):
     model, true = load(folders / "run"), RangeImage.stack([street(SENSOR)] * 4)
     every = torch.ones_like(true.return_mask)
     clean = RangeImage.masked(torch.where(true.return_mask, true.range_m, 30.0), every, SENSOR)

@@ -1,6 +1,7 @@
 """The trees of scans: their splits, folders of mixed formats, and the real trees."""
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -200,6 +201,13 @@ def test_simulated_streets_are_scanned_by_the_sensor_behind_the_at_sign(tmp_path
     assert images.sensor.height == 16
     rings_with_returns = images.batch([0]).return_mask.any(2)
     assert rings_with_returns.float().mean() > 0.5
+    source, vlp16 = open_source(f"simulated:1@{file}:test"), load_sensor("vlp16")
+    before = source.images(vlp16).batch([0])
+    write_json(
+        file, replace(vlp16, elevation_rad=vlp16.elevation_rad / 2).to_json()
+    )  # made anew, not found in the cache
+    after = open_source(f"simulated:1@{file}:test").images(vlp16).batch([0])
+    assert not torch.equal(before.return_mask, after.return_mask)
     with pytest.raises(UnknownNameError, match=r"'vlp15'.*vlp16"):
         open_dataset("simulated:2@vlp15")
     for wrong in ("2@", "@vlp16"):

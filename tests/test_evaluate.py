@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -181,7 +182,9 @@ def test_words_of_reading_scans_are_obeyed_or_refused(tmp_path, capsys):
     assert former.projection_variant == "reference"
     assert former.max_scans == 7
     assert read_config(ScanSettings.read(["data.max_scans=7"]), max_scans=3).max_scans == 3
-    for option in (["--report", str(tmp_path / "r.html")], ["--pixel-statistics"], ["--metrics", "bev_jsd"]):
+    report = ["--report", str(tmp_path / "r.html")]
+    others = ["--variant", "exact"], ["--sensor", "vlp16"], ["--protocol", "r2dm"], ["--metrics", "bev_jsd"]
+    for option in (report, ["--pixel-statistics"], *others):
         assert main(["evaluate", "pretrained", "simulated:2:test", *option]) == 2
         error = the_one_line(capsys.readouterr().err, "evaluate")
         assert f"got {option[0]} for the run pretrained, of which only reconstructions are measured" in error
@@ -198,6 +201,12 @@ def test_files_of_one_name_are_told_apart_and_rows_complete_each_other(card, tmp
     assert all(str(path.with_suffix("")) in table for path in paths)
     (real,) = (line for line in table.splitlines() if line.startswith("(real against real"))
     assert all(format_value(score.real_against_real.value) in real for score in card.scores)
+    bounds = [path.with_name("marginal.json") for path in paths]
+    for path in bounds:
+        write_json(path, card.to_json())
+    table, _ = read_tables([*paths, *bounds])
+    assert table.count("marginal (pixel statistics)") == 2
+    assert not re.search(r"marginal: (Better|Within)", table)
 
 
 def test_pixel_statistics_without_reflectance_leave_its_scores_alone():

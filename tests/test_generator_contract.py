@@ -245,11 +245,11 @@ def test_names_a_command_that_shows_what_a_run_has_learned(name):
     assert build_parser().parse_args(words).verb == words[0]
 
 
-def test_tells_what_it_writes_and_where_it_comes_from(name):
+def test_tells_what_it_generates_and_where_it_comes_from(name):
     cls = load_class(name)
     assert cls.facts is not Generator.facts, "the class names no facts of its own"
     lines = cls.about()
-    assert lines[0] == f"writes {cls.facts.writes}"
+    assert lines[0] == f"generates {cls.facts.generates}"
     assert any(line == "from: this project" or cls.facts.paper in line for line in lines)
     assert bool(cls.facts.weights_licence) or not cls.published_files, (
         "weights can be imported, their licence is not told"

@@ -46,7 +46,7 @@ def test_what_is_measured_is_part_of_what_is_clean(simulated):
     assert 0.7 < measured.return_mask.float().mean() < clean.return_mask.float().mean() < 1
 
 
-def test_the_coin_keeps_a_share_whatever_it_meets(simulated):
+def test_independent_drops_keep_a_share_whatever_it_meets(simulated):
     for share in (0.3, 0.8):
         dropped = drop_independently(simulated.clean, share)
         assert math.isclose(dropped.return_mask.float().mean(), share, abs_tol=0.01)
@@ -59,7 +59,7 @@ def test_the_coin_keeps_a_share_whatever_it_meets(simulated):
     assert torch.equal(dropped.return_mask, drop_independently(simulated.clean, 0.8).return_mask)
 
 
-def test_scans_are_nearer_to_the_simulator_that_made_them_than_to_a_coin(simulated, recorded, scores):
+def test_scans_are_nearer_to_the_simulator_that_made_them_than_to_independent_drops(simulated, recorded, scores):
     """The two differ only by the projection and by the halves of the scans that real against real compares."""
     assert recorded.batch([0]).return_mask.sum() > 0
     named = {score.simulated.metric: score for score in scores}

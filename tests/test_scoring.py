@@ -115,5 +115,5 @@ def test_a_metric_that_fails_leaves_the_others_their_scores(passes):
     assert [isinstance(each, LidarGritError) for each in found] == [True, False, True, True, False, True]
     assert "variant 'nonsense'" in str(found[0])
     assert "without reflectance" in str(found[2])
-    assert "the metric 'no_metric'" in str(found[3])
+    assert "'no_metric', which is not among the metrics" in str(found[3])
     assert "nowhere.pth" in str(found[5])

@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     groups = "number of blocks of consecutive scans that --intervals halves; an odd number is lowered by one"
     add("--groups", type=int, default=16, metavar="G", help=groups)
     add("--seed", type=seed_number, default=0, help="seed of all random choices")
-    add("--device", default="cpu", help="device for feature networks: cpu or cuda")
+    add("--device", default="cpu", help="device that networks of metrics and of a run compute on: cpu or cuda")
     add_scans(parser)
     add("--report", type=Path, metavar="FILE.html", help="also write a page with scores and pictures")
     add_json(parser, "the files of --json and --report")

@@ -214,6 +214,8 @@ def _write(path: Path, kind: str, image: RangeImage, job: _Job) -> bool:
         write_with_labels(path, scan)
         return True
     named = [one for one in formats.candidates(path) if one.can_write()]
-    form = writable_format(kind)[0] if kind else job.form if job.form in named else named[0]
+    form = writable_format(kind)[0] if kind else named[0]
+    if not kind and job.form in named and (scan.reflectance is None or "reflectance" in job.form.keeps):
+        form = job.form
     form.write(path, scan)
     return scan.label is None or "label" in form.keeps

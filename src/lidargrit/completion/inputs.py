@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -24,7 +25,7 @@ from lidargrit.loading.config import ScanSettings
 from lidargrit.projection import ProjectionVariant, index_map, project, unproject
 from lidargrit.projection.fit import projection_that_fits
 from lidargrit.reporting import Reporter
-from lidargrit.sensors import SensorModel, load_sensor
+from lidargrit.sensors import ProjectionName, SensorModel, load_sensor
 from lidargrit.sources import DatasetSource, open_images, open_source
 from lidargrit.sources.image_files import ImageFileSource
 from lidargrit.structures import RangeImage, Scan
@@ -150,7 +151,7 @@ class ScanReader:
     partial: bool = False
 
     def read(self, scan: Scan) -> InputScan:
-        """Project a scan; one without rings and firing order, for a sensor that needs them, by elevation."""
+        """Project a scan; by elevation if its rings or its firing order do not fit, but not a file that was cut off."""
         rings = self.sensor.height if scan.ring is None else int(scan.ring.max()) + 1
         if 2 * rings <= self.sensor.height:
             raise ScanError(
@@ -159,6 +160,17 @@ class ScanReader:
                 "add the missing rows with: lidargrit upsample",
             )
         method = projection_that_fits(scan, self.sensor)
+        try:
+            return self._read(scan, method)
+        except ScanError:
+            # Points without a ring that are in firing order, and too few, are a file that was cut off.
+            if method == "spherical" or (scan.ring is None and not self.partial):
+                raise
+            with contextlib.suppress(ScanError):
+                return self._read(scan, "spherical")
+            raise
+
+    def _read(self, scan: Scan, method: ProjectionName) -> InputScan:
         # The reference variant of a projection by elevation knows no sensor.
         variant = self.variant if method == self.sensor.projection else "exact"
         image = project(scan, self.sensor, method, variant, self.partial)

@@ -25,6 +25,7 @@ class Streets(ScanDataset):
 
     Attributes:
         seeds: seeds of the streets.
+        made_by: sensor that scans them.
 
     Raises:
         DataError: no count, or an unknown split.
@@ -52,9 +53,8 @@ class Streets(ScanDataset):
             raise DataError(
                 f"{str(root)!r} where a count belongs", self.tree, f"type for example {self.public_name()}:1000"
             )
-        if sensor:
-            load_sensor(sensor)  # refuses an unknown one before the first street is made
-            self.sensor = sensor
+        self.sensor = sensor or self.sensor
+        self.made_by = load_sensor(self.sensor)  # read once: a file may change while streets are made
         wanted = Split.parse(split)
         first_seeds = {**self.splits(), "all": self.splits()["train"]}
         name = "+".join(wanted.parts)

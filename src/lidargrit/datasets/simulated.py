@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from lidargrit.datasets._streets import Streets
-from lidargrit.sensors import load_sensor
 from lidargrit.structures import Scan
 
 
@@ -23,4 +22,4 @@ class Simulated(Streets):
         # Only here: naming and counting need no simulator.
         from lidargrit.simulator import simulate  # noqa: PLC0415
 
-        return simulate(seed=self.seeds[index], sensor=load_sensor(self.sensor))
+        return simulate(seed=self.seeds[index], sensor=self.made_by)

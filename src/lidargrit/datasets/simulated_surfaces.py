@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from lidargrit.datasets._streets import Streets
-from lidargrit.sensors import load_sensor
 from lidargrit.structures import Scan
 
 
@@ -25,5 +24,5 @@ class SimulatedSurfaces(Streets):
         # Only here: naming and counting need no simulator.
         from lidargrit.simulator import observe  # noqa: PLC0415
 
-        sensor, source = load_sensor(self.sensor), f"surfaces of {self.name(index)}"
+        sensor, source = self.made_by, f"surfaces of {self.name(index)}"
         return observe(self.seeds[index], sensor).surfaces(source, (sensor.range_min_m, sensor.range_max_m))

@@ -19,7 +19,7 @@ from lidargrit.configuration import override
 from lidargrit.errors import CheckpointError, ConfigError
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair, open_pair
 from lidargrit.evaluation.likelihood import bits_per_return
-from lidargrit.evaluation.pairs import EvalPair
+from lidargrit.evaluation.pairs import EvalPair, EvalSet
 from lidargrit.evaluation.protocols import public_name
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.evaluation.tables import Format, TableBlock, render, side_by_side
@@ -43,8 +43,8 @@ _COSTS = {  # entry of the file → name and unit in the table, and whether a sy
     "bits_per_return": (("likelihood", "bits/return"), True),
 }
 _NOTES = (
-    "time: on this machine, in batches; likelihood: exact, of the reference, with ranges in steps of 10 mm, "
-    "and - where a system has none",
+    "time: on this machine, in batches; likelihood: of at most 64 scans of the reference, ranges in steps of 10 mm, "
+    "- where a system has none; MaskGIT's tokens count as equally likely",
 )
 _SAMPLES_AT_MOST = 10**8  # names of files have eight digits
 
@@ -148,8 +148,9 @@ def _finish(
         samples = folder / name / "samples"
         seconds = _sample(generator, plan.run, samples, plan.sampling, benchmark, reporter)
         sampled += seconds is not None
+        _write_costs(folder / name / COSTS, plan, generator, seconds, benchmark.num_samples)
         pair = open_pair(open_source(str(samples)), reference, settings, reporter)
-        _write_costs(folder / name / COSTS, plan, generator, seconds, pair)
+        _add_bits(folder / name / COSTS, generator, pair.reference, reporter)
         _score(pair, settings, folder / name / f"{name}.json", reporter)
         if len(pair.samples) < benchmark.num_samples:
             reporter.message(f"WARNING: {benchmark.reference} has {len(pair.samples)} scans, so as many are compared")
@@ -279,15 +280,10 @@ def _score(pair: EvalPair, settings: EvalConfig, path: Path, reporter: Reporter)
     write_json(path, compare_pair(pair, settings, reporter).to_json())
 
 
-def _write_costs(path: Path, plan: _Plan, generator: Generator, seconds: float | None, pair: EvalPair) -> None:
-    """Write what a system costs; a time and bits that were measured before, of the same scans, are kept."""
-    before = _read_costs(path) if path.is_file() else {}
-    near_far_m = list(pair.reference.range_m or ())
-    reference = {"sha256": pair.reference.record().sha256, "range_m": near_far_m}
-    is_known = before.get("reference") == reference
-    if is_known and seconds is None:
+def _write_costs(path: Path, plan: _Plan, generator: Generator, seconds: float | None, num_samples: int) -> None:
+    """Write what a system costs, once: a later call that samples nothing has measured no time."""
+    if seconds is None and path.is_file():
         return
-    bits = before["bits_per_return"] if is_known else bits_per_return(generator, pair.reference)
     cost = generator.cost(plan.sampling)
     write_json(
         path,
@@ -296,9 +292,21 @@ def _write_costs(path: Path, plan: _Plan, generator: Generator, seconds: float |
             "training_flops": None if plan.recipe is None else sum(training_flops(plan.recipe).values()),
             "network_evaluations": cost.network_evaluations,
             "flops_per_scan": cost.flops,
-            "seconds_per_scan": before.get("seconds_per_scan") if seconds is None else seconds,
-            "bits_per_return": bits,
-            "reference": reference,
-            "scans": len(pair.samples.images),
+            "seconds_per_scan": seconds,
+            "scans": num_samples,
         },
     )
+
+
+def _add_bits(path: Path, generator: Generator, scans: EvalSet, reporter: Reporter) -> None:
+    """Add the bits a return of the reference to what a system costs, unless those of the same scans are there."""
+    costs = _read_costs(path)
+    reference = {"sha256": scans.record().sha256, "range_m": list(scans.range_m or ())}
+    if costs.get("reference") == reference:
+        return
+    try:
+        bits = bits_per_return(generator, scans)
+    except ConfigError as error:  # scans that the model cannot encode can still be compared with
+        reporter.message(f"no likelihood of the reference: {error}")
+        bits = None
+    write_json(path, {**costs, "bits_per_return": bits, "reference": reference})

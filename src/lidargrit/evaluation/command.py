@@ -12,6 +12,7 @@ from lidargrit.errors import ConfigError, nearest_names
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair, open_pair
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.pairs import EvalPair
+from lidargrit.evaluation.protocols import DEFAULT, public_name
 from lidargrit.evaluation.reconstruction import score_run
 from lidargrit.evaluation.reference_rows import with_pixel_statistics
 from lidargrit.evaluation.scorecard import Scorecard
@@ -128,13 +129,15 @@ def _require_plain(run: str, config: EvalConfig, report: Path | None) -> None:
         "--report": report is not None,
         "--metrics": bool(config.metrics),
         "--variant": bool(config.variant),
+        "--protocol": public_name(config.protocol) != DEFAULT,
+        "--weights": bool(config.weights),
         "--pixel-statistics": config.pixel_statistics,
         "--sensor": bool(config.sensor),
     }
     if wrong := [option for option, is_given in given.items() if is_given]:
         raise ConfigError(
             f"{wrong[0]} for the run {run}, of which only reconstructions are measured",
-            "samples, or none of these options",
+            "samples, or a run without this option",
             f"generate samples first with: lidargrit sample {run} FOLDER",
         )
 

@@ -30,9 +30,9 @@ def with_pixel_statistics(card: Scorecard, pair: EvalPair, real: RangeImages, se
     count = len(pair.samples)
     images = RangeImages(real.sensor, [ImagesInMemory(statistics.sample(range(count)))])
     scans = EvalSet("pixel statistics", images, range(count), pair.samples.range_m)
-    values = _values_of(EvalPair(scans, pair.reference), settings, card)
+    values, warnings = _values_of(EvalPair(scans, pair.reference), settings, card)
     scores = (replace(s, pixel_statistics=values.get((s.result.metric, s.result.variant))) for s in card.scores)
-    return replace(card, scores=tuple(scores))
+    return replace(card, scores=tuple(scores), warnings=(*card.warnings, *warnings))
 
 
 def with_held_out(card: Scorecard, held_out: EvalSet, reference: EvalSet, settings: EvalConfig) -> Scorecard:
@@ -44,23 +44,25 @@ def with_held_out(card: Scorecard, held_out: EvalSet, reference: EvalSet, settin
         reference: scans of the samples' reference, as many as are held out.
         settings: protocol and its changes, as for the samples.
     """
-    values = _values_of(EvalPair(held_out, reference), settings, card)
+    values, warnings = _values_of(EvalPair(held_out, reference), settings, card)
     scores = []
     for score in card.scores:
         value = values.get((score.result.metric, score.result.variant))
         real = None if value is None else RealAgainstReal(value, len(held_out), 0)
         scores.append(replace(score, real_against_real=real))
-    return replace(card, scores=tuple(scores))
+    return replace(card, scores=tuple(scores), warnings=(*card.warnings, *warnings))
 
 
-def _values_of(pair: EvalPair, settings: EvalConfig, card: Scorecard) -> dict[tuple[str, str], float]:
-    """Score the metrics that a scorecard has, without intervals; those that the pair cannot have are left out."""
+def _values_of(
+    pair: EvalPair, settings: EvalConfig, card: Scorecard
+) -> tuple[dict[tuple[str, str], float], tuple[str, ...]]:
+    """Score the metrics that a scorecard has, without intervals; return values, and a warning if there are none."""
     metrics = tuple(dict.fromkeys(score.result.metric for score in card.scores))
     try:
         found = compare_pair(pair, replace(settings, metrics=metrics, resampling=Resampling(halves=0)))
-    except DataError:  # not one of them, as metrics of reflectance of scans without any
-        return {}
-    return {(score.result.metric, score.result.variant): score.result.value for score in found.scores}
+    except DataError as error:  # not one of them, as metrics of reflectance of scans without any
+        return {}, (f"no reference row: {error}",)
+    return {(score.result.metric, score.result.variant): score.result.value for score in found.scores}, ()
 
 
 class ImagesInMemory:

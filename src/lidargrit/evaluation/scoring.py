@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from lidargrit import _discovery
-from lidargrit.errors import ConfigError, LidarGritError, ScanError
+from lidargrit.errors import LidarGritError, ScanError
 from lidargrit.evaluation.intervals import Part, Resampling, Score, blocks, interval_of, merged, real_against_real
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
 from lidargrit.evaluation.protocols import MetricChoice
@@ -41,13 +40,11 @@ class MetricFactory:
         """Return an empty metric.
 
         Raises:
-            ConfigError: no such metric, variant or device.
+            UnknownNameError: no such metric.
+            ConfigError: no such variant or device.
             WeightsError: weights that cannot be found or read.
         """
-        name = self.choice.metric
-        if name not in _discovery.names("metrics"):
-            raise ConfigError(f"the metric {name!r}", "one that this version has", "see: lidargrit list metrics")
-        cls = load_metric(name)
+        cls = load_metric(self.choice.metric)
         options: dict[str, Any] = {"variant": self.choice.variant or None, "seed": self.seed}
         if cls.needs_weights:
             options |= {"weights": self.weights, "device": self.device, "reporter": self.reporter}

@@ -82,6 +82,11 @@ def _names(paths: Sequence[Path]) -> list[str]:
     return [path.stem if stems.count(path.stem) == 1 else str(path.with_suffix("")) for path in paths]
 
 
+def _system(name: str) -> str:
+    """Return the name of a row without the folder that tells it from others of this name."""
+    return Path(name).name
+
+
 def _measured(cards: Sequence[tuple[str, Scorecard]]) -> TableBlock:
     cards = _with_pixel_statistics(cards)
     words = [{(each.metric, each.variant): each.verdict for each in _not_applicable(card)} for _, card in cards]
@@ -90,7 +95,7 @@ def _measured(cards: Sequence[tuple[str, Scorecard]]) -> TableBlock:
     rows, notes = [], []
     for (name, card), not_applicable in zip(cards, words, strict=True):
         cells = not_applicable | {_column(score): _cell(score) for score in card.scores}
-        rows.append((f"{name}{_BOUNDS.get(name, '')}", tuple(cells.get(column, "") for column in columns)))
+        rows.append((f"{name}{_BOUNDS.get(_system(name), '')}", tuple(cells.get(column, "") for column in columns)))
         notes += [f"{name}: {text}" for text in (*card.deviations, *card.warnings)]
     card = cards[0][1]
     reference_row = {
@@ -112,14 +117,14 @@ def _measured(cards: Sequence[tuple[str, Scorecard]]) -> TableBlock:
     verdicts = tuple(
         f"{name}: {' '.join(sentences)}"
         for name, card in cards
-        if name not in _BOUNDS and (sentences := verdict(card.scores))
+        if _system(name) not in _BOUNDS and (sentences := verdict(card.scores))
     )
     return TableBlock(title, tuple(columns), tuple(rows), tuple(notes), verdicts)
 
 
 def _with_pixel_statistics(cards: Sequence[tuple[str, Scorecard]]) -> list[tuple[str, Scorecard]]:
     """Give every score that of the row of pixel statistics, if there is such a row."""
-    rows = [card for name, card in cards if name == PIXEL_STATISTICS]
+    rows = [card for name, card in cards if _system(name) == PIXEL_STATISTICS]
     if not rows:
         return list(cards)
     values = {_column(score): score.result.value for score in rows[0].scores}

@@ -31,7 +31,7 @@ from lidargrit.loading.shards import LocalBytes, range_step_m, read_index
 from lidargrit.loading.workers import make_shards
 from lidargrit.processes import rank_and_world_size
 from lidargrit.reporting import Reporter
-from lidargrit.sensors import SensorModel
+from lidargrit.sensors import SensorModel, load_sensor
 
 _SHARD_SCANS = 128  # 12 MB of KITTI-360 size images, and 625 files for 80,000 scans
 _WAIT_S, _PATIENCE_S = 0.5, 1800.0  # for shards that other machines make
@@ -191,6 +191,8 @@ def _spec(
         )
         size, time_ns = (status.st_size, status.st_mtime_ns) if status else (0, 0)
         scans.append((name, dataset.recording(index), size, time_ns))
+    # A file of a sensor by which scans are simulated may change, and its name stays the same.
+    of_file = json.dumps(load_sensor(dataset.sensor).to_json()) if dataset.sensor.endswith(".json") else ""
     spec = PreparedSpec(
         format=FORMAT,
         version=__version__,
@@ -203,7 +205,7 @@ def _spec(
         range_step_m=range_step_m(fine),
         shard_scans=_SHARD_SCANS,
         num_scans=len(scans),
-        digest=hashlib.sha256(json.dumps(scans).encode()).hexdigest(),
+        digest=hashlib.sha256((json.dumps(scans) + of_file).encode()).hexdigest(),
     )
     return spec, scans
 

@@ -46,11 +46,8 @@ def read_checkpoint(
             found = {name: of for name, of in found.items() if not any(fnmatchcase(str(name), p) for p in ignored)}
         return float_tensors(found, bytes_at_most)
     except (RefusedFileError, OSError) as why:
-        raise CheckpointError(
-            f"{path}, {why}",
-            f"a checkpoint with weights {f'at {chr(39)}{chr(46).join(names)}{chr(39)}' if names else 'by name'}",
-            "check the path",
-        ) from None
+        where = f"at {'.'.join(names)!r}" if names else "by name"
+        raise CheckpointError(f"{path}, {why}", f"a checkpoint with weights {where}", "check the path") from None
 
 
 def read_everything(path: Path, bytes_at_most: int) -> Any:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -18,8 +17,6 @@ from torch import Tensor, nn
 from lidargrit.errors import ConfigError
 from lidargrit.nn.blocks import Block, Network, zeroed
 from lidargrit.nn.convolution import Convolution
-
-Layer = TypeVar("Layer", bound=nn.Module)
 
 _EPSILON = 1e-6  # of every norm, as in the reference
 _LONGEST_PERIOD = 10_000  # of the sinusoids that tell the log SNR, as in the reference

@@ -17,7 +17,7 @@ from lidargrit.structures import Scan
 __all__ = ["Observation", "RaydropModel", "Scene", "Theme", "observe", "scene_of", "simulate"]
 
 FRAME_S = REVOLUTION_S  # from one frame to the next
-_FRAMES_AT_MOST = 100_000  # each has a random stream of its own, and they are set up one after the other
+FRAMES_AT_MOST = 100_000  # each has a random stream of its own, and they are set up one after the other
 _HDL64E_OF_KITTI = RaydropModel()
 
 
@@ -120,8 +120,8 @@ def check_settings(seed: int, theme: str, frame: int = 0, wet: float = 0.0) -> N
     Raises:
         ConfigError: a negative seed, an unknown theme, or a frame or a wetness out of its bounds.
     """
-    if not 0 <= frame <= _FRAMES_AT_MOST:
-        raise ConfigError(f"the frame {frame}", f"a frame from 0 to {_FRAMES_AT_MOST}", "choose another frame")
+    if not 0 <= frame < FRAMES_AT_MOST:
+        raise ConfigError(f"the frame {frame}", f"a frame from 0 to {FRAMES_AT_MOST - 1}", "choose another frame")
     if not 0 <= wet <= 1:  # also refuses NaN
         raise ConfigError(f"wet {wet}", "a wetness from 0 (dry) to 1 (soaked)", "choose a number between")
     if seed < 0:

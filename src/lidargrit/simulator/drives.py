@@ -16,7 +16,7 @@ from lidargrit.formats.kitti_bin import KittiBin
 from lidargrit.processes import process_pool
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel
-from lidargrit.simulator import FRAME_S, Theme, check_settings, observe, scene_of
+from lidargrit.simulator import FRAME_S, FRAMES_AT_MOST, Theme, check_settings, observe, scene_of
 
 MANIFEST = "simulated.json"
 _SCANS_PER_SEQUENCE = 10_000  # of streets seen once each: a folder that any file browser still opens
@@ -48,8 +48,8 @@ class DriveConfig:
     clean: bool = False
 
     def __post_init__(self) -> None:
-        if self.frames < 1 or self.seed < 0:
-            raise ConfigError(f"frames={self.frames}, seed={self.seed}", "1 frame or more, a seed from 0", "correct it")
+        if not 1 <= self.frames <= FRAMES_AT_MOST:
+            raise ConfigError(f"frames={self.frames}", f"1 to {FRAMES_AT_MOST:,} scans of a street", "correct it")
         check_settings(self.seed, self.theme, self.frames - 1, self.wet)
 
     def street_of(self, scan: int) -> tuple[int, int]:
