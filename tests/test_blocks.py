@@ -73,7 +73,7 @@ def test_what_has_no_blocks_says_so():
     recipe = load_recipe("dusty_small")
     objective = load_class("dusty")(recipe.model, recipe.data.load_sensor()).objective("adversarial")
     for choice in ((True, False), (False, True)):
-        with pytest.raises(ConfigError, match=r"=true for \w+, which cannot"):
+        with pytest.raises(ConfigError, match=r"=true for \w+, which has no (Block|Network)"):
             prepare_for_training(objective, *choice)
 
 

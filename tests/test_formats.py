@@ -240,10 +240,10 @@ def test_reflectance_beyond_all_scales_is_refused(tmp_path, values):
 @pytest.mark.parametrize(
     ("arrays", "text"),
     [
-        ({"ring": [0.5, 1]}, "a ring that is none"),
-        ({"ring": [-1, 1]}, "a ring that is none"),
-        ({"ring": [np.nan, 1]}, "a ring that is none"),
-        ({"label": [0, 2**32]}, "a label that is none"),
+        ({"ring": [0.5, 1]}, "a ring that is not whole or out of bounds"),
+        ({"ring": [-1, 1]}, "a ring that is not whole or out of bounds"),
+        ({"ring": [np.nan, 1]}, "a ring that is not whole or out of bounds"),
+        ({"label": [0, 2**32]}, "a label that is not whole or out of bounds"),
         ({"ring": [0, 1, 2]}, r"2 points, but ring of shape \(3,\)"),
         ({"ring": [[0], [1]]}, r"2 points, but ring of shape \(2, 1\)"),
         ({"points": np.ones((2, 6))}, r"an array of shape \(2, 6\)"),
