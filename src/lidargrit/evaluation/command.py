@@ -56,7 +56,7 @@ def evaluate(
     first = open_source(samples, config.data.bad_points, config.samples_format)
     second = open_source(reference, config.data.bad_points)
     if isinstance(first, RunSource):
-        _require_plain(samples, config, report)
+        _refuse_options_of_samples(samples, config, report)
         return _reconstruction(first, second, config, reporter)
     pair = open_pair(first, second, config, reporter)
     card = compare_pair(pair, config, reporter)
@@ -119,8 +119,8 @@ def _weights(words: Sequence[str]) -> dict[str, Path]:
     return files
 
 
-def _require_plain(run: str, config: EvalConfig, report: Path | None) -> None:
-    """Refuse options that have no meaning for the reconstructions of a run.
+def _refuse_options_of_samples(run: str, config: EvalConfig, report: Path | None) -> None:
+    """Refuse options of scoring samples, which have no meaning for the reconstructions of a run.
 
     Raises:
         ConfigError: one of them is given.

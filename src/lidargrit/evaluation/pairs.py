@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 
@@ -73,11 +74,13 @@ class EvalSet:
             len(self),
             f"{sensor.name} {sensor.height}x{sensor.width}",
             f"{sensor.projection}, {self.projection_variant or 'variant not known'}",
-            self._sha256(),
+            self._sha256,
             self.weights_sha256,
         )
 
+    @cached_property
     def _sha256(self) -> str:
+        """Hash of the compared ranges; it reads every image where a set has no fingerprints, so once."""
         content = hashlib.sha256()
         fingerprints = self.images.provenance.fingerprints
         if len(fingerprints) == len(self.images):  # of the images with all fine columns: of which some were compared

@@ -71,7 +71,13 @@ def _mean_over_returns(value: Float64[Tensor, "B H W"], return_mask: Bool[Tensor
     return torch.where(return_mask, value, 0.0).sum((1, 2)) / return_mask.sum((1, 2))
 
 
-_OF_SCANS = (abs_rel, sq_rel, rmse, rmse_log, accuracy)
+_OF_SCANS = {  # field of the errors → measure of each image
+    "abs_rel": abs_rel,
+    "sq_rel_m": sq_rel,
+    "scan_rmse_m": rmse,
+    "rmse_log": rmse_log,
+    "accuracy_1_25": accuracy,
+}
 
 
 @dataclass(frozen=True)
@@ -160,7 +166,7 @@ class ReconstructionScore:
         self._num_scans += len(real)
         has_returns = returned.any((1, 2))
         pairs = real.range_m[has_returns], clean_range_m.detach()[has_returns], returned[has_returns]
-        self._of_scans = self._of_scans + torch.stack([measure(*pairs).sum() for measure in _OF_SCANS])
+        self._of_scans = self._of_scans + torch.stack([measure(*pairs).sum() for measure in _OF_SCANS.values()])
         self._scans_with_returns += int(has_returns.sum())
 
     def merge(self, other: ReconstructionScore) -> None:
@@ -190,7 +196,7 @@ class ReconstructionScore:
             drop_precision=_share(self._both, self._both + self._only_decoded),
             drop_recall=_share(self._both, self._both + self._only_real),
             drop_iou=_share(self._both, self._both + self._only_decoded + self._only_real),
-            **dict(zip(("abs_rel", "sq_rel_m", "scan_rmse_m", "rmse_log", "accuracy_1_25"), of_scans, strict=True)),
+            **dict(zip(_OF_SCANS, of_scans, strict=True)),
             num_scans=self._num_scans,
         )
 
