@@ -216,11 +216,10 @@ class _Attention(nn.Module):
 
     def forward(self, x: Tensor, embedding: Tensor, angles_rad: Tensor) -> Tensor:
         joint = self.qkv_proj(self.norm(x, embedding)).unflatten(-1, (3, self.heads, -1))
-        q, k, v = joint.permute(3, 0, 4, 1, 2, 5)  # each (B, heads, h, w, d)
+        joint = joint.permute(3, 0, 4, 1, 2, 5)  # (3, B, heads, h, w, d)
         sharpness = self.scale.clamp(max=math.log(100)).exp().sqrt()[:, None, None]
-        turn = self.rope(angles_rad)
-        q, k = (_turned(_unit(each) * sharpness, turn) for each in (q, k))
-        q, k = q.type_as(v), k.type_as(v)
+        v = joint[2]
+        q, k = _turned(_of_length(joint[:2], sharpness), self.rope(angles_rad)).type_as(v)
         if self.everywhere:
             mixed = F.scaled_dot_product_attention(q.flatten(2, 3), k.flatten(2, 3), v.flatten(2, 3), scale=1.0)
             mixed = mixed.unflatten(2, q.shape[2:4])
@@ -255,9 +254,9 @@ def _turned(x: Tensor, turn_rad: Tensor) -> Tensor:
     return torch.cat((first * cos - second * sin, second * cos + first * sin), dim=-1)
 
 
-def _unit(x: Tensor) -> Tensor:
+def _of_length(x: Tensor, length: Tensor) -> Tensor:
     x = x.float()
-    return x * torch.rsqrt(x.square().sum(-1, keepdim=True) + _EPSILON)
+    return x * (length * torch.rsqrt(x.square().sum(-1, keepdim=True) + _EPSILON))
 
 
 class _FeedForward(nn.Module):

@@ -25,21 +25,24 @@ def neighbourhood_attention(
     """
     columns = q.shape[3]
     together = next(size for size in range(_COLUMNS_AT_ONCE, 0, -1) if columns % size == 0)
-    keys, values = (_windows(each, together) for each in (k, v))  # each (B, heads, h, w / together, d, keys)
-    logits = (q.unflatten(3, (-1, together)) @ keys).float()  # (B, heads, h, w / together, together, keys)
+    keys, values = (_windows(each, together) for each in (k, v))  # each (B, heads, h, w / together, keys, d)
+    logits = (q.unflatten(3, (-1, together)) @ keys.transpose(-1, -2)).float()  # (B, heads, h, n, together, keys)
     column = torch.arange(together, device=q.device)[:, None]
     offset = torch.arange(together + 2 * _REACH, device=q.device) - column
-    seen = ((offset >= 0) & (offset <= 2 * _REACH)).repeat_interleave(min(_ROWS, q.shape[2]), dim=1)
+    seen = ((offset >= 0) & (offset <= 2 * _REACH)).repeat(1, min(_ROWS, q.shape[2]))
     weights = logits.masked_fill(~seen, -torch.inf).softmax(-1).type_as(values)
-    return (weights @ values.transpose(-1, -2)).flatten(3, 4)
+    return (weights @ values).flatten(3, 4)
 
 
-def _windows(x: Float[Tensor, "B heads h w d"], together: int) -> Float[Tensor, "B heads h n d keys"]:
-    """Return what each group of neighbouring columns may see: columns one after the other, and the rows of each."""
-    rows = min(_ROWS, x.shape[2])
-    before, after = (rows - 1) // 2, rows // 2
-    turns = [x] * -(-_REACH // x.shape[3])
-    x = torch.cat((torch.cat(turns, 3)[:, :, :, -_REACH:], x, torch.cat(turns, 3)[:, :, :, :_REACH]), dim=3)
-    x = x.unfold(3, together + 2 * _REACH, together).unfold(2, rows, 1)  # (B, heads, h - rows + 1, n, d, columns, rows)
-    x = torch.cat((*[x[:, :, :1]] * before, x, *[x[:, :, -1:]] * after), dim=2)
-    return x.flatten(-2)
+def _windows(x: Float[Tensor, "B heads h w d"], together: int) -> Float[Tensor, "B heads h n keys d"]:
+    """Return what each group of neighbouring columns may see: rows one after the other, and the columns of each."""
+    # By slices and shifts, since the gradient of Tensor.unfold takes five times as long.
+    width, height, rows = together + 2 * _REACH, x.shape[2], min(_ROWS, x.shape[2])
+    before, after, inner = (rows - 1) // 2, rows // 2, height - rows + 1
+    parts = []
+    for each in (x[:, :, row : row + inner] for row in range(rows)):
+        shifted = torch.cat((*[each[:, :, :1]] * before, each, *[each[:, :, -1:]] * after), dim=2)
+        for start in range(0, width, together):
+            groups = shifted.roll(_REACH - start, dims=3).unflatten(3, (-1, together))
+            parts.append(groups[..., : width - start, :])
+    return torch.cat(parts, dim=4)
