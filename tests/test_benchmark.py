@@ -126,7 +126,7 @@ def test_a_budget_counts_what_is_prepared_once(monkeypatch):
     monkeypatch.setattr(compute, "stage_costs", lambda recipe: {"tokenizer": cost})
     recipe = load_recipe("demo", ["training.tokenizer.scans=4000", "training.tokenizer.batch_size=1"])
     recipe = replace(recipe, training={"tokenizer": recipe.training["tokenizer"]})
-    for budget in (20_000.0, 60_000.0, 200_000.0):
+    for budget in (20_000.0, 60_000.0, 200_000.0, 2_000_000.0):
         scans = with_budget(recipe, budget).training["tokenizer"].scans
         assert 100 * scans + 900 * min(scans, 50) == pytest.approx(budget, rel=0.021)
 

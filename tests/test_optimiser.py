@@ -154,6 +154,22 @@ def test_gradients_are_clipped_and_infinite_ones_change_nothing(images):
     assert before.numel() == 2
 
 
+def test_a_gradient_that_is_no_number_moves_nothing_without_a_limit_either(images):
+    class Cornered(Objective):
+        def __init__(self):
+            super().__init__(images.sensor)
+            self.weight = nn.Parameter(torch.zeros(2))
+
+        def forward(self, images, rng, player):
+            return {"loss": self.weight.sqrt().sum()}  # 0, with a slope of infinity
+
+    cornered = Cornered()
+    engine = Engine("fp32")
+    engine.set_up(cornered, torch.optim.SGD(cornered.parameters(), lr=1.0))
+    assert not bool(engine.step(images, 0, gradient_clip=0.0)["loss"].isfinite())
+    assert cornered.weight.tolist() == [0.0, 0.0]
+
+
 def test_ranges_reach_the_objective_unrounded(images):
     class Listening(Objective):
         def __init__(self):

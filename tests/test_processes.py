@@ -1,5 +1,6 @@
 """Two processes, or a batch taken in parts, against one process with the whole batch."""
 
+import copy
 import json
 import os
 import socket
@@ -13,6 +14,7 @@ import torch
 
 from lidargrit.errors import ConfigError
 from lidargrit.files import read_tensors
+from lidargrit.generators.multiscale import Multiscale
 from lidargrit.loading import DataConfig
 from lidargrit.nn.objective import Objective
 from lidargrit.recipes import load_recipe
@@ -23,7 +25,7 @@ from lidargrit.structures import RangeImage
 from lidargrit.tokenizers.vqvae import Vqvae
 from lidargrit.training import FitConfig
 from lidargrit.training.engine import Engine
-from lidargrit.training.fit import Fit
+from lidargrit.training.fit import Fit, engine_for
 from lidargrit.training.optimiser import make_optimiser
 from tiny_runs import train_words
 
@@ -44,13 +46,14 @@ import contextlib, io, os, sys
 from pathlib import Path
 import torch
 from lidargrit.cli import main
-from test_processes import play, steps_with_a_bad_process
+from test_processes import learn_pixels, play, steps_with_a_bad_process
 
 folder, words = Path(sys.argv[1]), sys.argv[2:]
 assert main(words) == 0
 weights, rank = play()
 torch.save(weights, folder / f"game{rank}.pt")
 assert steps_with_a_bad_process() == [False, False]
+assert learn_pixels()
 assert main([*words, "training.tokenizer.learning_rate=1"]) == 2  # all are told what the first found
 if rank == 1:
     os._exit(0)  # dies in the middle of the work, as far as the other can see
@@ -96,7 +99,7 @@ def some_images(count):
 
 def play():
     torch.manual_seed(0)
-    game, engine = Game(), Engine("fp32", players_take_turns=True)
+    game, engine = Game(), Engine("fp32", reaches_all_weights=False)
     engine.set_up(game, torch.optim.AdamW(game.parameters(), lr=0.1))
     share = 4 // engine.world_size
     for step in range(5):
@@ -113,6 +116,19 @@ def steps_with_a_bad_process():
         images = replace(images, range_m=images.range_m.clone())
         images.range_m[0, 0, 0] = torch.nan
     return [bool(engine.step(images, 0, gradient_clip=1.0)["loss"].isfinite()) for _ in range(2)]
+
+
+def learn_pixels():
+    """Return whether steps of which each reaches some of a pixel decoder's weights alone have moved all networks."""
+    torch.manual_seed(0)
+    objective = Multiscale(Multiscale.smallest_config(SENSOR), SENSOR).objective("pixels")
+    learn = FitConfig(scans=8, batch_size=2, learning_rate=1e-3)
+    engine, before = engine_for(objective, learn), copy.deepcopy(objective.state_dict())
+    engine.set_up(objective, make_optimiser(objective, learn))
+    for step in range(4):
+        assert bool(engine.step(some_images(1), step + engine.rank, gradient_clip=0.0)["loss"].isfinite())
+    moved = [name for name, weight in objective.state_dict().items() if not torch.equal(weight, before[name])]
+    return len(moved) > len(before) / 2
 
 
 def losses(folder: Path, stage: str, name: str) -> list[float]:

@@ -268,7 +268,7 @@ def test_calibrated_raydrop_returns_as_many_rays_as_the_training_scans():
     with pytest.raises(ConfigError, match=r"raydrop=calibrated.*never fitted"):
         generator.sample([0], DiffusionSampling(steps=2, raydrop="calibrated"))
     generator.return_share.fill_(0.7)
-    generator.calibrate()
+    generator.after_training()
     sampling = DiffusionSampling(steps=32, raydrop="calibrated")
     assert float(generator.sample(range(4), sampling).return_mask.float().mean()) == pytest.approx(0.7, abs=0.03)
 

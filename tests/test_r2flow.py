@@ -222,8 +222,15 @@ def test_cost_counts_the_passes_of_either_solver():
 
 
 def test_a_flow_that_explodes_is_told_in_one_line():
-    with pytest.raises(ConfigError, match=r"cannot be followed with tolerance=0\.001 .*; wanted a larger tolerance"):
-        flow.dopri5(lambda image, _: torch.full_like(image, torch.nan), torch.zeros(1, 1, 4, 8), 1e-3)
+    for begins in (0.0, 0.5):
+        with pytest.raises(
+            ConfigError, match=r"a flow that is not finite at time 0.*; wanted a network whose training"
+        ):
+            flow.dopri5(
+                lambda image, time, begins=begins: torch.full_like(image, torch.nan if time[0] >= begins else 1.0),
+                torch.zeros(1, 1, 4, 8),
+                1e-3,
+            )
     for settings in ({"steps": -1}, {"tolerance": 0.0}, {"tolerance": float("nan")}):
         with pytest.raises(ConfigError, match=f"got {next(iter(settings))}="):
             FlowSampling(**settings)

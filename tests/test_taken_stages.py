@@ -8,8 +8,10 @@ import pytest
 import torch
 
 from lidargrit.errors import ConfigError
+from lidargrit.generators import load_class
 from lidargrit.generators.lidargrit import TokenSampling
 from lidargrit.generators.maskgit import MaskGitConfig
+from lidargrit.loading import DataConfig
 from lidargrit.training import FitConfig, train
 from lidargrit.training.taken_stages import taken_stages
 from test_pixel_stage import PIXELS, TOKENIZER, TRANSFORMER, made, recipe_of
@@ -48,6 +50,22 @@ def test_fine_tuning_starts_from_the_weights_of_the_other_run(tmp_path):
             taken_stages(wrong, wrong.build_generator())
     with pytest.raises(ConfigError, match="fine_tune=tokenizer without stages_from"):
         replace(recipe, stages_from=None)
+    with pytest.raises(ConfigError, match="train_anew=pixels without stages_from"):
+        replace(recipe, stages_from=None, fine_tune=(), train_anew=("pixels",))
+
+
+SENSORS = ("hdl64e_kitti_odometry", "hdl64e_kitti_360")
+
+
+@pytest.mark.parametrize("kind", ["r2dm", "r2flow"])
+def test_rays_of_another_sensor_are_not_taken_over(kind):
+    theirs, ours = (DataConfig(sensor=name, columns=1024, column_stride=8).load_sensor() for name in SENSORS)
+    donor, own = (load_class(kind)(load_class(kind).smallest_config(each), each) for each in (theirs, ours))
+    stage = own.stages[0]
+    taken = own.objective(stage).weights_from(donor.objective(stage))
+    assert "network.coords" not in taken
+    assert "network.coords" in own.objective(stage).weights_from(own.objective(stage))
+    assert taken.keys() | {"network.coords"} == own.objective(stage).state_dict().keys()
 
 
 def test_fine_tuning_takes_a_run_of_fewer_columns_and_another_dropout(tmp_path):

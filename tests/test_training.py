@@ -12,7 +12,7 @@ import torch
 
 from lidargrit import configuration
 from lidargrit.datasets.kitti_odometry import KittiOdometry
-from lidargrit.errors import CheckpointError, OutputError, TrainingError
+from lidargrit.errors import CheckpointError, ConfigError, OutputError, TrainingError
 from lidargrit.files import claim_folder, read_tensors, write_json, write_tensors
 from lidargrit.loading import Batches, DataConfig
 from lidargrit.nn.objective import Objective
@@ -243,6 +243,31 @@ def test_a_run_goes_on_though_the_words_about_its_recipe_have_changed(tmp_path):
     check_folder(tmp_path, recipe)
     with pytest.raises(OutputError, match=r"there seed=0, here 1"):
         check_folder(tmp_path, replace(recipe, seed=1))
+
+
+def test_a_run_goes_on_with_settings_that_change_nothing_computed(tmp_path):
+    write_json(tmp_path / "run.json", {"recipe": configuration.to_json(load_recipe("demo"))})
+    stage = "training.tokenizer"
+    check_folder(
+        tmp_path, load_recipe("demo", ["data.workers=7", f"{stage}.checkpoint_every=3", f"{stage}.pictures_every=5"])
+    )
+    with pytest.raises(OutputError, match=r"training\.tokenizer\.validate_every"):
+        check_folder(tmp_path, load_recipe("demo", [f"{stage}.validate_every=3"]))
+
+
+def test_settings_that_a_later_stage_cannot_follow_are_refused_before_the_first(tmp_path):
+    for settings, message in (
+        (
+            ["training.transformer.batch_size=2", "training.transformer.accumulate=3"],
+            "batch_size=2 on 1 processes in 3 parts",
+        ),
+        (["training.tokenizer.optimiser=muon"], "optimiser=muon for networks without linear layers"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            train(load_recipe("demo", [*TINY, *settings]), tmp_path)
+        assert not [*tmp_path.iterdir()]
+    with pytest.raises(ConfigError, match=r"without training\.reflow"):
+        train(load_recipe("r2flow_small", ["model.reflow={}"]), tmp_path)
 
 
 def test_a_folder_is_trained_in_by_one_process_at_a_time(tmp_path):

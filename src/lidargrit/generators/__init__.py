@@ -133,6 +133,9 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         """Load the weights of a stage's trained objective."""
         raise NotImplementedError(f"{self.public_name()} has no stage {stage!r}")
 
+    def after_training(self) -> None:
+        """Fit what depends on the trained weights of all stages; nothing by default."""
+
     @final
     @torch.no_grad()
     def sample(self, seeds: Sequence[int], sampling: SamplingT | None = None) -> RangeImage:

@@ -116,6 +116,8 @@ def solve(
 class FlowMatching(Objective):
     """The first training (1-RF): the squared error of the velocity at a random time between noise and image."""
 
+    ray_buffers = ("network.coords",)
+
     def __init__(self, network: Hdit, sensor: SensorModel) -> None:
         super().__init__(sensor)
         self.network = network
@@ -143,6 +145,8 @@ class PairMatching(Objective):
             and near clean images more often.
     """
 
+    ray_buffers = ("network.coords",)
+
     def __init__(
         self, network: Hdit, sensor: SensorModel, pairs: int, solving: FlowSampling, distilled_steps: int
     ) -> None:
@@ -167,7 +171,9 @@ class PairMatching(Objective):
 
     def preparation_flops(self, scans: int) -> int:
         """Return the operations of making the pairs; the adaptive solver counts as 256 equal steps."""
-        return min(self._count, scans) * self._pairs.flops()
+        kept = min(self._count, self._pairs.kept_at_most)
+        # Each pair that is kept is made once, and the others at every sight.
+        return round(min(kept, scans) + scans * (1 - kept / self._count)) * self._pairs.flops()
 
 
 class FlowPairs:
@@ -188,7 +194,8 @@ class FlowPairs:
         self, network: Hdit, sensor: SensorModel, solving: FlowSampling, bytes_at_most: int = _KEPT_BYTES_AT_MOST
     ) -> None:
         self._network = copy.deepcopy(network).eval().requires_grad_(False)
-        self._sensor, self._solving, self._free = sensor, solving, bytes_at_most
+        self._sensor, self._solving = sensor, solving
+        self._bytes_at_most = self._free = bytes_at_most
         self._shape = (network.images, sensor.height, sensor.width)
         self._kept: dict[int, Tensor] = {}
 
@@ -202,6 +209,11 @@ class FlowPairs:
         )()
         clean = [self._clean(number, noise[[index]]) for index, number in enumerate(numbers.tolist())]
         return noise, torch.cat(clean).to(noise)
+
+    @property
+    def kept_at_most(self) -> int:
+        """Number of pairs that the bound of memory holds."""
+        return self._bytes_at_most // (4 * math.prod(self._shape))
 
     def flops(self) -> int:
         """Return the floating-point operations of making one pair."""

@@ -20,6 +20,7 @@ from lidargrit.nn.encoding_cache import EncodingCache
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.pixel_decoder import PixelDecoder, PixelSampling, nats_to_range_bits
 from lidargrit.nn.pixel_networks import PixelDecoderConfig
+from lidargrit.nn.precision import without_autocast
 from lidargrit.nn.processes import sum_over_processes
 from lidargrit.nn.range_steps import RangeSteps
 from lidargrit.nn.transformer import Transformer, TransformerConfig, resample_positions
@@ -68,6 +69,12 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
         self.tokenizer = make_tokenizer(config.tokenizer, sensor)
         self.pixels: PixelDecoder | None = None
         if config.pixels is not None:
+            if not self.tokenizer.num_features:
+                raise ConfigError(
+                    f"model.pixels over the tokenizer {config.tokenizer.name()!r}, whose decoder gives no features",
+                    "a tokenizer with features, such as vqvae",
+                    "choose another tokenizer, or leave model.pixels out",
+                )
             self.pixels = PixelDecoder(config.pixels, sensor, self.tokenizer.num_features)
 
     @abstractmethod
@@ -231,6 +238,8 @@ class PixelObjective(Objective):
         tokenizer: the frozen tokenizer; None for a pixel decoder without tokens.
     """
 
+    reaches_all_weights = False  # some phases stand for all
+
     def __init__(self, pixels: PixelDecoder, tokenizer: Tokenizer | None = None) -> None:
         super().__init__(pixels.sensor)
         self.pixels = pixels
@@ -244,7 +253,7 @@ class PixelObjective(Objective):
         decoded = None
         if self._tokens is not None:
             tokenizer = self._tokens.network(images.range_m.device)
-            with torch.no_grad():
+            with torch.no_grad(), without_autocast(images.range_m.device):  # as when scans are sampled
                 decoded = tokenizer.decode(TokenGrid(self._tokens(images).long(), tokenizer.num_codes))
         if self.training:
             mask_nats, range_nats = self.pixels.estimate(decoded, images, rng)

@@ -84,8 +84,8 @@ class TokenSampling:
     top_k: int = 0
     top_p: float = 1.0
     mask: PixelChoice = "auto"
-    range_temperature: float = PixelSampling.temperature
-    range_noise: float = PixelSampling.noise
+    range_temperature: float = PixelSampling.range_temperature
+    range_noise: float = PixelSampling.range_noise
     completion: Literal["auto", "network", "tokens"] = "auto"
     weights: WeightPrecision = "fp32"
     decoder: Precision = "fp32"

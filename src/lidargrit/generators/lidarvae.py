@@ -181,7 +181,8 @@ class LidarVae(Generator[LidarVaeConfig, VaeSampling]):
 
         noise = self._normal(seeds, sampling.search_steps + 1)
         noise[:, 0] = self.encode(target).chunk(2, dim=1)[0]
-        return self.image.decode(self.decode(search_latents(error_of, noise, sampling.search_rate)))
+        # Means of dimensions that tell nothing lie near 0, far within the sphere of random latents.
+        return self.image.decode(self.decode(search_latents(error_of, noise, sampling.search_rate, on_sphere=False)))
 
     def _normal(self, seeds: Sequence[int], count: int) -> Float[Tensor, "B count D"]:
         """Sample standard normal latents for each seed, on the CPU: the same numbers on every device."""

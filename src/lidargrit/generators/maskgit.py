@@ -59,8 +59,8 @@ class MaskedSampling:
     temperature: float = 1.0
     order_temperature: float = 4.5
     mask: PixelChoice = "auto"
-    range_temperature: float = PixelSampling.temperature
-    range_noise: float = PixelSampling.noise
+    range_temperature: float = PixelSampling.range_temperature
+    range_noise: float = PixelSampling.range_noise
     weights: Precision = "fp32"
     decoder: Precision = "fp32"
 

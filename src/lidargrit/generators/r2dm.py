@@ -146,13 +146,12 @@ class R2dm(Generator[R2dmConfig, DiffusionSampling]):
         return Denoising(self.network, self.sensor)
 
     def load_stage(self, stage: str, objective: Objective) -> None:
-        """Take over the trained network, and fit the threshold of the calibrated raydrop."""
+        """Take over the trained network."""
         assert isinstance(objective, Denoising)
         self.network.load_state_dict(objective.network.state_dict())
-        self.calibrate()
 
-    def calibrate(self) -> None:
-        """Fit the threshold above which as many sampled values lie as rays returned in the training scans."""
+    def after_training(self) -> None:
+        """Fit the threshold of the calibrated raydrop: as many values lie above it as rays returned in training."""
         seeds = range(_CALIBRATION_SEED, _CALIBRATION_SEED + self.config.calibration_scans)
         if not seeds or not bool(self.return_share.isfinite()):
             return
@@ -208,6 +207,8 @@ class R2dm(Generator[R2dmConfig, DiffusionSampling]):
 
 class Denoising(Objective):
     """The objective: the squared error of the predicted noise at a random time, weighed by min-SNR."""
+
+    ray_buffers = ("network.coords",)
 
     def __init__(self, network: EfficientUnet, sensor: SensorModel) -> None:
         super().__init__(sensor)

@@ -149,7 +149,7 @@ def prepare_and_describe(
     if verify and (damaged := damaged_shards(folder, reporter)):
         reporter.message(f"damaged and made again: {', '.join(map(shard_name, damaged))}")
         for shard in damaged:
-            (folder / shard_name(shard)).unlink()
+            (folder / shard_name(shard)).unlink(missing_ok=True)  # another process may have removed it
         prepare(source, config, folder, reporter, sensor, rank, world_size, dataset)
     images, seconds = PreparedImages(str(folder)), time.monotonic() - begun
     for why in images.left_out.values():

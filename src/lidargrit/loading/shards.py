@@ -6,10 +6,12 @@ magic again. A file that was cut short is recognised by its end, and one image i
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import math
 import mmap
+import resource
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -84,13 +86,24 @@ class LocalBytes:
     def __init__(self, path: Path) -> None:
         if not path.is_file():  # a pipe would hang
             raise FileNotFoundError("no such file" if not path.exists() else "not a file")
-        with path.open("rb") as file:
-            self._map = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        try:
+            self._map = _mapped(path)
+        except OSError as error:
+            if error.errno != errno.EMFILE:
+                raise
+            _, most = resource.getrlimit(resource.RLIMIT_NOFILE)  # many systems allow 1,024 files until one asks
+            resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+            self._map = _mapped(path)
         self.size = len(self._map)
 
     def read(self, start: int, end: int) -> memoryview:
         """Return the bytes from ``start`` up to ``end``, without copying them."""
         return memoryview(self._map)[start:end]
+
+
+def _mapped(path: Path) -> mmap.mmap:
+    with path.open("rb") as file:
+        return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
 
 
 def range_step_m(sensor: SensorModel) -> float:

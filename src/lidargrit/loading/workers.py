@@ -98,14 +98,13 @@ def _made_by_processes(folder: Path, shares: list[list[int]]) -> Iterator[int]:
     """Start processes that make shards, and yield the numbers of further scans done."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}  # one core each: threads of several would fight for them
     command = module_command("lidargrit.loading", str(folder), str(os.getpid()))
-    processes = [
-        subprocess.Popen([*command, *map(str, share)], stdout=subprocess.PIPE, text=True, env=environment)
-        for share in shares
-    ]
+    processes: list[subprocess.Popen[str]] = []
     lines: queue.Queue[str | None] = queue.Queue()
-    for process in processes:
-        threading.Thread(target=_listen, args=(process, lines), daemon=True).start()
     try:
+        for share in shares:
+            process = subprocess.Popen([*command, *map(str, share)], stdout=subprocess.PIPE, text=True, env=environment)
+            processes.append(process)
+            threading.Thread(target=_listen, args=(process, lines), daemon=True).start()
         running = len(processes)
         while running:
             line = lines.get()

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from lidargrit.nn.precision import without_autocast
 from lidargrit.nn.processes import sample_from_all, sum_over_processes
 
 _LATENTS_PER_CODE = 10  # in the reservoir
@@ -70,7 +71,8 @@ class CodebookCare(nn.Module):
         if idle.is_meta:  # without values, where operations are only counted: k-means is rare
             return
         if int(self.rest_steps) == 0 and float(idle.float().mean()) > _IDLE_SHARE:
-            codes.copy_(self._moved(codes, idle, rng))
+            with without_autocast(codes.device):  # codes lie too close together for 16 bits
+                codes.copy_(self._moved(codes, idle, rng))
             self.idle_steps.zero_()
             self.rest_steps.fill_(_REST_STEPS)
 

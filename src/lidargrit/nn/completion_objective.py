@@ -41,6 +41,7 @@ class CompletionObjective(Objective):
     """
 
     additions = frozenset({"labels", "reflectance"})
+    reaches_all_weights = False  # some phases stand for all
 
     def __init__(self, network: CompletionNetwork, sensor: SensorModel) -> None:
         super().__init__(sensor)

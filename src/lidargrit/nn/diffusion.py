@@ -40,7 +40,7 @@ def noised(
     clean: Float[Tensor, "B C H W"], log_snr: Float[Tensor, "*B"], noise: Float[Tensor, "B C H W"]
 ) -> Float[Tensor, "B C H W"]:
     """Mix images with noise, each at its own log SNR or all at one."""
-    alpha, sigma = alpha_sigma(log_snr[..., None, None, None].float())
+    alpha, sigma = alpha_sigma(log_snr[..., None, None, None].float().to(clean.device))
     return alpha * clean + sigma * noise
 
 

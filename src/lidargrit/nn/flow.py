@@ -100,7 +100,7 @@ def dopri5(velocity: Velocity, noise: Float[Tensor, "B C H W"], tolerance: float
         tolerance: largest error of a step, both in the units of the images and relative to their values.
 
     Raises:
-        ConfigError: the solver finds no step that is short enough.
+        ConfigError: the solver finds no step that is short enough, or the network gives a velocity that is no number.
 
     Source:
         Dormand and Prince, A family of embedded Runge-Kutta formulae, 1980; scipy's solver, whose norm of an error is
@@ -109,7 +109,12 @@ def dopri5(velocity: Velocity, noise: Float[Tensor, "B C H W"], tolerance: float
 
     def slope(now: float, state: np.ndarray) -> np.ndarray:
         image = torch.from_numpy(state).to(noise).view_as(noise)
-        return velocity(image, _times(now, image)).double().flatten().cpu().numpy()
+        found = velocity(image, _times(now, image)).double().flatten().cpu().numpy()
+        if not np.isfinite(found).all():  # the solver would try shorter steps for ever
+            raise ConfigError(
+                f"a flow that is not finite at time {now:.3g}", "a network whose training went well", "train it again"
+            )
+        return found
 
     start = noise.double().flatten().cpu().numpy()
     solved = solve_ivp(slope, (0.0, 1.0), start, method="RK45", t_eval=(1.0,), rtol=tolerance, atol=tolerance)

@@ -26,6 +26,13 @@ class Objective(nn.Module, ABC):
     Every step asks the objective once for each player, and moves the weights that this player's loss reaches before it
     asks for the next. The objective itself keeps the other players' weights out of a player's reach.
     """
+    reaches_all_weights: bool = True
+    """Whether every step's loss has a gradient in every weight; several processes then need not look for those without.
+
+    It is taken as false where there are players.
+    """
+    ray_buffers: tuple[str, ...] = ()
+    """Names of buffers that hold the angles of the sensor's rays: they are not taken over from another sensor."""
     additions: frozenset[str] = frozenset()
     """Settings of the stage that, if true, add weights; training may start from a stage that lacks them."""
     period: int = 1
@@ -58,7 +65,11 @@ class Objective(nn.Module, ABC):
 
         Training goes on from them; weights that the trained one lacks keep the values that they have.
         """
-        return dict(trained.state_dict())
+        weights = dict(trained.state_dict())
+        if not self.sensor.same_rays(trained.sensor):
+            for name in self.ray_buffers:
+                del weights[name]
+        return weights
 
     def warnings(self) -> list[str]:
         """Return lines that a person should read after a validation, such as that a codebook has collapsed."""

@@ -38,21 +38,21 @@ class PixelSampling:
     that are sampled with 1 and 1 follow the distribution whose likelihood the model computes.
 
     Args:
-        temperature: temperature of the components' weights; 1 leaves them unchanged, below 1 prefers the likelier
+        range_temperature: temperature of the components' weights; 1 leaves them unchanged, below 1 prefers the likelier
             surface.
-        noise: multiplier of the components' scales; 1 takes them as they are.
+        range_noise: multiplier of the components' scales; 1 takes them as they are.
         precision: number type of the networks' products. ``fp32`` is exact; ``bf16`` is quicker and moves some pixels;
             ``auto`` is ``bf16`` where the machine has instructions for it.
     """
 
-    temperature: float = 0.6
-    noise: float = 0.7
+    range_temperature: float = 0.6
+    range_noise: float = 0.7
     precision: Precision = "fp32"
 
     def __post_init__(self) -> None:
-        if not (self.temperature > 0 and self.noise > 0):
+        if not (self.range_temperature > 0 and self.range_noise > 0):
             raise ConfigError(
-                f"range_temperature={self.temperature}, range_noise={self.noise}",
+                f"range_temperature={self.range_temperature}, range_noise={self.range_noise}",
                 "positive numbers",
                 "take 1 for both to sample from the model's own distribution",
             )
@@ -243,7 +243,7 @@ class PixelDecoder(nn.Module):
             output = self.range.outputs([phase], guided, guide, mask, v)
             mixture = self.range.mixture(output, candidates)
             component, within = uniform[pixels].unbind(1)
-            sampled = mixture.sample(component[None], within[None], sampling.temperature, sampling.noise)[0]
+            sampled = mixture.sample(component[None], within[None], sampling.range_temperature, sampling.range_noise)[0]
             sampled = torch.where(condition.range_observed[pixels], condition.range_m[pixels], sampled)
             range_m[pixels] = torch.where(mask[pixels], sampled, 0.0)
             v[pixels] = range_m[pixels].log1p()

@@ -118,10 +118,10 @@ class VectorQuantiser(nn.Module):
             alive = (self.usage > 1e-3).unsqueeze(1)
             self.embedding.weight.copy_(torch.where(alive, self.code_sums / smoothed, self.embedding.weight))
         if self.restart_dead:
-            self._restart(flat, rng)
+            self._restart(flat, counts, rng)
 
-    def _restart(self, flat: Tensor, rng: torch.Generator | None) -> None:
-        dead = self.usage < self._dead_below()
+    def _restart(self, flat: Tensor, counts: Tensor, rng: torch.Generator | None) -> None:
+        dead = (self.usage < self._dead_below()) & (counts == 0)  # not those that this batch is about to look up
         candidates = sample_from_all(flat, len(dead), rng)
         even_use = self.usage.mean().expand_as(self.usage)
         self.embedding.weight.copy_(torch.where(dead.unsqueeze(1), candidates, self.embedding.weight))

@@ -34,6 +34,7 @@ class RaydropObjective(Objective):
     """
 
     additions = frozenset({"labels", "reflectance"})
+    reaches_all_weights = False  # some phases stand for all
 
     def __init__(self, network: RaydropNetwork, sensor: SensorModel) -> None:
         super().__init__(sensor)

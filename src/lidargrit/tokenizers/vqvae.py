@@ -63,9 +63,10 @@ class VqvaeConfig(TokenizerConfig):
         range_encoding: map from metres to [-1, 1]; ``linear`` is the paper's.
         raydrop_loss: whether a return mask is decoded beside the range, with its own loss (RL in the paper's ablation).
             Without it one channel learns the range image with its holes.
-        raydrop_weight: weight of that loss, lambda; 0.1 in the paper, 0.0001 in the released configuration for KITTI
-            odometry.
-        reconstruction: pixels that the error of the range covers, and its divisor. ``paper``: the clean range at
+        raydrop_weight: weight of that loss, lambda, if there is one; 0.1 in the paper, 0.0001 in the released
+            configuration for KITTI odometry.
+        reconstruction: pixels that the error of the range covers, and its divisor; without the raydrop loss it covers
+            all pixels. ``paper``: the clean range at
             returns, divided by the number of all pixels. ``reference``: a mask is sampled first, only its pixels count,
             and the sum is divided by the returns of each scan. ``returns``: the clean range at returns, divided by
             their number in each scan.

@@ -142,14 +142,18 @@ def with_budget(recipe: Recipe, flops: float) -> Recipe:
     costs, share, scaled = stage_costs(recipe), 1.0, recipe
     if not costs:
         return recipe
+    spent, best, best_spent = _flops_of(costs, scaled), None, 0
     for _ in range(_CORRECTIONS):
-        # What is prepared once, such as a reflow's pairs, does not shrink in proportion.
-        share *= flops / _flops_of(costs, scaled)
+        # What is prepared once, such as a reflow's pairs, does not grow or shrink in proportion.
+        share *= flops / spent
         trained = {name: _scaled(recipe.training[name], share) for name in costs}
         scaled = replace(recipe, training={**recipe.training, **trained})
-        if _flops_of(costs, scaled) <= flops * (1 + _OVERSPENT_AT_MOST):
+        spent = _flops_of(costs, scaled)
+        if best_spent < spent <= flops * (1 + _OVERSPENT_AT_MOST):  # whole batches may come no nearer
+            best, best_spent = scaled, spent
+        if abs(spent / flops - 1) <= _OVERSPENT_AT_MOST:
             break
-    return scaled
+    return best or scaled
 
 
 def _flops_of(costs: Mapping[str, StageCost], recipe: Recipe) -> int:

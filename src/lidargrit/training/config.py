@@ -126,12 +126,13 @@ class Recipe:
                 "one of them: the stages of a run include its tokenizer",
                 "leave tokenizer_from out",
             )
-        if self.fine_tune and self.stages_from is None:
-            raise ConfigError(
-                f"fine_tune={self.fine_tune[0]} without stages_from",
-                "the run whose weights are trained further",
-                "set stages_from as well",
-            )
+        for setting, stages in (("fine_tune", self.fine_tune), ("train_anew", self.train_anew)):
+            if stages and self.stages_from is None:
+                raise ConfigError(
+                    f"{setting}={stages[0]} without stages_from",
+                    "the run that has this stage",
+                    "set stages_from as well",
+                )
         if self.seed < 0:
             raise ConfigError(f"seed={self.seed}", "0 or more", "choose another seed")
 

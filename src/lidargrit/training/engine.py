@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import resource
 import sys
@@ -28,11 +29,11 @@ class Engine:
 
     Args:
         precision: ``fp32``, ``bf16``, or ``auto`` for ``bf16`` where the machine has instructions for it.
-        players_take_turns: whether a loss leaves some weights without gradients, as in adversarial training; processes
-            then do not wait for these gradients.
+        reaches_all_weights: whether every loss has a gradient in every weight; otherwise, as in adversarial training,
+            processes do not wait for gradients that do not come.
     """
 
-    def __init__(self, precision: Precision, players_take_turns: bool = False) -> None:
+    def __init__(self, precision: Precision, reaches_all_weights: bool = True) -> None:
         from lightning_fabric import Fabric  # noqa: PLC0415  takes a second, and only training needs it
         from lightning_fabric.plugins.environments.torchelastic import TorchElasticEnvironment  # noqa: PLC0415
         from lightning_fabric.strategies.ddp import DDPStrategy  # noqa: PLC0415
@@ -43,7 +44,7 @@ class Engine:
         _, processes = rank_and_world_size(None, None)
         if "LOCAL_RANK" in os.environ and processes > 1:
             here = int(os.environ.get("LOCAL_WORLD_SIZE", processes))
-            strategy = DDPStrategy(find_unused_parameters=players_take_turns)
+            strategy = DDPStrategy(find_unused_parameters=not reaches_all_weights)
             where = {"devices": here, "num_nodes": processes // here, "strategy": strategy}
             where["plugins"] = [TorchElasticEnvironment()]
         short = dtype_of(precision) == torch.bfloat16
@@ -130,12 +131,11 @@ class Engine:
                     return {**found, "loss": loss}, False
                 self._fabric.backward(found["loss"] / parts)
             terms = {name: terms.get(name, 0.0) + term.detach() / parts for name, term in found.items()}
-        if gradient_clip:
-            norm = self._fabric.clip_gradients(
-                self._objective, self._optimiser, max_norm=gradient_clip, error_if_nonfinite=False
-            )
-            if not bool(norm.isfinite()):
-                return {**terms, "loss": norm}, False
+        norm = self._fabric.clip_gradients(
+            self._objective, self._optimiser, max_norm=gradient_clip or math.inf, error_if_nonfinite=False
+        )
+        if not bool(norm.isfinite()):
+            return {**terms, "loss": norm}, False
         self._optimiser.step()
         self._optimiser.zero_grad()  # to None: the optimiser leaves alone what the next player does not move
         return self._means(terms), True

@@ -53,9 +53,7 @@ class Fit:
     plot: Callable[[Objective, Path], None] | None = None
 
     def __post_init__(self) -> None:
-        takes_turns = bool(self.objective.players)
-        self.engine = Engine(self.config.precision, takes_turns)
-        _check_parts(self.config, self.engine.world_size, takes_turns)
+        self.engine = engine_for(self.objective, self.config)
         prepare_for_training(self.objective, self.config.recompute, self.config.compile)
         self.optimiser = make_optimiser(self.objective, self.config)
         self.engine.set_up(self.objective, self.optimiser)
@@ -179,9 +177,20 @@ class Fit:
                 self.reporter.message(f"  WARNING: {warning}")
 
 
-def _check_parts(config: FitConfig, processes: int, players_take_turns: bool) -> None:
+def engine_for(objective: Objective, config: FitConfig) -> Engine:
+    """Return the engine that a stage is trained with.
+
+    Raises:
+        ConfigError: a process cannot divide its share of a batch into the parts asked for.
+    """
+    engine = Engine(config.precision, objective.reaches_all_weights and not objective.players)
+    check_parts(objective, config, engine.world_size)
+    return engine
+
+
+def check_parts(objective: Objective, config: FitConfig, processes: int) -> None:
     """Refuse a number of parts into which a process cannot divide its share of a batch."""
-    if config.accumulate > 1 and players_take_turns:
+    if config.accumulate > 1 and objective.players:
         raise ConfigError(
             f"accumulate={config.accumulate} for players who take turns",
             "1: they count their turns by the batches they see",

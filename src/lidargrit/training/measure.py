@@ -10,7 +10,7 @@ import torch
 from lidargrit.nn.blocks import prepare_for_training
 from lidargrit.training.compute import duration, training_flops, uniform_images
 from lidargrit.training.config import Recipe
-from lidargrit.training.engine import Engine
+from lidargrit.training.fit import engine_for
 from lidargrit.training.optimiser import make_optimiser
 
 _WARM_UP_STEPS, _TIMED_STEPS = 1, 3  # the first one allocates and chooses kernels
@@ -54,7 +54,7 @@ def measure(recipe: Recipe) -> list[Measured]:
         for stage in flops:  # those that are trained
             config, objective = recipe.training[stage], generator.objective(stage)
             prepare_for_training(objective, config.recompute, config.compile)
-            engine = Engine(config.precision, bool(objective.players))
+            engine = engine_for(objective, config)
             engine.set_up(objective, make_optimiser(objective, config))
             images = uniform_images(recipe.data.load_sensor(), config.batch_size // engine.world_size)
             images = images.to(engine.device)

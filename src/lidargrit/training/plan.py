@@ -8,11 +8,15 @@ from typing import Any
 import torch
 
 from lidargrit import configuration
+from lidargrit.errors import ConfigError
+from lidargrit.nn.blocks import prepare_for_training
+from lidargrit.nn.objective import Objective
 from lidargrit.nn.precision import Precision
 from lidargrit.sources import PreparedSource, open_to_train
 from lidargrit.training.compute import computing_time, training_flops
 from lidargrit.training.config import Recipe
-from lidargrit.training.optimiser import memory_of_weights
+from lidargrit.training.fit import check_parts
+from lidargrit.training.optimiser import make_optimiser, memory_of_weights
 from lidargrit.training.taken_stages import donors_of_stages, taken_stages
 
 
@@ -100,6 +104,34 @@ def check_data(recipe: Recipe) -> None:
                 source.images(recipe.data.load_sensor(), recipe.data)
 
 
+def check_stages(recipe: Recipe, processes: int = 1) -> dict[str, Objective]:
+    """Refuse settings of any stage that its training would refuse, and return the objectives, without values.
+
+    Args:
+        recipe: recipe whose stages they are.
+        processes: number of processes that share each batch.
+
+    Raises:
+        ConfigError: a stage without settings of its training, or settings that its networks cannot follow.
+    """
+    sensor = recipe.data.load_sensor()
+    with torch.device("meta"):  # sizes alone, without values, so that wide networks take no time
+        generator = recipe.build_generator(sensor).to("meta")
+        objectives = {name: generator.objective(name) for name in generator.stages}
+    for name, objective in objectives.items():
+        if name not in recipe.training:
+            raise ConfigError(
+                f"a recipe without training.{name}, a stage of model={recipe.generator}",
+                "the settings of every stage's training",
+                f"leave out the model.* that adds {name}, or begin with a recipe that trains it",
+            )
+        config = recipe.training[name]
+        check_parts(objective, config, processes)
+        prepare_for_training(objective, config.recompute, config.compile)
+        make_optimiser(objective, config)
+    return objectives
+
+
 def plan_training(recipe: Recipe) -> TrainingPlan:
     """Return the plan of a recipe's training; no scan is read, and nothing is written.
 
@@ -109,9 +141,9 @@ def plan_training(recipe: Recipe) -> TrainingPlan:
     """
     sensor = recipe.data.load_sensor()
     stages = []
-    with torch.device("meta"):  # sizes alone, without values, so that wide networks take no time
+    objectives = check_stages(recipe)
+    with torch.device("meta"):
         generator = recipe.build_generator(sensor).to("meta")
-        objectives = {name: generator.objective(name) for name in generator.stages}
     taken_stages(recipe, generator)  # raises where a stage does not fit
     donors = donors_of_stages(recipe, generator.stages)
     flops = training_flops(recipe)

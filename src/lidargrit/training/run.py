@@ -30,9 +30,11 @@ from lidargrit.training.checkpoint import fingerprint
 from lidargrit.training.config import FitConfig, Recipe
 from lidargrit.training.engine import Engine
 from lidargrit.training.fit import Fit
+from lidargrit.training.plan import check_stages
 from lidargrit.training.taken_stages import check_donor, taken_stages
 
-_WORDS = {"title", "published"}  # of a recipe; they change nothing that is computed
+# Settings of a recipe that change nothing that is computed, the last two of each stage.
+_NO_CHANGE, _NO_CHANGE_OF_STAGES = {"title", "published", "data.workers"}, ("checkpoint_every", "pictures_every")
 
 PlotProgress = Callable[[Generator, str, RangeImages, Path], None]
 """Plots what a half-trained generator makes at a stage, beside validation scans, into a file."""
@@ -65,6 +67,7 @@ def train(
     with ExitStack() as held, engine.lost_processes_reported():
         engine.by_first(lambda: check_folder(folder, recipe))
         engine.by_first(lambda: check_donor(recipe))
+        check_stages(recipe, engine.world_size)
         engine.by_first(lambda: held.enter_context(claim_folder(folder)))
         return _train(recipe, folder, reporter, plot, engine)
 
@@ -93,6 +96,7 @@ def _train(recipe: Recipe, folder: Path, reporter: Reporter, plot: PlotProgress 
                 trained = fit.run(train_images, val_images, f"training {stage}")
             generator.load_stage(stage, trained)
             built_on = fingerprint(trained)
+        generator.after_training()
     engine.by_first(lambda: generator.save(folder))
     return generator.cpu().eval()
 
@@ -122,7 +126,7 @@ def check_folder(folder: Path, recipe: Recipe) -> None:
                 f"{folder}, whose weights were {about['origin']}", "a run of train's", "choose another folder"
             )
         mine, other = configuration.leaves(ours), {**_defaults(recipe), **theirs}
-        settings = (mine.keys() | other.keys()) - _WORDS
+        settings = {name for name in mine.keys() | other.keys() if not name.endswith(_NO_CHANGE_OF_STAGES)} - _NO_CHANGE
         differing = [name for name in settings if (mine.get(name) or None) != (other.get(name) or None)]
         if differing:
             name = sorted(differing)[0]
