@@ -17,6 +17,7 @@ from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.files import claim_folder
 from lidargrit.generators import load_class
+from lidargrit.loading import DataConfig, prepare
 from lidargrit.nn.flops import flops_of
 from lidargrit.recipes import load_recipe
 from lidargrit.training import compute, computing_time, training_flops, with_budget
@@ -87,6 +88,14 @@ def test_wrong_words_are_told_before_anything_is_trained(systems, message, tmp_p
     with pytest.raises(LidarGritError, match=message):
         run_benchmark(systems, tmp_path, BENCHMARK)
     assert not list(tmp_path.rglob("*"))
+
+
+def test_scans_of_another_sensor_are_told_before_anything_is_trained(tmp_path):
+    config = DataConfig(train=(), val=(), columns=64, column_stride=8)
+    prepared = prepare("simulated:2:test", config, tmp_path / "narrow")
+    with pytest.raises(LidarGritError, match="narrow"):
+        run_benchmark(["marginal"], tmp_path / "table", replace(BENCHMARK, reference=str(prepared)))
+    assert not list((tmp_path / "table").rglob("run.json"))
 
 
 def test_training_flops_are_three_forward_passes_of_a_plain_stack():
@@ -220,7 +229,7 @@ def test_processes_make_a_table_that_can_be_extended(tmp_path, capfd):
     assert first == again
     assert (tmp_path / "table.html").read_text().count("<tr>") == 1 + 3 + 1
     for wrong, got in (
-        (["--add", "small", "-n", "5"], "--add with settings of its own (count)"),
+        (["--add", "small", "-n", "5"], "--add with settings of its own (-n)"),
         (["small", "--add", "demo"], "--add with systems before it"),
     ):
         capfd.readouterr()

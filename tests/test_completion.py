@@ -169,6 +169,18 @@ def test_two_images_whose_names_differ_in_letters_alone_are_two_files(tmp_path, 
     assert not recwarn.list
 
 
+def test_completions_of_no_scan_leave_the_folder_to_a_corrected_command(folders, tmp_path, capsys):
+    (tmp_path / "scans").mkdir()
+    (tmp_path / "scans/1.bin").write_bytes(b"no scan at all, of an odd length")
+    words = ["complete", str(tmp_path / "scans"), str(tmp_path / "out"), "--bad-scans", "skip", "--model"]
+    assert main([*words, "linear"]) == 2
+    assert "no usable scan" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    (tmp_path / "scans/1.bin").unlink()
+    NumpyArray.write(tmp_path / "scans/1.npz", unproject(street(SENSOR)))
+    assert main([*words, f"{folders}/run"]) == 0
+
+
 def test_upsample_adds_the_rows_that_lack(folders, tmp_path):
     words = ["upsample", f"{folders}/sparse", str(tmp_path / "out"), "--sensor", "vlp16"]
     assert main([*words, "--to", f"{folders}/sensor.json", "--model", "triangulation"]) == 0
@@ -253,7 +265,16 @@ def test_the_drops_of_a_model_are_scored_beside_independent_ones(folders):
         (["raydrop", "{}/scans", "--model", "{}/run", "--probability", "-1"], "--probability -1; wanted 0 or more"),
         (["complete", "{}/scans", "--model", "{}/run", "-n", "9999999"], "9,999,999 completions of each of 2 scans"),
         (["complete", "{}/scans", "--model", "{}/run", "--format", "las2"], "the format 'las2' to write"),
-        (["raydrop", "{}/scans", "--model", "linear"], "--model linear for a task for a model"),
+        (
+            ["raydrop", "{}/scans", "--model", "linear"],
+            "--model linear, a classical method, which takes pixels of which range and return are known; wanted a run",
+        ),
+        (["complete", "{}/scans", "--model", "linear", "--set", "a=1"], "--model linear for --set a=1; wanted a run"),
+        (
+            ["upsample", "{}/sparse", "--model", "linear", "--sensor", "vlp16", "--to", "os1_64", "-n", "3"],
+            "-n 3 for linear; wanted 1",
+        ),
+        (["upsample", "{}/sparse", "--model", "linear", "--sensor", "vlp16"], "name it with --to"),
         (["upsample", "{}/scans", "--model", "{}/run", "--sensor", "hdl64e_kitti_odometry"], "with 64 rows from"),
         (["upsample", "{}/flat.npy", "--model", "{}/run", "--sensor", "vlp16"], "a range image, which has no rows"),
         (

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
+import struct
+import zlib
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -174,6 +177,39 @@ def test_damaged_files_are_refused(tmp_path):
             Archive(path).check()
 
 
+def archive_of(lines: list[list], header: bytes = b"{}", scans: bytes = b"") -> bytes:
+    """Return a file whose checksums hold, whatever its index says."""
+    index = zlib.compress(b"".join(json.dumps(line).encode() + b"\n" for line in lines))
+    start = struct.pack("<4sII", b"LGZ2", len(header), zlib.crc32(header)) + header + scans
+    return start + index + struct.pack("<QI4s", len(start), zlib.crc32(index), b"2ZGL")
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        [["a", 5, -1, 1]],
+        [["a", 5, 2**32, 1]],
+        [["a", 2**64, 0, 1]],
+        [["a", 2**64 - 1, 0, 1], ["b", 6, 0, 1]],  # together 5, as the scans, where sums have 64 bits
+        [["a", 2**63, 0, 1], ["b", 2**63 + 5, 0, 1]],
+    ],
+)
+def test_an_index_of_numbers_that_cannot_be_is_refused(tmp_path, lines):
+    path = tmp_path / "scans.lgz"
+    path.write_bytes(archive_of([["a", 5, zlib.crc32(b"hello"), 1]], scans=b"hello"))
+    assert Archive(path).read(0) == b"hello"
+    path.write_bytes(archive_of(lines, scans=b"hello"))
+    with pytest.raises(ScanError, match="cut off or altered"):
+        Archive(path).check()
+
+
+def test_an_index_into_a_file_without_scans_is_refused_in_words(tmp_path, capsys):
+    path = tmp_path / "scans.lgz"
+    path.write_bytes(archive_of([]))
+    assert main(["decompress", str(path), str(tmp_path / "out"), "--only", "0"]) == 2
+    assert f"no index: {path} holds no scans" in the_one_line(capsys.readouterr().err, "decompress")
+
+
 def test_an_interrupted_file_goes_on_and_ends_as_an_uninterrupted_one(tmp_path):
     rng, names = np.random.default_rng(0), ["one", "bad", "two", "three"]
     content = {name: b"" if name == "bad" else rng.bytes(200) for name in names}
@@ -264,6 +300,84 @@ def test_the_commands_restore_what_was_compressed(tmp_path, capsys):
     assert "cut off or altered" in error
     assert error.count("\n") == 1
     assert not (tmp_path / "nothing").exists()
+
+
+@pytest.fixture
+def two_sources(tmp_path, monkeypatch) -> list[str]:
+    """Save a run, and two folders of images of the same names, of which the second is one scan shorter."""
+    monkeypatch.chdir(tmp_path)
+    made().save(tmp_path / "run")
+    for name, images in (("a", scans(3).range_m), ("b", scans(3).range_m.flip(0)[:2])):
+        (tmp_path / name).mkdir()
+        for index, range_m in enumerate(images):
+            np.save(tmp_path / name / f"{index}.npy", range_m.numpy())
+    return ["a", "b"]
+
+
+def compress(source: str, out: str, *words: str) -> int:
+    return main(["compress", source, out, "--model", "run", "--step-mm", "20", *words])
+
+
+def test_another_file_of_the_same_name_is_not_taken_for_the_one_before(two_sources, capsys):
+    for source in two_sources:
+        assert compress(source, f"{source}/scans.lgz", "-n", "1") == 0
+    command = ["out", "--model", "run"]
+    assert main(["decompress", "a/scans.lgz", *command]) == 0
+    assert main(["decompress", "a/scans.lgz", *command]) == 0, "the same goes on"
+    capsys.readouterr()
+    assert main(["decompress", "b/scans.lgz", *command]) == 2
+    assert "out, which holds other scans" in the_one_line(capsys.readouterr().err, "decompress")
+
+
+def test_an_interrupted_file_goes_on_only_with_the_options_that_say_which_scans(two_sources, capsys, monkeypatch):
+    whole, calls = ScanCodec.compress, []
+
+    def interrupted(self, image):
+        calls.append(image)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return whole(self, image)
+
+    monkeypatch.setattr(ScanCodec, "compress", interrupted)
+    assert compress("a", "scans.lgz") != 0
+    for source, words, changed in (
+        ("b", [], "source"),
+        ("a", ["-n", "2"], "max_scans"),
+        ("b", ["-n", "2"], "source, max_scans"),
+    ):
+        capsys.readouterr()
+        assert compress(source, "scans.lgz", *words) == 2
+        line = the_one_line(capsys.readouterr().err, "compress")
+        assert f"an unfinished file with scans of other options ({changed})" in line
+    assert compress("a", "scans.lgz", "--bad-scans", "skip") == 0, "what it stopped at may be left out"
+    assert compress("a", "whole.lgz") == 0
+    assert Path("scans.lgz").read_bytes() == Path("whole.lgz").read_bytes()
+    assert not Path("scans.lgz.unfinished").exists()
+
+
+def test_one_that_may_have_left_scans_out_does_not_go_on_as_one_that_refuses_them(tmp_path):
+    path = tmp_path / "scans.lgz"
+    for begun, then in (("skip", "refuse"), ("refuse", "skip")):
+        with suppress(KeyboardInterrupt), writing(path, {}, {"bad_scans": begun}) as writer:
+            writer.add("one", b"one", 1)
+            raise KeyboardInterrupt
+        if begun == "skip":
+            with pytest.raises(OutputError, match=r"scans of other options \(bad_scans\)"):
+                writing(path, {}, {"bad_scans": then}).__enter__()
+        with writing(path, {}, {"bad_scans": "skip"}) as writer:
+            assert writer.go_on(iter(["one"])) == 1
+
+
+def test_the_formats_that_are_named_are_those_it_writes(tmp_path, two_sources, capsys):
+    assert compress("a", "scans.lgz", "-n", "1") == 0
+    for kind in ("kitti_odometry", "docx"):
+        capsys.readouterr()
+        assert main(["decompress", "scans.lgz", "out", "--model", "run", "--format", kind]) == 2
+        got, wanted, _ = the_one_line(capsys.readouterr().err, "decompress").split(";")
+        assert f"--format {kind}" in got
+        assert "image, " in wanted
+        assert "ply" in wanted
+        assert "kitti_odometry" not in wanted
 
 
 def test_functions_that_every_machine_computes_alike_are_right():

@@ -8,7 +8,7 @@ from typing import Literal
 import pytest
 
 from lidargrit import _discovery
-from lidargrit.configuration import from_json, leaves, override, to_json
+from lidargrit.configuration import from_json, leaves, name_and_settings, override, to_json
 from lidargrit.errors import ConfigError
 from lidargrit.generators import load_class
 from lidargrit.loading import DataConfig
@@ -187,3 +187,18 @@ def test_a_setting_is_known_by_its_former_name():
     recipe = load_recipe("small", ["data.variant=reference"])
     assert recipe.data.projection_variant == "reference"
     assert leaves({"data": {"variant": "reference"}}) == {"data.projection_variant": "reference"}
+
+
+@pytest.mark.parametrize(
+    ("word", "name", "settings"),
+    [
+        ("pretrained", "pretrained", []),
+        ("small:steps=32,eta=0.5", "small", ["steps=32", "eta=0.5"]),
+        ("runs/12:30", "runs/12:30", []),
+        ("runs/12:30:steps=32", "runs/12:30", ["steps=32"]),
+        ("runs/a=b", "runs/a=b", []),
+        ("small:", "small:", []),
+    ],
+)
+def test_a_name_may_hold_colons_beside_its_settings(word, name, settings):
+    assert name_and_settings(word) == (name, settings)

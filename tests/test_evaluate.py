@@ -184,11 +184,20 @@ def test_words_of_reading_scans_are_obeyed_or_refused(tmp_path, capsys):
     assert read_config(ScanSettings.read(["data.max_scans=7"]), max_scans=3).max_scans == 3
     report = ["--report", str(tmp_path / "r.html")]
     others = ["--variant", "exact"], ["--sensor", "vlp16"], ["--protocol", "r2dm"], ["--metrics", "bev_jsd"]
-    for option in (report, ["--pixel-statistics"], *others):
-        assert main(["evaluate", "pretrained", "simulated:2:test", *option]) == 2
+    more = ["--intervals or --groups", ""], ["--seed", "5"]
+    for option in (report, ["--pixel-statistics"], *others, *more):
+        words = ["--groups", "4"] if " or " in option[0] else option
+        assert main(["evaluate", "pretrained", "simulated:2:test", *words]) == 2
         error = the_one_line(capsys.readouterr().err, "evaluate")
         assert f"got {option[0]} for the run pretrained, of which only reconstructions are measured" in error
     assert not (tmp_path / "r.html").exists()
+    for words, got in (
+        (["samples", "--tables", "a.json"], "--tables and samples"),
+        (["a", "b", "--format", "latex"], "--format latex without --tables"),
+        (["a", "b", "--report", str(tmp_path / "r.png")], "r.png, which will hold HTML"),
+    ):
+        assert main(["evaluate", *words]) == 2
+        assert got in the_one_line(capsys.readouterr().err, "evaluate")
 
 
 def test_files_of_one_name_are_told_apart_and_rows_complete_each_other(card, tmp_path):
@@ -363,7 +372,7 @@ def test_the_command_line_writes_scores_page_and_table(tmp_path, capsys, sets):
         (["evaluate", sets[0]], "alone; wanted samples and what they are compared with"),
         ([*words, "--weights", "pointnet"], "NAME=FILE"),
         ([*words, "--protocol", "r3dm"], "wanted one of"),
-        ([*words, "--groups", "2"], "half"),
+        ([*words, "--groups", "2"], "--groups 2"),
     ):
         assert main(wrong) != 0
-        assert message in capsys.readouterr().err.replace("halves", "half")
+        assert message in capsys.readouterr().err

@@ -209,6 +209,45 @@ def test_bad_scans_are_refused_or_left_out(samples, tmp_path):
         export_scans(str(scans), tmp_path / "none", "ply", DataConfig(bad_scans="skip"))
 
 
+@pytest.mark.parametrize("bad_scans", ["refuse", "skip"])
+def test_an_export_of_no_scan_leaves_the_folder_to_a_corrected_command(samples, tmp_path, bad_scans):
+    scans, out, ours = tmp_path / "scans", tmp_path / "out", tmp_path / "ours"
+    export_scans(str(samples), scans, "bin")
+    good = {path: path.read_bytes() for path in scans.glob("*.bin")}
+    for path in good:
+        path.write_bytes(b"no scan at all, of an odd length")
+    ours.mkdir()
+    for folder in (out, ours):
+        with pytest.raises((DataError, ScanError)):
+            export_scans(str(scans), folder, "ply", DataConfig(bad_scans=bad_scans))
+    assert not out.exists()
+    assert not list(ours.iterdir())
+    for path, data in good.items():
+        path.write_bytes(data)
+    assert export_scans(str(scans), ours, "pcd") == 2
+    for path in (*good, *ours.glob("*.pcd")):
+        path.write_bytes(b"no scan at all, of an odd length")
+    (ours / "000000.pcd").unlink()
+    with pytest.raises(ScanError):
+        export_scans(str(scans), ours, "pcd")
+    assert (ours / MANIFEST).is_file(), "of the scan that is there"
+
+
+def test_range_images_of_one_sensor_are_not_taken_for_those_of_another(samples, tmp_path, capsys):
+    np.save(tmp_path / "image.npy", np.full((16, 1800), 9, np.float32))
+    vlp16 = load_sensor("vlp16")
+    (tmp_path / "other.json").write_text(json.dumps({**vlp16.to_json(), "name": "other", "range_max_m": 50.0}))
+    words = ["export", str(tmp_path / "image.npy"), str(tmp_path / "out"), "--sensor"]
+    assert main([*words, "vlp16"]) == 0
+    assert main([*words, "vlp16"]) == 0, "the same command"
+    assert main([*words, str(tmp_path / "other.json")]) == 2
+    assert "which holds other scans or another format" in capsys.readouterr().err
+    for source, kind in (("simulated:1", "scans"), (str(samples), "generated range images")):
+        with pytest.raises(ConfigError, match=f"--sensor vlp16 for .*, which holds {kind}; .*; leave --sensor out"):
+            export_scans(source, tmp_path / "none", "ply", sensor=vlp16)
+    assert not (tmp_path / "none").exists()
+
+
 def test_other_formats_and_sources_are_refused(samples, tmp_path):
     assert {"kitti_bin", "pcd", "ply", "las", "numpy_array", "kitti_odometry"} <= set(kinds())
     for kind in ("plx", "ouster_pcap", "pcap", ""):

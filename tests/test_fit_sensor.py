@@ -10,8 +10,8 @@ import torch
 from lidargrit import simulate
 from lidargrit.cli import main
 from lidargrit.datasets import open_dataset
-from lidargrit.errors import ConfigError, LidarGritError, ScanError
-from lidargrit.fitting import SensorFit, fit_sensor, fit_sensor_to_source
+from lidargrit.errors import ConfigError, ScanError
+from lidargrit.fitting import SensorFit, fit_sensor, fit_sensor_to_dataset
 from lidargrit.fitting.elevations import nearest_row, rows_of_rings
 from lidargrit.fitting.limits import quantum_m, range_limits_m
 from lidargrit.fitting.table import as_table
@@ -204,9 +204,14 @@ def test_refuses_rings_seen_from_another_place():
 def test_refuses_no_scans_and_no_name():
     with pytest.raises(ConfigError, match="no scan"):
         fit_sensor([])
-    for name, count in (("", 1), ("a", 0)):
-        with pytest.raises(LidarGritError):
-            fit_sensor_to_source("simulated:1", name, count)
+    for name, count, message in ((" ", 1, "--name ' '; wanted a name"), ("a", -1, "-n -1; wanted .* or 0 for all")):
+        with pytest.raises(ConfigError, match=message):
+            fit_sensor_to_dataset(open_dataset("simulated:1"), name, count)
+
+
+def test_no_number_of_scans_takes_all(folder):
+    assert fit_sensor_to_dataset(open_dataset(str(folder)), num_scans=0).num_scans == 2
+    assert fit_sensor_to_dataset(open_dataset(str(folder)), num_scans=1).num_scans == 1
 
 
 @pytest.fixture(scope="module")
@@ -239,7 +244,7 @@ def test_the_verb_writes_a_sensor_and_a_picture_that_others_accept(folder, tmp_p
     assert sorted(path.name for path in tmp_path.iterdir()) == ["fit.png", "mine.json"]
 
 
-@pytest.mark.parametrize("arguments", [["-o", "mine.txt"], ["-n", "0"], ["--name", " "]], ids=str)
+@pytest.mark.parametrize("arguments", [["-o", "mine.txt"], ["-n", "-1"], ["--name", " "]], ids=str)
 def test_the_verb_refuses_wrong_words_in_one_line(folder, tmp_path, monkeypatch, capsys, arguments):
     monkeypatch.chdir(tmp_path)
     assert main(["fit-sensor", str(folder), *arguments]) == 2

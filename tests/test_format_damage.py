@@ -199,6 +199,45 @@ def test_archives_whose_directory_is_the_bomb(refused):
         assert "no directory of at most 65536 bytes at its end" in refused(buffer.getvalue(), "a.npz")
 
 
+def bombs_of_arrow() -> dict[str, bytes]:
+    """Return sweeps of 40 points whose other content unpacks to far more, unseen by who adds up their buffers."""
+    pa = pytest.importorskip("pyarrow")
+    ipc = pytest.importorskip("pyarrow.ipc")
+
+    def stream(batch, metadata=None) -> bytes:
+        with BytesIO() as buffer:
+            with ipc.new_stream(buffer, batch.schema, options=ipc.IpcWriteOptions(compression="zstd")) as writer:
+                writer.write_batch(batch, custom_metadata=metadata)
+            return b"ARROW1\0\0" + buffer.getvalue()
+
+    def columns(count: int) -> dict[str, np.ndarray]:
+        return dict.fromkeys("xyz", np.ones(count)) | dict.fromkeys(("intensity", "laser_number"), np.ones(count, "u1"))
+
+    unrelated = pa.DictionaryArray.from_arrays(np.zeros(40, "i1"), np.zeros(30_000_000))
+    with_dictionary = stream(pa.record_batch(columns(40) | {"note": unrelated}))
+    old = bytearray(stream(pa.record_batch(columns(10_000_000)), {"ARROW:experimental_compression": "ZSTD"}))
+    message = 8 + 8 + struct.unpack_from("<i", old, 8 + 4)[0] + 8  # behind the file's mark and the schema
+
+    def field(table: int, which: int) -> tuple[int, int]:
+        """Return where a flatbuffers table says where a field lies, and where it lies."""
+        entry = table - struct.unpack_from("<i", old, table)[0] + 4 + 2 * which
+        return entry, table + struct.unpack_from("<H", old, entry)[0]
+
+    root = message + struct.unpack_from("<I", old, message)[0]
+    struct.pack_into("<h", old, field(root, 0)[1], 3)  # version 4
+    header = field(root, 2)[1]
+    batch = header + struct.unpack_from("<I", old, header)[0]
+    struct.pack_into("<H", old, field(batch, 3)[0], 0)  # no compression, where version 5 has it
+    return {"dictionary": with_dictionary, "old compression": bytes(old)}
+
+
+@pytest.mark.parametrize("kind", ["dictionary", "old compression"])
+def test_sweeps_that_would_unpack_to_far_more_where_no_size_is_counted(refused, kind):
+    data = bombs_of_arrow()[kind]
+    assert len(data) < 200_000
+    assert "a column with a dictionary, or packed as in 2020" in refused(data, "a.feather")
+
+
 def test_pickles_are_not_loaded(refused, tmp_path):
     np.save(tmp_path / "o.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
     assert "dtype('O')" in refused((tmp_path / "o.npy").read_bytes(), "a.npy")

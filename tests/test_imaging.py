@@ -86,8 +86,9 @@ def test_orders_that_are_none_of_firing_are_recognised(fired):
         image = project(scan, HDL64E, "spherical")
         assert (image.return_mask == by_ring.return_mask).float().mean() > 0.999, name
         for variant in ("exact", "reference"):
-            with pytest.raises(ScanError, match=r"data\.projection=spherical"):
+            with pytest.raises(ScanError, match=r"where the command lets you: data\.projection=spherical") as refusal:
                 project(scan, HDL64E, variant=variant)
+            assert "--" not in str(refusal.value), "complete, likelihood and others have no such option"
             assert inspect(scan, HDL64E, variant=variant).problems, (name, variant)
 
 
@@ -145,8 +146,9 @@ def test_rings_of_another_sensor_are_refused_with_the_cure():
     x, y, z = scan.points_xyz_m.double().unbind(dim=1)
     rays = load_sensor("vlp16").elevation_rad[:, 0].double()
     scan = replace(scan, ring=(torch.atan2(z, torch.hypot(x, y))[:, None] - rays).abs().argmin(dim=1))
-    with pytest.raises(ScanError, match=r"vlp16.*fit-sensor"):
+    with pytest.raises(ScanError, match=r"or a model of that sensor: .*vlp16.*fit-sensor") as refusal:
         project(scan, HDL64E)
+    assert "--" not in str(refusal.value), "no option that only some commands have"
     assert "fewer lasers" in doubts_about_rays(scan, load_sensor("os1_64"), "spherical")
     assert not doubts_about_rays(scan, load_sensor("vlp16"), "spherical")
 

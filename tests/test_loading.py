@@ -1,7 +1,6 @@
 """Prepared range images: pixels of projecting, found again, never stale, never half, whoever made which part."""
 
 import os
-import resource
 import shutil
 import subprocess
 import sys
@@ -28,7 +27,6 @@ from lidargrit.loading import (
     workers,
 )
 from lidargrit.loading import prepare as prepare_function
-from lidargrit.loading.shards import LocalBytes
 from lidargrit.projection import project
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import load_sensor
@@ -400,14 +398,3 @@ def test_overlap_is_told_by_file_by_pixels_and_by_drive(tree, tmp_path):
     halves = [load_range_images((f"{tree}:00{share}",), SIMULATED) for share in ("[:50%]", "[50%:]")]
     assert overlap_of(*halves) == f"both have scans of {open_dataset(f'{tree}:00').recording(0)}"
     assert overlap_of(*(load_range_images((f"simulated:1:{split}",), SIMULATED) for split in ("train", "val"))) == ""
-
-
-def test_more_shards_than_a_process_may_open_are_opened_all_the_same(tmp_path):
-    (tmp_path / "shard").write_bytes(b"bytes")
-    allowed, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-    try:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (min(128, allowed), most))
-        kept = [LocalBytes(tmp_path / "shard") for _ in range(150)]
-        assert bytes(kept[-1].read(1, 3)) == b"yt"
-    finally:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, most))

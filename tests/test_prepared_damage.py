@@ -2,6 +2,7 @@
 
 import json
 import os
+import resource
 import shutil
 import sys
 
@@ -10,6 +11,7 @@ import pytest
 
 from lidargrit.errors import DataError
 from lidargrit.loading import DataConfig, PreparedImages, damaged_shards, prepare
+from lidargrit.loading.shards import LocalBytes
 
 prepare_module = sys.modules[prepare.__module__]
 CONFIG = DataConfig(workers=1, columns=512, column_stride=8)
@@ -115,3 +117,14 @@ def test_a_pipe_in_a_prepared_folder_does_not_hang(folder, name):
     os.mkfifo(folder / name)
     with pytest.raises(DataError, match=rf"{name}, which cannot be read \(not a file\)"):
         PreparedImages(str(folder))
+
+
+def test_more_shards_than_a_process_may_open_are_opened_all_the_same(tmp_path):
+    (tmp_path / "shard").write_bytes(b"bytes")
+    allowed, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    try:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (min(128, allowed), most))
+        kept = [LocalBytes(tmp_path / "shard") for _ in range(150)]
+        assert bytes(kept[-1].read(1, 3)) == b"yt"
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, most))

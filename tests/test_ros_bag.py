@@ -1,16 +1,21 @@
 """ROS recordings: what the libraries' own writers write is read, point for point; damaged files are refused."""
 
 import sqlite3
+import tracemalloc
 
 import numpy as np
 import pytest
 
 from lidargrit.errors import ScanError
-from lidargrit.formats import count_scans, read_scan
+from lidargrit.formats import count_scans, read_scan, ros_bag
 
 rosbag1 = pytest.importorskip("rosbags.rosbag1")
 typesys = pytest.importorskip("rosbags.typesys")
 mcap_writer = pytest.importorskip("mcap.writer")
+records = pytest.importorskip("mcap.records")
+data_stream = pytest.importorskip("mcap.data_stream")
+zstandard = pytest.importorskip("zstandard")
+lz4_frame = pytest.importorskip("lz4.frame")
 
 TYPE, POINTS = "sensor_msgs/msg/PointCloud2", 40
 ROWS = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("ring", "<u2"), ("time", "<f8")])
@@ -120,4 +125,109 @@ def test_a_view_in_place_of_the_messages_is_refused(tmp_path):
         database.execute(f"CREATE VIEW messages AS {endless}")
     database.close()
     with pytest.raises(ScanError, match="no table messages"):
+        read_scan(path)
+
+
+def test_a_computed_message_that_is_too_large_is_refused(tmp_path):
+    path = tmp_path / "computed.db3"
+    with sqlite3.connect(path) as database:
+        database.execute("CREATE TABLE topics(id INTEGER, name TEXT, type TEXT)")
+        computed = "data TEXT AS (hex(zeroblob(400000000)))"
+        database.execute(f"CREATE TABLE messages(topic_id INTEGER, timestamp INTEGER, {computed})")
+        database.execute("INSERT INTO topics VALUES(1, '/top', ?)", (TYPE,))
+        database.execute("INSERT INTO messages VALUES(1, 1)")
+    database.close()
+    with pytest.raises(ScanError, match="too big"):
+        read_scan(path)
+
+
+PACK = {
+    "": bytes,
+    "zstd": zstandard.compress,
+    "zstd of unknown size": lambda data: zstandard.ZstdCompressor(write_content_size=False).compress(data),
+    "lz4": lz4_frame.compress,
+    "lz4 of unknown size": lambda data: lz4_frame.compress(data, store_size=False),
+}
+
+
+def message_record(data: bytes, channel: int = 1) -> bytes:
+    stream = data_stream.RecordBuilder()
+    records.Message(channel_id=channel, data=data, log_time=5, publish_time=5, sequence=0).write(stream)
+    return stream.end()
+
+
+def write_mcap(path, content: bytes, packing: str, in_chunk=None, in_index=None, chunk_in_summary: bool = False):
+    """Write a recording of one chunk, whose size may be another in its own header and in the index."""
+    packed, compression = PACK[packing](content), packing.partition(" ")[0]
+    size = len(content) if in_chunk is None else in_chunk
+    stream = data_stream.RecordBuilder()
+    records.Chunk(compression, packed, 5, 5, 0, size).write(stream)
+    chunk = stream.end()
+    start = b"\x89MCAP0\r\n"
+    stream = data_stream.RecordBuilder()
+    records.Schema(data=b"", encoding="ros2msg", id=1, name=TYPE).write(stream)
+    for number, topic in ((1, "/top"), (2, "/rear")):
+        records.Channel(id=number, topic=topic, message_encoding="cdr", metadata={}, schema_id=1).write(stream)
+    size = len(content) if in_index is None else in_index
+    records.ChunkIndex(len(chunk), len(start), compression, len(packed), 5, 0, {1: 0}, 5, size).write(stream)
+    records.Statistics(0, 2, {1: 3}, 1, 3, 5, 5, 0, 1).write(stream)
+    begins = len(start) + len(chunk)
+    records.Footer(summary_crc=0, summary_offset_start=0, summary_start=begins).write(stream)
+    path.write_bytes(start + chunk + (chunk if chunk_in_summary else b"") + stream.end() + start)
+
+
+def refused_within(path, megabytes: int) -> str:
+    count_scans(path)  # loads what the reader needs, which is not to be counted
+    ros_bag._opened.cache_clear()
+    tracemalloc.start()
+    with pytest.raises(ScanError) as refusal:
+        read_scan(path)
+    most_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most_bytes < megabytes * 1_000_000
+    return str(refusal.value)
+
+
+@pytest.mark.parametrize("packing", PACK)
+def test_packed_chunks_are_read(packing, tmp_path):
+    store = typesys.get_typestore(typesys.Stores.ROS2_FOXY)
+    raw = [bytes(store.serialize_cdr(cloud(store, number), TYPE)) for number in range(3)]
+    write_mcap(tmp_path / "a.mcap", b"".join(map(message_record, raw)), packing)
+    assert count_scans(tmp_path / "a.mcap") == 3
+    for number in range(3):  # all at the same time
+        assert np.array_equal(read_scan(tmp_path / "a.mcap", number).points_xyz_m[:, 0].numpy(), rows(number)["x"])
+
+
+@pytest.mark.parametrize("packing", PACK)
+@pytest.mark.parametrize("sizes", [{"in_index": 1000}, {"in_chunk": 1000}, {"in_chunk": 1000, "in_index": 1000}])
+def test_a_chunk_that_unpacks_to_more_than_the_index_says_is_refused(packing, sizes, tmp_path):
+    write_mcap(tmp_path / "a.mcap", message_record(bytes(30_000_000)), packing, **sizes)
+    before_it_is_unpacked = packing and "in_index" in sizes
+    said = refused_within(tmp_path / "a.mcap", 10 if before_it_is_unpacked else 200)
+    assert "a chunk that" in said or "decompress" in said
+
+
+def test_a_chunk_in_the_summary_is_refused_before_it_is_unpacked(tmp_path):
+    write_mcap(tmp_path / "a.mcap", message_record(bytes(30_000_000)), "zstd", in_index=1000, chunk_in_summary=True)
+    assert "a chunk in its summary" in refused_within(tmp_path / "a.mcap", 10)
+
+
+def test_a_chunk_of_very_many_messages_makes_no_list_of_them(tmp_path):
+    write_mcap(tmp_path / "a.mcap", message_record(b"", 2) * 50_000 + message_record(b"damaged"), "zstd")
+    refused_within(tmp_path / "a.mcap", 5)
+
+
+def test_a_bag_whose_chunk_unpacks_to_too_much_is_refused(tmp_path, monkeypatch):
+    store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
+    path = tmp_path / "a.bag"
+    bag = rosbag1.Writer(path)
+    bag.set_compression(rosbag1.Writer.CompressionFormat.LZ4)
+    with bag:
+        top = bag.add_connection("/top", TYPE, typestore=store)
+        for number in range(2):
+            bag.write(top, 10, store.serialize_ros1(cloud(store, number), TYPE))
+    for number in range(2):
+        assert np.array_equal(read_scan(path, number).points_xyz_m[:, 0].numpy(), rows(number)["x"])
+    monkeypatch.setattr(ros_bag, "BYTES_AT_MOST", 1000)
+    with pytest.raises(ScanError, match="that unpacks to more than any recorder's"):
         read_scan(path)

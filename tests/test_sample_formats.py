@@ -3,6 +3,7 @@
 import contextlib
 import pickle
 import zipfile
+from pathlib import Path
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from lidargrit.errors import DataError, ScanError, UnknownNameError
 from lidargrit.projection import unproject
 from lidargrit.sources import open_images, open_source
 from lidargrit.sources.sample_formats import (
+    _paths,
     is_tensor_folder,
     load_sample_format,
     read_tensor,
@@ -91,6 +93,16 @@ def test_a_file_may_hold_a_batch_of_scans(tmp_path):
     images = read_tensor_folder(tmp_path, count=2)
     assert len(images) == 2
     assert torch.allclose(images.batch([1]).range_m[0], scan(1)[0], atol=0.01)
+
+
+def test_files_of_the_same_number_are_in_the_order_of_their_names(tmp_path, monkeypatch):
+    for name in ("b_10.pth", "b_2.pth", "a_2.pth", "a_10.pth"):
+        (tmp_path / name).write_bytes(b"")
+    plain = Path.glob
+    for turned in (False, True):  # file systems have orders of their own
+        listed = sorted(plain(tmp_path, "*.pth"), reverse=turned)
+        monkeypatch.setattr(Path, "glob", lambda *_, listed=listed: iter(listed))
+        assert [path.stem for path in _paths(tmp_path)] == ["a_2", "b_2", "a_10", "b_10"]
 
 
 def test_the_small_images_of_lidargrit_are_by_ring(tmp_path):

@@ -73,7 +73,11 @@ def test_range_images_in_npy_files_are_a_set_of_a_named_sensor(tmp_path, capsys)
     words = ["evaluate", str(folder), str(folder), "--metrics", "bev_jsd", "--intervals", "0", "--json", "scores.json"]
     assert main([*words, "--overwrite"]) == 2
     assert "got range images of 16x90 in" in (told := capsys.readouterr().err)
-    assert "name it with --sensor NAME or FILE.json" in told
+    assert "name it with --sensor NAME or FILE.json, which may have other columns" in told
+    assert main(["export", str(folder), str(tmp_path / "points")]) == 2
+    assert "--set" not in capsys.readouterr().err, "which export does not have"
+    (tmp_path / "narrow.json").write_text(json.dumps(sensor.to_json()))
+    assert main(["export", str(folder), str(tmp_path / "points"), "--sensor", str(tmp_path / "narrow.json")]) == 0
     out = tmp_path / "scores.json"
     named = ["--sensor", "vlp16", "--set", "data.columns=90"]
     assert main([*words[:-1], str(out), *named]) == 0
@@ -155,12 +159,11 @@ def test_nobody_else_asks_what_a_source_is():
             if asked := sorted(names & asking):
                 found[path.relative_to(root).as_posix()] = asked
     assert found == {
-        "fitting/__init__.py": ["open_dataset"],  # below the room of sources; takes points of scans only
         "publishing/__init__.py": ["is_sample_folder"],
     }
 
 
-@pytest.mark.parametrize("verb", ["prepare", "inspect"])
+@pytest.mark.parametrize("verb", ["prepare", "inspect", "fit-sensor"])
 def test_a_verb_that_wants_points_says_what_a_source_holds_instead(verb, capsys):
     assert main([verb, "pretrained"]) == 2
     assert "pretrained, which holds a trained model; wanted the points of scans" in capsys.readouterr().err

@@ -9,6 +9,7 @@ import matplotlib as mpl
 import pytest
 import torch
 
+from lidargrit.cli import main
 from lidargrit.errors import ConfigError, OutputError
 from lidargrit.generators import load_class
 from lidargrit.reporting import Reporter
@@ -134,3 +135,17 @@ def test_sets_of_one_name_are_told_apart_and_runs_of_other_rays_reconstruct_noth
     sets = load_scan_sets([str(samples[0]), "pretrained"], 1, reporter=Listener(told))
     assert [one.name for one in sets][1:] == ["pretrained: generated"]
     assert any("pretrained: no reconstructions, for its sensor has other rays" in text for text in told)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["-o", "a.svg"], "got a.svg, which is to hold a picture or a page; wanted a name in .png or .html"),
+        (["-o", "a.png", "--model", "nosuch"], "got --model nosuch with --color range; wanted --color surprise"),
+    ],
+)
+def test_words_that_the_command_would_not_follow_are_refused(words, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["view", "simulated:1", *words]) == 2
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

@@ -25,6 +25,7 @@ METRICS = ("sliced_wasserstein", "point_cloud_jsd", "range_histogram_per_ring", 
 NAMES = {
     "small_pixels": "LidarGRIT with a pixel decoder",
     "small": "LidarGRIT",
+    "multiscale_small": "pixel decoder without tokens",
     "maskgit_small": "MaskGIT",
     "dusty_small": "DUSty-I",
     "dcgan_small": "DCGAN",
@@ -37,8 +38,8 @@ NAMES = {
     "lidm_small": "LiDM",
     "lidm_shared_small": "LiDM over LidarGRIT's tokens",
 }
-MARKERS = "osD^v<>PX*hdp"
-COLOURS = colormaps["tab20"].colors[:13]  # one for each name
+MARKERS = "osD^v<>PX*hdp8"
+COLOURS = colormaps["tab20"].colors[:14]  # one for each name
 
 
 class Cell(NamedTuple):

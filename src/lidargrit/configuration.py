@@ -112,6 +112,19 @@ def override(config: T, settings: Iterable[str], owner: str = "this recipe", cur
     return _replaced(config, "", values)
 
 
+def name_and_settings(word: str) -> tuple[str, list[str]]:
+    """Split ``NAME:SETTING=VALUE,...`` into the name, which may hold colons, and its settings; a bare name has none.
+
+    Example:
+        >>> name_and_settings("runs/12:30:steps=32,eta=0.5")
+        ('runs/12:30', ['steps=32', 'eta=0.5'])
+        >>> name_and_settings("runs/12:30")
+        ('runs/12:30', [])
+    """
+    name, colon, settings = word.rpartition(":")
+    return (name, settings.split(",")) if colon and "=" in settings else (word, [])
+
+
 def setting_name(path: str) -> str:
     """Return a setting's dotted name of today for one that a user typed or a file holds."""
     return _RENAMED.get(path.strip(), path.strip())

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -16,7 +17,7 @@ from torch import Tensor
 from lidargrit import _discovery, formats
 from lidargrit.datasets import ScanDataset
 from lidargrit.determinism import evenly_spaced
-from lidargrit.errors import DataError, OutputError, ScanError, UnknownNameError, nearest_names
+from lidargrit.errors import ConfigError, DataError, OutputError, ScanError, UnknownNameError, nearest_names
 from lidargrit.files import atomic_path, claim_folder, is_partial, is_taken, read_json, write_json
 from lidargrit.formats import ScanFormat
 from lidargrit.formats.kitti_bin import KittiBin
@@ -56,13 +57,14 @@ def export_scans(
             ``sequences/SS/velodyne/NNNNNN.bin``, with SemanticKITTI's ``labels/NNNNNN.label`` where scans have labels.
         config: number of scans, and what to do with unusable points and scans; nothing else of it is used.
         reporter: receiver of progress and messages.
-        sensor: sensor of range images that do not name theirs, as ``.npy``; not used for other sources.
+        sensor: sensor of range images that do not name theirs, as ``.npy``; no other source takes one.
 
     Returns:
         Number of scans that are there now.
 
     Raises:
         UnknownNameError: no such format.
+        ConfigError: a sensor for a source that has its own.
         OutputError: the folder holds something else, or cannot be written.
         DataError: no such source, or no usable scan in it.
         ScanError: a scan that cannot be used.
@@ -72,10 +74,8 @@ def export_scans(
     scans = _open(source, config, sensor)
     files = layout.files([scans.name(index) for index in range(len(scans))])
     identities = [scans.identity(index) for index in range(len(scans))]
-    with claim_folder(out):
-        claim_scans(
-            out / MANIFEST, {"source": source, "format": kind, "scans": dict(zip(files, identities, strict=True))}
-        )
+    facts = {"source": source, "format": kind, **scans.facts(), "scans": dict(zip(files, identities, strict=True))}
+    with claim_folder(out), claimed_scans(out / MANIFEST, facts):
         missing = [index for index, file in enumerate(files) if not layout.is_there(file)]
         left_out = 0
         with reporter.progress("exporting", len(files), len(files) - len(missing)) as progress:
@@ -114,6 +114,10 @@ class _OfDataset:
     def __len__(self) -> int:
         return len(self.indices)
 
+    def facts(self) -> dict[str, Any]:
+        """Return further entries of the manifest: none, for the source says all."""
+        return {}
+
     def name(self, index: int) -> str:
         """Return the name of its file, without the ending."""
         return self.dataset.name(self.indices[index])
@@ -131,9 +135,15 @@ class _OfImages:
     """Range images as scans; they are numbered, because they have no short names."""
 
     images: RangeImages
+    of_files: bool
+    """Whether they are ``.npy``, which do not name their sensor."""
 
     def __len__(self) -> int:
         return len(self.images)
+
+    def facts(self) -> dict[str, Any]:
+        """Return further entries of the manifest: the sensor, where the source does not say which it is."""
+        return {"sensor": self.images.sensor.to_json()} if self.of_files else {}
 
     def name(self, index: int) -> str:
         """Return its index."""
@@ -149,8 +159,13 @@ class _OfImages:
 
 def _open(source: str, config: DataConfig, sensor: SensorModel | None) -> _OfDataset | _OfImages:
     opened = open_source(source, config.bad_points)
+    of_files = isinstance(opened, ImageFileSource)
+    if sensor is not None and not of_files:
+        wanted = "range images in .npy files, which do not name their sensor"
+        got = f"--sensor {sensor.name} for {source}, which holds {opened.kind}"
+        raise ConfigError(got, wanted, "leave --sensor out: the points are as the source has them")
     if not isinstance(opened, DatasetSource):
-        return _OfImages(opened.images(sensor if isinstance(opened, ImageFileSource) else None, config))
+        return _OfImages(opened.images(sensor, config), of_files)
     dataset = opened.scans()
     return _OfDataset(dataset, evenly_spaced(config.max_scans or len(dataset), len(dataset)))
 
@@ -265,3 +280,19 @@ def claim_scans(manifest: Path, facts: dict[str, Any]) -> None:
             return
         facts = {**facts, "scans": {**known, **facts["scans"]}}
     write_json(manifest, facts)
+
+
+@contextmanager
+def claimed_scans(manifest: Path, facts: dict[str, Any]) -> Iterator[None]:
+    """Claim a folder as :func:`claim_scans` does; a new manifest is removed again if no scan was written after all.
+
+    Otherwise the folder would be refused to a corrected command, of another format or model.
+    """
+    is_new = not manifest.exists()
+    claim_scans(manifest, facts)
+    try:
+        yield
+    finally:
+        with suppress(OSError):  # the folder was removed meanwhile
+            if is_new and all(path == manifest or is_partial(path.name) for path in manifest.parent.iterdir()):
+                manifest.unlink()

@@ -17,6 +17,7 @@ from torch import Tensor
 from lidargrit.errors import ConfigError, ScanError
 from lidargrit.sensors import SensorModel
 
+TYPICAL_LOG_RANGE = 2.5  # ln(1 + range in metres) in the middle of what scans hold: subtracted, inputs are near 0
 CLASS_BITS = 0xFFFF  # of a label: its class; the bits above number the instance
 
 MaskDecoding = Literal["bernoulli", "threshold"]

@@ -29,8 +29,9 @@ def wanted(options: argparse.Namespace) -> tuple[list[str], Benchmark]:
     if options.add:
         changed = [name for name, default in DEFAULTS.items() if getattr(options, name) != default]
         if options.systems or changed:
+            own = [f"--{name}" if name != "count" else "-n" for name in changed]
             raise ConfigError(
-                f"--add with {'systems before it' if options.systems else f'settings of its own ({changed[0]})'}",
+                f"--add with {'systems before it' if options.systems else f'settings of its own ({own[0]})'}",
                 "--add SYSTEM ... alone: all else is as in the table",
                 "leave them out, or begin a table in another folder",
             )

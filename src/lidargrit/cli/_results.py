@@ -19,12 +19,12 @@ from lidargrit.untrusted import check_path
 STANDARD_OUTPUT = Path("-")
 
 
-def add_json(parser: argparse.ArgumentParser, files: str = "files") -> None:
+def add_json(parser: argparse.ArgumentParser, files: str = "the file of --json") -> None:
     """Add ``--json [FILE.json]``, and ``--overwrite`` for the ``files`` that it may replace."""
     what = "print the result as JSON; with a file name, print the table and write the JSON to the file"
     file = {"nargs": "?", "const": STANDARD_OUTPUT, "type": _json_file, "metavar": "FILE.json"}
     parser.add_argument("--json", help=what, **file)
-    parser.add_argument("--overwrite", action="store_true", help=f"replace {files} if they exist")
+    parser.add_argument("--overwrite", action="store_true", help=f"replace {files} if already there")
 
 
 def refuse_taken(options: argparse.Namespace) -> None:

@@ -45,12 +45,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Score and print a table."""
-    from lidargrit.evaluation.command import evaluate, read_config
+    from lidargrit.evaluation.command import check_modes, evaluate, read_config
     from lidargrit.evaluation.tables import read_tables
     from lidargrit.reporting import TerminalReporter
     from lidargrit.viewer.report import write_report
 
     refuse_taken(options)
+    check_modes(options.tables, options.format, options.samples, options.report)
     if options.tables:
         return print_result(options, *read_tables(options.tables, options.format))
     names = "protocol metrics variant max_scans seed samples_format device weights groups intervals pixel_statistics"

@@ -19,7 +19,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("source", help="folder, data set or file of scans that one sensor made")
     parser.add_argument("-o", "--out", type=Path, default=Path("my_sensor.json"), help="sensor file to write")
     parser.add_argument("--picture", type=Path, metavar="PNG", help="also plot the evidence for and against the fit")
-    parser.add_argument("-n", "--max-scans", type=int, default=20, help="number of scans to fit, evenly spaced")
+    some = "number of scans to fit, evenly spaced; 0 for all"
+    parser.add_argument("-n", "--max-scans", type=int, default=20, help=some)
     parser.add_argument("--name", help="name of the sensor (default: the name of the sensor file)")
     add_bad_points(parser)
     add_json(parser, "the files of --out, --picture and --json")
@@ -28,14 +29,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Fit, print a table, write the sensor file and perhaps a picture."""
     from lidargrit.files import refuse_to_overwrite, write_json
-    from lidargrit.fitting import fit_sensor_to_source
+    from lidargrit.fitting import fit_sensor_to_dataset
     from lidargrit.fitting.table import as_json, as_table
+    from lidargrit.sources import open_source
 
     refuse_to_overwrite(options.out, options.overwrite, ".json")
     refuse_to_overwrite(options.picture, options.overwrite, ".png")
     refuse_taken(options)
     name = options.out.stem if options.name is None else options.name
-    fit = fit_sensor_to_source(options.source, name, options.max_scans, options.bad_points)
+    dataset = open_source(options.source, options.bad_points).scans()
+    fit = fit_sensor_to_dataset(dataset, name, options.max_scans)
     if options.picture:
         from lidargrit.viewer.sensor_fit import plot_sensor_fit
 

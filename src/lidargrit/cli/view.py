@@ -29,19 +29,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     colour = "colour of pixels: range, or surprise for the bits beyond those expected"
     parser.add_argument("--color", choices=["range", "surprise"], default="range", help=colour)
     model = "run whose likelihood gives the surprise; needs a pixel decoder (default: pretrained)"
-    parser.add_argument("--model", default="pretrained", help=model)
+    parser.add_argument("--model", default="", help=model)
     add_scans(parser)
     parser.add_argument("--overwrite", action="store_true", help="replace the file if it exists")
 
 
 def run(options: argparse.Namespace) -> None:
     """Render the picture, or write the page."""
+    from lidargrit.errors import ConfigError, OutputError
     from lidargrit.files import refuse_to_overwrite
     from lidargrit.reporting import TerminalReporter
     from lidargrit.viewer import view
 
-    ending = ".html" if options.out.suffix.lower() == ".html" else ".png"
-    refuse_to_overwrite(options.out, options.overwrite, ending)
+    if options.out.suffix.lower() not in {".png", ".html"}:
+        got = f"{options.out}, which is to hold a picture or a page"
+        raise OutputError(got, "a name in .png or .html", "choose another name")
+    if options.model and options.color != "surprise":
+        raise ConfigError(
+            f"--model {options.model} with --color range", "--color surprise", "add it, or leave --model out"
+        )
+    refuse_to_overwrite(options.out, options.overwrite)
     named = (options.places, options.out, options.count, options.seed, scan_settings(options), TerminalReporter())
-    view(*named, options.model if options.color == "surprise" else "")
+    view(*named, (options.model or "pretrained") if options.color == "surprise" else "")
     print(f"done: look at {options.out}")

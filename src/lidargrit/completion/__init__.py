@@ -8,12 +8,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Generic
 
-import torch
-
 from lidargrit import configuration
 from lidargrit.conditions import KINDS, Condition, ConditionKind
 from lidargrit.conditions.fills import FILLS, fill
-from lidargrit.configuration import override
+from lidargrit.configuration import name_and_settings, override
 from lidargrit.errors import ConfigError
 from lidargrit.generators import WEIGHTS_FILE, Generator, SamplingT, load, locate
 from lidargrit.loading import Provenance
@@ -134,14 +132,17 @@ def open_completer(
         ConfigError: a run that cannot complete such scans, or one of another sensor than the named one.
     """
     if is_classical(word):
-        if kind != "pixels" or settings:
-            what = "a task for a model" if kind != "pixels" else f"--set {settings[0]}"
-            raise ConfigError(f"--model {word} for {what}", "a run, such as pretrained", "name a run")
-        if sensor is None:
-            raise ConfigError(f"{word} without a sensor", "that of the scans", "name the sensor")
+        if kind != "pixels":
+            got = f"--model {word}, a classical method, which takes {KINDS['pixels']}"
+            raise ConfigError(got, f"a run that takes {KINDS[kind]}", "name one, such as pretrained")
+        if settings:
+            raise ConfigError(f"--model {word} for --set {settings[0]}", "a run, such as pretrained", "name a run")
+        if sensor is None:  # other verbs take that of the source
+            got = f"--model {word}, a classical method, without the sensor of the scans that it writes"
+            raise ConfigError(got, "its name or .json file", "name it with --to (in Python: sensor=...)")
         return ClassicalCompleter(word, sensor)
     folder = locate(word)
-    generator = load(folder).to(usable_device(device or ("cuda" if torch.cuda.is_available() else "cpu")))
+    generator = load(folder).to(usable_device(device))
     if kind not in generator.conditions:
         takes = " or ".join(KINDS[one] for one in sorted(generator.conditions)) or "no condition at all"
         raise ConfigError(
@@ -173,17 +174,11 @@ def open_completers(words: Sequence[str], sensor: SensorModel | None = None, dev
     runs: dict[str, Completer] = {}
     for word in words:
         if not is_classical(word):
-            folder, settings = _with_settings(word)
+            folder, settings = name_and_settings(word)
             runs[word] = open_completer(folder, "pixels", sensor, settings, device)
             runs[word].name = word
     own = next((run.sensor for run in runs.values()), sensor)
     return [runs[word] if word in runs else open_completer(word, "pixels", own) for word in words]
-
-
-def _with_settings(word: str) -> tuple[str, list[str]]:
-    """Split a word into the name of a run and the settings after a colon, if there are any."""
-    folder, colon, settings = word.rpartition(":")
-    return (folder, settings.split(",")) if colon and "=" in settings else (word, [])
 
 
 def is_classical(word: str) -> bool:

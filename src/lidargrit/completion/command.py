@@ -10,7 +10,6 @@ from lidargrit.completion.inputs import Inputs, InputScan, ScanReader, open_inpu
 from lidargrit.completion.sparse import SparseReader, observed_rows
 from lidargrit.conditions import Condition
 from lidargrit.conditions.patterns import Pattern
-from lidargrit.errors import ConfigError
 from lidargrit.loading import DataConfig
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel
@@ -44,10 +43,6 @@ def complete_scans(
         UsageError: all pixels or no return are observed, or a mask of another size.
         ScanError: a scan that cannot be used, or of another sensor.
     """
-    if output.count > 1 and not completer.random:
-        raise ConfigError(
-            f"-n {output.count} for {completer.name}", "1: it completes a scan in one way", "leave it out"
-        )
 
     def condition_of(scan: InputScan, seed: int) -> Condition:
         return Condition.of_pixels(_batch(scan.image), pattern.mask(scan.image, seed)[None])

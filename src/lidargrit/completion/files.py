@@ -18,7 +18,7 @@ from lidargrit.completion.inputs import Inputs, InputScan
 from lidargrit.conditions import Condition
 from lidargrit.determinism import derive_seed
 from lidargrit.errors import ConfigError, DataError, ScanError
-from lidargrit.export import IMAGE, TREE, KittiTree, claim_scans, writable_format, write_array, write_with_labels
+from lidargrit.export import IMAGE, TREE, KittiTree, claimed_scans, writable_format, write_array, write_with_labels
 from lidargrit.files import claim_folder
 from lidargrit.formats import ScanFormat
 from lidargrit.reporting import Reporter
@@ -93,14 +93,12 @@ def write_completions(
         Number of completed scans that are there now.
 
     Raises:
+        ConfigError: several completions by what completes a scan in one way.
         OutputError: the folder holds something else, or cannot be written.
         ScanError: a scan that cannot be used.
         DataError: no usable scan.
     """
-    files = _files(inputs, output)
-    manifest = {**facts, **completer.identity(), "count": output.count, "seed": output.seed, "format": output.format}
-    if output.probability:
-        manifest["probability"] = output.probability  # files of before it were written without these shares
+    manifest, files = facts | _facts(completer, output), _files(inputs, output)
     scans = {file: inputs.name(index) for (index, _), file in files.items()}
     left_out, labels_lost = set[int](), False
     missing = [job for job, file in files.items() if not (out / file).exists()]
@@ -108,22 +106,35 @@ def write_completions(
     jobs = chain(
         list(islice(remaining, 1)), remaining
     )  # a mistake in the first scan is told before anything is written
-    with claim_folder(out):
-        claim_scans(out / "completed.json", {**manifest, "scans": scans})
-        with reporter.progress("completing", len(files), len(files) - len(missing)) as progress:
-            while batch := list(islice(jobs, completer.batch)):
-                for job, image in zip(batch, _completed(completer, batch, output.seed), strict=True):
-                    file = files[job.index, job.turn]
-                    if output.probability and job.turn == 0:
-                        share = _return_share(completer, job, output)
-                        write_array(out / f"{file.removesuffix(Path(file).suffix)}{PROBABILITY}", share)
-                    if not _write(out / file, output.format, image, job) and not labels_lost:
-                        labels_lost = True
-                        reporter.message(f"{Path(file).suffix} keeps no labels; --format {TREE} or npz keeps them")
-                    progress.advance(1)
+    with (
+        claim_folder(out),
+        claimed_scans(out / "completed.json", {**manifest, "scans": scans}),
+        reporter.progress("completing", len(files), len(files) - len(missing)) as progress,
+    ):
+        while batch := list(islice(jobs, completer.batch)):
+            for job, image in zip(batch, _completed(completer, batch, output.seed), strict=True):
+                file = files[job.index, job.turn]
+                if output.probability and job.turn == 0:
+                    share = _return_share(completer, job, output)
+                    write_array(out / f"{file.removesuffix(Path(file).suffix)}{PROBABILITY}", share)
+                if not _write(out / file, output.format, image, job) and not labels_lost:
+                    labels_lost = True
+                    reporter.message(f"{Path(file).suffix} keeps no labels; --format {TREE} or npz keeps them")
+                progress.advance(1)
     if len(left_out) == len(inputs):
         raise DataError("no usable scan", "at least one", "see the messages above")
     return len(files) - len(left_out) * output.count
+
+
+def _facts(completer: Completer, output: OutputConfig) -> dict[str, Any]:
+    """Return the entries of the manifest that say how the files are made."""
+    if output.count > 1 and not completer.random:
+        got = f"-n {output.count} for {completer.name}"
+        raise ConfigError(got, "1: it completes a scan in one way", "leave it out")
+    made = {**completer.identity(), "count": output.count, "seed": output.seed, "format": output.format}
+    if output.probability:
+        made["probability"] = output.probability  # files of before it were written without these shares
+    return made
 
 
 def _files(inputs: Inputs, output: OutputConfig) -> dict[tuple[int, int], str]:

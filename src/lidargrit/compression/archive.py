@@ -22,7 +22,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 
 from lidargrit.errors import LidarGritError, OutputError, ScanError
-from lidargrit.files import claim_folder
+from lidargrit.files import claim_folder, read_json, write_json
 from lidargrit.formats import open_file
 from lidargrit.untrusted import JSON_BYTES_AT_MOST, parse_json
 
@@ -33,6 +33,7 @@ _START = struct.Struct("<4sII")
 _TAIL = struct.Struct("<QI4s")
 _INDEX_BYTES_AT_MOST = 256 * 2**20  # of the index's lines: those of a million scans take 50 MB
 _CHUNK = 2**20
+_STRICTER = {"bad_points": ["refuse"], "bad_scans": ["refuse"]}  # options by which no other scans were written so far
 
 
 class Entry(NamedTuple):
@@ -56,13 +57,13 @@ class Entry(NamedTuple):
         name, length, crc32, num_returns = parse_json(line, "a line of the index", list, ScanError)
         if not (isinstance(name, str) and all(isinstance(each, int) for each in (length, crc32, num_returns))):
             raise ValueError
-        if length < 0:
+        if length < 0 or not 0 <= crc32 < 2**32:
             raise ValueError
         return cls(name, length, crc32, num_returns)
 
 
 @contextmanager
-def writing(path: Path, header: dict[str, Any]) -> Iterator[ArchiveWriter]:
+def writing(path: Path, header: dict[str, Any], chosen: dict[str, Any] | None = None) -> Iterator[ArchiveWriter]:
     """Give a writer of a file that appears when the block has ended well; if it was interrupted, the next goes on.
 
     Until then scans lie in a folder beside the file, named as the file with ``.unfinished``.
@@ -70,26 +71,30 @@ def writing(path: Path, header: dict[str, Any]) -> Iterator[ArchiveWriter]:
     Args:
         path: file to write.
         header: facts that all scans have in common, as JSON.
+        chosen: options that say which scans these are, as JSON, to be kept beside an unfinished file.
 
     Raises:
         OutputError: the folder cannot be written to, another process is writing, or an unfinished file has another
-            header.
+            header or was begun with other options.
     """
     folder = path.with_name(path.name + UNFINISHED)
-    scans, index = folder / "scans", folder / "index"
+    scans, index, options = folder / "scans", folder / "index", folder / "options.json"
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with claim_folder(folder), scans.open("a+b") as scans_file, index.open("a+b") as index_file:
             writer = ArchiveWriter(scans_file, index_file, header, folder)
+            writer.claim(options, chosen or {})
             try:
                 yield writer
                 writer.close()
                 scans.replace(path)
                 index.unlink()
+                options.unlink()
             finally:
                 if index.exists() and scans.stat().st_size <= writer.num_header_bytes:  # nothing to go on with
                     scans.unlink()
                     index.unlink()
+                    options.unlink()
     except OSError as error:
         got = f"'{error.strerror or error}' while writing {path}"
         cure = "free some space; the same command goes on"
@@ -124,6 +129,20 @@ class ArchiveWriter:
             raise self._of_others("scans of another model, step or version")
         if not there:
             self._scans.write(self._start)
+
+    def claim(self, path: Path, chosen: dict[str, Any]) -> None:
+        """Keep the options of the command, unless the file was begun with others: scans may all have the same names.
+
+        A command that stopped at a bad point or scan may go on without it.
+
+        Raises:
+            OutputError: the unfinished file was begun with other options.
+        """
+        begun = read_json(path) if path.exists() else chosen
+        changed = [name for name, of in chosen.items() if begun.get(name) not in (of, *_STRICTER.get(name, ()))]
+        if changed:
+            raise self._of_others(f"scans of other options ({', '.join(changed)})")
+        write_json(path, chosen)
 
     def go_on(self, names: Iterator[str]) -> int:
         """Keep the scans of an unfinished file, up to one that was not written whole, and return their number.
@@ -195,6 +214,9 @@ class Archive:
     Args:
         path: path of the file.
 
+    Attributes:
+        index_crc32: checksum of the index, which tells two files of scans with the same names apart.
+
     Raises:
         ScanError: another kind of file, or one that was cut off or altered.
     """
@@ -207,17 +229,20 @@ class Archive:
             header, begins = self._header(file, size)
             self.header = parse_json(header, str(path), dict, ScanError)
             index, scans_end = self._index(file, size)
+        self.index_crc32 = zlib.crc32(index)
+        end = begins
         for entry in self._entries(index):
             if entry.length:
+                end += entry.length
+                if end > scans_end:  # before a length or a sum that no array can hold
+                    raise self._damaged()
                 self.names.append(entry.name)
                 lengths.append(entry.length)
                 crc32s.append(entry.crc32)
-        if len(set(self.names)) < len(self.names):  # two scans would be one file
+        if end != scans_end or len(set(self.names)) < len(self.names):  # two scans would be one file
             raise self._damaged()
         self._ends = begins + np.cumsum(np.frombuffer(lengths, dtype=np.uint64), dtype=np.uint64)
         self._begins, self._crc32s = begins, crc32s
-        if (int(self._ends[-1]) if len(self) else begins) != scans_end:
-            raise self._damaged()
 
     def __len__(self) -> int:
         return len(self.names)

@@ -14,9 +14,10 @@ from lidargrit.completion.inputs import ScanReader, open_inputs
 from lidargrit.compression.archive import Archive, writing
 from lidargrit.compression.coder import not_reproduced
 from lidargrit.compression.scan_codec import ScanCodec
-from lidargrit.errors import CheckpointError, DataError, ScanError, UsageError
-from lidargrit.export import IMAGE, claim_scans, writable_format, write_array
+from lidargrit.errors import CheckpointError, DataError, ScanError, UnknownNameError, UsageError, one_of
+from lidargrit.export import IMAGE, TREE, claim_scans, kinds, writable_format, write_array
 from lidargrit.files import claim_folder
+from lidargrit.formats import ScanFormat
 from lidargrit.generators import load, locate
 from lidargrit.loading import DataConfig
 from lidargrit.projection import unproject
@@ -66,7 +67,9 @@ def compress_scans(
     codec = ScanCodec(load(model), step_mm)
     variant = "reference" if projection_of(locate(model)) == "reference" else "exact"
     inputs = open_inputs(source, ScanReader(codec.sensor, variant), config)
-    with writing(out, _header(codec, model)) as writer:
+    chosen = {"source": source, "max_scans": config.max_scans}
+    chosen |= {"bad_points": config.bad_points, "bad_scans": config.bad_scans}
+    with writing(out, _header(codec, model), chosen) as writer:
         done = writer.go_on(inputs.name(index) for index in range(len(inputs)))
         with reporter.progress("compressing", len(inputs), done) as progress:
             for index in range(done, len(inputs)):
@@ -101,20 +104,23 @@ def decompress_scans(path: Path, out: Path, model: str, kind: str, chosen: Seque
     Raises:
         ScanError: a file that was cut off or altered, or that this machine cannot reproduce.
         CheckpointError: another model than the file's.
+        UnknownNameError: a format that is none, or that cannot be written.
         UsageError: an index that the file does not have.
     """
     archive = Archive(path)
     wrong = [index for index in chosen if not 0 <= index < len(archive)]
     if wrong:
-        raise UsageError(f"--only {wrong[0]}", f"indices from 0 to {len(archive) - 1}", "correct it")
+        wanted = f"indices from 0 to {len(archive) - 1}" if len(archive) else f"no index: {path} holds no scans"
+        raise UsageError(f"--only {wrong[0]}", wanted, "correct it" if len(archive) else "name another file")
     archive.check()
     codec = _codec_of(archive, model)
-    form, suffix = (None, ".npy") if kind == IMAGE else writable_format(kind)
+    form, suffix = (None, ".npy") if kind == IMAGE else _format(kind)
     files = {index: archive.names[index] + suffix for index in chosen or range(len(archive))}
     scans = {file: archive.names[index] for index, file in files.items()}
     missing = [index for index, file in files.items() if not (out / file).exists()]
     with claim_folder(out):
-        facts = {"source": path.name, "step_mm": codec.steps.step_mm, "format": kind}
+        facts = {"source": path.name, "index_crc32": archive.index_crc32}
+        facts |= {"step_mm": codec.steps.step_mm, "format": kind}
         claim_scans(out / "decompressed.json", {**facts, "scans": scans})
         with reporter.progress("decompressing", len(files), len(files) - len(missing)) as progress:
             for index in missing:
@@ -125,6 +131,15 @@ def decompress_scans(path: Path, out: Path, model: str, kind: str, chosen: Seque
                     form.write(out / files[index], unproject(image))
                 progress.advance(1)
     return len(files)
+
+
+def _format(kind: str) -> tuple[type[ScanFormat], str]:
+    """Return the format of a name or an ending, and the ending of its files; the tree of a data set is none here."""
+    try:
+        return writable_format(kind)
+    except UnknownNameError:
+        known = (IMAGE, *(name for name in kinds() if name != TREE))
+        raise UnknownNameError(f"--format {kind}", one_of(known), "choose one") from None
 
 
 def _header(codec: ScanCodec, model: str) -> dict[str, Any]:

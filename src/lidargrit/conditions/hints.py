@@ -13,6 +13,7 @@ from torch import Tensor
 
 from lidargrit.conditions import Condition
 from lidargrit.conditions.fills import Observed, linear
+from lidargrit.structures import TYPICAL_LOG_RANGE
 
 NUM_MAPS, NUM_CANDIDATES, NUM_LABELS, NUM_REFLECTANCES = 19, 9, 5, 6
 LABELLED = slice(2, 7)  # candidates that are the range of one return, whose label is known, too
@@ -22,7 +23,6 @@ _LEFT_RIGHT_CANDIDATES = {5: 6, 6: 5}
 _LEFT_RIGHT_LABELS = [0, 1, 2, 4, 3]
 _LEFT_RIGHT_REFLECTANCES = [0, 1, 2, 3, 5, 4]
 _SIDES = ((-1, 0), (1, 0), (0, -1), (0, 1))  # rows down and columns to the right of each side
-_TYPICAL_V = 2.5  # ln(1 + 11 m), the middle of what scans hold, so that maps are near 0
 _FAR_PIXELS, _FARTHEST = 16.0, 4.0  # a distance is told in units of 16 pixels, up to 64 of them
 _WINDOW = 9  # rows and columns in which shares are counted
 
@@ -97,7 +97,7 @@ def _of_one(
     if not seen.returned.any():
         empty = np.zeros((NUM_MAPS, *seen.returned.shape), dtype=np.float32)
         empty[0] = seen.observed
-        return empty, np.full((NUM_CANDIDATES, *seen.returned.shape), _TYPICAL_V, dtype=np.float32)
+        return empty, np.full((NUM_CANDIDATES, *seen.returned.shape), TYPICAL_LOG_RANGE, dtype=np.float32)
     tiling = seen.triangles
     filled, lines, near = (np.log1p(part) for part in (tiling.range_m, linear(seen), seen.nearest_range_m))
     corners = np.log1p(tiling.corners_m[1:])
@@ -110,7 +110,7 @@ def _of_one(
         seen.returned,
         drops,
         near - filled,
-        filled - _TYPICAL_V,
+        filled - TYPICAL_LOG_RANGE,
         *(v - filled for v in next_v),
         *(found.away for found in next_returns),
         share_dropped / np.maximum(share_observed, 1e-6),

@@ -15,16 +15,17 @@ from typing import Any
 import torch
 
 from lidargrit import __version__
-from lidargrit.configuration import override
+from lidargrit.configuration import name_and_settings, override
 from lidargrit.errors import CheckpointError, ConfigError
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair, open_pair
 from lidargrit.evaluation.likelihood import bits_per_return
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
-from lidargrit.evaluation.protocols import public_name
+from lidargrit.evaluation.protocols import load_protocol, public_name
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.evaluation.tables import Format, TableBlock, render, side_by_side
 from lidargrit.files import claim_folder, read_json, write_json
 from lidargrit.generators import Generator, is_run, load, load_class, locate
+from lidargrit.nn.devices import usable_device
 from lidargrit.processes import process_pool
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
@@ -113,6 +114,7 @@ def run(
     by_run: dict[Path, list[_Plan]] = {}  # systems of one run one after the other: it is trained once
     for plan in plans:
         by_run.setdefault(plan.run, []).append(plan)
+    _check_reference(reference, plans, benchmark.settings)
     processes = min(processes, len(by_run))  # more would only take cores from one another
     remaining = _Remaining(list(systems), reporter)
     with claim_folder(folder):
@@ -131,6 +133,14 @@ def run(
     return [folder / name / f"{name}.json" for name in names]
 
 
+def _check_reference(reference: Source, plans: Sequence[_Plan], settings: EvalConfig) -> None:
+    """Refuse scans that a system's sensor does not see, before anything is trained."""
+    variant = settings.projection_variant or load_protocol(settings.protocol).variant
+    config = replace(settings.data, projection_variant=variant, max_scans=1)
+    for recipe in (plan.recipe for plan in plans if plan.recipe is not None):
+        reference.images(recipe.data.load_sensor(), config)
+
+
 def _finish(
     plans: Sequence[_Plan], folder: Path, benchmark: Benchmark, reporter: Reporter, reference: Source | None = None
 ) -> int:
@@ -144,7 +154,7 @@ def _finish(
         generator = (
             load(plan.run) if plan.recipe is None or is_run(plan.run) else train(plan.recipe, plan.run, reporter)
         )
-        generator.to("cuda" if torch.cuda.is_available() else "cpu")
+        generator.to(usable_device(""))
         samples = folder / name / "samples"
         seconds = _sample(generator, plan.run, samples, plan.sampling, benchmark, reporter)
         sampled += seconds is not None
@@ -243,12 +253,12 @@ class _Plan:
 
     @classmethod
     def of(cls, system: str, folder: Path, benchmark: Benchmark) -> _Plan:
-        name, _, settings = system.partition(":")
+        name, settings = name_and_settings(system)
         run = locate(name)
         recipe = None if is_run(run) else load_recipe(name, benchmark.recipe_settings)
         cls_of = type(load(name)) if recipe is None else load_class(recipe.generator)
         owner, cure = f"sampling from {name!r}", "see all with: lidargrit list generators"
-        sampling = override(cls_of.Sampling(), settings.split(",") if settings else [], owner, cure)
+        sampling = override(cls_of.Sampling(), settings, owner, cure)
         if recipe is not None and benchmark.flops:
             recipe = with_budget(recipe, benchmark.flops)
         if recipe is None:

@@ -51,7 +51,7 @@ def evaluate(
     if not (samples and reference):
         got = f"{samples!r} alone" if samples else "nothing to score"
         raise ConfigError(got, "samples and what they are compared with", "name two sets, or use --tables")
-    refuse_to_overwrite(report, overwrite)
+    refuse_to_overwrite(report, overwrite, ".html")
     usable_device(config.device)
     first = open_source(samples, config.data.bad_points, config.samples_format)
     second = open_source(reference, config.data.bad_points)
@@ -67,6 +67,20 @@ def evaluate(
     if report and write_report:
         write_report(card, pair, report)
     return card.as_table(), card.to_json()
+
+
+def check_modes(tables: Sequence[Path] | None, form: str, samples: str, report: Path | None) -> None:
+    """Refuse words for scoring beside ``--tables``, which only prints, and a format of tables without it.
+
+    Raises:
+        ConfigError: they are mixed.
+    """
+    if tables and (samples or report):
+        got = f"--tables and {samples or '--report'}"
+        raise ConfigError(got, "files of scores to print, or sets to score", "run the two one after the other")
+    if form != "text" and not tables:
+        cure = "score with --json FILE.json, then print it with --tables FILE.json"
+        raise ConfigError(f"--format {form} without --tables", "files of scores to print", cure)
 
 
 def read_config(
@@ -133,6 +147,8 @@ def _refuse_options_of_samples(run: str, config: EvalConfig, report: Path | None
         "--weights": bool(config.weights),
         "--pixel-statistics": config.pixel_statistics,
         "--sensor": bool(config.sensor),
+        "--intervals or --groups": replace(config.resampling, seed=0) != Resampling(),
+        "--seed": config.resampling.seed != 0,
     }
     if wrong := [option for option, is_given in given.items() if is_given]:
         raise ConfigError(

@@ -35,7 +35,10 @@ _REFLECTANCE_WIDTH = 25  # of the column, in letters
 
 @dataclass(frozen=True)
 class CompletionScore:
-    """How well one model or classical method fills in one pattern; only pixels that were not observed count.
+    """How well one model or classical method fills in one pattern.
+
+    Only pixels that were not observed count, except in ``drop_run_lengths``; errors, ``found`` and ``iou`` are means
+    over the completions of a scan, while ``drop_run_lengths`` and both scores of classes take the first alone.
 
     Args:
         model: name of the model or method, as the user typed it.
@@ -45,7 +48,7 @@ class CompletionScore:
         found: share of the true hidden returns where the completed scan has a return, too; ``mae_m`` covers only these.
         iou: intersection over union of the 0.1 m voxels that hold a point; higher is better.
         drop_run_lengths: distance between the distributions of the lengths of runs of drops in completed and true
-            scans.
+            scans, over all pixels, those that were observed among them.
         diversity_m: mean absolute difference in metres between two completions of a scan, over pixels where both
             return; None for a single completion.
         seconds_per_scan: time in seconds that one completion took on this machine.

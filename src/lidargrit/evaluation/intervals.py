@@ -50,9 +50,9 @@ class Resampling:
     def __post_init__(self) -> None:
         if self.halves and not (self.groups >= _AT_LEAST and self.halves >= 2):
             raise ConfigError(
-                f"{self.halves} halves of {self.groups} groups",
-                f"at least 2 halves of at least {_AT_LEAST} groups, or 0 halves for no interval",
-                "raise the number",
+                f"--intervals {self.halves} with --groups {self.groups}",
+                f"at least --intervals 2 with --groups {_AT_LEAST}, or --intervals 0 for none",
+                "raise the one that is too small",
             )
 
 

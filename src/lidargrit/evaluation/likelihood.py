@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-import torch
 
 from lidargrit.determinism import evenly_spaced
 from lidargrit.evaluation.estimates import Estimate
@@ -20,6 +19,7 @@ from lidargrit.loading import DataConfig, RangeImages
 from lidargrit.nn.devices import usable_device
 from lidargrit.reporting import Reporter
 from lidargrit.sources import RunSource, open_source, overlap
+from lidargrit.structures import ScanBits
 
 _BATCH = 4
 _COMPARED_AT_MOST = 64  # scans: enough to tell systems apart, and seconds where all would take minutes
@@ -120,16 +120,14 @@ def score_likelihood(
     sensor, returns, whole = images.sensor, [], False
     size = (len(images), sensor.height, sensor.width)
     with _maps(maps, size) as pixels, (reporter or Reporter()).progress("scans", len(images)) as progress:
-        for first in range(0, len(images), _BATCH):
-            some = range(first, min(first + _BATCH, len(images)))
-            bits = generator.bits(images.batch(some), step_mm)
+        for bits in _bits(generator, images, range(len(images)), step_mm):
             for name, values in bits.per_scan().items():
                 parts.setdefault(name, []).extend(values.tolist())
             returns += bits.return_mask.sum((1, 2)).tolist()
             whole = bits.is_whole
             if pixels is not None:
                 pixels.write(bits.per_pixel().cpu().numpy().astype("<f4").tobytes())
-            progress.advance(len(some))
+            progress.advance(len(bits.return_mask))
     return Likelihood(step_mm, whole, images.provenance.names, parts, returns, sensor.height * sensor.width)
 
 
@@ -144,14 +142,19 @@ def bits_per_return(generator: Generator, scans: EvalSet, step_mm: int = 10) -> 
     if "likelihood" not in generator.capabilities:
         return None
     bits, returns = 0.0, 0
-    chosen = evenly_spaced(_COMPARED_AT_MOST, len(scans))
-    for first in range(0, len(chosen), _BATCH):
-        found = generator.bits(scans.batch(chosen[first : first + _BATCH]), step_mm)
+    for found in _bits(generator, scans, evenly_spaced(_COMPARED_AT_MOST, len(scans)), step_mm):
         if not found.is_whole:
             return None
         bits += float(found.total().sum())
         returns += int(found.return_mask.sum())
     return bits / returns if returns else None
+
+
+def _bits(
+    generator: Generator, scans: RangeImages | EvalSet, indices: Sequence[int], step_mm: int
+) -> Iterator[ScanBits]:
+    for first in range(0, len(indices), _BATCH):
+        yield generator.bits(scans.batch(indices[first : first + _BATCH]), step_mm)
 
 
 @contextmanager
@@ -195,7 +198,7 @@ def likelihood_of_source(
     run = RunSource(model, locate(model))
     variant = run.projection_variant(config) or config.projection_variant
     config = replace(config, projection_variant=variant)
-    generator = run.generator.to(usable_device(device or ("cuda" if torch.cuda.is_available() else "cpu")))
+    generator = run.generator.to(usable_device(device))
     images = open_source(text, config.bad_points).images(run.sensor, config, reporter)
     if shared := overlap(run, None, images):
         reporter.message(f"WARNING: {run.text} has learned from some of these scans ({shared}): they take fewer bits")

@@ -70,9 +70,8 @@ def score_raydrop(
     dropped = []
     for first in range(0, len(clean), generator.compute_batch):
         some = clean[first : first + generator.compute_batch]
-        device = next(iter(generator.state_dict().values())).device
         seeds = range(seed + first, seed + first + len(some))
-        dropped.append(generator.complete(Condition.of_surfaces(some).to(device), seeds).to("cpu"))
+        dropped.append(generator.complete(Condition.of_surfaces(some).to(generator.device), seeds).to("cpu"))
     by_model = RangeImage.cat(dropped)
     independent = drop_independently(clean, float(true.return_mask.float().mean()), seed)
     half = len(true) // 2
@@ -131,9 +130,9 @@ def decoded_surfaces(generator: Generator, real: RangeImages) -> tuple[RangeImag
         )
     tokenizer, sensor = generator.get_tokenizer(), generator.sensor
     true = real.batch(range(len(real)))
-    device = next(iter(generator.state_dict().values())).device
     ranges = [
-        tokenizer.decode(tokenizer.encode(true[index : index + 1].to(device))).range_m for index in range(len(true))
+        tokenizer.decode(tokenizer.encode(true[index : index + 1].to(generator.device))).range_m
+        for index in range(len(true))
     ]
     range_m = torch.cat(ranges).float().cpu().clamp(sensor.range_min_m, sensor.range_max_m)
     return _surfaces(range_m, true), true

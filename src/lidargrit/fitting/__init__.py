@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 
-from lidargrit.datasets import BadPoints, open_dataset
+from lidargrit.datasets import ScanDataset
+from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import ConfigError, ScanError
 from lidargrit.fitting.azimuths import columns_of_scans, firing_steps_deg, offsets_deg
 from lidargrit.fitting.elevations import FittedRows, cluster_rows, nearest_row, rows_of_rings
@@ -19,7 +20,7 @@ from lidargrit.fitting.rings import Method, Rings, recover_rings
 from lidargrit.sensors import ProjectionName, SensorModel, column_azimuths_rad
 from lidargrit.structures import Scan
 
-__all__ = ["SensorFit", "fit_sensor", "fit_sensor_to_source"]
+__all__ = ["SensorFit", "fit_sensor", "fit_sensor_to_dataset"]
 
 _HALVED = 8  # networks halve the columns up to three times
 _COLUMNS_UNCLEAR = 1024  # what most range images of the literature have
@@ -127,27 +128,24 @@ def fit_sensor(scans: Sequence[Scan], name: str = "fitted") -> SensorFit:
     )
 
 
-def fit_sensor_to_source(
-    source: str, name: str = "fitted", num_scans: int = 20, bad_points: BadPoints = "refuse"
-) -> SensorFit:
-    """Find the sensor that made the scans of a data source, from some of them, evenly spaced.
+def fit_sensor_to_dataset(dataset: ScanDataset, name: str = "fitted", num_scans: int = 20) -> SensorFit:
+    """Find the sensor that made the scans of a data set, from some of them, evenly spaced.
 
     Args:
-        source: source of scans, see :func:`lidargrit.datasets.open_dataset`.
+        dataset: scans, see :func:`lidargrit.datasets.open_dataset`.
         name: name of the new sensor.
-        num_scans: largest number of scans to use.
-        bad_points: ``refuse`` scans with NaN, infinite or origin points, or ``drop`` these points.
+        num_scans: largest number of scans to use; 0 for all.
 
     Raises:
-        ConfigError: no scan to look at, or no name.
-        DataError: the source holds no scans.
+        ConfigError: a negative number of scans, or no name.
         ScanError: a scan that cannot be used, or does not show its sensor.
     """
-    if num_scans < 1 or not name.strip():
-        raise ConfigError(f"{num_scans} scans and the name {name!r}", "at least one scan, and a name", "correct them")
-    dataset = open_dataset(source, bad_points)
-    wanted = min(num_scans, len(dataset))
-    return fit_sensor([dataset.scan(index * len(dataset) // wanted) for index in range(wanted)], name)
+    if num_scans < 0:
+        raise ConfigError(f"-n {num_scans}", "at least 1 scan, or 0 for all", "raise it")
+    if not name.strip():
+        raise ConfigError(f"--name {name!r}", "a name that is not blank", "choose another")
+    indices = evenly_spaced(num_scans or len(dataset), len(dataset))
+    return fit_sensor([dataset.scan(index) for index in indices], name)
 
 
 def _rows_by_order(scans: Sequence[Points], rings: Rings) -> tuple[FittedRows | None, Rings | None]:

@@ -224,9 +224,12 @@ def _unpacked_bytes(message: Any) -> int:
         Apache Arrow, columnar format, Message.fbs: Message.header -> RecordBatch.buffers; each compressed buffer begins
         with its unpacked length, an int64, -1 for one that is not compressed.
     """
+    header, body = bytes(message.metadata), message.body
+    # No sweep has these: dictionaries are unpacked of whatever column, and version 4 says elsewhere that it is packed.
+    if message.type == "dictionary" or b"ARROW:experimental_compression" in header:
+        raise ValueError("a column with a dictionary, or packed as in 2020: write it anew by pyarrow's feather")
     if message.type != "record batch":
         return 0
-    header, body = bytes(message.metadata), message.body
 
     def number(kind: str, position: int) -> int:
         return struct.unpack_from(kind, header, position)[0]

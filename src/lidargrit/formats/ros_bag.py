@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import functools
+import os
 import sqlite3
 import warnings
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from io import BytesIO
+from itertools import islice
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, BinaryIO, Protocol, runtime_checkable
 from urllib.parse import quote
 
 import numpy as np
@@ -128,14 +131,17 @@ class _Ros1:
     def message(self, index: int) -> Any:
         from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415  an optional part
 
+        unpack = functools.partial(_unpacked_lz4, at_most=BYTES_AT_MOST)
         with _bag(self._path) as reader:
-            for chunk in reader.chunks.values():
+            for position, chunk in reader.chunks.items():
                 if chunk.datasize > _CHUNK_BYTES_AT_MOST or chunk.decompressor.__module__ == "bz2":
                     raise ValueError("chunks of bzip2 or of more than 64 MB: unpack it with rosbag decompress")
+                if chunk.decompressor.__module__.startswith("lz4"):  # which would unpack whatever is there
+                    reader.chunks[position] = chunk._replace(decompressor=unpack)
             clouds = [each for each in reader.connections if each.id in self._ids]
             same = self.times[:index].count(self.times[index])
             found = reader.messages(clouds, self.times[index], self.times[index] + 1)
-            raw = [data for _, _, data in found][same]
+            _, _, raw = next(islice(found, same, None))
         return get_typestore(Stores.ROS1_NOETIC).deserialize_ros1(raw, _TYPES[0])
 
 
@@ -153,18 +159,25 @@ def _bag(path: Path) -> Iterator[Any]:
             reader.bio.close()
 
 
+def _unpacked_lz4(packed: bytes, at_most: int) -> bytes:
+    from lz4.frame import LZ4FrameDecompressor  # noqa: PLC0415  an optional part
+
+    opened = LZ4FrameDecompressor()
+    unpacked = opened.decompress(packed, max_length=at_most + 1)
+    if len(unpacked) > at_most or not opened.eof:
+        raise ValueError("a chunk that was cut off, or that unpacks to more than any recorder's")
+    return unpacked
+
+
 class _Mcap:
     def __init__(self, path: Path) -> None:
-        from mcap.reader import SeekingReader  # noqa: PLC0415  an optional part
-
         self._path = path
         with path.open("rb") as file:
-            reader = SeekingReader(file, record_size_limit=BYTES_AT_MOST)
-            summary = reader.get_summary()
+            summary = _summary(file)
             if summary is None or summary.statistics is None or not summary.chunk_indexes:
                 raise ValueError("no summary at its end: repair it with mcap recover")
             for chunk in summary.chunk_indexes:
-                if chunk.uncompressed_size > BYTES_AT_MOST or chunk.compressed_size > _CHUNK_BYTES_AT_MOST:
+                if chunk.uncompressed_size > BYTES_AT_MOST or chunk.chunk_length > _CHUNK_BYTES_AT_MOST:
                     raise ValueError("a chunk larger than any recorder's")
             types = {key: schema.name for key, schema in summary.schemas.items()}
             counts = summary.statistics.channel_message_counts
@@ -172,21 +185,80 @@ class _Mcap:
             topics: Counter[str] = Counter()
             for each in clouds:
                 topics[each.topic] += counts.get(each.id, 0)
-            self._topic = _busiest(topics)
-            if topics[self._topic] > _MESSAGES_AT_MOST:
+            topic = _busiest(topics)
+            if topics[topic] > _MESSAGES_AT_MOST:
                 raise ValueError("more messages than a recording can have")
-            self._encoding = next(each.message_encoding for each in clouds if each.topic == self._topic)
-            self.times = [message.log_time for _, _, message in reader.iter_messages(topics=[self._topic])]
+            self._encoding = next(each.message_encoding for each in clouds if each.topic == topic)
+            self._channels = {each.id for each in clouds if each.topic == topic}
+            self._chunks = sorted(summary.chunk_indexes, key=lambda chunk: chunk.chunk_start_offset)
+            found = islice(self._messages(file, self._chunks), _MESSAGES_AT_MOST + 1)
+            self.times = sorted(message.log_time for message in found)
 
     def message(self, index: int) -> Any:
-        from mcap.reader import SeekingReader  # noqa: PLC0415  an optional part
-
         time, same = self.times[index], self.times[:index].count(self.times[index])
-        with self._path.open("rb") as file, warnings.catch_warnings(action="ignore"):
-            reader = SeekingReader(file, record_size_limit=BYTES_AT_MOST)
-            found = reader.iter_messages(topics=[self._topic], start_time=time, end_time=time + 1)
-            raw = [message.data for _, _, message in found][same]
+        chunks = [each for each in self._chunks if each.message_start_time <= time <= each.message_end_time]
+        with self._path.open("rb") as file:
+            found = (each.data for each in self._messages(file, chunks) if each.log_time == time)
+            raw = next(islice(found, same, None))
         return _decoded(raw, self._encoding)
+
+    def _messages(self, file: BinaryIO, chunks: list[Any]) -> Iterator[Any]:
+        """Read the topic's messages one by one: the library makes a list of all that a chunk says it has."""
+        from mcap.data_stream import ReadDataStream  # noqa: PLC0415  an optional part
+        from mcap.opcode import Opcode  # noqa: PLC0415
+        from mcap.records import Message  # noqa: PLC0415
+
+        for chunk in chunks:
+            if chunk.message_index_offsets and not self._channels & chunk.message_index_offsets.keys():
+                continue
+            unpacked = _unpacked_chunk(file, chunk)
+            stream = ReadDataStream(BytesIO(unpacked))
+            while stream.count < len(unpacked):
+                kind, length = stream.read1(), stream.read8()
+                if kind != Opcode.MESSAGE:
+                    stream.read(length)
+                elif (message := Message.read(stream, length)).channel_id in self._channels:
+                    yield message
+
+
+def _summary(file: BinaryIO) -> Any:
+    """Read the summary at a file's end; a chunk among its records, which the library would unpack, is refused."""
+    from mcap.reader import FOOTER_SIZE, SeekingReader  # noqa: PLC0415  an optional part
+    from mcap.records import Chunk, Footer  # noqa: PLC0415
+    from mcap.stream_reader import MAGIC_SIZE, StreamReader  # noqa: PLC0415
+
+    def records() -> Iterator[Any]:
+        return StreamReader(file, skip_magic=True, emit_chunks=True, record_size_limit=BYTES_AT_MOST).records
+
+    reader = SeekingReader(file, record_size_limit=BYTES_AT_MOST)
+    file.seek(-(FOOTER_SIZE + MAGIC_SIZE), os.SEEK_END)
+    footer = next(records())
+    if not isinstance(footer, Footer) or not footer.summary_start:
+        return None
+    file.seek(footer.summary_start)
+    if any(isinstance(each, Chunk) for each in records()):
+        raise ValueError("a chunk in its summary")
+    return reader.get_summary()
+
+
+def _unpacked_chunk(file: BinaryIO, index: Any) -> bytes:
+    """Read the records of a chunk, which must be of the size that the index says."""
+    import zstandard  # noqa: PLC0415  an optional part
+    from mcap.data_stream import ReadDataStream  # noqa: PLC0415
+    from mcap.records import Chunk  # noqa: PLC0415
+
+    file.seek(index.chunk_start_offset)
+    stream = ReadDataStream(BytesIO(file.read(index.chunk_length)))
+    stream.read(9)  # kind and length of the record
+    chunk, size = Chunk.read(stream), index.uncompressed_size
+    unpacked = chunk.data
+    if chunk.compression == "lz4":
+        unpacked = _unpacked_lz4(chunk.data, size)
+    elif chunk.compression == "zstd" and zstandard.frame_content_size(chunk.data) <= size:
+        unpacked = zstandard.decompress(chunk.data, size)  # at most that, where the frame does not say
+    if not len(unpacked) == size == chunk.uncompressed_size:
+        raise ValueError("a chunk that is not of the size that the index says")
+    return unpacked
 
 
 class _Sqlite:
@@ -220,6 +292,7 @@ class _Sqlite:
         """Open the file to read only, without files beside it, and with an end to every question."""
         database = sqlite3.connect(f"file:{quote(str(self._path.resolve()))}?mode=ro&immutable=1", uri=True)
         database.execute("PRAGMA trusted_schema = OFF")
+        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, BYTES_AT_MOST)  # of a column that is computed, too
         database.set_progress_handler(lambda: 1, _SQLITE_STEPS_AT_MOST)
         return database
 

@@ -64,8 +64,8 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     ``capabilities``; asked for more, it answers which generators can.
 
     The public methods check their arguments and form batches, the same for all. A subclass writes ``_sample``, and for
-    its capabilities ``_complete``, ``_invert``, ``_reconstruct``, ``_bits`` and ``get_tokenizer``; these get
-    valid arguments on the generator's device, in evaluation mode and without gradients.
+    its capabilities ``_complete``, ``_invert``, ``_reconstruct``, ``_bits`` and ``get_tokenizer``; these get valid
+    arguments on the generator's device, in evaluation mode and without gradients.
     """
 
     Sampling: ClassVar[type] = NoSampling
@@ -77,11 +77,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     @classmethod
     @abstractmethod
     def smallest_config(cls, sensor: SensorModel) -> ConfigT:
-        """Return settings of networks as small as can be, for tests and first trials.
-
-        Args:
-            sensor: sensor of the images, whose rows and columns are multiples of 32.
-        """
+        """Return settings of networks as small as can be, for images whose rows and columns are multiples of 32."""
 
     @classmethod
     def quickest_sampling(cls) -> SamplingT:
@@ -110,10 +106,9 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
 
     @property
     def compute_batch(self) -> int:
-        """Number of scans that are computed at once, always.
+        """Number of scans that are computed at once, always; the last batch is filled up with copies.
 
-        Kernels differ by the size of a batch, and with them the last bits of a result. So every batch has this size,
-        the last one filled up with copies, and a seed gives the same scan whatever else is asked for.
+        Kernels differ by the size of a batch, and a seed is to give the same scan whatever else is asked for.
         """
         return 1
 
@@ -126,7 +121,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         """Compute statistics of the training scans that need no objective; called once, before the stages."""
 
     def objective(self, stage: str) -> Objective:
-        """Return what a stage minimises; its trained weights are given back by :meth:`load_stage`."""
+        """Return what a stage minimises; :meth:`load_stage` takes its trained weights."""
         raise NotImplementedError(f"{self.public_name()} has no stage {stage!r}")
 
     def load_stage(self, stage: str, objective: Objective) -> None:
@@ -134,7 +129,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         raise NotImplementedError(f"{self.public_name()} has no stage {stage!r}")
 
     def after_training(self) -> None:
-        """Fit what depends on the trained weights of all stages; nothing by default."""
+        """Fit what depends on all trained stages."""
 
     @final
     @torch.no_grad()

@@ -280,7 +280,7 @@ class PreparedImages:
             raise DataError(
                 f"{location}, prepared by the projection {projections[0]}",
                 projections[1],
-                "choose that projection with --set data.projection=... data.projection_variant=..., or prepare anew",
+                "choose it where the command lets you (data.projection, data.projection_variant), or prepare anew",
             )
         return FewerColumns(self, prepared.width, wanted.width) if is_wider else self
 

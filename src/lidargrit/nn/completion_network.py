@@ -23,7 +23,7 @@ from lidargrit.conditions.hints import (
     hints_of,
 )
 from lidargrit.errors import ConfigError
-from lidargrit.nn.pixel_networks import Guide, MaskNetwork
+from lidargrit.nn.pixel_networks import LOGIT_BOUND, Guide, MaskNetwork
 from lidargrit.nn.reflectance import TYPICAL_REFLECTANCE
 from lidargrit.nn.semantic_classes import NUM_CLASSES, ClassMaps, class_indices, labels_of, votes
 from lidargrit.nn.small_unet import Part, SmallUnet, SmallUnetConfig, check_image
@@ -31,7 +31,6 @@ from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
 _TRUST = 3.0  # logit by which triangulation is preferred to the other candidates at first
-_LOGIT_BOUND = 8.0
 _CLASS_CHANNELS = 4  # learned, of each label that the network sees
 _VOTE = 5.0  # logit of a class for which all observed labels around a pixel speak
 _ONE_SURFACE = 0.1  # of ln(1 + range): a return so much farther or nearer than a pixel has a logit lower by 1
@@ -157,7 +156,7 @@ class CompletionNetwork(nn.Module):
         features, weights, moved, logits = output.float().split(self.outputs, 1)
         shares = (4 * weights + self.preferred).softmax(1)
         v = (shares * hints.candidates).sum(1) + 0.3 * moved[:, 0]
-        return_logits = (2 * logits[:, 0] + 1.5).clamp(-_LOGIT_BOUND, _LOGIT_BOUND)
+        return_logits = (2 * logits[:, 0] + 1.5).clamp(-LOGIT_BOUND, LOGIT_BOUND)
         v = v.clamp(*self.limits_v)
         class_logits, reflectance = None, None
         if indices is not None:

@@ -8,11 +8,12 @@ from lidargrit.errors import ConfigError
 
 
 def usable_device(name: str) -> torch.device:
-    """Return a device by its name, such as "cpu" or "cuda".
+    """Return a device by its name, such as "cpu" or "cuda"; with "", a GPU if there is one, and else the CPU.
 
     Raises:
         ConfigError: no such device here.
     """
+    name = name or ("cuda" if torch.cuda.is_available() else "cpu")
     try:
         device = torch.device(name)
         torch.zeros(1, device=device).item()  # "meta" has shapes and no numbers

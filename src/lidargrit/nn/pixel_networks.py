@@ -19,10 +19,9 @@ from lidargrit.nn.pixel_phases import Lattice, Phase, at_phases, cells_of, gener
 from lidargrit.nn.precision import at_least_32_bits
 from lidargrit.nn.range_mixture import RangeMixture
 from lidargrit.sensors import SensorModel
-from lidargrit.structures import Decoded
+from lidargrit.structures import TYPICAL_LOG_RANGE, Decoded
 
-_TYPICAL_V = 2.5  # ln(1 + 11 m), the middle of what scans hold, so that inputs are near 0
-_LOGIT_BOUND = 8.0  # of the decoder's return logits, beyond which it is as good as sure
+LOGIT_BOUND = 8.0  # of the decoder's return logits, beyond which it is as good as sure
 _SAME_SURFACE_V = 3e-4  # two ranges nearer than this, 6 mm at 20 m, are on one surface
 _NEIGHBOURS = 6  # candidates of a range: an interpolation and two neighbours, of each of two pairs
 _HALVINGS_AT_MOST = 8  # of one side alone
@@ -109,14 +108,14 @@ class Guide(NamedTuple):
                 "one that gives them (Decoded.features)",
                 "leave the pixel decoder out, or choose the tokenizer vqvae",
             )
-        logits = at_least_32_bits(decoded.return_logits).clamp(-_LOGIT_BOUND, _LOGIT_BOUND)
+        logits = at_least_32_bits(decoded.return_logits).clamp(-LOGIT_BOUND, LOGIT_BOUND)
         return cls(at_least_32_bits(decoded.features), at_least_32_bits(decoded.range_m).log1p(), logits)
 
     @classmethod
     def nothing(cls, like: Tensor, count: int, sensor: SensorModel) -> Guide:
         """Return the guide of scans of which no token tells anything, as numbers of the type of another tensor."""
         size = (count, sensor.height, sensor.width)
-        return cls(like.new_zeros(count, 0, *size[1:]), like.new_full(size, _TYPICAL_V), like.new_zeros(size))
+        return cls(like.new_zeros(count, 0, *size[1:]), like.new_full(size, TYPICAL_LOG_RANGE), like.new_zeros(size))
 
 
 class PhaseNetwork(nn.Module, ABC):
@@ -159,7 +158,7 @@ class PhaseNetwork(nn.Module, ABC):
     def guided(self, guide: Guide) -> dict[Lattice, Tensor]:
         """Return the first layer's output for the guide, (B, C, h, w), by lattice, the same for all phases."""
         rows = self.rows[None, :, :, None].expand(len(guide.v), -1, -1, guide.v.shape[-1])
-        decoded = torch.stack((guide.v - _TYPICAL_V, guide.return_logits / 4), 1)
+        decoded = torch.stack((guide.v - TYPICAL_LOG_RANGE, guide.return_logits / 4), 1)
         maps = torch.cat((self.features(guide.features), rows, decoded), 1)
         return {lattice: network.guide(cells_of(maps, lattice)) for lattice, network in self._networks()}
 
@@ -315,8 +314,8 @@ class RangeNetwork(PhaseNetwork):
         apart = ((apart + _SAME_SURFACE_V).log() + 5) / 2
         maps = [generated, 1 - returned, generated * beside, (candidates - expected).clamp(-2, 2), apart]
         if not self.guided_by_tokens:
-            maps[2] = generated * (beside - (expected - _TYPICAL_V)).clamp(-2, 2)
-            maps.append(expected - _TYPICAL_V)
+            maps[2] = generated * (beside - (expected - TYPICAL_LOG_RANGE)).clamp(-2, 2)
+            maps.append(expected - TYPICAL_LOG_RANGE)
         return torch.cat(maps, 1)
 
     def candidates(

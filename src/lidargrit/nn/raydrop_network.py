@@ -13,15 +13,13 @@ from torch import Tensor, nn
 
 from lidargrit.conditions import Condition
 from lidargrit.errors import ConfigError
-from lidargrit.nn.pixel_networks import Guide, MaskNetwork
+from lidargrit.nn.pixel_networks import LOGIT_BOUND, Guide, MaskNetwork
 from lidargrit.nn.reflectance import TYPICAL_REFLECTANCE
 from lidargrit.nn.semantic_classes import ClassMaps, class_indices
 from lidargrit.nn.small_unet import Part, SmallUnet, SmallUnetConfig, check_image
 from lidargrit.sensors import SensorModel
-from lidargrit.structures import RangeImage
+from lidargrit.structures import TYPICAL_LOG_RANGE, RangeImage
 
-_TYPICAL_V = 2.5  # ln(1 + 11 m), the middle of what scans hold, so that inputs are near 0
-_LOGIT_BOUND = 8.0
 _EDGE = 0.5  # of ln(range): neighbours further apart lie on two surfaces
 _NUM_MAPS = 8
 _CLASS_CHANNELS = 4  # learned, of the label of a surface
@@ -133,7 +131,7 @@ class RaydropNetwork(nn.Module):
         output, of_parts = self.unet(maps, more)
         features, logits = output.float().split((self.config.features, 1), 1)
         v = torch.where(surface, range_m, 0.0).log1p()
-        logits = (2 * logits[:, 0] + 1.5).clamp(-_LOGIT_BOUND, _LOGIT_BOUND)
+        logits = (2 * logits[:, 0] + 1.5).clamp(-LOGIT_BOUND, LOGIT_BOUND)
         reflectance = None
         if self.config.reflectance:
             reflectance = TYPICAL_REFLECTANCE + of_parts["reflectance"].float()[:, 0]
@@ -180,6 +178,6 @@ class RaydropNetwork(nn.Module):
             slope = torch.minimum(*sides)  # the nearer neighbour lies on the same surface, if one of both does
             slopes.append(torch.where(slope.isfinite(), slope, 0.0))
         log_cos = -0.5 * (1 + slopes[0].square() + slopes[1].square()).log()
-        near = torch.where(surface, range_m.log1p() - _TYPICAL_V, 0.0)
+        near = torch.where(surface, range_m.log1p() - TYPICAL_LOG_RANGE, 0.0)
         maps = [surface.to(near.dtype), near, *(4 * step for step in steps), log_cos, log_cos.exp()]
         return torch.stack(maps, 1)

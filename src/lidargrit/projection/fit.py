@@ -41,8 +41,11 @@ _CROWDED_AT_MOST = 0.35
 _EMPTY_ROWS_AT_MOST = 0.4  # 0 to 0.1 in the rows of the scan's own sensor; scans of 16 lasers in 64 rows: 0.6 and more
 _FEW_POINTS = 0.02  # of what a row has in the median: a stray point does not fill a row
 
-_BY_ELEVATION = "project by elevation: --set data.projection=spherical (in Python: method='spherical')"
-FIT_SENSOR = "or find yours with lidargrit fit-sensor, and name its file with --set data.sensor=FILE.json"
+# True in all commands: some choose the projection and the sensor of the scans, in others these are the model's.
+_BY_ELEVATION = (
+    "project by elevation where the command lets you: data.projection=spherical (in Python: method='spherical')"
+)
+FIT_SENSOR = "or find yours with lidargrit fit-sensor, and name its file in place of a sensor"
 
 
 def fit_problems(
@@ -204,7 +207,7 @@ def _misplaced(
         "a scan of this sensor",
         _name_sensor(scan)
         if method == "unfolding"
-        else "project with --set data.projection_variant=exact (in Python: variant='exact')",
+        else "choose data.projection_variant=exact where the command lets you (in Python: variant='exact')",
     )
 
 
@@ -212,7 +215,7 @@ def _no_firing_order(scan: Scan) -> ScanError:
     return ScanError(
         f"points that are not stored as they were fired, ring by ring from the highest, in {scan.source}",
         "points in firing order, or the ring of each, to put them into rows by ring",
-        _BY_ELEVATION,
+        f"leave the scan out, or {_BY_ELEVATION}",
     )
 
 
@@ -250,7 +253,7 @@ def _wrong_elevations(scan: Scan, sensor: SensorModel, outside: float) -> ScanEr
 
 def _name_sensor(scan: Scan) -> str:
     if fitting := " or ".join(sensors_that_fit(scan)):
-        return f"name the sensor that made the scan: {fitting}, {FIT_SENSOR}"
+        return f"name the sensor that made the scan, or a model of that sensor: {fitting}, {FIT_SENSOR}"
     return f"no sensor in the package spans its elevations: {FIT_SENSOR.removeprefix('or ')}"
 
 

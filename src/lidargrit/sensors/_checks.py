@@ -21,6 +21,7 @@ FINE_COLUMNS_AT_MOST = 65536  # sensors fire up to 4096 times a revolution
 _PIXELS_AT_MOST = (
     2**24
 )  # 128 rows of 4096 columns have a thirtieth; images of a stranger's sensor would fill the memory
+_APART_AT_MOST = 0.75  # of a column: published programs take the edges of columns, half a column from the centres
 _NAME_AT_MOST = 200  # letters: a name is part of messages
 _CURE = "compare it with what SensorModel.to_json writes"
 
@@ -66,6 +67,21 @@ def check_tables(name: str, elevation: Tensor, azimuth: Tensor, offset: Tensor |
             f"elevations of the sensor {name!r} that do not fall from row to row",
             "row 0 the highest ray, every next row lower",
             "sort the rows of the sensor",
+        )
+    if len(azimuth) == 1:
+        _check_columns(name, azimuth[0], column_stride)
+
+
+def _check_columns(name: str, azimuth_rad: Tensor, stride: int) -> None:
+    """Refuse azimuths of columns other than those into which points are projected: equal ones, from +pi down."""
+    step_rad = 2 * math.pi / (len(azimuth_rad) * stride)
+    centres_rad = math.pi - step_rad * (torch.arange(len(azimuth_rad), dtype=torch.float64) * stride + 0.5)
+    apart_rad = (azimuth_rad.double() - centres_rad + math.pi).remainder(2 * math.pi) - math.pi
+    if float(apart_rad.abs().max()) > _APART_AT_MOST * step_rad:
+        raise ConfigError(
+            f"azimuths of the sensor {name!r} that are not those of equal columns from +pi down",
+            f"the centres of {len(azimuth_rad) * stride} columns around the circle, clockwise from behind",
+            "give azimuth_rad so, as lidargrit fit-sensor does",
         )
 
 

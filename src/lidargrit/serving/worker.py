@@ -29,9 +29,12 @@ from lidargrit.conditions import Condition
 from lidargrit.conditions.patterns import Pattern
 from lidargrit.errors import ConfigError, LidarGritError, OutputError
 from lidargrit.files import atomic_path, write_text
-from lidargrit.generators import Generator, load
+from lidargrit.generators import Generator, load, locate
+from lidargrit.nn.devices import usable_device
+from lidargrit.projection import ProjectionVariant
 from lidargrit.sensors import load_sensor
 from lidargrit.serving.requests import TASKS, UPSAMPLED, SampleRequest, sampling_settings
+from lidargrit.sources.samples import projection_of
 from lidargrit.structures import RangeImage
 from lidargrit.viewer.interactive import page_data
 from lidargrit.viewer.scan_sets import ScanSet
@@ -47,7 +50,8 @@ def run_worker(runs: Sequence[Path], device: str) -> None:
     write_line = partial(print, file=sys.stdout, flush=True)
     sys.stdout = sys.stderr  # whatever a library prints is no answer
     try:
-        generators = [load(run).to(device or ("cuda" if torch.cuda.is_available() else "cpu")) for run in runs]
+        generators = [load(run).to(usable_device(device)) for run in runs]
+        variants: list[ProjectionVariant] = [_variant_of(run) for run in runs]
     except LidarGritError as error:
         _send(write_line, {"refused": [type(error).__name__, error.got, error.wanted, error.cure]})
         return
@@ -60,7 +64,8 @@ def run_worker(runs: Sequence[Path], device: str) -> None:
     for line in sys.stdin:
         message = json.loads(line)
         request = SampleRequest(**message["request"])
-        _send(write_line, _answer_request(generators[request.model], request, Path(message["folder"])))
+        generator, variant = generators[request.model], variants[request.model]
+        _send(write_line, _answer_request(generator, variant, request, Path(message["folder"])))
 
 
 def describe_model(name: str, generator: Generator) -> dict[str, Any]:
@@ -72,28 +77,47 @@ def describe_model(name: str, generator: Generator) -> dict[str, Any]:
         "sensor": f"{sensor.name}, {sensor.height} x {sensor.width}",
         "upload": next((able for able in ("complete", "encode") if able in generator.capabilities), ""),
         "tasks": [task for task in TASKS if task != "raydrop" or "surfaces" in generator.conditions],
-        "settings": [dataclasses.asdict(setting) for setting in sampling_settings(generator.Sampling())],
+        "settings": _settings_of(generator),
         "rays": sensor.to_json(),
     }
 
 
-def compute_result(generator: Generator, request: SampleRequest) -> list[ScanSet]:
+def _variant_of(run: Path) -> ProjectionVariant:
+    return "reference" if projection_of(locate(run)) == "reference" else "exact"
+
+
+def _settings_of(generator: Generator) -> list[dict[str, Any]]:
+    """Return the sampling settings, which say where a completion that is told nothing else takes another value."""
+    settings = []
+    for one in sampling_settings(generator.Sampling()):
+        value = getattr(generator.completion_sampling(), one.name)
+        note = "" if value == one.default else f" If you leave it alone, a scan is completed with {value}."
+        settings.append(dataclasses.asdict(one) | {"about": one.about + note})
+    return settings
+
+
+def compute_result(generator: Generator, request: SampleRequest, variant: ProjectionVariant = "exact") -> list[ScanSet]:
     """Sample new scans, or complete, upsample, drop or reconstruct an uploaded scan.
+
+    Args:
+        generator: model that does it.
+        request: what is asked for.
+        variant: variant of the projection that the model learned from.
 
     Raises:
         LidarGritError: a file that cannot be used, or a setting out of its bounds.
     """
     # Settings that the client left alone stay with the generator: it may complete by other values than it samples by.
-    sampling = dataclasses.replace(generator.Sampling(), **request.sampling) if request.sampling else None
-    device = next(iter(generator.state_dict().values())).device
+    own = generator.completion_sampling() if request.file else generator.Sampling()
+    sampling = dataclasses.replace(own, **request.sampling) if request.sampling else None
     seeds = range(request.seed, request.seed + request.count)
     if not request.file:
         names = tuple(f"seed {seed}" for seed in seeds)
         return [ScanSet("generated", generator.sample(seeds, sampling).to("cpu"), names)]
-    seen = _read_upload(request, _reader(request, generator))
+    seen = _read_upload(request, _reader(request, generator, variant))
     image = RangeImage.stack([seen.image])
     sets = [ScanSet("as uploaded", image, (request.name,))]
-    image = image.to(device)
+    image = image.to(generator.device)
     if "complete" not in generator.capabilities:
         return [*sets, ScanSet("reconstructed", generator.reconstruct(image).to("cpu"), (request.name,))]
     if request.task == "region" and not request.region:
@@ -103,19 +127,19 @@ def compute_result(generator: Generator, request: SampleRequest) -> list[ScanSet
     if request.task == "raydrop":
         dropped = generator.complete(Condition.of_surfaces(images), seeds, sampling)
         return [*sets, ScanSet("with raydrop", dropped.to("cpu"), names)]
-    observed = _observed(request, seen).to(device)
+    observed = _observed(request, seen).to(generator.device)
     condition = Condition.of_pixels(images, observed.expand_as(images.return_mask))
     if bool((images[0].return_mask & ~observed).any()):
         sets.append(ScanSet("what the model saw", condition[0:1].images.to("cpu"), (request.name,)))
     return [*sets, ScanSet("completed", generator.complete(condition, seeds, sampling).to("cpu"), names)]
 
 
-def _reader(request: SampleRequest, generator: Generator) -> ScanReader:
+def _reader(request: SampleRequest, generator: Generator, variant: ProjectionVariant) -> ScanReader:
     """Return what projects an uploaded scan; it may be a part of the circle if the model completes it."""
     partial = "complete" in generator.capabilities and request.task != "raydrop"
     if request.task in UPSAMPLED:
-        return SparseReader(generator.sensor, partial=partial, source=load_sensor(request.task))
-    return ScanReader(generator.sensor, partial=partial)
+        return SparseReader(generator.sensor, variant, partial, load_sensor(request.task))
+    return ScanReader(generator.sensor, variant, partial)
 
 
 def _read_upload(request: SampleRequest, reader: ScanReader) -> InputScan:
@@ -143,10 +167,12 @@ def _observed(request: SampleRequest, seen: InputScan) -> Bool[Tensor, "H W"]:
     return Pattern(pattern).mask(seen.image)
 
 
-def _answer_request(generator: Generator, request: SampleRequest, folder: Path) -> dict[str, Any]:
+def _answer_request(
+    generator: Generator, variant: ProjectionVariant, request: SampleRequest, folder: Path
+) -> dict[str, Any]:
     """Write a result into a folder, and return the answer."""
     try:
-        sets = compute_result(generator, request)
+        sets = compute_result(generator, request, variant)
         pixels: dict[str, Any] = {}
         for index, scans in enumerate(sets):
             pixels[f"range_m_{index}"] = scans.images.range_m.numpy()

@@ -53,7 +53,7 @@ class ImageFileSource(Source):
         raise ConfigError(
             f"range images of {'x'.join(map(str, size))} in {self.text}",
             f"the sensor of their rows and columns{', such as ' + ' or '.join(fitting) if fitting else ''}",
-            "name it with --sensor NAME or FILE.json, and other columns with --set data.columns=NUMBER",
+            "name it with --sensor NAME or FILE.json, which may have other columns",
         )
 
     def projection_variant(self, config: DataConfig) -> str:

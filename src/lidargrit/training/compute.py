@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
@@ -46,7 +46,7 @@ class StageCost:
         return round(self.flops_per_scan * scans) + self.preparation_flops(scans)
 
 
-def training_flops(recipe: Recipe) -> dict[str, int]:
+def training_flops(recipe: Recipe, taken: Collection[str] | None = None) -> dict[str, int]:
     """Count the floating-point operations of a recipe's training, forward and backward, for each stage.
 
     Matrix products and convolutions are counted while a few steps run, on scans whose every pixel returns at 10 m. A
@@ -58,6 +58,7 @@ def training_flops(recipe: Recipe) -> dict[str, int]:
 
     Args:
         recipe: recipe whose training it is.
+        taken: names of the stages that are taken from another run, if that is known already.
 
     Returns:
         number of operations, by the name of the stage; none for stages that are taken from another run.
@@ -65,10 +66,10 @@ def training_flops(recipe: Recipe) -> dict[str, int]:
     Raises:
         CheckpointError: no finished run to take stages from.
     """
-    return {name: cost.flops(recipe.training[name].scans) for name, cost in stage_costs(recipe).items()}
+    return {name: cost.flops(recipe.training[name].scans) for name, cost in stage_costs(recipe, taken).items()}
 
 
-def stage_costs(recipe: Recipe) -> dict[str, StageCost]:
+def stage_costs(recipe: Recipe, taken: Collection[str] | None = None) -> dict[str, StageCost]:
     """Count the operations of every stage that is trained by its name, whatever number of scans it is trained on."""
     with torch.random.fork_rng(range(torch.cuda.device_count())):
         torch.manual_seed(0)
@@ -76,7 +77,7 @@ def stage_costs(recipe: Recipe) -> dict[str, StageCost]:
         with torch.device("meta"):
             generator = recipe.build_generator(sensor).to("meta")
         costs = {}
-        taken = donors_of_stages(recipe, generator.stages)
+        taken = donors_of_stages(recipe, generator.stages) if taken is None else taken
         for stage in (name for name in generator.stages if name not in taken):
             try:
                 costs[stage] = _cost_without_values(generator, stage, sensor)

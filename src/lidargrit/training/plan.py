@@ -17,7 +17,7 @@ from lidargrit.training.compute import computing_time, training_flops
 from lidargrit.training.config import Recipe
 from lidargrit.training.fit import check_parts
 from lidargrit.training.optimiser import make_optimiser, memory_of_weights
-from lidargrit.training.taken_stages import donors_of_stages, taken_stages
+from lidargrit.training.taken_stages import taken_stages
 
 
 @dataclass(frozen=True)
@@ -144,9 +144,9 @@ def plan_training(recipe: Recipe) -> TrainingPlan:
     objectives = check_stages(recipe)
     with torch.device("meta"):
         generator = recipe.build_generator(sensor).to("meta")
-    taken_stages(recipe, generator)  # raises where a stage does not fit
-    donors = donors_of_stages(recipe, generator.stages)
-    flops = training_flops(recipe)
+    donor = recipe.tokenizer_from or recipe.stages_from or ""
+    donors = {stage: donor for stage in taken_stages(recipe, generator) if stage not in recipe.fine_tune}
+    flops = training_flops(recipe, donors)
     for name, objective in objectives.items():
         budget = recipe.training[name]
         parameters = sum(weight.numel() for weight in objective.parameters())

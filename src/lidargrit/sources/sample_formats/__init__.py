@@ -196,7 +196,12 @@ def _array(values: Tensor) -> np.ndarray[Any, np.dtype[np.float32]]:
 
 
 def _paths(folder: Path) -> list[Path]:
-    found = sorted(folder.glob("[!.]*.pth"), key=lambda path: [int(n) for n in re.findall(r"\d{1,18}", path.stem)])
+    found = sorted(folder.glob("[!.]*.pth"), key=_order)
     if not found:
         raise DataError(f"no .pth file in {folder}", "samples as tensors, one file each", "check the folder")
     return found
+
+
+def _order(path: Path) -> tuple[list[int], str]:
+    """Return the numbers in a file's name, 10 after 9, then the name, since file systems have orders of their own."""
+    return [int(number) for number in re.findall(r"\d{1,18}", path.stem)], path.name

@@ -1,0 +1,66 @@
+"""What the server's worker process computes is what the commands compute: settings left alone, and the projection."""
+
+import json
+from dataclasses import replace
+from io import StringIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lidargrit
+from lidargrit.completion.inputs import ScanReader
+from lidargrit.formats import load, read_scan
+from lidargrit.serving.requests import SampleRequest
+from lidargrit.serving.worker import PIXELS_FILE, compute_result, describe_model, run_worker
+from test_generator_contract import made
+
+
+@pytest.fixture(scope="module")
+def scan_file(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("scans") / "street.ply"
+    load("ply").write(path, lidargrit.simulate(seed=5))
+    return path
+
+
+class BegunError(Exception):
+    """A model would begin to compute."""
+
+
+@pytest.mark.parametrize(
+    ("name", "other", "changed"), [("r2dm", "steps", {"resamples": 2}), ("dusty", "search_steps", {"search_rate": 0.5})]
+)
+def test_settings_that_were_left_alone_are_those_of_what_is_done(name, other, changed, scan_file, monkeypatch):
+    def begin(*given):
+        raise BegunError(given[-1])
+
+    model = made(name)[0]
+    monkeypatch.setattr(model, "sample", begin)
+    monkeypatch.setattr(model, "complete", begin)
+    for file, own in (("", model.Sampling()), (str(scan_file), model.completion_sampling())):
+        with pytest.raises(BegunError) as begun:
+            compute_result(model, SampleRequest(0, sampling=changed, file=file, name="mine.ply"))
+        assert begun.value.args == (replace(own, **changed),)
+    value = getattr(model.completion_sampling(), other)
+    settings = describe_model("tiny", model)["settings"]
+    assert [one["name"] for one in settings if f"a scan is completed with {value}." in one["about"]] == [other]
+
+
+def test_an_uploaded_scan_is_projected_as_those_that_the_model_learned_from(scan_file, tmp_path, monkeypatch):
+    runs = [tmp_path / variant for variant in ("reference", "exact")]
+    model, images = made("r2dm")[0], []
+    for run in runs:
+        model.save(run)
+        (run / "run.json").write_text(json.dumps({"recipe": {"data": {"projection_variant": run.name}}}))
+    for number, run in enumerate(runs):
+        out = tmp_path / f"{run.name} result"
+        out.mkdir()
+        request = {"model": number, "task": "ahead", "file": str(scan_file), "sampling": {"steps": 1, "resamples": 1}}
+        monkeypatch.setattr("sys.stdin", StringIO(json.dumps({"request": request, "folder": str(out)})))
+        monkeypatch.setattr("sys.stdout", answers := StringIO())
+        run_worker(runs, "cpu")
+        assert json.loads(answers.getvalue().splitlines()[-1]) == {"done": True}
+        images.append(np.load(out / PIXELS_FILE)["range_m_0"][0])
+        wanted = ScanReader(model.sensor, run.name, partial=True).read(read_scan(scan_file, bad_points="drop"))
+        assert np.array_equal(images[-1], wanted.image.range_m.numpy())
+    assert not np.array_equal(*images)
