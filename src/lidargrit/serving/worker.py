@@ -101,7 +101,7 @@ def compute_result(generator: Generator, request: SampleRequest, variant: Projec
 
     Args:
         generator: model that does it.
-        request: what is asked for.
+        request: task and settings that the page sent.
         variant: variant of the projection that the model learned from.
 
     Raises:
