@@ -59,7 +59,7 @@ def main() -> None:
     alone = surfaces.return_mask & (torch.rand(logits.shape, generator=rng) < logits.sigmoid())
     rows = {
         "true scans of the same streets": measured,
-        "the simulator, drawn anew": RangeImage.stack(redrawn[: options.count]),
+        "the simulator, sampled again": RangeImage.stack(redrawn[: options.count]),
         "model": dropped,
         "its probabilities, pixel by pixel": RangeImage.masked(surfaces.range_m, alone, model.sensor),
         "Bernoulli": drop_independently(surfaces, float(measured.return_mask.float().mean())),
