@@ -100,7 +100,7 @@ def test_images_are_those_that_the_protocol_wants(number):
 
 
 def test_a_plan_tells_scans_and_cost(tmp_path, capsys, monkeypatch):
-    told_at_once = lambda recipe: dict.fromkeys(recipe.training, 10**18)  # noqa: E731
+    told_at_once = lambda recipe, taken: dict.fromkeys(recipe.training, 10**18)  # noqa: E731
     monkeypatch.setattr(sys.modules["lidargrit.training.plan"], "training_flops", told_at_once)
     load("kitti_360").write_example(tmp_path / "root", 1)
     (scan,) = (tmp_path / "root").rglob("*.bin")
