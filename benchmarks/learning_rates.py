@@ -15,9 +15,9 @@ from lidargrit.errors import TrainingError
 from lidargrit.evaluation.benchmark import Benchmark, as_table
 from lidargrit.evaluation.benchmark import run as run_benchmark
 from lidargrit.evaluation.comparison import EvalConfig
-from lidargrit.generators import is_run
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import TerminalReporter
+from lidargrit.run_folder import is_run
 from lidargrit.training import check_folder, train, training_flops, with_budget
 
 METRICS = ("sliced_wasserstein", "point_cloud_jsd", "range_histogram_per_ring", "return_rate_per_ring")

@@ -21,9 +21,10 @@ import torch
 from lidargrit.conditions import Condition
 from lidargrit.evaluation.raydrop import RAYDROP_CURVES
 from lidargrit.evaluation.realism import distance, drop_independently, pair_of
-from lidargrit.generators import load, locate
+from lidargrit.generators import load
 from lidargrit.generators.lidargrit import LidarGrit
 from lidargrit.loading import DataConfig
+from lidargrit.run_folder import locate
 from lidargrit.simulator import observe
 from lidargrit.sources import open_images
 from lidargrit.structures import RangeImage

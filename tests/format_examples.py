@@ -1,15 +1,18 @@
 """What tests of file formats share: a small scan for each format, and files of it in all the ways they are written."""
 
 import math
+import tracemalloc
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from pypcd4.pypcd4 import Encoding, PointCloud
 
 from lidargrit import _discovery
-from lidargrit.formats import ScanFormat, load
+from lidargrit.errors import ScanError
+from lidargrit.formats import ScanFormat, load, read_scan
 from lidargrit.projection import unproject
 from lidargrit.sensors import load_sensor
 from lidargrit.structures import RangeImage, Scan
@@ -46,6 +49,19 @@ def written(cls: type[ScanFormat], folder: Path, suffix: str = "", columns: int 
     path = folder / f"example{suffix or cls.suffixes[0]}"
     cls.write(path, example(cls, columns))
     return path
+
+
+def refused_within(path: Path, megabytes: int) -> str:
+    """Read a file that must be refused before it takes that much memory, and return the message."""
+    tracemalloc.start()
+    try:
+        with pytest.raises(ScanError) as refusal:
+            read_scan(path)
+        most_bytes = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert most_bytes < megabytes * 1_000_000
+    return str(refusal.value)
 
 
 def small_files(folder: Path) -> list[tuple[str, str, bytes]]:

@@ -9,6 +9,7 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
 from lidargrit.cli import main
+from lidargrit.datasets import load
 from lidargrit.errors import CheckpointError, ConfigError, LidarGritError, OutputError
 from lidargrit.evaluation import benchmark
 from lidargrit.evaluation.benchmark import Benchmark, as_table
@@ -98,6 +99,39 @@ def test_scans_of_another_sensor_are_told_before_anything_is_trained(tmp_path):
     assert not list((tmp_path / "table").rglob("run.json"))
 
 
+def test_a_run_of_another_sensor_is_told_before_it_is_sampled(tmp_path):
+    prepared = prepare("simulated:2:test", DataConfig(columns=64, column_stride=8), tmp_path / "narrow")
+    wanted = replace(BENCHMARK, reference=str(prepared), recipe_settings=())
+    with pytest.raises(LidarGritError, match="narrow"):
+        run_benchmark(["pretrained"], tmp_path / "table", wanted)
+    assert not list((tmp_path / "table").rglob("*"))
+
+
+def test_settings_that_a_later_recipe_cannot_follow_are_told_before_the_first_system(tmp_path):
+    wrong = replace(BENCHMARK, recipe_settings=(*FEW, "training.tokenizer.optimiser=muon"))
+    with pytest.raises(ConfigError, match="optimiser=muon for networks without linear layers"):
+        run_benchmark(["pretrained", "demo"], tmp_path, wrong)
+    assert not list(tmp_path.rglob("*"))
+
+
+def test_the_reference_is_projected_once_for_all_systems_of_a_sensor(tmp_path, monkeypatch):
+    monkeypatch.setenv("LIDARGRIT_CACHE", str(tmp_path / "cache"))
+    run_benchmark(["marginal", "memorised"], tmp_path / "table", replace(BENCHMARK, num_samples=4))
+    assert len(list((tmp_path / "cache").iterdir())) == 3, "train, val and the four scans that are compared"
+
+
+def test_bounds_of_another_data_set_are_warned_of(tmp_path, capsys):
+    load("kitti_odometry").write_example(tmp_path / "real", 2)
+    words = ["-n", "2", "--metrics", "bev_jsd", "--against", str(tmp_path / "real")]
+    assert main(["compare", str(tmp_path / "table"), "marginal", "memorised", *words, "--set", *FEW]) == 0
+    (line,) = (line for line in capsys.readouterr().err.splitlines() if "bound no score" in line)
+    assert line.startswith("WARNING: marginal and memorised would learn from simulated:6:train, another data set ")
+    assert "--set data.train=FOLDER data.val=FOLDER" in line
+    own = [f"data.train={tmp_path / 'real'}", f"data.val={tmp_path / 'real'}", *FEW[2:]]
+    assert main(["compare", str(tmp_path / "own"), "marginal", *words, "--set", *own]) == 0
+    assert "bound no score" not in capsys.readouterr().err
+
+
 def test_training_flops_are_three_forward_passes_of_a_plain_stack():
     recipe = load_recipe("r2dm_small", FEW)
     network = load_recipe("r2dm_small", FEW).model
@@ -118,6 +152,10 @@ def test_a_budget_scales_all_stages_alike():
     assert with_budget(load_recipe("marginal"), 1.0) == load_recipe("marginal")
     with pytest.raises(ConfigError, match="at least one batch"):
         with_budget(recipe, 1e6)
+    lacking = load_recipe("r2flow_small", ["model.reflow={}"])
+    for count in (training_flops, lambda recipe: with_budget(recipe, 1e13)):
+        with pytest.raises(ConfigError, match=r"without training\.reflow, a stage of model=r2flow"):
+            count(lacking)
 
 
 def test_stages_that_are_taken_from_another_run_are_not_counted():

@@ -290,7 +290,6 @@ def test_list_names_everything_there_is(typed):
     assert "licence: " in typed("list", "datasets")
     assert "  lidargrit-kitti-360 " in typed("list", "protocols")
     assert "  lidargen " in typed("list", "sample-formats")
-    assert typed("list", "dialects") == typed("list", "sample-formats"), "the former word still works"
 
 
 def test_doctor_tells_versions_and_room(typed):

@@ -265,6 +265,7 @@ def test_the_drops_of_a_model_are_scored_beside_independent_ones(folders):
         (["raydrop", "{}/scans", "--model", "{}/run", "--probability", "-1"], "--probability -1; wanted 0 or more"),
         (["complete", "{}/scans", "--model", "{}/run", "-n", "9999999"], "9,999,999 completions of each of 2 scans"),
         (["complete", "{}/scans", "--model", "{}/run", "--format", "las2"], "the format 'las2' to write"),
+        (["complete", "{}/scans", "--model", "{}/run", "--format", "docx"], "wanted image, kitti_odometry, "),
         (
             ["raydrop", "{}/scans", "--model", "linear"],
             "--model linear, a classical method, which takes pixels of which range and return are known; wanted a run",

@@ -329,6 +329,17 @@ def test_another_file_of_the_same_name_is_not_taken_for_the_one_before(two_sourc
     assert "out, which holds other scans" in the_one_line(capsys.readouterr().err, "decompress")
 
 
+def test_a_first_scan_that_is_not_restored_leaves_the_folder_to_a_corrected_command(two_sources, capsys, monkeypatch):
+    assert compress("a", "scans.lgz", "-n", "1") == 0
+    Path("out").mkdir()
+    with monkeypatch.context() as patch:
+        patch.delattr(ScanCodec, "decompress")
+        with pytest.raises(AttributeError):
+            main(["decompress", "scans.lgz", "out", "--model", "run"])
+    assert main(["decompress", "scans.lgz", "out", "--model", "run", "--format", "pcd"]) == 0
+    assert sorted(os.listdir("out")) == ["0.pcd", "decompressed.json"]
+
+
 def test_an_interrupted_file_goes_on_only_with_the_options_that_say_which_scans(two_sources, capsys, monkeypatch):
     whole, calls = ScanCodec.compress, []
 
@@ -374,7 +385,7 @@ def test_the_formats_that_are_named_are_those_it_writes(tmp_path, two_sources, c
         capsys.readouterr()
         assert main(["decompress", "scans.lgz", "out", "--model", "run", "--format", kind]) == 2
         got, wanted, _ = the_one_line(capsys.readouterr().err, "decompress").split(";")
-        assert f"--format {kind}" in got
+        assert f"the format {kind!r} to write" in got
         assert "image, " in wanted
         assert "ply" in wanted
         assert "kitti_odometry" not in wanted

@@ -13,11 +13,11 @@ from lidargrit import demo
 from lidargrit.evaluation.intervals import RealAgainstReal
 from lidargrit.evaluation.reconstruction import score_reconstruction
 from lidargrit.evaluation.reference_rows import ImagesInMemory
-from lidargrit.generators import RUN_FILE
 from lidargrit.generators.lidargrit import LidarGrit
 from lidargrit.loading import Provenance, RangeImages
 from lidargrit.nn.pixel_networks import PixelDecoderConfig
 from lidargrit.reporting import Reporter
+from lidargrit.run_folder import RUN_FILE
 from lidargrit.viewer.report_charts import score_chart
 from test_generator_contract import SENSOR, Store, made
 

@@ -6,6 +6,7 @@ import importlib.util
 import inspect
 import re
 import shlex
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 
@@ -104,6 +105,16 @@ def test_programs_that_pages_tell_to_run_are_there():
     for page, text in TEXTS.items():
         for path in re.findall(r"\b((?:benchmarks|examples)/\w+\.py)", text):
             assert (ROOT / path).is_file(), f"{page.name}: {path}"
+
+
+def test_the_architecture_names_every_package_in_the_order_of_the_layers():
+    table = TEXTS[ROOT / "docs" / "architecture.md"].partition("## Packages")[2].partition("\n## ")[0]
+    named = re.findall(r"^\| `(\w+)(?:/|\.py)`", table, re.MULTILINE)
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"][
+        "contracts"
+    ]
+    (layers,) = (each["layers"] for each in contracts if each["type"] == "layers")
+    assert [name for name in named if name != "pretrained"] == layers[::-1]  # pretrained holds weights, no code
 
 
 def quoted_in_source() -> str:

@@ -72,7 +72,7 @@ def test_raydrop_has_a_seed_of_its_own():
 def test_masks_follow_the_logits():
     generator = made()
     with torch.no_grad():
-        _, logits = generator.synthesis(generator._normal([4], 1)[:, 0])
+        _, logits = generator.synthesis(generator._latents([4]))
         assert torch.equal(generator.sample([4], DustySampling(mask="threshold")).return_mask, logits[:, 0] > 0)
         sampled = torch.stack([generator.sample([4], DustySampling(raydrop_seed=s)).return_mask[0] for s in range(400)])
     assert torch.allclose(sampled.float().mean(0), logits[0, 0].sigmoid(), atol=0.13)  # five standard errors

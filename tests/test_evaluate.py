@@ -193,8 +193,27 @@ def test_words_of_reading_scans_are_obeyed_or_refused(tmp_path, capsys):
     assert not (tmp_path / "r.html").exists()
     for words, got in (
         (["samples", "--tables", "a.json"], "--tables and samples"),
+        (["--tables", "a.json", "--protocol", "r2dm"], "--tables and --protocol"),
+        (["--tables", "a.json", "-n", "3"], "--tables and --max-scans"),
+        (["--tables", "a.json", "--set", "data.columns=64"], "--tables and --set"),
         (["a", "b", "--format", "latex"], "--format latex without --tables"),
         (["a", "b", "--report", str(tmp_path / "r.png")], "r.png, which will hold HTML"),
+    ):
+        assert main(["evaluate", *words]) == 2
+        assert got in the_one_line(capsys.readouterr().err, "evaluate")
+
+
+def test_options_that_change_no_score_are_refused(sets, tmp_path, capsys):
+    ours = write_scans(tmp_path / "ours", 2, 3, variant="exact")
+    weights = ["--weights", f"pointnet={tmp_path / 'weights.pth'}"]
+    for words, got in (
+        ([ours, sets[1], "--sensor", "vlp16"], f"--sensor vlp16 for {ours}, which holds generated range images"),
+        ([*sets, "--sensor", "vlp16"], f"--sensor vlp16 for {sets[0]}, which holds generated range images"),
+        ([*sets, *weights], "weights.pth, which none of the chosen metrics needs; wanted no weights"),
+        (
+            [*sets, *weights, "--metrics", "frechet_range_distance"],
+            "weights.pth, which none of the chosen metrics needs; wanted weights of rangenet53",
+        ),
     ):
         assert main(["evaluate", *words]) == 2
         assert got in the_one_line(capsys.readouterr().err, "evaluate")

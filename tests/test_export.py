@@ -12,7 +12,7 @@ import torch
 from lidargrit.cli import main
 from lidargrit.datasets import open_dataset
 from lidargrit.errors import ConfigError, DataError, OutputError, ScanError, UnknownNameError
-from lidargrit.export import MANIFEST, export_scans, kinds
+from lidargrit.export import MANIFEST, export_scans
 from lidargrit.formats import read_scan
 from lidargrit.loading import DataConfig, prepare
 from lidargrit.projection import unproject
@@ -240,6 +240,7 @@ def test_range_images_of_one_sensor_are_not_taken_for_those_of_another(samples, 
     words = ["export", str(tmp_path / "image.npy"), str(tmp_path / "out"), "--sensor"]
     assert main([*words, "vlp16"]) == 0
     assert main([*words, "vlp16"]) == 0, "the same command"
+    assert (tmp_path / "out" / "image.bin").is_file(), "an image keeps its name"
     assert main([*words, str(tmp_path / "other.json")]) == 2
     assert "which holds other scans or another format" in capsys.readouterr().err
     for source, kind in (("simulated:1", "scans"), (str(samples), "generated range images")):
@@ -249,10 +250,12 @@ def test_range_images_of_one_sensor_are_not_taken_for_those_of_another(samples, 
 
 
 def test_other_formats_and_sources_are_refused(samples, tmp_path):
-    assert {"kitti_bin", "pcd", "ply", "las", "numpy_array", "kitti_odometry"} <= set(kinds())
-    for kind in ("plx", "ouster_pcap", "pcap", ""):
-        with pytest.raises(UnknownNameError, match="the format"):
+    for kind in ("plx", "ouster_pcap", "pcap", "", "image"):
+        with pytest.raises(UnknownNameError, match="the format") as refused:
             export_scans(str(samples), tmp_path / "out", kind)
+        wanted = set(re.split(", | or ", refused.value.wanted))
+        assert {"kitti_bin", "pcd", "ply", "las", "numpy_array", "kitti_odometry"} <= wanted
+        assert not {"image", "ouster_pcap"} & wanted
     with pytest.raises(DataError):
         export_scans(str(tmp_path / "nowhere"), tmp_path / "out", "ply")
     with pytest.raises(ConfigError):

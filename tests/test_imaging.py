@@ -8,7 +8,7 @@ import torch
 
 from lidargrit import cli, formats
 from lidargrit.errors import ScanError
-from lidargrit.evaluation.pairs import pair_for_protocol
+from lidargrit.evaluation.pairs import EvalSet, pair_for_protocol
 from lidargrit.evaluation.protocols import load_protocol
 from lidargrit.loading import DataConfig
 from lidargrit.loading.config import ScanSettings
@@ -113,6 +113,18 @@ def test_a_shuffled_set_is_compared_as_if_it_were_in_order(folders, protocol):
     swapped = pair_for_protocol(*map(open_source, names[::-1]), load_protocol(protocol), DataConfig())
     assert torch.equal(swapped.samples.batch([0, 1]).range_m, ours.range_m)
     assert {each.projection_variant for each in (swapped.samples, swapped.reference)} == {"exact"}
+
+
+def test_a_window_keeps_reflectance_and_labels_of_what_it_keeps():
+    images = open_source("simulated:1:test").images(HDL64E)
+    whole, near = (EvalSet("a", images, [0], window).batch([0]) for window in (None, (5.0, 20.0)))
+    assert whole.label is not None
+    assert whole.reflectance is not None
+    assert near.label is not None
+    assert near.reflectance is not None
+    assert 0 < near.return_mask.sum() < whole.return_mask.sum()
+    assert torch.equal(near.label, whole.label * near.return_mask)
+    assert torch.equal(near.reflectance, whole.reflectance * near.return_mask)
 
 
 def test_scans_are_known_again_without_their_reflectance(folders, tmp_path):

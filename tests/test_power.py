@@ -7,6 +7,7 @@ import pytest
 
 from lidargrit.sensors import load_sensor
 from lidargrit.simulator import labels, materials
+from lidargrit.simulator.beams import Beams
 from lidargrit.simulator.kitti_car import hidden_by_car
 from lidargrit.simulator.mesh import Mesh
 from lidargrit.simulator.observation import ObservationConfig, observe_scene
@@ -185,6 +186,10 @@ def test_lasers_of_kitti_are_its_own():
     assert drawn.log_gain.shape == (128, 1)
     assert drawn.log_gain.std() == pytest.approx(MODEL.laser_spread, rel=0.25)
     assert (drawn.reading == 1).all()
+    for other in (load_sensor("hdl64e_kitti_360"), replace(SENSOR, name="hdl64e_kitti_of_mine")):
+        assert (Lasers.of(other, MODEL).reading == 1).all()
+    mine = Beams.sample(replace(SENSOR, name="hdl64e_kitti_of_mine"), np.random.default_rng(0), 0.0)
+    assert mine.clear.all(), "another's sensor is on another car"
 
 
 def test_readings_of_lasers_reach_the_reflectance():

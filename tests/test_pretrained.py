@@ -15,8 +15,9 @@ from lidargrit import project, simulate, unproject
 from lidargrit.cli import main
 from lidargrit.errors import CheckpointError
 from lidargrit.files import read_tensors
-from lidargrit.generators import Generator, load, locate
+from lidargrit.generators import Generator, load
 from lidargrit.recipes import load_recipe
+from lidargrit.run_folder import locate
 from lidargrit.serving import finished_runs
 from lidargrit.sources.samples import read_samples
 from lidargrit.structures import RangeImage

@@ -25,7 +25,7 @@ from lidargrit.structures import RangeImage
 from lidargrit.tokenizers.vqvae import Vqvae
 from lidargrit.training import FitConfig
 from lidargrit.training.engine import Engine
-from lidargrit.training.fit import Fit, engine_for
+from lidargrit.training.fit import Fit, begin_training
 from lidargrit.training.optimiser import make_optimiser
 from tiny_runs import train_words
 
@@ -123,8 +123,8 @@ def learn_pixels():
     torch.manual_seed(0)
     objective = Multiscale(Multiscale.smallest_config(SENSOR), SENSOR).objective("pixels")
     learn = FitConfig(scans=8, batch_size=2, learning_rate=1e-3)
-    engine, before = engine_for(objective, learn), copy.deepcopy(objective.state_dict())
-    engine.set_up(objective, make_optimiser(objective, learn))
+    before = copy.deepcopy(objective.state_dict())
+    engine, _ = begin_training(objective, learn)
     for step in range(4):
         assert bool(engine.step(some_images(1), step + engine.rank, gradient_clip=0.0)["loss"].isfinite())
     moved = [name for name, weight in objective.state_dict().items() if not torch.equal(weight, before[name])]

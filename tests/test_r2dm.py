@@ -316,6 +316,21 @@ def test_reflectance_is_saved_with_samples_and_read_back(tmp_path):
     assert torch.allclose(read.reflectance, drawn.reflectance)
 
 
+def test_settings_that_a_model_cannot_take_leave_the_folder_to_corrected_ones(tmp_path):
+    generator, run, ours = made(), tmp_path / "run", tmp_path / "ours"
+    generator.save(run)
+    (run / "trained_on.json").write_text("{}")
+    ours.mkdir()
+    for out in (tmp_path / "new", ours):
+        calibrated = DiffusionSampling(steps=2, raydrop="calibrated")
+        with pytest.raises(ConfigError, match="threshold was never fitted"):
+            write_samples(generator, run, out, [0], calibrated)
+        write_samples(generator, run, out, [], calibrated)  # as a process of many does that gets no seed
+        assert out.exists() == (out == ours)
+        write_samples(generator, run, out, [0], DiffusionSampling(steps=2))
+        assert {path.name for path in out.iterdir()} == {"00000000.npz", "samples.json", "trained_on.json"}
+
+
 def test_an_image_is_learned_by_heart():
     generator, images = made(reflectance=False), walls(1, reflectance=False)
     objective = generator.objective("diffusion").train()

@@ -55,6 +55,7 @@ def test_independent_drops_keep_a_share_whatever_it_meets(simulated):
         kept = [float(dropped.return_mask[some].float().mean()) for some in (near, far)]
         assert math.isclose(*kept, abs_tol=0.02)
         assert (dropped.reflectance[~dropped.return_mask] == 0).all()
+        assert torch.equal(dropped.label, simulated.clean.label * dropped.return_mask)
     assert torch.equal(drop_independently(simulated.clean, 1.0).return_mask, simulated.clean.return_mask)
     assert torch.equal(dropped.return_mask, drop_independently(simulated.clean, 0.8).return_mask)
 
@@ -128,5 +129,7 @@ def test_the_verb(tmp_path, capsys):
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert main(words) == 2  # it is there already
     assert "add --overwrite" in capsys.readouterr().err
+    assert main([*words, "--overwrite", "--device", "cuda:99"]) == 2
+    assert "device 'cuda:99'" in capsys.readouterr().err
     assert main(["compare-sim", "simulated:2", "-n", "1", "-o", str(tmp_path / "new.png")]) == 2
     assert "at least 2" in capsys.readouterr().err

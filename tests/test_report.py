@@ -14,10 +14,12 @@ from lidargrit.evaluation.profiles import matches, profile
 from lidargrit.evaluation.scorecard import LeftOut
 from lidargrit.projection import points_of_pixels
 from lidargrit.structures import MetricResult
+from lidargrit.viewer._page import document
 from lidargrit.viewer.report import page, write_report
 from lidargrit.viewer.report_charts import line_chart, score_chart
 
 VOID = {"meta", "img", "br", "line", "circle"}
+POLICY = r'Content-Security-Policy" content="([^"]*)"'
 EVIL = "<script>alert('x')</script>\"'&"
 
 
@@ -159,3 +161,13 @@ def test_a_scan_is_its_own_nearest(evaluated):
             ((pair.samples, other[0].generated), (pair.reference, other[0].real))]  # fmt: skip
     apart = [torch.log2(1 + one[rows][:, columns]) for one in pair]
     assert other[0].distance == pytest.approx(float((apart[0] - apart[1]).abs().mean()), rel=1e-4)
+
+
+def test_pages_run_no_script_but_their_own_and_fetch_nothing():
+    plain, scripted = document(EVIL, "", ""), document("", "", "", "let a = 1;", "[]", "data: blob:")
+    assert re.findall(POLICY, plain) == ["default-src 'none'; style-src 'unsafe-inline'"]
+    assert EVIL not in plain
+    digest = "xY6QKfH9PRsQnLz56nj6MBwiK5oHg+im1Jkpdp1x/Ck="
+    policy = f"default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
+    assert re.findall(POLICY, scripted) == [policy]
+    assert scripted.count("<script") == 2

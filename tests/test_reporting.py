@@ -8,8 +8,8 @@ from rich.console import Console
 from lidargrit import reporting
 from lidargrit.demo import _INTERRUPTED, _Clock
 from lidargrit.files import read_json
-from lidargrit.generators import RUN_FILE
 from lidargrit.reporting import Schedule, TerminalReporter
+from lidargrit.run_folder import RUN_FILE
 
 
 class Clock:

@@ -14,7 +14,7 @@ from lidargrit.cli import main
 from lidargrit.datasets import load
 from lidargrit.errors import ConfigError
 from lidargrit.evaluation.protocols import load_protocol
-from lidargrit.evaluation.reproduction import TABLES, Reproduction
+from lidargrit.evaluation.reproduction import TABLES, Reproduction, reproduce
 from lidargrit.evaluation.tables import published
 from lidargrit.recipes import load_recipe
 from lidargrit.training import train
@@ -117,6 +117,14 @@ def test_a_plan_tells_scans_and_cost(tmp_path, capsys, monkeypatch):
     assert "sample 5,000 scans" in output
     assert "train lidargen_kitti_360 (to do)" in output
     assert "train ultralidar_kitti_360 (to do)" in output
+    assert not (tmp_path / "out").exists()
+
+
+def test_settings_that_a_stage_cannot_follow_are_told_before_any_scan(tmp_path, monkeypatch):
+    monkeypatch.delattr("lidargrit.evaluation.reproduction.load_range_images")
+    wrong = Reproduction(3, "simulated", small=True, flops=0.0, settings=("training.tokenizer.optimiser=muon",))
+    with pytest.raises(ConfigError, match="optimiser=muon for networks without linear layers"):
+        reproduce(wrong, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 

@@ -1,11 +1,11 @@
 """ROS recordings: what the libraries' own writers write is read, point for point; damaged files are refused."""
 
 import sqlite3
-import tracemalloc
 
 import numpy as np
 import pytest
 
+from format_examples import refused_within
 from lidargrit.errors import ScanError
 from lidargrit.formats import count_scans, read_scan, ros_bag
 
@@ -141,6 +141,13 @@ def test_a_computed_message_that_is_too_large_is_refused(tmp_path):
         read_scan(path)
 
 
+def test_a_stored_message_that_is_too_large_is_refused(recording, monkeypatch):
+    if recording.suffix == ".db3":
+        monkeypatch.setattr(ros_bag, "BYTES_AT_MOST", 1000)
+        with pytest.raises(ScanError, match="too big"):
+            read_scan(recording)
+
+
 PACK = {
     "": bytes,
     "zstd": zstandard.compress,
@@ -176,16 +183,10 @@ def write_mcap(path, content: bytes, packing: str, in_chunk=None, in_index=None,
     path.write_bytes(start + chunk + (chunk if chunk_in_summary else b"") + stream.end() + start)
 
 
-def refused_within(path, megabytes: int) -> str:
+def refused(path, megabytes: int) -> str:
     count_scans(path)  # loads what the reader needs, which is not to be counted
     ros_bag._opened.cache_clear()
-    tracemalloc.start()
-    with pytest.raises(ScanError) as refusal:
-        read_scan(path)
-    most_bytes = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert most_bytes < megabytes * 1_000_000
-    return str(refusal.value)
+    return refused_within(path, megabytes)
 
 
 @pytest.mark.parametrize("packing", PACK)
@@ -203,18 +204,18 @@ def test_packed_chunks_are_read(packing, tmp_path):
 def test_a_chunk_that_unpacks_to_more_than_the_index_says_is_refused(packing, sizes, tmp_path):
     write_mcap(tmp_path / "a.mcap", message_record(bytes(30_000_000)), packing, **sizes)
     before_it_is_unpacked = packing and "in_index" in sizes
-    said = refused_within(tmp_path / "a.mcap", 10 if before_it_is_unpacked else 200)
+    said = refused(tmp_path / "a.mcap", 10 if before_it_is_unpacked else 200)
     assert "a chunk that" in said or "decompress" in said
 
 
 def test_a_chunk_in_the_summary_is_refused_before_it_is_unpacked(tmp_path):
     write_mcap(tmp_path / "a.mcap", message_record(bytes(30_000_000)), "zstd", in_index=1000, chunk_in_summary=True)
-    assert "a chunk in its summary" in refused_within(tmp_path / "a.mcap", 10)
+    assert "a chunk in its summary" in refused(tmp_path / "a.mcap", 10)
 
 
 def test_a_chunk_of_very_many_messages_makes_no_list_of_them(tmp_path):
     write_mcap(tmp_path / "a.mcap", message_record(b"", 2) * 50_000 + message_record(b"damaged"), "zstd")
-    refused_within(tmp_path / "a.mcap", 5)
+    refused(tmp_path / "a.mcap", 5)
 
 
 def test_a_bag_whose_chunk_unpacks_to_too_much_is_refused(tmp_path, monkeypatch):

@@ -272,6 +272,14 @@ def test_a_scan_that_is_uploaded_is_completed(opened, scan_file):
     assert opened.troubles() == []
 
 
+def test_a_number_that_is_typed_is_sent_though_it_is_the_one_that_is_shown(opened):
+    fill(opened, "#model", "2")
+    assert opened.run("document.querySelector('[name=steps]').placeholder") == "256"
+    assert opened.run("desk.request().sampling") == {}, "a scan is completed in other steps than 256"
+    fill(opened, "[name=steps]", "256")
+    assert opened.run("desk.request().sampling") == {"steps": 256}
+
+
 def test_the_mouse_draws_the_region_that_is_filled_in(opened, scan_file):
     fill(opened, "#task", "region")
     choose_file(opened, scan_file)

@@ -8,9 +8,10 @@ import pytest
 from torch import nn
 
 from lidargrit.errors import ConfigError
-from lidargrit.generators import PRETRAINED, load
+from lidargrit.generators import load
 from lidargrit.nn.size import numbers_at_most
 from lidargrit.recipes import load_recipe
+from lidargrit.run_folder import PRETRAINED
 
 
 def test_weights_and_buffers_of_all_modules_are_counted():

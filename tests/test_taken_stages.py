@@ -12,7 +12,8 @@ from lidargrit.generators import load_class
 from lidargrit.generators.lidargrit import TokenSampling
 from lidargrit.generators.maskgit import MaskGitConfig
 from lidargrit.loading import DataConfig
-from lidargrit.training import FitConfig, train
+from lidargrit.training import FitConfig, plan_training, train
+from lidargrit.training.plan import check_stages
 from lidargrit.training.taken_stages import taken_stages
 from test_pixel_stage import PIXELS, TOKENIZER, TRANSFORMER, made, recipe_of
 
@@ -52,6 +53,33 @@ def test_fine_tuning_starts_from_the_weights_of_the_other_run(tmp_path):
         replace(recipe, stages_from=None)
     with pytest.raises(ConfigError, match="train_anew=pixels without stages_from"):
         replace(recipe, stages_from=None, fine_tune=(), train_anew=("pixels",))
+
+
+def test_settings_of_a_stage_that_is_not_trained_are_not_looked_at(tmp_path):
+    made(None).save(tmp_path / "donor")
+    recipe = recipe_of(PIXELS, stages_from=str(tmp_path / "donor"))
+    fits = {"tokenizer": recipe.training["tokenizer"], "pixels": replace(recipe.training["pixels"], batch_size=6)}
+    recipe = replace(recipe, training=fits)  # a batch of 2 that 3 processes cannot share, and no transformer's settings
+    checked = check_stages(recipe, processes=3)
+    assert checked.donors == dict.fromkeys(("tokenizer", "transformer"), str(tmp_path / "donor"))
+    assert list(checked.objectives) == ["tokenizer", "transformer", "pixels"]
+    assert [stage.scans for stage in plan_training(recipe).stages] == [0, 0, 4]
+    for settings, message in (
+        ({"train_anew": ("tokenizer",)}, "batch_size=2 on 3 processes"),
+        ({"fine_tune": ("transformer",)}, r"without training\.transformer"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            check_stages(replace(recipe, **settings), processes=3)
+
+
+def test_a_stage_that_does_not_fit_is_told_before_any_scan(tmp_path):
+    made(None).save(tmp_path / "donor")
+    recipe = recipe_of(PIXELS, stages_from=str(tmp_path / "donor"))
+    wider = replace(recipe.model, transformer=replace(TRANSFORMER, width=32))
+    recipe = replace(recipe, model=wider, data=replace(recipe.data, train=("nowhere",)))
+    with pytest.raises(ConfigError, match="whose transformer is another"):
+        train(recipe, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
 
 
 SENSORS = ("hdl64e_kitti_odometry", "hdl64e_kitti_360")

@@ -1,8 +1,9 @@
 """The verdict on scores: what it counts, which metrics it sets apart, and what it says of odd values."""
 
-from dataclasses import replace
+import pytest
 
 from lidargrit.cli import main
+from lidargrit.errors import DataError
 from lidargrit.evaluation.intervals import Interval, RealAgainstReal, Score
 from lidargrit.evaluation.scorecard import EvalSetRecord, Scorecard
 from lidargrit.evaluation.tables import side_by_side
@@ -74,16 +75,18 @@ def test_a_table_takes_pixel_statistics_from_their_own_row(tmp_path):
     assert side_by_side(paths, "latex").splitlines()[1].startswith("% mine: Better")
 
 
-def test_files_of_before_one_name_are_read(tmp_path):
-    data = card(score(0.5, 0.1, 0.9)).to_json()
-    for each in data["scores"]:
-        each["floor"] = each.pop("real_against_real")
-        del each["pixel_statistics"]
-    write_json(tmp_path / "old.json", data)
-    found = Scorecard.read(tmp_path / "old.json").scores[0]
-    assert (found.real_against_real, found.pixel_statistics) == (RealAgainstReal(0.1, 9, 5), None)
-    write_json(tmp_path / "new.json", card(replace(found, pixel_statistics=0.9)).to_json())
-    assert Scorecard.read(tmp_path / "new.json").scores[0].pixel_statistics == 0.9
+def test_both_bounds_are_read_as_they_were_written(tmp_path):
+    data = card(score(0.5, 0.1, 0.9), score(0.5)).to_json()
+    write_json(tmp_path / "scores.json", data)
+    found = Scorecard.read(tmp_path / "scores.json").scores
+    assert [(each.real_against_real, each.pixel_statistics) for each in found] == [
+        (RealAgainstReal(0.1, 9, 5), 0.9),
+        (None, None),
+    ]
+    del data["scores"][0]["real_against_real"]
+    write_json(tmp_path / "without.json", data)
+    with pytest.raises(DataError, match=r"without\.json"):
+        Scorecard.read(tmp_path / "without.json")
 
 
 def test_the_command_scores_pixel_statistics_where_they_are_wanted(tmp_path, capsys):

@@ -17,7 +17,7 @@ from lidargrit.sensors import load_sensor
 from lidargrit.sources import open_source
 from lidargrit.sources.samples import write_samples
 from lidargrit.structures import RangeImage
-from lidargrit.viewer import pictures, plot_comparison
+from lidargrit.viewer import pictures, plot_comparison, view
 from lidargrit.viewer.scan_sets import load_scan_sets
 
 
@@ -121,6 +121,15 @@ class Listener(Reporter):
         self.lines.append(text)
 
 
+def test_runs_compute_on_the_device_that_is_named(tmp_path):
+    with pytest.raises(ConfigError, match="device 'cuda:99'"):
+        load_scan_sets(["pretrained"], 1, device="cuda:99")
+    with pytest.raises(ConfigError, match="device 'cuda:99'"):
+        view(["simulated:1"], tmp_path / "a.png", surprise_by="pretrained", device="cuda:99")
+    assert main(["view", "pretrained", "-o", str(tmp_path / "a.png"), "--device", "cuda:99"]) == 2
+    assert not list(tmp_path.iterdir())
+
+
 def test_sets_of_one_name_are_told_apart_and_runs_of_other_rays_reconstruct_nothing(tmp_path):
     samples = [tmp_path / f"a_run_{word}_reflectance_and_a_long_name" / "samples" for word in ("with", "without")]
     sensor = load_sensor("hdl64e_kitti_odometry").with_columns(128)
@@ -140,7 +149,7 @@ def test_sets_of_one_name_are_told_apart_and_runs_of_other_rays_reconstruct_noth
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["-o", "a.svg"], "got a.svg, which is to hold a picture or a page; wanted a name in .png or .html"),
+        (["-o", "a.svg"], "got a.svg, which will hold PNG or HTML; wanted a name in .png or .html"),
         (["-o", "a.png", "--model", "nosuch"], "got --model nosuch with --color range; wanted --color surprise"),
     ],
 )

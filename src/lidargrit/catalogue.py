@@ -10,8 +10,6 @@ from lidargrit import _discovery
 KINDS = {kind: kind for kind in ("datasets", "formats", "sensors", "tokenizers", "generators", "metrics")}
 KINDS |= {"protocols": "evaluation.protocols", "sample-formats": "sources.sample_formats", "recipes": "recipes"}
 """Each kind as a user types it, and the folder that defines it."""
-FORMER_KINDS = {"dialects": "sample-formats"}
-"""Former names of kinds, which still work, and their names of today."""
 
 
 def entries(kind: str, in_full: bool = False) -> list[dict[str, Any]]:

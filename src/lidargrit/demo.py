@@ -19,12 +19,15 @@ from lidargrit.evaluation.reconstruction import ReconstructionErrors, score_reco
 from lidargrit.evaluation.reference_rows import with_held_out, with_pixel_statistics
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.files import read_json, write_json
-from lidargrit.generators import PRETRAINED, RUN_FILE, Generator, load
+from lidargrit.generators import Generator, load
 from lidargrit.generators.lidargrit import LidarGrit, TokenSampling
 from lidargrit.loading import DataConfig, RangeImages
+from lidargrit.nn.devices import usable_device
 from lidargrit.nn.pixel_phases import completed_lattices
+from lidargrit.nn.seeds import rngs_of
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
+from lidargrit.run_folder import PRETRAINED, RUN_FILE
 from lidargrit.sources import load_range_images, open_source
 from lidargrit.sources.samples import read_samples, write_samples
 from lidargrit.structures import RangeImage
@@ -82,7 +85,9 @@ def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter
         clock.add(f"train the {stage}", _trained_s(folder / stage / LOG_FILE))
     sampling = _sampling(recipe)
     with clock.stage(f"sample {_NUM_SAMPLES} new scans"):
+        generator.to(usable_device(""))
         write_samples(generator, folder, folder / "samples", range(_NUM_SAMPLES), sampling, reporter)
+        generator.to("cpu")  # where the images of the pages and pictures are
     samples = read_samples(folder / "samples", _NUM_SAMPLES)
     packaged = _packaged_samples(folder / "samples_of_packaged_model", clock, reporter) if data is None else None
     with clock.stage("score reconstruction and new scans"):
@@ -178,7 +183,7 @@ def write_results_page(
     with torch.no_grad():
         tokens = tokenizer.encode(held_out[:1])
         decoded = tokenizer.decode(tokens)
-        sampled = tokenizer.sample(tokens, [torch.Generator().manual_seed(0)])
+        sampled = tokenizer.sample(tokens, rngs_of([0]))
         reconstructed = _reconstructed(generator, held_out, sampling)
     by_phases, lattices = None, []
     if isinstance(generator, LidarGrit) and generator.pixels is not None:
@@ -201,7 +206,7 @@ def write_results_page(
 def _reconstructed(generator: Generator, images: RangeImage, sampling: TokenSampling) -> RangeImage:
     """Return scans decoded from the tokens of others just as those of new scans are, with sampled return masks."""
     tokenizer = generator.get_tokenizer()
-    tokens, rngs = tokenizer.encode(images), [torch.Generator().manual_seed(seed) for seed in range(len(images))]
+    tokens, rngs = tokenizer.encode(images), rngs_of(range(len(images)))
     if isinstance(generator, LidarGrit) and generator.pixels is not None:
         return generator.pixels.sample(tokenizer.decode(tokens), rngs, sampling.pixels())
     return tokenizer.sample(tokens, rngs)
@@ -210,7 +215,9 @@ def _reconstructed(generator: Generator, images: RangeImage, sampling: TokenSamp
 def _packaged_samples(folder: Path, clock: _Clock, reporter: Reporter) -> RangeImages:
     """Sample from the model in the package, which was trained for hours, for comparison."""
     with clock.stage(f"sample {_PACKAGED_SCANS} scans from the packaged model"):
-        write_samples(load(PRETRAINED), PRETRAINED, folder, range(_PACKAGED_SCANS), reporter=reporter)
+        write_samples(
+            load(PRETRAINED).to(usable_device("")), PRETRAINED, folder, range(_PACKAGED_SCANS), reporter=reporter
+        )
     return read_samples(folder, _PACKAGED_SCANS)
 
 

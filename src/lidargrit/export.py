@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -15,18 +14,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidargrit import _discovery, formats
-from lidargrit.datasets import ScanDataset
-from lidargrit.determinism import evenly_spaced
-from lidargrit.errors import ConfigError, DataError, OutputError, ScanError, UnknownNameError, nearest_names
+from lidargrit.errors import ConfigError, DataError, OutputError, ScanError, UnknownNameError, one_of
 from lidargrit.files import atomic_path, claim_folder, is_partial, is_taken, read_json, write_json
 from lidargrit.formats import ScanFormat
 from lidargrit.formats.kitti_bin import KittiBin
-from lidargrit.loading import DataConfig, RangeImages
-from lidargrit.projection import unproject
+from lidargrit.loading import DataConfig
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel
-from lidargrit.sources import DatasetSource, open_source
+from lidargrit.sources import open_source
 from lidargrit.sources.image_files import ImageFileSource
+from lidargrit.sources.named import ImageScans, NamedScans, named_scans
 from lidargrit.structures import Scan
 from lidargrit.untrusted import user_path
 
@@ -70,11 +67,11 @@ def export_scans(
         ScanError: a scan that cannot be used.
     """
     config, reporter = config or DataConfig(), reporter or Reporter()
-    layout = KittiTree(out) if kind == TREE else _Flat(out, *writable_format(kind))
-    scans = _open(source, config, sensor)
+    layout = KittiTree(out) if kind == TREE else _Flat(out, *writable_format(kind, TREE))
+    scans, of_images = _open(source, config, sensor)
     files = layout.files([scans.name(index) for index in range(len(scans))])
     identities = [scans.identity(index) for index in range(len(scans))]
-    facts = {"source": source, "format": kind, **scans.facts(), "scans": dict(zip(files, identities, strict=True))}
+    facts = {"source": source, "format": kind, **of_images, "scans": dict(zip(files, identities, strict=True))}
     with claim_folder(out), claimed_scans(out / MANIFEST, facts):
         missing = [index for index, file in enumerate(files) if not layout.is_there(file)]
         left_out = 0
@@ -99,75 +96,16 @@ def write_array(path: Path, pixels: Float[Tensor, "H W"]) -> None:
         np.save(file, pixels.cpu().numpy())
 
 
-def kinds() -> list[str]:
-    """Return the names that a user may choose: the formats that can be written, and the KITTI tree."""
-    return [*(name for name in _discovery.names("formats") if formats.load(name).can_write()), TREE]
-
-
-@dataclass(frozen=True)
-class _OfDataset:
-    """Some scans of a data set."""
-
-    dataset: ScanDataset
-    indices: Sequence[int]
-
-    def __len__(self) -> int:
-        return len(self.indices)
-
-    def facts(self) -> dict[str, Any]:
-        """Return further entries of the manifest: none, for the source says all."""
-        return {}
-
-    def name(self, index: int) -> str:
-        """Return the name of its file, without the ending."""
-        return self.dataset.name(self.indices[index])
-
-    def identity(self, index: int) -> str:
-        """Return what identifies the scan, so that another scan is not taken for it."""
-        return self.name(index)
-
-    def scan(self, index: int) -> Scan:
-        return self.dataset.scan(self.indices[index])
-
-
-@dataclass(frozen=True)
-class _OfImages:
-    """Range images as scans; they are numbered, because they have no short names."""
-
-    images: RangeImages
-    of_files: bool
-    """Whether they are ``.npy``, which do not name their sensor."""
-
-    def __len__(self) -> int:
-        return len(self.images)
-
-    def facts(self) -> dict[str, Any]:
-        """Return further entries of the manifest: the sensor, where the source does not say which it is."""
-        return {"sensor": self.images.sensor.to_json()} if self.of_files else {}
-
-    def name(self, index: int) -> str:
-        """Return its index."""
-        return f"{index:06d}"
-
-    def identity(self, index: int) -> str:
-        """Return which model's seed it is, or whose scan it was projected from."""
-        return self.images.provenance.names[index]
-
-    def scan(self, index: int) -> Scan:
-        return unproject(self.images.batch([index])[0])
-
-
-def _open(source: str, config: DataConfig, sensor: SensorModel | None) -> _OfDataset | _OfImages:
+def _open(source: str, config: DataConfig, sensor: SensorModel | None) -> tuple[NamedScans, dict[str, Any]]:
+    """Return the scans of a source, and the sensor as an entry of the manifest where the source does not name it."""
     opened = open_source(source, config.bad_points)
     of_files = isinstance(opened, ImageFileSource)
     if sensor is not None and not of_files:
         wanted = "range images in .npy files, which do not name their sensor"
         got = f"--sensor {sensor.name} for {source}, which holds {opened.kind}"
         raise ConfigError(got, wanted, "leave --sensor out: the points are as the source has them")
-    if not isinstance(opened, DatasetSource):
-        return _OfImages(opened.images(sensor, config), of_files)
-    dataset = opened.scans()
-    return _OfDataset(dataset, evenly_spaced(config.max_scans or len(dataset), len(dataset)))
+    scans = named_scans(opened, config, sensor)
+    return scans, {"sensor": scans.images.sensor.to_json()} if of_files and isinstance(scans, ImageScans) else {}
 
 
 class _Flat:
@@ -227,8 +165,12 @@ def write_with_labels(path: Path, scan: Scan) -> None:
     KittiBin.write(path, scan)
 
 
-def writable_format(kind: str) -> tuple[type[ScanFormat], str]:
+def writable_format(kind: str, *others: str) -> tuple[type[ScanFormat], str]:
     """Return the format of a name or an ending, and the ending of its files.
+
+    Args:
+        kind: name or ending.
+        others: words that the command takes besides, to be named in the message.
 
     Raises:
         UnknownNameError: no such format, or one that cannot be written.
@@ -239,12 +181,17 @@ def writable_format(kind: str) -> tuple[type[ScanFormat], str]:
         suffix = f".{kind.lower().removeprefix('.')}"
         form = next((one for one in formats.candidates(Path(f"scan{suffix}")) if suffix in one.suffixes), None)
     if form is None or not form.can_write():
-        raise UnknownNameError(f"the format {kind!r} to write", nearest_names(kind, kinds(), 99), "choose one")
+        known = [name for name in _discovery.names("formats") if formats.load(name).can_write()]
+        raise UnknownNameError(f"the format {kind!r} to write", one_of([*others, *known]), "choose one")
     return form, suffix
 
 
-def claim_scans(manifest: Path, facts: dict[str, Any]) -> None:
+@contextmanager
+def claimed_scans(manifest: Path, facts: dict[str, Any]) -> Iterator[None]:
     """Write the manifest of a folder of scans, or add to the one that the same command wrote before.
+
+    A new manifest is removed again if no scan was written after all. Otherwise the folder would be refused to a
+    corrected command, of another format or model.
 
     Args:
         manifest: file in the folder that says how its scans were made.
@@ -253,6 +200,18 @@ def claim_scans(manifest: Path, facts: dict[str, Any]) -> None:
     Raises:
         OutputError: the folder holds something else, or another scan in one of the files.
     """
+    is_new = not manifest.exists()
+    _claim(manifest, facts)
+    try:
+        yield
+    finally:
+        with suppress(OSError):  # the folder was removed meanwhile
+            if is_new and all(path == manifest or is_partial(path.name) for path in manifest.parent.iterdir()):
+                manifest.unlink()
+
+
+def _claim(manifest: Path, facts: dict[str, Any]) -> None:
+    """Write the manifest, or add to the one that is there."""
     out = manifest.parent
     for file in facts["scans"]:
         parts = PurePosixPath(file).parts
@@ -280,19 +239,3 @@ def claim_scans(manifest: Path, facts: dict[str, Any]) -> None:
             return
         facts = {**facts, "scans": {**known, **facts["scans"]}}
     write_json(manifest, facts)
-
-
-@contextmanager
-def claimed_scans(manifest: Path, facts: dict[str, Any]) -> Iterator[None]:
-    """Claim a folder as :func:`claim_scans` does; a new manifest is removed again if no scan was written after all.
-
-    Otherwise the folder would be refused to a corrected command, of another format or model.
-    """
-    is_new = not manifest.exists()
-    claim_scans(manifest, facts)
-    try:
-        yield
-    finally:
-        with suppress(OSError):  # the folder was removed meanwhile
-            if is_new and all(path == manifest or is_partial(path.name) for path in manifest.parent.iterdir()):
-                manifest.unlink()

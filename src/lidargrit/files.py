@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import hashlib
 import json
 import math
 import os
@@ -15,7 +16,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lidargrit.errors import CheckpointError, ConfigError, LidarGritError, OutputError
+from lidargrit.errors import CheckpointError, ConfigError, LidarGritError, OutputError, one_of
 from lidargrit.untrusted import JSON_BYTES_AT_MOST, TEXT_BYTES_AT_MOST, parse_json
 
 if TYPE_CHECKING:  # quick start of commands that only read and write JSON
@@ -199,17 +200,18 @@ def is_taken(folder: Path) -> bool:
     return any(not is_partial(path.name) for path in folder.iterdir())
 
 
-def refuse_to_overwrite(path: Path | None, overwrite: bool, ending: str = "") -> None:
+def refuse_to_overwrite(path: Path | None, overwrite: bool, *endings: str) -> None:
     """Raise OutputError if something stands where a user's result is to be written, unless that is allowed.
 
-    Also if a file stands where its folder should, a folder where the file should, or if its name has another ending
-    than what will be in it.
+    Also if a file stands where its folder should, a folder where the file should, or if its name has none of the
+    endings of what may be in it.
     """
     above = None if path is None else next((parent for parent in path.absolute().parents if parent.exists()), None)
     if above is not None and not above.is_dir():
         raise OutputError(f"{path}, whose folder {above} is a file", "a folder", "choose another path")
-    if path is not None and ending and path.suffix.lower() != ending:
-        raise OutputError(f"{path}, which will hold {ending[1:].upper()}", f"a name in {ending}", "choose another name")
+    if path is not None and endings and path.suffix.lower() not in endings:
+        kinds = one_of([ending[1:].upper() for ending in endings])
+        raise OutputError(f"{path}, which will hold {kinds}", f"a name in {one_of(endings)}", "choose another name")
     if path is not None and path.is_dir():
         raise OutputError(f"{path}, which is a folder", "a file", "choose another name")
     if path is not None and path.exists() and not overwrite:
@@ -283,6 +285,12 @@ def _read_bytes(path: Path, error: type[LidarGritError], wanted: str, cure: str,
         reason = why.strerror if isinstance(why, OSError) and why.strerror else why
         raise error(f"{path}, which cannot be read ({reason})", wanted, cure) from None
     return data
+
+
+def sha256_of(path: Path) -> str:
+    """Return the SHA-256 hash of a file of any size, in hexadecimal digits."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], about: Mapping[str, Any] | None = None) -> None:

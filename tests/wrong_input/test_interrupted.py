@@ -70,6 +70,7 @@ def uninterrupted(tmp_path_factory) -> bytes:
         (["compare-completion", "scans"], "the same command begins anew"),
         (["evaluate", "one", "other"], "the same command begins anew"),
         (["complete", "scans", "out"], "the same command goes on"),
+        (["compress", "scans", "out.lgz"], "the same command goes on"),
     ],
 )
 def test_only_verbs_that_keep_their_work_say_that_they_go_on(words, follows, monkeypatch, capsys):

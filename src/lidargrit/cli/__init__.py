@@ -27,25 +27,6 @@ examples:
 a verb's own examples: lidargrit VERB --help
 """
 
-_CONTINUED = frozenset(
-    {
-        "compare",
-        "complete",
-        "decompress",
-        "demo",
-        "export",
-        "prepare",
-        "publish",
-        "raydrop",
-        "reproduce",
-        "sample",
-        "simulate",
-        "train",
-        "upsample",
-    }
-)
-"""Verbs that keep what they have done in a folder, and go on there."""
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb; 0 = done, 2 = the user's mistake, printed in one line, 130 = interrupted, 143 = terminated."""
@@ -71,19 +52,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"lidargrit {options.verb}: {error}", file=sys.stderr)
         return 2
     except Terminated:
-        print(f"\nlidargrit {options.verb}: terminated; {_what_follows(options.verb)}", file=sys.stderr)
+        print(f"\nlidargrit {options.verb}: terminated; {_what_follows(options)}", file=sys.stderr)
         return 143
     except KeyboardInterrupt:
-        print(f"\nlidargrit {options.verb}: interrupted; {_what_follows(options.verb)}", file=sys.stderr)
+        print(f"\nlidargrit {options.verb}: interrupted; {_what_follows(options)}", file=sys.stderr)
         return 130
     except BrokenPipeError:  # the reader of our output, such as head, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return 0
 
 
-def _what_follows(verb: str) -> str:
+def _what_follows(options: argparse.Namespace) -> str:
     """Say what the same command does when it is run again after an interruption."""
-    return "the same command goes on" if verb in _CONTINUED else "the same command begins anew"
+    return "the same command goes on" if options.goes_on else "the same command begins anew"
 
 
 def _let_threads_sleep() -> None:
@@ -111,6 +92,7 @@ def build_parser() -> Parser:
             **raw,
         )
         sub.add_argument("--debug", action="store_true", help="show a full traceback of an error")
+        sub.set_defaults(goes_on=False)  # a verb that keeps what it has done, and goes on there, says so itself
         verb.add_arguments(sub)
         sub.set_defaults(run=verb.run, words=sub)
     return parser

@@ -33,20 +33,21 @@ def add_bad_scans(parser: argparse.ArgumentParser, default: str | None = "refuse
     )
 
 
-def add_scans(parser: argparse.ArgumentParser, *variant_aliases: str) -> None:
+def add_scans(parser: argparse.ArgumentParser, several: bool = True) -> None:
     """Add the options of all verbs that read and project scans; :func:`scan_settings` reads them.
 
     Args:
         parser: parser of the verb.
-        variant_aliases: older words for ``--projection-variant``.
+        several: whether the verb reads several scans, of which it may skip some.
     """
     sensor = "name or .json file of the sensor (default: that of the data set, the samples, the run or the protocol)"
     parser.add_argument("--sensor", default="", help=sensor)
     rows = "rows by elevation (spherical), by ring (unfolding), or the sensor's own (default), by elevation where "
     rows += "points are not in firing order"
     parser.add_argument("--projection", choices=["sensor", "spherical", "unfolding"], help=rows)
-    add_projection_variant(parser, *variant_aliases, default=None)
-    add_bad_scans(parser, default=None)
+    variant = "exact, or reference to repeat the projection of the released LidarGRIT program"
+    parser.add_argument("--projection-variant", choices=["exact", "reference"], help=variant)
+    (add_bad_scans if several else add_bad_points)(parser, default=None)
     add_settings(parser, "settings of reading scans, the same for all verbs, such as data.columns=1024")
 
 
@@ -60,19 +61,12 @@ def scan_settings(options: argparse.Namespace, **more: int | None) -> ScanSettin
     from lidargrit.loading.config import ScanSettings
 
     names = ("sensor", "projection", "projection_variant", "bad_points", "bad_scans")
-    return ScanSettings.read(options.set, **{name: vars(options)[name] for name in names}, **more)
+    return ScanSettings.read(options.set, **{name: vars(options).get(name) for name in names}, **more)
 
 
 def add_settings(parser: argparse.ArgumentParser, what: str) -> None:
     """Add ``--set NAME=VALUE ...``, which changes settings of ``what``."""
     parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help=what)
-
-
-def add_projection_variant(parser: argparse.ArgumentParser, *aliases: str, default: str | None = "exact") -> None:
-    """Add ``--projection-variant``."""
-    variant = "exact, or reference to repeat the projection of the released LidarGRIT program"
-    words = ("--projection-variant", *aliases)
-    parser.add_argument(*words, choices=["exact", "reference"], default=default, help=variant)
 
 
 def add_rank(parser: argparse.ArgumentParser, what: str) -> None:

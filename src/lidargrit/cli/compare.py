@@ -19,6 +19,7 @@ EXAMPLES = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
+    parser.set_defaults(goes_on=True)
     parser.add_argument("out", type=Path, help="folder for runs, samples and scores; the same command continues there")
     what = "name of a recipe or folder of a finished run; SYSTEM:NAME=VALUE,... also sets how it is sampled"
     parser.add_argument("systems", nargs="*", metavar="SYSTEM", help=what)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from lidargrit.cli._options import add_scans, scan_settings
+from lidargrit.cli._options import add_device, add_scans, scan_settings
 from lidargrit.cli._results import add_json, print_result, refuse_taken
 from lidargrit.untrusted import seed_number
 
@@ -32,6 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "-o", "--out", type=Path, default=Path("compare_sim.png"), metavar="PNG", help="picture of the curves"
     )
     add_scans(parser)
+    add_device(parser)
     add_json(parser, "the files of --out and --json")
 
 
@@ -51,7 +52,7 @@ def run(options: argparse.Namespace) -> None:
         options.real, options.count, settings.sensor, options.fine, options.seed, settings.data, TerminalReporter()
     )
     scores = compare(simulated, real)
-    drops = scores_of_model(options.model, simulated, real) if options.model else []
+    drops = scores_of_model(options.model, simulated, real, device=options.device) if options.model else []
     plot_curves(scores, options.out, f"real: {options.real}")
     result = {**about, "seed": options.seed, "curves": as_json(scores), "raydrop": raydrop_json(drops)}
     tables = "\n\n".join([as_table(scores), *([raydrop_table(drops)] if drops else [])])

@@ -16,6 +16,7 @@ EXAMPLES = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
+    parser.set_defaults(goes_on=True)
     observed = "what is kept: returns, rows:N (every N-th), sector:A,B (degrees from A counter-clockwise to B, 0 is "
     observed += "ahead), pixels:SHARE (a random share), or an .npy of truth values, one for each pixel"
     parser.add_argument("--observed", default="returns", help=observed)
@@ -39,7 +40,7 @@ def run(options: argparse.Namespace) -> None:
     named = options.sensor or is_classical(options.model)
     sensor = sensor_of(options.scans, options.sensor) if named else None
     completer = open_completer(options.model, "pixels", sensor, options.set, options.device)
-    output = OutputConfig(options.count, options.seed, options.format, options.bad_scans == "skip")
-    config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points)
+    output = OutputConfig(options.count, options.seed, options.format)
+    config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)
     count = complete_scans(options.scans, options.out, completer, pattern, output, config, TerminalReporter())
     print(f"done: {count} completed scans in {options.out}; completed.json says how they were made")

@@ -16,6 +16,7 @@ EXAMPLES = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
+    parser.set_defaults(goes_on=True)
     add = parser.add_argument
     add("scans", help="scans: a file, a folder, NAME:ROOT:SPLIT, samples, prepared scans, or range images as .npy")
     add("out", type=Path, metavar="OUT.lgz", help="file to write")

@@ -16,6 +16,7 @@ EXAMPLES = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
+    parser.set_defaults(goes_on=True)
     add = parser.add_argument
     add("file", type=Path, metavar="FILE.lgz", help="file that lidargrit compress wrote")
     add("out", type=Path, help="folder for the scans: empty, or begun by the same command")

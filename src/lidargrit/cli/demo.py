@@ -16,6 +16,7 @@ EXAMPLES = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
+    parser.set_defaults(goes_on=True)
     parser.add_argument("--data", metavar="SOURCE", help="folder of scans (default: simulated scans)")
     parser.add_argument("--out", type=Path, help="run folder (default: runs/demo, or runs/demo-FOLDER)")
     anew = "train all networks anew (default: begin with those of the model pretrained, if it has your sensor)"

@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     groups = "number of blocks of consecutive scans that --intervals halves; an odd number is lowered by one"
     add("--groups", type=int, default=16, metavar="G", help=groups)
     add("--seed", type=seed_number, default=0, help="seed of all random choices")
-    add("--device", default="cpu", help="device that networks of metrics and of a run compute on: cpu or cuda")
+    add("--device", default="cpu", help="device of networks: cpu, or cuda, which changes the last digits of scores")
     add_scans(parser)
     add("--report", type=Path, metavar="FILE.html", help="also write a page with scores and pictures")
     add_json(parser, "the files of --json and --report")
@@ -51,7 +51,7 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.viewer.report import write_report
 
     refuse_taken(options)
-    check_modes(options.tables, options.format, options.samples, options.report)
+    check_modes(vars(options), options.words.get_default)
     if options.tables:
         return print_result(options, *read_tables(options.tables, options.format))
     names = "protocol metrics variant max_scans seed samples_format device weights groups intervals pixel_statistics"

@@ -17,6 +17,7 @@ EXAMPLES = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
+    parser.set_defaults(goes_on=True)
     parser.add_argument(
         "source", help="samples, prepared scans, or scans: a folder, NAME:ROOT:SPLIT or simulated:COUNT"
     )

@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
     parser.add_argument("scan", help="file of a scan, or a source of scans whose first scan is inspected")
     parser.add_argument("--columns", type=int, help="number of columns of the full circle (default: the sensor's)")
-    add_scans(parser, "--variant")
+    add_scans(parser, several=False)
     parser.add_argument("-o", "--out", type=Path, metavar="PNG", help="also plot the range image and what is lost")
     add_json(parser, "the files of --out and --json")
 

@@ -19,6 +19,7 @@ EXAMPLES = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
+    parser.set_defaults(goes_on=True)
     parser.add_argument("source", help="scans: a folder, NAME:ROOT:SPLIT or simulated:COUNT")
     out = "folder for the range images, a source for train and evaluate (default: in the cache)"
     parser.add_argument("-o", "--out", type=Path, help=out)

@@ -14,6 +14,7 @@ EXAMPLES = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
+    parser.set_defaults(goes_on=True)
     parser.add_argument("run_folder", type=Path, metavar="RUN", help="folder of a finished run")
     parser.add_argument("out", type=Path, help="folder for the weights, their configuration and the model card")
     parser.add_argument(

@@ -15,6 +15,7 @@ EXAMPLES = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
+    parser.set_defaults(goes_on=True)
     share = "also write NAME.probability.npy, the share of returns of each pixel over this many samples"
     parser.add_argument("--probability", type=int, default=0, metavar="SAMPLES", help=share)
     add_completion(parser, "run whose sensor's raydrop is wanted")
@@ -30,8 +31,7 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.reporting import TerminalReporter
 
     completer = open_completer(options.model, "surfaces", None, options.set, options.device)
-    skips = options.bad_scans == "skip"
-    output = OutputConfig(options.count, options.seed, options.format, skips, options.probability)
-    config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points)
+    output = OutputConfig(options.count, options.seed, options.format, options.probability)
+    config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)
     count = raydrop_scans(options.scans, options.out, completer, output, config, TerminalReporter())
     print(f"done: {count} scans with raydrop in {options.out}")

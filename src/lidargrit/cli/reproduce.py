@@ -17,6 +17,7 @@ EXAMPLES = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
+    parser.set_defaults(goes_on=True)
     parser.add_argument("table", type=int, help="number of the table in the paper: 1, 2 or 3")
     parser.add_argument(
         "root", help="root folder of KITTI-360 (table 1) or KITTI odometry (tables 2, 3), or the word simulated"

@@ -21,6 +21,7 @@ EXAMPLES = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
+    parser.set_defaults(goes_on=True)
     parser.add_argument("run_folder", type=Path, metavar="RUN", help="a finished run, pretrained or pretrained_wide")
     parser.add_argument("out", type=Path, help="folder for the samples; the same command continues there")
     parser.add_argument("-n", "--count", type=int, default=16, help="number of scans")
@@ -36,18 +37,16 @@ def run(options: argparse.Namespace) -> None:
 
     from lidargrit.configuration import override
     from lidargrit.errors import ConfigError
-    from lidargrit.generators import load, locate
+    from lidargrit.generators import load
     from lidargrit.nn.devices import usable_device
     from lidargrit.processes import rank_and_world_size
     from lidargrit.reporting import TerminalReporter
+    from lidargrit.run_folder import locate
     from lidargrit.sources.samples import write_samples
 
     if options.count < 1 or options.seed < 0:
-        raise ConfigError(
-            f"-n {options.count}, --seed {options.seed}",
-            "at least one scan, and no negative seed",
-            "correct the number",
-        )
+        got = f"-n {options.count}, --seed {options.seed}"
+        raise ConfigError(got, "at least one scan, and no negative seed", "correct the number")
     rank, world_size = rank_and_world_size(options.rank, options.world_size)
     own = f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu"
     device = usable_device(options.device or own)

@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Serve until interrupted."""
-    from lidargrit.generators import locate
+    from lidargrit.run_folder import locate
     from lidargrit.serving import Limits, finished_runs, serve
 
     runs = [locate(run) for run in options.runs] or finished_runs(Path("runs"))

@@ -18,6 +18,7 @@ _SENSOR = "hdl64e_kitti_odometry"  # of the data set whose layout is written
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
+    parser.set_defaults(goes_on=True)
     parser.add_argument("out", type=Path, help="folder for the scans: empty, or begun by the same command")
     parser.add_argument("-n", "--num-scans", type=int, required=True, help="number of scans in all")
     parser.add_argument("--sensor", default=_SENSOR, help="name or .json file of the sensor")

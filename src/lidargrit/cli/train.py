@@ -18,6 +18,7 @@ EXAMPLES = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
+    parser.set_defaults(goes_on=True)
     parser.add_argument("recipe", help="name of a recipe; see: lidargrit list recipes")
     parser.add_argument("out", type=Path, help="run folder to write; the same command continues there")
     settings = "settings of the recipe to change, such as data.train=/data/scans; see all with --dry-run"

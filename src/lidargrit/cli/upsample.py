@@ -15,6 +15,7 @@ EXAMPLES = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
+    parser.set_defaults(goes_on=True)
     parser.add_argument("--sensor", default="", help="sensor that made the scans (default: that of the source)")
     parser.add_argument("--to", default="", help="sensor of the dense scans (default: that of the run)")
     add_completion(parser, "run that adds the rows, or nearest, linear or triangulation")
@@ -34,7 +35,7 @@ def run(options: argparse.Namespace) -> None:
     scans_sensor = sensor_of(options.scans, options.sensor)
     wanted_sensor = load_sensor(options.to) if options.to else None
     completer = open_completer(options.model, "pixels", wanted_sensor, options.set, options.device)
-    output = OutputConfig(options.count, options.seed, options.format, options.bad_scans == "skip")
-    config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points)
+    output = OutputConfig(options.count, options.seed, options.format)
+    config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)
     count = upsample_scans(options.scans, options.out, completer, scans_sensor, output, config, TerminalReporter())
     print(f"done: {count} scans of {completer.sensor.name} in {options.out}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from lidargrit.cli._options import add_scans, scan_settings
+from lidargrit.cli._options import add_device, add_scans, scan_settings
 from lidargrit.untrusted import seed_number
 
 EXAMPLES = """\
@@ -31,24 +31,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     model = "run whose likelihood gives the surprise; needs a pixel decoder (default: pretrained)"
     parser.add_argument("--model", default="", help=model)
     add_scans(parser)
+    add_device(parser)
     parser.add_argument("--overwrite", action="store_true", help="replace the file if it exists")
 
 
 def run(options: argparse.Namespace) -> None:
     """Render the picture, or write the page."""
-    from lidargrit.errors import ConfigError, OutputError
+    from lidargrit.errors import ConfigError
     from lidargrit.files import refuse_to_overwrite
     from lidargrit.reporting import TerminalReporter
     from lidargrit.viewer import view
 
-    if options.out.suffix.lower() not in {".png", ".html"}:
-        got = f"{options.out}, which is to hold a picture or a page"
-        raise OutputError(got, "a name in .png or .html", "choose another name")
     if options.model and options.color != "surprise":
         raise ConfigError(
             f"--model {options.model} with --color range", "--color surprise", "add it, or leave --model out"
         )
-    refuse_to_overwrite(options.out, options.overwrite)
+    refuse_to_overwrite(options.out, options.overwrite, ".png", ".html")
     named = (options.places, options.out, options.count, options.seed, scan_settings(options), TerminalReporter())
-    view(*named, (options.model or "pretrained") if options.color == "surprise" else "")
+    view(*named, (options.model or "pretrained") if options.color == "surprise" else "", options.device)
     print(f"done: look at {options.out}")

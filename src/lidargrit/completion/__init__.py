@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,12 +12,12 @@ from lidargrit.conditions import KINDS, Condition, ConditionKind
 from lidargrit.conditions.fills import FILLS, fill
 from lidargrit.configuration import name_and_settings, override
 from lidargrit.errors import ConfigError
-from lidargrit.generators import WEIGHTS_FILE, Generator, SamplingT, load, locate
+from lidargrit.generators import Generator, SamplingT, load
 from lidargrit.loading import Provenance
 from lidargrit.nn.devices import usable_device
 from lidargrit.projection import ProjectionVariant
+from lidargrit.run_folder import locate, projection_variant, trained_on, weights_sha256
 from lidargrit.sensors import SensorModel
-from lidargrit.sources.samples import projection_of, trained_on
 from lidargrit.structures import RangeImage
 
 
@@ -91,8 +90,7 @@ class LearnedCompleter(Completer, Generic[SamplingT]):
         super().__init__(name, generator.sensor)
         self._folder, self._generator, self._sampling = folder, generator, sampling
         self.batch = generator.compute_batch
-        if projection_of(folder) == "reference":
-            self.projection_variant = "reference"
+        self.projection_variant = projection_variant(folder)
 
     def complete(self, condition: Condition, seeds: Sequence[int]) -> RangeImage:
         """Return what the generator makes of the conditions, in the computer's memory."""
@@ -108,8 +106,7 @@ class LearnedCompleter(Completer, Generic[SamplingT]):
 
     def identity(self) -> dict[str, Any]:
         """Return the hash of its weights, and its settings."""
-        weights = hashlib.sha256((self._folder / WEIGHTS_FILE).read_bytes()).hexdigest()
-        return {"weights_sha256": weights, "sampling": configuration.to_json(self._sampling)}
+        return {"weights_sha256": weights_sha256(self._folder), "sampling": configuration.to_json(self._sampling)}
 
 
 def open_completer(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from lidargrit.completion import Completer
 from lidargrit.completion.files import OutputConfig, write_completions
-from lidargrit.completion.inputs import Inputs, InputScan, ScanReader, open_inputs
+from lidargrit.completion.inputs import InputScan, ScanReader, open_inputs
 from lidargrit.completion.sparse import SparseReader, observed_rows
 from lidargrit.conditions import Condition
 from lidargrit.conditions.patterns import Pattern
@@ -33,7 +33,7 @@ def complete_scans(
         completer: model or classical method; see :func:`lidargrit.completion.open_completer`.
         pattern: choice of the observed pixels.
         output: number and kind of files.
-        config: number of scans, and what to do with unusable points; nothing else of it is used.
+        config: number of scans, and what to do with unusable points and scans; nothing else of it is used.
         reporter: receiver of progress and messages.
 
     Returns:
@@ -43,13 +43,14 @@ def complete_scans(
         UsageError: all pixels or no return are observed, or a mask of another size.
         ScanError: a scan that cannot be used, or of another sensor.
     """
+    config = config or DataConfig()
 
     def condition_of(scan: InputScan, seed: int) -> Condition:
         return Condition.of_pixels(_batch(scan.image), pattern.mask(scan.image, seed)[None])
 
-    inputs = open_inputs(source, _reader(completer, pattern.partial), config or DataConfig())
+    inputs = open_inputs(source, _reader(completer, pattern.partial), config)
     facts = {"verb": "complete", "source": source, "observed": pattern.text}
-    return write_completions(inputs, out, completer, condition_of, output, facts, reporter or Reporter())
+    return write_completions(inputs, out, completer, condition_of, output, facts, config, reporter or Reporter())
 
 
 def upsample_scans(
@@ -71,14 +72,15 @@ def upsample_scans(
         ConfigError: sensors whose rows hardly look the same ways.
         ScanError: a scan that cannot be used, or of another sensor.
     """
+    config = config or DataConfig()
 
     def condition_of(scan: InputScan, seed: int) -> Condition:
         return Condition.of_pixels(_batch(scan.image), observed_rows(scan)[None])
 
     reader = SparseReader(completer.sensor, completer.projection_variant, source=scans_sensor)
-    inputs = open_inputs(source, reader, config or DataConfig())
+    inputs = open_inputs(source, reader, config)
     facts = {"verb": "upsample", "source": source, "scans_sensor": scans_sensor.to_json()}
-    return write_completions(inputs, out, completer, condition_of, output, facts, reporter or Reporter())
+    return write_completions(inputs, out, completer, condition_of, output, facts, config, reporter or Reporter())
 
 
 def raydrop_scans(
@@ -95,13 +97,14 @@ def raydrop_scans(
         source, out, completer, output, config, reporter: the arguments of :func:`complete_scans`; the completer takes
             ranges of surfaces.
     """
+    config = config or DataConfig()
 
     def condition_of(scan: InputScan, seed: int) -> Condition:
         return Condition.of_surfaces(_batch(scan.image))
 
-    inputs: Inputs = open_inputs(source, _reader(completer, partial=False), config or DataConfig())
+    inputs = open_inputs(source, _reader(completer, partial=False), config)
     facts = {"verb": "raydrop", "source": source}
-    return write_completions(inputs, out, completer, condition_of, output, facts, reporter or Reporter())
+    return write_completions(inputs, out, completer, condition_of, output, facts, config, reporter or Reporter())
 
 
 def _reader(completer: Completer, partial: bool) -> ScanReader:

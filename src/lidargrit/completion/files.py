@@ -21,6 +21,7 @@ from lidargrit.errors import ConfigError, DataError, ScanError
 from lidargrit.export import IMAGE, TREE, KittiTree, claimed_scans, writable_format, write_array, write_with_labels
 from lidargrit.files import claim_folder
 from lidargrit.formats import ScanFormat
+from lidargrit.loading import DataConfig
 from lidargrit.reporting import Reporter
 from lidargrit.sources.image_files import PROBABILITY
 from lidargrit.structures import RangeImage
@@ -39,7 +40,6 @@ class OutputConfig:
         format: name or ending of a format, ``image`` for range images (H, W) in metres as ``.npy``, or
             ``kitti_odometry`` for its tree, with SemanticKITTI's files of labels. If empty, each file has the format of
             its scan where that can be written, and ``.npz`` elsewhere.
-        skip_bad: whether a scan that cannot be used is left out; otherwise it ends the command.
         probability: number of samples of the mask from which ``NAME.probability.npy`` gives each pixel's share of
             returns; 0 for no such files.
     """
@@ -47,7 +47,6 @@ class OutputConfig:
     count: int = 1
     seed: int = 0
     format: str = ""
-    skip_bad: bool = False
     probability: int = 0
 
     def __post_init__(self) -> None:
@@ -73,6 +72,7 @@ def write_completions(
     condition_of: Callable[[InputScan, int], Condition],
     output: OutputConfig,
     facts: dict[str, Any],
+    config: DataConfig,
     reporter: Reporter,
 ) -> int:
     """Complete every scan and write it; files that are there already are not written again.
@@ -87,6 +87,7 @@ def write_completions(
         condition_of: function that returns the condition for a scan and a seed.
         output: number and kind of files.
         facts: further entries of ``completed.json``; a folder with other entries is refused.
+        config: treatment of scans that cannot be used; nothing else of it is used.
         reporter: receiver of progress and messages.
 
     Returns:
@@ -102,10 +103,10 @@ def write_completions(
     scans = {file: inputs.name(index) for (index, _), file in files.items()}
     left_out, labels_lost = set[int](), False
     missing = [job for job, file in files.items() if not (out / file).exists()]
-    remaining = _jobs(inputs, missing, condition_of, output, left_out, reporter)
-    jobs = chain(
-        list(islice(remaining, 1)), remaining
-    )  # a mistake in the first scan is told before anything is written
+    skipped = left_out if config.bad_scans == "skip" else None
+    remaining = _jobs(inputs, missing, condition_of, output.seed, skipped, reporter)
+    first = list(islice(remaining, 1))  # a mistake in it is told before anything is written
+    jobs = chain(first, remaining)
     with (
         claim_folder(out),
         claimed_scans(out / "completed.json", {**manifest, "scans": scans}),
@@ -158,23 +159,23 @@ def _jobs(
     inputs: Inputs,
     missing: Sequence[tuple[int, int]],
     condition_of: Callable[[InputScan, int], Condition],
-    output: OutputConfig,
-    left_out: set[int],
+    seed: int,
+    skipped: set[int] | None,
     reporter: Reporter,
 ) -> Iterator[_Job]:
-    """Read each scan of missing files once."""
+    """Read each scan of missing files once; note those that cannot be used in a set, or refuse them without one."""
     last, scan, condition = -1, None, None
     for index, turn in missing:
         if index != last:
             last, scan = index, None
             try:
                 scan = inputs.read(index)
-                condition = condition_of(scan, derive_seed(output.seed, index))
+                condition = condition_of(scan, derive_seed(seed, index))
             except ScanError as error:
-                if not output.skip_bad:
+                if skipped is None:
                     raise
                 reporter.message(f"left out: {error}")
-                left_out.add(index)
+                skipped.add(index)
                 scan = None
         if scan is not None and condition is not None:
             yield _Job(index, turn, scan, condition, inputs.form(index))
@@ -210,7 +211,7 @@ def _suffix(of_input: str, kind: str) -> str:
     if kind == IMAGE:
         return ".npy"
     if kind:
-        return writable_format(kind)[1]
+        return writable_format(kind, IMAGE, TREE)[1]
     known = formats.candidates(Path(f"scan{of_input}")) if of_input else ()
     return of_input if any(one.can_write() and of_input in one.suffixes for one in known) else _UNWRITABLE
 

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -16,8 +14,6 @@ from torch import Tensor
 from lidargrit import formats
 from lidargrit.completion import Completer, LearnedCompleter
 from lidargrit.conditions import Condition
-from lidargrit.datasets import ScanDataset
-from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import ConfigError, ScanError
 from lidargrit.formats import ScanFormat
 from lidargrit.loading import DataConfig, RangeImages
@@ -26,8 +22,8 @@ from lidargrit.projection import ProjectionVariant, index_map, project, unprojec
 from lidargrit.projection.fit import projection_that_fits
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import ProjectionName, SensorModel, load_sensor
-from lidargrit.sources import DatasetSource, open_images, open_source
-from lidargrit.sources.image_files import ImageFileSource
+from lidargrit.sources import open_images, open_source
+from lidargrit.sources.named import ImageScans, PointScans, named_scans
 from lidargrit.structures import RangeImage, Scan
 
 
@@ -73,67 +69,43 @@ class InputScan:
         return _together(whole, unproject(new)) if bool(added.any()) else whole
 
 
-class Inputs(ABC):
-    """The scans of a source, one after the other."""
+class Inputs:
+    """The scans of a source, one after the other.
 
-    @abstractmethod
-    def __len__(self) -> int: ...
+    Args:
+        scans: scans of the source.
+        reader: projection of points to range images.
+    """
 
-    @abstractmethod
+    def __init__(self, scans: PointScans | ImageScans, reader: ScanReader) -> None:
+        self._scans, self._reader = scans, reader
+
+    def __len__(self) -> int:
+        return len(self._scans)
+
     def name(self, index: int) -> str:
         """Return the name of its file, without the ending."""
+        return self._scans.name(index)
 
     def suffix(self, index: int) -> str:
-        """Return the ending of its file; "" where it has none that can be written."""
-        return ""
+        """Return the ending of its file; "" where it is not in a file of points."""
+        path = self._scans.path(index)
+        return "" if path is None else path.name[len(formats.stem(path)) :]
 
     def form(self, index: int) -> type[ScanFormat] | None:
         """Return the format of its file; None where it has none."""
-        return None
+        path = self._scans.path(index)
+        return None if path is None or not formats.candidates(path) else formats.recognise(path)
 
-    @abstractmethod
     def read(self, index: int) -> InputScan:
         """Read one scan.
 
         Raises:
             ScanError: a scan that cannot be used, or of another sensor.
         """
-
-
-class _OfDataset(Inputs):
-    def __init__(self, dataset: ScanDataset, indices: Sequence[int], reader: ScanReader) -> None:
-        self._dataset, self._indices, self._reader = dataset, indices, reader
-
-    def __len__(self) -> int:
-        return len(self._indices)
-
-    def name(self, index: int) -> str:
-        return self._dataset.name(self._indices[index])
-
-    def suffix(self, index: int) -> str:
-        path = self._dataset.path(self._indices[index])
-        return "" if path is None else path.name[len(formats.stem(path)) :]
-
-    def form(self, index: int) -> type[ScanFormat] | None:
-        path = self._dataset.path(self._indices[index])
-        return None if path is None or not formats.candidates(path) else formats.recognise(path)
-
-    def read(self, index: int) -> InputScan:
-        return self._reader.read(self._dataset.scan(self._indices[index]))
-
-
-class _OfImages(Inputs):
-    def __init__(self, images: RangeImages, names: Sequence[str]) -> None:
-        self._images, self._names = images, names
-
-    def __len__(self) -> int:
-        return len(self._images)
-
-    def name(self, index: int) -> str:
-        return self._names[index]
-
-    def read(self, index: int) -> InputScan:
-        return InputScan(self._images.batch([index])[0])
+        if isinstance(self._scans, ImageScans):
+            return InputScan(self._scans.image(index))
+        return self._reader.read(self._scans.scan(index))
 
 
 @dataclass(frozen=True)
@@ -209,30 +181,20 @@ def open_inputs(source: str, reader: ScanReader, config: DataConfig) -> Inputs:
     Raises:
         ConfigError: range images of other rays than the reader's sensor.
     """
-    opened = open_source(source, config.bad_points)
-    if isinstance(opened, DatasetSource):
-        dataset = opened.scans()
-        return _OfDataset(dataset, evenly_spaced(config.max_scans or len(dataset), len(dataset)), reader)
-    images = opened.images(reader.sensor, config)
-    of, wanted = images.sensor, reader.sensor
-    if not of.same_rays(wanted):
+    scans = named_scans(open_source(source, config.bad_points), config, reader.sensor)
+    if isinstance(scans, ImageScans) and not scans.images.sensor.same_rays(reader.sensor):
+        of, wanted = scans.images.sensor, reader.sensor
         raise ConfigError(
             f"range images of {of.height}x{of.width} of the sensor {of.name!r} in {source}",
             f"images of the model's {wanted.height}x{wanted.width} of {wanted.name!r}, with the same rays",
             "name a model for such images with --model, or give the scans as points",
         )
-    if isinstance(opened, ImageFileSource):
-        return _OfImages(images, [_name_of(Path(name)) for name in images.provenance.names])
-    return _OfImages(images, [f"{index:06d}" for index in range(len(images))])
+    return Inputs(scans, reader)
 
 
 def sensor_of(source: str, name: str = "") -> SensorModel:
     """Return the sensor of a source of scans, or the one that is named for it by a name or a ``.json`` file."""
     return load_sensor(name) if name else open_source(source).sensor
-
-
-def _name_of(image: Path) -> str:
-    return image.stem if image.suffix == ".npy" else image.name  # beside scan.npy there may lie scan.NPY
 
 
 def _together(own: Scan, added: Scan) -> Scan:

@@ -14,15 +14,14 @@ from lidargrit.completion.inputs import ScanReader, open_inputs
 from lidargrit.compression.archive import Archive, writing
 from lidargrit.compression.coder import not_reproduced
 from lidargrit.compression.scan_codec import ScanCodec
-from lidargrit.errors import CheckpointError, DataError, ScanError, UnknownNameError, UsageError, one_of
-from lidargrit.export import IMAGE, TREE, claim_scans, kinds, writable_format, write_array
+from lidargrit.errors import CheckpointError, DataError, ScanError, UsageError
+from lidargrit.export import IMAGE, claimed_scans, writable_format, write_array
 from lidargrit.files import claim_folder
-from lidargrit.formats import ScanFormat
-from lidargrit.generators import load, locate
+from lidargrit.generators import load
 from lidargrit.loading import DataConfig
 from lidargrit.projection import unproject
 from lidargrit.reporting import Reporter
-from lidargrit.sources.samples import projection_of
+from lidargrit.run_folder import locate, projection_variant
 
 
 @dataclass(frozen=True)
@@ -65,8 +64,7 @@ def compress_scans(
         ScanError: a scan that cannot be used.
     """
     codec = ScanCodec(load(model), step_mm)
-    variant = "reference" if projection_of(locate(model)) == "reference" else "exact"
-    inputs = open_inputs(source, ScanReader(codec.sensor, variant), config)
+    inputs = open_inputs(source, ScanReader(codec.sensor, projection_variant(locate(model))), config)
     chosen = {"source": source, "max_scans": config.max_scans}
     chosen |= {"bad_points": config.bad_points, "bad_scans": config.bad_scans}
     with writing(out, _header(codec, model), chosen) as writer:
@@ -114,32 +112,25 @@ def decompress_scans(path: Path, out: Path, model: str, kind: str, chosen: Seque
         raise UsageError(f"--only {wrong[0]}", wanted, "correct it" if len(archive) else "name another file")
     archive.check()
     codec = _codec_of(archive, model)
-    form, suffix = (None, ".npy") if kind == IMAGE else _format(kind)
+    form, suffix = (None, ".npy") if kind == IMAGE else writable_format(kind, IMAGE)
     files = {index: archive.names[index] + suffix for index in chosen or range(len(archive))}
     scans = {file: archive.names[index] for index, file in files.items()}
     missing = [index for index, file in files.items() if not (out / file).exists()]
-    with claim_folder(out):
-        facts = {"source": path.name, "index_crc32": archive.index_crc32}
-        facts |= {"step_mm": codec.steps.step_mm, "format": kind}
-        claim_scans(out / "decompressed.json", {**facts, "scans": scans})
-        with reporter.progress("decompressing", len(files), len(files) - len(missing)) as progress:
-            for index in missing:
-                image = codec.decompress(archive.read(index))
-                if form is None:
-                    write_array(out / files[index], image.range_m)
-                else:
-                    form.write(out / files[index], unproject(image))
-                progress.advance(1)
+    facts = {"source": path.name, "index_crc32": archive.index_crc32}
+    facts |= {"step_mm": codec.steps.step_mm, "format": kind}
+    with (
+        claim_folder(out),
+        claimed_scans(out / "decompressed.json", {**facts, "scans": scans}),
+        reporter.progress("decompressing", len(files), len(files) - len(missing)) as progress,
+    ):
+        for index in missing:
+            image = codec.decompress(archive.read(index))
+            if form is None:
+                write_array(out / files[index], image.range_m)
+            else:
+                form.write(out / files[index], unproject(image))
+            progress.advance(1)
     return len(files)
-
-
-def _format(kind: str) -> tuple[type[ScanFormat], str]:
-    """Return the format of a name or an ending, and the ending of its files; the tree of a data set is none here."""
-    try:
-        return writable_format(kind)
-    except UnknownNameError:
-        known = (IMAGE, *(name for name in kinds() if name != TREE))
-        raise UnknownNameError(f"--format {kind}", one_of(known), "choose one") from None
 
 
 def _header(codec: ScanCodec, model: str) -> dict[str, Any]:

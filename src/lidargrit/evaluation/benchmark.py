@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import time
 from collections.abc import Sequence
@@ -20,19 +21,23 @@ from lidargrit.errors import CheckpointError, ConfigError
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair, open_pair
 from lidargrit.evaluation.likelihood import bits_per_return
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
-from lidargrit.evaluation.protocols import load_protocol, public_name
+from lidargrit.evaluation.protocols import public_name
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.evaluation.tables import Format, TableBlock, render, side_by_side
+from lidargrit.evaluation.verdict import MEMORISED, PIXEL_STATISTICS
 from lidargrit.files import claim_folder, read_json, write_json
-from lidargrit.generators import Generator, is_run, load, load_class, locate
+from lidargrit.generators import Generator, load, load_class
 from lidargrit.nn.devices import usable_device
 from lidargrit.processes import process_pool
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
-from lidargrit.sources import Source, open_source
+from lidargrit.run_folder import is_run, locate
+from lidargrit.sensors import SensorModel
+from lidargrit.sources import Source, data_set_of, open_source
 from lidargrit.sources.samples import write_samples
 from lidargrit.training import Recipe, check_folder, train, training_flops, with_budget
 from lidargrit.training.compute import duration
+from lidargrit.training.plan import check_stages
 
 COSTS = "costs.json"
 _COSTS = {  # entry of the file → name and unit in the table, and whether a system may lack it
@@ -77,6 +82,20 @@ class Benchmark:
                 "correct the number",
             )
 
+    def evaluation(self) -> EvalConfig:
+        """Return the settings of the evaluation, of as many scans as samples."""
+        return replace(self.settings, max_scans=self.num_samples)
+
+    def recipe(self, name: str) -> Recipe:
+        """Return a recipe with the settings and the budget that all systems get.
+
+        Raises:
+            ConfigError: a setting that the recipe does not take, or that one of its stages cannot follow.
+        """
+        recipe = load_recipe(name, self.recipe_settings)
+        check_stages(recipe)
+        return with_budget(recipe, self.flops) if self.flops else recipe
+
 
 def run(
     systems: Sequence[str],
@@ -114,7 +133,8 @@ def run(
     by_run: dict[Path, list[_Plan]] = {}  # systems of one run one after the other: it is trained once
     for plan in plans:
         by_run.setdefault(plan.run, []).append(plan)
-    _check_reference(reference, plans, benchmark.settings)
+    _warn_of_bounds(plans, reference, reporter)
+    _check_reference(reference, plans, benchmark, reporter)
     processes = min(processes, len(by_run))  # more would only take cores from one another
     remaining = _Remaining(list(systems), reporter)
     with claim_folder(folder):
@@ -133,12 +153,30 @@ def run(
     return [folder / name / f"{name}.json" for name in names]
 
 
-def _check_reference(reference: Source, plans: Sequence[_Plan], settings: EvalConfig) -> None:
-    """Refuse scans that a system's sensor does not see, before anything is trained."""
-    variant = settings.projection_variant or load_protocol(settings.protocol).variant
-    config = replace(settings.data, projection_variant=variant, max_scans=1)
-    for recipe in (plan.recipe for plan in plans if plan.recipe is not None):
-        reference.images(recipe.data.load_sensor(), config)
+def _check_reference(reference: Source, plans: Sequence[_Plan], benchmark: Benchmark, reporter: Reporter) -> None:
+    """Project the reference for every sensor before anything is trained: what cannot be used is refused now."""
+    config = benchmark.evaluation().data_config()
+    distinct = {json.dumps(sensor.to_json()): sensor for sensor in (plan.sensor() for plan in plans)}
+    for sensor in distinct.values():
+        reference.images(sensor, config, reporter)
+
+
+def _warn_of_bounds(plans: Sequence[_Plan], reference: Source, reporter: Reporter) -> None:
+    """Warn of rows that bound the scores of another data set than the reference's: theirs has to be trained on."""
+    unclear = {"", "folder", data_set_of(reference.text)[0] or reference.data_set}  # a folder's may be any data set
+    recipes = {plan.system: plan.recipe for plan in plans if plan.recipe is not None}
+    others = {
+        name: source
+        for name, recipe in recipes.items()
+        for source in recipe.data.train
+        if recipe.generator in (PIXEL_STATISTICS, MEMORISED) and data_set_of(source)[0] not in unclear
+    }
+    if others:
+        reporter.message(
+            f"WARNING: {' and '.join(others)} would learn from {' and '.join(sorted({*others.values()}))}, another "
+            f"data set than that of {reference.text}, and bound no score against it; name scans of that data set with "
+            "--set data.train=FOLDER data.val=FOLDER"
+        )
 
 
 def _finish(
@@ -146,7 +184,7 @@ def _finish(
 ) -> int:
     """Train or load the systems of one run, sample from each, score the samples, and return how many were sampled."""
     sampled = 0
-    settings = replace(benchmark.settings, max_scans=benchmark.num_samples)
+    settings = benchmark.evaluation()
     reference = reference or open_source(benchmark.reference, settings.data.bad_points)
     for plan in plans:
         name = _folder_name(plan.system)
@@ -255,16 +293,18 @@ class _Plan:
     def of(cls, system: str, folder: Path, benchmark: Benchmark) -> _Plan:
         name, settings = name_and_settings(system)
         run = locate(name)
-        recipe = None if is_run(run) else load_recipe(name, benchmark.recipe_settings)
+        recipe = None if is_run(run) else benchmark.recipe(name)
         cls_of = type(load(name)) if recipe is None else load_class(recipe.generator)
         owner, cure = f"sampling from {name!r}", "see all with: lidargrit list generators"
         sampling = override(cls_of.Sampling(), settings, owner, cure)
-        if recipe is not None and benchmark.flops:
-            recipe = with_budget(recipe, benchmark.flops)
         if recipe is None:
             return cls(system, run, None, sampling)
         check_folder(folder / "runs" / name, recipe)
         return cls(system, folder / "runs" / name, recipe, sampling)
+
+    def sensor(self) -> SensorModel:
+        """Return the sensor of the system's samples."""
+        return load(self.run).sensor if self.recipe is None else self.recipe.data.load_sensor()
 
 
 def _sample(

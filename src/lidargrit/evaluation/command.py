@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from lidargrit import _discovery
-from lidargrit.errors import ConfigError, nearest_names
+from lidargrit.errors import ConfigError, nearest_names, one_of
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair, open_pair
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.pairs import EvalPair
@@ -21,7 +21,9 @@ from lidargrit.loading.config import ScanSettings
 from lidargrit.metrics import load_metric
 from lidargrit.nn.devices import usable_device
 from lidargrit.reporting import Reporter
-from lidargrit.sources import RunSource, Source, open_source
+from lidargrit.sources import RunSource, SampleSource, Source, TensorSource, open_source
+
+_OF_TABLES = ("tables", "format", "json", "overwrite", "debug", "verb")  # options that printing takes as well
 
 
 def evaluate(
@@ -45,7 +47,7 @@ def evaluate(
         overwrite: whether a report that is there already is replaced.
 
     Raises:
-        ConfigError: a name is missing.
+        ConfigError: a name is missing, or an option has no meaning for these sets or metrics.
         OutputError: the report is there already.
     """
     if not (samples and reference):
@@ -58,6 +60,7 @@ def evaluate(
     if isinstance(first, RunSource):
         _refuse_options_of_samples(samples, config, report)
         return _reconstruction(first, second, config, reporter)
+    _refuse_unused(first, config)
     pair = open_pair(first, second, config, reporter)
     card = compare_pair(pair, config, reporter)
     if config.pixel_statistics:
@@ -69,18 +72,23 @@ def evaluate(
     return card.as_table(), card.to_json()
 
 
-def check_modes(tables: Sequence[Path] | None, form: str, samples: str, report: Path | None) -> None:
+def check_modes(options: Mapping[str, Any], default_of: Callable[[str], Any]) -> None:
     """Refuse words for scoring beside ``--tables``, which only prints, and a format of tables without it.
+
+    Args:
+        options: values of all options, by their names.
+        default_of: function that returns the default of an option.
 
     Raises:
         ConfigError: they are mixed.
     """
-    if tables and (samples or report):
-        got = f"--tables and {samples or '--report'}"
+    of_scoring = [name for name, value in options.items() if name not in _OF_TABLES and value != default_of(name)]
+    if options["tables"] and of_scoring:
+        got = f"--tables and {options['samples'] or '--' + of_scoring[0].replace('_', '-')}"
         raise ConfigError(got, "files of scores to print, or sets to score", "run the two one after the other")
-    if form != "text" and not tables:
+    if options["format"] != "text" and not options["tables"]:
         cure = "score with --json FILE.json, then print it with --tables FILE.json"
-        raise ConfigError(f"--format {form} without --tables", "files of scores to print", cure)
+        raise ConfigError(f"--format {options['format']} without --tables", "files of scores to print", cure)
 
 
 def read_config(
@@ -155,6 +163,27 @@ def _refuse_options_of_samples(run: str, config: EvalConfig, report: Path | None
             f"{wrong[0]} for the run {run}, of which only reconstructions are measured",
             "samples, or a run without this option",
             f"generate samples first with: lidargrit sample {run} FOLDER",
+        )
+
+
+def _refuse_unused(samples: Source, config: EvalConfig) -> None:
+    """Refuse a sensor for generated images, which keep their own, and weights of networks that no metric needs.
+
+    Raises:
+        ConfigError: one of them is given.
+    """
+    if config.sensor and isinstance(samples, (SampleSource, TensorSource)):
+        raise ConfigError(
+            f"--sensor {config.sensor} for {samples.text}, which holds {samples.kind}",
+            "a sensor for scans, or for range images in .npy files",
+            "leave --sensor out: the reference is projected with the sensor of the samples",
+        )
+    needed = {load_metric(choice.metric).needs_weights for choice in config.chosen_metrics()}
+    if unused := sorted(config.weights.keys() - needed):
+        raise ConfigError(
+            f"--weights {unused[0]}={config.weights[unused[0]]}, which none of the chosen metrics needs",
+            f"weights of {one_of(sorted(needed - {''}))}" if needed - {""} else "no weights",
+            "leave it out, or choose a metric or protocol that needs it",
         )
 
 

@@ -94,12 +94,18 @@ class EvalConfig:
                 kept.append(choice)
         return kept
 
+    def data_config(self) -> DataConfig:
+        """Return the settings by which scans of either set are read and projected, as the protocol or the user says."""
+        protocol = load_protocol(self.protocol)
+        variant = self.projection_variant or protocol.variant
+        return replace(self.data, projection_variant=variant, max_scans=protocol.scans_at_most(self.max_scans))
+
     def facts(self) -> dict[str, Any]:
         """Return the entries of a scorecard, as plain values."""
         return {
             "metrics": list(self.metrics),
             "variant": self.variant,
-            "projection_variant": self.projection_variant or load_protocol(self.protocol).variant,
+            "projection_variant": self.data_config().projection_variant,
             **({"sensor": self.sensor} if self.sensor else {}),
             **({"projection": self.data.projection} if self.data.projection != "sensor" else {}),
             "max_scans": self.max_scans,
@@ -136,9 +142,7 @@ def compare_sources(
 
 def open_pair(samples: Source, reference: Source, settings: EvalConfig, reporter: Reporter) -> EvalPair:
     """Read the two sets of an evaluation, and warn where they are not comparable."""
-    protocol = load_protocol(settings.protocol)
-    variant = settings.projection_variant or protocol.variant
-    config = replace(settings.data, projection_variant=variant, max_scans=settings.max_scans)
+    protocol, config = load_protocol(settings.protocol), settings.data_config()
     sensor = load_sensor(settings.sensor) if settings.sensor else protocol.load_sensor()
     sensor = sensor and config.imaged(sensor)
     pair = pair_for_protocol(samples, reference, protocol, config, reporter, sensor)

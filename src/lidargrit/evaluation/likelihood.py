@@ -14,10 +14,11 @@ from lidargrit.determinism import evenly_spaced
 from lidargrit.evaluation.estimates import Estimate
 from lidargrit.evaluation.pairs import EvalSet
 from lidargrit.files import atomic_path
-from lidargrit.generators import Generator, locate
+from lidargrit.generators import Generator
 from lidargrit.loading import DataConfig, RangeImages
 from lidargrit.nn.devices import usable_device
 from lidargrit.reporting import Reporter
+from lidargrit.run_folder import locate
 from lidargrit.sources import RunSource, open_source, overlap
 from lidargrit.structures import ScanBits
 

@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import torch
-
 from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import ConfigError
 from lidargrit.evaluation.protocols import Protocol
@@ -59,9 +57,7 @@ class EvalSet:
             return images
         near, far = self.range_m
         mask = (images.range_m > near) & (images.range_m < far)
-        reflectance = images.reflectance
-        kept = RangeImage.masked(images.range_m, mask, images.sensor)
-        return kept if reflectance is None else replace(kept, reflectance=torch.where(mask, reflectance, 0))
+        return RangeImage.masked(images.range_m, mask, images.sensor, images.reflectance, images.label)
 
     def record(self) -> EvalSetRecord:
         """Return the entry of the set in a score file; its hash is of the ranges before limits are applied."""
@@ -144,34 +140,49 @@ def pair_for_protocol(
         ConfigError: the two sets look along different rays.
     """
     reporter, sensor = reporter or Reporter(), sensor or protocol.load_sensor()
-    at_most = min((n for n in (config.max_scans, protocol.num_scans) if n), default=0)
-    config = replace(config, max_scans=at_most)
-    first = samples.images(sensor, config, reporter)
+    config = replace(config, max_scans=protocol.scans_at_most(config.max_scans))
+    first = _Opened.of(samples, sensor, config, reporter)
     if isinstance(samples, DatasetSource):  # whose points may have had to go by elevation: then so do the reference's
-        config = replace(config, projection_variant=samples.projection_variant(config))
-    second = reference.images(first.sensor, config, reporter)
-    if isinstance(samples, DatasetSource) and second.sensor.projection != first.sensor.projection:
-        config = replace(config, projection_variant=reference.projection_variant(config))
-        first = samples.images(second.sensor, config, reporter)
-    _require_same_rays(first, second)
-    count = min(len(first), len(second), at_most or len(first))
-    both = [
-        EvalSet(
+        config = replace(config, projection_variant=first.projection_variant)
+    second = _Opened.of(reference, first.images.sensor, config, reporter)
+    if isinstance(samples, DatasetSource) and second.images.sensor.projection != first.images.sensor.projection:
+        config = replace(config, projection_variant=second.projection_variant)
+        first = _Opened.of(samples, second.images.sensor, config, reporter)
+    _require_same_rays(first.images, second.images)
+    count = min(len(first.images), len(second.images), config.max_scans or len(first.images))
+    pair = EvalPair(first.as_set(count, protocol.range_m), second.as_set(count, protocol.range_m))
+    warnings = (*_warnings(pair, overlap(samples, first.images, second.images)), *first.doubts, *second.doubts)
+    return replace(pair, deviations=deviations(pair, protocol), warnings=warnings)
+
+
+@dataclass(frozen=True, eq=False)
+class _Opened:
+    """Images of a source, and what the source says of them; later it speaks of those that were opened last."""
+
+    source: Source
+    images: RangeImages
+    projection_variant: str
+    doubts: tuple[str, ...]
+
+    @classmethod
+    def of(cls, source: Source, sensor: SensorModel | None, config: DataConfig, reporter: Reporter) -> _Opened:
+        images = source.images(sensor, config, reporter)
+        return cls(source, images, source.projection_variant(config), source.doubts)
+
+    def as_set(self, count: int, range_m: tuple[float, float] | None) -> EvalSet:
+        """Return so many of the images, evenly spaced, as one set of an evaluation."""
+        source, images = self.source, self.images
+        return EvalSet(
             source.text,
             images,
             evenly_spaced(count, len(images)),
-            protocol.range_m,
+            range_m,
             source.data_set,
             source.split,
-            source.projection_variant(config),
+            self.projection_variant,
             source.weights_sha256(),
             full_rows_of(source.folder) if isinstance(source, SampleSource) else None,
         )
-        for source, images in ((samples, first), (reference, second))
-    ]
-    pair = EvalPair(both[0], both[1])
-    warnings = (*_warnings(pair, overlap(samples, first, second)), *samples.doubts, *reference.doubts)
-    return replace(pair, deviations=deviations(pair, protocol), warnings=warnings)
 
 
 def deviations(pair: EvalPair, protocol: Protocol) -> tuple[str, ...]:

@@ -13,8 +13,10 @@ from lidargrit.conditions import Condition
 from lidargrit.conditions.fills import ranges_from_others
 from lidargrit.errors import ConfigError
 from lidargrit.evaluation.realism import SimulatedScans, distance, drop_independently
-from lidargrit.generators import Generator, load, locate
+from lidargrit.generators import Generator, load
 from lidargrit.loading import RangeImages
+from lidargrit.nn.devices import usable_device
+from lidargrit.run_folder import locate
 from lidargrit.structures import MetricResult, RangeImage
 
 RAYDROP_CURVES = (
@@ -71,7 +73,7 @@ def score_raydrop(
     for first in range(0, len(clean), generator.compute_batch):
         some = clean[first : first + generator.compute_batch]
         seeds = range(seed + first, seed + first + len(some))
-        dropped.append(generator.complete(Condition.of_surfaces(some).to(generator.device), seeds).to("cpu"))
+        dropped.append(generator.complete(Condition.of_surfaces(some), seeds).to("cpu"))
     by_model = RangeImage.cat(dropped)
     independent = drop_independently(clean, float(true.return_mask.float().mean()), seed)
     half = len(true) // 2
@@ -86,7 +88,9 @@ def score_raydrop(
     ]
 
 
-def scores_of_model(word: str, simulated: SimulatedScans, real: RangeImages, seed: int = 0) -> list[RaydropScore]:
+def scores_of_model(
+    word: str, simulated: SimulatedScans, real: RangeImages, seed: int = 0, device: str = ""
+) -> list[RaydropScore]:
     """Score the drops of a run: on simulated scans, whose clean ranges are known, and on real ones, estimated twice.
 
     Args:
@@ -94,11 +98,12 @@ def scores_of_model(word: str, simulated: SimulatedScans, real: RangeImages, see
         simulated: simulated scans of the run's sensor, before and after drops.
         real: real scans of its sensor.
         seed: seed of the first scan's drops.
+        device: device to compute on; a GPU if there is one and none is named.
 
     Raises:
-        ConfigError: a run that does not drop returns of clean scans, or of another sensor.
+        ConfigError: a run that does not drop returns of clean scans, or of another sensor; no such device.
     """
-    generator = load(locate(word))
+    generator = load(locate(word)).to(usable_device(device))
     decoded, true = decoded_surfaces(generator, real)
     pairs = {
         "simulated": (simulated.clean, simulated.measured),

@@ -115,8 +115,7 @@ def drop_independently(clean: RangeImage, return_share: float, seed: int = 0) ->
     rng = torch.Generator().manual_seed(seed)
     keep = return_share / max(float(clean.return_mask.float().mean()), 1e-9)
     mask = clean.return_mask & (torch.rand(clean.range_m.shape, generator=rng) < keep)
-    dropped = RangeImage.masked(clean.range_m, mask, clean.sensor)
-    return dropped if clean.reflectance is None else replace(dropped, reflectance=clean.reflectance * mask)
+    return RangeImage.masked(clean.range_m, mask, clean.sensor, clean.reflectance, clean.label)
 
 
 def scans_of_both(

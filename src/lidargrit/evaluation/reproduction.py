@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +14,11 @@ from lidargrit.evaluation.benchmark import run as run_benchmark
 from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.evaluation.protocols import load_protocol
 from lidargrit.evaluation.tables import Format
-from lidargrit.generators import is_run
 from lidargrit.metrics import load_metric
-from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
+from lidargrit.run_folder import is_run
 from lidargrit.sources import load_range_images, open_source
-from lidargrit.training import Recipe, computing_time, plan_training, with_budget
+from lidargrit.training import computing_time, plan_training
 
 SIMULATED = "simulated"  # in place of a root
 _SIMULATED_SCANS = {"train": 300, "val": 16}  # the demo's: a few minutes of simulating
@@ -186,7 +185,7 @@ def table_of(wanted: Reproduction, scores: list[Path], form: Format = "text") ->
 def plan(wanted: Reproduction, folder: Path) -> dict[str, Any]:
     """Return the steps of :func:`reproduce` and their costs, as plain values."""
     benchmark = wanted.benchmark()
-    recipes = {system: _recipe(system, benchmark) for system in wanted.systems().values()}
+    recipes = {system: benchmark.recipe(system) for system in wanted.systems().values()}
     data = next(iter(recipes.values())).data
     counted = {source: len(open_source(source).scans()) for source in (*data.train, *data.val, benchmark.reference)}
     systems = {}
@@ -216,22 +215,12 @@ def plan_as_text(wanted: Reproduction, facts: dict[str, Any]) -> str:
     return "\n".join([*lines, "", *_remarks(wanted)])
 
 
-def _recipe(system: str, benchmark: Benchmark) -> Recipe:
-    recipe = load_recipe(system, benchmark.recipe_settings)
-    return with_budget(recipe, benchmark.flops) if benchmark.flops else recipe
-
-
 def _prepare(benchmark: Benchmark, systems: list[str], reporter: Reporter) -> None:
-    """Project everything before anything is trained: a scan that cannot be used is refused now, not after days."""
-    protocol = load_protocol(benchmark.settings.protocol)
-    reference = open_source(benchmark.reference)
-    for system in systems:
-        data = load_recipe(system, benchmark.recipe_settings).data
+    """Project all training scans before anything is trained: one that cannot be used is refused now, not after days."""
+    open_source(benchmark.reference)  # refuses a split that is not there
+    for data in [benchmark.recipe(system).data for system in systems]:
         load_range_images(data.train, data, reporter)
         load_range_images(data.val, data, reporter)
-        at_most = min(benchmark.num_samples, protocol.num_scans)
-        config = replace(benchmark.settings.data, projection_variant=protocol.variant, max_scans=at_most)
-        reference.images(data.load_sensor(), config, reporter)
 
 
 def _remarks(wanted: Reproduction) -> list[str]:

@@ -209,9 +209,7 @@ def _score(data: dict[str, Any]) -> Score:
         str(data["variant"]),
         dict(data["details"]),
     )
-    # Files of before the reference rows had one name everywhere.
-    interval, real = data["interval"], data["real_against_real"] if "real_against_real" in data else data["floor"]
-    pixels = data.get("pixel_statistics")
+    interval, real, pixels = data["interval"], data["real_against_real"], data["pixel_statistics"]
     return Score(
         result,
         None

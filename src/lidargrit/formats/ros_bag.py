@@ -284,8 +284,7 @@ class _Sqlite:
 
     def message(self, index: int) -> Any:
         with closing(self._connected()) as database:
-            query = "SELECT data FROM messages WHERE rowid = ? AND length(data) <= ?"
-            (raw,) = database.execute(query, (self.times[index], BYTES_AT_MOST)).fetchone()
+            (raw,) = database.execute("SELECT data FROM messages WHERE rowid = ?", (self.times[index],)).fetchone()
         return _decoded(raw, "cdr")
 
     def _connected(self) -> sqlite3.Connection:

@@ -14,25 +14,20 @@ import torch
 from lidargrit import _discovery, configuration
 from lidargrit.conditions import Condition, ConditionKind
 from lidargrit.errors import CheckpointError, ConfigError, LidarGritError, one_of
-from lidargrit.files import is_taken, read_json, read_tensors
+from lidargrit.files import read_json, read_tensors
 from lidargrit.generators._batches import BatchSeeds, in_batches
 from lidargrit.generators._checks import check_condition, check_images, check_seeds
 from lidargrit.generators._facts import CAPABILITIES, SystemFacts
 from lidargrit.generators._hub import download
-from lidargrit.generators._saved import CARD_FILE as CARD_FILE
-from lidargrit.generators._saved import CONFIG_FILE, WEIGHTS_FILE, ConfigT, SavedModel
+from lidargrit.generators._saved import ConfigT, SavedModel
 from lidargrit.loading import RangeImages
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.range_steps import RangeSteps
 from lidargrit.nn.size import numbers_at_most
+from lidargrit.run_folder import CONFIG_FILE, PACKAGED, WEIGHTS_FILE, is_run, locate
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage, ScanBits
 from lidargrit.tokenizers import Tokenizer
-
-RUN_FILE = "run.json"  # ``origin`` in it says that the weights beside it were not trained in this folder
-TRAINED_ON_FILE = "trained_on.json"  # in a run's folder and beside its samples: which drives, which pixels
-PRETRAINED = Path(__file__).parents[1] / "pretrained"
-PACKAGED = (PRETRAINED, PRETRAINED.with_name("pretrained_wide"))  # their names go wherever a run is wanted
 
 
 @dataclass(frozen=True)
@@ -339,22 +334,6 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
                 "read it with Generator.from_pretrained",
             )
         return generator
-
-
-def locate(run: str | Path) -> Path:
-    """Return the folder of a run; the package has ``pretrained`` and ``pretrained_wide``, unless you have your own."""
-    packaged = {folder.name: folder for folder in PACKAGED}
-    return Path(run) if is_taken(Path(run)) else packaged.get(str(run), Path(run))
-
-
-def is_run(folder: Path) -> bool:
-    """Return whether a folder is that of a finished run."""
-    return (folder / CONFIG_FILE).is_file()
-
-
-def recipe_settings(about: Any) -> dict[str, Any]:
-    """Return every setting of the recipe in a ``run.json`` by its name of today; none where there is no recipe."""
-    return configuration.leaves(about.get("recipe") if isinstance(about, dict) else {})
 
 
 def load(folder: str | Path) -> Generator:

@@ -195,8 +195,9 @@ class FlowPairs:
     ) -> None:
         self._network = copy.deepcopy(network).eval().requires_grad_(False)
         self._sensor, self._solving = sensor, solving
-        self._bytes_at_most = self._free = bytes_at_most
         self._shape = (network.images, sensor.height, sensor.width)
+        self.kept_at_most = bytes_at_most // (4 * math.prod(self._shape))
+        """Number of pairs that the bound of memory holds."""
         self._kept: dict[int, Tensor] = {}
 
     def __call__(self, numbers: Tensor) -> tuple[Float[Tensor, "B C H W"], Float[Tensor, "B C H W"]]:
@@ -210,11 +211,6 @@ class FlowPairs:
         clean = [self._clean(number, noise[[index]]) for index, number in enumerate(numbers.tolist())]
         return noise, torch.cat(clean).to(noise)
 
-    @property
-    def kept_at_most(self) -> int:
-        """Number of pairs that the bound of memory holds."""
-        return self._bytes_at_most // (4 * math.prod(self._shape))
-
     def flops(self) -> int:
         """Return the floating-point operations of making one pair."""
         return steps_of(self._solving) * flops_of(self._network, (1, *self._shape), (1,))
@@ -226,8 +222,7 @@ class FlowPairs:
             with without_autocast(noise.device):
                 end = solve(self._network.to(noise.device), noise, self._solving).images
             end = as_kept(end, self._sensor).cpu()
-            if end.nbytes <= self._free:
-                self._free -= end.nbytes
+            if len(self._kept) < self.kept_at_most:
                 self._kept[number] = end
         return end
 

@@ -10,9 +10,8 @@ from torch import Tensor, nn
 from lidargrit import configuration
 from lidargrit.errors import ConfigError
 from lidargrit.files import load_exactly, write_json, write_tensors, write_text
+from lidargrit.run_folder import CARD_FILE, CONFIG_FILE, WEIGHTS_FILE
 from lidargrit.sensors import SensorModel
-
-CONFIG_FILE, WEIGHTS_FILE, CARD_FILE = "config.json", "model.safetensors", "README.md"  # the names that the hub knows
 
 ConfigT = TypeVar("ConfigT")
 ModelT = TypeVar("ModelT", bound=nn.Module)

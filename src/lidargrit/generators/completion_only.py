@@ -13,6 +13,7 @@ from lidargrit.nn.completion_network import CompletionNetwork, CompletionNetwork
 from lidargrit.nn.completion_objective import CompletionObjective
 from lidargrit.nn.flops import FlopCounter
 from lidargrit.nn.objective import Objective
+from lidargrit.nn.seeds import rngs_of
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
@@ -69,7 +70,7 @@ class CompletionOnly(Generator[CompletionOnlyConfig, NoSampling]):
         return self._complete(Condition.nothing(self.sensor, len(seeds)).to(self.device), seeds, sampling)
 
     def _complete(self, condition: Condition, seeds: BatchSeeds, sampling: NoSampling) -> RangeImage:
-        rngs = [torch.Generator().manual_seed(seed) for seed in seeds]  # on the CPU: the same numbers on every device
+        rngs = rngs_of(seeds)
         return self.completion.sample(condition, rngs)
 
     def cost(self, sampling: NoSampling | None = None) -> Cost:

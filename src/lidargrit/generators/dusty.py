@@ -29,6 +29,7 @@ from lidargrit.nn.latent_search import search_latents
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.published import read_checkpoint
 from lidargrit.nn.raydrop import logistic_noise, straight_through
+from lidargrit.nn.seeds import normal_latents, rngs_of
 from lidargrit.projection import RangeEncoding
 from lidargrit.sensors import SensorModel, load_sensor
 from lidargrit.structures import MaskDecoding, RangeImage
@@ -172,7 +173,7 @@ class Dusty(Generator[DustyConfig, DustySampling]):
         self.synthesis.load_state_dict(objective.synthesis.state_dict())
 
     def _sample(self, seeds: Sequence[int], sampling: DustySampling) -> RangeImage:
-        return self._generate(self._normal(seeds, 1)[:, 0], seeds, sampling)
+        return self._generate(self._latents(seeds), seeds, sampling)
 
     def cost(self, sampling: DustySampling | None = None) -> Cost:
         """Return one pass of the network."""
@@ -206,14 +207,11 @@ class Dusty(Generator[DustyConfig, DustySampling]):
         """Return what is added to logits, whose signs then are sampled returns; each seed has its own numbers."""
         if sampling.mask == "threshold":
             return self._latent_like(torch.zeros(()))
-        rngs = [torch.Generator().manual_seed(derive_seed(seed, sampling.raydrop_seed)) for seed in seeds]
+        rngs = rngs_of([derive_seed(seed, sampling.raydrop_seed) for seed in seeds])
         return self._latent_like(torch.stack([logistic_noise(_size(self.sensor), rng) for rng in rngs]))
 
-    def _normal(self, seeds: Sequence[int], count: int) -> Float[Tensor, "B count D"]:
-        """Sample latents for each seed, on the CPU: the same numbers on every device."""
-        rngs = [torch.Generator().manual_seed(seed) for seed in seeds]
-        size = (count, self.config.latent_dim)
-        return self._latent_like(torch.stack([torch.randn(size, generator=rng) for rng in rngs]))
+    def _latents(self, seeds: Sequence[int], *count: int) -> Float[Tensor, "B *count D"]:
+        return self._latent_like(normal_latents(seeds, *count, self.config.latent_dim))
 
     def _latent_like(self, tensor: Tensor) -> Tensor:
         return tensor.to(self.synthesis.project.weight)
@@ -228,7 +226,7 @@ class Dusty(Generator[DustyConfig, DustySampling]):
             distance = (self.synthesis(latents)[0][:, 0] - target).abs() / 2
             return (distance * observed).sum((1, 2)) / observed.sum((1, 2)).clamp(min=1)
 
-        return search_latents(error_of, self._normal(seeds, sampling.search_steps + 1), sampling.search_rate)
+        return search_latents(error_of, self._latents(seeds, sampling.search_steps + 1), sampling.search_rate)
 
 
 class InverseRange:

@@ -29,6 +29,7 @@ from lidargrit.nn.lidargan import (
 )
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.published import read_checkpoint
+from lidargrit.nn.seeds import normal_latents
 from lidargrit.nn.size import numbers_of_file
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
@@ -119,9 +120,8 @@ class LidarGan(Generator[LidarGanConfig, NoSampling]):
         self.decoder.load_state_dict(objective.decoder.state_dict())
 
     def _sample(self, seeds: Sequence[int], sampling: NoSampling) -> RangeImage:
-        rngs = [torch.Generator().manual_seed(seed) for seed in seeds]  # on the CPU: the same numbers on every device
-        latents = torch.stack([torch.randn(self.config.latent_dim, generator=rng) for rng in rngs])
-        return self.image.decode(self.decoder(latents.to(self.device)))
+        latents = normal_latents(seeds, self.config.latent_dim).to(self.device)
+        return self.image.decode(self.decoder(latents))
 
     def cost(self, sampling: NoSampling | None = None) -> Cost:
         """Return one pass of the network."""

@@ -35,6 +35,7 @@ from lidargrit.nn.precision import Precision
 from lidargrit.nn.published import read_checkpoint
 from lidargrit.nn.raydrop_network import RaydropConfig, RaydropNetwork
 from lidargrit.nn.raydrop_objective import RaydropObjective
+from lidargrit.nn.seeds import rngs_of
 from lidargrit.nn.transformer import CausalTransformer
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage, TokenGrid
@@ -172,7 +173,7 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         return 8 if self.device.type == "cpu" else 32
 
     def _sample(self, seeds: BatchSeeds, sampling: TokenSampling) -> RangeImage:
-        rngs = [torch.Generator().manual_seed(seed) for seed in seeds]  # on the CPU: the same numbers on every device
+        rngs = rngs_of(seeds)
         uniform = torch.stack([torch.rand(self.transformer.context_length, generator=rng) for rng in rngs])
         decoder, tokenizer = self._prepare(len(seeds), sampling)
         tokens = decoder.generate(uniform.to(self.device))
@@ -189,7 +190,7 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         Tokens come row by row, and pixels in phases. Each is conditioned on the observed ones before it, not on later
         ones.
         """
-        rngs = [torch.Generator().manual_seed(seed) for seed in seeds]
+        rngs = rngs_of(seeds)
         network = self._completing_network(condition, sampling)
         if network is not None:
             return network.sample(condition, rngs[: seeds.num_asked_for])

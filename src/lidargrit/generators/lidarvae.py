@@ -30,6 +30,7 @@ from lidargrit.nn.lidargan import (
 )
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.published import read_checkpoint
+from lidargrit.nn.seeds import normal_latents
 from lidargrit.nn.size import numbers_of_file
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
@@ -157,7 +158,7 @@ class LidarVae(Generator[LidarVaeConfig, VaeSampling]):
         self.decode.load_state_dict(objective.decode.state_dict())
 
     def _sample(self, seeds: Sequence[int], sampling: VaeSampling) -> RangeImage:
-        return self.image.decode(self.decode(self._normal(seeds, 1)[:, 0]))
+        return self.image.decode(self.decode(self._latents(seeds)))
 
     def cost(self, sampling: VaeSampling | None = None) -> Cost:
         """Return one pass of the decoder."""
@@ -169,7 +170,7 @@ class LidarVae(Generator[LidarVaeConfig, VaeSampling]):
 
     def _complete(self, condition: Condition, seeds: Sequence[int], sampling: VaeSampling) -> RangeImage:
         mean, log_variance = self.encode(self.image.encode(condition.images)).chunk(2, dim=1)
-        latents = mean + sampling.spread * (log_variance / 2).exp() * self._normal(seeds, 1)[:, 0]
+        latents = mean + sampling.spread * (log_variance / 2).exp() * self._latents(seeds)
         return self.image.decode(self.decode(latents))
 
     def _invert(self, images: RangeImage, seeds: Sequence[int], sampling: VaeSampling) -> RangeImage:
@@ -179,16 +180,13 @@ class LidarVae(Generator[LidarVaeConfig, VaeSampling]):
         def error_of(latents: Tensor) -> Tensor:
             return (self.decode(latents) - target).abs().mean(dim=(1, 2, 3))
 
-        noise = self._normal(seeds, sampling.search_steps + 1)
+        noise = self._latents(seeds, sampling.search_steps + 1)
         noise[:, 0] = self.encode(target).chunk(2, dim=1)[0]
         # Means of dimensions that tell nothing lie near 0, far within the sphere of random latents.
         return self.image.decode(self.decode(search_latents(error_of, noise, sampling.search_rate, on_sphere=False)))
 
-    def _normal(self, seeds: Sequence[int], count: int) -> Float[Tensor, "B count D"]:
-        """Sample standard normal latents for each seed, on the CPU: the same numbers on every device."""
-        rngs = [torch.Generator().manual_seed(seed) for seed in seeds]
-        size = (count, self.config.latent_dim)
-        return torch.stack([torch.randn(size, generator=rng) for rng in rngs]).to(self.device)
+    def _latents(self, seeds: Sequence[int], *count: int) -> Float[Tensor, "B *count D"]:
+        return normal_latents(seeds, *count, self.config.latent_dim).to(self.device)
 
     @classmethod
     def from_published(cls, files: Sequence[Path], config: LidarVaeConfig, sensor: SensorModel) -> LidarVae:

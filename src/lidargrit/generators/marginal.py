@@ -12,6 +12,7 @@ from torch import Tensor
 from lidargrit.errors import CheckpointError, ConfigError
 from lidargrit.generators import Cost, Generator, NoSampling, SystemFacts
 from lidargrit.loading import RangeImages
+from lidargrit.nn.seeds import rngs_of
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
@@ -78,8 +79,7 @@ class Marginal(Generator[MarginalConfig, NoSampling]):
         edges = self._edges_m().to(self.counts.device)
         total = self.counts.cumsum(dim=0)
         images = []
-        for seed in seeds:
-            rng = torch.Generator().manual_seed(seed)  # on the CPU: the same numbers on every device
+        for rng in rngs_of(seeds):
             uniform = torch.rand(3, self.sensor.height, self.sensor.width, generator=rng).to(self.counts.device)
             returned = uniform[0] < total[-1] / self.scans
             # The first bin at which the counts so far exceed the sampled share of all.

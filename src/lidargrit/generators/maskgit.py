@@ -24,6 +24,7 @@ from lidargrit.generators._tokens import (
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.pixel_decoder import PixelSampling
 from lidargrit.nn.precision import Precision, autocast_to
+from lidargrit.nn.seeds import rngs_of
 from lidargrit.nn.transformer import MaskedTransformer
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
@@ -117,7 +118,7 @@ class MaskGit(TokenGenerator[MaskGitConfig, MaskedSampling]):
         return MaskedSampling(steps=4)
 
     def _sample(self, seeds: BatchSeeds, sampling: MaskedSampling) -> RangeImage:
-        rngs = [torch.Generator().manual_seed(seed) for seed in seeds]  # on the CPU: the same numbers on every device
+        rngs = rngs_of(seeds)
         tokens = generate_tokens(self.transformer, rngs, sampling)
         tokenizer = self.tokenizer.for_decoding(sampling.decoder)
         return self.decode(tokens, seeds.num_asked_for, rngs, sampling.mask, sampling.pixels(), tokenizer)

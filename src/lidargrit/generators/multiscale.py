@@ -15,6 +15,7 @@ from lidargrit.nn.objective import Objective
 from lidargrit.nn.pixel_decoder import PixelDecoder, PixelSampling
 from lidargrit.nn.pixel_networks import PixelDecoderConfig
 from lidargrit.nn.range_steps import RangeSteps
+from lidargrit.nn.seeds import rngs_of
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage, ScanBits
 
@@ -67,11 +68,11 @@ class Multiscale(Generator[MultiscaleConfig, PixelSampling]):
         self.pixels.load_state_dict(objective.get_submodule(stage).state_dict())
 
     def _sample(self, seeds: BatchSeeds, sampling: PixelSampling) -> RangeImage:
-        rngs = [torch.Generator().manual_seed(seed) for seed in seeds]  # on the CPU: the same numbers on every device
+        rngs = rngs_of(seeds)
         return self.pixels.sample(None, rngs, sampling)
 
     def _complete(self, condition: Condition, seeds: BatchSeeds, sampling: PixelSampling) -> RangeImage:
-        rngs = [torch.Generator().manual_seed(seed) for seed in seeds]
+        rngs = rngs_of(seeds)
         return self.pixels.sample(None, rngs, sampling, condition)
 
     def _bits(self, images: RangeImage, steps: RangeSteps, expected: bool) -> ScanBits:

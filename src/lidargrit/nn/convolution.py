@@ -17,6 +17,12 @@ from lidargrit.nn.blocks import Block
 Padding = Literal["zero", "wrap"]
 
 
+def wrapped(x: Float[Tensor, "B C H W"], left: int = 1, right: int = 1) -> Float[Tensor, "B C H w"]:
+    """Return a map with its last columns also before the first, and its first ones behind the last."""
+    # Not by F.pad: its circular mode takes several times as long, most of all backwards.
+    return torch.cat((x[..., x.shape[-1] - left :], x, x[..., :right]), dim=-1)
+
+
 class Convolution(nn.Conv2d):
     """A convolution that keeps the size; rows are padded with zeros, columns with zeros or around the circle.
 
@@ -38,9 +44,7 @@ class Convolution(nn.Conv2d):
         """Convolve."""
         if not self.wraps:
             return super().forward(input)
-        # Not by F.pad: its circular mode takes several times as long, most of all backwards.
-        first = input.shape[-1] - self.left
-        return super().forward(torch.cat((input[..., first:], input, input[..., : self.right]), dim=-1))
+        return super().forward(wrapped(input, self.left, self.right))
 
 
 class Downsample(nn.Module):
@@ -61,7 +65,7 @@ class Downsample(nn.Module):
     def forward(self, x: Float[Tensor, "B C H W"]) -> Float[Tensor, "B C h w"]:
         """Halve the columns, and the rows if so made."""
         if self.wraps:
-            return self.conv(F.pad(F.pad(x, (0, 1, 0, 0), mode="circular"), (0, 0, self.above, 1)))
+            return self.conv(F.pad(wrapped(x, left=0), (0, 0, self.above, 1)))
         return self.conv(F.pad(x, (0, 1, self.above, 1)))
 
 
@@ -97,8 +101,7 @@ class FoldedUpsample(nn.Module):
         """Double the rows and the columns."""
         if not self.wraps:
             return F.conv_transpose2d(x, self.weight, self.bias, stride=2, padding=1)
-        x = F.pad(x, (1, 1, 0, 0), mode="circular")
-        return F.conv_transpose2d(x, self.weight, self.bias, stride=2, padding=(1, 3))
+        return F.conv_transpose2d(wrapped(x), self.weight, self.bias, stride=2, padding=(1, 3))
 
 
 def group_norm(channels: int) -> nn.GroupNorm:

@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from lidargrit.nn.convolution import wrapped
 from lidargrit.nn.precision import without_autocast
 
 LEVELS = 4  # times that rows and columns double, or halve
@@ -160,7 +161,7 @@ def _rectify(features: Tensor) -> Tensor:
 
 def _pad(features: Tensor) -> Tensor:
     """Add a pixel on all sides: columns go around the circle, rows are mirrored."""
-    wide = torch.cat((features[..., -1:], features, features[..., :1]), dim=3)
+    wide = wrapped(features)
     return torch.cat((wide[..., 1:2, :], wide, wide[..., -2:-1, :]), dim=2)
 
 

@@ -18,6 +18,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from lidargrit.nn.seeds import rngs_of
+
 Sampler = Literal["ddpm", "ddim"]
 Denoiser = Callable[[Tensor, Tensor], Tensor]
 """(noisy images (B, C, H, W), their log SNR (B,)) → the noise in them."""
@@ -57,7 +59,7 @@ class SeededNoise:
     """Standard normal images, each sampled on the CPU by its own seed: the same on every device and in every batch."""
 
     def __init__(self, seeds: Sequence[int], shape: tuple[int, int, int], device: torch.device) -> None:
-        self.rngs = [torch.Generator().manual_seed(seed) for seed in seeds]
+        self.rngs = rngs_of(seeds)
         self._shape, self._device = shape, device
 
     def __call__(self) -> Float[Tensor, "B C H W"]:

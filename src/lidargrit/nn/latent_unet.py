@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from lidargrit.errors import ConfigError
 from lidargrit.nn.blocks import Block, Network, zeroed
-from lidargrit.nn.convolution import Convolution
+from lidargrit.nn.convolution import Convolution, wrapped
 
 _GROUPS = 32  # of every norm, as in the reference; so channels are multiples of it
 _LONGEST_PERIOD = 10_000  # of the waves that tell the time step, as in the reference
@@ -194,7 +194,7 @@ class _Halve(nn.Module):
         self.op = nn.Conv2d(channels, channels, 3, stride=2, padding=(1, 0))
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.op(torch.cat((x[..., -1:], x, x[..., :1]), dim=-1))
+        return self.op(wrapped(x))
 
 
 class _Double(nn.Module):

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from lidargrit.nn.blocks import Block, Network
+from lidargrit.nn.convolution import wrapped
 
 _EPSILON = 1e-5  # of every norm, as in the reference
 SIDE_AT_LEAST = 8  # pixels: at half the size, the widest convolutions reach 4 pixels beyond each border
@@ -37,8 +38,8 @@ class TorusConvolution(nn.Conv2d):
 
     def forward(self, input: Float[Tensor, "B C H W"]) -> Float[Tensor, "B D H W"]:
         """Convolve."""
-        margin = self.margin  # not by F.pad: its circular mode takes several times as long, most of all backwards
-        wide = torch.cat((input[..., -margin:], input, input[..., :margin]), dim=-1)
+        margin = self.margin
+        wide = wrapped(input, margin, margin)
         return super().forward(torch.cat((wide[..., -margin:, :], wide, wide[..., :margin, :]), dim=-2))
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,21 +12,13 @@ import torch
 from lidargrit import __version__, configuration
 from lidargrit.errors import CheckpointError, ConfigError, OutputError
 from lidargrit.evaluation.scorecard import Scorecard
-from lidargrit.files import claim_folder, is_taken, read_json, write_json
-from lidargrit.generators import (
-    CARD_FILE,
-    RUN_FILE,
-    TRAINED_ON_FILE,
-    WEIGHTS_FILE,
-    Generator,
-    load,
-    load_class,
-    locate,
-)
+from lidargrit.files import claim_folder, is_taken, read_json, sha256_of, write_json
+from lidargrit.generators import Generator, load, load_class
 from lidargrit.publishing.card import model_card
 from lidargrit.recipes import load_recipe
+from lidargrit.run_folder import CARD_FILE, RUN_FILE, TRAINED_ON_FILE, locate, trained_on, weights_sha256
 from lidargrit.sources import data_set_of
-from lidargrit.sources.samples import is_sample_folder, trained_on, weights_of
+from lidargrit.sources.samples import is_sample_folder, weights_of
 
 
 def import_weights(recipe: str, folder: Path, files: Sequence[Path], settings: Sequence[str] = ()) -> Generator:
@@ -56,7 +47,7 @@ def import_weights(recipe: str, folder: Path, files: Sequence[Path], settings: S
     generator = cls.from_published(files, made_of.model, made_of.data.load_sensor())
     about: dict[str, Any] = {
         "origin": "imported",
-        "files": [{"name": path.name, "sha256": _sha256(path)} for path in files],
+        "files": [{"name": path.name, "sha256": sha256_of(path)} for path in files],
         "recipe": configuration.to_json(made_of),
         "lidargrit": __version__,
     }
@@ -160,12 +151,7 @@ def _check_scores(scores: Scorecard, run: Path) -> None:
         if not is_sample_folder(Path(samples)):
             return
         theirs = weights_of(Path(samples))
-    if theirs != _sha256(run / WEIGHTS_FILE):
+    if theirs != weights_sha256(run):
         raise ConfigError(
             f"scores of {samples}, which were not sampled from {run}", "scores of this run's samples", "evaluate those"
         )
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -13,8 +13,9 @@ from lidargrit.datasets import load as load_dataset
 from lidargrit.errors import one_line
 from lidargrit.evaluation.scorecard import NOT_APPLICABLE, Scorecard, format_value
 from lidargrit.evaluation.verdict import verdict
-from lidargrit.generators import Generator, recipe_settings
+from lidargrit.generators import Generator
 from lidargrit.loading import Provenance
+from lidargrit.run_folder import recipe_settings
 from lidargrit.sources import data_set_of
 
 _PIPELINE = "unconditional-image-generation"  # of the hub's tasks the nearest; it has none for scans

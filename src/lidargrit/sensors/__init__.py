@@ -14,6 +14,7 @@ from lidargrit import _discovery
 from lidargrit.errors import ConfigError
 from lidargrit.files import read_json
 from lidargrit.sensors._checks import FINE_COLUMNS_AT_MOST, check_projection, check_tables, checked_entries
+from lidargrit.sensors._columns import column_azimuths_rad
 from lidargrit.untrusted import user_path
 
 ProjectionName = Literal["spherical", "unfolding"]
@@ -134,12 +135,6 @@ class SensorModel:
         return torch.allclose(self.elevation_rad, other.elevation_rad, rtol=0, atol=tolerance) and torch.allclose(
             self.azimuth_rad, other.azimuth_rad, rtol=0, atol=tolerance
         )
-
-
-def column_azimuths_rad(columns: int, stride: int = 1) -> Float[Tensor, "1 W"]:
-    """Return the azimuths of the centres of every ``stride``-th of ``columns`` equal columns, from +pi down to -pi."""
-    index = torch.arange(0, columns, stride, dtype=torch.float64)
-    return (math.pi - 2 * math.pi * (index + 0.5) / columns).float()[None]
 
 
 def load_sensor(name: str) -> SensorModel:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from lidargrit.errors import ConfigError, nearest_names
+from lidargrit.sensors._columns import column_azimuths_rad
 
 _WORDS = ("name", "source", "projection")
 _NUMBERS: dict[str, Any] = {"range_min_m": (int, float), "range_max_m": (int, float), "column_stride": int}
@@ -74,13 +75,13 @@ def check_tables(name: str, elevation: Tensor, azimuth: Tensor, offset: Tensor |
 
 def _check_columns(name: str, azimuth_rad: Tensor, stride: int) -> None:
     """Refuse azimuths of columns other than those into which points are projected: equal ones, from +pi down."""
-    step_rad = 2 * math.pi / (len(azimuth_rad) * stride)
-    centres_rad = math.pi - step_rad * (torch.arange(len(azimuth_rad), dtype=torch.float64) * stride + 0.5)
+    columns = len(azimuth_rad) * stride
+    centres_rad = column_azimuths_rad(columns, stride)[0].double()
     apart_rad = (azimuth_rad.double() - centres_rad + math.pi).remainder(2 * math.pi) - math.pi
-    if float(apart_rad.abs().max()) > _APART_AT_MOST * step_rad:
+    if float(apart_rad.abs().max()) > _APART_AT_MOST * 2 * math.pi / columns:
         raise ConfigError(
             f"azimuths of the sensor {name!r} that are not those of equal columns from +pi down",
-            f"the centres of {len(azimuth_rad) * stride} columns around the circle, clockwise from behind",
+            f"the centres of {columns} columns around the circle, clockwise from behind",
             "give azimuth_rad so, as lidargrit fit-sensor does",
         )
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 from waitress.server import create_server
 
 from lidargrit.errors import ConfigError, OutputError
-from lidargrit.generators import PACKAGED, is_run
+from lidargrit.run_folder import PACKAGED, is_run
 from lidargrit.serving.application import LOOPBACK_NAMES, Application
 from lidargrit.serving.jobs import JobQueue
 from lidargrit.serving.limits import Limits

@@ -29,12 +29,12 @@ from lidargrit.conditions import Condition
 from lidargrit.conditions.patterns import Pattern
 from lidargrit.errors import ConfigError, LidarGritError, OutputError
 from lidargrit.files import atomic_path, write_text
-from lidargrit.generators import Generator, load, locate
+from lidargrit.generators import Generator, load
 from lidargrit.nn.devices import usable_device
 from lidargrit.projection import ProjectionVariant
+from lidargrit.run_folder import locate, projection_variant
 from lidargrit.sensors import load_sensor
 from lidargrit.serving.requests import TASKS, UPSAMPLED, SampleRequest, sampling_settings
-from lidargrit.sources.samples import projection_of
 from lidargrit.structures import RangeImage
 from lidargrit.viewer.interactive import page_data
 from lidargrit.viewer.scan_sets import ScanSet
@@ -50,14 +50,15 @@ def run_worker(runs: Sequence[Path], device: str) -> None:
     write_line = partial(print, file=sys.stdout, flush=True)
     sys.stdout = sys.stderr  # whatever a library prints is no answer
     try:
-        generators = [load(run).to(usable_device(device)) for run in runs]
-        variants: list[ProjectionVariant] = [_variant_of(run) for run in runs]
+        chosen = usable_device(device)
+        generators = [load(run).to(chosen) for run in runs]
+        variants: list[ProjectionVariant] = [projection_variant(locate(run)) for run in runs]
     except LidarGritError as error:
         _send(write_line, {"refused": [type(error).__name__, error.got, error.wanted, error.cure]})
         return
-    except (RuntimeError, AssertionError) as error:  # torch's ways to say: no such device, or not in this build
-        got = f"--device {device} ({_first_line(error)})"
-        _send(write_line, {"refused": ["ConfigError", got, "cpu or cuda", "leave it out"]})
+    except RuntimeError as error:  # torch's way to say that memory is full
+        got = f"models that the device has no room for ({_first_line(error)})"
+        _send(write_line, {"refused": ["ConfigError", got, "fewer or smaller ones", "name fewer, or add --device cpu"]})
         return
     models = [describe_model(run.resolve().name, model) for run, model in zip(runs, generators, strict=True)]
     _send(write_line, {"models": models})
@@ -80,10 +81,6 @@ def describe_model(name: str, generator: Generator) -> dict[str, Any]:
         "settings": _settings_of(generator),
         "rays": sensor.to_json(),
     }
-
-
-def _variant_of(run: Path) -> ProjectionVariant:
-    return "reference" if projection_of(locate(run)) == "reference" else "exact"
 
 
 def _settings_of(generator: Generator) -> list[dict[str, Any]]:
@@ -117,7 +114,6 @@ def compute_result(generator: Generator, request: SampleRequest, variant: Projec
     seen = _read_upload(request, _reader(request, generator, variant))
     image = RangeImage.stack([seen.image])
     sets = [ScanSet("as uploaded", image, (request.name,))]
-    image = image.to(generator.device)
     if "complete" not in generator.capabilities:
         return [*sets, ScanSet("reconstructed", generator.reconstruct(image).to("cpu"), (request.name,))]
     if request.task == "region" and not request.region:
@@ -127,10 +123,10 @@ def compute_result(generator: Generator, request: SampleRequest, variant: Projec
     if request.task == "raydrop":
         dropped = generator.complete(Condition.of_surfaces(images), seeds, sampling)
         return [*sets, ScanSet("with raydrop", dropped.to("cpu"), names)]
-    observed = _observed(request, seen).to(generator.device)
+    observed = _observed(request, seen)
     condition = Condition.of_pixels(images, observed.expand_as(images.return_mask))
     if bool((images[0].return_mask & ~observed).any()):
-        sets.append(ScanSet("what the model saw", condition[0:1].images.to("cpu"), (request.name,)))
+        sets.append(ScanSet("what the model saw", condition[0:1].images, (request.name,)))
     return [*sets, ScanSet("completed", generator.complete(condition, seeds, sampling).to("cpu"), names)]
 
 

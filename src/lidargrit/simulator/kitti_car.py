@@ -5,6 +5,10 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 
+from lidargrit.sensors import SensorModel
+
+_SENSORS = ("hdl64e_kitti_360", "hdl64e_kitti_odometry")
+
 # Measured in 67 scans of KITTI, which docs/results/simulator-against-kitti.md names: azimuths, in whole degrees, at
 # which fewer than half of them return anything. One line a laser, by its elevation in degrees. No two lasers see the
 # same rim: they look past the roof's edge from different places.
@@ -55,6 +59,11 @@ LASER_READINGS = (
 )
 """Factor of the reflectance that each laser reports."""
 # fmt: on
+
+
+def is_on_car(sensor: SensorModel) -> bool:
+    """Return whether a sensor is KITTI's own on its car: one of the two of this package, by name."""
+    return sensor.name in _SENSORS
 
 
 def hidden_by_car(

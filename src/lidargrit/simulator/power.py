@@ -9,9 +9,11 @@ from jaxtyping import Float32, Int32, UInt8
 from scipy.special import ndtr
 
 from lidargrit.sensors import SensorModel
-from lidargrit.simulator.kitti_car import LASER_GAINS, LASER_READINGS
+from lidargrit.simulator.kitti_car import LASER_GAINS, LASER_READINGS, is_on_car
 from lidargrit.simulator.materials import ASPHALT, CONCRETE, MATERIALS, Material
 from lidargrit.simulator.mesh import Mesh
+
+_EVEN_RAD = 1e-4  # by which equal steps may differ, because of rounding; those of lasers differ by far more
 
 
 @dataclass(frozen=True)
@@ -178,14 +180,17 @@ class Lasers:
 
     @classmethod
     def of(cls, sensor: SensorModel, model: RaydropModel) -> Lasers:
-        """Look up the lasers of KITTI's own sensor, or sample those of another.
-
-        Rows of equal elevations, as in KITTI-360's images, are no lasers: several meet in one.
-        """
-        if sensor.name == "hdl64e_kitti_odometry" and sensor.height == len(model.laser_gains):
+        """Look up the lasers of KITTI's own sensor, or sample those of another."""
+        if is_on_car(sensor) and _rows_are_lasers(sensor, len(model.laser_gains)):
             return cls(*(np.array(t, np.float32)[:, None] for t in (model.laser_gains, model.laser_readings)))
         gains = np.random.default_rng(64).normal(0, model.laser_spread, (sensor.height, 1)).astype(np.float32)
         return cls(gains, np.ones_like(gains))
+
+
+def _rows_are_lasers(sensor: SensorModel, count: int) -> bool:
+    """Return whether each row is a laser: of rows in equal steps, as in KITTI-360's images, several meet in one."""
+    steps_rad = sensor.elevation_rad.diff(dim=0)
+    return sensor.height == count and float(steps_rad.max() - steps_rad.min()) > _EVEN_RAD
 
 
 @dataclass(frozen=True, eq=False)

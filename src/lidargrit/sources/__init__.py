@@ -9,7 +9,7 @@ from pathlib import Path
 from lidargrit.datasets import ScanDataset, data_set_and_split, open_dataset
 from lidargrit.errors import DataError, LidarGritError
 from lidargrit.formats import BadPoints
-from lidargrit.generators import Generator, is_run, load, locate
+from lidargrit.generators import Generator, load
 from lidargrit.loading import (
     DataConfig,
     Imaging,
@@ -22,10 +22,11 @@ from lidargrit.loading import (
     prepare,
 )
 from lidargrit.reporting import Reporter
+from lidargrit.run_folder import is_run, locate, recorded_projection, trained_on
 from lidargrit.sensors import SensorModel, load_sensor
 from lidargrit.sources.image_files import ImageFileSource, image_files
 from lidargrit.sources.sample_formats import is_tensor_folder, load_sample_format, read_tensor_folder, recognise
-from lidargrit.sources.samples import is_sample_folder, projection_of, read_samples, trained_on, weights_of
+from lidargrit.sources.samples import is_sample_folder, projection_of, read_samples, weights_of
 from lidargrit.sources.source import Source
 
 
@@ -201,7 +202,7 @@ class RunSource(Source):
 
     def projection_variant(self, config: DataConfig) -> str:
         """Return the variant by which the training scans became images."""
-        return projection_of(self.folder)
+        return recorded_projection(self.folder)
 
     def images(
         self, sensor: SensorModel | None = None, config: DataConfig | None = None, reporter: Reporter | None = None

@@ -9,6 +9,7 @@ import os
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import asdict
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -28,9 +29,10 @@ from lidargrit.files import (
     write_text,
 )
 from lidargrit.formats import open_file
-from lidargrit.generators import RUN_FILE, TRAINED_ON_FILE, WEIGHTS_FILE, Generator, SamplingT, recipe_settings
+from lidargrit.generators import Generator, SamplingT
 from lidargrit.loading import Pixels, Provenance, RangeImages
 from lidargrit.reporting import Reporter
+from lidargrit.run_folder import TRAINED_ON_FILE, recorded_projection, weights_sha256
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
@@ -63,48 +65,64 @@ def write_samples(
     """
     sampling = generator.Sampling() if sampling is None else sampling
     manifest: dict[str, Any] = {
-        "weights_sha256": hashlib.sha256((run_folder / WEIGHTS_FILE).read_bytes()).hexdigest(),
+        "weights_sha256": weights_sha256(run_folder),
         "generator": generator.public_name(),
         "sampling": configuration.to_json(sampling),
         "cost_per_scan": asdict(generator.cost(sampling)),
         "sensor": generator.sensor.to_json(),
     }
-    if variant := projection_of(run_folder):
+    if variant := recorded_projection(run_folder):
         manifest["projection_variant"] = variant
     if generator.full_rows is not None:
         manifest["full_rows"] = [generator.full_rows.start, generator.full_rows.stop]
-    _claim(folder, manifest, configuration.to_json(generator.Sampling()))
-    if (run_folder / TRAINED_ON_FILE).is_file() and not (folder / TRAINED_ON_FILE).exists():
-        write_text(folder / TRAINED_ON_FILE, json.dumps(read_json(run_folder / TRAINED_ON_FILE)) + "\n")
+    defaults = configuration.to_json(generator.Sampling())
+    begun = _is_begun(folder, manifest, defaults)
     missing = _missing(folder, seeds)
+    images = generator.stream(missing, sampling)
     with (
         claim_folder(folder, shared=True) if missing else nullcontext(),
         (reporter or Reporter()).progress("sampling", len(seeds), len(seeds) - len(missing)) as progress,
     ):
-        for seed, image in zip(missing, generator.stream(missing, sampling), strict=True):
+        first = list(islice(images, 1))  # what the model refuses is told before anything is written
+        if missing and not begun:
+            _begin(folder, manifest, defaults)
+        _copy_trained_on(run_folder, folder)
+        for seed, image in zip(missing, chain(first, images), strict=True):
             if not is_sample_folder(folder):  # or the write would make the folder anew, without the earlier samples
                 raise removed_meanwhile(folder)
             _write_image(_file(folder, seed), image)
             progress.advance(1)
-    if not is_sample_folder(folder) or _missing(folder, seeds):
+    if seeds and (not is_sample_folder(folder) or _missing(folder, seeds)):
         raise removed_meanwhile(folder)
     remove_partials(folder)
 
 
-def _claim(folder: Path, manifest: dict[str, Any], defaults: dict[str, Any]) -> None:
-    """Write the manifest into a free folder, or find that the samples there are of the same kind."""
+def _is_begun(folder: Path, manifest: dict[str, Any], defaults: dict[str, Any]) -> bool:
+    """Return whether a folder holds samples of the same kind; False for a free one, others are refused."""
     if (folder / MANIFEST).exists():
-        there = read_json(folder / MANIFEST)
-        if not _same(there, manifest, defaults):
+        if not _same(read_json(folder / MANIFEST), manifest, defaults):
             raise OutputError(
                 f"{folder}, which holds samples of another model or sampled in another way",
                 "an empty folder, or one that this very command began",
                 "choose another folder",
             )
-    elif is_taken(folder) and not (folder / MANIFEST).exists():  # another process may just have begun it
+        return True
+    if is_taken(folder) and not (folder / MANIFEST).exists():  # another process may just have begun it
         raise OutputError(f"{folder}, which is not empty and holds no samples", "an empty folder", "choose another one")
-    else:
+    return False
+
+
+def _begin(folder: Path, manifest: dict[str, Any], defaults: dict[str, Any]) -> None:
+    """Write the manifest into a free folder, unless another process has written it meanwhile."""
+    if not _is_begun(folder, manifest, defaults):
         write_json(folder / MANIFEST, manifest)
+
+
+def _copy_trained_on(run_folder: Path, folder: Path) -> None:
+    """Copy what the model learned from into a folder of samples."""
+    source, target = run_folder / TRAINED_ON_FILE, folder / TRAINED_ON_FILE
+    if is_sample_folder(folder) and source.is_file() and not target.exists():
+        write_text(target, json.dumps(read_json(source)) + "\n")
 
 
 def read_samples(folder: Path, count: int | None = None) -> RangeImages:
@@ -135,17 +153,12 @@ def read_samples(folder: Path, count: int | None = None) -> RangeImages:
 
 
 def projection_of(folder: Path) -> str:
-    """Return by which variant of the projection the training scans of a run became images, or those of samples.
+    """Return by which variant of the projection the training scans of the samples' model became images.
 
     "" where that is not known.
     """
-    is_samples = is_sample_folder(folder)
-    path = folder / (MANIFEST if is_samples else RUN_FILE)
-    about: Any = read_json(path) if path.is_file() else {}
-    if is_samples:
-        variant = about.get("projection_variant") if isinstance(about, dict) else None
-    else:
-        variant = recipe_settings(about).get("data.projection_variant")
+    manifest = read_json(folder / MANIFEST)
+    variant = manifest.get("projection_variant") if isinstance(manifest, dict) else None
     return variant if isinstance(variant, str) else ""
 
 
@@ -162,21 +175,6 @@ def full_rows_of(folder: Path) -> range | None:
     return range(*rows)
 
 
-def trained_on(folder: Path) -> Provenance:
-    """Return what the model of a run, or of a folder of samples, learned from; empty where that is not known."""
-    if not (folder / TRAINED_ON_FILE).is_file():
-        return Provenance()
-    try:
-        facts = {name: tuple(of) for name, of in read_json(folder / TRAINED_ON_FILE).items()}
-        if not all(isinstance(each, str) for of in facts.values() for each in of):
-            raise TypeError("something is no text")
-        return Provenance(**facts)
-    except (TypeError, AttributeError) as error:
-        raise CheckpointError(
-            f"{folder / TRAINED_ON_FILE}, in which {error}", "what lidargrit wrote", "restore it, or remove it"
-        ) from None
-
-
 def weights_of(folder: Path) -> str:
     """Return the hash of the weights that generated the samples of a folder; "" where the folder does not tell."""
     manifest = read_json(folder / MANIFEST)
@@ -191,7 +189,7 @@ def is_sample_folder(folder: Path) -> bool:
 
 def _missing(folder: Path, seeds: Sequence[int]) -> list[int]:
     """Return the seeds whose samples are not in a folder."""
-    there = {entry.name for entry in os.scandir(folder)}
+    there = {entry.name for entry in os.scandir(folder)} if folder.exists() else set[str]()
     return [seed for seed in seeds if _file(folder, seed).name not in there]
 
 

@@ -64,9 +64,10 @@ def training_flops(recipe: Recipe, taken: Collection[str] | None = None) -> dict
         number of operations, by the name of the stage; none for stages that are taken from another run.
 
     Raises:
+        ConfigError: a stage without settings of its training.
         CheckpointError: no finished run to take stages from.
     """
-    return {name: cost.flops(recipe.training[name].scans) for name, cost in stage_costs(recipe, taken).items()}
+    return {name: cost.flops(recipe.settings_of(name).scans) for name, cost in stage_costs(recipe, taken).items()}
 
 
 def stage_costs(recipe: Recipe, taken: Collection[str] | None = None) -> dict[str, StageCost]:
@@ -136,7 +137,7 @@ def with_budget(recipe: Recipe, flops: float) -> Recipe:
         flops: number of floating-point operations that the training may take.
 
     Raises:
-        ConfigError: the budget is smaller than one batch of every stage.
+        ConfigError: the budget is smaller than one batch of every stage, or a stage has no settings of its training.
     """
     if not recipe.training:
         return recipe
@@ -147,7 +148,7 @@ def with_budget(recipe: Recipe, flops: float) -> Recipe:
     for _ in range(_CORRECTIONS):
         # What is prepared once, such as a reflow's pairs, does not grow or shrink in proportion.
         share *= flops / spent
-        trained = {name: _scaled(recipe.training[name], share) for name in costs}
+        trained = {name: _scaled(recipe.settings_of(name), share) for name in costs}
         scaled = replace(recipe, training={**recipe.training, **trained})
         spent = _flops_of(costs, scaled)
         if best_spent < spent <= flops * (1 + _OVERSPENT_AT_MOST):  # whole batches may come no nearer
@@ -158,7 +159,7 @@ def with_budget(recipe: Recipe, flops: float) -> Recipe:
 
 
 def _flops_of(costs: Mapping[str, StageCost], recipe: Recipe) -> int:
-    return sum(cost.flops(recipe.training[name].scans) for name, cost in costs.items())
+    return sum(cost.flops(recipe.settings_of(name).scans) for name, cost in costs.items())
 
 
 def _scaled(config: FitConfig, share: float) -> FitConfig:

@@ -136,6 +136,20 @@ class Recipe:
         if self.seed < 0:
             raise ConfigError(f"seed={self.seed}", "0 or more", "choose another seed")
 
+    def settings_of(self, stage: str) -> FitConfig:
+        """Return the settings of a stage's training.
+
+        Raises:
+            ConfigError: the recipe has none for this stage.
+        """
+        if stage not in self.training:
+            raise ConfigError(
+                f"a recipe without training.{stage}, a stage of model={self.generator}",
+                "the settings of every stage's training",
+                f"leave out the model.* that adds {stage}, or begin with a recipe that trains it",
+            )
+        return self.training[stage]
+
     def build_generator(self, sensor: SensorModel | None = None) -> Generator:
         """Return the generator with new random weights.
 

@@ -53,10 +53,7 @@ class Fit:
     plot: Callable[[Objective, Path], None] | None = None
 
     def __post_init__(self) -> None:
-        self.engine = engine_for(self.objective, self.config)
-        prepare_for_training(self.objective, self.config.recompute, self.config.compile)
-        self.optimiser = make_optimiser(self.objective, self.config)
-        self.engine.set_up(self.objective, self.optimiser)
+        self.engine, self.optimiser = begin_training(self.objective, self.config)
         self.average = WeightAverage(self.objective, self.config.average_over_scans)
         self.scans_seen = 0
         if self.checkpoint.exists():
@@ -177,18 +174,36 @@ class Fit:
                 self.reporter.message(f"  WARNING: {warning}")
 
 
-def engine_for(objective: Objective, config: FitConfig) -> Engine:
-    """Return the engine that a stage is trained with.
+def begin_training(objective: Objective, config: FitConfig) -> tuple[Engine, torch.optim.Optimizer]:
+    """Return the engine that a stage is trained with, which holds the objective from now on, and the optimiser.
 
     Raises:
-        ConfigError: a process cannot divide its share of a batch into the parts asked for.
+        ConfigError: settings that the objective's networks or the processes cannot follow.
     """
     engine = Engine(config.precision, objective.reaches_all_weights and not objective.players)
-    check_parts(objective, config, engine.world_size)
-    return engine
+    optimiser = follow_settings(objective, config, engine.world_size)
+    engine.set_up(objective, optimiser)
+    return engine, optimiser
 
 
-def check_parts(objective: Objective, config: FitConfig, processes: int) -> None:
+def follow_settings(objective: Objective, config: FitConfig, processes: int) -> torch.optim.Optimizer:
+    """Set an objective's networks as the settings of its training say, and return the optimiser.
+
+    Args:
+        objective: objective that a stage minimises.
+        config: settings of the stage's training.
+        processes: number of processes that share each batch.
+
+    Raises:
+        ConfigError: a process cannot divide its share of a batch into the parts asked for, or the networks lack what
+            is to be recomputed, compiled or trained by Muon.
+    """
+    _check_parts(objective, config, processes)
+    prepare_for_training(objective, config.recompute, config.compile)
+    return make_optimiser(objective, config)
+
+
+def _check_parts(objective: Objective, config: FitConfig, processes: int) -> None:
     """Refuse a number of parts into which a process cannot divide its share of a batch."""
     if config.accumulate > 1 and objective.players:
         raise ConfigError(

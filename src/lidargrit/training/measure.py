@@ -7,11 +7,9 @@ from dataclasses import dataclass
 
 import torch
 
-from lidargrit.nn.blocks import prepare_for_training
 from lidargrit.training.compute import duration, training_flops, uniform_images
 from lidargrit.training.config import Recipe
-from lidargrit.training.fit import engine_for
-from lidargrit.training.optimiser import make_optimiser
+from lidargrit.training.fit import begin_training
 
 _WARM_UP_STEPS, _TIMED_STEPS = 1, 3  # the first one allocates and chooses kernels
 
@@ -52,10 +50,8 @@ def measure(recipe: Recipe) -> list[Measured]:
         generator = recipe.build_generator()
         found = []
         for stage in flops:  # those that are trained
-            config, objective = recipe.training[stage], generator.objective(stage)
-            prepare_for_training(objective, config.recompute, config.compile)
-            engine = engine_for(objective, config)
-            engine.set_up(objective, make_optimiser(objective, config))
+            config, objective = recipe.settings_of(stage), generator.objective(stage)
+            engine, _ = begin_training(objective, config)
             images = uniform_images(recipe.data.load_sensor(), config.batch_size // engine.world_size)
             images = images.to(engine.device)
             begun = 0.0

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
 
 from lidargrit import configuration
-from lidargrit.errors import ConfigError
-from lidargrit.nn.blocks import prepare_for_training
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.precision import Precision
 from lidargrit.sources import PreparedSource, open_to_train
 from lidargrit.training.compute import computing_time, training_flops
 from lidargrit.training.config import Recipe
-from lidargrit.training.fit import check_parts
-from lidargrit.training.optimiser import make_optimiser, memory_of_weights
-from lidargrit.training.taken_stages import taken_stages
+from lidargrit.training.fit import follow_settings
+from lidargrit.training.optimiser import memory_of_weights
+from lidargrit.training.taken_stages import donors_of_stages, taken_stages
 
 
 @dataclass(frozen=True)
@@ -104,55 +103,59 @@ def check_data(recipe: Recipe) -> None:
                 source.images(recipe.data.load_sensor(), recipe.data)
 
 
-def check_stages(recipe: Recipe, processes: int = 1) -> dict[str, Objective]:
-    """Refuse settings of any stage that its training would refuse, and return the objectives, without values.
+@dataclass(frozen=True)
+class CheckedStages:
+    """Stages of a recipe whose training can begin.
+
+    Args:
+        objectives: objective of every stage, without values, by the name of the stage.
+        donors: run from which a stage is taken as it is, by the name of the stage; the others are trained.
+    """
+
+    objectives: Mapping[str, Objective]
+    donors: Mapping[str, str]
+
+
+def check_stages(recipe: Recipe, processes: int = 1) -> CheckedStages:
+    """Refuse settings of any stage that its training would refuse, and stages to take that do not fit.
 
     Args:
         recipe: recipe whose stages they are.
         processes: number of processes that share each batch.
 
     Raises:
-        ConfigError: a stage without settings of its training, or settings that its networks cannot follow.
+        ConfigError: a stage without settings of its training, settings that its networks cannot follow, or a stage to
+            take from another run that does not fit.
+        CheckpointError: no finished run to take stages from.
     """
     sensor = recipe.data.load_sensor()
     with torch.device("meta"):  # sizes alone, without values, so that wide networks take no time
         generator = recipe.build_generator(sensor).to("meta")
         objectives = {name: generator.objective(name) for name in generator.stages}
+    donors = donors_of_stages(recipe, generator.stages)
+    taken_stages(recipe, generator)
     for name, objective in objectives.items():
-        if name not in recipe.training:
-            raise ConfigError(
-                f"a recipe without training.{name}, a stage of model={recipe.generator}",
-                "the settings of every stage's training",
-                f"leave out the model.* that adds {name}, or begin with a recipe that trains it",
-            )
-        config = recipe.training[name]
-        check_parts(objective, config, processes)
-        prepare_for_training(objective, config.recompute, config.compile)
-        make_optimiser(objective, config)
-    return objectives
+        if name not in donors:
+            follow_settings(objective, recipe.settings_of(name), processes)
+    return CheckedStages(objectives, donors)
 
 
 def plan_training(recipe: Recipe) -> TrainingPlan:
     """Return the plan of a recipe's training; no scan is read, and nothing is written.
 
     Raises:
-        ConfigError: a stage to take from another run that does not fit.
+        ConfigError: settings that a stage cannot follow, or a stage to take from another run that does not fit.
         CheckpointError: no finished run to take stages from.
     """
     sensor = recipe.data.load_sensor()
-    stages = []
-    objectives = check_stages(recipe)
-    with torch.device("meta"):
-        generator = recipe.build_generator(sensor).to("meta")
-    donor = recipe.tokenizer_from or recipe.stages_from or ""
-    donors = {stage: donor for stage in taken_stages(recipe, generator) if stage not in recipe.fine_tune}
-    flops = training_flops(recipe, donors)
-    for name, objective in objectives.items():
-        budget = recipe.training[name]
+    checked, stages = check_stages(recipe), []
+    flops = training_flops(recipe, checked.donors)
+    for name, objective in checked.objectives.items():
         parameters = sum(weight.numel() for weight in objective.parameters())
-        if name in donors:
-            stages.append(StagePlan(name, parameters, 0, 0, 0, 0, budget.precision, donors[name]))
+        if name in checked.donors:
+            stages.append(StagePlan(name, parameters, 0, 0, 0, 0, "fp32", checked.donors[name]))
             continue
+        budget = recipe.settings_of(name)
         size = (parameters, budget.scans, budget.batch_size, memory_of_weights(objective))
         stages.append(StagePlan(name, *size, flops[name], budget.precision))
     return TrainingPlan(

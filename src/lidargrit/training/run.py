@@ -8,7 +8,7 @@ import json
 import platform
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -20,12 +20,12 @@ from lidargrit import __version__, configuration
 from lidargrit.determinism import derive_seed
 from lidargrit.errors import CheckpointError, OutputError
 from lidargrit.files import claim_folder, is_taken, read_json, write_json, write_text
-from lidargrit.generators import RUN_FILE, TRAINED_ON_FILE, Generator, locate, recipe_settings
+from lidargrit.generators import Generator
 from lidargrit.loading import DataConfig, RangeImages
 from lidargrit.nn.objective import Objective
 from lidargrit.reporting import Reporter
+from lidargrit.run_folder import RUN_FILE, TRAINED_ON_FILE, locate, recipe_settings, trained_on
 from lidargrit.sources import load_range_images
-from lidargrit.sources.samples import trained_on
 from lidargrit.training.checkpoint import fingerprint
 from lidargrit.training.config import FitConfig, Recipe
 from lidargrit.training.engine import Engine
@@ -67,12 +67,19 @@ def train(
     with ExitStack() as held, engine.lost_processes_reported():
         engine.by_first(lambda: check_folder(folder, recipe))
         engine.by_first(lambda: check_donor(recipe))
-        check_stages(recipe, engine.world_size)
+        donors = check_stages(recipe, engine.world_size).donors
         engine.by_first(lambda: held.enter_context(claim_folder(folder)))
-        return _train(recipe, folder, reporter, plot, engine)
+        return _train(recipe, donors, folder, reporter, plot, engine)
 
 
-def _train(recipe: Recipe, folder: Path, reporter: Reporter, plot: PlotProgress | None, engine: Engine) -> Generator:
+def _train(
+    recipe: Recipe,
+    donors: Mapping[str, str],
+    folder: Path,
+    reporter: Reporter,
+    plot: PlotProgress | None,
+    engine: Engine,
+) -> Generator:
     train_images = load_range_images(recipe.data.train, recipe.data, reporter)
     val_images = load_range_images(recipe.data.val, recipe.data, reporter)
     _warn_of_overlap(train_images, val_images, reporter)
@@ -84,14 +91,14 @@ def _train(recipe: Recipe, folder: Path, reporter: Reporter, plot: PlotProgress 
         generator.fit_statistics(train_images)
         built_on = ""
         for number, stage in enumerate(generator.stages):
-            if stage in taken and stage not in recipe.fine_tune:
+            if stage in donors:
                 trained = taken[stage]
             else:
                 seed, objective = derive_seed(recipe.seed, number), generator.objective(stage)
                 if stage in taken:
                     objective.load_state_dict({**objective.state_dict(), **objective.weights_from(taken[stage])})
                 picture = None if plot is None else partial(_plot, plot, generator, stage, val_images)
-                workers, config = recipe.data.workers, recipe.training[stage]
+                workers, config = recipe.data.workers, recipe.settings_of(stage)
                 fit = Fit(objective, config, folder / stage, seed, reporter, built_on, workers, picture)
                 trained = fit.run(train_images, val_images, f"training {stage}")
             generator.load_stage(stage, trained)

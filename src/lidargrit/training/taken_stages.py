@@ -11,8 +11,9 @@ from torch import Tensor
 
 from lidargrit import configuration
 from lidargrit.errors import ConfigError
-from lidargrit.generators import Generator, is_run, load, locate
+from lidargrit.generators import Generator, load
 from lidargrit.nn.objective import Objective
+from lidargrit.run_folder import is_run, locate
 from lidargrit.training.config import Recipe
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -22,6 +20,7 @@ from lidargrit.files import write_text
 from lidargrit.nn.pixel_phases import Lattice
 from lidargrit.structures import Decoded, RangeImage, TokenGrid
 from lidargrit.viewer import interactive
+from lidargrit.viewer._page import document, figure
 from lidargrit.viewer.interactive import button
 from lidargrit.viewer.report_charts import bar_chart
 from lidargrit.viewer.report_pictures import colour_picture, range_picture, rate_picture
@@ -104,25 +103,13 @@ def write_demo_page(demo: DemoPage, path: Path) -> None:
 
 def page(demo: DemoPage) -> str:
     """Return the page as text; names of files and other foreign text are escaped."""
-    script = interactive.opening_script()
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     steps = [_the_scan, _its_tokens, _its_reconstruction, _its_raydrop, _its_phases, _new_scans, _scores, _timings]
     if demo.by_phases is None:
         steps.remove(_its_phases)
     parts = [_lead(demo), *(_step(f"{number}. ", *step(demo)) for number, step in enumerate(steps, 1)), _next(demo)]
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        '<meta name="color-scheme" content="light dark">\n'
-        # Nothing is fetched and no other script runs, whatever a file name may hold.
-        '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; img-src data: blob:; '
-        f"style-src 'unsafe-inline'; script-src 'sha256-{digest}'\">\n"
-        f"<title>lidargrit demo: {escape(demo.name)}</title>\n"
-        f"<style>{interactive.style()}{STYLE}{_STYLE}</style>\n</head>\n<body>\n<main>\n"
-        + "\n".join(parts)
-        + f'\n</main>\n<script type="application/json" id="scans">{interactive.as_json(demo.sets)}</script>\n'
-        f"<script>{script}</script>\n</body>\n</html>\n"
-    )
+    looks = f"{interactive.style()}{STYLE}{_STYLE}"
+    title, scans = f"lidargrit demo: {demo.name}", interactive.as_json(demo.sets)
+    return document(title, looks, "\n".join(parts), interactive.opening_script(), scans, "data: blob:")
 
 
 class _Step(NamedTuple):
@@ -149,10 +136,6 @@ def _step(number: str, title: str, text: str, body: str) -> str:
     return f'<div class="step"><h2>{number}{escape(title)}</h2><p>{text}</p>{body}</div>'
 
 
-def _figure(picture: str, caption: str) -> str:
-    return f'<figure><img src="{picture}" alt="{escape(caption)}"><figcaption>{escape(caption)}</figcaption></figure>'
-
-
 def _limits_m(demo: DemoPage) -> tuple[float, float]:
     ranges = demo.scan.range_m[demo.scan.return_mask].numpy()
     near, far = (float(edge) for edge in np.quantile(ranges, (0.005, 0.995))) if len(ranges) else (1.0, 80.0)
@@ -163,7 +146,7 @@ def _ranges(demo: DemoPage, image: RangeImage, caption: str, lattice: Lattice = 
     """Render a range image, or a lattice of its pixels."""
     pixels = (0, *lattice.pixels)
     range_m, returned = image.range_m[pixels].numpy(), image.return_mask[pixels].numpy()
-    return _figure(
+    return figure(
         range_picture(range_m, returned, _limits_m(demo)), f"{caption}; {returned.mean():.0%} of rays returned"
     )
 
@@ -258,7 +241,7 @@ def _its_reconstruction(demo: DemoPage) -> _Step:
         f"no return: a clean range image without holes. Over {demo.errors.num_scans} held-out scans, the mean error of "
         f"the distance is {demo.errors.range_mae_m:.2f} m where the scan has a return."
     )
-    return _Step("Its reconstruction", text, _figure(every, "decoded range, before any ray is dropped"))
+    return _Step("Its reconstruction", text, figure(every, "decoded range, before any ray is dropped"))
 
 
 def _its_raydrop(demo: DemoPage) -> _Step:
@@ -271,11 +254,11 @@ def _its_raydrop(demo: DemoPage) -> _Step:
         "predicts as lost are lost indeed."
     )
     pictures = (
-        _figure(
+        figure(
             rate_picture(demo.scan.return_mask[0].float().numpy()), "the return mask of the scan: yellow is a return"
         )
-        + _figure(rate_picture(likely), "decoded probability of a return: dark blue 0, yellow 1")
-        + _figure(
+        + figure(rate_picture(likely), "decoded probability of a return: dark blue 0, yellow 1")
+        + figure(
             rate_picture(demo.sampled.return_mask[0].float().numpy()), "a return mask sampled from these probabilities"
         )
     )
@@ -297,7 +280,7 @@ def _its_phases(demo: DemoPage) -> _Step:
     for lattice, count in demo.lattices[-_LATTICES_SHOWN:]:
         after = f"after {count} phase" + ("s" if count > 1 else "")
         mask = whole.return_mask[(0, *lattice.pixels)].float().numpy()
-        masks.append(_figure(rate_picture(mask), f"return mask {after}"))
+        masks.append(figure(rate_picture(mask), f"return mask {after}"))
         ranges.append(_ranges(demo, whole, after, lattice))
     before_and_after = (
         _ranges(demo, demo.scan, "the scan itself")

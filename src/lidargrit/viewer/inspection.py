@@ -15,9 +15,9 @@ from lidargrit.files import atomic_path
 from lidargrit.projection.fit import elevations_deg
 from lidargrit.projection.inspection import FATES, Inspection
 from lidargrit.projection.pixel_coordinates import row_elevation_rad
+from lidargrit.viewer.report_pictures import NO_RETURN
 
 _DOTS_PER_INCH = 100
-_NO_RETURN = "#e4e4e4"  # near white: no colour of the range scale comes near it
 _COLOURS = {
     "above": "#7b3294",
     "below": "#e66101",
@@ -61,7 +61,7 @@ def plot_inspection(inspection: Inspection, path: Path) -> None:
 
 def _plot_range(figure: Figure, axes: Axes, inspection: Inspection) -> None:
     shown = np.ma.masked_where(~inspection.filled(), inspection.range_m)
-    colours = colormaps["viridis_r"].with_extremes(bad=_NO_RETURN)
+    colours = colormaps["viridis_r"].with_extremes(bad=NO_RETURN)
     norm = LogNorm(inspection.sensor.range_min_m, inspection.sensor.range_max_m)
     plotted = axes.imshow(shown, cmap=colours, norm=norm, aspect="auto", interpolation="nearest")
     figure.colorbar(plotted, ax=axes, label="range [m]", pad=0.01)
@@ -71,7 +71,7 @@ def _plot_range(figure: Figure, axes: Axes, inspection: Inspection) -> None:
 
 def _plot_collisions(figure: Figure, axes: Axes, inspection: Inspection) -> None:
     # 0 grey, 1 white, and from 2 on ever darker red.
-    colours = ListedColormap([_NO_RETURN, "white", "#fcae91", "#fb6a4a", "#cb181d", "#67000d"])
+    colours = ListedColormap([NO_RETURN, "white", "#fcae91", "#fb6a4a", "#cb181d", "#67000d"])
     norm = BoundaryNorm([0, 1, 2, 3, 4, 6, 1000], colours.N)
     plotted = axes.imshow(inspection.points_per_pixel, cmap=colours, norm=norm, aspect="auto", interpolation="nearest")
     bar = figure.colorbar(plotted, ax=axes, label="points", pad=0.01)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import base64
 import gzip
-import hashlib
 import json
 import re
 from collections.abc import Sequence
@@ -23,6 +22,7 @@ from lidargrit import __version__
 from lidargrit.errors import ConfigError
 from lidargrit.files import write_text
 from lidargrit.projection import points_of_pixels
+from lidargrit.viewer._page import document
 from lidargrit.viewer.classes import name_and_colour
 from lidargrit.viewer.scan_sets import SURPRISED_BITS, ScanSet
 
@@ -75,20 +75,11 @@ def page(sets: Sequence[ScanSet]) -> str:
         raise ConfigError(
             f"{len(sets)} sets of scans side by side", f"1 to {SOURCES_AT_MOST}", "name fewer, or make two pages"
         )
-    script = opening_script()
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     coarsest_m = max(_far_m(scans) for scans in sets) / _RANGE_STEPS
     precision = f"Ranges are kept here in steps of {1000 * coarsest_m:.1f} mm. Written by lidargrit {__version__}."
-    parts = {
-        "title": escape(f"Scans: {', '.join(scans.name for scans in sets)}"),
-        "style": style(),
-        "viewer": viewer_html("<h1>Scans</h1>", button("bin", "Save .bin") + button("ply", "Save .ply"), precision),
-        "script": script,
-        # No other script runs, and nothing is fetched, whatever a file name may hold.
-        "script_hash": f"sha256-{digest}",
-        "scans": as_json(sets),
-    }
-    return filled(_read("page.html"), parts)
+    title = f"Scans: {', '.join(scans.name for scans in sets)}"
+    content = viewer_html("<h1>Scans</h1>", button("bin", "Save .bin") + button("ply", "Save .ply"), precision)
+    return document(title, style(), content, opening_script(), as_json(sets), "data: blob:")
 
 
 def scripts() -> str:

@@ -19,13 +19,13 @@ from lidargrit.errors import ConfigError
 from lidargrit.files import atomic_path
 from lidargrit.projection import points_of_pixels
 from lidargrit.structures import RangeImage
+from lidargrit.viewer.report_pictures import NO_RETURN
 from lidargrit.viewer.scan_sets import SURPRISED_BITS
 
 SCANS_AT_MOST = 8  # scans of a group; more make a picture that no viewer shows well
 _DOTS_PER_INCH = 100  # 1400 pixels across: a laptop shows the picture without shrinking it
 _WIDTH, _ROW, _HEAD, _FOOT = 14.0, 2.95, 0.75, 0.95  # inches: the picture, one scan of one group, title, colour bars
 _SURPRISE_NOTE = f"\nsurprise: black = as expected or less,\nyellow = {SURPRISED_BITS:g} bits more or beyond"
-_NO_RETURN = "#e4e4e4"  # near white: no colour of the range scale comes near it
 
 
 def plot_comparison(
@@ -114,8 +114,8 @@ class _Scales:
             Normalize(float(low), float(max(high, low + 0.1))),
             max_range_m or max(float(np.quantile(away, 0.99)), 1.0),
             # Yellow is near and violet far; near-white is left to the rays without a return.
-            _with_bad("viridis_r", _NO_RETURN),
-            _with_bad("turbo", _NO_RETURN),
+            _with_bad("viridis_r", NO_RETURN),
+            _with_bad("turbo", NO_RETURN),
         )
 
 
@@ -168,7 +168,7 @@ def _plot_row(figure: Figure, height: float, bottom: float, panel: _Panel, scale
     mask = axes(0.75, 0.45, 9.9, 1.05)
     shape = {"aspect": "auto", "interpolation": "nearest", "extent": extent}
     if panel.surprise is None:
-        mask.imshow(panel.return_mask, cmap=ListedColormap([_NO_RETURN, "#26323c"]), vmin=0, vmax=1, **shape)
+        mask.imshow(panel.return_mask, cmap=ListedColormap([NO_RETURN, "#26323c"]), vmin=0, vmax=1, **shape)
     else:
         mask.imshow(panel.surprise, cmap="inferno", vmin=0, vmax=SURPRISED_BITS, **shape)
     mask.set_xlabel("azimuth, counter-clockwise from forward", fontsize=10, labelpad=0)

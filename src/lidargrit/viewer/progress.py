@@ -20,8 +20,7 @@ def plot_progress(generator: Generator, stage: str, val: RangeImages, path: Path
     real = val.batch(evenly_spaced(_SCANS, len(val)))
     groups = {"val": real}
     if "encode" in generator.capabilities:
-        device = next(generator.parameters()).device
-        groups["reconstructed"] = generator.reconstruct(real.to(device)).to("cpu")
+        groups["reconstructed"] = generator.reconstruct(real).to("cpu")
     if stage != generator.stages[0] or len(generator.stages) == 1:
         groups["generated"] = generator.sample(range(_SCANS)).to("cpu")
     plot_comparison(groups, path, title=f"{stage}, {path.stem} scans seen")

@@ -15,6 +15,7 @@ from lidargrit.evaluation.pairs import EvalPair, EvalSet
 from lidargrit.evaluation.profiles import HALF_VIEW_M, Match, Profile, matches, profile
 from lidargrit.evaluation.scorecard import NOT_APPLICABLE, EvalSetRecord, Scorecard
 from lidargrit.files import write_text
+from lidargrit.viewer._page import document, figure
 from lidargrit.viewer.report_charts import line_chart
 from lidargrit.viewer.report_pictures import (
     NO_RETURN,
@@ -62,18 +63,8 @@ def page(card: Scorecard, pair: EvalPair) -> str:
         _sheet(pair.samples, limits_m),
         _settings(card),
     ]
-    title = _escaped(f"{card.samples.source} against {card.reference.source}")
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        '<meta name="color-scheme" content="light dark">\n'
-        # Nothing is fetched and no script runs, whatever a file name may hold.
-        '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; img-src data:; '
-        "style-src 'unsafe-inline'\">\n"
-        f"<title>{title}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n<main>\n"
-        + "\n".join(part for part in parts if part)
-        + "\n</main>\n</body>\n</html>\n"
-    )
+    title = without_folders(f"{card.samples.source} against {card.reference.source}")
+    return document(title, STYLE, "\n".join(part for part in parts if part), images="data:")
 
 
 def _head(card: Scorecard) -> str:
@@ -136,11 +127,7 @@ def _scan(scans: EvalSet, index: int, limits_m: tuple[float, float], caption: st
     share = float(image.return_mask.float().mean())
     picture = range_picture(image.range_m.numpy(), image.return_mask.numpy(), limits_m)
     caption = f"{caption}, {share:.0%} of rays returned"
-    return _figure(picture, f"range image of {caption}", caption)
-
-
-def _figure(picture: str, spoken: str, caption: str) -> str:
-    return f'<figure><img src="{picture}" alt="{escape(spoken)}"><figcaption>{escape(caption)}</figcaption></figure>'
+    return figure(picture, caption, f"range image of {caption}")
 
 
 def _name(scans: EvalSet, index: int) -> str:
@@ -188,10 +175,10 @@ def _means(both: tuple[Profile, Profile], limits_m: tuple[float, float]) -> str:
     for name, scans in zip(("samples", "reference"), both, strict=True):
         finite = ~np.isnan(scans.mean_range_m)
         picture = range_picture(np.where(finite, scans.mean_range_m, 1.0), finite, limits_m)
-        figures.append(_figure(picture, f"mean range image of the {name}", f"mean range of the {name}"))
+        figures.append(figure(picture, f"mean range of the {name}", f"mean range image of the {name}"))
     for name, scans in zip(("samples", "reference"), both, strict=True):
         caption = f"return rate of the {name}: dark blue never, yellow always"
-        figures.append(_figure(rate_picture(scans.return_rate), f"image of the {caption}", caption))
+        figures.append(figure(rate_picture(scans.return_rate), caption, f"image of the {caption}"))
     why = "The mean over all scans of each set. A good generator has the same mean as the real scans."
     return f'<section><h2>Mean images</h2><p>{why}</p><div class="pair">{"".join(figures)}</div></section>'
 
@@ -219,8 +206,8 @@ def _densities(both: tuple[Profile, Profile]) -> str:
     highest = max(float(scans.density.max()) for scans in both)
     difference = both[0].density - both[1].density
     figures = [
-        _figure(
-            density_picture(scans.density, highest), f"density of points of the {name}, seen from above", f"the {name}"
+        figure(
+            density_picture(scans.density, highest), f"the {name}", f"density of points of the {name}, seen from above"
         )
         for name, scans in zip(("samples", "reference"), both, strict=True)
     ]
@@ -229,7 +216,7 @@ def _densities(both: tuple[Profile, Profile]) -> str:
     return (
         "<section><h2>Seen from above</h2><p>Points per scan and square metre, on one scale. Forward is up and left is "
         f"left, each picture is {2 * HALF_VIEW_M:.0f} m long, and the sensor is in the middle.</p>"
-        f'<div class="views">{"".join(figures)}{_figure(picture, caption, caption)}</div></section>'
+        f'<div class="views">{"".join(figures)}{figure(picture, caption)}</div></section>'
     )
 
 

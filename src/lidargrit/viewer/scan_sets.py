@@ -13,6 +13,7 @@ from lidargrit.errors import ConfigError, DataError, ScanError
 from lidargrit.generators import Generator
 from lidargrit.loading import DataConfig
 from lidargrit.loading.config import ScanSettings
+from lidargrit.nn.devices import usable_device
 from lidargrit.projection import project
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel
@@ -51,6 +52,7 @@ def load_scan_sets(
     reporter: Reporter | None = None,
     sensor: SensorModel | None = None,
     all_columns: bool = False,
+    device: str = "",
 ) -> list[ScanSet]:
     """Read scans and samples, and sample from runs.
 
@@ -67,6 +69,7 @@ def load_scan_sets(
         sensor: sensor to project scans with if the settings name none; those of runs and samples keep theirs.
         all_columns: whether scans are shown with all columns that their sensor fires, up to 200,000 pixels; otherwise
             with those that its image keeps. It has no effect if a sensor is named, nor beside samples and runs.
+        device: device that runs compute on; a GPU if there is one and none is named.
 
     Raises:
         ConfigError: no source.
@@ -76,7 +79,8 @@ def load_scan_sets(
     settings, reporter = settings or ScanSettings(), reporter or Reporter()
     config = settings.data
     opened = [open_source(source, config.bad_points) for source in sources]
-    generators = {source.text: source.generator for source in opened if isinstance(source, RunSource)}
+    runs = [source for source in opened if isinstance(source, RunSource)]
+    generators = {source.text: source.generator.to(usable_device(device)) for source in runs}
     of_runs = (generator.sensor for generator in generators.values())
     sensor = settings.load_sensor() or sensor or next(of_runs, None)
     if sensor is None:

@@ -13,6 +13,7 @@ from torch import Tensor
 from lidargrit.errors import ConfigError
 from lidargrit.generators import Generator, load
 from lidargrit.loading.config import ScanSettings
+from lidargrit.nn.devices import usable_device
 from lidargrit.reporting import Reporter
 from lidargrit.structures import RangeImage
 from lidargrit.viewer.interactive import PAGE_SCANS_AT_MOST, write_page
@@ -28,6 +29,7 @@ def view(
     settings: ScanSettings | None = None,
     reporter: Reporter | None = None,
     surprise_by: str = "",
+    device: str = "",
 ) -> None:
     """Plot scans, samples, and the scans that runs generate and reconstruct.
 
@@ -40,6 +42,7 @@ def view(
         reporter: receiver of messages about scans that are left out.
         surprise_by: folder of the run whose surprise at every pixel is a colour of the page, or is plotted in place of
             the return mask; none if empty.
+        device: device that runs compute on; a GPU if there is one and none is named.
 
     Raises:
         ConfigError: too few or too many scans, or no source.
@@ -50,9 +53,9 @@ def view(
     at_most = PAGE_SCANS_AT_MOST if is_page else SCANS_AT_MOST
     if not 1 <= count <= at_most:
         raise ConfigError(f"{count} scans of each set", f"1 to {at_most}", "correct the number")
-    model = load(surprise_by) if surprise_by else None
+    model = load(surprise_by).to(usable_device(device)) if surprise_by else None
     rays = None if model is None else model.sensor
-    sets = load_scan_sets(sources, count, seed, settings, reporter, rays, all_columns=is_page)
+    sets = load_scan_sets(sources, count, seed, settings, reporter, rays, is_page, device)
     if model is not None:
         sets = [replace(scans, surprise=_surprise(model, scans.images)) for scans in sets]
     groups = {scans.name: scans.images for scans in sets}

@@ -65,6 +65,14 @@ class Protocol:
         sensor = load_sensor(self.sensor)
         return sensor.with_columns(self.columns, self.column_stride) if self.columns else sensor
 
+    def scans_at_most(self, wanted: int = 0) -> int:
+        """Return the largest number of scans of each set; 0 for as many as there are.
+
+        Args:
+            wanted: largest number that the user wants; 0 for the protocol's.
+        """
+        return min((count for count in (wanted, self.num_scans) if count), default=0)
+
 
 def load_protocol(name: str) -> Protocol:
     """Return a protocol by its name, with "-" or "_".

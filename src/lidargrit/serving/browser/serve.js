@@ -136,10 +136,11 @@ class Desk {
     el("complete").disabled = Boolean(this.busy) || this.model.upload === "";
   }
 
-  // The settings that the user changed; the generator chooses the others.
+  // The settings that the user typed. The generator chooses the others: it may complete by other values than it
+  // samples by, which are those that empty fields show.
   request() {
-    const fields = [...el("request").querySelectorAll("[name]")].filter((field) => field.value !== field.defaultValue);
-    const data = fields.filter((field) => field.value !== "").map((field) => [field.name, Number(field.value)]);
+    const fields = [...el("request").querySelectorAll("[name]")].filter((field) => field.value !== "");
+    const data = fields.map((field) => [field.name, Number(field.value)]);
     return { model: Number(el("model").value), seed: Number(el("seed").value), sampling: Object.fromEntries(data) };
   }
 
@@ -247,7 +248,7 @@ function fieldOf(setting) {
   if (setting.whole) {
     input.min = "0";
   }
-  input.defaultValue = setting.default === null ? "" : String(setting.default);
+  input.placeholder = setting.default === null ? "" : String(setting.default);
   about.textContent = setting.about.split(/[.;] /)[0].replace(/\.$/, "");
   input.title = setting.about;
   label.append(setting.name.replaceAll("_", " "), input, about);

@@ -1,0 +1,66 @@
+"""The folder of a finished run: its name → its files, and what they say of its training."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from lidargrit import configuration
+from lidargrit.errors import CheckpointError
+from lidargrit.files import is_taken, read_json, sha256_of
+from lidargrit.loading import Provenance
+from lidargrit.projection import ProjectionVariant
+
+CONFIG_FILE, WEIGHTS_FILE, CARD_FILE = "config.json", "model.safetensors", "README.md"  # the names that the hub knows
+RUN_FILE = "run.json"  # ``origin`` in it says that the weights beside it were not trained in this folder
+TRAINED_ON_FILE = "trained_on.json"  # in a run's folder and beside its samples: which drives, which pixels
+PRETRAINED = Path(__file__).parent / "pretrained"
+PACKAGED = (PRETRAINED, PRETRAINED.with_name("pretrained_wide"))  # their names go wherever a run is wanted
+
+
+def locate(run: str | Path) -> Path:
+    """Return the folder of a run; the package has ``pretrained`` and ``pretrained_wide``, unless you have your own."""
+    packaged = {folder.name: folder for folder in PACKAGED}
+    return Path(run) if is_taken(Path(run)) else packaged.get(str(run), Path(run))
+
+
+def is_run(folder: Path) -> bool:
+    """Return whether a folder is that of a finished run."""
+    return (folder / CONFIG_FILE).is_file()
+
+
+def weights_sha256(folder: Path) -> str:
+    """Return the hash of the weights of a run, by which they are told from others."""
+    return sha256_of(folder / WEIGHTS_FILE)
+
+
+def recipe_settings(about: Any) -> dict[str, Any]:
+    """Return every setting of the recipe in a ``run.json`` by its name of today; none where there is no recipe."""
+    return configuration.leaves(about.get("recipe") if isinstance(about, dict) else {})
+
+
+def recorded_projection(folder: Path) -> str:
+    """Return by which variant of the projection the training scans of a run became images; "" if it is not known."""
+    path = folder / RUN_FILE
+    variant = recipe_settings(read_json(path) if path.is_file() else {}).get("data.projection_variant")
+    return variant if isinstance(variant, str) else ""
+
+
+def projection_variant(folder: Path) -> ProjectionVariant:
+    """Return the variant by which scans become images for the model of a run; "exact" if it is not known."""
+    return "reference" if recorded_projection(folder) == "reference" else "exact"
+
+
+def trained_on(folder: Path) -> Provenance:
+    """Return what the model of a run, or of a folder of samples, learned from; empty where that is not known."""
+    if not (folder / TRAINED_ON_FILE).is_file():
+        return Provenance()
+    try:
+        facts = {name: tuple(of) for name, of in read_json(folder / TRAINED_ON_FILE).items()}
+        if not all(isinstance(each, str) for of in facts.values() for each in of):
+            raise TypeError("something is no text")
+        return Provenance(**facts)
+    except (TypeError, AttributeError) as error:
+        raise CheckpointError(
+            f"{folder / TRAINED_ON_FILE}, in which {error}", "what lidargrit wrote", "restore it, or remove it"
+        ) from None

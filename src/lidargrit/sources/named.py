@@ -1,0 +1,122 @@
+"""An opened source → its scans one after the other, each with the name of the file that is written for it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from pathlib import Path
+
+from lidargrit.datasets import ScanDataset
+from lidargrit.determinism import evenly_spaced
+from lidargrit.loading import DataConfig, RangeImages
+from lidargrit.projection import unproject
+from lidargrit.sensors import SensorModel
+from lidargrit.sources import DatasetSource
+from lidargrit.sources.image_files import ImageFileSource
+from lidargrit.sources.source import Source
+from lidargrit.structures import RangeImage, Scan
+
+
+class NamedScans(ABC):
+    """Scans of a source, evenly spaced where fewer than all are wanted."""
+
+    @abstractmethod
+    def __len__(self) -> int: ...
+
+    @abstractmethod
+    def name(self, index: int) -> str:
+        """Return the name of the file that is written for a scan, without the ending."""
+
+    @abstractmethod
+    def identity(self, index: int) -> str:
+        """Return what identifies a scan, so that another scan is not taken for it."""
+
+    @abstractmethod
+    def scan(self, index: int) -> Scan:
+        """Return the points of a scan; those of a range image lie on the rays of its pixels."""
+
+    def path(self, index: int) -> Path | None:
+        """Return the file that holds the points of a scan; None where there is none."""
+        return None
+
+
+class PointScans(NamedScans):
+    """Scans of a data set, by their own names.
+
+    Args:
+        dataset: data set.
+        max_scans: number of scans; 0 for all.
+    """
+
+    def __init__(self, dataset: ScanDataset, max_scans: int) -> None:
+        self._dataset, self._indices = dataset, evenly_spaced(max_scans or len(dataset), len(dataset))
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    def name(self, index: int) -> str:
+        """Return its name in the data set."""
+        return self._dataset.name(self._indices[index])
+
+    def identity(self, index: int) -> str:
+        """Return its name in the data set."""
+        return self.name(index)
+
+    def scan(self, index: int) -> Scan:
+        """Read its points."""
+        return self._dataset.scan(self._indices[index])
+
+    def path(self, index: int) -> Path | None:
+        """Return its file."""
+        return self._dataset.path(self._indices[index])
+
+
+class ImageScans(NamedScans):
+    """Range images as scans.
+
+    Args:
+        images: range images.
+        names: name of each.
+    """
+
+    def __init__(self, images: RangeImages, names: Sequence[str]) -> None:
+        self.images, self._names = images, names
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def name(self, index: int) -> str:
+        """Return its name."""
+        return self._names[index]
+
+    def identity(self, index: int) -> str:
+        """Return which file it is, which model's seed, or whose scan it was projected from."""
+        return self.images.provenance.names[index]
+
+    def image(self, index: int) -> RangeImage:
+        """Return its pixels (H, W)."""
+        return self.images.batch([index])[0]
+
+    def scan(self, index: int) -> Scan:
+        """Return a point for each return."""
+        return unproject(self.image(index))
+
+
+def named_scans(source: Source, config: DataConfig, sensor: SensorModel | None = None) -> PointScans | ImageScans:
+    """Return the scans of a source: named as in their data set or as their image's file, else by their index.
+
+    Args:
+        source: opened source.
+        config: number of scans.
+        sensor: sensor of range images that do not name theirs; see :meth:`Source.images`.
+    """
+    if isinstance(source, DatasetSource):
+        return PointScans(source.scans(), config.max_scans)
+    images = source.images(sensor, config)
+    if isinstance(source, ImageFileSource):
+        return ImageScans(images, [_name_of(Path(name)) for name in images.provenance.names])
+    return ImageScans(images, [f"{index:06d}" for index in range(len(images))])
+
+
+def _name_of(image: Path) -> str:
+    return image.stem if image.suffix == ".npy" else image.name  # beside scan.npy there may lie scan.NPY
