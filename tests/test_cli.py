@@ -210,6 +210,7 @@ def test_sampling_options_reach_the_model(run_folder, tmp_path, typed):
         "mask": "threshold",
         "range_temperature": 0.6,
         "range_noise": 0.7,
+        "mask_correlation": 2.0,
         "completion": "auto",
         "weights": "fp32",
         "decoder": "fp32",

@@ -58,7 +58,7 @@ def browser(tmp_path_factory):
 def test_numbers_of_every_generator_can_be_chosen():
     found = {name: [setting.name for setting in sampling_settings(made(name)[0].Sampling())] for name in MODELS}
     assert found == {
-        "lidargrit": ["temperature", "top_k", "top_p", "range_temperature", "range_noise"],
+        "lidargrit": ["temperature", "top_k", "top_p", "range_temperature", "range_noise", "mask_correlation"],
         "marginal": [],
         "r2dm": ["steps", "resamples"],
     }

@@ -70,6 +70,8 @@ class TokenSampling:
             surface is preferred. Only scans sampled with 1, and a noise of 1, follow the distribution whose likelihood
             the model gives.
         range_noise: multiplier of the pixel decoder's spread of ranges about a surface.
+        mask_correlation: multiplier of how much of their noise close pixels of a mask share that are sampled at once; 0
+            samples them independently, which is the distribution whose likelihood the model gives.
         completion: method by which scans are completed. ``network`` takes the network that was trained for what was
             observed: the one for completion where pixels were, the one for raydrop where all surfaces were. ``tokens``
             samples the tokens without any observed pixel, and then all pixels that were not observed. ``auto`` is
@@ -87,6 +89,7 @@ class TokenSampling:
     mask: PixelChoice = "auto"
     range_temperature: float = PixelSampling.range_temperature
     range_noise: float = PixelSampling.range_noise
+    mask_correlation: float = PixelSampling.mask_correlation
     completion: Literal["auto", "network", "tokens"] = "auto"
     weights: WeightPrecision = "fp32"
     decoder: Precision = "fp32"
@@ -102,7 +105,7 @@ class TokenSampling:
 
     def pixels(self) -> PixelSampling:
         """Return the settings of the pixel decoder."""
-        return PixelSampling(self.range_temperature, self.range_noise, self.decoder)
+        return PixelSampling(self.range_temperature, self.range_noise, self.mask_correlation, self.decoder)
 
 
 @dataclass(frozen=True)

@@ -51,6 +51,8 @@ class MaskedSampling:
         range_temperature: divisor of the logarithms of the pixel decoder's weights of surfaces; below 1 it prefers the
             likelier surface.
         range_noise: multiplier of the pixel decoder's spread of ranges about a surface.
+        mask_correlation: multiplier of how much of their noise close pixels of a mask share that are sampled at once; 0
+            samples them independently.
         weights: number type of the transformer's products. ``fp32`` is exact; ``bf16`` computes them in 16 bits, as
             training does where that is quicker; ``auto`` is ``bf16`` where the machine has instructions for it.
         decoder: number type of the tokenizer's decoder and of the pixel decoder, with the same choices.
@@ -62,6 +64,7 @@ class MaskedSampling:
     mask: PixelChoice = "auto"
     range_temperature: float = PixelSampling.range_temperature
     range_noise: float = PixelSampling.range_noise
+    mask_correlation: float = PixelSampling.mask_correlation
     weights: Precision = "fp32"
     decoder: Precision = "fp32"
 
@@ -76,7 +79,7 @@ class MaskedSampling:
 
     def pixels(self) -> PixelSampling:
         """Return the settings of the pixel decoder."""
-        return PixelSampling(self.range_temperature, self.range_noise, self.decoder)
+        return PixelSampling(self.range_temperature, self.range_noise, self.mask_correlation, self.decoder)
 
 
 @dataclass(frozen=True)

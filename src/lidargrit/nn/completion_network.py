@@ -199,8 +199,7 @@ class CompletionNetwork(nn.Module):
             hints = hints_of(shown)
             point, mirrored = self(hints, one.return_observed), self(hints.mirrored(), one.return_observed.flip(-1))
             v = (point.v + mirrored.v.flip(-1)) / 2
-            uniform = torch.rand(one.range_m.shape, generator=rng).to(one.range_m.device)
-            mask = self.mask.sample(point.guide, uniform, one)
+            mask = self.mask.sample(point.guide, self.mask.uniform(rng), one)
             low_m, high_m = condition.sensor.range_min_m, condition.sensor.range_max_m
             label, reflectance = None, None
             if hints.labels is not None and point.class_logits is not None and mirrored.class_logits is not None:

@@ -32,21 +32,24 @@ BITS_STEP_M = 0.01  # bits of a return are those of naming its range to a centim
 
 @dataclass(frozen=True)
 class PixelSampling:
-    """Settings of sampling ranges from their mixtures.
+    """Settings of sampling masks, and ranges from their mixtures.
 
     The defaults are sharper than the mixtures themselves, which have speckles where a surface is uncertain. Only scans
-    that are sampled with 1 and 1 follow the distribution whose likelihood the model computes.
+    that are sampled with 1, 1 and a correlation of 0 follow the distribution whose likelihood the model computes.
 
     Args:
         range_temperature: temperature of the components' weights; 1 leaves them unchanged, below 1 prefers the likelier
             surface.
         range_noise: multiplier of the components' scales; 1 takes them as they are.
+        mask_correlation: multiplier of how much of their noise close pixels of a mask share that are sampled at once,
+            so that drops cluster; 1 takes what was learned in training, 0 samples them independently.
         precision: number type of the networks' products. ``fp32`` is exact; ``bf16`` is quicker and moves some pixels;
             ``auto`` is ``bf16`` where the machine has instructions for it.
     """
 
     range_temperature: float = 0.6
     range_noise: float = 0.7
+    mask_correlation: float = 2.0
     precision: Precision = "fp32"
 
     def __post_init__(self) -> None:
@@ -55,6 +58,12 @@ class PixelSampling:
                 f"range_temperature={self.range_temperature}, range_noise={self.range_noise}",
                 "positive numbers",
                 "take 1 for both to sample from the model's own distribution",
+            )
+        if not 0 <= self.mask_correlation < math.inf:
+            raise ConfigError(
+                f"mask_correlation={self.mask_correlation}",
+                "a number that is at least 0",
+                "take 0 for independent pixels",
             )
 
 
@@ -77,7 +86,8 @@ class PixelDecoder(nn.Module):
     Reflectance is not sampled: it is the mean that the tokenizer's decoder gives, if it gives one.
 
     First comes the whole mask, one Bernoulli number a pixel, then the range of what returned, from a mixture that may
-    stand on either side of an edge. The pixels of one phase are independent of one another, given the earlier ones.
+    stand on either side of an edge. The pixels of one phase are independent of one another, given the earlier ones, but
+    for the noise that their masks may share (:class:`PhaseNoise`).
 
     Args:
         config: sizes of the networks.
@@ -181,8 +191,7 @@ class PixelDecoder(nn.Module):
         """Return the negative log-likelihood of mask and range at phases of one lattice."""
         mask, v = images.return_mask, images.range_m.log1p()
         returned = at_phases(mask, phases)
-        logits = self.mask.logits(phases, self.mask.outputs(phases, guided[0], guide, mask, v), guide)
-        of_mask = F.binary_cross_entropy_with_logits(logits, returned.float(), reduction="none")
+        of_mask = self.mask.phase_nll(phases, guided[0], guide, mask)
         candidates = self.range.candidates(phases, guide, mask, v)
         output = self.range.outputs(phases, guided[1], guide, mask, v)
         # Where nothing returned, any range within the limits stands in: its likelihood is not used.
@@ -211,11 +220,15 @@ class PixelDecoder(nn.Module):
                 are when their phase comes: later phases know of them, earlier ones do not.
         """
         guide, size = self.guide(decoded, len(rngs)), (3, self.sensor.height, self.sensor.width)
-        uniform = torch.stack([torch.rand(size, generator=rng) for rng in rngs]).to(guide.v.device)
+        choices = sampling or PixelSampling()
+        uniform = torch.stack([torch.rand(size, generator=rng) for rng in rngs])
+        for numbers, rng in zip(uniform, rngs, strict=True):
+            numbers[0] = self.mask.noise(numbers[0], rng, choices.mask_correlation)
+        uniform = uniform.to(guide.v.device)
         condition = (condition or Condition.nothing(self.sensor, len(rngs))).to(guide.v.device)
         # One scan after the other on a CPU: with other batch sizes its sums have other rounding errors.
         step = 1 if guide.v.device.type == "cpu" else len(uniform)
-        images, choices = [], sampling or PixelSampling()
+        images = []
         for first in range(0, len(uniform), step):
             part = slice(first, first + step)
             some = guide.part(part)

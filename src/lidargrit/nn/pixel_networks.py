@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from lidargrit.conditions import Condition
 from lidargrit.errors import ConfigError
 from lidargrit.nn.lattice_network import LatticeNetwork
+from lidargrit.nn.phase_noise import PhaseNoise
 from lidargrit.nn.pixel_phases import Lattice, Phase, at_phases, cells_of, generated_before, neighbours_of, phases_of
 from lidargrit.nn.precision import at_least_32_bits
 from lidargrit.nn.range_mixture import RangeMixture
@@ -205,6 +206,7 @@ class MaskNetwork(PhaseNetwork):
     def __init__(self, config: PixelDecoderConfig, sensor: SensorModel, features: int) -> None:
         super().__init__(config, sensor, features, config.mask_features, (config.mask_width, config.mask_width), 1)
         self.row_bias = nn.Parameter(torch.zeros(sensor.height))
+        self.noise = PhaseNoise(self.phases)
 
     @classmethod
     def behind(cls, features: int, width: int, sensor: SensorModel) -> MaskNetwork:
@@ -228,12 +230,17 @@ class MaskNetwork(PhaseNetwork):
             certain = torch.maximum(certain, cells_of(guide.observed[:, None].to(v.dtype), phase.lattice))
         return torch.cat((certain * returned, certain * (1 - returned)), 1)
 
+    def uniform(self, rng: torch.Generator) -> Float[Tensor, "1 H W"]:
+        """Return random numbers for one scan's mask, correlated as learned, on the device of the network."""
+        size = (self.sensor.height, self.sensor.width)
+        return self.noise(torch.rand(size, generator=rng), rng)[None].to(self.row_bias.device)
+
     def sample(self, guide: Guide, uniform: Float[Tensor, "B H W"], condition: Condition) -> Bool[Tensor, "B H W"]:
         """Return the mask, sampled phase by phase around its observed pixels.
 
         Args:
             guide: output of the decoder for every pixel.
-            uniform: random numbers in [0, 1).
+            uniform: random numbers in [0, 1): independent ones, or those that ``noise`` makes of them.
             condition: observed part of the scans, whose returns are kept as they are.
         """
         guided = self.guided(guide)
@@ -249,6 +256,21 @@ class MaskNetwork(PhaseNetwork):
         """Return the logits of the pixels of phases of one lattice."""
         decoded = guide.return_logits + self.row_bias[:, None]
         return output[:, :, 0] + at_phases(decoded, phases)
+
+    def phase_nll(
+        self, phases: list[Phase], guided: dict[Lattice, Tensor], guide: Guide, returned: Bool[Tensor, "B H W"]
+    ) -> Float[Tensor, "P B h w"]:
+        """Return the negative log-likelihood in nats of the pixels of phases of one lattice, 0 for observed ones.
+
+        In training the noise learns from them how pixels of one phase depend on one another.
+        """
+        logits = self.logits(phases, self.outputs(phases, guided, guide, returned, guide.v), guide)
+        truth = at_phases(returned, phases)
+        nll = F.binary_cross_entropy_with_logits(logits, truth.float(), reduction="none")
+        known = None if guide.observed is None else at_phases(guide.observed, phases)
+        if self.training:
+            self.noise.learn(phases, logits if known is None else logits.masked_fill(known, torch.inf), truth)
+        return nll if known is None else nll * ~known
 
     def nats(
         self, guide: Guide, returned: Bool[Tensor, "B H W"], rng: torch.Generator | None = None
@@ -266,10 +288,7 @@ class MaskNetwork(PhaseNetwork):
             if rng is not None:
                 index = torch.randint(len(phases), (), generator=rng, device=rng.device)
                 chosen = [phases[0 if index.is_meta else int(index)]]  # all take as many operations, if counted
-            logits = self.logits(chosen, self.outputs(chosen, guided, guide, returned, guide.v), guide)
-            nll = F.binary_cross_entropy_with_logits(logits, at_phases(returned, chosen).float(), reduction="none")
-            if guide.observed is not None:
-                nll = nll * ~at_phases(guide.observed, chosen)
+            nll = self.phase_nll(chosen, guided, guide, returned)
             total = total + nll.sum((0, 2, 3)) * (len(phases) / len(chosen))
         return total
 

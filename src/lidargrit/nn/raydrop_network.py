@@ -151,8 +151,7 @@ class RaydropNetwork(nn.Module):
         for index, rng in enumerate(rngs):
             one = condition[index : index + 1]
             found = self(one.range_m, one.range_observed, one.label)
-            uniform = torch.rand(one.range_m.shape, generator=rng).to(one.range_m.device)
-            returned = self.mask.sample(found.guide, uniform, one)
+            returned = self.mask.sample(found.guide, self.mask.uniform(rng), one)
             reflectance = None if found.reflectance is None else found.reflectance.clamp(0, 1)
             images.append(RangeImage.masked(one.range_m, returned, condition.sensor, reflectance, one.label))
         return RangeImage.cat(images)

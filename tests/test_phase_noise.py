@@ -1,0 +1,109 @@
+"""Random numbers of masks: correlated within a phase as was learned, independent between phases, always uniform."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import kstest, multivariate_normal, norm
+from torch import Tensor
+
+from lidargrit.nn.phase_noise import PhaseNoise
+from lidargrit.nn.pixel_phases import Phase, phases_of
+
+PHASES = phases_of(4)
+HEIGHT, WIDTH = 32, 128
+
+
+def of_phase(noise: PhaseNoise, phase: Phase, logit: float, scans: int, seed: int = 0) -> Tensor:
+    """Return masks of one phase that are sampled with one probability everywhere, by the noise."""
+    rng = torch.Generator().manual_seed(seed)
+    uniform = torch.stack([noise(torch.rand(HEIGHT, WIDTH, generator=rng), rng) for _ in range(scans)])
+    return (uniform < torch.tensor(logit).sigmoid())[(..., *phase.pixels)]
+
+
+def with_shares(phase: Phase, down: float, along: float) -> PhaseNoise:
+    """Return a noise that has learned, from as many pixels as wanted, shares of one phase."""
+    noise = PhaseNoise(PHASES)
+    correlations = 0.6 * torch.tensor([down, along])
+    terms = torch.tensor([1.0, 0.2, 0.1, 0.05]) * 1e9  # so many that what is assumed before them does not count
+    powers = torch.stack([correlations**term for term in range(1, 5)], -1)
+    noise.sums[PHASES.index(phase), :, 0] = (powers * terms).sum(-1)
+    noise.sums[PHASES.index(phase), :, 1:] = terms
+    return noise
+
+
+def test_nothing_learned_leaves_the_numbers_as_they_are() -> None:
+    uniform = torch.rand(HEIGHT, WIDTH)
+    rng = torch.Generator().manual_seed(0)
+    before = rng.get_state()
+    assert PhaseNoise(PHASES)(uniform, rng) is uniform
+    assert with_shares(PHASES[-1], 0.5, 0.1)(uniform, rng, strength=0.0) is uniform
+    assert torch.equal(rng.get_state(), before)
+
+
+def test_numbers_stay_uniform_and_are_correlated_within_their_phase_alone() -> None:
+    phase = PHASES[4]
+    noise = with_shares(phase, 0.5, 0.2)
+    rng = torch.Generator().manual_seed(1)
+    numbers = torch.stack([noise(torch.rand(HEIGHT, WIDTH, generator=rng), rng) for _ in range(100)])
+    normal = torch.special.ndtri(numbers.double())
+    own = normal[(..., *phase.pixels)]
+    assert own.mean() == pytest.approx(0, abs=0.02)
+    assert own.std() == pytest.approx(1, abs=0.02)
+    assert kstest(numbers[:, 1::4, 1::4].flatten()[::7].numpy(), "uniform").pvalue > 1e-3
+    assert (own[:, 1:] * own[:, :-1]).mean() == pytest.approx(0.5 * 0.6, abs=0.02)
+    assert (own[:, 2:] * own[:, :-2]).mean() == pytest.approx(0.5 * 0.36, abs=0.02)
+    assert (own * own.roll(1, -1)).mean() == pytest.approx(0.2 * 0.6, abs=0.02)
+    assert (own[..., 0] * own[..., -1]).mean() == pytest.approx(0.2 * 0.6, abs=0.03)  # columns close a circle
+    assert (own[:, 0] * own[:, -1]).mean() == pytest.approx(0, abs=0.03)  # rows do not
+    other = normal[(..., *PHASES[5].pixels)]
+    assert (other[:, 1:] * other[:, :-1]).mean() == pytest.approx(0, abs=0.02)
+    assert (own * other).mean() == pytest.approx(0, abs=0.02)
+
+
+@pytest.mark.parametrize("logit", [0.0, 1.5])
+def test_shares_are_learned_from_masks_that_have_them(logit: float) -> None:
+    phase = PHASES[4]
+    masks = of_phase(with_shares(phase, 0.5, 0.2), phase, logit, 400)
+    learning = PhaseNoise(PHASES)
+    learning.learn([phase], torch.full((1, *masks.shape), logit), masks[None])
+    down, along = learning.shares()[PHASES.index(phase)].tolist()
+    assert down == pytest.approx(0.5, abs=0.04)
+    assert along == pytest.approx(0.2, abs=0.04)
+    assert learning.shares()[PHASES.index(phase) + 1].tolist() == pytest.approx([0, 0], abs=1e-6)
+
+
+@pytest.mark.parametrize("correlation", [0.1, 0.3, 0.5])
+@pytest.mark.parametrize("thresholds", [(0.0, 0.0), (1.0, 0.7), (-1.2, -0.8)])
+def test_the_series_is_the_covariance_of_two_pixels(correlation: float, thresholds: tuple[float, float]) -> None:
+    upper, lower = (float(norm.cdf(threshold)) for threshold in thresholds)
+    both = float(multivariate_normal(cov=np.array([[1, correlation], [correlation, 1]])).cdf(thresholds))
+    pairs = {(True, True): both, (True, False): upper - both, (False, True): lower - both}
+    pairs[False, False] = 1 - sum(pairs.values())
+    logits, noise = torch.tensor([upper, lower]).logit()[None, None, :, None], PhaseNoise(PHASES)
+    for returned, share in pairs.items():  # as if every pair had been seen as often as it is likely
+        seen = PhaseNoise(PHASES)
+        seen.learn(PHASES[-1:], logits, torch.tensor(returned)[None, None, :, None])
+        noise.sums += 1e6 * share * seen.sums
+    assert float(noise.correlations()[-1, 0]) == pytest.approx(correlation, rel=0.02)
+
+
+def test_pixels_with_infinite_logits_are_left_out() -> None:
+    phase = PHASES[-1]
+    logits = torch.randn(1, 8, 4, 8, generator=torch.Generator().manual_seed(2))
+    returned = torch.rand(1, 8, 4, 8) < 0.5
+    out, some = logits.clone(), PhaseNoise(PHASES)
+    out[:, 4:] = math.inf
+    some.learn([phase], out, returned)
+    half = PhaseNoise(PHASES)
+    half.learn([phase], logits[:, :4], returned[:, :4])
+    assert torch.allclose(some.sums, half.sums, rtol=1e-5)
+
+
+def test_too_large_shares_keep_a_part_of_each_pixels_own() -> None:
+    noise = with_shares(PHASES[-1], 0.8, 0.8)
+    assert noise.shares()[-1].sum() == pytest.approx(0.9)
+    assert noise(torch.rand(HEIGHT, WIDTH), torch.Generator().manual_seed(0), strength=50.0).isfinite().all()
