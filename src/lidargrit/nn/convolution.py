@@ -9,7 +9,7 @@ from typing import Literal
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 
 from lidargrit.nn.blocks import Block
@@ -17,8 +17,8 @@ from lidargrit.nn.blocks import Block
 Padding = Literal["zero", "wrap"]
 
 
-def wrapped(x: Float[Tensor, "B C H W"], left: int = 1, right: int = 1) -> Float[Tensor, "B C H w"]:
-    """Return a map with its last columns also before the first, and its first ones behind the last."""
+def wrapped(x: Shaped[Tensor, "*B W"], left: int = 1, right: int = 1) -> Shaped[Tensor, "*B w"]:
+    """Return maps with their last columns also before the first, and their first ones behind the last."""
     # Not by F.pad: its circular mode takes several times as long, most of all backwards.
     return torch.cat((x[..., x.shape[-1] - left :], x, x[..., :right]), dim=-1)
 

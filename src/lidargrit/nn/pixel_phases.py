@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from lidargrit.errors import ConfigError
+from lidargrit.nn.convolution import wrapped
 
 _BOTH = ((0, 0), (1, 1), (0, 1), (1, 0))  # of 2x2 pixels of a lattice: a corner, its opposite, then the others
 _COLUMNS = ((0, 0), (1, 0), (0, 1), (1, 1))  # where whole columns are known: the next column, its even rows first
@@ -165,8 +166,7 @@ def neighbours_of(phase: Phase, values: Float[Tensor, "B H W"], known: Bool[Tens
     """
     lattice = phase.lattice
     values, known = (maps[(..., *lattice.pixels)] for maps in (values, known))
-    values = F.pad(torch.cat((values[..., -1:], values, values[..., :1]), -1), (0, 0, 1, 1))
-    known = F.pad(torch.cat((known[..., -1:], known, known[..., :1]), -1), (0, 0, 1, 1))
+    values, known = (F.pad(wrapped(maps), (0, 0, 1, 1)) for maps in (values, known))
     height, width = (known.shape[-2] - 2) // 2, (known.shape[-1] - 2) // 2
     found_values, found_known = [], []
     for down, right in phase.pairs:
