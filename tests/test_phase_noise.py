@@ -10,8 +10,12 @@ from scipy.integrate import quad
 from scipy.stats import kstest, norm
 from torch import Tensor
 
+from lidargrit.errors import ConfigError
 from lidargrit.nn.phase_noise import PhaseNoise
+from lidargrit.nn.pixel_decoder import PixelSampling
 from lidargrit.nn.pixel_phases import Phase, phases_of
+from lidargrit.structures import RangeImage
+from pixel_decoder_examples import random_decoded, random_decoder, random_images, tiny_sensor
 
 PHASES = phases_of(4)
 HEIGHT, WIDTH = 32, 128
@@ -113,3 +117,35 @@ def test_too_large_shares_keep_a_part_of_each_pixels_own() -> None:
     noise = with_shares(PHASES[-1], 0.8, 0.8)
     assert noise.shares()[-1].sum() == pytest.approx(0.9)
     assert noise(torch.rand(HEIGHT, WIDTH), torch.Generator().manual_seed(0), strength=50.0).isfinite().all()
+
+
+@torch.no_grad()
+def test_training_learns_the_noise_of_masks_and_sampling_follows_it() -> None:
+    sensor = tiny_sensor(16, 32)
+    decoder, decoded = random_decoder(sensor, 4, spread=0.02), random_decoded(sensor, 8)
+    images = random_images(sensor, 8)
+    rows_alike = images.return_mask[:, ::4].repeat_interleave(4, 1)  # so that drops are as high as four rows
+    images = RangeImage.masked(images.range_m + 1, rows_alike, sensor)
+
+    def sample(correlation: float) -> RangeImage:
+        rngs = [torch.Generator().manual_seed(seed) for seed in range(8)]
+        return decoder.sample(decoded, rngs, PixelSampling(mask_correlation=correlation))
+
+    before = sample(2.0)
+    decoder.estimate(decoded, images, torch.Generator().manual_seed(0))
+    assert not decoder.mask.noise.sums.any()
+    assert torch.equal(sample(0.0).return_mask, before.return_mask)
+    for step in range(20):
+        decoder.train().estimate(decoded, images, torch.Generator().manual_seed(step))
+    decoder.eval()
+    assert decoder.mask.noise.correlations()[-3, 0] > 0.3
+    assert torch.equal(sample(0.0).return_mask, before.return_mask)
+    assert not torch.equal(sample(2.0).return_mask, before.return_mask)
+    copied = random_decoder(sensor, 4)
+    copied.load_state_dict(decoder.state_dict())
+    assert torch.equal(copied.mask.noise.sums, decoder.mask.noise.sums)
+
+
+def test_a_negative_correlation_of_masks_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"mask_correlation=-1\.0"):
+        PixelSampling(mask_correlation=-1.0)

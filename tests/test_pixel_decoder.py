@@ -16,47 +16,9 @@ from lidargrit.nn.pixel_networks import Guide, PixelDecoderConfig
 from lidargrit.nn.pixel_phases import at_phases, completed_lattices, generated_before, join_phases, phases_of
 from lidargrit.nn.precision import Precision
 from lidargrit.nn.range_mixture import RangeMixture
-from lidargrit.sensors import SensorModel, load_sensor
+from lidargrit.sensors import load_sensor
 from lidargrit.structures import Decoded, RangeImage
-
-FEATURES = 5
-
-
-def tiny_sensor(rows: int, columns: int) -> SensorModel:
-    elevation_rad = torch.linspace(0.05, -0.35, rows)[:, None]
-    azimuth_rad = math.pi - 2 * math.pi * (torch.arange(columns) + 0.5)[None] / columns
-    return SensorModel("tiny", elevation_rad, azimuth_rad, 1.0, 80.0, "spherical")
-
-
-def random_decoder(
-    sensor: SensorModel, cell: int, spread: float = 0.3, halvings: tuple[int, int] = (0, 0), features: int = FEATURES
-) -> PixelDecoder:
-    """Return a decoder none of whose weights are zero, so that everything depends on everything it may."""
-    torch.manual_seed(0)
-    config = PixelDecoderConfig(
-        cell, *halvings, mask_features=3, range_features=3, mask_width=6, range_width=6, blocks=1
-    )
-    decoder = PixelDecoder(config, sensor, features)
-    for weight in decoder.parameters():
-        weight.data = spread * torch.randn_like(weight)
-    return decoder.eval()
-
-
-def random_decoded(sensor: SensorModel, batch: int, seed: int = 1) -> Decoded:
-    rng = torch.Generator().manual_seed(seed)
-    size = (batch, sensor.height, sensor.width)
-    return Decoded(
-        2 + 40 * torch.rand(size, generator=rng),
-        torch.randn(size, generator=rng),
-        sensor,
-        features=torch.randn((batch, FEATURES, *size[1:]), generator=rng),
-    )
-
-
-def random_images(sensor: SensorModel, batch: int, seed: int = 2) -> RangeImage:
-    rng = torch.Generator().manual_seed(seed)
-    size = (batch, sensor.height, sensor.width)
-    return RangeImage.masked(1 + 70 * torch.rand(size, generator=rng), torch.rand(size, generator=rng) < 0.7, sensor)
+from pixel_decoder_examples import FEATURES, random_decoded, random_decoder, random_images, tiny_sensor
 
 
 def repeated(decoded: Decoded, times: int) -> Decoded:
@@ -304,38 +266,6 @@ def test_a_seed_gives_the_same_bits_whatever_its_batch() -> None:
     assert torch.equal(together.range_m[4], apart[0].range_m[0])
     assert torch.equal(together.range_m[2], apart[1].range_m[0])
     assert torch.equal(together.return_mask, together.range_m > 0)
-
-
-@torch.no_grad()
-def test_training_learns_the_noise_of_masks_and_sampling_follows_it() -> None:
-    sensor = tiny_sensor(16, 32)
-    decoder, decoded = random_decoder(sensor, 4, spread=0.02), random_decoded(sensor, 8)
-    images = random_images(sensor, 8)
-    rows_alike = images.return_mask[:, ::4].repeat_interleave(4, 1)  # so that drops are as high as four rows
-    images = RangeImage.masked(images.range_m + 1, rows_alike, sensor)
-
-    def sample(correlation: float) -> RangeImage:
-        rngs = [torch.Generator().manual_seed(seed) for seed in range(8)]
-        return decoder.sample(decoded, rngs, PixelSampling(mask_correlation=correlation))
-
-    before = sample(2.0)
-    decoder.estimate(decoded, images, torch.Generator().manual_seed(0))
-    assert not decoder.mask.noise.sums.any()
-    assert torch.equal(sample(0.0).return_mask, before.return_mask)
-    for step in range(20):
-        decoder.train().estimate(decoded, images, torch.Generator().manual_seed(step))
-    decoder.eval()
-    assert decoder.mask.noise.correlations()[-3, 0] > 0.3
-    assert torch.equal(sample(0.0).return_mask, before.return_mask)
-    assert not torch.equal(sample(2.0).return_mask, before.return_mask)
-    copied = random_decoder(sensor, 4)
-    copied.load_state_dict(decoder.state_dict())
-    assert torch.equal(copied.mask.noise.sums, decoder.mask.noise.sums)
-
-
-def test_a_negative_correlation_of_masks_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"mask_correlation=-1\.0"):
-        PixelSampling(mask_correlation=-1.0)
 
 
 @torch.no_grad()

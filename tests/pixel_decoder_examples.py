@@ -1,0 +1,51 @@
+"""Small sensors, and pixel decoders with what goes into them, none of whose numbers are trained."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from lidargrit.nn.pixel_decoder import PixelDecoder
+from lidargrit.nn.pixel_networks import PixelDecoderConfig
+from lidargrit.sensors import SensorModel
+from lidargrit.structures import Decoded, RangeImage
+
+FEATURES = 5
+
+
+def tiny_sensor(rows: int, columns: int) -> SensorModel:
+    elevation_rad = torch.linspace(0.05, -0.35, rows)[:, None]
+    azimuth_rad = math.pi - 2 * math.pi * (torch.arange(columns) + 0.5)[None] / columns
+    return SensorModel("tiny", elevation_rad, azimuth_rad, 1.0, 80.0, "spherical")
+
+
+def random_decoder(
+    sensor: SensorModel, cell: int, spread: float = 0.3, halvings: tuple[int, int] = (0, 0), features: int = FEATURES
+) -> PixelDecoder:
+    """Return a decoder none of whose weights are zero, so that everything depends on everything it may."""
+    torch.manual_seed(0)
+    config = PixelDecoderConfig(
+        cell, *halvings, mask_features=3, range_features=3, mask_width=6, range_width=6, blocks=1
+    )
+    decoder = PixelDecoder(config, sensor, features)
+    for weight in decoder.parameters():
+        weight.data = spread * torch.randn_like(weight)
+    return decoder.eval()
+
+
+def random_decoded(sensor: SensorModel, batch: int, seed: int = 1) -> Decoded:
+    rng = torch.Generator().manual_seed(seed)
+    size = (batch, sensor.height, sensor.width)
+    return Decoded(
+        2 + 40 * torch.rand(size, generator=rng),
+        torch.randn(size, generator=rng),
+        sensor,
+        features=torch.randn((batch, FEATURES, *size[1:]), generator=rng),
+    )
+
+
+def random_images(sensor: SensorModel, batch: int, seed: int = 2) -> RangeImage:
+    rng = torch.Generator().manual_seed(seed)
+    size = (batch, sensor.height, sensor.width)
+    return RangeImage.masked(1 + 70 * torch.rand(size, generator=rng), torch.rand(size, generator=rng) < 0.7, sensor)
