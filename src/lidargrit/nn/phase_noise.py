@@ -72,7 +72,7 @@ class PhaseNoise(nn.Module):
         """Return the correlation of a pixel's normal number with that of the next of its phase, down and along."""
         sums = self.sums.double().cpu()
         low, high = torch.zeros(sums.shape[:2], dtype=sums.dtype), torch.full(sums.shape[:2], 0.99, dtype=sums.dtype)
-        for _ in range(30):  # the series grows with the correlation
+        for _ in range(20):  # the series grows with the correlation
             middle = (low + high) / 2
             powers = torch.stack([middle**term for term in range(1, 1 + _TERMS)], -1)
             below = (sums[..., 1:] * powers).sum(-1) + _PRIOR * middle < sums[..., 0]
