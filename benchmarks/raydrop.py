@@ -15,6 +15,7 @@ the true scan, beside that of one number for all returns or for each class, whic
 from __future__ import annotations
 
 import argparse
+import copy
 
 import torch
 
@@ -54,6 +55,9 @@ def main() -> None:
     surfaces, others = RangeImage.stack(clean[: options.count]), RangeImage.stack(true[options.count :])
     measured = RangeImage.stack(true[: options.count])
     dropped = model.complete(Condition.of_surfaces(surfaces), range(options.count))
+    independent = copy.deepcopy(model)
+    assert independent.raydrop is not None
+    independent.raydrop.mask.noise.sums.zero_()
     with torch.no_grad():
         every = [surfaces[index : index + 1] for index in range(options.count)]
         logits = torch.cat([model.raydrop(one.range_m, one.return_mask, one.label).logits for one in every])
@@ -62,6 +66,9 @@ def main() -> None:
         "true scans of the same streets": measured,
         "the simulator, sampled again": RangeImage.stack(redrawn[: options.count]),
         "model": dropped,
+        "model, pixels of a phase independent": independent.complete(
+            Condition.of_surfaces(surfaces), range(options.count)
+        ),
         "its probabilities, pixel by pixel": RangeImage.masked(surfaces.range_m, alone, model.sensor),
         "Bernoulli": drop_independently(surfaces, float(measured.return_mask.float().mean())),
     }

@@ -24,7 +24,7 @@ HEIGHT, WIDTH = 32, 128
 def of_phase(noise: PhaseNoise, phase: Phase, logit: float, scans: int, seed: int = 0) -> Tensor:
     """Return masks of one phase that are sampled with one probability everywhere, by the noise."""
     rng = torch.Generator().manual_seed(seed)
-    uniform = torch.stack([noise(torch.rand(HEIGHT, WIDTH, generator=rng), rng) for _ in range(scans)])
+    uniform = torch.stack([noise(torch.rand(HEIGHT, WIDTH, generator=rng), rng, noise.shares()) for _ in range(scans)])
     return (uniform < torch.tensor(logit).sigmoid())[(..., *phase.pixels)]
 
 
@@ -43,8 +43,10 @@ def test_nothing_learned_leaves_the_numbers_as_they_are() -> None:
     uniform = torch.rand(HEIGHT, WIDTH)
     rng = torch.Generator().manual_seed(0)
     before = rng.get_state()
-    assert PhaseNoise(PHASES)(uniform, rng) is uniform
-    assert with_shares(PHASES[-1], 0.5, 0.1)(uniform, rng, strength=0.0) is uniform
+    nothing = PhaseNoise(PHASES)
+    assert nothing(uniform, rng, nothing.shares()) is uniform
+    learned = with_shares(PHASES[-1], 0.5, 0.1)
+    assert learned(uniform, rng, learned.shares(strength=0.0)) is uniform
     assert torch.equal(rng.get_state(), before)
 
 
@@ -52,7 +54,7 @@ def test_numbers_stay_uniform_and_are_correlated_within_their_phase_alone() -> N
     phase = PHASES[4]
     noise = with_shares(phase, 0.5, 0.2)
     rng = torch.Generator().manual_seed(1)
-    numbers = torch.stack([noise(torch.rand(HEIGHT, WIDTH, generator=rng), rng) for _ in range(100)])
+    numbers = torch.stack([noise(torch.rand(HEIGHT, WIDTH, generator=rng), rng, noise.shares()) for _ in range(100)])
     normal = torch.special.ndtri(numbers.double())
     own = normal[(..., *phase.pixels)]
     assert own.mean() == pytest.approx(0, abs=0.02)
@@ -116,7 +118,32 @@ def test_pixels_with_infinite_logits_are_left_out() -> None:
 def test_too_large_shares_keep_a_part_of_each_pixels_own() -> None:
     noise = with_shares(PHASES[-1], 0.8, 0.8)
     assert noise.shares()[-1].sum() == pytest.approx(0.9)
-    assert noise(torch.rand(HEIGHT, WIDTH), torch.Generator().manual_seed(0), strength=50.0).isfinite().all()
+    numbers = noise(torch.rand(HEIGHT, WIDTH), torch.Generator().manual_seed(0), noise.shares(strength=50.0))
+    assert numbers.isfinite().all()
+
+
+def test_one_column_is_not_its_own_neighbour() -> None:
+    noise, rng = PhaseNoise(PHASES), torch.Generator().manual_seed(3)
+    noise.learn(PHASES[-1:], torch.zeros(1, 2000, 4, 1), torch.rand(1, 2000, 4, 1, generator=rng) < 0.5)
+    assert noise.shares()[-1, 1] == pytest.approx(0, abs=1e-5)
+
+
+def test_only_phases_that_were_taken_forget() -> None:
+    noise, rng = PhaseNoise(PHASES), torch.Generator().manual_seed(4)
+    scans, taken = 200, PHASES[-1:]
+
+    def learn() -> Tensor:
+        noise.learn(taken, torch.zeros(1, scans, 4, 8), torch.rand(1, scans, 4, 8, generator=rng) < 0.5)
+        return noise.sums.clone()
+
+    noise.sums.fill_(1.0)
+    before = noise.sums.clone()
+    after = learn()
+    assert torch.equal(after[:-1], before[:-1])
+    fresh = PhaseNoise(PHASES)
+    rng.manual_seed(4)
+    fresh.learn(taken, torch.zeros(1, scans, 4, 8), torch.rand(1, scans, 4, 8, generator=rng) < 0.5)
+    assert torch.allclose(after[-1], 0.5 + fresh.sums[-1], atol=1e-4)  # half of it after as many scans as 200
 
 
 @torch.no_grad()

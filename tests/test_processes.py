@@ -17,6 +17,8 @@ from lidargrit.files import read_tensors
 from lidargrit.generators.multiscale import Multiscale
 from lidargrit.loading import DataConfig
 from lidargrit.nn.objective import Objective
+from lidargrit.nn.phase_noise import PhaseNoise
+from lidargrit.nn.pixel_phases import phases_of
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import load_sensor
@@ -46,7 +48,7 @@ import contextlib, io, os, sys
 from pathlib import Path
 import torch
 from lidargrit.cli import main
-from test_processes import learn_pixels, play, steps_with_a_bad_process
+from test_processes import learn_noise, learn_pixels, play, steps_with_a_bad_process
 
 folder, words = Path(sys.argv[1]), sys.argv[2:]
 assert main(words) == 0
@@ -54,6 +56,7 @@ weights, rank = play()
 torch.save(weights, folder / f"game{rank}.pt")
 assert steps_with_a_bad_process() == [False, False]
 assert learn_pixels()
+torch.save(learn_noise(rank), folder / f"noise{rank}.pt")
 assert main([*words, "training.tokenizer.learning_rate=1"]) == 2  # all are told what the first found
 if rank == 1:
     os._exit(0)  # dies in the middle of the work, as far as the other can see
@@ -131,6 +134,14 @@ def learn_pixels():
     return len(moved) > len(before) / 2
 
 
+def learn_noise(rank: int) -> torch.Tensor:
+    """Return the sums of a mask's noise, of whose last phases each process learns another."""
+    phases = phases_of(2)
+    noise = PhaseNoise(phases)
+    noise.learn(phases[-1 - rank :][:1], torch.zeros(1, 2, 4, 8), torch.ones(1, 2, 4, 8, dtype=torch.bool))
+    return noise.sums
+
+
 def losses(folder: Path, stage: str, name: str) -> list[float]:
     lines = [json.loads(line) for line in (folder / stage / "log.jsonl").read_text().splitlines()]
     return [line[name] for line in lines if line["split"] == "val"]
@@ -176,6 +187,8 @@ def test_two_processes_learn_what_one_does(tmp_path):
     assert torch.allclose(one["objective.quantize.usage"], two["objective.quantize.usage"], rtol=0.02, atol=0.5)
     alone, _ = play()
     for rank in range(2):
+        noise = torch.load(tmp_path / f"noise{rank}.pt", weights_only=True)
+        assert torch.equal(noise, learn_noise(0) + learn_noise(1)), "each process learns from both"
         together = torch.load(tmp_path / f"game{rank}.pt", weights_only=True)
         assert all(torch.allclose(alone[name], together[name], atol=1e-5) for name in alone)
 

@@ -141,11 +141,11 @@ def test_a_computed_message_that_is_too_large_is_refused(tmp_path):
         read_scan(path)
 
 
+@pytest.mark.parametrize("recording", [".db3"], indirect=True)
 def test_a_stored_message_that_is_too_large_is_refused(recording, monkeypatch):
-    if recording.suffix == ".db3":
-        monkeypatch.setattr(ros_bag, "BYTES_AT_MOST", 1000)
-        with pytest.raises(ScanError, match="too big"):
-            read_scan(recording)
+    monkeypatch.setattr(ros_bag, "BYTES_AT_MOST", 1000)
+    with pytest.raises(ScanError, match="too big"):
+        read_scan(recording)
 
 
 PACK = {

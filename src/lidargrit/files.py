@@ -331,13 +331,22 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         ) from None
 
 
-def load_exactly(module: nn.Module, weights: dict[str, Tensor], source: Path) -> None:
+def load_exactly(
+    module: nn.Module, weights: dict[str, Tensor], source: Path, may_lack: frozenset[str] = frozenset()
+) -> None:
     """Load weights into a module of the very same layout.
+
+    Args:
+        module: module that gets the weights.
+        weights: weights by their names.
+        source: file that they were read from.
+        may_lack: names that files of earlier versions lack; the module's own values stay.
 
     Raises:
         CheckpointError: a name or a size differs; names the first.
     """
     wanted = module.state_dict()
+    weights = {**{name: wanted[name] for name in may_lack}, **weights}
     cure = "load them with the configuration that they were trained with"
     for name in sorted(wanted.keys() | weights.keys()):
         if name not in weights or name not in wanted:

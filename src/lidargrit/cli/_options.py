@@ -83,9 +83,10 @@ def add_device(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--device", default="", help=device)
 
 
-def add_completion(parser: argparse.ArgumentParser, model: str) -> None:
+def add_completion(parser: argparse.ArgumentParser, model: str, points_only: bool = False) -> None:
     """Add the options of all verbs that complete scans: source, folder, ``model``, number and kind of files."""
-    scans = "scans: a file, a folder, NAME:ROOT:SPLIT, samples, prepared scans, or range images as .npy"
+    images = ", samples, prepared scans, or range images as .npy"
+    scans = f"scans: a file, a folder, NAME:ROOT:SPLIT{' of points' if points_only else images}"
     parser.add_argument("scans", help=scans)
     parser.add_argument("out", type=Path, help="folder for the files: empty, or begun by the same command")
     parser.add_argument("--model", default="pretrained", help=model)

@@ -20,11 +20,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
     parser.add_argument("real", metavar="REAL", help="source of real scans")
     parser.add_argument("-n", "--count", type=int, default=32, help="number of simulated scans, and the most real ones")
-    parser.add_argument(
-        "--fine",
-        action="store_true",
-        help="compare every column that the sensor fires, not only those that the data set keeps",
-    )
+    fine = "compare every column that the sensor fires, not only those that the data set keeps"
+    parser.add_argument("--fine", action="store_true", help=fine)
     drops = "run that drops returns of clean scans; its drops are compared, too"
     parser.add_argument("--model", default="", metavar="RUN", help=drops)
     parser.add_argument("--seed", type=seed_number, default=0, help="seed of the first simulated scan")
@@ -38,12 +35,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Simulate, compare, print a table and plot the curves."""
+    from lidargrit.errors import ConfigError
     from lidargrit.evaluation.raydrop import raydrop_json, raydrop_table, scores_of_model
     from lidargrit.evaluation.realism import as_json, as_table, compare, scans_of_both
     from lidargrit.files import refuse_to_overwrite
     from lidargrit.reporting import TerminalReporter
     from lidargrit.viewer.curves import plot_curves
 
+    if options.device and not options.model:
+        raise ConfigError(f"--device {options.device} without --model", "a run that computes", "leave --device out")
     refuse_to_overwrite(options.out, options.overwrite, ".png")
     refuse_taken(options)
     settings = scan_settings(options)

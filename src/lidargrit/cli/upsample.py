@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(goes_on=True)
     parser.add_argument("--sensor", default="", help="sensor that made the scans (default: that of the source)")
     parser.add_argument("--to", default="", help="sensor of the dense scans (default: that of the run)")
-    add_completion(parser, "run that adds the rows, or nearest, linear or triangulation")
+    add_completion(parser, "run that adds the rows, or nearest, linear or triangulation", points_only=True)
     add_bad_scans(parser)
 
 

@@ -20,7 +20,7 @@ from lidargrit.configuration import name_and_settings, override
 from lidargrit.errors import CheckpointError, ConfigError
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair, open_pair
 from lidargrit.evaluation.likelihood import bits_per_return
-from lidargrit.evaluation.pairs import EvalPair, EvalSet
+from lidargrit.evaluation.pairs import EvalPair, EvalSet, require_same_rays
 from lidargrit.evaluation.protocols import public_name
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.evaluation.tables import Format, TableBlock, render, side_by_side
@@ -86,14 +86,19 @@ class Benchmark:
         """Return the settings of the evaluation, of as many scans as samples."""
         return replace(self.settings, max_scans=self.num_samples)
 
-    def recipe(self, name: str) -> Recipe:
+    def recipe(self, name: str, check: bool = True) -> Recipe:
         """Return a recipe with the settings and the budget that all systems get.
+
+        Args:
+            name: name of the recipe.
+            check: whether it is still to be trained, so that its stages have to follow the settings.
 
         Raises:
             ConfigError: a setting that the recipe does not take, or that one of its stages cannot follow.
         """
         recipe = load_recipe(name, self.recipe_settings)
-        check_stages(recipe)
+        if check:
+            check_stages(recipe)
         return with_budget(recipe, self.flops) if self.flops else recipe
 
 
@@ -154,11 +159,12 @@ def run(
 
 
 def _check_reference(reference: Source, plans: Sequence[_Plan], benchmark: Benchmark, reporter: Reporter) -> None:
-    """Project the reference for every sensor before anything is trained: what cannot be used is refused now."""
+    """Project the reference for every sensor, and refuse one of other rays, before anything is trained."""
     config = benchmark.evaluation().data_config()
-    distinct = {json.dumps(sensor.to_json()): sensor for sensor in (plan.sensor() for plan in plans)}
-    for sensor in distinct.values():
-        reference.images(sensor, config, reporter)
+    for sensor in {json.dumps(plan.sensor.to_json()): plan.sensor for plan in plans}.values():
+        images = reference.images(sensor, config, reporter)
+        require_same_rays(sensor, images.sensor)
+        images.batch([0])  # the size of a file is known once it is read
 
 
 def _warn_of_bounds(plans: Sequence[_Plan], reference: Source, reporter: Reporter) -> None:
@@ -282,29 +288,27 @@ class _Plan:
         run: folder of a finished run, or of the one that the recipe gets.
         recipe: recipe that is trained; None for a finished run.
         sampling: settings of the generator's own ``Sampling``.
+        sensor: sensor of the system's samples.
     """
 
     system: str
     run: Path
     recipe: Recipe | None
     sampling: object
+    sensor: SensorModel
 
     @classmethod
     def of(cls, system: str, folder: Path, benchmark: Benchmark) -> _Plan:
         name, settings = name_and_settings(system)
-        run = locate(name)
-        recipe = None if is_run(run) else benchmark.recipe(name)
-        cls_of = type(load(name)) if recipe is None else load_class(recipe.generator)
+        run, trained = locate(name), folder / "runs" / name
         owner, cure = f"sampling from {name!r}", "see all with: lidargrit list generators"
-        sampling = override(cls_of.Sampling(), settings, owner, cure)
-        if recipe is None:
-            return cls(system, run, None, sampling)
-        check_folder(folder / "runs" / name, recipe)
-        return cls(system, folder / "runs" / name, recipe, sampling)
-
-    def sensor(self) -> SensorModel:
-        """Return the sensor of the system's samples."""
-        return load(self.run).sensor if self.recipe is None else self.recipe.data.load_sensor()
+        if is_run(run):
+            generator = load(run)
+            return cls(system, run, None, override(generator.Sampling(), settings, owner, cure), generator.sensor)
+        recipe = benchmark.recipe(name, check=not is_run(trained))
+        sampling = override(load_class(recipe.generator).Sampling(), settings, owner, cure)
+        check_folder(trained, recipe)
+        return cls(system, trained, recipe, sampling, recipe.data.load_sensor())
 
 
 def _sample(

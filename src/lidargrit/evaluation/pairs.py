@@ -148,7 +148,7 @@ def pair_for_protocol(
     if isinstance(samples, DatasetSource) and second.images.sensor.projection != first.images.sensor.projection:
         config = replace(config, projection_variant=second.projection_variant)
         first = _Opened.of(samples, second.images.sensor, config, reporter)
-    _require_same_rays(first.images, second.images)
+    require_same_rays(first.images.sensor, second.images.sensor)
     count = min(len(first.images), len(second.images), config.max_scans or len(first.images))
     pair = EvalPair(first.as_set(count, protocol.range_m), second.as_set(count, protocol.range_m))
     warnings = (*_warnings(pair, overlap(samples, first.images, second.images)), *first.doubts, *second.doubts)
@@ -224,11 +224,11 @@ def _warnings(pair: EvalPair, shared: str) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _require_same_rays(generated: RangeImages, reference: RangeImages) -> None:
+def require_same_rays(generated: SensorModel, reference: SensorModel) -> None:
     """Refuse two sets that look along different rays, with ConfigError."""
-    if not generated.sensor.same_rays(reference.sensor):
+    if not generated.same_rays(reference):
         raise ConfigError(
-            f"range images of {generated.sensor.name!r} ({generated.sensor.height}x{generated.sensor.width})",
-            f"the rays of {reference.sensor.name!r} ({reference.sensor.height}x{reference.sensor.width})",
+            f"range images of {generated.name!r} ({generated.height}x{generated.width})",
+            f"the rays of {reference.name!r} ({reference.height}x{reference.width})",
             "project the scans with the samples' sensor: give the samples first, the scans second",
         )

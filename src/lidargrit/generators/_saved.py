@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from lidargrit import configuration
 from lidargrit.errors import ConfigError
 from lidargrit.files import load_exactly, write_json, write_tensors, write_text
+from lidargrit.nn.phase_noise import PhaseNoise
 from lidargrit.run_folder import CARD_FILE, CONFIG_FILE, WEIGHTS_FILE
 from lidargrit.sensors import SensorModel
 
@@ -73,7 +74,7 @@ class SavedModel(nn.Module, Generic[ConfigT]):
             CheckpointError: weights of another configuration.
         """
         generator = cls(config, sensor)
-        load_exactly(generator, weights, source)
+        load_exactly(generator, weights, source, PhaseNoise.names_in(generator))
         return generator.eval()
 
     def save_pretrained(self, folder: str | Path, card: str = "", half: bool = False) -> None:

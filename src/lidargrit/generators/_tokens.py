@@ -133,7 +133,7 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
             wanted: number of scans to return; the rest are the copies of ``BatchSeeds``.
             rngs: random generators on the CPU, one for each scan.
             mask: method by which returns and ranges are decided.
-            pixels: settings by which the pixel decoder samples ranges.
+            pixels: settings by which the pixel decoder samples masks and ranges.
             tokenizer: the generator's own tokenizer, or its copy for decoding only.
             condition: observed part of the scans, which a pixel decoder keeps.
 

@@ -67,11 +67,11 @@ class TokenSampling:
             return that is at least as likely as not (the paper's eq. 1). ``auto`` is ``pixels`` where there is a pixel
             decoder, and ``bernoulli`` elsewhere.
         range_temperature: divisor of the logarithms of the pixel decoder's weights of surfaces; below 1 the likelier
-            surface is preferred. Only scans sampled with 1, and a noise of 1, follow the distribution whose likelihood
-            the model gives.
+            surface is preferred. Only scans sampled with 1, a noise of 1 and a correlation of 0 follow the distribution
+            whose likelihood the model gives.
         range_noise: multiplier of the pixel decoder's spread of ranges about a surface.
-        mask_correlation: multiplier of how much of their noise close pixels of a mask share that are sampled at once; 0
-            samples them independently, which is the distribution whose likelihood the model gives.
+        mask_correlation: multiplier of how much of their noise close pixels of the pixel decoder's mask share that are
+            sampled at once; 0 samples them independently. The networks for completion and raydrop always take 1.
         completion: method by which scans are completed. ``network`` takes the network that was trained for what was
             observed: the one for completion where pixels were, the one for raydrop where all surfaces were. ``tokens``
             samples the tokens without any observed pixel, and then all pixels that were not observed. ``auto`` is

@@ -51,8 +51,8 @@ class MaskedSampling:
         range_temperature: divisor of the logarithms of the pixel decoder's weights of surfaces; below 1 it prefers the
             likelier surface.
         range_noise: multiplier of the pixel decoder's spread of ranges about a surface.
-        mask_correlation: multiplier of how much of their noise close pixels of a mask share that are sampled at once; 0
-            samples them independently.
+        mask_correlation: multiplier of how much of their noise close pixels of the pixel decoder's mask share that are
+            sampled at once; 0 samples them independently.
         weights: number type of the transformer's products. ``fp32`` is exact; ``bf16`` computes them in 16 bits, as
             training does where that is quicker; ``auto`` is ``bf16`` where the machine has instructions for it.
         decoder: number type of the tokenizer's decoder and of the pixel decoder, with the same choices.

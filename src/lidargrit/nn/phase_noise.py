@@ -15,7 +15,7 @@ from lidargrit.nn.processes import sum_over_processes
 
 _REACH = 0.6  # correlation of a shared part between a pixel and the next of its phase
 _TERMS = 4  # of the series, whose error is below 2 % up to a correlation of 0.5
-_FORGET = 0.995  # what a step leaves of the sums before it
+_HALF_LIFE_SCANS = 200  # of the sums of a phase, in scans of which it was taken
 _PRIOR = 10.0  # as if about a hundred uncertain pairs had been seen without any correlation
 _MOST = 0.9  # of the noise that is shared; the rest decides each pixel alone
 _LEAST = 1e-6  # of a probability, so that its quantile is finite
@@ -39,8 +39,14 @@ class PhaseNoise(nn.Module):
 
     sums: Tensor
 
+    @classmethod
+    def names_in(cls, module: nn.Module) -> frozenset[str]:
+        """Return the names of all sums in a module; weights that lack them were trained with independent pixels."""
+        return frozenset(f"{name}.sums" for name, each in module.named_modules() if isinstance(each, cls))
+
     def __init__(self, phases: Sequence[Phase]) -> None:
         super().__init__()
+        self.phases = tuple(phases)
         self._index = {phase: index for index, phase in enumerate(phases)}
         # For each phase and direction (down, along the row): residuals' products, then the series' coefficients.
         self.register_buffer("sums", torch.zeros(len(phases), 2, 1 + _TERMS))
@@ -58,15 +64,15 @@ class PhaseNoise(nn.Module):
         """
         seen = torch.zeros_like(self.sums)
         for phase, of_phase, truth in zip(phases, logits.detach().double(), returned, strict=True):
-            residual, terms = _hermite_terms(of_phase, truth)
-            for direction, (one, other) in enumerate(((slice(None, -1), slice(1, None)), (None, None))):
-                found = []
-                for factor in (residual, *terms):
-                    beside = factor.roll(-1, -1) if other is None else factor[:, other]
-                    found.append(((factor if one is None else factor[:, one]) * beside).sum())
-                seen[self._index[phase], direction] = torch.stack(found).to(seen)
-        visited = [self._index[phase] for phase in phases]
-        self.sums[visited] = _FORGET * self.sums[visited] + sum_over_processes(seen)[visited]
+            factors = _hermite_factors(of_phase, truth)
+            pairs = [(factors[..., :-1, :], factors[..., 1:, :])]
+            if factors.shape[-1] > 1:  # one column alone would be its own neighbour
+                pairs.append((factors, factors.roll(-1, -1)))
+            for direction, (one, other) in enumerate(pairs):
+                seen[self._index[phase], direction] = (one * other).sum((1, 2, 3)).to(seen)
+        seen = sum_over_processes(seen)  # which may each have taken other phases
+        kept = 0.5 ** ((seen[:, :, 1] > 0) * (logits.shape[1] / _HALF_LIFE_SCANS))
+        self.sums.mul_(kept[:, :, None]).add_(seen)
 
     def correlations(self) -> Float64[Tensor, "phases 2"]:
         """Return the correlation of a pixel's normal number with that of the next of its phase, down and along."""
@@ -88,19 +94,21 @@ class PhaseNoise(nn.Module):
         shares = strength * self.correlations() / _REACH
         return shares * (_MOST / shares.sum(-1, keepdim=True).clamp(min=_MOST))
 
-    def forward(self, uniform: Float[Tensor, "H W"], rng: torch.Generator, strength: float = 1.0) -> Tensor:
+    def forward(
+        self, uniform: Float[Tensor, "H W"], rng: torch.Generator, shares: Float64[Tensor, "phases 2"]
+    ) -> Float[Tensor, "H W"]:
         """Return uniform numbers in [0, 1) of the same image, correlated within each phase and not between phases.
 
         Args:
             uniform: independent random numbers in [0, 1).
             rng: source of the shared parts, on the CPU.
-            strength: multiplier of the shares; 0 leaves the numbers as they are.
+            shares: shares of every phase; if all are 0 the numbers stay as they are.
         """
-        if strength == 0 or not bool(self.sums.any()):
+        if not bool(shares.any()):
             return uniform
         shared = torch.randn((2, *uniform.shape), generator=rng, dtype=torch.float64)
         normal = torch.special.ndtri(uniform.double().clamp(_LEAST, 1 - _LEAST))
-        for phase, (down, along) in zip(self._index, self.shares(strength).tolist(), strict=True):
+        for phase, (down, along) in zip(self.phases, shares.tolist(), strict=True):
             own, rows, columns = normal[phase.pixels], shared[0][phase.pixels], shared[1][phase.pixels]
             height, width = own.shape
             mixed = math.sqrt(1 - down - along) * own
@@ -109,8 +117,8 @@ class PhaseNoise(nn.Module):
         return torch.special.ndtr(normal).to(uniform.dtype).clamp(max=1 - torch.finfo(uniform.dtype).eps)
 
 
-def _hermite_terms(logits: Float64[Tensor, "B h w"], returned: Bool[Tensor, "B h w"]) -> tuple[Tensor, list[Tensor]]:
-    """Return the residuals, and one factor of each term of the covariance of two of them, which are 0 if left out.
+def _hermite_factors(logits: Float64[Tensor, "B h w"], returned: Bool[Tensor, "B h w"]) -> Float64[Tensor, "F B h w"]:
+    """Return the residuals, and one factor of each term of the covariance of two of them; 0 for pixels left out.
 
     For thresholds s and t of two normal numbers of correlation r it is the sum over k of r^k / k! times the product of
     the factors He_{k-1}(s) phi(s) and He_{k-1}(t) phi(t), with Hermite's polynomials He and the normal density phi.
@@ -123,9 +131,8 @@ def _hermite_terms(logits: Float64[Tensor, "B h w"], returned: Bool[Tensor, "B h
     polynomials = [torch.ones_like(threshold), threshold]
     for degree in range(1, _TERMS - 1):
         polynomials.append(threshold * polynomials[-1] - degree * polynomials[-2])
-    return residual, [
-        polynomial * density / math.sqrt(math.factorial(term)) for term, polynomial in enumerate(polynomials, start=1)
-    ]
+    terms = [each * density / math.sqrt(math.factorial(term)) for term, each in enumerate(polynomials, start=1)]
+    return torch.stack([residual, *terms])
 
 
 @lru_cache(maxsize=64)

@@ -57,7 +57,7 @@ class PixelSampling:
             raise ConfigError(
                 f"range_temperature={self.range_temperature}, range_noise={self.range_noise}",
                 "positive numbers",
-                "take 1 for both to sample from the model's own distribution",
+                "take 1 for both, and mask_correlation=0, to sample from the model's own distribution",
             )
         if not 0 <= self.mask_correlation < math.inf:
             raise ConfigError(
@@ -215,15 +215,16 @@ class PixelDecoder(nn.Module):
         Args:
             decoded: output of the tokenizer's decoder for as many scans; None without a tokenizer.
             rngs: random generators on the CPU, one for each scan.
-            sampling: settings of the sampling of ranges.
+            sampling: settings of the sampling of masks and ranges.
             condition: observed part of the scans; nothing if not given. Observed returns and ranges are kept as they
                 are when their phase comes: later phases know of them, earlier ones do not.
         """
         guide, size = self.guide(decoded, len(rngs)), (3, self.sensor.height, self.sensor.width)
         choices = sampling or PixelSampling()
         uniform = torch.stack([torch.rand(size, generator=rng) for rng in rngs])
+        shares = self.mask.noise.shares(choices.mask_correlation)
         for numbers, rng in zip(uniform, rngs, strict=True):
-            numbers[0] = self.mask.noise(numbers[0], rng, choices.mask_correlation)
+            numbers[0] = self.mask.noise(numbers[0], rng, shares)
         uniform = uniform.to(guide.v.device)
         condition = (condition or Condition.nothing(self.sensor, len(rngs))).to(guide.v.device)
         # One scan after the other on a CPU: with other batch sizes its sums have other rounding errors.

@@ -233,7 +233,7 @@ class MaskNetwork(PhaseNetwork):
     def uniform(self, rng: torch.Generator) -> Float[Tensor, "1 H W"]:
         """Return random numbers for one scan's mask, correlated as learned, on the device of the network."""
         size = (self.sensor.height, self.sensor.width)
-        return self.noise(torch.rand(size, generator=rng), rng)[None].to(self.row_bias.device)
+        return self.noise(torch.rand(size, generator=rng), rng, self.noise.shares())[None].to(self.row_bias.device)
 
     def sample(self, guide: Guide, uniform: Float[Tensor, "B H W"], condition: Condition) -> Bool[Tensor, "B H W"]:
         """Return the mask, sampled phase by phase around its observed pixels.

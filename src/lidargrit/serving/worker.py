@@ -56,9 +56,10 @@ def run_worker(runs: Sequence[Path], device: str) -> None:
     except LidarGritError as error:
         _send(write_line, {"refused": [type(error).__name__, error.got, error.wanted, error.cure]})
         return
-    except RuntimeError as error:  # torch's way to say that memory is full
-        got = f"models that the device has no room for ({_first_line(error)})"
-        _send(write_line, {"refused": ["ConfigError", got, "fewer or smaller ones", "name fewer, or add --device cpu"]})
+    except RuntimeError as error:  # most of all where a GPU has no room for them
+        got = f"models that cannot be loaded on the device ({_first_line(error)})"
+        cure = "name fewer models, or another --device"
+        _send(write_line, {"refused": ["ConfigError", got, "a device with room for all of them", cure]})
         return
     models = [describe_model(run.resolve().name, model) for run, model in zip(runs, generators, strict=True)]
     _send(write_line, {"models": models})

@@ -153,7 +153,8 @@ def plan_training(recipe: Recipe) -> TrainingPlan:
     for name, objective in checked.objectives.items():
         parameters = sum(weight.numel() for weight in objective.parameters())
         if name in checked.donors:
-            stages.append(StagePlan(name, parameters, 0, 0, 0, 0, "fp32", checked.donors[name]))
+            precision = recipe.training[name].precision if name in recipe.training else "fp32"
+            stages.append(StagePlan(name, parameters, 0, 0, 0, 0, precision, checked.donors[name]))
             continue
         budget = recipe.settings_of(name)
         size = (parameters, budget.scans, budget.batch_size, memory_of_weights(objective))

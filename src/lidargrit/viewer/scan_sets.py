@@ -79,8 +79,8 @@ def load_scan_sets(
     settings, reporter = settings or ScanSettings(), reporter or Reporter()
     config = settings.data
     opened = [open_source(source, config.bad_points) for source in sources]
-    runs = [source for source in opened if isinstance(source, RunSource)]
-    generators = {source.text: source.generator.to(usable_device(device)) for source in runs}
+    runs, chosen = [source for source in opened if isinstance(source, RunSource)], usable_device(device)
+    generators = {source.text: source.generator.to(chosen) for source in runs}
     of_runs = (generator.sensor for generator in generators.values())
     sensor = settings.load_sensor() or sensor or next(of_runs, None)
     if sensor is None:

@@ -1,0 +1,68 @@
+"""Learn how much noise the pixels of a finished run's masks share: all other weights stay → a run's folder, a table.
+
+    python benchmarks/phase_noise.py pretrained shared --scans simulated:400:train
+    python benchmarks/phase_noise.py runs/mine shared --stage raydrop --scans simulated_surfaces:400:train
+
+Runs that were trained before masks shared noise get it in this way; others learn it while they train.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+from pathlib import Path
+
+import torch
+
+from lidargrit.files import read_tensors
+from lidargrit.generators import load
+from lidargrit.generators.lidargrit import LidarGrit
+from lidargrit.nn.phase_noise import PhaseNoise
+from lidargrit.nn.pixel_networks import MaskNetwork
+from lidargrit.run_folder import RUN_FILE, TRAINED_ON_FILE, WEIGHTS_FILE, locate
+from lidargrit.sources import open_images
+
+_AT_ONCE = 4
+
+
+@torch.no_grad()
+def main() -> None:
+    """Take scans through the stage's objective as training does, keep what its noise learned, and print the shares."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", help="finished run of lidargrit with the stage")
+    parser.add_argument("out", type=Path, help="folder for the weights with the shares: one that is not there yet")
+    parser.add_argument("--stage", choices=["pixels", "raydrop", "completion"], default="pixels")
+    parser.add_argument(
+        "--scans", default="simulated:400:train", help="source of training scans (default: %(default)s)"
+    )
+    options = parser.parse_args()
+    model = load(options.run)
+    if not isinstance(model, LidarGrit) or options.stage not in model.stages:
+        parser.error(f"{options.run} has no stage {options.stage}")
+    images = open_images(options.scans, sensor=model.sensor)
+    objective = model.objective(options.stage).train()
+    noise = next(module for module in objective.modules() if isinstance(module, MaskNetwork)).noise
+    noise.sums.zero_()
+    rng = torch.Generator().manual_seed(0)
+    for first in range(0, len(images), _AT_ONCE):
+        objective(images.batch(range(first, min(first + _AT_ONCE, len(images)))), rng)
+    _print_shares(noise)
+    model.load_stage(options.stage, objective)
+    folder = locate(options.run)
+    options.out.mkdir(parents=True)
+    for name in (RUN_FILE, TRAINED_ON_FILE):
+        if (folder / name).is_file():
+            shutil.copy(folder / name, options.out)
+    half = any(weight.dtype == torch.float16 for weight in read_tensors(folder / WEIGHTS_FILE)[0].values())
+    model.eval().save(options.out, half)
+    print(f"done: the run with these shares is in {options.out}")
+
+
+def _print_shares(noise: PhaseNoise) -> None:
+    print(f"{'lattice, pixel of its 2x2':28}{'down the columns':>18}{'along the rows':>18}")
+    for phase, (down, along) in zip(noise.phases, noise.shares().tolist(), strict=True):
+        print(f"{f'{phase.lattice.name}, ({phase.row}, {phase.column})':28}{down:18.3f}{along:18.3f}")
+
+
+if __name__ == "__main__":
+    main()
