@@ -41,6 +41,7 @@ def main() -> None:
         further = json.loads(extra.read_text(encoding="utf-8"))["scores"] if extra.exists() else []
         name = system.replace(":", ".").replace("=", "")  # names that every file system takes
         text = json.dumps(kept(scores, further, costs, system), indent=1) + "\n"
+        text = text.replace(scores["inputs"]["samples"]["source"], system)  # warnings name it, too
         (choices.out / f"{name}.json").write_text(text, encoding="utf-8")
 
 
