@@ -6,10 +6,10 @@ import dataclasses
 import json
 import math
 from collections.abc import Iterable
-from typing import Any, ClassVar, TypeVar, get_origin, get_type_hints
+from typing import Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from lidargrit import _discovery
-from lidargrit.errors import ConfigError, UnknownNameError, nearest_names
+from lidargrit.errors import ConfigError, UnknownNameError, nearest_names, one_of
 from lidargrit.untrusted import SEED_AT_MOST
 
 T = TypeVar("T")
@@ -152,6 +152,14 @@ def _replaced(node: Any, prefix: str, values: dict[str, Any]) -> Any:
     return {**node, **changed} if isinstance(node, dict) else dataclasses.replace(node, **changed)
 
 
+def _in_words(hint: Any) -> str:
+    """Return what a value of a type is, for a person."""
+    if get_origin(hint) is Literal:
+        return one_of([str(choice) for choice in get_args(hint)])
+    usual = {int: "a whole number", float: "a number", bool: "true or false"}
+    return usual.get(hint) or f"a value of the type {str(hint).replace('typing.', '')}"
+
+
 def _parsed(hint: Any, path: str, text: str) -> Any:
     if len(text) > _LETTERS_AT_MOST or text.count(",") >= _VALUES_AT_MOST:
         raise ConfigError(
@@ -166,8 +174,7 @@ def _parsed(hint: Any, path: str, text: str) -> Any:
     try:
         value = parser.instantiate(parser.parse_args([f"--value={text}"])).value
     except (Exception, SystemExit):  # see from_json
-        name = hint.__name__ if isinstance(hint, type) else str(hint).replace("typing.", "")
-        raise ConfigError(f"{path}={text}", f"a value of the type {name}", "correct the value") from None
+        raise ConfigError(f"{path}={text}", _in_words(hint), "correct the value") from None
     _check_numbers(value, path)
     return tuple(value) if isinstance(value, list) else value
 

@@ -148,7 +148,7 @@ def test_a_sensor_that_does_not_fit_the_scan(refused, tmp_path):
             ["train", "demo", "OUT", "--set", "training.tokeniser.scans=4"],
             r"wanted one such as training\.tokenizer\.scans",
         ),
-        (["train", "demo", "OUT", "--set", "seed=many"], r"seed=many; wanted a value of the type int"),
+        (["train", "demo", "OUT", "--set", "seed=many"], r"seed=many; wanted a whole number"),
         (["train", "demo", "OUT", "--set", "data.train=[]"], r"no source of scans; .*data\.train="),
         (
             ["train", "demo", "OUT", "--set", "data.train=[kiti_odometry:/d]"],
@@ -181,7 +181,7 @@ def test_a_sensor_that_does_not_fit_the_scan(refused, tmp_path):
             ["sample", "RUN", "OUT", "--set", "temprature=1"],
             r"'temprature', which sampling from 'lidargrit' does not have; wanted one such as temperature; .*list gen",
         ),
-        (["sample", "RUN", "OUT", "--set", "mask=never"], r"mask=never; wanted a value of the type .*threshold"),
+        (["sample", "RUN", "OUT", "--set", "mask=never"], r"mask=never; wanted auto, .*threshold"),
         (["sample", "RUN", "OUT", "--device", "gpu"], r"device 'gpu'; wanted"),
         (["sample", "nowhere", "OUT"], r"nowhere, which holds no finished model; .*finish the training"),
         (
