@@ -142,7 +142,7 @@ class ScanCodec:
         network, mask = self._pixels.mask, torch.zeros_like(guide.v, dtype=torch.bool)
         guided = network.guided(guide)
         for phase in network.phases:
-            logits = network.logits([phase], network.outputs([phase], guided, guide, mask, guide.v), guide)[0, 0]
+            logits = network.logits([phase], guided, guide, mask)[0, 0]
 
             def probabilities(rounding: Rounding, logits: Tensor = logits) -> Int64[np.ndarray, " n"]:
                 rounded = rounding.indices(logits.flatten().numpy(), MASK_LOGITS) * MASK_LOGITS.step

@@ -188,8 +188,8 @@ class CompletionNetwork(nn.Module):
             condition: observed pixels of as many scans.
             rngs: random generators on the CPU, one for each scan.
         """
-        images = []
-        for index, rng in enumerate(rngs):
+        images, uniform = [], self.mask.uniform(rngs)
+        for index in range(len(rngs)):
             one = condition[index : index + 1]
             shown = replace(  # what the network has not learned needs no hints
                 one,
@@ -199,7 +199,7 @@ class CompletionNetwork(nn.Module):
             hints = hints_of(shown)
             point, mirrored = self(hints, one.return_observed), self(hints.mirrored(), one.return_observed.flip(-1))
             v = (point.v + mirrored.v.flip(-1)) / 2
-            mask = self.mask.sample(point.guide, self.mask.uniform(rng), one)
+            mask = self.mask.sample(point.guide, uniform[index : index + 1], one)
             low_m, high_m = condition.sensor.range_min_m, condition.sensor.range_max_m
             label, reflectance = None, None
             if hints.labels is not None and point.class_logits is not None and mirrored.class_logits is not None:

@@ -47,7 +47,6 @@ class PhaseNoise(nn.Module):
     def __init__(self, phases: Sequence[Phase]) -> None:
         super().__init__()
         self.phases = tuple(phases)
-        self._index = {phase: index for index, phase in enumerate(phases)}
         # For each phase and direction (down, along the row): residuals' products, then the series' coefficients.
         self.register_buffer("sums", torch.zeros(len(phases), 2, 1 + _TERMS))
 
@@ -69,7 +68,7 @@ class PhaseNoise(nn.Module):
             if factors.shape[-1] > 1:  # one column alone would be its own neighbour
                 pairs.append((factors, factors.roll(-1, -1)))
             for direction, (one, other) in enumerate(pairs):
-                seen[self._index[phase], direction] = (one * other).sum((1, 2, 3)).to(seen)
+                seen[self.phases.index(phase), direction] = (one * other).sum((1, 2, 3)).to(seen)
         seen = sum_over_processes(seen)  # which may each have taken other phases
         kept = 0.5 ** ((seen[:, :, 1] > 0) * (logits.shape[1] / _HALF_LIFE_SCANS))
         self.sums.mul_(kept[:, :, None]).add_(seen)

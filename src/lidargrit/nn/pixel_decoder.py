@@ -141,7 +141,7 @@ class PixelDecoder(nn.Module):
         mask, v = images.return_mask, images.range_m.log1p()
         mask_nats, range_nats = None, None
         for phases in self.mask.by_lattice():
-            logits = self.mask.logits(phases, self.mask.outputs(phases, guided[0], guide, mask, v), guide)
+            logits = self.mask.logits(phases, guided[0], guide, mask)
             # H(p) = ln(1 + e^z) - z p of the logit z
             mask_nats = join_phases(mask_nats, F.softplus(logits) - logits * logits.sigmoid())
             candidates = self.range.candidates(phases, guide, mask, v)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -230,10 +231,11 @@ class MaskNetwork(PhaseNetwork):
             certain = torch.maximum(certain, cells_of(guide.observed[:, None].to(v.dtype), phase.lattice))
         return torch.cat((certain * returned, certain * (1 - returned)), 1)
 
-    def uniform(self, rng: torch.Generator) -> Float[Tensor, "1 H W"]:
-        """Return random numbers for one scan's mask, correlated as learned, on the device of the network."""
-        size = (self.sensor.height, self.sensor.width)
-        return self.noise(torch.rand(size, generator=rng), rng, self.noise.shares())[None].to(self.row_bias.device)
+    def uniform(self, rngs: Sequence[torch.Generator]) -> Float[Tensor, "B H W"]:
+        """Return random numbers for one mask of each generator, correlated as learned, on the device of the network."""
+        size, shares = (self.sensor.height, self.sensor.width), self.noise.shares()
+        numbers = [self.noise(torch.rand(size, generator=rng), rng, shares) for rng in rngs]
+        return torch.stack(numbers).to(self.row_bias.device)
 
     def sample(self, guide: Guide, uniform: Float[Tensor, "B H W"], condition: Condition) -> Bool[Tensor, "B H W"]:
         """Return the mask, sampled phase by phase around its observed pixels.
@@ -247,13 +249,15 @@ class MaskNetwork(PhaseNetwork):
         mask = condition.return_mask & condition.return_observed
         for phase in self.phases:
             pixels = (..., *phase.pixels)
-            output = self.outputs([phase], guided, guide, mask, guide.v)
-            sampled = uniform[pixels] < self.logits([phase], output, guide)[0].sigmoid()
+            sampled = uniform[pixels] < self.logits([phase], guided, guide, mask)[0].sigmoid()
             mask[pixels] = torch.where(condition.return_observed[pixels], mask[pixels], sampled)
         return mask
 
-    def logits(self, phases: list[Phase], output: Float[Tensor, "P B 1 h w"], guide: Guide) -> Float[Tensor, "P B h w"]:
-        """Return the logits of the pixels of phases of one lattice."""
+    def logits(
+        self, phases: list[Phase], guided: dict[Lattice, Tensor], guide: Guide, return_mask: Bool[Tensor, "B H W"]
+    ) -> Float[Tensor, "P B h w"]:
+        """Return the logits of the pixels of phases of one lattice; later pixels of the mask have no influence."""
+        output = self.outputs(phases, guided, guide, return_mask, guide.v)
         decoded = guide.return_logits + self.row_bias[:, None]
         return output[:, :, 0] + at_phases(decoded, phases)
 
@@ -264,7 +268,7 @@ class MaskNetwork(PhaseNetwork):
 
         In training the noise learns from them how pixels of one phase depend on one another.
         """
-        logits = self.logits(phases, self.outputs(phases, guided, guide, returned, guide.v), guide)
+        logits = self.logits(phases, guided, guide, returned)
         truth = at_phases(returned, phases)
         nll = F.binary_cross_entropy_with_logits(logits, truth.float(), reduction="none")
         known = None if guide.observed is None else at_phases(guide.observed, phases)

@@ -147,11 +147,11 @@ class RaydropNetwork(nn.Module):
                 rays.
             rngs: random generators on the CPU, one for each scan.
         """
-        images = []
-        for index, rng in enumerate(rngs):
+        images, uniform = [], self.mask.uniform(rngs)
+        for index in range(len(rngs)):
             one = condition[index : index + 1]
             found = self(one.range_m, one.range_observed, one.label)
-            returned = self.mask.sample(found.guide, self.mask.uniform(rng), one)
+            returned = self.mask.sample(found.guide, uniform[index : index + 1], one)
             reflectance = None if found.reflectance is None else found.reflectance.clamp(0, 1)
             images.append(RangeImage.masked(one.range_m, returned, condition.sensor, reflectance, one.label))
         return RangeImage.cat(images)
