@@ -53,8 +53,8 @@ def main() -> None:
     for name in (RUN_FILE, TRAINED_ON_FILE):
         if (folder / name).is_file():
             shutil.copy(folder / name, options.out)
-    half = any(weight.dtype == torch.float16 for weight in read_tensors(folder / WEIGHTS_FILE)[0].values())
-    model.eval().save(options.out, half)
+    types = {weight.dtype for weight in read_tensors(folder / WEIGHTS_FILE)[0].values()}
+    model.eval().save(options.out, 8 if torch.int8 in types else 16 if torch.float16 in types else 32)
     print(f"done: the run with these shares is in {options.out}")
 
 

@@ -271,15 +271,17 @@ def test_shared_latents_are_scaled_and_come_back_as_tokens():
         generator.tokenizer.quantize.embedding.weight.normal_(0.3, 5.0, generator=torch.Generator().manual_seed(1))
     objective = generator.objective("denoiser")
     spread = float(generator.tokenizer.quantize.embedding.weight.detach().std(correction=0))
-    assert float(generator.latent_scale) == pytest.approx(spread, rel=1e-5)
+    assert float(objective.latent_scale) == pytest.approx(spread, rel=1e-5)
     with torch.no_grad():
         terms = objective(images, torch.Generator().manual_seed(0))
     latents = generator.tokenizer.latents(images)
     assert float(terms["latent_std"]) == pytest.approx(float(latents.std().detach()) / spread, rel=1e-4)
     fresh = made(config)
     fresh.load_stage("tokenizer", generator.tokenizer)
-    fresh.load_stage("denoiser", objective)
-    assert torch.equal(fresh.latent_scale, generator.latent_scale)
+    assert float(generator.latent_scale) == 1, "asking for an objective changes nothing"
+    for each in (fresh, generator):
+        each.load_stage("denoiser", objective)
+        assert torch.equal(each.latent_scale, objective.latent_scale)
     assert torch.equal(fresh.sample([3]).range_m, generator.sample([3]).range_m)
     tokens = generator.tokenizer.encode(images)
     assert torch.equal(

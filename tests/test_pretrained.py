@@ -150,7 +150,7 @@ def test_half_as_many_bytes_keep_what_networks_compute(model, tmp_path):
     images = uniform_images(model.sensor, 2)
     wanted = whole.tokenizer.latents(images)
     whole.save_pretrained(tmp_path / "whole")
-    whole.save_pretrained(tmp_path / "half", half=True)
+    whole.save_pretrained(tmp_path / "half", bits=16)
     sizes = [(tmp_path / name / "model.safetensors").stat().st_size for name in ("whole", "half")]
     assert sizes[1] < 0.52 * sizes[0]
     weights, _ = read_tensors(tmp_path / "half" / "model.safetensors")
@@ -165,14 +165,15 @@ def test_weights_beyond_16_bits_are_refused_before_anything_is_written(tmp_path,
     model = load("pretrained")
     next(model.parameters()).data.view(-1)[0] = 1e6
     model.save(tmp_path / "run")
-    assert main(["publish", str(tmp_path / "run"), str(tmp_path / "out"), "--half"]) == 2
+    assert main(["publish", str(tmp_path / "run"), str(tmp_path / "out"), "--bits", "16"]) == 2
     assert "of up to 1e+06; wanted at most 65,504" in the_one_line(capsys.readouterr().err, "publish")
     assert not (tmp_path / "out").exists()
 
 
 def test_notes_end_the_card(tmp_path, capsys):
     (tmp_path / "notes.md").write_text("## Where it fails\n\nEverywhere.\n", encoding="utf-8")
-    assert main(["publish", "pretrained", str(tmp_path / "out"), "--notes", str(tmp_path / "notes.md"), "--half"]) == 0
+    words = ["publish", "pretrained", str(tmp_path / "out"), "--notes", str(tmp_path / "notes.md"), "--bits", "8"]
+    assert main(words) == 0
     assert (tmp_path / "out" / "README.md").read_text(encoding="utf-8").endswith("## Where it fails\n\nEverywhere.\n")
     weights = "model.safetensors"
     assert (tmp_path / "out" / weights).read_bytes() == (FOLDER / weights).read_bytes()

@@ -138,7 +138,7 @@ def test_scores_of_other_weights_and_taken_folders_are_refused(run, tmp_path, ca
     moved = scores.replace(str(run.parent), "/elsewhere")  # as if they came from another machine
     (tmp_path / "other.json").write_text(moved.replace(weights, "0" * 64))
     assert "which were not sampled from" in error(run, tmp_path / "new", "--scores", tmp_path / "other.json")
-    assert "then rounded" in error(run, tmp_path / "new", "--half", "--scores", run.parent / "scores.json")
+    assert "then rounded" in error(run, tmp_path / "new", "--bits", "16", "--scores", run.parent / "scores.json")
     assert not (tmp_path / "new").exists()
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "thesis.tex").write_text("")

@@ -33,10 +33,10 @@ def test_fine_tuning_starts_from_the_weights_of_the_other_run(tmp_path):
     donor.save(tmp_path / "donor")
     fit = FitConfig(scans=2, batch_size=2, learning_rate=1e-6, validation_scans=1)
     recipe = recipe_of(PIXELS, stages_from=str(tmp_path / "donor"))
-    recipe = replace(recipe, training=dict.fromkeys(recipe.training, fit), fine_tune=("tokenizer", "pixels"))
+    recipe = replace(recipe, training=dict.fromkeys(recipe.training, fit), fine_tune=("pixels",))
     tuned = train(recipe, tmp_path / "run").state_dict()
     assert not (tmp_path / "run" / "transformer").exists()
-    for stage in ("transformer", "pixels"):
+    for stage in ("tokenizer", "transformer", "pixels"):
         moved = [
             float((tuned[name] - weight).abs().max())
             for name, weight in donor.state_dict().items()
@@ -51,10 +51,24 @@ def test_fine_tuning_starts_from_the_weights_of_the_other_run(tmp_path):
         wrong = replace(recipe, **settings)
         with pytest.raises(ConfigError, match=message):
             taken_stages(wrong, wrong.build_generator())
-    with pytest.raises(ConfigError, match="fine_tune=tokenizer without stages_from"):
+    with pytest.raises(ConfigError, match="fine_tune=pixels without stages_from"):
         replace(recipe, stages_from=None)
     with pytest.raises(ConfigError, match="train_anew=pixels without stages_from"):
         replace(recipe, stages_from=None, fine_tune=(), train_anew=("pixels",))
+
+
+@pytest.mark.parametrize("setting", ["train_anew", "fine_tune"])
+def test_a_stage_over_a_tokenizer_that_is_trained_again_is_refused(tmp_path, setting):
+    made().save(tmp_path / "donor")
+    recipe = recipe_of(PIXELS, stages_from=str(tmp_path / "donor"))
+    for names in (("tokenizer",), ("tokenizer", "pixels")):
+        wrong = replace(recipe, **{setting: names})
+        with pytest.raises(ConfigError, match=f"{setting}=tokenizer without transformer, which learned from the token"):
+            taken_stages(wrong, wrong.build_generator())
+    with pytest.raises(ConfigError, match=f"{setting}=tokenizer without pixels"):
+        check_stages(replace(recipe, **{setting: ("tokenizer", "transformer")}))
+    right = replace(recipe, **{setting: ("tokenizer", "transformer", "pixels")})
+    assert set(taken_stages(right, right.build_generator())) == ({*right.fine_tune})
 
 
 def test_settings_of_a_stage_that_is_not_trained_are_not_looked_at(tmp_path):
@@ -67,7 +81,7 @@ def test_settings_of_a_stage_that_is_not_trained_are_not_looked_at(tmp_path):
     assert list(checked.objectives) == ["tokenizer", "transformer", "pixels"]
     assert [stage.scans for stage in plan_training(recipe).stages] == [0, 0, 4]
     for settings, message in (
-        ({"train_anew": ("tokenizer",)}, "batch_size=2 on 3 processes"),
+        ({"train_anew": ("tokenizer", "transformer")}, "batch_size=2 on 3 processes"),
         ({"fine_tune": ("transformer",)}, r"without training\.transformer"),
     ):
         with pytest.raises(ConfigError, match=message):

@@ -8,7 +8,7 @@ from pathlib import Path
 EXAMPLES = """\
   lidargrit publish runs/mine to_share
   lidargrit publish runs/mine to_share --scores scores.json        which lidargrit evaluate --json wrote
-  lidargrit publish runs/mine to_share --notes failures.md --half  16 bits a weight: half the size
+  lidargrit publish runs/mine to_share --notes failures.md --bits 8    a quarter of the size
 """
 
 
@@ -26,7 +26,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--notes", type=Path, metavar="MD", help="Markdown file for the end of the card, such as known failures"
     )
-    parser.add_argument("--half", action="store_true", help="store weights in 16 bits: half the size")
+    parser.add_argument(
+        "--bits",
+        type=int,
+        choices=(8, 16, 32),
+        default=32,
+        help="bits of a stored weight; networks compute in 32 bits whatever it is (default: %(default)s)",
+    )
 
 
 def run(options: argparse.Namespace) -> None:
@@ -35,5 +41,5 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.publishing import publish
 
     notes = read_text(options.notes) if options.notes else ""
-    publish(options.run_folder, options.out, options.scores, notes, options.half)
+    publish(options.run_folder, options.out, options.scores, notes, options.bits)
     print(f"done: read {options.out / 'README.md'} before you share it; to upload: hf upload USER/NAME {options.out}")

@@ -22,6 +22,7 @@ from lidargrit.generators._hub import download
 from lidargrit.generators._saved import ConfigT, SavedModel
 from lidargrit.loading import RangeImages
 from lidargrit.nn.objective import Objective
+from lidargrit.nn.quantization import without_quantized
 from lidargrit.nn.range_steps import RangeSteps
 from lidargrit.nn.size import numbers_at_most
 from lidargrit.run_folder import CONFIG_FILE, PACKAGED, WEIGHTS_FILE, is_run, locate
@@ -364,7 +365,7 @@ def load(folder: str | Path) -> Generator:
             f"{folder / CONFIG_FILE}, which cannot be used ({error})", "what lidargrit wrote", "restore the file"
         ) from None
     config = configuration.from_json(cls.Config, config, str(folder / CONFIG_FILE))
-    weights = read_tensors(folder / WEIGHTS_FILE)[0]
+    weights = without_quantized(read_tensors(folder / WEIGHTS_FILE)[0])
     expected = sum(tensor.numel() for tensor in weights.values())
     # Twice as many as the file holds, for what is built besides: a wrong file is refused before it fills the memory.
     with numbers_at_most(2 * expected + 2**20, f"{folder / CONFIG_FILE} with a network", "restore both files"):

@@ -16,6 +16,7 @@ from lidargrit.errors import ConfigError
 from lidargrit.generators._log_range import decode, encode
 from lidargrit.nn import flow
 from lidargrit.nn.diffusion import SeededNoise
+from lidargrit.nn.encoding_cache import Frozen
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.hdit import Hdit
 from lidargrit.nn.objective import Objective
@@ -146,6 +147,7 @@ class PairMatching(Objective):
     """
 
     ray_buffers = ("network.coords",)
+    over = ("flow", "reflow")
 
     def __init__(
         self, network: Hdit, sensor: SensorModel, pairs: int, solving: FlowSampling, distilled_steps: int
@@ -176,7 +178,7 @@ class PairMatching(Objective):
         return round(min(kept, scans) + scans * (1 - kept / self._count)) * self._pairs.flops()
 
 
-class FlowPairs:
+class FlowPairs(Frozen[Hdit]):
     """Pairs of noise and the scan that a frozen flow leads to, each made once for all times that training sees it.
 
     The scan is what a file would keep of it: a value outside the sensor's limits is no return, and becomes the lowest
@@ -193,7 +195,7 @@ class FlowPairs:
     def __init__(
         self, network: Hdit, sensor: SensorModel, solving: FlowSampling, bytes_at_most: int = _KEPT_BYTES_AT_MOST
     ) -> None:
-        self._network = copy.deepcopy(network).eval().requires_grad_(False)
+        super().__init__(copy.deepcopy(network).requires_grad_(False))
         self._sensor, self._solving = sensor, solving
         self._shape = (network.images, sensor.height, sensor.width)
         self.kept_at_most = bytes_at_most // (4 * math.prod(self._shape))
@@ -220,7 +222,7 @@ class FlowPairs:
         end = self._kept.get(number)
         if end is None:
             with without_autocast(noise.device):
-                end = solve(self._network.to(noise.device), noise, self._solving).images
+                end = solve(self.network(noise.device), noise, self._solving).images
             end = as_kept(end, self._sensor).cpu()
             if len(self._kept) < self.kept_at_most:
                 self._kept[number] = end

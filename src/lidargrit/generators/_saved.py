@@ -11,6 +11,7 @@ from lidargrit import configuration
 from lidargrit.errors import ConfigError
 from lidargrit.files import load_exactly, write_json, write_tensors, write_text
 from lidargrit.nn.phase_noise import PhaseNoise
+from lidargrit.nn.quantization import WeightBits, with_quantized
 from lidargrit.run_folder import CARD_FILE, CONFIG_FILE, WEIGHTS_FILE
 from lidargrit.sensors import SensorModel
 
@@ -37,26 +38,28 @@ class SavedModel(nn.Module, Generic[ConfigT]):
         """Return the name of the file that defines the class."""
         return cls.__module__.rpartition(".")[2]
 
-    def weights(self, half: bool = False) -> dict[str, Tensor]:
+    def weights(self, bits: WeightBits = 32) -> dict[str, Tensor]:
         """Return the tensors that are saved, by name.
 
         Args:
-            half: whether parameters, but no buffers, are rounded to 16 bits; a network that reads them computes in 32
-                bits as before.
+            bits: bits of a parameter; a network that reads them computes in 32 bits as before. With 8, matrices and
+                kernels are quantized, and vectors such as biases have 16 bits. Buffers are saved as they are.
 
         Raises:
-            ConfigError: a parameter is beyond what 16 bits hold.
+            ConfigError: a parameter is beyond what 16 bits hold, and not to be stored in 32.
         """
-        halved = {name: weight.detach().half() for name, weight in self.named_parameters()} if half else {}
+        named = {} if bits == 32 else {name: each.detach() for name, each in self.named_parameters()}
+        halved = {name: each.half() for name, each in named.items()}
         for name, weight in halved.items():
             if not weight.isfinite().all():
-                largest = self.get_parameter(name).abs().max()
-                raise ConfigError(f"weights {name!r} of up to {largest:g}", "at most 65,504", "leave half out")
-        return {**self.state_dict(), **halved}
+                largest = named[name].abs().max()
+                raise ConfigError(f"weights {name!r} of up to {largest:g}", "at most 65,504", "store 32 bits")
+        matrices = {name: each for name, each in named.items() if bits == 8 and each.ndim >= 2}
+        return with_quantized({**self.state_dict(), **halved, **matrices}, matrices.keys())
 
-    def save(self, folder: Path, half: bool = False) -> None:
+    def save(self, folder: Path, bits: WeightBits = 32) -> None:
         """Write :meth:`weights` and, last, the configuration that says they are there."""
-        write_tensors(folder / WEIGHTS_FILE, self.weights(half))
+        write_tensors(folder / WEIGHTS_FILE, self.weights(bits))
         config = {
             "generator": self.public_name(),
             "config": configuration.to_json(self.config),
@@ -77,7 +80,7 @@ class SavedModel(nn.Module, Generic[ConfigT]):
         load_exactly(generator, weights, source, PhaseNoise.names_in(generator))
         return generator.eval()
 
-    def save_pretrained(self, folder: str | Path, card: str = "", half: bool = False) -> None:
+    def save_pretrained(self, folder: str | Path, card: str = "", bits: WeightBits = 32) -> None:
         """Write what a repository of the Hugging Face hub holds: weights, configuration, and a model card if given.
 
         These are the files of :meth:`save`. ``lidargrit publish`` writes the card from a run.
@@ -85,8 +88,8 @@ class SavedModel(nn.Module, Generic[ConfigT]):
         Args:
             folder: folder that gets the files.
             card: text of ``README.md``, in Markdown; no such file if empty.
-            half: whether parameters are rounded to 16 bits; see :meth:`weights`.
+            bits: bits of a parameter, 8, 16 or 32; see :meth:`weights`.
         """
-        self.save(Path(folder), half)
+        self.save(Path(folder), bits)
         if card:
             write_text(Path(folder) / CARD_FILE, card)

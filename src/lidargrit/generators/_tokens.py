@@ -114,6 +114,15 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
         """Return what the tokens keep of a batch of scans, the mask by threshold."""
         return self.tokenizer.reconstruct(images)
 
+    def check_choice(self, mask: PixelChoice) -> None:
+        """Refuse a choice of the pixel decoder where there is none, before any token is sampled, with ConfigError."""
+        if mask == "pixels" and self.pixels is None:
+            raise ConfigError(
+                "mask=pixels for a model without a pixel decoder",
+                "a model with one",
+                "leave mask out, or train a recipe with the stage pixels, such as compact_pixels",
+            )
+
     def decode(
         self,
         tokens: Int[Tensor, "B T"],
@@ -132,20 +141,12 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
             tokens: tokens of ``compute_batch`` scans in raster order.
             wanted: number of scans to return; the rest are the copies of ``BatchSeeds``.
             rngs: random generators on the CPU, one for each scan.
-            mask: method by which returns and ranges are decided.
+            mask: method by which returns and ranges are decided, checked by :meth:`check_choice`.
             pixels: settings by which the pixel decoder samples masks and ranges.
             tokenizer: the generator's own tokenizer, or its copy for decoding only.
             condition: observed part of the scans, which a pixel decoder keeps.
 
-        Raises:
-            ConfigError: ``mask`` asks for a pixel decoder, and there is none.
         """
-        if mask == "pixels" and self.pixels is None:
-            raise ConfigError(
-                "mask=pixels for a model without a pixel decoder",
-                "a model with one",
-                "leave mask out, or train a recipe with the stage pixels, such as compact_pixels",
-            )
         images = []
         for first in range(0, wanted, _DECODED_AT_ONCE):
             some = slice(first, first + _DECODED_AT_ONCE)
@@ -176,11 +177,7 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
         if self.pixels is None:
             return ScanBits(steps.step_mm, images.return_mask, tokens)
         decoded = self.tokenizer.decode(grid)
-        mask, range_ = (nats / math.log(2) for nats in self.pixels(decoded, images, steps))
-        usual = None
-        if expected:
-            usual = sum(self.pixels.expected(decoded, images, steps), torch.zeros_like(mask)) / math.log(2)
-        return ScanBits(steps.step_mm, images.return_mask, tokens, mask, range_, usual)
+        return ScanBits(steps.step_mm, images.return_mask, tokens, *self.pixels.bits(decoded, images, steps, expected))
 
     def token_bits(self, grid: TokenGrid) -> Float[Tensor, "B h w"]:
         """Return the bits of each token if all tokens are equally likely.
@@ -200,6 +197,7 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
 class TokenObjective(Objective):
     """Base of the objectives of transformers over the tokens of a frozen tokenizer."""
 
+    over = ("tokenizer",)
     token_counts: Tensor
 
     def __init__(self, tokenizer: Tokenizer, transformer: Transformer) -> None:
@@ -244,6 +242,7 @@ class PixelObjective(Objective):
         super().__init__(pixels.sensor)
         self.pixels = pixels
         self._tokens = None if tokenizer is None else EncodingCache(tokenizer, _tokens)
+        self.over = () if tokenizer is None else ("tokenizer",)
 
     def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the nats of the mask a pixel plus those of the range a return as ``loss``, and each of them in bits.
@@ -266,10 +265,3 @@ class PixelObjective(Objective):
 
 def _tokens(tokenizer: Tokenizer, images: RangeImage) -> Int[Tensor, "B h w"]:
     return tokenizer.encode(images).tokens.int()  # half as many bytes to keep
-
-
-def sample_tokens(logits: Float[Tensor, "*B K"], uniform: Float[Tensor, "*B"]) -> Int[Tensor, "*B"]:
-    """Sample one token for each row of logits: where the distribution function first exceeds its uniform number."""
-    distribution = logits.double().softmax(dim=-1).cumsum(dim=-1)
-    threshold = uniform.double()[..., None] * distribution[..., -1:]  # the sum may miss 1 by a rounding error
-    return torch.searchsorted(distribution, threshold, right=True)[..., 0].clamp(max=logits.shape[-1] - 1)

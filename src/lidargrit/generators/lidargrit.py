@@ -24,7 +24,6 @@ from lidargrit.generators._tokens import (
     TokenGenerator,
     TokenGeneratorConfig,
     TokenObjective,
-    sample_tokens,
 )
 from lidargrit.nn.completion_network import CompletionNetwork, CompletionNetworkConfig
 from lidargrit.nn.completion_objective import CompletionObjective
@@ -33,6 +32,7 @@ from lidargrit.nn.objective import Objective
 from lidargrit.nn.pixel_decoder import PixelSampling
 from lidargrit.nn.precision import Precision
 from lidargrit.nn.published import read_checkpoint
+from lidargrit.nn.random_choices import sample_index
 from lidargrit.nn.raydrop_network import RaydropConfig, RaydropNetwork
 from lidargrit.nn.raydrop_objective import RaydropObjective
 from lidargrit.nn.seeds import rngs_of
@@ -75,7 +75,7 @@ class TokenSampling:
         completion: method by which scans are completed. ``network`` takes the network that was trained for what was
             observed: the one for completion where pixels were, the one for raydrop where all surfaces were. ``tokens``
             samples the tokens without any observed pixel, and then all pixels that were not observed. ``auto`` is
-            ``network`` where a model has one.
+            ``network`` where a model has one. A network takes none of the other settings.
         weights: number type of the transformer's weights. ``fp32`` is exact; ``bf16`` and ``int8`` (CPUs only) read
             less memory for a token and change probabilities a little, see docs/performance.md.
         decoder: number type of the tokenizer's decoder and of the pixel decoder. ``fp32`` is exact; ``bf16`` is
@@ -176,11 +176,7 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         return 8 if self.device.type == "cpu" else 32
 
     def _sample(self, seeds: BatchSeeds, sampling: TokenSampling) -> RangeImage:
-        rngs = rngs_of(seeds)
-        uniform = torch.stack([torch.rand(self.transformer.context_length, generator=rng) for rng in rngs])
-        decoder, tokenizer = self._prepare(len(seeds), sampling)
-        tokens = decoder.generate(uniform.to(self.device))
-        return self.decode(tokens, seeds.num_asked_for, rngs, sampling.mask, sampling.pixels(), tokenizer)
+        return self._by_tokens(None, rngs_of(seeds), seeds.num_asked_for, sampling)
 
     @property
     def conditions(self) -> frozenset[ConditionKind]:
@@ -188,21 +184,41 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         return frozenset({"pixels", "surfaces"})
 
     def _complete(self, condition: Condition, seeds: BatchSeeds, sampling: TokenSampling) -> RangeImage:
+        """Complete each scan by the network for what is known of it, or by tokens, whatever the others' conditions."""
+        rngs, count = rngs_of(seeds), seeds.num_asked_for
+        networks = [self._completing_network(condition[[index]], sampling) for index in range(count)]
+        found: dict[int, RangeImage] = {}
+        for network in (self.completion, self.raydrop):
+            own = [index for index, each in enumerate(networks) if each is not None and each is network]
+            if network is not None and own:
+                completed = network.sample(condition[own], [rngs[index] for index in own])
+                found |= {index: completed[[at]] for at, index in enumerate(own)}
+        if None in networks:  # the whole batch, whose size decides how sums are rounded
+            completed = self._by_tokens(condition, rngs, count, sampling)
+            found |= {index: completed[[index]] for index, each in enumerate(networks) if each is None}
+        return RangeImage.cat([found[index] for index in range(count)])
+
+    def _by_tokens(
+        self, condition: Condition | None, rngs: list[torch.Generator], count: int, sampling: TokenSampling
+    ) -> RangeImage:
         """Generate the tokens without any observed pixel, and with a pixel decoder the pixels around observed ones.
 
         Tokens come row by row, and pixels in phases. Each is conditioned on the observed ones before it, not on later
         ones.
+
+        Args:
+            condition: observed part of the scans; None for new ones.
+            rngs: random generators on the CPU, one for each scan of a batch.
+            count: number of scans to return.
+            sampling: settings.
         """
-        rngs = rngs_of(seeds)
-        network = self._completing_network(condition, sampling)
-        if network is not None:
-            return network.sample(condition, rngs[: seeds.num_asked_for])
+        self.check_choice(sampling.mask)
         uniform = torch.stack([torch.rand(self.transformer.context_length, generator=rng) for rng in rngs])
-        decoder, tokenizer = self._prepare(len(seeds), sampling)
-        tokens = self.observed_tokens(condition)
-        if bool((tokens < 0).any()):
+        decoder, tokenizer = self._prepare(len(rngs), sampling)
+        tokens = None if condition is None else self.observed_tokens(condition)
+        if tokens is None or bool((tokens < 0).any()):
             tokens = decoder.generate(uniform.to(self.device), tokens)
-        return self.decode(tokens, seeds.num_asked_for, rngs, sampling.mask, sampling.pixels(), tokenizer, condition)
+        return self.decode(tokens, count, rngs, sampling.mask, sampling.pixels(), tokenizer, condition)
 
     def _completing_network(
         self, condition: Condition, sampling: TokenSampling
@@ -241,13 +257,18 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
     def _prepare(self, batch_size: int, sampling: TokenSampling) -> tuple[CachedDecoder, Tokenizer]:
         """Return what generates tokens and what decodes them, kept from the last call if nothing has changed since."""
         weights = tuple((weight.data_ptr(), weight._version) for weight in self.parameters())
-        key = (batch_size, sampling, weights)
+        choices = (sampling.temperature, sampling.top_k, sampling.top_p, sampling.weights, sampling.decoder)
+        key = (batch_size, choices, weights)
         if self._prepared is None or self._prepared.key != key:
             self._prepared = None  # its cache is given back before the next is taken
             by_choices = partial(sample_token, sampling=sampling)
             decoder = CachedDecoder(self.transformer, batch_size, by_choices, START_TOKEN, sampling.weights)
             self._prepared = _Prepared(key, decoder, self.tokenizer.for_decoding(sampling.decoder))
         return self._prepared.decoder, self._prepared.tokenizer
+
+    def __getstate__(self) -> dict[str, object]:
+        """Leave out what can be prepared again: it holds functions that cannot be pickled."""
+        return {**self.__dict__, "_prepared": None}
 
     @classmethod
     def from_published(cls, files: Sequence[Path], config: LidarGritConfig, sensor: SensorModel) -> LidarGrit:
@@ -304,4 +325,4 @@ def sample_token(
         ordered, order = logits.softmax(dim=1).sort(dim=1, descending=True)
         spare = ordered.cumsum(dim=1) - ordered >= sampling.top_p  # the likelier ones hold enough
         logits = logits.masked_fill(torch.zeros_like(spare).scatter(1, order, spare), -torch.inf)
-    return sample_tokens(logits, uniform)
+    return sample_index(logits, uniform)

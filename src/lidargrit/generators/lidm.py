@@ -130,9 +130,8 @@ class Lidm(Generator[LidmConfig, LidmSampling]):
         """Return the tokenizer itself, or the denoising of its latents."""
         if stage == "tokenizer":
             return self.tokenizer
-        if self.config.scale_latents:
-            self.latent_scale.copy_(self.tokenizer.quantize.spread())
-        return LatentDenoising(self.tokenizer, self.denoiser, self.latent_scale, self._shares())
+        scale = self.tokenizer.quantize.spread() if self.config.scale_latents else self.latent_scale
+        return LatentDenoising(self.tokenizer, self.denoiser, scale, self._shares())
 
     def load_stage(self, stage: str, objective: Objective) -> None:
         """Take over a stage's trained weights."""
@@ -195,6 +194,7 @@ class Lidm(Generator[LidmConfig, LidmSampling]):
 class LatentDenoising(Objective):
     """The objective: the squared error of the predicted noise in the latents of a frozen tokenizer, at random steps."""
 
+    over = ("tokenizer",)
     latent_scale: Tensor
 
     def __init__(

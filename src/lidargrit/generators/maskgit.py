@@ -19,11 +19,11 @@ from lidargrit.generators._tokens import (
     TokenGenerator,
     TokenGeneratorConfig,
     TokenObjective,
-    sample_tokens,
 )
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.pixel_decoder import PixelSampling
 from lidargrit.nn.precision import Precision, autocast_to
+from lidargrit.nn.random_choices import gumbel_of, sample_index
 from lidargrit.nn.seeds import rngs_of
 from lidargrit.nn.transformer import MaskedTransformer
 from lidargrit.sensors import SensorModel
@@ -121,6 +121,7 @@ class MaskGit(TokenGenerator[MaskGitConfig, MaskedSampling]):
         return MaskedSampling(steps=4)
 
     def _sample(self, seeds: BatchSeeds, sampling: MaskedSampling) -> RangeImage:
+        self.check_choice(sampling.mask)
         rngs = rngs_of(seeds)
         tokens = generate_tokens(self.transformer, rngs, sampling)
         tokenizer = self.tokenizer.for_decoding(sampling.decoder)
@@ -197,8 +198,7 @@ def generate_tokens(
             logits = transformer(tokens).float()
         sampled = _sample(logits, uniform[0], sampling.temperature)
         confidence = logits.log_softmax(dim=-1).gather(-1, sampled[..., None])[..., 0]
-        noise = -(-uniform[1].clamp(1e-9, 1 - 1e-7).log()).log()  # Gumbel's distribution; the bounds keep it finite
-        confidence += sampling.order_temperature * (1 - done / len(schedule)) * noise
+        confidence += sampling.order_temperature * (1 - done / len(schedule)) * gumbel_of(uniform[1])
         hidden = tokens == transformer.mask_token
         kept = confidence.masked_fill(~hidden, torch.inf).topk(length - left, dim=1).indices
         tokens = tokens.scatter(1, kept, torch.where(hidden, sampled, tokens).gather(1, kept))
@@ -206,4 +206,4 @@ def generate_tokens(
 
 
 def _sample(logits: Tensor, uniform: Tensor, temperature: float) -> Tensor:
-    return logits.argmax(dim=-1) if temperature == 0 else sample_tokens(logits / temperature, uniform)
+    return logits.argmax(dim=-1) if temperature == 0 else sample_index(logits / temperature, uniform)

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
-
-import torch
 
 from lidargrit.conditions import Condition
 from lidargrit.generators import Cost, Generator, SystemFacts
@@ -77,11 +74,8 @@ class Multiscale(Generator[MultiscaleConfig, PixelSampling]):
 
     def _bits(self, images: RangeImage, steps: RangeSteps, expected: bool) -> ScanBits:
         """Return the bits of mask and ranges; there are no tokens, which take none."""
-        mask, range_ = (nats / math.log(2) for nats in self.pixels(None, images, steps))
-        usual = None
-        if expected:
-            usual = sum(self.pixels.expected(None, images, steps), torch.zeros_like(mask)) / math.log(2)
-        return ScanBits(steps.step_mm, images.return_mask, mask.new_zeros(len(mask), 1, 1), mask, range_, usual)
+        no_tokens = images.range_m.new_zeros(len(images), 1, 1)
+        return ScanBits(steps.step_mm, images.return_mask, no_tokens, *self.pixels.bits(None, images, steps, expected))
 
     def cost(self, sampling: PixelSampling | None = None) -> Cost:
         """Return the cost of all phases."""

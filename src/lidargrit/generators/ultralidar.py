@@ -14,11 +14,12 @@ from lidargrit.errors import ConfigError
 from lidargrit.files import load_exactly
 from lidargrit.generators import Cost, Generator, SystemFacts
 from lidargrit.generators._checks import check_seeds
-from lidargrit.generators._tokens import sample_tokens
 from lidargrit.nn.codebook_care import CodebookCare
+from lidargrit.nn.encoding_cache import Frozen
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.precision import without_autocast
+from lidargrit.nn.random_choices import gumbel_of, sample_index
 from lidargrit.nn.size import numbers_of_file
 from lidargrit.nn.swin import SwinConfig
 from lidargrit.nn.ultralidar_checkpoint import read_ultralidar_checkpoint
@@ -195,11 +196,11 @@ class UltraLidar(Generator[UltraLidarConfig, VoxelSampling]):
             return torch.rand(size, generator=rng).to(self.device)
 
         def gumbel() -> Tensor:
-            return -(-uniform(1, length).clamp(1e-9, 1 - 1e-7).log()).log()  # the bounds keep it finite
+            return gumbel_of(uniform(1, length))
 
         start = torch.zeros(1, length, dtype=torch.long, device=self.device)
         tokens = generate_tokens(
-            self._logits, start, lambda logits: sample_tokens(logits, uniform(1, length)), gumbel, sampling
+            self._logits, start, lambda logits: sample_index(logits, uniform(1, length)), gumbel, sampling
         )
         occupied = self.autoencoder.sample_voxels(tokens, uniform(*shape))
         for _ in range(sampling.rounds):
@@ -249,14 +250,16 @@ class VoxelReconstruction(Objective):
 class HiddenVoxelTokens(Objective):
     """The second stage's objective: cross-entropy of hidden tokens given those shown, with smoothed labels."""
 
+    over = ("autoencoder",)
+
     def __init__(self, autoencoder: VoxelAutoencoder, prior: VoxelPrior, sensor: SensorModel, flips: bool) -> None:
         super().__init__(sensor)
         self.prior, self._flips = prior, flips
-        self._frozen = [autoencoder.eval()]  # in a list: its weights are not this stage's
+        self._frozen = Frozen(autoencoder)
 
     def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the error in nats for each hidden token, of which a batch hides one share, and how many are right."""
-        autoencoder = self._frozen[0].to(images.range_m.device)
+        autoencoder = self._frozen.network(images.range_m.device)
         voxels = _training_voxels(images, autoencoder.config.grid, self._flips, rng)
         with torch.no_grad(), without_autocast(voxels.device):  # tokens as outside of training
             tokens = autoencoder.tokens(voxels)

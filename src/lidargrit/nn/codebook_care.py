@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from lidargrit.nn.precision import without_autocast
-from lidargrit.nn.processes import sample_from_all, sum_over_processes
+from lidargrit.nn.processes import of_first_process, sample_from_all, sum_over_processes
 
 _LATENTS_PER_CODE = 10  # in the reservoir
 _NEW_SHARE = 0.01  # of the reservoir, taken in at every step
@@ -72,7 +72,7 @@ class CodebookCare(nn.Module):
             return
         if int(self.rest_steps) == 0 and float(idle.float().mean()) > _IDLE_SHARE:
             with without_autocast(codes.device):  # codes lie too close together for 16 bits
-                codes.copy_(self._moved(codes, idle, rng))
+                codes.copy_(of_first_process(self._moved(codes, idle, rng)))
             self.idle_steps.zero_()
             self.rest_steps.fill_(_REST_STEPS)
 

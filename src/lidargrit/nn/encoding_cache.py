@@ -1,4 +1,4 @@
-"""Images encoded by a frozen network, each computed once: range images → latents or tokens."""
+"""Frozen networks that an objective computes with, and images encoded by one, each once: range images → tensors."""
 
 from __future__ import annotations
 
@@ -18,10 +18,26 @@ _BYTES_AT_MOST = 1 << 30  # 65,000 latents of LiDM's small recipe, or a million 
 NetworkT = TypeVar("NetworkT", bound=nn.Module)
 
 
-class EncodingCache(Generic[NetworkT]):
-    """What a frozen network makes of images, computed once for all times that training sees an image.
+class Frozen(Generic[NetworkT]):
+    """A trained network that an objective computes with; it is not trained, averaged, copied or saved with it.
 
-    The network is no part of the objective that holds the cache: it is not trained, averaged or saved with it.
+    Args:
+        network: trained network, which is set to evaluation mode.
+    """
+
+    def __init__(self, network: NetworkT) -> None:
+        self._network = network.eval()
+
+    def network(self, device: torch.device) -> NetworkT:
+        """Return the network on a device."""
+        return self._network.to(device)
+
+    def __deepcopy__(self, memo: dict[int, object]) -> Frozen[NetworkT]:
+        return self
+
+
+class EncodingCache(Frozen[NetworkT]):
+    """What a frozen network makes of images, computed once for all times that training sees an image.
 
     An image is known again by its pixels, so that augmented images are told apart. Once a bound of memory is reached,
     further images are encoded anew each time. They are encoded in full precision, as outside of training, and on a CPU
@@ -40,13 +56,10 @@ class EncodingCache(Generic[NetworkT]):
         encode: Callable[[NetworkT, RangeImage], Tensor],
         bytes_at_most: int = _BYTES_AT_MOST,
     ) -> None:
-        self._network, self._encode = network.eval(), encode
+        super().__init__(network)
+        self._encode = encode
         self._kept: dict[bytes, Tensor] = {}
         self._free = bytes_at_most
-
-    def network(self, device: torch.device) -> NetworkT:
-        """Return the network on a device."""
-        return self._network.to(device)
 
     @torch.no_grad()
     def __call__(self, images: RangeImage) -> Shaped[Tensor, "B ..."]:

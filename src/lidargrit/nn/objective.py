@@ -35,6 +35,8 @@ class Objective(nn.Module, ABC):
     """Names of buffers that hold the angles of the sensor's rays: they are not taken over from another sensor."""
     additions: frozenset[str] = frozenset()
     """Settings of the stage that, if true, add weights; training may start from a stage that lacks them."""
+    over: tuple[str, ...] = ()
+    """Names of earlier stages whose networks compute what it learns from; it is of no use with other networks."""
     period: int = 1
     """Number of training steps after which the same operations come again; more than 1 if some terms come rarely."""
 

@@ -61,17 +61,18 @@ class PhaseNoise(nn.Module):
             logits: logits of the probability of a return, given the earlier phases; infinite for pixels to leave out.
             returned: True where a pixel returned.
         """
-        seen = torch.zeros_like(self.sums)
+        seen = self.sums.new_zeros(*self.sums.shape[:2], 2 + _TERMS)  # the sums, then the number of scans
         for phase, of_phase, truth in zip(phases, logits.detach().double(), returned, strict=True):
             factors = _hermite_factors(of_phase, truth)
             pairs = [(factors[..., :-1, :], factors[..., 1:, :])]
             if factors.shape[-1] > 1:  # one column alone would be its own neighbour
                 pairs.append((factors, factors.roll(-1, -1)))
             for direction, (one, other) in enumerate(pairs):
-                seen[self.phases.index(phase), direction] = (one * other).sum((1, 2, 3)).to(seen)
-        seen = sum_over_processes(seen)  # which may each have taken other phases
-        kept = 0.5 ** ((seen[:, :, 1] > 0) * (logits.shape[1] / _HALF_LIFE_SCANS))
-        self.sums.mul_(kept[:, :, None]).add_(seen)
+                seen[self.phases.index(phase), direction, :-1] = (one * other).sum((1, 2, 3)).to(seen)
+                seen[self.phases.index(phase), direction, -1] = logits.shape[1]
+        seen, scans = sum_over_processes(seen).split((1 + _TERMS, 1), -1)  # which may each have taken other phases
+        kept = 0.5 ** ((seen[:, :, 1:2] > 0) * (scans / _HALF_LIFE_SCANS))
+        self.sums.mul_(kept).add_(seen)
 
     def correlations(self) -> Float64[Tensor, "phases 2"]:
         """Return the correlation of a pixel's normal number with that of the next of its phase, down and along."""

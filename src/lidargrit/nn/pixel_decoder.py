@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from lidargrit.conditions import Condition
 from lidargrit.errors import ConfigError
 from lidargrit.nn.pixel_networks import Guide, MaskNetwork, PixelDecoderConfig, RangeNetwork
-from lidargrit.nn.pixel_phases import Lattice, Phase, at_phases, join_phases
+from lidargrit.nn.pixel_phases import Lattice, Phase, at_phases, join_phases, one_of_phases
 from lidargrit.nn.precision import Precision, autocast_to
 from lidargrit.nn.range_steps import RangeSteps
 from lidargrit.sensors import SensorModel
@@ -152,6 +152,19 @@ class PixelDecoder(nn.Module):
         assert range_nats is not None
         return PixelNll(mask_nats, range_nats)
 
+    def bits(
+        self, decoded: Decoded | None, images: RangeImage, steps: RangeSteps, expected: bool
+    ) -> tuple[Float[Tensor, "B H W"], Float[Tensor, "B H W"], Float[Tensor, "B H W"] | None]:
+        """Return the bits of :meth:`forward` for mask and range, and those of :meth:`expected` together if asked for.
+
+        They are what :class:`~lidargrit.structures.ScanBits` has of every pixel.
+        """
+        mask, range_ = (nats / math.log(2) for nats in self(decoded, images, steps))
+        if not expected:
+            return mask, range_, None
+        usual = self.expected(decoded, images, steps)
+        return mask, range_, (usual.mask + usual.range) / math.log(2)
+
     def estimate(
         self, decoded: Decoded | None, images: RangeImage, rng: torch.Generator
     ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
@@ -165,10 +178,7 @@ class PixelDecoder(nn.Module):
         mask_nats, range_nats = guide.v.new_zeros(()), guide.v.new_zeros(())
         returns = guide.v.new_zeros(())
         for phases in self.mask.by_lattice():
-            chosen = phases
-            if phases[0].lattice.area < _ALL_PHASES_AREA:
-                index = torch.randint(len(phases), (), generator=rng, device=rng.device)
-                chosen = [phases[0 if index.is_meta else int(index)]]  # all take as many operations, if counted
+            chosen = one_of_phases(phases, rng) if phases[0].lattice.area < _ALL_PHASES_AREA else phases
             of_mask, of_range = self._nll(chosen, guided, guide, images)
             share = len(phases) / len(chosen)
             mask_nats = mask_nats + share * of_mask.sum()

@@ -17,7 +17,17 @@ from lidargrit.conditions import Condition
 from lidargrit.errors import ConfigError
 from lidargrit.nn.lattice_network import LatticeNetwork
 from lidargrit.nn.phase_noise import PhaseNoise
-from lidargrit.nn.pixel_phases import Lattice, Phase, at_phases, cells_of, generated_before, neighbours_of, phases_of
+from lidargrit.nn.pixel_phases import (
+    Lattice,
+    Phase,
+    at_phases,
+    cells_of,
+    generated_before,
+    neighbours_of,
+    one_of_phases,
+    phases_of,
+    plane_weights,
+)
 from lidargrit.nn.precision import at_least_32_bits
 from lidargrit.nn.range_mixture import RangeMixture
 from lidargrit.sensors import SensorModel
@@ -288,10 +298,7 @@ class MaskNetwork(PhaseNetwork):
         """
         guided, total = self.guided(guide), guide.v.new_zeros(len(returned))
         for phases in self.by_lattice():
-            chosen = phases
-            if rng is not None:
-                index = torch.randint(len(phases), (), generator=rng, device=rng.device)
-                chosen = [phases[0 if index.is_meta else int(index)]]  # all take as many operations, if counted
+            chosen = phases if rng is None else one_of_phases(phases, rng)
             nll = self.phase_nll(chosen, guided, guide, returned)
             total = total + nll.sum((0, 2, 3)) * (len(phases) / len(chosen))
         return total
@@ -359,7 +366,7 @@ class RangeNetwork(PhaseNetwork):
         if not self.guided_by_tokens:
             count, total = near.known.sum((1, 2)), torch.where(near.known, near.values, 0.0).sum((1, 2))
             expected = torch.where(count > 0, total / count.clamp(min=1), expected)
-        weights = self._weights(phase)
+        weights = plane_weights(phase, self.elevation_rad)
         found = []
         for pair, rows_apart in enumerate(near.rows_apart):
             (one, other), (has_one, has_other) = near.values[:, pair].unbind(1), near.known[:, pair].unbind(1)
@@ -386,14 +393,3 @@ class RangeNetwork(PhaseNetwork):
         log_scales = log_scales_m - centres  # dv = d range / (1 + range): so the scale is one in metres
         logits, centres, log_scales = (part.movedim(2, -1).contiguous() for part in (logits, centres, log_scales))
         return RangeMixture(logits, centres, log_scales, self.limits_m)
-
-    def _weights(self, phase: Phase) -> Float[Tensor, "h 1 2"]:
-        """Return for each row of a phase the weights of 1 / range in the row above and in the row below."""
-        rows = torch.arange(self.sensor.height, device=self.elevation_rad.device)[phase.pixels[0]]
-        above, below = rows - phase.lattice.rows, rows + phase.lattice.rows
-        inside = (above >= 0) & (below < self.sensor.height)
-        here = self.elevation_rad[rows]
-        up, down = (self.elevation_rad[row.clamp(0, self.sensor.height - 1)] for row in (above, below))
-        between = (up - down).sin()
-        weights = torch.stack(((here - down).sin() / between, (up - here).sin() / between), -1)
-        return torch.where(inside[:, None], weights, 0.5)[:, None]

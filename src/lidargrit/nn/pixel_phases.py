@@ -132,6 +132,12 @@ def completed_lattices(phases: list[Phase]) -> list[tuple[Lattice, int]]:
     return [(Lattice(2 * coarsest.rows, 2 * coarsest.columns), 1), *ends.items()]
 
 
+def one_of_phases(phases: list[Phase], rng: torch.Generator) -> list[Phase]:
+    """Return a random phase of one lattice, which stands for all of them in training."""
+    index = torch.randint(len(phases), (), generator=rng, device=rng.device)
+    return [phases[0 if index.is_meta else int(index)]]  # all take as many operations, where they are counted
+
+
 def generated_before(phase: Phase) -> Bool[Tensor, "4"]:
     """Return which of the 2x2 pixels, row by row, are generated before a phase's."""
     before = torch.zeros(2, 2, dtype=torch.bool)
@@ -178,6 +184,24 @@ def neighbours_of(phase: Phase, values: Float[Tensor, "B H W"], known: Bool[Tens
     rows_apart = (phase.pairs[0][0] != 0, phase.pairs[1][0] != 0)
     stacked = torch.stack(found_values, 1).unflatten(1, (2, 2)), torch.stack(found_known, 1).unflatten(1, (2, 2))
     return Neighbours(*stacked, rows_apart)
+
+
+def plane_weights(phase: Phase, elevation_rad: Float[Tensor, "H"]) -> Float[Tensor, "h 1 2"]:
+    """Return for each row of a phase the weights of 1 / range in the row above and in the row below, on a plane.
+
+    Args:
+        phase: phase whose pixels are interpolated.
+        elevation_rad: elevation of the image's rows in radians.
+    """
+    height = len(elevation_rad)
+    rows = torch.arange(height, device=elevation_rad.device)[phase.pixels[0]]
+    above, below = rows - phase.lattice.rows, rows + phase.lattice.rows
+    inside = (above >= 0) & (below < height)
+    here = elevation_rad[rows]
+    up, down = (elevation_rad[row.clamp(0, height - 1)] for row in (above, below))
+    between = (up - down).sin()
+    weights = torch.stack(((here - down).sin() / between, (up - here).sin() / between), -1)
+    return torch.where(inside[:, None], weights, 0.5)[:, None]
 
 
 def at_phases(values: Shaped[Tensor, "B H W"], phases: list[Phase]) -> Shaped[Tensor, "P B h w"]:

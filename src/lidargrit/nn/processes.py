@@ -36,5 +36,12 @@ def sample_from_all(rows: Float[Tensor, "n D"], count: int, rng: torch.Generator
     return sum_over_processes(mine)
 
 
+def of_first_process(tensor: Shaped[Tensor, "*shape"]) -> Shaped[Tensor, "*shape"]:
+    """Return the first process's tensor in all of them, in place, where each computed it with errors of rounding."""
+    if _several():
+        distributed.broadcast(tensor, src=0)
+    return tensor
+
+
 def _several() -> bool:
     return distributed.is_available() and distributed.is_initialized()

@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from lidargrit.nn.random_choices import sample_index
 from lidargrit.nn.range_steps import RangeSteps
 
 _QUANTILES = (0.05, 0.2, 0.4, 0.6, 0.8, 0.95)
@@ -90,9 +91,7 @@ class RangeMixture:
             self.log_scales + torch.tensor(noise, dtype=self.log_scales.dtype).log(),
             self.limits_m,
         )
-        distribution = scaled.logits.double().softmax(-1).cumsum(-1)
-        chosen = torch.searchsorted(distribution, component.double()[..., None].clamp(max=1 - 1e-12), right=True)
-        chosen = chosen.clamp(max=scaled.logits.shape[-1] - 1)
+        chosen = sample_index(scaled.logits, component)[..., None]
         low, high = (bound.gather(-1, chosen)[..., 0].double() for bound in scaled._bounds())
         centre = scaled.centres.gather(-1, chosen)[..., 0].double()
         scale = scaled.log_scales.gather(-1, chosen)[..., 0].double().exp()

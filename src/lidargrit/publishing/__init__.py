@@ -14,6 +14,7 @@ from lidargrit.errors import CheckpointError, ConfigError, OutputError
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.files import claim_folder, is_taken, read_json, sha256_of, write_json
 from lidargrit.generators import Generator, load, load_class
+from lidargrit.nn.quantization import WeightBits, without_quantized
 from lidargrit.publishing.card import model_card
 from lidargrit.recipes import load_recipe
 from lidargrit.run_folder import CARD_FILE, RUN_FILE, TRAINED_ON_FILE, locate, trained_on, weights_sha256
@@ -58,7 +59,7 @@ def import_weights(recipe: str, folder: Path, files: Sequence[Path], settings: S
     return generator
 
 
-def publish(run: Path, folder: Path, scores: Path | None = None, notes: str = "", half: bool = False) -> str:
+def publish(run: Path, folder: Path, scores: Path | None = None, notes: str = "", bits: WeightBits = 32) -> str:
     """Write the files of a run that others need into a folder, without the user's own paths; nothing is uploaded.
 
     A command that was killed, or that met a full disk, goes on where the same run is published again.
@@ -69,7 +70,7 @@ def publish(run: Path, folder: Path, scores: Path | None = None, notes: str = ""
             without paths and file names, and last a model card (``README.md``). It can be used wherever a run can.
         scores: scores of the run's samples, as ``lidargrit evaluate --json`` wrote them.
         notes: Markdown for the end of the card: what the model is good for, and where it fails.
-        half: whether parameters are rounded to 16 bits.
+        bits: bits of a stored parameter, 8, 16 or 32.
 
     Returns:
         Text of the card.
@@ -85,18 +86,18 @@ def publish(run: Path, folder: Path, scores: Path | None = None, notes: str = ""
         _refuse_taken(folder, None)  # soon, before much is read
     about: Any = read_json(run / RUN_FILE) if (run / RUN_FILE).is_file() else {}
     card_scores = Scorecard.read(scores) if scores else None
-    whole, written = generator.state_dict(), generator.weights(half)
+    whole, written = generator.state_dict(), without_quantized(generator.weights(bits))
     if card_scores:
         _check_scores(card_scores, run)
         if any(not torch.equal(weight, written[name].to(weight.dtype)) for name, weight in whole.items()):
             raise ConfigError(
                 "scores of weights that are then rounded",
                 "those of the rounded ones",
-                "publish with --half alone, score that, and publish it with its scores",
+                f"publish with --bits {bits} alone, score that, and publish it with its scores",
             )
     learned = trained_on(run)
     try:
-        card, public = model_card(generator, about, learned, card_scores, half), _public_facts(about, generator)
+        card, public = model_card(generator, about, learned, card_scores, bits), _public_facts(about, generator)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise CheckpointError(
             f"{run / RUN_FILE}, which cannot be used ({error!r})", "what lidargrit wrote", "restore the file"
@@ -113,7 +114,7 @@ def publish(run: Path, folder: Path, scores: Path | None = None, notes: str = ""
             found = {"fingerprints": learned.fingerprints, "range_fingerprints": learned.range_fingerprints}
             hashes = {name: list(of) for name, of in found.items()}
             write_json(folder / TRAINED_ON_FILE, {"recordings": drives, **hashes})
-        generator.save_pretrained(folder, card, half)  # the card last: it says that the folder is finished
+        generator.save_pretrained(folder, card, bits)  # the card last: it says that the folder is finished
     return card
 
 

@@ -15,6 +15,7 @@ from lidargrit.evaluation.scorecard import NOT_APPLICABLE, Scorecard, format_val
 from lidargrit.evaluation.verdict import verdict
 from lidargrit.generators import Generator
 from lidargrit.loading import Provenance
+from lidargrit.nn.quantization import WeightBits
 from lidargrit.run_folder import recipe_settings
 from lidargrit.sources import data_set_of
 
@@ -29,7 +30,7 @@ def model_card(
     about: dict[str, Any],
     learned: Provenance,
     scores: Scorecard | None = None,
-    half: bool = False,
+    bits: WeightBits = 32,
 ) -> str:
     """Return the card of a model, made from the facts in its run folder alone.
 
@@ -38,7 +39,7 @@ def model_card(
         about: content of its ``run.json``; empty if there is no such file.
         learned: recordings and images that it was trained on.
         scores: scores of its samples, if there are any.
-        half: whether its parameters are rounded to 16 bits.
+        bits: bits of a stored parameter, 8, 16 or 32.
 
     Source:
         The head's entries are those of the hub's documentation, "Model cards".
@@ -53,7 +54,7 @@ def model_card(
     }
     parts = [
         "\n".join(["---", *(f"{name}: {json.dumps(of)}" for name, of in head.items()), "---"]),  # JSON is YAML
-        _what(generator, half),
+        _what(generator, bits),
         _how_to_sample(),
         _data(about, learned),
         _licence(about, licences),
@@ -63,15 +64,16 @@ def model_card(
     return "\n\n".join(parts) + "\n"
 
 
-def _what(generator: Generator, half: bool) -> str:
+def _what(generator: Generator, bits: WeightBits) -> str:
     sensor, name = generator.sensor, generator.public_name()
     weights = sum(weight.numel() for weight in generator.parameters())
+    rounded = {8: ", rounded to 8 bits (vectors to 16)", 16: ", rounded to 16 bits", 32: ""}[bits]
     return (
         f"# {name} for {_text(sensor.name)}\n\n"
         f"{_discovery.summary('generators', name)}\n\n"
         f"This model generates LiDAR scans as range images of {sensor.height}x{sensor.width} pixels, "
         f"{sensor.range_min_m:g} to {sensor.range_max_m:g} m, along the rays of the sensor {_code(sensor.name)}.\n"
-        f"It has {weights:,} parameters{', rounded to 16 bits' if half else ''}.\n"
+        f"It has {weights:,} parameters{rounded}.\n"
         "The Python package `lidargrit` reads it; `config.json` holds its sizes and the rays of the sensor."
     )
 

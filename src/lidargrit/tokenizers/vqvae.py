@@ -66,10 +66,9 @@ class VqvaeConfig(TokenizerConfig):
         raydrop_weight: weight of that loss, lambda, if there is one; 0.1 in the paper, 0.0001 in the released
             configuration for KITTI odometry.
         reconstruction: pixels that the error of the range covers, and its divisor; without the raydrop loss it covers
-            all pixels. ``paper``: the clean range at
-            returns, divided by the number of all pixels. ``reference``: a mask is sampled first, only its pixels count,
-            and the sum is divided by the returns of each scan. ``returns``: the clean range at returns, divided by
-            their number in each scan.
+            all pixels. ``paper``: the clean range at returns, divided by the number of all pixels. ``reference``: a
+            mask is sampled first, only its pixels count, and the sum is divided by the returns of each scan.
+            ``returns``: the clean range at returns, divided by their number in each scan.
         error_unit: ``encoded`` for the error between encodings, as in the paper; ``metres`` for the error between
             ranges, scaled so that with the linear encoding the two are equal. With the logarithmic encoding the first
             weighs near surfaces more, the second far ones.
@@ -108,6 +107,9 @@ class VqvaeConfig(TokenizerConfig):
             )
         if not 0 <= self.dropout < 1:
             raise ConfigError(f"dropout={self.dropout}", "a share in [0, 1)", "lower it")
+        for name in ("raydrop_weight", "reflectance_weight"):
+            if not getattr(self, name) >= 0:
+                raise ConfigError(f"{name}={getattr(self, name)}", "0 or more", "raise it")
 
 
 def _level(

@@ -23,8 +23,8 @@ class FitConfig:
         scans: number of scans seen over the whole training of the stage.
         batch_size: number of scans in a batch, over all processes.
         accumulate: number of parts in which each process takes its share of a batch, one after the other. More parts
-            need less memory and give the same step up to rounding. Only a codebook comes out differently, since its
-            codes move or restart after each part.
+            need less memory. The step is the same in expectation: each part has random numbers of its own, a loss that
+            is divided by the returns of a batch is divided by those of a part, and codes move or restart after a part.
         learning_rate: highest learning rate.
         schedule: course of the learning rate. ``constant``; ``cosine`` falls to 0 over all scans;
             ``linear_second_half`` stays constant for the first half and falls to 0 over the second, as LidarGRIT's

@@ -98,6 +98,10 @@ class Engine:
         """Return whether ``asked`` is true in any process."""
         return asked if self.world_size == 1 else bool(self._mean(torch.tensor(float(asked), device=self.device)) > 0)
 
+    def same(self, number: int) -> bool:
+        """Return whether a number is the same in all processes."""
+        return not self.any(self.world_size > 1 and self._fabric.broadcast(number) != number)
+
     def step(self, images: RangeImage, seed: int, gradient_clip: float, parts: int = 1) -> dict[str, Tensor]:
         """Take one step, or one for each player in turn, and return the loss terms, averaged over the processes.
 

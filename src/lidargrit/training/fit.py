@@ -60,6 +60,12 @@ class Fit:
             self.scans_seen = load_checkpoint(
                 self.checkpoint, self.objective, self.average, self.optimiser, self.built_on
             )
+        if not self.engine.same(self.scans_seen):
+            raise TrainingError(
+                f"{self.checkpoint} after {self.scans_seen} scans here, and not so in another process",
+                "one checkpoint for all processes",
+                "share the run's folder between the machines, and start again",
+            )
         self.engine.by_first(self._begin)
 
     @property

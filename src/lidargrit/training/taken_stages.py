@@ -62,7 +62,7 @@ def taken_stages(recipe: Recipe, generator: Generator) -> dict[str, Objective]:
     """
     if recipe.tokenizer_from is not None:
         donor = load(Path(recipe.tokenizer_from))
-        _check(f"tokenizer_from={recipe.tokenizer_from}", generator, donor, "tokenizer")
+        _check(f"tokenizer_from={recipe.tokenizer_from}", _Stage("tokenizer", generator), _Stage("tokenizer", donor))
         return {"tokenizer": donor.get_tokenizer()}
     if recipe.stages_from is None:
         return {}
@@ -80,9 +80,14 @@ def taken_stages(recipe: Recipe, generator: Generator) -> dict[str, Objective]:
         names = ", ".join(stage for stage in shared if stage not in recipe.train_anew)
         raise ConfigError(f"fine_tune={unknown[0]}", f"one of {names}", "name a stage that the run of stages_from has")
     stages = [stage for stage in shared if stage not in recipe.train_anew]
-    for stage in stages:
-        _check(f"stages_from={recipe.stages_from}", generator, donor, stage, stage in recipe.fine_tune)
-    return {stage: donor.objective(stage) for stage in stages}
+    found = {}
+    for name in stages:
+        ours, theirs = _Stage(name, generator), _Stage(name, donor)
+        _check(f"stages_from={recipe.stages_from}", ours, theirs, name in recipe.fine_tune)
+        if name not in recipe.fine_tune:
+            _check_base(recipe, ours)
+        found[name] = theirs.objective
+    return found
 
 
 def _learn_alike(generator: Generator, donor: Generator, stages: Sequence[str]) -> bool:
@@ -90,23 +95,41 @@ def _learn_alike(generator: Generator, donor: Generator, stages: Sequence[str]) 
     return bool(stages) and all(type(generator.objective(one)) is type(donor.objective(one)) for one in stages)
 
 
-def _check(setting: str, generator: Generator, donor: Generator, stage: str, trained: bool = False) -> None:
+class _Stage:
+    """A stage of a generator: its name, its objective, and the settings of its networks."""
+
+    def __init__(self, name: str, generator: Generator) -> None:
+        self.name, self.objective = name, generator.objective(name)
+        self.settings = _settings(generator, name)
+        self.shapes = _shapes(self.objective.state_dict())
+
+
+def _check_base(recipe: Recipe, stage: _Stage) -> None:
+    """Refuse a stage taken as it is whose training rested on networks that are to be trained."""
+    trained = {"train_anew": recipe.train_anew, "fine_tune": recipe.fine_tune}
+    for base in (name for name in stage.objective.over if name != stage.name):
+        for setting in (setting for setting, names in trained.items() if base in names):
+            raise ConfigError(
+                f"{setting}={base} without {stage.name}, which learned from the {base} of {recipe.stages_from}",
+                f"both trained, or neither: the {stage.name} is of no use with another {base}",
+                f"add {stage.name} to train_anew or fine_tune",
+            )
+
+
+def _check(setting: str, mine: _Stage, given: _Stage, trained: bool = False) -> None:
     """Refuse a stage whose sizes or sensor are not the generator's.
 
     One that is trained further may lack its additions, may have had another dropout, and may be of another sensor if
     its weights fit this one.
     """
-    ours, theirs = _settings(generator, stage), _settings(donor, stage)
+    stage, ours, theirs = mine.name, mine.settings, given.settings
     differing = [name for name in ours if ours[name] != theirs.get(name)]
-    same_sensor = generator.sensor.same_rays(donor.sensor)
+    same_sensor = mine.objective.sensor.same_rays(given.objective.sensor)
     if trained:
-        added = {name for name in generator.objective(stage).additions if ours.get(name) and not theirs.get(name)}
+        added = {name for name in mine.objective.additions if ours.get(name) and not theirs.get(name)}
         differing = [name for name in differing if name not in added and not name.endswith("dropout")]
-        objective = generator.objective(stage)
-        taken = objective.weights_from(donor.objective(stage))
-        same_sensor |= _shapes(objective.state_dict()).items() >= _shapes(taken).items()
-    states = generator.objective(stage).state_dict(), donor.objective(stage).state_dict()
-    if not ours and _shapes(states[0]) != _shapes(states[1]):  # its settings have no stage's name
+        same_sensor |= mine.shapes.items() >= _shapes(mine.objective.weights_from(given.objective)).items()
+    if not ours and mine.shapes != given.shapes:  # its settings have no stage's name
         raise ConfigError(
             f"{setting}, whose {stage} has weights of other sizes",
             "one of this recipe's model and sensor",
