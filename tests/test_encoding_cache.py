@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import torch
 from torch import nn
 
@@ -47,6 +49,11 @@ def test_each_image_is_encoded_once_and_alone():
     assert len(network.batches) == 5, "the bound has room for three; the fourth is encoded anew"
     flipped = RangeImage(images.range_m.flip(-1), images.return_mask.flip(-1), SENSOR)
     assert torch.equal(cache(flipped[:1]), together[:1].flip(-1)), "an augmented image is another"
+
+
+def test_a_copy_of_what_holds_it_shares_network_and_results():
+    cache = EncodingCache(Half(), Half.forward)
+    assert copy.deepcopy([cache])[0] is cache
 
 
 def test_images_of_other_reflectance_are_others():

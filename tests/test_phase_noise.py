@@ -11,6 +11,7 @@ from scipy.stats import kstest, norm
 from torch import Tensor
 
 from lidargrit.errors import ConfigError
+from lidargrit.nn import phase_noise
 from lidargrit.nn.phase_noise import PhaseNoise
 from lidargrit.nn.pixel_decoder import PixelSampling
 from lidargrit.nn.pixel_phases import Phase, phases_of
@@ -144,6 +145,18 @@ def test_only_phases_that_were_taken_forget() -> None:
     rng.manual_seed(4)
     fresh.learn(taken, torch.zeros(1, scans, 4, 8), torch.rand(1, scans, 4, 8, generator=rng) < 0.5)
     assert torch.allclose(after[-1], 0.5 + fresh.sums[-1], atol=1e-4)  # half of it after as many scans as 200
+
+
+def test_four_processes_forget_as_one_that_has_all_of_their_scans(monkeypatch) -> None:
+    rng = torch.Generator().manual_seed(4)
+    seen = torch.rand(20, 1, 8, 4, 8, generator=rng) < 0.5
+    alone, shared = PhaseNoise(PHASES), PhaseNoise(PHASES)
+    for batch in seen:
+        alone.learn(PHASES[-1:], torch.zeros(1, 32, 4, 8), batch.repeat(1, 4, 1, 1))
+    monkeypatch.setattr(phase_noise, "sum_over_processes", lambda counted: 4 * counted)
+    for batch in seen:
+        shared.learn(PHASES[-1:], torch.zeros(1, 8, 4, 8), batch)
+    assert torch.allclose(alone.sums, shared.sums)
 
 
 @torch.no_grad()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import pickle
 import re
 from functools import partial
 
@@ -16,7 +17,7 @@ from lidargrit.conditions import Condition
 from lidargrit.errors import ConfigError
 from lidargrit.evaluation.estimates import Estimate
 from lidargrit.evaluation.likelihood import _maps, score_likelihood
-from lidargrit.generators import load
+from lidargrit.generators import lidargrit, load
 from lidargrit.generators._batches import in_batches
 from lidargrit.generators.lidargrit import (
     START_TOKEN,
@@ -94,6 +95,31 @@ def test_the_pixel_decoder_is_what_samples_unless_told_otherwise():
 def test_a_seed_gives_the_same_scan_whatever_its_batch():
     generator = made()
     assert torch.equal(generator.sample([0, 1, 2, 3, 4, 5]).range_m[4], generator.sample([4]).range_m[0])
+
+
+def test_after_sampling_it_can_still_be_pickled():
+    generator = made()
+    again = pickle.loads(pickle.dumps(generator))
+    wanted = generator.sample([1])
+    assert torch.equal(pickle.loads(pickle.dumps(generator)).sample([1]).range_m, wanted.range_m)
+    assert torch.equal(again.sample([1]).range_m, wanted.range_m)
+
+
+def test_what_was_prepared_for_sampling_is_kept_for_other_choices_of_pixels(monkeypatch):
+    generator = made()
+    generator.sample([0])
+    monkeypatch.setattr(lidargrit, "CachedDecoder", None)
+    generator.sample([0], TokenSampling(range_noise=0.5, mask_correlation=0.0))
+    with pytest.raises(TypeError):
+        generator.sample([0], TokenSampling(temperature=0.5))
+
+
+@pytest.mark.parametrize("kind", [LidarGrit, MaskGit])
+def test_a_choice_that_cannot_be_is_refused_before_any_token(kind, monkeypatch):
+    generator = kind(kind.Config(TOKENIZER, TRANSFORMER), SENSOR).eval()
+    monkeypatch.setattr(generator, "transformer", None)
+    with pytest.raises(ConfigError, match="without a pixel decoder"):
+        generator.sample([0], generator.Sampling(mask="pixels"))
 
 
 def test_a_model_without_a_pixel_decoder_refuses_to_sample_by_one():

@@ -19,6 +19,7 @@ from lidargrit.loading import DataConfig
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.phase_noise import PhaseNoise
 from lidargrit.nn.pixel_phases import phases_of
+from lidargrit.nn.processes import of_first_process
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import load_sensor
@@ -48,7 +49,7 @@ import contextlib, io, os, sys
 from pathlib import Path
 import torch
 from lidargrit.cli import main
-from test_processes import learn_noise, learn_pixels, play, steps_with_a_bad_process
+from test_processes import agreements, learn_noise, learn_pixels, play, steps_with_a_bad_process
 
 folder, words = Path(sys.argv[1]), sys.argv[2:]
 assert main(words) == 0
@@ -56,6 +57,7 @@ weights, rank = play()
 torch.save(weights, folder / f"game{rank}.pt")
 assert steps_with_a_bad_process() == [False, False]
 assert learn_pixels()
+assert agreements(rank) == [True, False]
 torch.save(learn_noise(rank), folder / f"noise{rank}.pt")
 assert main([*words, "training.tokenizer.learning_rate=1"]) == 2  # all are told what the first found
 if rank == 1:
@@ -119,6 +121,14 @@ def steps_with_a_bad_process():
         images = replace(images, range_m=images.range_m.clone())
         images.range_m[0, 0, 0] = torch.nan
     return [bool(engine.step(images, 0, gradient_clip=1.0)["loss"].isfinite()) for _ in range(2)]
+
+
+def agreements(rank: int) -> list[bool]:
+    """Return whether all processes have the same number, of one that they do and one that they do not share."""
+    engine = Engine("fp32")
+    codes = of_first_process(torch.full((2,), float(rank)))
+    assert torch.equal(codes, torch.zeros(2))
+    return [engine.same(5_700_001), engine.same(5_700_001 + rank)]
 
 
 def learn_pixels():

@@ -122,3 +122,26 @@ def test_a_run_with_it_drops_by_it(tmp_path):
     of_pixels = Condition.of_pixels(pairs(2), observed)
     with pytest.raises(ConfigError, match="without a network for what is known"):
         again.complete(of_pixels, [3, 4], TokenSampling(completion="network"))
+
+
+@torch.no_grad()
+def test_each_scan_is_completed_by_the_network_for_what_is_known_of_it():
+    torch.manual_seed(0)
+    sizes = replace(LidarGrit.smallest_config(SENSOR), raydrop=TINY)
+    model = LidarGrit(sizes, SENSOR).eval()
+    unknown = torch.zeros(3, 64, 32, dtype=torch.bool)
+    unknown[1, 20, 5] = True  # so the second one is completed by its tokens
+    conditions, seeds = Condition.of_surfaces(pairs(3), unknown), [3, 4, 5]
+    together = model.complete(conditions, seeds)
+    for index, seed in enumerate(seeds):
+        alone = model.complete(conditions[[index]], [seed])
+        assert torch.equal(together.return_mask[index], alone.return_mask[0])
+        assert torch.equal(together.range_m[index], alone.range_m[0])
+    by_tokens = model.complete(conditions, seeds, TokenSampling(completion="tokens"))
+    assert [
+        torch.equal(one, other) for one, other in zip(together.return_mask, by_tokens.return_mask, strict=True)
+    ] == [
+        False,
+        True,
+        False,
+    ]

@@ -237,3 +237,10 @@ def test_sizes_that_cannot_be_halved_are_refused():
         Vqvae(replace(SMALL, channel_multipliers=(1, 1, 1)), sensor_of(16, 30))
     with pytest.raises(ConfigError, match="multiple of 32"):
         replace(SMALL, channels=20)
+
+
+@pytest.mark.parametrize("name", ["raydrop_weight", "reflectance_weight"])
+@pytest.mark.parametrize("wrong", [-0.1, float("nan")])
+def test_negative_weights_of_the_loss_are_refused(name, wrong):
+    with pytest.raises(ConfigError, match=f"{name}={wrong}; wanted 0 or more"):
+        VqvaeConfig(**{name: wrong})

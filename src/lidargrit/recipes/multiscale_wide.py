@@ -8,7 +8,7 @@ from lidargrit.recipes import multiscale_small
 
 RECIPE = replace(
     multiscale_small.RECIPE,
-    title="a pixel decoder without tokens: 64x1024, for one CPU core and an hour",
+    title="a pixel decoder without tokens: 64x1024, for one CPU core and half an hour",
     model=MultiscaleConfig(PixelDecoderConfig(column_halvings=2, row_channels=2, range_width=36)),
     data=replace(
         multiscale_small.RECIPE.data,

@@ -9,7 +9,7 @@ _MODEL = small.RECIPE.model
 
 RECIPE = replace(
     small.RECIPE,
-    title="LidarGRIT with a pixel decoder, small: 64x256 in 256 tokens, for one CPU core and three hours",
+    title="LidarGRIT with a pixel decoder, small: 64x256 in 256 tokens, for one CPU core and four hours",
     model=replace(
         _MODEL,
         # Fewer tokens are learned sooner, and the pixel decoder adds the detail that they leave out.
