@@ -30,7 +30,7 @@ NAMES = {
     "dusty_small": "DUSty-I",
     "dcgan_small": "DCGAN",
     "lidargan_small": "LidarGAN",
-    "lidarvae_small": "its VAE",
+    "lidarvae_small": "LidarGAN's VAE",
     "ultralidar_small": "UltraLiDAR",
     "r2dm_small.steps32": "R2DM, 32 steps",
     "r2flow_small.steps16": "R2Flow, 16 steps",
