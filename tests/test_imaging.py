@@ -158,7 +158,9 @@ def test_rings_of_another_sensor_are_refused_with_the_cure():
     x, y, z = scan.points_xyz_m.double().unbind(dim=1)
     rays = load_sensor("vlp16").elevation_rad[:, 0].double()
     scan = replace(scan, ring=(torch.atan2(z, torch.hypot(x, y))[:, None] - rays).abs().argmin(dim=1))
-    with pytest.raises(ScanError, match=r"or a model of that sensor: .*vlp16.*fit-sensor") as refusal:
+    with pytest.raises(
+        ScanError, match=r"that made the scan \(.*vlp16.*fit-sensor.*or take a model of that sensor"
+    ) as refusal:
         project(scan, HDL64E)
     assert "--" not in str(refusal.value), "no option that only some commands have"
     assert "fewer lasers" in doubts_about_rays(scan, load_sensor("os1_64"), "spherical")

@@ -1,6 +1,10 @@
 """What long work says: how much is left of it and of all work, on terminals and in files."""
 
 import io
+import os
+import sys
+from contextlib import suppress
+from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -84,3 +88,33 @@ def test_interrupted_stages_keep_the_time_that_they_took(tmp_path):
     with _Clock(path).stage("sample"):  # the same command again
         pass
     assert read_json(path) == {"sample": 41.0}
+
+
+def test_a_reader_that_has_gone_ends_no_work(monkeypatch):
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write, "w") as gone:
+        monkeypatch.setattr(sys, "stderr", gone)
+        reporter = TerminalReporter()
+        with reporter.progress("sampling", 2) as progress:
+            for _ in range(2):
+                progress.advance(1)
+        reporter.of_process("two").message("a line")
+        monkeypatch.undo()
+        with suppress(BrokenPipeError):
+            gone.close()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+def test_a_full_disk_for_messages_ends_no_work(monkeypatch):
+    with open("/dev/full", "w") as full:
+        monkeypatch.setattr(sys, "stderr", full)
+        TerminalReporter().message("a line")
+        monkeypatch.undo()
+        with suppress(OSError):
+            full.close()
+
+
+def test_no_standard_error_is_no_error(monkeypatch):
+    monkeypatch.setattr(sys, "stderr", None)
+    TerminalReporter().message("a line")

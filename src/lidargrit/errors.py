@@ -112,7 +112,9 @@ def nearest_names(name: str, known: Iterable[str], at_most: int = 3) -> str:
         'sliced_wasserstein'
     """
     names = sorted(set(known))
-    close = difflib.get_close_matches(name, names, n=at_most, cutoff=0.4) or names[:at_most]
+    begun = [each for each in names if name and each.startswith(name)]
+    alike = difflib.get_close_matches(name, names, n=at_most, cutoff=0.4)
+    close = [*begun, *(each for each in alike if each not in begun)][:at_most] or names[:at_most]
     surely = difflib.get_close_matches(name, names, n=2, cutoff=_SURELY_MEANT)
     return one_of(surely if len(surely) == 1 else close)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 _SILENT_S_AT_MOST = 10.0  # between two lines of one piece of work, where there is no terminal
@@ -93,12 +93,19 @@ class TerminalReporter(Reporter):
     def __init__(self) -> None:
         from rich.console import Console  # noqa: PLC0415  only the command line needs it
 
-        self._console = Console(file=sys.stderr, highlight=False)
+        class Silent(Console):
+            """A console that falls silent when its reader has gone; rich's own would end the program."""
+
+            def on_broken_pipe(self) -> None:
+                self.quiet = True
+
+        self._console = Silent(file=sys.stderr, highlight=False, quiet=sys.stderr is None)
         self._schedule = Schedule({})
 
     def message(self, text: str) -> None:
         """Say one line."""
-        self._console.print(text, markup=False, soft_wrap=True)
+        with suppress(OSError):  # a full disk: what is worked on matters more
+            self._console.print(text, markup=False, soft_wrap=True)
 
     def expect(self, expected_s: Mapping[str, float]) -> None:
         """Show from now on how long all pieces of work will still take."""
@@ -134,7 +141,8 @@ class _LineReporter(Reporter):
         self._name = name
 
     def message(self, text: str) -> None:
-        print(f"{self._name}: {text}", file=sys.stderr, flush=True)
+        with suppress(OSError):
+            print(f"{self._name}: {text}", file=sys.stderr, flush=True)
 
     @contextmanager
     def progress(self, what: str, total: int, done: int = 0) -> Iterator[Progress]:

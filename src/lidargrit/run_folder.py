@@ -13,6 +13,7 @@ from lidargrit.projection import ProjectionVariant
 
 CONFIG_FILE, WEIGHTS_FILE, CARD_FILE = "config.json", "model.safetensors", "README.md"  # the names that the hub knows
 RUN_FILE = "run.json"  # ``origin`` in it says that the weights beside it were not trained in this folder
+CHECKPOINT_FILE = "checkpoint.safetensors"  # of a stage, in its own folder
 TRAINED_ON_FILE = "trained_on.json"  # in a run's folder and beside its samples: which drives, which pixels
 PRETRAINED = Path(__file__).parent / "pretrained"
 PACKAGED = (PRETRAINED, PRETRAINED.with_name("pretrained_wide"))  # their names go wherever a run is wanted
@@ -27,6 +28,11 @@ def locate(run: str | Path) -> Path:
 def is_run(folder: Path) -> bool:
     """Return whether a folder is that of a finished run."""
     return (folder / CONFIG_FILE).is_file()
+
+
+def is_unfinished(folder: Path) -> bool:
+    """Return whether a folder is that of a run whose training has not ended, or of one of its stages."""
+    return not is_run(folder) and any((folder / name).is_file() for name in (RUN_FILE, CHECKPOINT_FILE))
 
 
 def weights_sha256(folder: Path) -> str:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import importlib
 import os
-import signal
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -13,6 +13,7 @@ from typing import Any
 
 from lidargrit import __version__, _discovery
 from lidargrit.cli._parser import EXIT_CODES, HelpFormatter, Parser
+from lidargrit.cli._signals import raising_on_signals
 from lidargrit.errors import LidarGritError, Terminated, UsageError
 
 _EXAMPLES = """\
@@ -30,8 +31,17 @@ a verb's own examples: lidargrit VERB --help
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb; 0 = done, 2 = the user's mistake, printed in one line, 130 = interrupted, 143 = terminated."""
+    try:
+        with raising_on_signals():
+            return _run([*(sys.argv[1:] if arguments is None else arguments)])  # list() here is our own verb
+    except KeyboardInterrupt:  # before the command was read
+        return 130
+    except Terminated:
+        return 143
+
+
+def _run(words: list[str]) -> int:
     _let_threads_sleep()
-    words = [*(sys.argv[1:] if arguments is None else arguments)]  # list() here is our own verb
     parser = build_parser()
     try:
         options = _parsed(parser, words)
@@ -43,9 +53,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.print_help()
         return 0
     try:
-        with _raising_on_termination(), _refusing_unusable_paths():
+        with _refusing_unusable_paths():
             options.run(options)
-        sys.stdout.flush()  # here, where a closed pipe is caught, and not when Python ends
+            if sys.stdout is not None:  # closed by the caller
+                sys.stdout.flush()  # here, where a closed pipe is caught, and not when Python ends
     except LidarGritError as error:
         if options.debug:
             raise
@@ -58,8 +69,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"\nlidargrit {options.verb}: interrupted; {_what_follows(options)}", file=sys.stderr)
         return 130
     except BrokenPipeError:  # the reader of our output, such as head, has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _write_nowhere()
     return 0
+
+
+def _write_nowhere() -> None:
+    """Let Python write the rest of its output nowhere when it ends, after standard output has failed."""
+    if sys.stdout is not None:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _what_follows(options: argparse.Namespace) -> str:
@@ -107,29 +124,15 @@ def _parsed(parser: Parser, words: list[str]) -> argparse.Namespace:
 
 
 @contextmanager
-def _raising_on_termination() -> Iterator[None]:
-    """Let SIGTERM, which batch schedulers send before they kill, end a verb as Ctrl-C does: with its files in order."""
-
-    def terminate(*_: object) -> None:
-        raise Terminated
-
-    try:
-        before = signal.signal(signal.SIGTERM, terminate)
-    except ValueError:  # a caller's thread: signals are the caller's
-        yield
-        return
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
-@contextmanager
 def _refusing_unusable_paths() -> Iterator[None]:
     """Turn the system's refusal of a path into an error of one line, wherever the path was opened."""
     try:
         yield
     except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EIO) and not error.filename:
+            _write_nowhere()
+            cure = "redirect it to a file on another disk"
+            raise UsageError(f"{error.strerror!r} while writing the output", "a disk with room", cure) from error
         if not error.filename:  # no matter of a path, such as a closed pipe
             raise
         raise UsageError(f"{error.strerror} for {error.filename}", "a file that can be used", "check it") from error

@@ -164,13 +164,16 @@ def _jobs(
     reporter: Reporter,
 ) -> Iterator[_Job]:
     """Read each scan of missing files once; note those that cannot be used in a set, or refuse them without one."""
-    last, scan, condition = -1, None, None
+    last, scan, condition, doubted = -1, None, None, False
     for index, turn in missing:
         if index != last:
             last, scan = index, None
             try:
                 scan = inputs.read(index)
                 condition = condition_of(scan, derive_seed(seed, index))
+                if scan.doubt and not doubted:
+                    reporter.message(f"WARNING: {scan.doubt}")
+                    doubted = True
             except ScanError as error:
                 if skipped is None:
                     raise

@@ -18,7 +18,7 @@ from lidargrit.errors import ConfigError, ScanError
 from lidargrit.formats import ScanFormat
 from lidargrit.loading import DataConfig, RangeImages
 from lidargrit.loading.config import ScanSettings
-from lidargrit.projection import ProjectionVariant, index_map, project, unproject
+from lidargrit.projection import FIT_SENSOR, ProjectionVariant, doubts_about_rays, index_map, project, unproject
 from lidargrit.projection.fit import projection_that_fits
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import ProjectionName, SensorModel, load_sensor
@@ -36,12 +36,14 @@ class InputScan:
         points: points of the scan; None where it was an image.
         point_of_pixel: index of the point that fills each pixel, -1 for none; None where it was an image.
         on_grid: True for pixels that the scan covers; None for all.
+        doubt: sign that another sensor than the named one made the scan, for a person; "" if there is none.
     """
 
     image: RangeImage
     points: Scan | None = None
     point_of_pixel: Int64[Tensor, "H W"] | None = None
     on_grid: Bool[Tensor, "H W"] | None = None
+    doubt: str = ""
 
     def joined(self, completed: RangeImage, condition: Condition) -> Scan:
         """Return the points of a completed scan: its own where ranges were observed, elsewhere points on the pixels'
@@ -147,7 +149,9 @@ class ScanReader:
         variant = self.variant if method == self.sensor.projection else "exact"
         image = project(scan, self.sensor, method, variant, self.partial)
         at = index_map(scan, self.sensor, method, variant, self.partial)[:, :: self.sensor.column_stride]
-        return InputScan(image, scan, torch.from_numpy(at.astype(np.int64)))
+        doubt = doubts_about_rays(scan, self.sensor, method)
+        said = f"{scan.source}, imaged as {self.sensor.name}: {doubt}; name that sensor, {FIT_SENSOR}" if doubt else ""
+        return InputScan(image, scan, torch.from_numpy(at.astype(np.int64)), doubt=said)
 
 
 def images_for(completers: Sequence[Completer], source: str, settings: ScanSettings, reporter: Reporter) -> RangeImages:

@@ -52,7 +52,7 @@ class SparseReader(ScanReader):
         if label is not None and seen.image.label is not None:
             label[target] = seen.image.label[own]
         within = (range_m >= wanted.range_min_m) & (range_m <= wanted.range_max_m)
-        return InputScan(RangeImage.masked(range_m, within, wanted, reflectance, label), scan, at, on_grid)
+        return InputScan(RangeImage.masked(range_m, within, wanted, reflectance, label), scan, at, on_grid, seen.doubt)
 
     def _source_like_wanted(self) -> SensorModel:
         """Return the scans' sensor with as many columns as the wanted one."""

@@ -18,5 +18,7 @@ def usable_device(name: str) -> torch.device:
         device = torch.device(name)
         torch.zeros(1, device=device).item()  # "meta" has shapes and no numbers
     except (RuntimeError, AssertionError, NotImplementedError):  # an assertion: PyTorch was built without it
-        raise ConfigError(f"device {name!r}", "one that PyTorch finds on this computer", "try cpu or cuda") from None
+        other = "cpu or cuda" if torch.cuda.is_available() else "cpu"
+        cure = f"try {other}; lidargrit doctor shows what there is"
+        raise ConfigError(f"device {name!r}", "one that PyTorch finds on this computer", cure) from None
     return device

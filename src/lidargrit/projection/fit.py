@@ -253,7 +253,7 @@ def _wrong_elevations(scan: Scan, sensor: SensorModel, outside: float) -> ScanEr
 
 def _name_sensor(scan: Scan) -> str:
     if fitting := " or ".join(sensors_that_fit(scan)):
-        return f"name the sensor that made the scan, or a model of that sensor: {fitting}, {FIT_SENSOR}"
+        return f"name the sensor that made the scan ({fitting}, {FIT_SENSOR}), or take a model of that sensor"
     return f"no sensor in the package spans its elevations: {FIT_SENSOR.removeprefix('or ')}"
 
 

@@ -22,7 +22,7 @@ from lidargrit.loading import (
     prepare,
 )
 from lidargrit.reporting import Reporter
-from lidargrit.run_folder import is_run, locate, recorded_projection, trained_on
+from lidargrit.run_folder import is_run, is_unfinished, locate, recorded_projection, trained_on
 from lidargrit.sensors import SensorModel, load_sensor
 from lidargrit.sources.image_files import ImageFileSource, image_files
 from lidargrit.sources.sample_formats import is_tensor_folder, load_sample_format, read_tensor_folder, recognise
@@ -254,6 +254,8 @@ def open_source(text: str, bad_points: BadPoints = "refuse", samples_format: str
         return RunSource(text, folder)
     if here and is_sample_folder(folder):
         return SampleSource(text, folder)
+    if here and is_unfinished(folder):
+        load(folder)  # which says so
     if here and is_tensor_folder(folder):
         return TensorSource(text, folder)
     if "://" in text or (here and is_prepared(text)):

@@ -17,6 +17,7 @@ from lidargrit.loading import Batches, RangeImages
 from lidargrit.nn.blocks import prepare_for_training
 from lidargrit.nn.objective import Objective
 from lidargrit.reporting import Reporter
+from lidargrit.run_folder import CHECKPOINT_FILE
 from lidargrit.structures import RangeImage
 from lidargrit.training.checkpoint import load_checkpoint, save_checkpoint
 from lidargrit.training.config import FitConfig
@@ -71,7 +72,7 @@ class Fit:
     @property
     def checkpoint(self) -> Path:
         """File from which the stage resumes."""
-        return self.folder / "checkpoint.safetensors"
+        return self.folder / CHECKPOINT_FILE
 
     def run(self, train: RangeImages, val: RangeImages, what: str) -> Objective:
         """Train until all scans of the budget are seen, and return the objective with its averaged weights.

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidargrit import _discovery
+from lidargrit import _discovery, formats
 from lidargrit.errors import DataError, ScanError, UnknownNameError, nearest_names
 from lidargrit.loading import Pixels, Provenance, RangeImages
 from lidargrit.sensors import SensorModel, load_sensor
@@ -68,9 +68,10 @@ def load_sample_format(name: str) -> SampleFormat:
 
 
 def is_tensor_folder(folder: Path) -> bool:
-    """Return whether a folder holds samples as tensors."""
+    """Return whether a folder holds samples as tensors, and no scans, beside which weights may lie."""
     try:
-        return folder.is_dir() and any(True for _ in folder.glob("[!.]*.pth"))
+        tensors = folder.is_dir() and any(True for _ in folder.glob("[!.]*.pth"))
+        return tensors and not any(formats.candidates(path) for path in folder.iterdir())
     except OSError:  # a name longer than names can be
         return False
 

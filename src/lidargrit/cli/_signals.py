@@ -1,0 +1,55 @@
+"""Ctrl-C and SIGTERM → KeyboardInterrupt and Terminated, never in the middle of an import."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from types import FrameType
+from typing import Any
+
+from lidargrit.errors import Terminated
+
+_IMPORTING = "<frozen importlib._bootstrap>"
+_AGAIN_S = 0.05
+
+
+@contextmanager
+def raising_on_signals() -> Iterator[None]:
+    """Let SIGTERM, which batch schedulers send before they kill, end a verb as Ctrl-C does: with its files in order.
+
+    A module that an exception leaves half imported fails later, with an error that hides the signal. So a signal that
+    comes during an import is raised as soon as the import is done.
+    """
+    raised: dict[int, type[BaseException]] = {signal.SIGTERM: Terminated}
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # ignored in the background of a script
+        raised[signal.SIGINT] = KeyboardInterrupt
+
+    def receive(number: int, frame: FrameType | None) -> None:
+        if not _is_importing(frame):
+            raise raised[number]
+        before = signal.getsignal(signal.SIGALRM)
+
+        def again(_: int, later: FrameType | None) -> None:
+            signal.signal(signal.SIGALRM, before)
+            receive(number, later)
+
+        signal.signal(signal.SIGALRM, again)
+        signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
+
+    befores: dict[int, Any] = {}
+    with suppress(ValueError):  # a caller's thread: signals are the caller's
+        befores = {number: signal.signal(number, receive) for number in raised}
+    try:
+        yield
+    finally:
+        for number, before in befores.items():
+            signal.signal(number, before)
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if frame.f_code.co_filename == _IMPORTING:
+            return True
+        frame = frame.f_back
+    return False

@@ -1,0 +1,68 @@
+"""Ctrl-C and SIGTERM: one line and an exit code, whenever they come."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from lidargrit.cli._signals import raising_on_signals
+from lidargrit.errors import Terminated
+
+SIGNALS = {signal.SIGTERM: Terminated, signal.SIGINT: KeyboardInterrupt}
+
+
+def interrupted(action: Callable[[], object]) -> None:
+    """Do something during which a signal comes, and then wait for it."""
+    with raising_on_signals():
+        action()
+        time.sleep(5)
+        pytest.fail("the signal was lost")
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_during_an_import_is_raised_after_it(number, tmp_path, monkeypatch):
+    name = f"slow_{number.name.lower()}"
+    module = f"import os, time\nos.kill(os.getpid(), {int(number)})\ntime.sleep(0.2)\nfinished = True\n"
+    (tmp_path / f"{name}.py").write_text(module)
+    monkeypatch.syspath_prepend(tmp_path)
+    before = signal.getsignal(number), signal.getsignal(signal.SIGALRM)
+    with pytest.raises(SIGNALS[number]):
+        interrupted(lambda: __import__(name))
+    assert sys.modules[name].finished
+    assert (signal.getsignal(number), signal.getsignal(signal.SIGALRM)) == before
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_elsewhere_it_is_raised_at_once(number):
+    with pytest.raises(SIGNALS[number]):
+        interrupted(lambda: os.kill(os.getpid(), number))
+
+
+def test_an_ignored_interrupt_stays_ignored():
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with raising_on_signals():
+            os.kill(os.getpid(), signal.SIGINT)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+def test_output_that_cannot_be_written_is_one_line():
+    with open("/dev/full", "wb") as full:
+        words = [sys.executable, "-P", "-m", "lidargrit", "list", "sensors"]
+        done = subprocess.run(words, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith("lidargrit list: got 'No space left on device' while writing the output; wanted")
+    assert done.stderr.count("\n") == 1
+
+
+def test_a_closed_standard_output_is_no_error():
+    code = "import sys; sys.stdout = None; from lidargrit.cli import main; sys.exit(main(['list', 'sensors']))"
+    done = subprocess.run([sys.executable, "-P", "-c", code], stderr=subprocess.PIPE, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
