@@ -34,10 +34,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with raising_on_signals():
             return _run([*(sys.argv[1:] if arguments is None else arguments)])  # list() here is our own verb
-    except KeyboardInterrupt:  # before the command was read
-        return 130
-    except Terminated:
+    except Terminated:  # before the command was read
         return 143
+    except KeyboardInterrupt:
+        return 130
 
 
 def _run(words: list[str]) -> int:
