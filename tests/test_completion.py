@@ -192,6 +192,17 @@ def test_upsample_adds_the_rows_that_lack(folders, tmp_path):
     assert float((ground[:, 2] + 1.7).abs().median()) < 0.2
 
 
+def test_scans_of_another_sensor_are_told_once(tmp_path, capsys):
+    for seed in (0, 1):
+        NumpyArray.write(tmp_path / "scans" / f"{seed}.npz", simulate(seed=seed))
+    words = ["complete", str(tmp_path / "scans"), str(tmp_path / "out"), "--model", "nearest", "--observed", "rows:2"]
+    assert main([*words, "--sensor", "vlp16"]) == 0
+    told = capsys.readouterr().err
+    assert told.count("WARNING: ") == 1
+    assert "imaged as vlp16: " in told
+    assert "the sensor that made the scans has more of them" in told
+
+
 def test_a_file_that_was_cut_off_is_refused_and_bare_coordinates_stay_bare(tmp_path):
     sensor = load_sensor("hdl64e_kitti_odometry")
     scan = simulate(seed=3)

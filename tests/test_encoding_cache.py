@@ -8,8 +8,11 @@ import torch
 from torch import nn
 
 from lidargrit.nn.encoding_cache import EncodingCache
+from lidargrit.recipes import load_recipe
 from lidargrit.sensors import load_sensor
 from lidargrit.structures import RangeImage
+from lidargrit.training.measure import measure
+from tiny_runs import MODEL, SHORT, SIMULATED
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(16)
 
@@ -70,3 +73,13 @@ def test_images_of_other_reflectance_are_others():
     cache = EncodingCache(nn.Identity(), reflectance)
     for image in (dark, bright, dark):
         assert torch.equal(cache(image), reflectance(nn.Identity(), image))
+
+
+def test_a_measured_stage_encodes_other_images_in_every_step(monkeypatch):
+    encoded, encode = [], EncodingCache._encoded
+    monkeypatch.setattr(EncodingCache, "_encoded", lambda cache, some: encoded.append(some) or encode(cache, some))
+    recipe = load_recipe("demo", [*MODEL, *SIMULATED, *SHORT])
+    batch = recipe.settings_of("transformer").batch_size
+    measure(recipe)
+    new = [some for some in encoded if not some.range_m.is_meta]  # the others are of counted operations
+    assert len(new) == 4 * batch, "one to warm up, and three timed steps"

@@ -5,6 +5,7 @@ import pickle
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -179,3 +180,10 @@ def test_other_sizes_numbers_and_names_are_refused(tmp_path):
         images.batch([0])
     with pytest.raises(ScanError, match="1x64x1024, as the first"):
         images.batch([1])
+
+
+def test_weights_beside_scans_make_no_samples_of_them(tmp_path):
+    torch.save({"weight": torch.zeros(2)}, tmp_path / "model.pth")
+    assert is_tensor_folder(tmp_path)
+    np.zeros((64, 4), np.float32).tofile(tmp_path / "000000.bin")
+    assert not is_tensor_folder(tmp_path)

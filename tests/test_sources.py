@@ -10,7 +10,7 @@ import pytest
 
 from lidargrit import sources
 from lidargrit.cli import main
-from lidargrit.errors import ConfigError, DataError, ScanError, UnknownNameError
+from lidargrit.errors import CheckpointError, ConfigError, DataError, ScanError, UnknownNameError
 from lidargrit.evaluation.benchmark import Benchmark
 from lidargrit.evaluation.comparison import EvalConfig, compare_sources
 from lidargrit.evaluation.intervals import Resampling
@@ -167,3 +167,10 @@ def test_nobody_else_asks_what_a_source_is():
 def test_a_verb_that_wants_points_says_what_a_source_holds_instead(verb, capsys):
     assert main([verb, "pretrained"]) == 2
     assert "pretrained, which holds a trained model; wanted the points of scans" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("begun", ["run.json", "checkpoint.safetensors"])
+def test_an_unfinished_run_is_told_as_such(tmp_path, begun):
+    (tmp_path / begun).write_text("{}")
+    with pytest.raises(CheckpointError, match=r"holds no finished model.*finish the training"):
+        open_source(str(tmp_path))

@@ -15,7 +15,6 @@ from lidargrit.datasets.kitti_odometry import KittiOdometry
 from lidargrit.errors import CheckpointError, ConfigError, OutputError, TrainingError
 from lidargrit.files import claim_folder, read_tensors, write_json, write_tensors
 from lidargrit.loading import Batches, DataConfig
-from lidargrit.nn.encoding_cache import EncodingCache
 from lidargrit.nn.objective import Objective
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
@@ -326,16 +325,6 @@ def test_a_measured_plan_tells_operations_time_and_memory():
     for line, (stage, flops) in zip(lines, training_flops(recipe).items(), strict=True):
         wanted = rf"{stage}: {flops:.2e} floating-point operations at [\d.e+]+ scans/s: [\d.]+ \w+ on cpu, [\d.]+ GiB"
         assert re.fullmatch(wanted.replace("e+", "e\\+", 1), line)
-
-
-def test_a_measured_stage_encodes_other_images_in_every_step(monkeypatch):
-    encoded, encode = [], EncodingCache._encoded
-    monkeypatch.setattr(EncodingCache, "_encoded", lambda cache, some: encoded.append(some) or encode(cache, some))
-    recipe = load_recipe("demo", TINY)
-    batch = recipe.settings_of("transformer").batch_size
-    measure(recipe)
-    new = [some for some in encoded if not some.range_m.is_meta]  # the others are of counted operations
-    assert len(new) == 4 * batch, "one to warm up, and three timed steps"
 
 
 def test_lines_that_are_no_entries_of_a_log_are_passed_over(tmp_path):

@@ -34,6 +34,8 @@ MISTAKES = {
     "evaluate nowhere nowhere --variant exakt": "got variant 'exakt'; wanted one such as exact or textbook; choose one",
     "evaluate nowhere nowhere --metrics slicd_wasserstein": "wanted one of sliced_wasserstein; see all",
     "view .": "got ., which is an empty folder; wanted one with scans in it;",
+    "sample nowhere out --device meta": "try cpu",
+    "inspect simulated:1 --sensor hdl64": "wanted one of hdl64e_kitti_360, hdl64e_kitti_odometry or",
 }
 FACTS = {
     "doctor": "processors",
