@@ -129,10 +129,10 @@ def _refusing_unusable_paths() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EIO) and not error.filename:
-            _write_nowhere()
-            cure = "redirect it to a file on another disk"
-            raise UsageError(f"{error.strerror!r} while writing the output", "a disk with room", cure) from error
-        if not error.filename:  # no matter of a path, such as a closed pipe
+        if error.filename:
+            raise UsageError(f"{error.strerror} for {error.filename}", "a file that can be used", "check it") from error
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EIO):  # such as a closed pipe
             raise
-        raise UsageError(f"{error.strerror} for {error.filename}", "a file that can be used", "check it") from error
+        _write_nowhere()
+        cure = "redirect it to a file on another disk"
+        raise UsageError(f"{error.strerror!r} while writing the output", "a disk with room", cure) from error

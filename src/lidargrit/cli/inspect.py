@@ -43,9 +43,10 @@ def run(options: argparse.Namespace) -> None:
         scan = load_scan(options.scan, bad_points=bad_points)
     else:
         source = open_source(options.scan, bad_points)
-        scan = source.scans().scan(0)
+        dataset = source.scans()
+        scan = dataset.scan(0)
         # The files of a folder that is no known data set tell no sensor, as a file alone tells none.
-        name = name or ("" if source.data_set == "folder" else source.scans().sensor)
+        name = name or ("" if source.data_set == "folder" else dataset.sensor)
     sensor, method = settings.data.imaged(load_sensor(name or closest_sensor(scan))), None
     if settings.data.projection == "sensor" and (method := projection_that_fits(scan, sensor)) != sensor.projection:
         TerminalReporter().message("points that are not in firing order, so rows go by elevation")

@@ -18,8 +18,8 @@ from lidargrit.errors import ConfigError, ScanError
 from lidargrit.formats import ScanFormat
 from lidargrit.loading import DataConfig, RangeImages
 from lidargrit.loading.config import ScanSettings
-from lidargrit.projection import FIT_SENSOR, ProjectionVariant, doubts_about_rays, index_map, project, unproject
-from lidargrit.projection.fit import projection_that_fits
+from lidargrit.projection import ProjectionVariant, doubts_about_rays, index_map, project, unproject
+from lidargrit.projection.fit import projection_that_fits, told_doubt
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import ProjectionName, SensorModel, load_sensor
 from lidargrit.sources import open_images, open_source
@@ -150,7 +150,7 @@ class ScanReader:
         image = project(scan, self.sensor, method, variant, self.partial)
         at = index_map(scan, self.sensor, method, variant, self.partial)[:, :: self.sensor.column_stride]
         doubt = doubts_about_rays(scan, self.sensor, method)
-        said = f"{scan.source}, imaged as {self.sensor.name}: {doubt}; name that sensor, {FIT_SENSOR}" if doubt else ""
+        said = told_doubt(scan.source, self.sensor, doubt)
         return InputScan(image, scan, torch.from_numpy(at.astype(np.int64)), doubt=said)
 
 

@@ -8,7 +8,8 @@ from lidargrit.datasets import ScanDataset
 from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import ScanError
 from lidargrit.loading.config import DataConfig
-from lidargrit.projection import FIT_SENSOR, doubts_about_rays, projection_that_fits
+from lidargrit.projection import doubts_about_rays, projection_that_fits
+from lidargrit.projection.fit import told_doubt
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import Scan
@@ -60,8 +61,7 @@ def choose_imaging(source: str, dataset: ScanDataset, sensor: SensorModel, confi
         notes.append(f"{source}: points that are not in firing order, so rows go by elevation (projection=spherical)")
     doubts_of_scans = (doubts_about_rays(scan, sensor, sensor.projection) for scan in probes)
     doubt = next((each for each in doubts_of_scans if each), "")
-    doubts = (f"{source}, imaged as {sensor.name}: {doubt}; name that sensor, {FIT_SENSOR}",) if doubt else ()
-    return Imaging(sensor, config, tuple(notes), doubts)
+    return Imaging(sensor, config, tuple(notes), (told_doubt(source, sensor, doubt),) if doubt else ())
 
 
 def _probes(dataset: ScanDataset, sensor: SensorModel) -> list[Scan]:

@@ -113,6 +113,11 @@ def doubts_about_rays(scan: Scan, sensor: SensorModel, method: ProjectionName) -
     return ""
 
 
+def told_doubt(source: str, sensor: SensorModel, doubt: str) -> str:
+    """Return what a person reads of a doubt about the sensor of a source; "" without one."""
+    return f"{source}, imaged as {sensor.name}: {doubt}; name that sensor, {FIT_SENSOR}" if doubt else ""
+
+
 def sensors_that_fit(scan: Scan) -> list[str]:
     """Name the bundled sensors whose rows span the elevations of a scan; the tightest comes first."""
     low_deg, high_deg = elevation_span_deg(scan)
