@@ -26,7 +26,14 @@ def random_decoder(
     """Return a decoder none of whose weights are zero, so that everything depends on everything it may."""
     torch.manual_seed(0)
     config = PixelDecoderConfig(
-        cell, *halvings, mask_features=3, range_features=3, mask_width=6, range_width=6, blocks=1
+        cell,
+        *halvings,
+        mask_features=3,
+        range_features=3,
+        mask_width=6,
+        range_width=6,
+        blocks=1,
+        surface_components=True,
     )
     decoder = PixelDecoder(config, sensor, features)
     for weight in decoder.parameters():

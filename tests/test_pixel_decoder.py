@@ -226,7 +226,7 @@ def test_sharpening_takes_the_likelier_component_nearer_to_its_centre() -> None:
     mixture = RangeMixture(
         torch.tensor([[1.0, 0.0]]).expand(4000, -1),
         torch.tensor([[2.0, 3.0]]).expand(4000, -1),
-        torch.full((4000, 2), -4.0),
+        torch.tensor([[-4.0, -5.0]]).expand(4000, -1),  # as broad in metres: v = ln(1 + range)
         (1.0, 80.0),
     )
     component, within = torch.rand(2, 4000, generator=torch.Generator().manual_seed(0))
@@ -235,6 +235,21 @@ def test_sharpening_takes_the_likelier_component_nearer_to_its_centre() -> None:
     assert float(near_plain.float().mean()) == pytest.approx(1 / (1 + math.exp(-1)), abs=0.03)
     assert float(near_sharp.float().mean()) == pytest.approx(1 / (1 + math.exp(-2)), abs=0.03)
     assert float(sharp[near_sharp].std()) == pytest.approx(0.5 * float(plain[near_plain].std()), rel=0.1)
+
+
+def test_sharpening_takes_components_on_one_surface_together() -> None:
+    one_surface = RangeMixture(
+        torch.tensor([[2.5, 2.0]]), torch.tensor([[3.0, 2.0]]), torch.tensor([[-5.0, -4.0]]), (1.0, 80.0)
+    )
+    parts = (torch.tensor([[2.5] + [2.0 - math.log(8)] * 8]), torch.tensor([[3.0] + [2.0] * 8]))
+    divided = RangeMixture(*parts, torch.tensor([[-5.0] + [-4.0] * 8]), (1.0, 80.0))
+    component, within = torch.rand(2, 4000, generator=torch.Generator().manual_seed(0))
+    shares = [
+        float((expanded(mixture, 4000).sample(component, within, temperature=0.5).log1p() > 2.5).float().mean())
+        for mixture in (one_surface, divided)
+    ]
+    assert shares[0] == pytest.approx(1 / (1 + math.exp(-2 * 0.5)), abs=0.03)
+    assert shares[1] == pytest.approx(shares[0], abs=0.01)
 
 
 @torch.no_grad()

@@ -38,7 +38,7 @@ class PixelSampling:
     that are sampled with 1, 1 and a correlation of 0 follow the distribution whose likelihood the model computes.
 
     Args:
-        range_temperature: temperature of the components' weights; 1 leaves them unchanged, below 1 prefers the likelier
+        range_temperature: temperature of the mixture's density; 1 leaves it unchanged, below 1 prefers the likelier
             surface.
         range_noise: multiplier of the components' scales; 1 takes them as they are.
         mask_correlation: multiplier of how much of their noise close pixels of a mask share that are sampled at once,

@@ -26,16 +26,14 @@ from lidargrit.nn.pixel_phases import (
     neighbours_of,
     one_of_phases,
     phases_of,
-    plane_weights,
 )
 from lidargrit.nn.precision import at_least_32_bits
+from lidargrit.nn.range_candidates import RangeCandidates
 from lidargrit.nn.range_mixture import RangeMixture
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import TYPICAL_LOG_RANGE, Decoded
 
 LOGIT_BOUND = 8.0  # of the decoder's return logits, beyond which it is as good as sure
-_SAME_SURFACE_V = 3e-4  # two ranges nearer than this, 6 mm at 20 m, are on one surface
-_NEIGHBOURS = 6  # candidates of a range: an interpolation and two neighbours, of each of two pairs
 _HALVINGS_AT_MOST = 8  # of one side alone
 _COARSE_AREA = 64  # lattices with one in so many pixels, or fewer, are coarse
 _FINEST_M, _COARSEST_M = math.exp(-6), math.exp(4)  # scales of a component: 2.5 mm to 55 m
@@ -61,8 +59,10 @@ class PixelDecoderConfig:
         coarse_range_width: number of channels of the range network's layers of lattices with one in 64 pixels or
             fewer; 0 for ``range_width``. Channels cost little there, and coarse ranges decide how straight walls are.
         blocks: number of residual blocks of each network.
-        free_components: number of components of a range's distribution that do not begin at a neighbour's range; 6 more
-            do.
+        free_components: number of components of a range's distribution that begin at the decoded range; 6 more begin at
+            neighbours.
+        surface_components: whether 8 more components begin on planes and straight lines through neighbours, so that the
+            surfaces on both sides of an edge are continued.
     """
 
     coarsest_cell: int = 8
@@ -76,10 +76,11 @@ class PixelDecoderConfig:
     coarse_range_width: int = 0
     blocks: int = 2
     free_components: int = 4
+    surface_components: bool = False
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            least = 0 if name in ("column_halvings", "row_halvings", "coarse_range_width") else 1
+            least = 0 if name in ("column_halvings", "row_halvings", "coarse_range_width", "surface_components") else 1
             if value < least:
                 raise ConfigError(f"{name}={value}", f"at least {least}", "raise it")
             if name.endswith("halvings") and value > _HALVINGS_AT_MOST:
@@ -311,25 +312,24 @@ class RangeNetwork(PhaseNetwork):
     Where no tokens tell what to expect of a pixel, the mean of its neighbours stands in.
     """
 
-    context_channels = 4 * 3 + _NEIGHBOURS + 3
     added_without_tokens = 1  # the expected range
 
     def __init__(self, config: PixelDecoderConfig, sensor: SensorModel, features: int) -> None:
-        components = config.free_components + _NEIGHBOURS
+        suggest = RangeCandidates(sensor, config.surface_components)
+        self.context_channels = 4 * 3 + suggest.count + suggest.distances
+        components = config.free_components + suggest.count
         widths = (config.range_width, config.coarse_range_width or config.range_width)
         super().__init__(config, sensor, features, config.range_features, widths, 3 * components)
+        self.suggest = suggest
         self.limits_m = (sensor.range_min_m, sensor.range_max_m)
         self.free = config.free_components
-        begin = torch.cat((torch.linspace(-0.2, 0.2, self.free), torch.zeros(_NEIGHBOURS)))
-        scale = torch.cat((torch.zeros(self.free), torch.full((_NEIGHBOURS,), -2.0)))
+        begin = torch.cat((torch.linspace(-0.2, 0.2, self.free), torch.zeros(suggest.count)))
+        scale = torch.cat((torch.zeros(self.free), torch.full((suggest.count,), -2.0)))
         self.register_buffer("begin", begin[:, None, None], persistent=False)
         self.register_buffer("begin_scale", scale[:, None, None], persistent=False)
-        elevation = sensor.elevation_rad.double().mean(1).float()
-        self.register_buffer("elevation_rad", elevation, persistent=False)
 
     begin: Tensor
     begin_scale: Tensor
-    elevation_rad: Tensor
 
     def context(
         self, phase: Phase, guide: Guide, return_mask: Bool[Tensor, "B H W"], v: Float[Tensor, "B H W"]
@@ -339,9 +339,7 @@ class RangeNetwork(PhaseNetwork):
         candidates, expected = candidates[:, :-1], candidates[:, -1:]
         returned, beside = cells_of(torch.stack((return_mask.to(v.dtype), v - guide.v), 1), phase.lattice).chunk(2, 1)
         generated = generated_before(phase).to(returned)[:, None, None] * returned
-        first, second = candidates[:, 1:3], candidates[:, 4:6]
-        apart = torch.cat((first.diff(dim=1), second.diff(dim=1), candidates[:, :1] - candidates[:, 3:4]), 1).abs()
-        apart = ((apart + _SAME_SURFACE_V).log() + 5) / 2
+        apart = self.suggest.apart(candidates)
         maps = [generated, 1 - returned, generated * beside, (candidates - expected).clamp(-2, 2), apart]
         if not self.guided_by_tokens:
             maps[2] = generated * (beside - (expected - TYPICAL_LOG_RANGE)).clamp(-2, 2)
@@ -350,7 +348,7 @@ class RangeNetwork(PhaseNetwork):
 
     def candidates(
         self, phases: list[Phase], guide: Guide, return_mask: Bool[Tensor, "B H W"], v: Float[Tensor, "B H W"]
-    ) -> Float[Tensor, "P B 7 h w"]:
+    ) -> Float[Tensor, "P B K h w"]:
         """Return ranges that the neighbours suggest, as ln(1 + range): for both pairs an interpolation, then the two.
 
         The last is what is expected: the decoded range, or without tokens the mean of the neighbours. One missing of a
@@ -360,28 +358,18 @@ class RangeNetwork(PhaseNetwork):
 
     def _candidates(
         self, phase: Phase, guide: Guide, return_mask: Bool[Tensor, "B H W"], v: Float[Tensor, "B H W"]
-    ) -> Float[Tensor, "B 7 h w"]:
-        near = neighbours_of(phase, v, return_mask)
+    ) -> Float[Tensor, "B K h w"]:
         expected = guide.v[(..., *phase.pixels)]
         if not self.guided_by_tokens:
+            near = neighbours_of(phase, v, return_mask)
             count, total = near.known.sum((1, 2)), torch.where(near.known, near.values, 0.0).sum((1, 2))
             expected = torch.where(count > 0, total / count.clamp(min=1), expected)
-        weights = plane_weights(phase, self.elevation_rad)
-        found = []
-        for pair, rows_apart in enumerate(near.rows_apart):
-            (one, other), (has_one, has_other) = near.values[:, pair].unbind(1), near.known[:, pair].unbind(1)
-            one_or_other = torch.where(has_one, one, torch.where(has_other, other, expected))
-            other_or_one = torch.where(has_other, other, torch.where(has_one, one, expected))
-            weight = weights if rows_apart else torch.full_like(weights, 0.5)
-            # On a plane 1 / range is linear in the sines of the angles between the rays.
-            inverse = weight[..., 0] / one_or_other.expm1() + weight[..., 1] / other_or_one.expm1()
-            found += [inverse.reciprocal().log1p(), one_or_other, other_or_one]
-        return torch.stack([*found, expected], 1)
+        return torch.cat((self.suggest(phase, v, return_mask, expected), expected[:, None]), 1)
 
     def mixture(
         self,
         output: Float[Tensor, "P B O h w"],
-        candidates: Float[Tensor, "P B 7 h w"],
+        candidates: Float[Tensor, "P B K h w"],
     ) -> RangeMixture:
         """Return the distributions of the ranges of the pixels of phases of one lattice."""
         logits, moved, scales = output.chunk(3, 2)

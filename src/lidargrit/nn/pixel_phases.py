@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from lidargrit.errors import ConfigError
-from lidargrit.nn.convolution import wrapped
 
 _BOTH = ((0, 0), (1, 1), (0, 1), (1, 0))  # of 2x2 pixels of a lattice: a corner, its opposite, then the others
 _COLUMNS = ((0, 0), (1, 0), (0, 1), (1, 1))  # where whole columns are known: the next column, its even rows first
@@ -165,20 +164,28 @@ class Neighbours(NamedTuple):
     rows_apart: tuple[bool, bool]
 
 
-def neighbours_of(phase: Phase, values: Float[Tensor, "B H W"], known: Bool[Tensor, "B H W"]) -> Neighbours:
+def neighbours_of(
+    phase: Phase, values: Float[Tensor, "B H W"], known: Bool[Tensor, "B H W"], distance: int = 1
+) -> Neighbours:
     """Return the nearest pixels of earlier phases: above, below, left and right, or at the corners.
 
     The first phase has none. Columns wrap around; rows beyond the image are not known.
+
+    Args:
+        phase: phase whose neighbours are meant.
+        values: values of every pixel.
+        known: True where a pixel holds a value.
+        distance: how many times as far as the nearest ones the pixels lie; odd, so that they are of earlier phases.
     """
-    lattice = phase.lattice
-    values, known = (maps[(..., *lattice.pixels)] for maps in (values, known))
-    values, known = (F.pad(wrapped(maps), (0, 0, 1, 1)) for maps in (values, known))
-    height, width = (known.shape[-2] - 2) // 2, (known.shape[-1] - 2) // 2
+    values, known = (maps[(..., *phase.lattice.pixels)] for maps in (values, known))
+    rows, columns = known.shape[-2:]
+    around = torch.arange(-distance, columns + distance, device=known.device) % columns
+    values, known = (F.pad(maps[..., around], (0, 0, distance, distance)) for maps in (values, known))
     found_values, found_known = [], []
     for down, right in phase.pairs:
-        for sign in (1, -1):
-            top, left = 1 + phase.row + sign * down, 1 + phase.column + sign * right
-            part = (..., slice(top, top + 2 * height, 2), slice(left, left + 2 * width, 2))
+        for sign in (distance, -distance):
+            top, left = distance + phase.row + sign * down, distance + phase.column + sign * right
+            part = (..., slice(top, top + rows, 2), slice(left, left + columns, 2))
             found_values.append(values[part])
             found_known.append(known[part] if phase.rank else torch.zeros_like(known[part]))
     rows_apart = (phase.pairs[0][0] != 0, phase.pairs[1][0] != 0)

@@ -81,12 +81,11 @@ class RangeMixture:
         Args:
             component: uniform random numbers in [0, 1) that choose a component.
             within: uniform random numbers in [0, 1) that choose a range of the component.
-            temperature: temperature of the components' weights; 1 leaves them unchanged, below 1 prefers the
-                likelier ones.
+            temperature: temperature of the density; 1 leaves it unchanged, below 1 prefers the likelier surfaces.
             noise: multiplier of the components' scales.
         """
         scaled = RangeMixture(
-            self.logits / temperature,
+            self._tempered_logits(temperature),
             self.centres,
             self.log_scales + torch.tensor(noise, dtype=self.log_scales.dtype).log(),
             self.limits_m,
@@ -97,6 +96,19 @@ class RangeMixture:
         scale = scaled.log_scales.gather(-1, chosen)[..., 0].double().exp()
         level = (low + within.double() * (high - low)).clamp(1e-9, 1 - 1e-9)
         return (centre + scale * level.logit()).expm1().clamp(*self.limits_m).float()
+
+    def _tempered_logits(self, temperature: float) -> Float[Tensor, "*P K"]:
+        """Return the logits of the weights with which the components approximate the density to the power 1 / T.
+
+        A component keeps its shape, and its weight is multiplied by the density at its centre to the power 1 / T - 1.
+        So components on one surface count together: the weights alone to that power would prefer one broad component to
+        many narrow ones that share a surface.
+        """
+        if temperature == 1:
+            return self.logits
+        logits, centres, log_scales = (part[..., None, :] for part in (self.logits, self.centres, self.log_scales))
+        at_centres = RangeMixture(logits, centres, log_scales, self.limits_m).log_density(self.centres.expm1())
+        return self.logits.log_softmax(-1) + (1 / temperature - 1) * at_centres
 
     def _bounds(self) -> tuple[Float[Tensor, "*P K"], Float[Tensor, "*P K"]]:
         """Return each component's distribution function at the two limits."""

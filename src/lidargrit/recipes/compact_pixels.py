@@ -23,7 +23,13 @@ RECIPE = replace(
         transformer=replace(compact.RECIPE.model.transformer, embedding_dropout=0.0, residual_dropout=0.0),
         # Sizes that leave these three networks, rounded to 16 bits, below 16 MiB.
         pixels=PixelDecoderConfig(
-            coarsest_cell=64, mask_features=6, range_features=12, row_channels=2, range_width=36, coarse_range_width=48
+            coarsest_cell=64,
+            mask_features=6,
+            range_features=12,
+            row_channels=2,
+            range_width=36,
+            coarse_range_width=48,
+            surface_components=True,
         ),
     ),
     data=replace(compact.RECIPE.data, train=("simulated:10000:train",)),
