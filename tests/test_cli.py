@@ -165,7 +165,7 @@ def test_a_plan_tells_which_stages_are_taken_and_not_trained(tmp_path, capsys, m
     assert main(["train", "compact_raydrop", str(tmp_path / "none"), *words]) == 0
     text = capsys.readouterr().out
     assert "transformer: 4,539,136 parameters, taken from pretrained and not trained" in text
-    assert "pixels: 916,015 parameters, 17,000 scans" in text
+    assert "pixels: 972,055 parameters, 26,000 scans" in text
     words = ["--dry-run", "--set", "model.pixels.coarsest_cell=8"]
     assert main(["train", "compact_raydrop", str(tmp_path / "none"), *words]) == 2
     assert "whose pixels is another (model.pixels.coarsest_cell=64)" in the_one_line(capsys.readouterr().err, "train")
@@ -208,7 +208,7 @@ def test_sampling_options_reach_the_model(run_folder, tmp_path, typed):
         "top_k": 0,
         "top_p": 1.0,
         "mask": "threshold",
-        "range_temperature": 0.6,
+        "range_temperature": 0.7,
         "range_noise": 0.7,
         "mask_correlation": 2.0,
         "completion": "auto",

@@ -48,7 +48,7 @@ _TRANSFORMER_S = 0.045, 0.026e-6  # for each scan seen, and for each of these an
 # A pixel decoder that was trained for a minute is unsure of every range: sharper than by default, the ground is smooth.
 _SHARPER = TokenSampling(range_temperature=0.1, range_noise=0.2)
 _DEFAULT = TokenSampling()
-_PACKAGED_SCANS = 6  # sampled by ``pretrained``, which was trained for four hours
+_PACKAGED_SCANS = 6  # sampled by ``pretrained``, which was trained for hours
 _STAGES = {"tokenizer": "the tokenizer", "transformer": "the transformer", "pixels": "the pixel decoder"}
 _SCANS_OF_A_SET = 6  # of each set on the page: enough to step through, and half a megabyte each
 

@@ -47,7 +47,7 @@ class PixelSampling:
             ``auto`` is ``bf16`` where the machine has instructions for it.
     """
 
-    range_temperature: float = 0.6
+    range_temperature: float = 0.7
     range_noise: float = 0.7
     mask_correlation: float = 2.0
     precision: Precision = "fp32"

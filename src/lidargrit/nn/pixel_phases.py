@@ -175,7 +175,7 @@ def neighbours_of(
         phase: phase whose neighbours are meant.
         values: values of every pixel.
         known: True where a pixel holds a value.
-        distance: how many times as far as the nearest ones the pixels lie; odd, so that they are of earlier phases.
+        distance: multiple of the distance of the nearest ones; odd, so that the pixels are of earlier phases.
     """
     values, known = (maps[(..., *phase.lattice.pixels)] for maps in (values, known))
     rows, columns = known.shape[-2:]

@@ -16,7 +16,7 @@ TRANSFORMER = replace(
 
 RECIPE = replace(
     compact.RECIPE,
-    title="LidarGRIT with a pixel decoder: 64x256 in 256 tokens, for one CPU core and four hours",
+    title="LidarGRIT with a pixel decoder: 64x256 in 256 tokens, for one CPU core and five hours",
     model=replace(
         compact.RECIPE.model,
         # No image comes often enough that dropout would prevent anything.
@@ -37,7 +37,7 @@ RECIPE = replace(
         **compact.RECIPE.training,
         "transformer": replace(TRANSFORMER, scans=54_000, average_over_scans=1000),
         "pixels": FitConfig(
-            scans=17_000,
+            scans=26_000,
             batch_size=2,
             learning_rate=2e-3,
             schedule="cosine",
