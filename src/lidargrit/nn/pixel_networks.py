@@ -349,10 +349,9 @@ class RangeNetwork(PhaseNetwork):
     def candidates(
         self, phases: list[Phase], guide: Guide, return_mask: Bool[Tensor, "B H W"], v: Float[Tensor, "B H W"]
     ) -> Float[Tensor, "P B K h w"]:
-        """Return ranges that the neighbours suggest, as ln(1 + range): for both pairs an interpolation, then the two.
+        """Return what neighbours suggest, as ln(1 + range), and last what is expected without them.
 
-        The last is what is expected: the decoded range, or without tokens the mean of the neighbours. One missing of a
-        pair is taken to be as far as the other; where both are missing, as far as expected.
+        Expected is the decoded range, or without tokens the mean of the neighbours.
         """
         return torch.stack([self._candidates(phase, guide, return_mask, v) for phase in phases])
 
