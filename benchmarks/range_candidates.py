@@ -36,7 +36,7 @@ def main(words: Sequence[str] | None = None) -> None:
     print(f"{'distance, phase':24}", *(f"{f'{name}, {near} m':>18}" for name in ("pairs", "all") for near in NEAR_M))
     for phase in phases_of(_CELL)[1:]:
         pixels = (..., *phase.pixels)
-        both = [RangeCandidates(sensor, surfaces) for surfaces in (False, True)]
+        both = [RangeCandidates(sensor, [phase], surfaces) for surfaces in (False, True)]
         nowhere = torch.full_like(v[pixels], 20.0)  # without any neighbour no candidate is near
         nearest_m = [_nearest_m(one(phase, v, returned, nowhere), images.range_m[pixels]) for one in both]
         shares = [float((one[returned[pixels]] < near).float().mean()) for one in nearest_m for near in NEAR_M]

@@ -18,7 +18,7 @@ _EXPECTED_M = 33.0
 
 def candidates_m(phase: Phase, images: RangeImage) -> np.ndarray:
     expected = torch.full_like(images.range_m, _EXPECTED_M)[(..., *phase.pixels)].log1p()
-    suggest = RangeCandidates(images.sensor, surfaces=True)
+    suggest = RangeCandidates(images.sensor, [phase], surfaces=True)
     found = suggest(phase, images.range_m.log1p(), images.return_mask, expected)
     assert found.shape[1] == suggest.count
     assert suggest.apart(found).shape[1] == suggest.distances

@@ -315,7 +315,8 @@ class RangeNetwork(PhaseNetwork):
     added_without_tokens = 1  # the expected range
 
     def __init__(self, config: PixelDecoderConfig, sensor: SensorModel, features: int) -> None:
-        suggest = RangeCandidates(sensor, config.surface_components)
+        phases = phases_of(config.coarsest_cell, config.column_halvings, config.row_halvings)
+        suggest = RangeCandidates(sensor, phases, config.surface_components)
         self.context_channels = 4 * 3 + suggest.count + suggest.distances
         components = config.free_components + suggest.count
         widths = (config.range_width, config.coarse_range_width or config.range_width)

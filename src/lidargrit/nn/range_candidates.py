@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Bool, Float
@@ -14,6 +15,7 @@ from lidargrit.sensors import SensorModel
 _OF_PAIRS = 6  # an interpolation and two neighbours, of each of two pairs
 _OF_SURFACES = 8  # four planes and four lines
 _BEHIND = 3  # times as far as a neighbour: what lies at twice its distance may belong to the same phase
+_WEIGHTS = ("planes", "lines", "lines_behind")  # buffers of every phase
 _SAME_SURFACE_V = 3e-4  # two ranges nearer than this, 6 mm at 20 m, are on one surface
 
 
@@ -26,20 +28,24 @@ class RangeCandidates(nn.Module):
 
     Args:
         sensor: rays of the range images.
+        phases: all phases of the pixel decoder.
         surfaces: whether planes and lines are among the candidates.
     """
 
-    def __init__(self, sensor: SensorModel, surfaces: bool) -> None:
+    elevation_rad: Tensor
+
+    def __init__(self, sensor: SensorModel, phases: Sequence[Phase], surfaces: bool) -> None:
         super().__init__()
-        self.surfaces = surfaces
+        self.phases, self.surfaces = tuple(phases), surfaces
         self.count = _OF_PAIRS + surfaces * _OF_SURFACES
         self.distances = 3 + surfaces * 8
         self.column_rad = 2 * math.pi / sensor.width
         self.limits_m = (sensor.range_min_m, sensor.range_max_m)
         elevation = sensor.elevation_rad.double().mean(1).float()
         self.register_buffer("elevation_rad", elevation, persistent=False)
-
-    elevation_rad: Tensor
+        for number, phase in enumerate(self.phases if surfaces else ()):
+            for name, weights in zip(_WEIGHTS, self._weights(phase), strict=True):
+                self.register_buffer(f"{name}_{number}", weights, persistent=False)
 
     def forward(
         self, phase: Phase, v: Float[Tensor, "B H W"], known: Bool[Tensor, "B H W"], expected: Float[Tensor, "B h w"]
@@ -90,7 +96,8 @@ class RangeCandidates(nn.Module):
         inverse, inverse_behind = (
             torch.where(which.known, which.values.expm1().reciprocal(), 0.0).flatten(1, 2) for which in (near, behind)
         )
-        of_planes, of_line, of_line_behind = self._weights(phase)
+        number = self.phases.index(phase)
+        of_planes, of_line, of_line_behind = (self.get_buffer(f"{name}_{number}") for name in _WEIGHTS)
         # Sums of products and no matrix product, which mixed precision would round to three digits.
         planes = torch.stack([(weight * inverse).sum(1) for weight in of_planes], 1)
         lines = of_line * inverse + of_line_behind * inverse_behind

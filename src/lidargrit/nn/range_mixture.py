@@ -106,9 +106,12 @@ class RangeMixture:
         """
         if temperature == 1:
             return self.logits
-        logits, centres, log_scales = (part[..., None, :] for part in (self.logits, self.centres, self.log_scales))
-        at_centres = RangeMixture(logits, centres, log_scales, self.limits_m).log_density(self.centres.expm1())
-        return self.logits.log_softmax(-1) + (1 / temperature - 1) * at_centres
+        heights = self.logits.log_softmax(-1) - self.log_scales - self._mass().clamp(min=_LEAST_MASS).log()
+        apart = (self.centres[..., :, None] - self.centres[..., None, :]).abs() * (-self.log_scales).exp()[..., None, :]
+        tail = (-apart).exp()  # the logistic density is tail / (1 + tail)^2, so without a logarithm for every pair
+        density = (heights.exp()[..., None, :] * tail / (1 + tail).square()).sum(-1)
+        density_per_m = density.log() - self.centres  # dv / d range = exp(-v)
+        return self.logits.log_softmax(-1) + (1 / temperature - 1) * density_per_m
 
     def _bounds(self) -> tuple[Float[Tensor, "*P K"], Float[Tensor, "*P K"]]:
         """Return each component's distribution function at the two limits."""
