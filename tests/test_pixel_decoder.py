@@ -150,9 +150,7 @@ def test_a_range_is_as_likely_as_a_loop_over_components_says() -> None:
     guided = decoder.range.guided(guide)
     low, high = math.log1p(sensor.range_min_m), math.log1p(sensor.range_max_m)
     for phase in decoder.range.phases:
-        candidates = decoder.range.candidates([phase], guide, images.return_mask, v)
-        output = decoder.range.outputs([phase], guided, guide, images.return_mask, v)
-        mixture = decoder.range.mixture(output, candidates)
+        mixture = decoder.range.distributions([phase], guided, guide, images.return_mask, v)
         rows, columns = torch.arange(4)[phase.pixels[0]].tolist(), torch.arange(8)[phase.pixels[1]].tolist()
         for (i, row), (j, column) in product(enumerate(rows), enumerate(columns)):
             if not images.return_mask[0, row, column]:

@@ -157,9 +157,7 @@ class ScanCodec:
         network, v = self._pixels.range, torch.zeros_like(guide.v)
         guided, pixels = network.guided(guide), np.zeros(v.shape[1:], dtype=np.int64)
         for phase in network.phases:
-            candidates = network.candidates([phase], guide, mask, v)
-            output = network.outputs([phase], guided, guide, mask, v)
-            mixture = network.mixture(output, candidates)
+            mixture = network.distributions([phase], guided, guide, mask, v)
             returned = mask[(0, *phase.pixels)]
             parts = mixture.logits, mixture.centres, mixture.log_scales
             logits, centres, log_scales = (part[0, 0][returned] for part in parts)

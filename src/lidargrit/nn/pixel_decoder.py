@@ -144,9 +144,7 @@ class PixelDecoder(nn.Module):
             logits = self.mask.logits(phases, guided[0], guide, mask)
             # H(p) = ln(1 + e^z) - z p of the logit z
             mask_nats = join_phases(mask_nats, F.softplus(logits) - logits * logits.sigmoid())
-            candidates = self.range.candidates(phases, guide, mask, v)
-            output = self.range.outputs(phases, guided[1], guide, mask, v)
-            entropy = self.range.mixture(output, candidates).entropy(steps)
+            entropy = self.range.distributions(phases, guided[1], guide, mask, v).entropy(steps)
             range_nats = join_phases(range_nats, torch.where(at_phases(mask, phases), entropy, 0.0))
         assert mask_nats is not None
         assert range_nats is not None
@@ -202,11 +200,9 @@ class PixelDecoder(nn.Module):
         mask, v = images.return_mask, images.range_m.log1p()
         returned = at_phases(mask, phases)
         of_mask = self.mask.phase_nll(phases, guided[0], guide, mask)
-        candidates = self.range.candidates(phases, guide, mask, v)
-        output = self.range.outputs(phases, guided[1], guide, mask, v)
         # Where nothing returned, any range within the limits stands in: its likelihood is not used.
         range_m = torch.where(returned, at_phases(images.range_m, phases), self.sensor.range_min_m)
-        mixture = self.range.mixture(output, candidates)
+        mixture = self.range.distributions(phases, guided[1], guide, mask, v)
         if steps is None:
             likelihood = mixture.log_density(range_m)
         else:
@@ -263,9 +259,7 @@ class PixelDecoder(nn.Module):
         range_m, v = torch.zeros_like(guide.v), torch.zeros_like(guide.v)
         for phase in self.range.phases:
             pixels = (..., *phase.pixels)
-            candidates = self.range.candidates([phase], guide, mask, v)
-            output = self.range.outputs([phase], guided, guide, mask, v)
-            mixture = self.range.mixture(output, candidates)
+            mixture = self.range.distributions([phase], guided, guide, mask, v)
             component, within = uniform[pixels].unbind(1)
             sampled = mixture.sample(component[None], within[None], sampling.range_temperature, sampling.range_noise)[0]
             sampled = torch.where(condition.range_observed[pixels], condition.range_m[pixels], sampled)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -131,7 +130,7 @@ class Guide(NamedTuple):
         return cls(like.new_zeros(count, 0, *size[1:]), like.new_full(size, TYPICAL_LOG_RANGE), like.new_zeros(size))
 
 
-class PhaseNetwork(nn.Module, ABC):
+class PhaseNetwork(nn.Module):
     """Base of the mask's and the range's network: a small network for each lattice, run anew for every phase."""
 
     def __init__(
@@ -162,12 +161,6 @@ class PhaseNetwork(nn.Module, ABC):
     context_channels: int
     added_without_tokens = 0
 
-    @abstractmethod
-    def context(
-        self, phase: Phase, guide: Guide, return_mask: Bool[Tensor, "B H W"], v: Float[Tensor, "B H W"]
-    ) -> Float[Tensor, "B D h w"]:
-        """Return the inputs that are known before a phase, on its cells; later pixels have no influence."""
-
     def guided(self, guide: Guide) -> dict[Lattice, Tensor]:
         """Return the first layer's output for the guide, (B, C, h, w), by lattice, the same for all phases."""
         rows = self.rows[None, :, :, None].expand(len(guide.v), -1, -1, guide.v.shape[-1])
@@ -176,18 +169,12 @@ class PhaseNetwork(nn.Module, ABC):
         return {lattice: network.guide(cells_of(maps, lattice)) for lattice, network in self._networks()}
 
     def outputs(
-        self,
-        phases: list[Phase],
-        guided: dict[Lattice, Tensor],
-        guide: Guide,
-        return_mask: Bool[Tensor, "B H W"],
-        v: Float[Tensor, "B H W"],
+        self, phases: list[Phase], guided: dict[Lattice, Tensor], contexts: Sequence[Float[Tensor, "B D h w"]]
     ) -> Float[Tensor, "P B O h w"]:
-        """Return the network's outputs for consecutive phases of one lattice."""
+        """Return the network's outputs for consecutive phases of one lattice, from what is known before each."""
         lattice = phases[0].lattice
-        contexts = torch.stack([self.context(phase, guide, return_mask, v) for phase in phases])
         first = [phase for phase in self.phases if phase.lattice == lattice].index(phases[0])
-        return self.networks[lattice.name](guided[lattice], contexts, first)
+        return self.networks[lattice.name](guided[lattice], torch.stack(tuple(contexts)), first)
 
     def flops(self) -> int:
         """Return the floating-point operations of all phases of one scan: two for each multiplication and addition."""
@@ -232,14 +219,15 @@ class MaskNetwork(PhaseNetwork):
         """
         return cls(PixelDecoderConfig(mask_features=features, mask_width=width), sensor, features)
 
-    def context(
-        self, phase: Phase, guide: Guide, return_mask: Bool[Tensor, "B H W"], v: Float[Tensor, "B H W"]
-    ) -> Float[Tensor, "B D h w"]:
-        """Return for each pixel of a cell whether it is known to have returned, and whether it is known not to."""
-        returned = cells_of(return_mask[:, None].to(v.dtype), phase.lattice)
+    def context(self, phase: Phase, guide: Guide, return_mask: Bool[Tensor, "B H W"]) -> Float[Tensor, "B D h w"]:
+        """Return for each pixel of a cell whether it is known to have returned, and whether it is known not to.
+
+        Later pixels have no influence.
+        """
+        returned = cells_of(return_mask[:, None].to(guide.v.dtype), phase.lattice)
         certain = generated_before(phase).to(returned)[:, None, None]
         if guide.observed is not None:
-            certain = torch.maximum(certain, cells_of(guide.observed[:, None].to(v.dtype), phase.lattice))
+            certain = torch.maximum(certain, cells_of(guide.observed[:, None].to(guide.v.dtype), phase.lattice))
         return torch.cat((certain * returned, certain * (1 - returned)), 1)
 
     def uniform(self, rngs: Sequence[torch.Generator]) -> Float[Tensor, "B H W"]:
@@ -268,7 +256,7 @@ class MaskNetwork(PhaseNetwork):
         self, phases: list[Phase], guided: dict[Lattice, Tensor], guide: Guide, return_mask: Bool[Tensor, "B H W"]
     ) -> Float[Tensor, "P B h w"]:
         """Return the logits of the pixels of phases of one lattice; later pixels of the mask have no influence."""
-        output = self.outputs(phases, guided, guide, return_mask, guide.v)
+        output = self.outputs(phases, guided, [self.context(phase, guide, return_mask) for phase in phases])
         decoded = guide.return_logits + self.row_bias[:, None]
         return output[:, :, 0] + at_phases(decoded, phases)
 
@@ -332,11 +320,29 @@ class RangeNetwork(PhaseNetwork):
     begin: Tensor
     begin_scale: Tensor
 
+    def distributions(
+        self,
+        phases: list[Phase],
+        guided: dict[Lattice, Tensor],
+        guide: Guide,
+        return_mask: Bool[Tensor, "B H W"],
+        v: Float[Tensor, "B H W"],
+    ) -> RangeMixture:
+        """Return the distributions of the ranges at phases of one lattice; later ranges have no influence."""
+        candidates = self.candidates(phases, guide, return_mask, v)
+        pairs = zip(phases, candidates, strict=True)
+        contexts = [self.context(phase, guide, return_mask, v, suggested) for phase, suggested in pairs]
+        return self.mixture(self.outputs(phases, guided, contexts), candidates)
+
     def context(
-        self, phase: Phase, guide: Guide, return_mask: Bool[Tensor, "B H W"], v: Float[Tensor, "B H W"]
+        self,
+        phase: Phase,
+        guide: Guide,
+        return_mask: Bool[Tensor, "B H W"],
+        v: Float[Tensor, "B H W"],
+        candidates: Float[Tensor, "B K h w"],
     ) -> Float[Tensor, "B D h w"]:
         """Return the mask, the known ranges beside the decoded ones, and how far the candidates are apart."""
-        candidates = self.candidates([phase], guide, return_mask, v)[0]
         candidates, expected = candidates[:, :-1], candidates[:, -1:]
         returned, beside = cells_of(torch.stack((return_mask.to(v.dtype), v - guide.v), 1), phase.lattice).chunk(2, 1)
         generated = generated_before(phase).to(returned)[:, None, None] * returned
