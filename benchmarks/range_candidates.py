@@ -2,9 +2,10 @@
 
     python benchmarks/range_candidates.py -n 24
 
-A pixel decoder's components begin at the candidates of earlier phases: at two interpolations and four neighbours, and
-with ``surface_components`` also at four planes and four lines. More of them are nearer by chance alone, so this bounds
-what they can bring; how many bits they save is told by training.
+A pixel decoder's components begin at the candidates of earlier phases: at two interpolations and four neighbours (pairs
+below), with ``surface_components`` also at four planes and four lines (surfaces), and with ``gravity_components`` at
+four upright planes and four level ones, too (all). More of them are nearer by chance alone, so this bounds what they
+can bring; how many bits they save is told by training.
 """
 
 from __future__ import annotations
@@ -33,12 +34,15 @@ def main(words: Sequence[str] | None = None) -> None:
     source = open_images(choices.scans, sensor=sensor)
     images = source.batch(range(min(choices.n, len(source))))
     v, returned = images.range_m.log1p(), images.return_mask
-    print(f"{'distance, phase':24}", *(f"{f'{name}, {near} m':>18}" for name in ("pairs", "all") for near in NEAR_M))
+    print(
+        f"{'distance, phase':24}",
+        *(f"{f'{name}, {near} m':>18}" for name in ("pairs", "surfaces", "all") for near in NEAR_M),
+    )
     for phase in phases_of(_CELL)[1:]:
         pixels = (..., *phase.pixels)
-        both = [RangeCandidates(sensor, [phase], surfaces) for surfaces in (False, True)]
+        suggest = [RangeCandidates(sensor, [phase], *parts) for parts in ((False, False), (True, False), (True, True))]
         nowhere = torch.full_like(v[pixels], 20.0)  # without any neighbour no candidate is near
-        nearest_m = [_nearest_m(one(phase, v, returned, nowhere), images.range_m[pixels]) for one in both]
+        nearest_m = [_nearest_m(one(phase, v, returned, nowhere), images.range_m[pixels]) for one in suggest]
         shares = [float((one[returned[pixels]] < near).float().mean()) for one in nearest_m for near in NEAR_M]
         title = f"{phase.lattice.rows}, row {phase.row} column {phase.column}"
         print(f"{title:24}", *(f"{share:18.3f}" for share in shares), flush=True)

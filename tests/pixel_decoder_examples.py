@@ -34,6 +34,7 @@ def random_decoder(
         range_width=6,
         blocks=1,
         surface_components=True,
+        gravity_components=True,
     )
     decoder = PixelDecoder(config, sensor, features)
     for weight in decoder.parameters():

@@ -295,7 +295,7 @@ def test_16_bits_move_few_pixels_and_leave_32_bits_as_they_were() -> None:
     assert not torch.equal(quick.range_m, exact.range_m)
     assert (quick.return_mask != exact.return_mask).float().mean() < 0.02
     both = quick.return_mask & exact.return_mask
-    assert ((quick.range_m - exact.range_m).abs() < 0.3)[both].float().mean() > 0.9
+    assert ((quick.range_m - exact.range_m).abs() < 0.3)[both].float().mean() > 0.8
     assert torch.equal(sample("fp32").range_m, exact.range_m)
 
 

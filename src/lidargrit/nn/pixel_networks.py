@@ -22,9 +22,9 @@ from lidargrit.nn.pixel_phases import (
     at_phases,
     cells_of,
     generated_before,
-    neighbours_of,
     one_of_phases,
     phases_of,
+    pixels_around,
 )
 from lidargrit.nn.precision import at_least_32_bits
 from lidargrit.nn.range_candidates import RangeCandidates
@@ -34,6 +34,7 @@ from lidargrit.structures import TYPICAL_LOG_RANGE, Decoded
 
 LOGIT_BOUND = 8.0  # of the decoder's return logits, beyond which it is as good as sure
 _HALVINGS_AT_MOST = 8  # of one side alone
+_MAY_BE_0 = ("column_halvings", "row_halvings", "coarse_range_width")
 _COARSE_AREA = 64  # lattices with one in so many pixels, or fewer, are coarse
 _FINEST_M, _COARSEST_M = math.exp(-6), math.exp(4)  # scales of a component: 2.5 mm to 55 m
 
@@ -62,6 +63,8 @@ class PixelDecoderConfig:
             neighbours.
         surface_components: whether 8 more components begin on planes and straight lines through neighbours, so that the
             surfaces on both sides of an edge are continued.
+        gravity_components: whether 8 more components begin on upright planes through two neighbours and on level ones
+            through one, so that walls and the ground are continued from fewer pixels. They take the sensor to be level.
     """
 
     coarsest_cell: int = 8
@@ -76,10 +79,11 @@ class PixelDecoderConfig:
     blocks: int = 2
     free_components: int = 4
     surface_components: bool = False
+    gravity_components: bool = False
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            least = 0 if name in ("column_halvings", "row_halvings", "coarse_range_width", "surface_components") else 1
+            least = 0 if isinstance(value, bool) or name in _MAY_BE_0 else 1
             if value < least:
                 raise ConfigError(f"{name}={value}", f"at least {least}", "raise it")
             if name.endswith("halvings") and value > _HALVINGS_AT_MOST:
@@ -304,7 +308,7 @@ class RangeNetwork(PhaseNetwork):
 
     def __init__(self, config: PixelDecoderConfig, sensor: SensorModel, features: int) -> None:
         phases = phases_of(config.coarsest_cell, config.column_halvings, config.row_halvings)
-        suggest = RangeCandidates(sensor, phases, config.surface_components)
+        suggest = RangeCandidates(sensor, phases, config.surface_components, config.gravity_components)
         self.context_channels = 4 * 3 + suggest.count + suggest.distances
         components = config.free_components + suggest.count
         widths = (config.range_width, config.coarse_range_width or config.range_width)
@@ -367,8 +371,8 @@ class RangeNetwork(PhaseNetwork):
     ) -> Float[Tensor, "B K h w"]:
         expected = guide.v[(..., *phase.pixels)]
         if not self.guided_by_tokens:
-            near = neighbours_of(phase, v, return_mask)
-            count, total = near.known.sum((1, 2)), torch.where(near.known, near.values, 0.0).sum((1, 2))
+            near, known = pixels_around(phase, v, return_mask, phase.neighbours)
+            count, total = known.sum(1), torch.where(known, near, 0.0).sum(1)
             expected = torch.where(count > 0, total / count.clamp(min=1), expected)
         return torch.cat((self.suggest(phase, v, return_mask, expected), expected[:, None]), 1)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import torch
@@ -84,6 +85,16 @@ class Phase(NamedTuple):
             return (both[0], _FALLING) if self.rank == 2 else both
         return (_FALLING, _RISING) if self.rank == 1 else (_VERTICAL, _HORIZONTAL)
 
+    @property
+    def neighbours(self) -> tuple[tuple[int, int], ...]:
+        """Rows and columns from a pixel to its four neighbours: those of the first pair, then those of the second."""
+        return tuple((sign * down, sign * right) for down, right in self.pairs for sign in (1, -1))
+
+    @property
+    def corners_known(self) -> bool:
+        """Whether the pixels one row and one column away in every direction are generated before this one."""
+        return self.rank == 1 or self.lattice.known != "corners"
+
 
 def phases_of(coarsest_cell: int, column_halvings: int = 0, row_halvings: int = 0) -> list[Phase]:
     """Return every phase in order.
@@ -150,47 +161,29 @@ def cells_of(maps: Float[Tensor, "B C H W"], lattice: Lattice) -> Float[Tensor, 
     return F.pixel_unshuffle(maps[(..., *lattice.pixels)], 2)
 
 
-class Neighbours(NamedTuple):
-    """The pixels around those of a phase that were generated before: two pairs that lie opposite each other.
-
-    Args:
-        values: values of the first and the second pair; each pair holds a neighbour and its opposite.
-        known: True where a neighbour is in the image and holds a value.
-        rows_apart: two flags, one a pair: True where its two neighbours lie in different rows.
-    """
-
-    values: Float[Tensor, "B 2 2 h w"]
-    known: Bool[Tensor, "B 2 2 h w"]
-    rows_apart: tuple[bool, bool]
-
-
-def neighbours_of(
-    phase: Phase, values: Float[Tensor, "B H W"], known: Bool[Tensor, "B H W"], distance: int = 1
-) -> Neighbours:
-    """Return the nearest pixels of earlier phases: above, below, left and right, or at the corners.
+def pixels_around(
+    phase: Phase, values: Float[Tensor, "B H W"], known: Bool[Tensor, "B H W"], offsets: Sequence[tuple[int, int]]
+) -> tuple[Float[Tensor, "B N h w"], Bool[Tensor, "B N h w"]]:
+    """Return some pixels of earlier phases around each pixel of a phase: their values, and whether they hold one.
 
     The first phase has none. Columns wrap around; rows beyond the image are not known.
 
     Args:
-        phase: phase whose neighbours are meant.
+        phase: phase whose pixels are in the middle.
         values: values of every pixel.
         known: True where a pixel holds a value.
-        distance: multiple of the distance of the nearest ones; odd, so that the pixels are of earlier phases.
+        offsets: rows and columns of the lattice from the pixel in the middle to others, all of earlier phases.
     """
     values, known = (maps[(..., *phase.lattice.pixels)] for maps in (values, known))
-    rows, columns = known.shape[-2:]
-    around = torch.arange(-distance, columns + distance, device=known.device) % columns
-    values, known = (F.pad(maps[..., around], (0, 0, distance, distance)) for maps in (values, known))
-    found_values, found_known = [], []
-    for down, right in phase.pairs:
-        for sign in (distance, -distance):
-            top, left = distance + phase.row + sign * down, distance + phase.column + sign * right
-            part = (..., slice(top, top + rows, 2), slice(left, left + columns, 2))
-            found_values.append(values[part])
-            found_known.append(known[part] if phase.rank else torch.zeros_like(known[part]))
-    rows_apart = (phase.pairs[0][0] != 0, phase.pairs[1][0] != 0)
-    stacked = torch.stack(found_values, 1).unflatten(1, (2, 2)), torch.stack(found_known, 1).unflatten(1, (2, 2))
-    return Neighbours(*stacked, rows_apart)
+    (rows, columns), farthest = known.shape[-2:], max(abs(step) for offset in offsets for step in offset)
+    around = torch.arange(-farthest, columns + farthest, device=known.device) % columns
+    values, known = (F.pad(maps[..., around], (0, 0, farthest, farthest)) for maps in (values, known))
+    parts = []
+    for down, right in offsets:
+        top, left = farthest + phase.row + down, farthest + phase.column + right
+        parts.append((..., slice(top, top + rows, 2), slice(left, left + columns, 2)))
+    found = torch.stack([known[part] for part in parts], 1)
+    return torch.stack([values[part] for part in parts], 1), found if phase.rank else torch.zeros_like(found)
 
 
 def plane_weights(phase: Phase, elevation_rad: Float[Tensor, "H"]) -> Float[Tensor, "h 1 2"]:

@@ -30,6 +30,7 @@ RECIPE = replace(
             range_width=36,
             coarse_range_width=48,
             surface_components=True,
+            gravity_components=True,
         ),
     ),
     data=replace(compact.RECIPE.data, train=("simulated:10000:train",)),
