@@ -107,9 +107,10 @@ class RangeMixture:
         if temperature == 1:
             return self.logits
         heights = self.logits.log_softmax(-1) - self.log_scales - self._mass().clamp(min=_LEAST_MASS).log()
-        apart = (self.centres[..., :, None] - self.centres[..., None, :]).abs() * (-self.log_scales).exp()[..., None, :]
-        tail = (-apart).exp()  # the logistic density is tail / (1 + tail)^2, so without a logarithm for every pair
-        density = (heights.exp()[..., None, :] * tail / (1 + tail).square()).sum(-1)
+        apart = self.centres[..., :, None] - self.centres[..., None, :]  # every pair, so each step overwrites it
+        at = apart.mul_((-self.log_scales).exp()[..., None, :]).sigmoid_()
+        # The logistic density is s (1 - s) / scale of the logistic function s.
+        density = (1 - at).mul_(at).mul_(heights.exp()[..., None, :]).sum(-1)
         density_per_m = density.log() - self.centres  # dv / d range = exp(-v)
         return self.logits.log_softmax(-1) + (1 / temperature - 1) * density_per_m
 
