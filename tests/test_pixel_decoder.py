@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from itertools import product
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -248,6 +249,19 @@ def test_sharpening_takes_components_on_one_surface_together() -> None:
     ]
     assert shares[0] == pytest.approx(1 / (1 + math.exp(-2 * 0.5)), abs=0.03)
     assert shares[1] == pytest.approx(shares[0], abs=0.01)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_components_are_sharpened_by_the_density_at_their_centres(seed: int) -> None:
+    mixture, count, power = mixture_of(seed), 20_000, 1 / 0.6 - 1
+    centres = mixture.centres[0].tolist()
+    density = expanded(mixture, 6).log_density(torch.tensor(centres, dtype=torch.float64).expm1()).exp().tolist()
+    weights = [w * d**power for w, d in zip(mixture.logits[0].softmax(-1).tolist(), density, strict=True)]
+    # Without noise every range is the centre of its component.
+    component, within = (torch.arange(count) + 0.5) / count, torch.full((count,), 0.5)
+    v = expanded(mixture, count).sample(component, within, temperature=0.6, noise=1e-9).log1p()
+    found = [float(((v - centre).abs() < 0.1).float().mean()) for centre in centres]
+    np.testing.assert_allclose(found, np.array(weights) / sum(weights), atol=1e-4)
 
 
 @torch.no_grad()
