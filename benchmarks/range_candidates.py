@@ -4,8 +4,8 @@
 
 A pixel decoder's components begin at the candidates of earlier phases: at two interpolations and four neighbours (pairs
 below), with ``surface_components`` also at four planes and four lines (surfaces), and with ``gravity_components`` at
-four upright planes and four level ones, too (all). More of them are nearer by chance alone, so this bounds what they
-can bring; how many bits they save is told by training.
+four vertical planes and four horizontal ones, too (all). More of them are nearer by chance alone, so this bounds what
+they can bring; how many bits they save is told by training.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ FEATURES = 5
 
 
 def tiny_sensor(rows: int, columns: int) -> SensorModel:
-    elevation_rad = torch.linspace(0.05, -0.35, rows)[:, None]
+    elevation_rad = 0.05 - 0.4 * torch.linspace(0, 1, rows)[:, None] ** 1.2  # rows are not evenly spaced
     azimuth_rad = math.pi - 2 * math.pi * (torch.arange(columns) + 0.5)[None] / columns
     return SensorModel("tiny", elevation_rad, azimuth_rad, 1.0, 80.0, "spherical")
 

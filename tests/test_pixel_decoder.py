@@ -251,17 +251,26 @@ def test_sharpening_takes_components_on_one_surface_together() -> None:
     assert shares[1] == pytest.approx(shares[0], abs=0.01)
 
 
+@pytest.mark.parametrize("temperature", [0.6, 2.0])
 @pytest.mark.parametrize("seed", range(3))
-def test_components_are_sharpened_by_the_density_at_their_centres(seed: int) -> None:
-    mixture, count, power = mixture_of(seed), 20_000, 1 / 0.6 - 1
+def test_components_are_sharpened_by_the_density_at_their_centres(seed: int, temperature: float) -> None:
+    mixture, count, power = mixture_of(seed), 20_000, 1 / temperature - 1
     centres = mixture.centres[0].tolist()
     density = expanded(mixture, 6).log_density(torch.tensor(centres, dtype=torch.float64).expm1()).exp().tolist()
     weights = [w * d**power for w, d in zip(mixture.logits[0].softmax(-1).tolist(), density, strict=True)]
     # Without noise every range is the centre of its component.
     component, within = (torch.arange(count) + 0.5) / count, torch.full((count,), 0.5)
-    v = expanded(mixture, count).sample(component, within, temperature=0.6, noise=1e-9).log1p()
+    v = expanded(mixture, count).sample(component, within, temperature, noise=1e-9).log1p()
     found = [float(((v - centre).abs() < 0.1).float().mean()) for centre in centres]
     np.testing.assert_allclose(found, np.array(weights) / sum(weights), atol=1e-4)
+
+
+def test_a_component_of_no_weight_is_not_sampled_at_any_temperature() -> None:
+    parts = torch.tensor([[0.0, -200.0]]), torch.tensor([[2.0, 3.0]]), torch.tensor([[-4.0, -4.0]])
+    component, within = torch.rand(2, 1000, generator=torch.Generator().manual_seed(0))
+    for temperature in (0.5, 1.0, 2.0):
+        v = expanded(RangeMixture(*parts, (1.0, 80.0)), 1000).sample(component, within, temperature).log1p()
+        assert float(v.max()) < 2.5
 
 
 @torch.no_grad()
@@ -298,7 +307,7 @@ def test_a_seed_gives_the_same_bits_whatever_its_batch() -> None:
 @torch.no_grad()
 def test_16_bits_move_few_pixels_and_leave_32_bits_as_they_were() -> None:
     sensor = tiny_sensor(32, 64)
-    decoder, decoded = random_decoder(sensor, 8, spread=0.1), random_decoded(sensor, 4)
+    decoder, decoded = random_decoder(sensor, 8, spread=0.06), random_decoded(sensor, 4)
 
     def sample(precision: Precision) -> RangeImage:
         rngs = [torch.Generator().manual_seed(seed) for seed in range(4)]
@@ -309,7 +318,7 @@ def test_16_bits_move_few_pixels_and_leave_32_bits_as_they_were() -> None:
     assert not torch.equal(quick.range_m, exact.range_m)
     assert (quick.return_mask != exact.return_mask).float().mean() < 0.02
     both = quick.return_mask & exact.return_mask
-    assert ((quick.range_m - exact.range_m).abs() < 0.3)[both].float().mean() > 0.8
+    assert ((quick.range_m - exact.range_m).abs() < 0.3)[both].float().mean() > 0.95
     assert torch.equal(sample("fp32").range_m, exact.range_m)
 
 

@@ -22,7 +22,6 @@ from lidargrit.generators._tokens import TokenGenerator
 from lidargrit.generators.multiscale import Multiscale
 from lidargrit.nn.pixel_decoder import PixelDecoder
 from lidargrit.nn.pixel_networks import Guide
-from lidargrit.nn.range_mixture import RangeMixture
 from lidargrit.nn.range_steps import RangeSteps
 from lidargrit.structures import Decoded, RangeImage, TokenGrid
 from lidargrit.tokenizers import Tokenizer
@@ -159,9 +158,7 @@ class ScanCodec:
         for phase in network.phases:
             mixture = network.distributions([phase], guided, guide, mask, v)
             returned = mask[(0, *phase.pixels)]
-            parts = mixture.logits, mixture.centres, mixture.log_scales
-            logits, centres, log_scales = (part[0, 0][returned] for part in parts)
-            some = RangeMixture(logits, centres, log_scales, mixture.limits_m)
+            some = mixture.at(returned[None, None])
             steps = coder.rounded(lambda rounding, some=some: StepMixture(some, rounding, self.steps))
             values = None if known is None else known.pixels[phase.pixels][returned.numpy()]
             pixels[phase.pixels][returned.numpy()] = coder.integers(steps, self.steps.first, self.steps.last, values)

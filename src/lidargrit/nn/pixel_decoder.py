@@ -260,10 +260,14 @@ class PixelDecoder(nn.Module):
         for phase in self.range.phases:
             pixels = (..., *phase.pixels)
             mixture = self.range.distributions([phase], guided, guide, mask, v)
-            component, within = uniform[pixels].unbind(1)
-            sampled = mixture.sample(component[None], within[None], sampling.range_temperature, sampling.range_noise)[0]
-            sampled = torch.where(condition.range_observed[pixels], condition.range_m[pixels], sampled)
-            range_m[pixels] = torch.where(mask[pixels], sampled, 0.0)
+            unknown = mask[pixels] & ~condition.range_observed[pixels]
+            component, within = (random[unknown] for random in uniform[pixels].unbind(1))
+            sampled = mixture.at(unknown[None]).sample(
+                component, within, sampling.range_temperature, sampling.range_noise
+            )
+            found = torch.where(mask[pixels], condition.range_m[pixels], 0.0)
+            found[unknown] = sampled
+            range_m[pixels] = found
             v[pixels] = range_m[pixels].log1p()
         return range_m
 

@@ -63,8 +63,9 @@ class PixelDecoderConfig:
             neighbours.
         surface_components: whether 8 more components begin on planes and straight lines through neighbours, so that the
             surfaces on both sides of an edge are continued.
-        gravity_components: whether 8 more components begin on upright planes through two neighbours and on level ones
-            through one, so that walls and the ground are continued from fewer pixels. They take the sensor to be level.
+        gravity_components: whether 8 more components begin on vertical planes through two earlier pixels and on
+            horizontal ones through a neighbour, so that walls and the ground are continued from fewer pixels. They
+            assume that the sensor is level.
     """
 
     coarsest_cell: int = 8
@@ -316,9 +317,9 @@ class RangeNetwork(PhaseNetwork):
         self.suggest = suggest
         self.limits_m = (sensor.range_min_m, sensor.range_max_m)
         self.free = config.free_components
-        begin = torch.cat((torch.linspace(-0.2, 0.2, self.free), torch.zeros(suggest.count)))
+        spread = torch.linspace(-0.2, 0.2, self.free) if self.free > 1 else torch.zeros(1)
         scale = torch.cat((torch.zeros(self.free), torch.full((suggest.count,), -2.0)))
-        self.register_buffer("begin", begin[:, None, None], persistent=False)
+        self.register_buffer("begin", spread[:, None, None], persistent=False)
         self.register_buffer("begin_scale", scale[:, None, None], persistent=False)
 
     begin: Tensor
@@ -350,7 +351,7 @@ class RangeNetwork(PhaseNetwork):
         candidates, expected = candidates[:, :-1], candidates[:, -1:]
         returned, beside = cells_of(torch.stack((return_mask.to(v.dtype), v - guide.v), 1), phase.lattice).chunk(2, 1)
         generated = generated_before(phase).to(returned)[:, None, None] * returned
-        apart = self.suggest.apart(candidates)
+        apart = self.suggest.differences(candidates)
         maps = [generated, 1 - returned, generated * beside, (candidates - expected).clamp(-2, 2), apart]
         if not self.guided_by_tokens:
             maps[2] = generated * (beside - (expected - TYPICAL_LOG_RANGE)).clamp(-2, 2)
@@ -370,7 +371,7 @@ class RangeNetwork(PhaseNetwork):
         self, phase: Phase, guide: Guide, return_mask: Bool[Tensor, "B H W"], v: Float[Tensor, "B H W"]
     ) -> Float[Tensor, "B K h w"]:
         expected = guide.v[(..., *phase.pixels)]
-        if not self.guided_by_tokens:
+        if not self.guided_by_tokens and phase.rank:
             near, known = pixels_around(phase, v, return_mask, phase.neighbours)
             count, total = known.sum(1), torch.where(known, near, 0.0).sum(1)
             expected = torch.where(count > 0, total / count.clamp(min=1), expected)
@@ -383,7 +384,7 @@ class RangeNetwork(PhaseNetwork):
     ) -> RangeMixture:
         """Return the distributions of the ranges of the pixels of phases of one lattice."""
         logits, moved, scales = output.chunk(3, 2)
-        free = candidates[:, :, -1:] + 2 * (moved + self.begin)[:, :, : self.free]
+        free = candidates[:, :, -1:] + 2 * (moved[:, :, : self.free] + self.begin)
         centres = torch.cat((free, candidates[:, :, :-1] + 0.1 * moved[:, :, self.free :]), 2)
         low, high = (math.log1p(limit) for limit in self.limits_m)
         centres = centres.clamp(low, high)

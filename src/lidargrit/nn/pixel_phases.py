@@ -166,10 +166,10 @@ def pixels_around(
 ) -> tuple[Float[Tensor, "B N h w"], Bool[Tensor, "B N h w"]]:
     """Return some pixels of earlier phases around each pixel of a phase: their values, and whether they hold one.
 
-    The first phase has none. Columns wrap around; rows beyond the image are not known.
+    Columns wrap around; rows beyond the image are not known.
 
     Args:
-        phase: phase whose pixels are in the middle.
+        phase: phase whose pixels are in the middle; not the first, which has none before it.
         values: values of every pixel.
         known: True where a pixel holds a value.
         offsets: rows and columns of the lattice from the pixel in the middle to others, all of earlier phases.
@@ -182,8 +182,7 @@ def pixels_around(
     for down, right in offsets:
         top, left = farthest + phase.row + down, farthest + phase.column + right
         parts.append((..., slice(top, top + rows, 2), slice(left, left + columns, 2)))
-    found = torch.stack([known[part] for part in parts], 1)
-    return torch.stack([values[part] for part in parts], 1), found if phase.rank else torch.zeros_like(found)
+    return torch.stack([values[part] for part in parts], 1), torch.stack([known[part] for part in parts], 1)
 
 
 def plane_weights(phase: Phase, elevation_rad: Float[Tensor, "H"]) -> Float[Tensor, "h 1 2"]:

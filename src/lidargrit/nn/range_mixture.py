@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lidargrit.nn.random_choices import sample_index
@@ -36,6 +36,10 @@ class RangeMixture:
     centres: Float[Tensor, "*P K"]
     log_scales: Float[Tensor, "*P K"]
     limits_m: tuple[float, float]
+
+    def at(self, pixels: Bool[Tensor, "*P"]) -> RangeMixture:
+        """Return the distributions of some pixels, one after the other."""
+        return RangeMixture(self.logits[pixels], self.centres[pixels], self.log_scales[pixels], self.limits_m)
 
     def log_density(self, range_m: Float[Tensor, "*P"]) -> Float[Tensor, "*P"]:
         """Return the natural logarithm of the probability density per metre."""
@@ -106,12 +110,15 @@ class RangeMixture:
         """
         if temperature == 1:
             return self.logits
+        inverse = (-self.log_scales).exp()
         heights = self.logits.log_softmax(-1) - self.log_scales - self._mass().clamp(min=_LEAST_MASS).log()
-        apart = self.centres[..., :, None] - self.centres[..., None, :]  # every pair, so each step overwrites it
-        at = apart.mul_((-self.log_scales).exp()[..., None, :]).sigmoid_()
-        # The logistic density is s (1 - s) / scale of the logistic function s.
-        density = (1 - at).mul_(at).mul_(heights.exp()[..., None, :]).sum(-1)
-        density_per_m = density.log() - self.centres  # dv / d range = exp(-v)
+        of_components = zip(*(part.split(1, -1) for part in (self.centres, inverse, heights.exp())), strict=True)
+        density = torch.zeros_like(self.centres)
+        for centre, steepness, height in of_components:  # one after the other takes less memory, and half the time
+            s = ((self.centres - centre) * steepness).sigmoid_()
+            density += s.addcmul_(s, s, value=-1).mul_(height)  # the logistic density is s (1 - s) / scale
+        least = torch.finfo(density.dtype).tiny  # the logarithm stays finite
+        density_per_m = density.clamp(min=least).log() - self.centres  # dv / d range = exp(-v)
         return self.logits.log_softmax(-1) + (1 / temperature - 1) * density_per_m
 
     def _bounds(self) -> tuple[Float[Tensor, "*P K"], Float[Tensor, "*P K"]]:
