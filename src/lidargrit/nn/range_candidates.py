@@ -170,7 +170,8 @@ class RangeCandidates(nn.Module):
             if coordinates == _Z:
                 exists &= below[through].all(1) & below[-1]
             columns = rays[through][..., coordinates].permute(0, 2, 3, 1)  # (surfaces, rows, coordinates, pixels)
-            columns = torch.where(exists[..., None, None], columns, torch.eye(len(coordinates), size).to(rays))
+            full_rank = torch.eye(len(coordinates), size, dtype=rays.dtype, device=rays.device)
+            columns = torch.where(exists[..., None, None], columns, full_rank)
             here = rays[-1][..., coordinates, None].expand(len(alike), -1, -1, -1)
             solved = torch.linalg.lstsq(columns, here).solution[..., 0]
             weights[alike, :size] = torch.where(exists[..., None], solved, torch.nan).mT
