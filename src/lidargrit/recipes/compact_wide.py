@@ -14,7 +14,7 @@ RECIPE = replace(
         # An image of 64x1024 is as much to learn from as four of 64x256.
         "tokenizer": replace(_STAGES["tokenizer"], scans=800, batch_size=1, learning_rate=5e-4, validate_every=400),
         "transformer": replace(_STAGES["transformer"], scans=9600, batch_size=4, validate_every=1200),
-        "pixels": replace(_STAGES["pixels"], scans=10_600, batch_size=1, learning_rate=1e-3, validate_every=1000),
+        "pixels": replace(_STAGES["pixels"], scans=12_200, batch_size=1, learning_rate=1e-3, validate_every=1000),
     },
     stages_from="pretrained",
     fine_tune=("tokenizer", "transformer", "pixels"),
