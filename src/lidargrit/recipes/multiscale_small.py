@@ -11,7 +11,11 @@ from lidargrit.training import Recipe
 RECIPE = Recipe(
     title="a pixel decoder without tokens, small: 64x256, for one CPU core and half an hour",
     generator="multiscale",
-    model=MultiscaleConfig(PixelDecoderConfig(coarsest_cell=64, row_channels=2, range_width=36)),
+    model=MultiscaleConfig(
+        PixelDecoderConfig(
+            coarsest_cell=64, row_channels=2, range_width=36, surface_components=True, gravity_components=True
+        )
+    ),
     data=replace(compact_pixels.RECIPE.data, train=("simulated:4352:train",)),
     training={"pixels": replace(compact_pixels.RECIPE.training["pixels"], scans=16_000, average_over_scans=700)},
 )
