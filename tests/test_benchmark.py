@@ -51,6 +51,17 @@ def test_systems_are_made_once_and_set_side_by_side(tmp_path):
     )
 
 
+def test_a_run_named_by_dots_has_the_name_of_its_folder(tmp_path, monkeypatch):
+    finished = tmp_path / "first" / "runs" / "marginal"
+    run_benchmark(["marginal"], tmp_path / "first", BENCHMARK)
+    wanted = replace(BENCHMARK, recipe_settings=())
+    for here, name in ((finished, "."), (finished / "below", "..")):
+        here.mkdir(exist_ok=True)
+        monkeypatch.chdir(here)
+        assert run_benchmark([name], tmp_path / "table", wanted) == [tmp_path / "table" / "marginal" / "marginal.json"]
+    assert [path.name for path in (tmp_path / "table").iterdir() if path.is_dir()] == ["marginal"]
+
+
 def test_bits_are_of_the_reference_of_today_and_a_time_once_measured_stays(tmp_path, monkeypatch):
     measured = iter((1.5, 2.5))
     monkeypatch.setattr(benchmark, "bits_per_return", lambda generator, scans: next(measured))

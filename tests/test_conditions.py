@@ -7,6 +7,7 @@ import torch
 from lidargrit.conditions import Condition
 from lidargrit.conditions.fills import fill_from_nearest
 from lidargrit.conditions.patterns import Pattern
+from lidargrit.determinism import derive_seed
 from lidargrit.errors import ConfigError, ScanError, UsageError
 from lidargrit.sensors import load_sensor
 from lidargrit.structures import RangeImage
@@ -64,6 +65,8 @@ def test_patterns_choose_rows_sectors_pixels_and_files(tmp_path):
     assert torch.equal(pixels[0], pixels[1])
     assert not torch.equal(pixels[0], pixels[2])
     assert 0.07 < float(pixels[0].float().mean()) < 0.13
+    completion = torch.rand(pixels[0].shape, generator=torch.Generator().manual_seed(derive_seed(0, 0))) < 0.1
+    assert 0.005 < float((pixels[0] & completion).float().mean()) < 0.015, "a completion has other random numbers"
     assert torch.equal(Pattern("returns").mask(image), image.return_mask)
     np.save(tmp_path / "mask.npy", rows.numpy().astype(np.uint8))
     assert torch.equal(Pattern(f"{tmp_path}/mask.npy").mask(image), rows)

@@ -25,7 +25,7 @@ from lidargrit.loading import DataConfig, Pixels, Provenance, RangeImages
 from lidargrit.loading.config import ScanSettings
 from lidargrit.metrics import load_metric
 from lidargrit.sensors import load_sensor
-from lidargrit.sources import open_source
+from lidargrit.sources import load_range_images, open_source
 from tiny_runs import the_one_line
 
 CHEAP = ("return_rate_per_ring", "bev_occupancy")
@@ -153,6 +153,8 @@ def test_a_metric_that_cannot_be_had_leaves_the_others(monkeypatch, tmp_path, se
     assert "none.pth" in card.left_out[0].why
     line = next(line for line in card.as_table().splitlines() if line.startswith("left out:"))
     assert "frechet_pointcloud_distance: got" in line
+    write_json(tmp_path / "mine.json", card.to_json())
+    assert "mine: left out: frechet_pointcloud_distance" in side_by_side([tmp_path / "mine.json"])
     with pytest.raises(LidarGritError, match=r"none\.pth"):
         compare_sources(*sets, replace(settings, metrics=("frechet_pointcloud_distance",)))
 
@@ -242,9 +244,19 @@ def test_pixel_statistics_without_reflectance_leave_its_scores_alone():
     pair = EvalPair(EvalSet("a", images, range(4)), EvalSet("b", images, range(4, 8)))
     settings = EvalConfig(metrics=("reflectance_histogram",), resampling=Resampling(halves=0))
     scored = compare_pair(pair, settings)
-    (score,) = with_pixel_statistics(scored, pair, images, settings).scores
+    (score,) = with_pixel_statistics(scored, pair, settings).scores
     assert score.result.value == scored.scores[0].result.value
     assert score.pixel_statistics is None
+
+
+def test_pixel_statistics_know_no_scan_that_they_are_compared_with():
+    """Counts of the compared scans themselves would be nearer to these than other real scans are."""
+    real = load_range_images(("simulated:24:test",), DataConfig(columns=512, column_stride=8))
+    pair = EvalPair(EvalSet("a", real, range(12)), EvalSet("b", real, range(12, 24)))
+    settings = EvalConfig(metrics=("range_histogram_per_ring",), resampling=Resampling(groups=12, halves=2))
+    (score,) = with_pixel_statistics(compare_pair(pair, settings), pair, settings).scores
+    assert score.real_against_real is not None
+    assert score.pixel_statistics > 0.9 * score.real_against_real.value
 
 
 def test_sets_that_overlap_and_projections_that_differ_are_told(sets, tmp_path):

@@ -1,5 +1,6 @@
 """Files that appear whole or not at all: killed writers, several writers, folders that a command holds."""
 
+import fcntl
 import os
 import shutil
 import signal
@@ -9,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+import torch
 
 from lidargrit.errors import CheckpointError, OutputError, ScanError
 from lidargrit.files import (
@@ -18,6 +20,7 @@ from lidargrit.files import (
     read_tensors,
     refuse_to_overwrite,
     remove_partials,
+    write_tensors,
     write_text,
 )
 from lidargrit.sources.sample_formats import read_tensor
@@ -149,6 +152,36 @@ def test_many_threads_write_into_one_folder_and_leave_their_files_alone(tmp_path
         list(pool.map(lambda index: write_text(tmp_path / f"{index}.txt", f"{index}"), range(400)))
     assert sorted(os.listdir(tmp_path)) == sorted(f"{index}.txt" for index in range(400))
     assert all((tmp_path / f"{index}.txt").read_text() == f"{index}" for index in range(400))
+
+
+def test_tensors_stay_locked_until_they_have_their_name(tmp_path, monkeypatch):
+    sync = os.fsync
+
+    def while_another_command_ends(file: int) -> None:
+        sync(file)
+        remove_partials(tmp_path)
+
+    monkeypatch.setattr(os, "fsync", while_another_command_ends)
+    write_tensors(tmp_path / "a.safetensors", {"x": torch.ones(3)}, {"of": 1})
+    tensors, about = read_tensors(tmp_path / "a.safetensors")
+    assert torch.equal(tensors["x"], torch.ones(3))
+    assert about == {"of": 1}
+
+
+def test_a_lock_made_anew_while_another_is_swept_stays(tmp_path, monkeypatch):
+    hidden = tmp_path / f".lidargrit-partial-{os.getuid()}"
+    hidden.mkdir()
+    (hidden / "lock").touch()
+    lock = fcntl.flock
+
+    def after_another_sweep(file: int, kind: int) -> None:
+        (hidden / "lock").unlink()
+        (hidden / "lock").write_text("process 7")
+        lock(file, kind)
+
+    monkeypatch.setattr(fcntl, "flock", after_another_sweep)
+    remove_partials(tmp_path)
+    assert (hidden / "lock").read_text() == "process 7"
 
 
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):

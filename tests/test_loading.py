@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 
 import fsspec
 import numpy as np
@@ -166,6 +167,34 @@ def test_a_failed_projection_leaves_nothing_that_looks_whole(tree, cache):
     assert len(images) == 4
     assert str(bad) not in images.provenance.names
     assert [line for line in listener.lines if "left out" in line and str(bad) in line]
+
+
+def test_a_folder_goes_on_with_what_its_refusal_advised(tree, tmp_path, monkeypatch):
+    monkeypatch.setattr(prepare_module, "_SHARD_SCANS", 2)
+    KittiOdometry(tree).path(3).write_bytes(b"")
+    config = DataConfig(workers=1)
+    with pytest.raises(ScanError, match=r"--bad-scans skip"):
+        prepare(str(tree), config, tmp_path / "out")
+    made = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").glob("*.shard")}
+    assert made
+    assert len(PreparedImages(str(prepare(str(tree), replace(config, bad_scans="skip"), tmp_path / "out")))) == 4
+    assert {path: path.stat().st_mtime_ns for path in made} == made
+    with pytest.raises(OutputError, match="prepared with another bad_scans"):
+        prepare(str(tree), config, tmp_path / "out")
+
+
+def test_what_one_scan_lacks_no_batch_has(tmp_path):
+    (tmp_path / "scans").mkdir()
+    points = np.random.default_rng(0).uniform(-20, 20, (2000, 4)).astype(np.float32)
+    points[:, 2:] = (points[:, 2:] + 20) / (-80, 40)
+    for name, columns in (("a", 4), ("b", 3), ("c", 4)):
+        np.save(tmp_path / "scans" / f"{name}.npy", points[:, :columns])
+    config = DataConfig(workers=1, projection="spherical")
+    mixed = load_range_images([str(tmp_path / "scans")], config)
+    assert [mixed.batch([index]).reflectance for index in range(3)] == [None] * 3
+    (tmp_path / "scans" / "b.npy").unlink()
+    alike = load_range_images([str(tmp_path / "scans")], config)
+    assert alike.batch([0, 1]).reflectance is not None
 
 
 def test_max_scans_are_spread_evenly(tree):

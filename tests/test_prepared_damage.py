@@ -119,6 +119,17 @@ def test_a_pipe_in_a_prepared_folder_does_not_hang(folder, name):
         PreparedImages(str(folder))
 
 
+def test_a_machine_verifies_its_own_shards_alone(tmp_path, small_shards):
+    """Another one may be making a damaged shard again, which must not be taken for damaged and removed."""
+    folder = prepare("simulated:6", CONFIG, tmp_path / "out")
+    second = folder / "000001.shard"
+    content = bytearray(second.read_bytes())
+    content[5000] ^= 255
+    second.write_bytes(content)
+    assert damaged_shards(folder, rank=0, world_size=2) == []
+    assert damaged_shards(folder, rank=1, world_size=2) == [1]
+
+
 def test_more_shards_than_a_process_may_open_are_opened_all_the_same(tmp_path):
     (tmp_path / "shard").write_bytes(b"bytes")
     allowed, most = resource.getrlimit(resource.RLIMIT_NOFILE)

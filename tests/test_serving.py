@@ -379,6 +379,11 @@ def test_the_command_says_where_and_to_whom(tmp_path, capsys, monkeypatch):
     said = capsys.readouterr().out
     assert said.startswith("WARNING: everybody who reaches 0.0.0.0 can use this machine")
     assert re.search(r"open http://0\.0\.0\.0:\d+ in a browser", said)
-    for wrong in (["--seconds", "-1"], ["--port", "99999"], ["--host", "no.such.host.invalid", "--port", "0"]):
+    for wrong in (
+        ["--seconds", "-1"],
+        ["--seconds", "inf"],
+        ["--port", "99999"],
+        ["--host", "no.such.host.invalid", "--port", "0"],
+    ):
         assert main(["serve", *wrong]) == 2
         assert capsys.readouterr().err.startswith("lidargrit serve: got ")

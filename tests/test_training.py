@@ -193,8 +193,19 @@ def test_a_loss_that_is_not_finite_stops_with_the_step(tmp_path, images):
     vqvae = Vqvae(load_recipe("demo", TINY).model.tokenizer, images.sensor)
     vqvae.encoder.conv_in.weight.data.fill_(torch.nan)
     fit = Fit(vqvae, FitConfig(scans=4, batch_size=2, learning_rate=1e-3), tmp_path, 0, Reporter())
-    with pytest.raises(TrainingError, match=r"a loss or gradient of nan after 0 scans"):
+    with pytest.raises(TrainingError, match=r"a loss or gradient of nan after 0 scans") as error:
         fit.run(images, images, "training")
+    assert "checkpoint" not in str(error.value), "there is none yet"
+
+
+def test_a_validation_needs_no_more_memory_than_a_step(tmp_path, images, monkeypatch):
+    vqvae = Vqvae(load_recipe("demo", TINY).model.tokenizer, images.sensor)
+    config = FitConfig(scans=4, batch_size=4, accumulate=2, learning_rate=1e-3, validation_scans=4)
+    fit = Fit(vqvae, config, tmp_path, 0, Reporter())
+    sizes = []
+    monkeypatch.setattr(fit.engine, "evaluate", lambda objective, some, seed: sizes.append(len(some)) or {"loss": 1.0})
+    assert fit.validate(images) == {"loss": 1.0}
+    assert sizes == [2] * (min(4, len(images)) // 2)
 
 
 @pytest.mark.shared

@@ -1,5 +1,7 @@
 """The verdict on scores: what it counts, which metrics it sets apart, and what it says of odd values."""
 
+from dataclasses import replace
+
 import pytest
 
 from lidargrit.cli import main
@@ -59,6 +61,16 @@ def test_values_below_zero_and_better_than_real_are_explained():
     assert "bev_jsd (exact), bev_jsd (r2dm) below 0" in " ".join(verdict(both))
 
 
+def test_halves_are_compared_with_halves():
+    """A score of whole sets is better than that of halves, so it would seem like real too often."""
+    of_halves = replace(score(0.15, 0.1, 0.25), interval=Interval(0.1, 0.2, 0.025, 20, mean_of_halves=0.3))
+    assert verdict([of_halves]) == (
+        "Better than pixel statistics in 0 of 1 scores; within noise of real against real in 0.",
+    )
+    held_out = replace(of_halves, real_against_real=RealAgainstReal(0.1, 9, 0))
+    assert "within noise of real against real in 1." in verdict([held_out])[0]
+
+
 def test_a_table_takes_pixel_statistics_from_their_own_row(tmp_path):
     files = {"marginal": card(score(0.9, 0.1)), "memorised": card(score(0.1, 0.1)), "mine": card(score(0.5, 0.1))}
     paths = []
@@ -90,7 +102,7 @@ def test_both_bounds_are_read_as_they_were_written(tmp_path):
 
 
 def test_the_command_scores_pixel_statistics_where_they_are_wanted(tmp_path, capsys):
-    words = ["evaluate", "simulated:2:val", "simulated:2:test", "--metrics", "bev_jsd", "--variant", "exact"]
+    words = ["evaluate", "simulated:4:val", "simulated:4:test", "--metrics", "bev_jsd", "--variant", "exact"]
     assert main([*words, "--pixel-statistics", "--json", str(tmp_path / "s.json")]) == 0
     assert "pixel statistics" in capsys.readouterr().out.splitlines()[0].lower()
     found = read_json(tmp_path / "s.json")

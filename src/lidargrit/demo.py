@@ -304,7 +304,7 @@ def _score(samples: RangeImages, val: RangeImages, real: RangeImages, reporter: 
     held_out = some("val", val, count)
     card = compare_pair(pair, settings, reporter)
     card = with_held_out(card, held_out, some("train", real, len(held_out)), settings)
-    return with_pixel_statistics(card, pair, real, settings)
+    return with_pixel_statistics(card, pair, settings)
 
 
 _INTERRUPTED = " (interrupted)"  # end of the name of a stage that is not done yet, with the time that it took so far

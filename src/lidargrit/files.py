@@ -7,9 +7,9 @@ import hashlib
 import json
 import math
 import os
+import secrets
 import socket
 import stat
-import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -42,9 +42,6 @@ def atomic_path(path: Path) -> Iterator[Path]:
             yield temporary
             with temporary.open("rb") as written:
                 os.fsync(written.fileno())
-            mask = os.umask(0)
-            os.umask(mask)
-            temporary.chmod(0o666 & ~mask)  # mkstemp keeps files private; ours are ordinary ones
             temporary.replace(path)
     except OSError as error:
         raise OutputError(
@@ -112,7 +109,8 @@ def _partial_file(folder: Path) -> Iterator[Path]:
     try:
         while path is None:
             with suppress(FileNotFoundError):  # another process has just removed the hidden folder, empty
-                lock, name = tempfile.mkstemp(suffix=".partial", dir=_hidden(folder))
+                new = _hidden(folder) / f"{secrets.token_hex(8)}.partial"
+                lock = os.open(new, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
                 try:
                     fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                     is_ours = os.fstat(lock).st_nlink > 0
@@ -121,7 +119,7 @@ def _partial_file(folder: Path) -> Iterator[Path]:
                 except OSError:  # a file system without locks
                     is_ours = True
                 if is_ours:
-                    path = Path(name)
+                    path = new
                 else:
                     os.close(lock)
                     lock = None
@@ -187,7 +185,8 @@ def _sweep(hidden: Path) -> None:
                 file = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK)
                 try:
                     fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    path.unlink()
+                    if os.fstat(file).st_nlink:  # else another process has removed it, and the name may be a new file's
+                        path.unlink()
                 finally:
                     os.close(file)
         hidden.rmdir()
@@ -296,17 +295,17 @@ def sha256_of(path: Path) -> str:
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], about: Mapping[str, Any] | None = None) -> None:
     """Write tensors and what is to be known about them into one safetensors file, atomically."""
     from safetensors import SafetensorError  # noqa: PLC0415  quick start of commands that write no weights
-    from safetensors.torch import save_file  # noqa: PLC0415
+    from safetensors.torch import save  # noqa: PLC0415
 
     with atomic_path(path) as temporary:
         try:
-            save_file(
+            data = save(
                 {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()},
-                temporary,
                 {"about": json.dumps(dict(about or {}))},
             )
-        except SafetensorError as error:  # its own class for what is here always a failed write
+        except SafetensorError as error:
             raise OSError(str(error)) from error
+        temporary.write_bytes(data)  # its save_file would put another file, without our lock, in this one's place
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:

@@ -54,6 +54,14 @@ def module_command(module: str, *words: str) -> list[str]:
     return [sys.executable, "-P", "-m", module, *words]
 
 
+def check_processes(count: int) -> None:
+    """Raise ConfigError for less than one process, or more than :data:`PROCESSES_AT_MOST`."""
+    if not 1 <= count <= PROCESSES_AT_MOST:
+        raise ConfigError(
+            f"{count} processes", f"1 to {PROCESSES_AT_MOST:,}", "choose about as many as there are cores"
+        )
+
+
 @contextmanager
 def process_pool(count: int, begin: Callable[[], None] | None = None) -> Iterator[ProcessPoolExecutor]:
     """Yield a pool of processes that import no file of the current folder.
@@ -69,10 +77,7 @@ def process_pool(count: int, begin: Callable[[], None] | None = None) -> Iterato
         ConfigError: less than one process, or more than :data:`PROCESSES_AT_MOST`.
         DataError: one of them died.
     """
-    if not 1 <= count <= PROCESSES_AT_MOST:
-        raise ConfigError(
-            f"{count} processes", f"1 to {PROCESSES_AT_MOST:,}", "choose about as many as there are cores"
-        )
+    check_processes(count)
     before = {*active_children()}
     try:
         with _safe_import_path(), ProcessPoolExecutor(count, get_context("spawn"), _begin, (begin,)) as pool:

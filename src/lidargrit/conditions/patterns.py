@@ -16,6 +16,7 @@ from lidargrit.errors import UsageError
 from lidargrit.structures import RangeImage
 
 FORMS = "rows:4, sector:45,315, pixels:0.1, returns or a mask.npy"
+_OF_PIXELS = 0x6D61736B  # keeps the random numbers of masks apart from those of a completion with the same seed
 _BYTES_AT_MOST = 1 << 26  # a mask of 64-bit numbers of the largest image
 
 
@@ -76,7 +77,7 @@ class Pattern:
             azimuth_deg = image.sensor.azimuth_rad.cpu().double().rad2deg().expand(height, width)
             return (azimuth_deg - first) % 360 <= ((last - first) % 360 or 360)
         if self.text.startswith("pixels:"):
-            rng = torch.Generator().manual_seed(derive_seed(seed))
+            rng = torch.Generator().manual_seed(derive_seed(seed, _OF_PIXELS))
             return torch.rand(height, width, generator=rng) < self._numbers()[0]
         return _read_mask(Path(self.text), (height, width))
 

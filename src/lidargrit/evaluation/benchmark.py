@@ -28,7 +28,7 @@ from lidargrit.evaluation.verdict import MEMORISED, PIXEL_STATISTICS
 from lidargrit.files import claim_folder, read_json, write_json
 from lidargrit.generators import Generator, load, load_class
 from lidargrit.nn.devices import usable_device
-from lidargrit.processes import process_pool
+from lidargrit.processes import check_processes, process_pool
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
 from lidargrit.run_folder import is_run, locate
@@ -130,6 +130,7 @@ def run(
         raise ConfigError(
             f"the systems {', '.join(systems) or '(none)'}", "each once, and at least one", "correct them"
         )
+    check_processes(processes)
     # Wrong words and runs of other recipes are refused before anything is trained.
     plans = [_Plan.of(system, folder, benchmark) for system in systems]
     reference = open_source(benchmark.reference, benchmark.settings.data.bad_points)
@@ -212,7 +213,9 @@ def _finish(
 
 
 def _folder_name(system: str) -> str:
-    return system.replace("/", "_")
+    """Return the name of a system's folder in the table; "." and ".." stand for the folders that they name."""
+    run, colon, settings = system.partition(":")
+    return (run if run.strip("./") else Path(run).resolve().name).replace("/", "_") + colon + settings.replace("/", "_")
 
 
 def _share(processes: int) -> None:

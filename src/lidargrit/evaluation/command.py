@@ -64,7 +64,7 @@ def evaluate(
     pair = open_pair(first, second, config, reporter)
     card = compare_pair(pair, config, reporter)
     if config.pixel_statistics:
-        card = with_pixel_statistics(card, pair, pair.reference.images, config)
+        card = with_pixel_statistics(card, pair, config)
     for warning in card.warnings[len(pair.warnings) :]:
         reporter.message(f"WARNING: {warning}")
     if report and write_report:

@@ -67,12 +67,15 @@ class Interval:
         high: value plus t standard errors, clipped to the metric's bounds.
         standard_error: standard deviation of the scores of half-samples.
         halves: number of half-samples.
+        mean_of_halves: mean score of half-samples, which have as many scans as the halves of real against real; None in
+            files of earlier versions.
     """
 
     low: float
     high: float
     standard_error: float
     halves: int
+    mean_of_halves: float | None = None
 
 
 @dataclass(frozen=True)
@@ -81,8 +84,8 @@ class RealAgainstReal:
 
     Args:
         value: mean over halvings of the reference, one half against the other; or score of held-out scans.
-        num_scans: number of scans in each set. Most metrics fall as sets grow, so whole sets would score a little lower
-            than halves.
+        num_scans: number of scans in each set. Most metrics fall as sets grow, some by a third where they double: so
+            compare it with ``Interval.mean_of_halves``, unless the scans were held out.
         halvings: number of halvings; 0 for held-out scans.
     """
 
@@ -100,7 +103,8 @@ class Score:
         interval: 95 % interval; None if it was not wanted or cannot be computed.
         real_against_real: score of real scans in place of the samples; None if it was not computed.
         seconds: time that the metric, its interval and real against real took.
-        pixel_statistics: score of the generator ``marginal`` in place of the samples; None if it was not computed.
+        pixel_statistics: score of the generator ``marginal`` in place of the samples, on sets of the size of the halves
+            where intervals were wanted; None if it was not computed.
     """
 
     result: MetricResult
@@ -200,7 +204,8 @@ def around(value: float, half_values: Sequence[float], groups: int, bounds: tupl
     error = float(np.std(half_values, ddof=1))
     reach = error * float(stdtrit(min(groups, len(half_values)) - 1, 0.975))
     least = max(bounds[0], 0.0) if min(value, *half_values) >= 0 else bounds[0]
-    return Interval(max(value - reach, least), min(value + reach, bounds[1]), error, len(half_values))
+    mean = float(np.mean(half_values))
+    return Interval(max(value - reach, least), min(value + reach, bounds[1]), error, len(half_values), mean)
 
 
 def real_against_real(

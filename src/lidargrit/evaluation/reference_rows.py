@@ -2,37 +2,61 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 from lidargrit.errors import DataError
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair
-from lidargrit.evaluation.intervals import RealAgainstReal, Resampling
+from lidargrit.evaluation.intervals import RealAgainstReal, Resampling, blocks
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
 from lidargrit.evaluation.scorecard import Scorecard
-from lidargrit.evaluation.verdict import PIXEL_STATISTICS
-from lidargrit.generators import load_class
+from lidargrit.generators.marginal import Marginal, MarginalConfig
 from lidargrit.loading import Pixels, Provenance, RangeImages
 from lidargrit.structures import RangeImage
 
 
-def with_pixel_statistics(card: Scorecard, pair: EvalPair, real: RangeImages, settings: EvalConfig) -> Scorecard:
+def with_pixel_statistics(card: Scorecard, pair: EvalPair, settings: EvalConfig) -> Scorecard:
     """Return a scorecard in which every score has that of pixel statistics beside it.
+
+    Pixels are counted in every second block of the reference, and as many sampled scans compared with the other blocks;
+    then the other way round. No scan is counted and compared with, and both sets are as large as the halves of real
+    against real. A score is the mean of the two.
 
     Args:
         card: scores of the samples.
         pair: the samples and the reference of these scores.
-        real: real scans whose pixels are counted.
         settings: protocol and its changes, as for the samples.
     """
-    marginal = load_class(PIXEL_STATISTICS)
-    statistics = marginal(marginal.Config(), real.sensor)
-    statistics.fit_statistics(real)
-    count = len(pair.samples)
-    images = RangeImages(real.sensor, [ImagesInMemory(statistics.sample(range(count)))])
-    scans = EvalSet("pixel statistics", images, range(count), pair.samples.range_m)
-    values, warnings = _values_of(EvalPair(scans, pair.reference), settings, card)
-    scores = (replace(s, pixel_statistics=values.get((s.result.metric, s.result.variant))) for s in card.scores)
+    groups = blocks(len(pair.reference), settings.resampling.groups)
+    if len(groups) < 2:
+        return replace(card, warnings=(*card.warnings, "no pixel statistics: they need two scans to compare with"))
+    even, odd = (_part(pair.reference, groups[first::2]) for first in range(2))
+    values, warnings = _pixel_statistics(even, odd, pair.samples.range_m, settings, card)
+    others, _ = _pixel_statistics(odd, even, pair.samples.range_m, settings, card)
+    scores = (
+        replace(score, pixel_statistics=(values[name] + others[name]) / 2)
+        if (name := (score.result.metric, score.result.variant)) in values.keys() & others.keys()
+        else score
+        for score in card.scores
+    )
     return replace(card, scores=tuple(scores), warnings=(*card.warnings, *warnings))
+
+
+def _part(scans: EvalSet, groups: Sequence[range]) -> EvalSet:
+    """Return some of the blocks of a set."""
+    return replace(scans, indices=[scans.indices[index] for group in groups for index in group])
+
+
+def _pixel_statistics(
+    counted: EvalSet, reference: EvalSet, range_m: tuple[float, float] | None, settings: EvalConfig, card: Scorecard
+) -> tuple[dict[tuple[str, str], float], tuple[str, ...]]:
+    """Score scans whose pixels are sampled from those of some real scans, one by one, against others."""
+    sensor, count = counted.images.sensor, len(reference)
+    statistics = Marginal(MarginalConfig(), sensor)
+    statistics.fit_statistics(counted)
+    images = RangeImages(sensor, [ImagesInMemory(statistics.sample(range(count)))])
+    scans = EvalSet("pixel statistics", images, range(count), range_m)
+    return _values_of(EvalPair(scans, reference), settings, card)
 
 
 def with_held_out(card: Scorecard, held_out: EvalSet, reference: EvalSet, settings: EvalConfig) -> Scorecard:

@@ -219,6 +219,7 @@ def _score(data: dict[str, Any]) -> Score:
             float(interval["high"]),
             float(interval["standard_error"]),
             int(interval["halves"]),
+            None if interval.get("mean_of_halves") is None else float(interval["mean_of_halves"]),
         ),
         None if real is None else RealAgainstReal(float(real["value"]), int(real["num_scans"]), int(real["halvings"])),
         float(data["seconds"]),

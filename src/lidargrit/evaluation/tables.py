@@ -13,7 +13,7 @@ from typing import Any, Literal
 from lidargrit.errors import DataError
 from lidargrit.evaluation.intervals import Score
 from lidargrit.evaluation.scorecard import NOT_APPLICABLE, LeftOut, Scorecard, format_value
-from lidargrit.evaluation.verdict import MEMORISED, PIXEL_STATISTICS, verdict
+from lidargrit.evaluation.verdict import MEMORISED, PIXEL_STATISTICS, value_of_halves, verdict
 from lidargrit.files import read_json
 
 Format = Literal["text", "markdown", "latex"]
@@ -96,7 +96,9 @@ def _measured(cards: Sequence[tuple[str, Scorecard]]) -> TableBlock:
     for (name, card), not_applicable in zip(cards, words, strict=True):
         cells = not_applicable | {_column(score): _cell(score) for score in card.scores}
         rows.append((f"{name}{_BOUNDS.get(_system(name), '')}", tuple(cells.get(column, "") for column in columns)))
-        notes += [f"{name}: {text}" for text in (*card.deviations, *card.warnings)]
+        missing = [each for each in card.left_out if each not in _not_applicable(card)]
+        left_out = [f"left out: {each.metric} ({each.variant}): {each.why}" for each in missing]
+        notes += [f"{name}: {text}" for text in (*card.deviations, *card.warnings, *left_out)]
     card = cards[0][1]
     reference_row = {
         _column(score): score.real_against_real
@@ -127,11 +129,16 @@ def _with_pixel_statistics(cards: Sequence[tuple[str, Scorecard]]) -> list[tuple
     rows = [card for name, card in cards if _system(name) == PIXEL_STATISTICS]
     if not rows:
         return list(cards)
-    values = {_column(score): score.result.value for score in rows[0].scores}
+    values = {_column(score): value_of_halves(score) for score in rows[0].scores}
     return [
         (
             name,
-            replace(card, scores=tuple(replace(s, pixel_statistics=values.get(_column(s))) for s in card.scores)),
+            replace(
+                card,
+                scores=tuple(
+                    replace(s, pixel_statistics=values.get(_column(s), s.pixel_statistics)) for s in card.scores
+                ),
+            ),
         )
         for name, card in cards
     ]

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from lidargrit.evaluation.intervals import Score
+from lidargrit.evaluation.intervals import RealAgainstReal, Score
 
 PIXEL_STATISTICS, MEMORISED = "marginal", "memorised"
 """The generators whose scans are the second and the third bound."""
@@ -28,14 +28,14 @@ def beats_pixel_statistics(score: Score) -> bool | None:
     """Return whether a score beats that of pixel statistics by more than chance; None where that is not known."""
     if score.pixel_statistics is None:
         return None
-    return _worse_by(score, score.pixel_statistics, score.result.value) > noise(score)
+    return _worse_by(score, score.pixel_statistics, value_of_halves(score)) > noise(score)
 
 
 def is_like_real(score: Score) -> bool | None:
     """Return whether a score is not worse than real against real by more than chance; None where that is not known."""
     if score.real_against_real is None:
         return None
-    return _worse_by(score, score.result.value, score.real_against_real.value) <= noise(score)
+    return _worse_by(score, _beside(score, score.real_against_real), score.real_against_real.value) <= noise(score)
 
 
 def tells_apart(score: Score) -> bool | None:
@@ -75,8 +75,8 @@ def verdict(scores: Sequence[Score]) -> tuple[str, ...]:
         )
     if beyond := [score for score in counted if _is_beyond_real(score)]:
         sentences.append(
-            f"Better than real against real: {_names(beyond)}. Either the two sets of that row are smaller, which "
-            "raises most scores, or the samples repeat scans of the reference."
+            f"Better than real against real: {_names(beyond)}. The samples repeat scans of the reference or vary less "
+            "than real ones, or the sets of that row are smaller, which makes most scores worse."
         )
     return tuple(sentences)
 
@@ -96,7 +96,18 @@ def _count(scores: Sequence[Score]) -> str:
 
 def _is_beyond_real(score: Score) -> bool:
     real = score.real_against_real
-    return real is not None and _worse_by(score, real.value, score.result.value) > noise(score)
+    return real is not None and _worse_by(score, real.value, _beside(score, real)) > noise(score)
+
+
+def value_of_halves(score: Score) -> float:
+    """Return the mean score of halves of both sets, since most metrics are worse for fewer scans; else the score."""
+    mean = None if score.interval is None else score.interval.mean_of_halves
+    return score.result.value if mean is None else mean
+
+
+def _beside(score: Score, real: RealAgainstReal) -> float:
+    """Return the value that compares with real against real: of whole sets where as many real scans were held out."""
+    return value_of_halves(score) if real.halvings else score.result.value
 
 
 def _worse_by(score: Score, value: float, other: float) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from lidargrit.errors import CheckpointError, ConfigError
 from lidargrit.generators import Cost, Generator, NoSampling, SystemFacts
-from lidargrit.loading import RangeImages
+from lidargrit.generators._batches import BatchSeeds
 from lidargrit.nn.seeds import rngs_of
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
@@ -32,6 +33,17 @@ class MarginalConfig:
     def __post_init__(self) -> None:
         if not 1 <= self.bins <= 4096:
             raise ConfigError(f"{self.bins} bins", "1 to 4096", "choose about a hundred")
+
+
+@runtime_checkable
+class ImageBatches(Protocol):
+    """Range images that are read in batches, such as those of a data set or the compared ones of an evaluation."""
+
+    def __len__(self) -> int: ...
+
+    def batch(self, indices: Sequence[int], /) -> RangeImage:
+        """Return some of the images."""
+        ...
 
 
 class Marginal(Generator[MarginalConfig, NoSampling]):
@@ -56,7 +68,7 @@ class Marginal(Generator[MarginalConfig, NoSampling]):
         """Return a histogram of 16 bins."""
         return MarginalConfig(bins=16)
 
-    def fit_statistics(self, images: RangeImages) -> None:
+    def fit_statistics(self, images: ImageBatches) -> None:
         """Count the returns of all images."""
         edges = self._edges_m()[1:-1]
         self.counts.zero_()
@@ -68,7 +80,12 @@ class Marginal(Generator[MarginalConfig, NoSampling]):
                 self.counts.scatter_add_(0, one[None], mask[None].int())
             self.scans += len(batch)
 
-    def _sample(self, seeds: Sequence[int], sampling: NoSampling) -> RangeImage:
+    @property
+    def compute_batch(self) -> int:
+        """Number of scans that are sampled at once; the histograms are summed up once for all of them."""
+        return _BATCH
+
+    def _sample(self, seeds: BatchSeeds, sampling: NoSampling) -> RangeImage:
         """Sample every pixel by itself.
 
         Raises:
@@ -79,7 +96,7 @@ class Marginal(Generator[MarginalConfig, NoSampling]):
         edges = self._edges_m().to(self.counts.device)
         total = self.counts.cumsum(dim=0)
         images = []
-        for rng in rngs_of(seeds):
+        for rng in rngs_of(seeds[: seeds.num_asked_for]):
             uniform = torch.rand(3, self.sensor.height, self.sensor.width, generator=rng).to(self.counts.device)
             returned = uniform[0] < total[-1] / self.scans
             # The first bin at which the counts so far exceed the sampled share of all.

@@ -34,6 +34,7 @@ from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel, load_sensor
 
 _SHARD_SCANS = 128  # 12 MB of KITTI-360 size images, and 625 files for 80,000 scans
+_BAD = ("bad_points", "bad_scans")  # the settings that refuse what cannot be used, or leave it out
 _WAIT_S, _PATIENCE_S = 0.5, 1800.0  # for shards that other machines make
 
 
@@ -146,7 +147,7 @@ def prepare_and_describe(
     imaging.report(reporter)
     config, sensor = imaging.config, imaging.sensor
     folder = prepare(source, config, folder, reporter, sensor, rank, world_size, dataset)
-    if verify and (damaged := damaged_shards(folder, reporter)):
+    if verify and (damaged := damaged_shards(folder, reporter, rank, world_size)):
         reporter.message(f"damaged and made again: {', '.join(map(shard_name, damaged))}")
         for shard in damaged:
             (folder / shard_name(shard)).unlink(missing_ok=True)  # another process may have removed it
@@ -159,12 +160,19 @@ def prepare_and_describe(
     return Prepared(folder, len(images), *shape, size, seconds, tuple(images.left_out.values()))
 
 
-def damaged_shards(folder: Path, reporter: Reporter | None = None) -> list[int]:
-    """Read every image of a prepared folder and return the numbers of the shards with a damaged one."""
+def damaged_shards(
+    folder: Path, reporter: Reporter | None = None, rank: int | None = None, world_size: int | None = None
+) -> list[int]:
+    """Read every image of this machine's shards of a prepared folder, and return the numbers of damaged shards.
+
+    A machine does not look at the shards of others: these may be making a damaged one again at this moment.
+    """
+    rank, world_size = rank_and_world_size(rank, world_size)
     images = PreparedImages(str(folder))
+    mine = [index for index in range(len(images)) if images.shard_of(index) % world_size == rank]
     damaged: set[int] = set()
-    with (reporter or Reporter()).progress("verifying", len(images)) as progress:
-        for index in range(len(images)):
+    with (reporter or Reporter()).progress("verifying", len(mine)) as progress:
+        for index in mine:
             try:
                 images.read(index, verify=True)
             except DataError:
@@ -213,7 +221,12 @@ def _spec(
 def _claim(folder: Path, spec: PreparedSpec, scans: list[tuple[str, str, int, int]]) -> None:
     """Write the plan into a free folder, or check that the folder's plan is the same."""
     if (folder / PLAN_FILE).exists():
-        if differing := spec.differences(PreparedFolder(str(folder)).read_spec()):
+        planned = PreparedFolder(str(folder)).read_spec()
+        differing = spec.differences(planned)
+        # Nothing bad was met so far, so all that is there is as the more lenient treatment would have it.
+        if differing and all(name in _BAD and getattr(planned, name) == "refuse" for name in differing):
+            write_json(folder / PLAN_FILE, asdict(spec))
+        elif differing:
             raise OutputError(
                 f"{folder}, which is stale: prepared with another {', '.join(differing)}",
                 "an empty folder, or what was prepared from these very scans in this very way",

@@ -226,6 +226,9 @@ class PreparedImages:
                 raise DataError(f"{shard_name(shard)} with other scans", "those of the plan", "prepare again")
             self._entries += [(shard, entry) for entry in entries]
             self.left_out |= left_out
+        # What some scans lack, none has: a batch has it of all of its images or of none, whichever they are.
+        self._has_reflectance = all(entry.reflectance_bytes for _, entry in self._entries)
+        self._has_labels = all(entry.label_bytes for _, entry in self._entries)
         self.provenance = Provenance(
             tuple(scans[entry.scan][0] for _, entry in self._entries),
             tuple(scans[entry.scan][1] for _, entry in self._entries),
@@ -285,7 +288,7 @@ class PreparedImages:
         return FewerColumns(self, prepared.width, wanted.width) if is_wider else self
 
     def read(self, index: int, verify: bool = False) -> Pixels:
-        """Return the pixels of one image.
+        """Return the pixels of one image, without reflectance or labels if any image of the folder lacks them.
 
         Args:
             index: number of the image.
@@ -296,7 +299,12 @@ class PreparedImages:
         """
         shard, entry = self._entries[index]
         name = f"{self._folder.location}/{shard_name(shard)}"
-        return read_image(self._bytes(shard), entry, self._shape, self.spec.range_step_m, name, verify)
+        pixels = read_image(self._bytes(shard), entry, self._shape, self.spec.range_step_m, name, verify)
+        return Pixels(
+            pixels.range_m,
+            pixels.reflectance if self._has_reflectance else None,
+            pixels.label if self._has_labels else None,
+        )
 
     def shard_of(self, index: int) -> int:
         """Return the number of the shard that holds an image."""

@@ -53,7 +53,7 @@ class PixelSampling:
     precision: Precision = "fp32"
 
     def __post_init__(self) -> None:
-        if not (self.range_temperature > 0 and self.range_noise > 0):
+        if not (0 < self.range_temperature < math.inf and 0 < self.range_noise < math.inf):
             raise ConfigError(
                 f"range_temperature={self.range_temperature}, range_noise={self.range_noise}",
                 "positive numbers",

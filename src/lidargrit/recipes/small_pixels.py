@@ -17,9 +17,7 @@ RECIPE = replace(
         # Dropout costs likelihood in so short a training, see docs/results/transformer-recipe.md.
         transformer=replace(_MODEL.transformer, embedding_dropout=0.0, residual_dropout=0.0),
         # Columns are 1.4 degrees apart and rows 0.4, so rows come closer last.
-        pixels=PixelDecoderConfig(
-            coarsest_cell=16, row_halvings=2, surface_components=True, gravity_components=True
-        ),
+        pixels=PixelDecoderConfig(coarsest_cell=16, row_halvings=2, surface_components=True, gravity_components=True),
     ),
     training={
         **small.RECIPE.training,

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 from lidargrit.errors import ConfigError
 
+_SECONDS_AT_MOST = 86_400
+
 
 @dataclass(frozen=True)
 class Limits:
@@ -36,5 +38,9 @@ class Limits:
     idle_seconds: int = 15
 
     def __post_init__(self) -> None:
-        if not self.seconds > 0:
-            raise ConfigError(f"{self.seconds:g} seconds for one job", "more than 0", "raise it")
+        if not 0 < self.seconds <= _SECONDS_AT_MOST:
+            raise ConfigError(
+                f"{self.seconds:g} seconds for one job",
+                f"more than 0, at most {_SECONDS_AT_MOST:,}",
+                "choose another number",
+            )

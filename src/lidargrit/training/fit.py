@@ -128,8 +128,10 @@ class Fit:
         """Return the averaged objective's mean loss terms over evenly spaced validation scans."""
         chosen = evenly_spaced(self.config.validation_scans, len(images))
         totals: dict[str, float] = {}
-        for first in range(0, len(chosen), self.config.batch_size):
-            indices = chosen[first : first + self.config.batch_size]
+        # As many at once as a process has in a step, since more may not fit in memory.
+        at_once = max(1, self.config.batch_size // (self.engine.world_size * self.config.accumulate))
+        for first in range(0, len(chosen), at_once):
+            indices = chosen[first : first + at_once]
             terms = self.engine.evaluate(
                 self.average.objective, images.batch(indices), derive_seed(self.seed, 3, first)
             )
@@ -142,13 +144,14 @@ class Fit:
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate_at(config, self.scans_seen)
         seed = derive_seed(self.seed, 2, self.scans_seen, self.engine.rank)
-        torch.manual_seed(seed)  # of dropout, which takes the global random numbers
+        torch.manual_seed(derive_seed(seed, 0, 1))  # of dropout, which takes the global random numbers
         terms = self.engine.step(images.to(self.engine.device), seed, config.gradient_clip, config.accumulate)
         if not bool(terms["loss"].isfinite()):
             raise TrainingError(
                 f"a loss or gradient of {float(terms['loss'].detach())} after {self.scans_seen} scans",
                 "finite numbers",
-                f"use a new folder and a lower training.*.learning_rate; the last checkpoint is {self.checkpoint}",
+                "use a new folder and a lower training.*.learning_rate"
+                + (f"; the last checkpoint is {self.checkpoint}" if self.checkpoint.exists() else ""),
             )
         self.scans_seen += config.batch_size
         self.average.update(self.objective, self.scans_seen, config.batch_size)

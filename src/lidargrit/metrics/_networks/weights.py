@@ -203,7 +203,7 @@ def _missing(published: PublishedWeights, target: Path, why: str) -> WeightsErro
     return WeightsError(
         f"no weights of {published.name} on this computer, and none from the network ({why})",
         f"{published.file_name} from {published.url} (licence: {published.licence})",
-        f"put it into {target.parent} or ${FOLDER_VARIABLE}, or name it: --weights {published.name}=FILE",
+        f"put it into {target.parent} or ${FOLDER_VARIABLE}, or name it to evaluate: --weights {published.name}=FILE",
     )
 
 
