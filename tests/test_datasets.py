@@ -151,6 +151,20 @@ class Heard(Reporter):
         self.messages.append(text)
 
 
+def test_what_one_scan_lacks_no_batch_has(tmp_path):
+    (tmp_path / "scans").mkdir()
+    points = np.random.default_rng(0).uniform(-20, 20, (2000, 4)).astype(np.float32)
+    points[:, 2:] = (points[:, 2:] + 20) / (-80, 40)
+    for name, columns in (("a", 4), ("b", 3), ("c", 4)):
+        np.save(tmp_path / "scans" / f"{name}.npy", points[:, :columns])
+    config = DataConfig(workers=1, projection="spherical")
+    mixed = load_range_images([str(tmp_path / "scans")], config)
+    assert [mixed.batch([index]).reflectance for index in range(3)] == [None] * 3
+    (tmp_path / "scans" / "b.npy").unlink()
+    alike = load_range_images([str(tmp_path / "scans")], config)
+    assert alike.batch([0, 1]).reflectance is not None
+
+
 def test_one_bad_file_among_others_is_told_by_its_name_and_left_out(tmp_path, monkeypatch):
     monkeypatch.setenv("LIDARGRIT_CACHE", str(tmp_path / "cache"))
     folder = tmp_path / "scans"

@@ -25,7 +25,7 @@ from lidargrit.loading import DataConfig, Pixels, Provenance, RangeImages
 from lidargrit.loading.config import ScanSettings
 from lidargrit.metrics import load_metric
 from lidargrit.sensors import load_sensor
-from lidargrit.sources import load_range_images, open_source
+from lidargrit.sources import open_source
 from tiny_runs import the_one_line
 
 CHEAP = ("return_rate_per_ring", "bev_occupancy")
@@ -247,16 +247,6 @@ def test_pixel_statistics_without_reflectance_leave_its_scores_alone():
     (score,) = with_pixel_statistics(scored, pair, settings).scores
     assert score.result.value == scored.scores[0].result.value
     assert score.pixel_statistics is None
-
-
-def test_pixel_statistics_know_no_scan_that_they_are_compared_with():
-    """Counts of the compared scans themselves would be nearer to these than other real scans are."""
-    real = load_range_images(("simulated:24:test",), DataConfig(columns=512, column_stride=8))
-    pair = EvalPair(EvalSet("a", real, range(12)), EvalSet("b", real, range(12, 24)))
-    settings = EvalConfig(metrics=("range_histogram_per_ring",), resampling=Resampling(groups=12, halves=2))
-    (score,) = with_pixel_statistics(compare_pair(pair, settings), pair, settings).scores
-    assert score.real_against_real is not None
-    assert score.pixel_statistics > 0.9 * score.real_against_real.value
 
 
 def test_sets_that_overlap_and_projections_that_differ_are_told(sets, tmp_path):

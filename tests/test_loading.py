@@ -103,7 +103,6 @@ def test_prepared_pixels_are_those_of_projecting_to_a_millimetre(tree):
 
 @pytest.mark.parametrize(("reach_m", "step_m"), [(80.0, 0.002), (131.0, 0.002), (131.1, 0.004), (300.0, 0.006)])
 def test_steps_are_2_mm_as_far_as_16_bits_reach(reach_m, step_m):
-    from dataclasses import replace
 
     sensor = replace(load_sensor("hdl64e_kitti_360"), range_max_m=reach_m)
     assert shards.range_step_m(sensor) == pytest.approx(step_m)
@@ -167,34 +166,6 @@ def test_a_failed_projection_leaves_nothing_that_looks_whole(tree, cache):
     assert len(images) == 4
     assert str(bad) not in images.provenance.names
     assert [line for line in listener.lines if "left out" in line and str(bad) in line]
-
-
-def test_a_folder_goes_on_with_what_its_refusal_advised(tree, tmp_path, monkeypatch):
-    monkeypatch.setattr(prepare_module, "_SHARD_SCANS", 2)
-    KittiOdometry(tree).path(3).write_bytes(b"")
-    config = DataConfig(workers=1)
-    with pytest.raises(ScanError, match=r"--bad-scans skip"):
-        prepare(str(tree), config, tmp_path / "out")
-    made = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").glob("*.shard")}
-    assert made
-    assert len(PreparedImages(str(prepare(str(tree), replace(config, bad_scans="skip"), tmp_path / "out")))) == 4
-    assert {path: path.stat().st_mtime_ns for path in made} == made
-    with pytest.raises(OutputError, match="prepared with another bad_scans"):
-        prepare(str(tree), config, tmp_path / "out")
-
-
-def test_what_one_scan_lacks_no_batch_has(tmp_path):
-    (tmp_path / "scans").mkdir()
-    points = np.random.default_rng(0).uniform(-20, 20, (2000, 4)).astype(np.float32)
-    points[:, 2:] = (points[:, 2:] + 20) / (-80, 40)
-    for name, columns in (("a", 4), ("b", 3), ("c", 4)):
-        np.save(tmp_path / "scans" / f"{name}.npy", points[:, :columns])
-    config = DataConfig(workers=1, projection="spherical")
-    mixed = load_range_images([str(tmp_path / "scans")], config)
-    assert [mixed.batch([index]).reflectance for index in range(3)] == [None] * 3
-    (tmp_path / "scans" / "b.npy").unlink()
-    alike = load_range_images([str(tmp_path / "scans")], config)
-    assert alike.batch([0, 1]).reflectance is not None
 
 
 def test_max_scans_are_spread_evenly(tree):

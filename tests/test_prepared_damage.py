@@ -5,11 +5,13 @@ import os
 import resource
 import shutil
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from lidargrit.errors import DataError
+from lidargrit.datasets.kitti_odometry import KittiOdometry
+from lidargrit.errors import DataError, OutputError, ScanError
 from lidargrit.loading import DataConfig, PreparedImages, damaged_shards, prepare
 from lidargrit.loading.shards import LocalBytes
 
@@ -117,6 +119,21 @@ def test_a_pipe_in_a_prepared_folder_does_not_hang(folder, name):
     os.mkfifo(folder / name)
     with pytest.raises(DataError, match=rf"{name}, which cannot be read \(not a file\)"):
         PreparedImages(str(folder))
+
+
+def test_a_folder_goes_on_with_what_its_refusal_advised(tmp_path, small_shards):
+    tree = tmp_path / "tree"
+    KittiOdometry.write_example(tree, 5)
+    KittiOdometry(tree).path(3).write_bytes(b"")
+    config = DataConfig(workers=1)
+    with pytest.raises(ScanError, match=r"--bad-scans skip"):
+        prepare(str(tree), config, tmp_path / "out")
+    made = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").glob("*.shard")}
+    assert made
+    assert len(PreparedImages(str(prepare(str(tree), replace(config, bad_scans="skip"), tmp_path / "out")))) == 4
+    assert {path: path.stat().st_mtime_ns for path in made} == made
+    with pytest.raises(OutputError, match="prepared with another bad_scans"):
+        prepare(str(tree), config, tmp_path / "out")
 
 
 def test_a_machine_verifies_its_own_shards_alone(tmp_path, small_shards):

@@ -231,3 +231,14 @@ def test_parts_that_cannot_be_are_refused(tmp_path):
         Fit(Game(), replace(learn, accumulate=2), tmp_path, 0, Reporter())
     with pytest.raises(ConfigError, match="accumulate=0"):
         replace(learn, accumulate=0)
+
+
+def test_a_validation_needs_no_more_memory_than_a_step(tmp_path, monkeypatch):
+    config = DataConfig(train=("simulated:4:train",), val=(), columns=512, column_stride=8)
+    images = load_range_images(config.train, config)
+    learn = FitConfig(scans=4, batch_size=4, accumulate=2, learning_rate=1e-3, validation_scans=4)
+    fit = Fit(Vqvae(load_recipe("demo", STEADY).model.tokenizer, images.sensor), learn, tmp_path, 0, Reporter())
+    sizes = []
+    monkeypatch.setattr(fit.engine, "evaluate", lambda objective, some, seed: sizes.append(len(some)) or {"loss": 1.0})
+    assert fit.validate(images) == {"loss": 1.0}
+    assert sizes == [2, 2]

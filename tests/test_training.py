@@ -198,16 +198,6 @@ def test_a_loss_that_is_not_finite_stops_with_the_step(tmp_path, images):
     assert "checkpoint" not in str(error.value), "there is none yet"
 
 
-def test_a_validation_needs_no_more_memory_than_a_step(tmp_path, images, monkeypatch):
-    vqvae = Vqvae(load_recipe("demo", TINY).model.tokenizer, images.sensor)
-    config = FitConfig(scans=4, batch_size=4, accumulate=2, learning_rate=1e-3, validation_scans=4)
-    fit = Fit(vqvae, config, tmp_path, 0, Reporter())
-    sizes = []
-    monkeypatch.setattr(fit.engine, "evaluate", lambda objective, some, seed: sizes.append(len(some)) or {"loss": 1.0})
-    assert fit.validate(images) == {"loss": 1.0}
-    assert sizes == [2] * (min(4, len(images)) // 2)
-
-
 @pytest.mark.shared
 @pytest.mark.timeout(600)  # a quarter of a minute on a quiet core, minutes on a busy one
 def test_one_real_scan_is_learned_by_heart(tmp_path, real):
