@@ -8,7 +8,7 @@ from lidargrit.cli._options import add_bad_scans, add_completion
 
 EXAMPLES = """\
   lidargrit complete /data/scans whole                             fill in every ray without a point
-  lidargrit complete scan.bin four -n 4 --observed sector:45,315 --set completion=tokens    90 degrees ahead, sampled four times
+  lidargrit complete scan.bin four -n 4 --observed sector:45,315 --set completion=tokens    four samples
   lidargrit complete /data/scans dense --observed rows:4 --model triangulation --sensor hdl64e_kitti_360
   lidargrit complete samples filled --observed mask.npy --format image
 """
