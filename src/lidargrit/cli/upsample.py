@@ -8,7 +8,7 @@ from lidargrit.cli._options import add_bad_scans, add_completion
 
 EXAMPLES = """\
   lidargrit upsample /data/vlp16 dense --sensor vlp16                          by pretrained, a model in the package
-  lidargrit upsample nuscenes:/data/nuscenes dense -n 4                        four masks over one estimate of the ranges
+  lidargrit upsample nuscenes:/data/nuscenes dense -n 4                       four masks over one estimate of the ranges
   lidargrit upsample scan.pcd dense --sensor vlp16 --to os1_64 --model triangulation
 """
 
