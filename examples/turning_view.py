@@ -29,7 +29,7 @@ def main(folder: Path) -> None:
             ImageDraw.Draw(whole).text((index * (WIDE + GAP) + 10, 8), title, fill=(215, 222, 228))
         frames.append(whole)
     path = folder / "turning_view.webp"
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=100, loop=0, quality=45, method=2)
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=100, loop=0, quality=40, method=2)
     print(f"{COUNT} pictures of {len(street):,} simulated and {len(new):,} generated points")
 
 

@@ -36,7 +36,7 @@ def model():
 @pytest.mark.parametrize(("folder", "megabytes"), [(FOLDER, 11.8), (WIDE, 12.0)])
 def test_all_of_it_is_small_and_its_card_is_whole(folder, megabytes):
     assert (folder / "model.safetensors").stat().st_size < megabytes * 1e6
-    assert sum(path.stat().st_size for path in folder.iterdir()) < (megabytes + 0.8) * 1e6, "with what it learned from"
+    assert sum(path.stat().st_size for path in folder.iterdir()) < (megabytes + 1.4) * 1e6, "with what it learned from"
     card = (folder / "README.md").read_text(encoding="utf-8")
     for part in ("## How to sample", "## Data", "## Licence", "## Training", "## Scores", "## Where it fails"):
         assert part in card
@@ -48,7 +48,7 @@ def test_it_is_what_its_recipe_makes(model):
     assert model.config == replace(recipe.model, completion=completing.model.completion)
     trained = json.loads((FOLDER / "run.json").read_text(encoding="utf-8"))["recipe"]
     seen = {stage: fit["scans"] for stage, fit in trained["training"].items()}
-    seen["transformer"] += 18_000  # before they were trained further, as the card says
+    seen["transformer"] += 18_000 + 36_000  # before they were trained further, as the card says
     seen["pixels"] += 17_000 + 9000
     assert seen == {stage: fit.scans for stage, fit in {**completing.training, **recipe.training}.items()}
 
@@ -89,7 +89,7 @@ def test_its_networks_compute_what_they_did_when_they_were_scored(model, capsys)
     bits = model.bits(one)
     found = {name: value.item() for name, value in bits.per_scan().items()}
     pixels, returns = 64 * 256, int(one.return_mask.sum())
-    assert found["tokens"] / pixels == pytest.approx(0.0938, abs=0.001)  # 4.16 nats a token; untrained 6.9
+    assert found["tokens"] / pixels == pytest.approx(0.0927, abs=0.001)  # 4.1 nats a token; untrained 6.9
     assert found["mask"] / pixels == pytest.approx(0.2691, abs=0.003)
     assert found["range"] / returns == pytest.approx(4.729, abs=0.02)
 
