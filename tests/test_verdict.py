@@ -62,6 +62,9 @@ def test_values_below_zero_and_better_than_real_are_explained():
     words = " ".join(verdict([score(-0.01, 0.0, 0.9, metric="bev_mmd"), score(0.1, 0.5, 0.9)]))
     assert "bev_mmd below 0: the unbiased estimate" in words
     assert "Better than real against real: bev_jsd." in words
+    assert "or the sets of that row are smaller" in words
+    of_halves = replace(score(0.1, 0.5), interval=Interval(0.05, 0.15, 0.025, 20, mean_of_halves=0.12))
+    assert verdict([of_halves])[-1].endswith("or they vary less than real ones.")
     both = [score(-0.01, 0.0, variant="exact"), score(-0.01, 0.0, variant="r2dm")]
     assert "bev_jsd (exact), bev_jsd (r2dm) below 0" in " ".join(verdict(both))
 

@@ -16,6 +16,8 @@ from lidargrit.evaluation.intervals import RealAgainstReal, Score
 PIXEL_STATISTICS, MEMORISED = "marginal", "memorised"
 """The generators whose scans are the second and the third bound."""
 
+_OR_MORE = ", or the sets of that row are smaller, which makes most scores worse"
+
 
 def noise(score: Score) -> float:
     """Return half the width of a score's interval, 0 without one."""
@@ -75,8 +77,8 @@ def verdict(scores: Sequence[Score]) -> tuple[str, ...]:
         )
     if beyond := [score for score in counted if _is_beyond_real(score)]:
         sentences.append(
-            f"Better than real against real: {_names(beyond)}. The samples repeat scans of the reference or vary less "
-            "than real ones, or the sets of that row are smaller, which makes most scores worse."
+            f"Better than real against real: {_names(beyond)}. Either the samples repeat scans of the reference, or they "
+            f"vary less than real ones{'' if all(map(_is_of_halves, beyond)) else _OR_MORE}."
         )
     return tuple(sentences)
 
@@ -103,6 +105,10 @@ def value_of_halves(score: Score) -> float:
     """Return the mean score of halves of both sets, since most metrics are worse for fewer scans; else the score."""
     mean = None if score.interval is None else score.interval.mean_of_halves
     return score.result.value if mean is None else mean
+
+
+def _is_of_halves(score: Score) -> bool:
+    return score.interval is not None and score.interval.mean_of_halves is not None
 
 
 def _beside(score: Score, real: RealAgainstReal) -> float:
