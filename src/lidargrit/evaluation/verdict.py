@@ -77,8 +77,8 @@ def verdict(scores: Sequence[Score]) -> tuple[str, ...]:
         )
     if beyond := [score for score in counted if _is_beyond_real(score)]:
         sentences.append(
-            f"Better than real against real: {_names(beyond)}. Either the samples repeat scans of the reference, or they "
-            f"vary less than real ones{'' if all(map(_is_of_halves, beyond)) else _OR_MORE}."
+            f"Better than real against real: {_names(beyond)}. Either the samples repeat scans of the reference, or "
+            f"they vary less than real ones{'' if all(map(_is_of_halves, beyond)) else _OR_MORE}."
         )
     return tuple(sentences)
 
