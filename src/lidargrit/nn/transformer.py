@@ -9,11 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from lidargrit.errors import ConfigError
+from lidargrit.nn.attention import attend
 from lidargrit.nn.blocks import Block, Network
 
 _LAYERS_AT_MOST = 1000  # of the largest language models about a hundred
@@ -117,7 +117,7 @@ class _Attention(nn.Module):
             linear(x).unflatten(-1, (self.heads, -1)).transpose(1, 2) for linear in (self.query, self.key, self.value)
         )  # (B, heads, T, d)
         dropout = self.dropout if self.training else 0.0
-        mixed = F.scaled_dot_product_attention(q, k, v, dropout_p=dropout, is_causal=self.causal)
+        mixed = attend(q, k, v, causal=self.causal, dropout=dropout)
         return self.proj(mixed.transpose(1, 2).flatten(-2))
 
 
