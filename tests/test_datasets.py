@@ -11,6 +11,7 @@ from PIL import Image
 from format_examples import NAMES, can_write, written
 from lidargrit import formats
 from lidargrit.datasets import ScanDataset, load, open_dataset
+from lidargrit.datasets.folder import Folder
 from lidargrit.errors import DataError, OutputError, ScanError, UnknownNameError
 from lidargrit.files import write_json
 from lidargrit.loading import DataConfig
@@ -81,6 +82,13 @@ def test_a_root_of_another_layout_is_told_how_to_open_it(bin_file, tmp_path):
     bin_file(ROWS, "training/velodyne/000000.bin")
     with pytest.raises(DataError, match=f"it looks like kitti_object: open it as kitti_object:{tmp_path}"):
         open_dataset(f"kitti_360:{tmp_path}")
+
+
+def test_a_share_of_a_folder_of_the_current_one(tmp_path, monkeypatch):
+    Folder.write_example(tmp_path / "scans", 4)
+    monkeypatch.chdir(tmp_path)
+    for source in ("scans[:50%]", "./scans[:50%]", "scans:all[:50%]", "folder:scans[:50%]"):
+        assert len(open_dataset(source)) == 2
 
 
 def test_sources_with_colons_brackets_and_places_that_do_not_exist(bin_file, tmp_path, monkeypatch):

@@ -197,6 +197,12 @@ def test_what_is_not_ours_is_left_alone(samples, tmp_path):
     assert (tmp_path / "000000.ply").read_bytes() == b"somebody's"
 
 
+def test_images_of_another_projection_are_exported_as_they_are(tmp_path, capsys):
+    prepared = prepare("simulated:1", DataConfig(projection_variant="reference", columns=256), tmp_path / "prepared")
+    assert export_scans(str(prepared), tmp_path / "out", "npz") == 1
+    assert main(["view", str(prepared), "-o", str(tmp_path / "view.png"), "-n", "1"]) == 0
+
+
 def test_bad_scans_are_refused_or_left_out(samples, tmp_path):
     scans = tmp_path / "scans"
     export_scans(str(samples), scans, "bin")

@@ -12,6 +12,7 @@ from lidargrit.cli import main
 from lidargrit.datasets import open_dataset
 from lidargrit.errors import ConfigError, ScanError
 from lidargrit.fitting import SensorFit, fit_sensor, fit_sensor_to_dataset
+from lidargrit.fitting.azimuths import columns_of_scans
 from lidargrit.fitting.elevations import nearest_row, rows_of_rings
 from lidargrit.fitting.limits import quantum_m, range_limits_m
 from lidargrit.fitting.table import as_table
@@ -325,6 +326,22 @@ def test_an_ouster_recording_gives_its_own_table(real):
     assert worst < 0.1
     assert fit.sensor.width == 1024
     assert fit.range_step_m == 0.008
+
+
+def test_columns_wider_than_any_sensor_has_are_not_guessed():
+    assert columns_of_scans([], [], np.full(200, 6.0)) is None
+    assert columns_of_scans([], [], np.full(200, 2.0)) == 180
+
+
+def test_names_and_files_that_no_command_would_read(tmp_path, capsys):
+    dataset = open_dataset("simulated:1")
+    with pytest.raises(ConfigError, match="a name of 201 letters; wanted at most 200"):
+        fit_sensor_to_dataset(dataset, "a" * 201)
+    path = tmp_path / "mine.JSON"
+    assert main(["fit-sensor", "simulated:1", "-o", str(path), "--json", str(path)]) == 2
+    assert "for two files" in capsys.readouterr().err
+    assert main(["fit-sensor", "simulated:1", "-o", str(path)]) == 0
+    assert load_sensor(str(path)).height == 64
 
 
 def test_argoverse_gives_the_table_of_the_vlp32c(real):

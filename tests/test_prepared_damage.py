@@ -136,6 +136,33 @@ def test_a_folder_goes_on_with_what_its_refusal_advised(tmp_path, small_shards):
         prepare(str(tree), config, tmp_path / "out")
 
 
+def test_scans_that_were_left_out_do_not_come_back_unseen(tmp_path, small_shards):
+    tree, out = tmp_path / "tree", tmp_path / "out"
+    KittiOdometry.write_example(tree, 4)
+    path = KittiOdometry(tree).path(2)
+    points = np.fromfile(path, "<f4")
+    points[:3] = 0
+    points.tofile(path)
+    skip = DataConfig(workers=1, bad_scans="skip")
+    assert len(PreparedImages(str(prepare(str(tree), skip, out)))) == 3
+    drop = replace(skip, bad_points="drop")
+    with pytest.raises(OutputError, match="stale: prepared with another bad_points"):
+        prepare(str(tree), drop, out)
+    assert len(PreparedImages(str(prepare(str(tree), drop, tmp_path / "anew")))) == 4
+
+
+def test_a_link_to_nothing_is_left_out_where_bad_scans_are(tmp_path):
+    tree = tmp_path / "tree"
+    KittiOdometry.write_example(tree, 2)
+    path = KittiOdometry(tree).path(0)
+    (path.parent / "000007.bin").symlink_to(tmp_path / "nothing.bin")
+    with pytest.raises(DataError, match=r"000007\.bin, which cannot be read"):
+        prepare(str(tree), DataConfig(workers=1), tmp_path / "out")
+    images = PreparedImages(str(prepare(str(tree), DataConfig(workers=1, bad_scans="skip"), tmp_path / "out")))
+    assert len(images) == 2
+    assert len(images.left_out) == 1
+
+
 def test_a_machine_verifies_its_own_shards_alone(tmp_path, small_shards):
     """Another one may be making a damaged shard again, which must not be taken for damaged and removed."""
     folder = prepare("simulated:6", CONFIG, tmp_path / "out")

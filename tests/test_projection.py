@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from lidargrit import _discovery
 from lidargrit.errors import ConfigError, ScanError
 from lidargrit.projection import RangeEncoding, project, unproject
-from lidargrit.sensors import SensorModel, load_sensor
+from lidargrit.sensors import SensorModel, column_azimuths_rad, load_sensor
 from lidargrit.simulator import simulate
 from lidargrit.structures import RangeImage, Scan
 
@@ -168,3 +168,15 @@ def test_points_of_64_bits_are_those_of_32():
     assert torch.equal(ours.range_m, theirs.range_m)
     assert torch.equal(ours.reflectance, theirs.reflectance)
     assert ours.return_mask.float().mean() > 0.5
+
+
+def test_a_sensor_of_one_row_is_projected_by_ring():
+    one = SensorModel("flat", torch.zeros(1, 1), column_azimuths_rad(360), 1.0, 50.0, "unfolding")
+    azimuth = one.azimuth_rad[0]
+    tilt = 0.001 * torch.sin(7 * azimuth)
+    points = torch.stack([10 * azimuth.cos(), 10 * azimuth.sin(), 10 * tilt.tan()], dim=1)
+    scan = Scan(points, ring=torch.zeros(360, dtype=torch.int64))
+    assert int(project(scan, one).return_mask.sum()) == 360
+    raised = Scan(points + torch.tensor([0.0, 0.0, 3.0]), ring=scan.ring)
+    with pytest.raises(ScanError, match="lie elsewhere"):
+        project(raised, one)

@@ -96,6 +96,21 @@ def test_a_file_may_hold_a_batch_of_scans(tmp_path):
     assert torch.allclose(images.batch([1]).range_m[0], scan(1)[0], atol=0.01)
 
 
+def test_a_tensor_with_a_gradient_is_read(tmp_path):
+    torch.save(lidargrit(*scan()).requires_grad_(), tmp_path / "0.pth")
+    assert torch.equal(open_images(str(tmp_path)).batch([0]).range_m[0], lidargrit(*scan())[0])
+
+
+def test_batches_of_no_scan_or_of_no_shape_are_refused(tmp_path):
+    torch.save(torch.zeros(0, 1, *SIZE), tmp_path / "0.pth")
+    with pytest.raises(DataError, match="no scan in"):
+        read_tensor_folder(tmp_path)
+    torch.save(lidargrit(*scan())[None], tmp_path / "0.pth")
+    torch.save(torch.tensor(1.0), tmp_path / "1.pth")
+    with pytest.raises(ScanError, match=r"a tensor of \(\) in .*1\.pth; wanted a batch of scans"):
+        read_tensor_folder(tmp_path)
+
+
 def test_files_of_the_same_number_are_in_the_order_of_their_names(tmp_path, monkeypatch):
     for name in ("b_10.pth", "b_2.pth", "a_2.pth", "a_10.pth"):
         (tmp_path / name).write_bytes(b"")

@@ -166,6 +166,9 @@ WRONG = {
     "rows that rise": changed(elevation_rad=[[-0.2], [0.0], [0.1]]),
     "columns that turn the other way": changed(azimuth_rad=[[0.1 + 0.7 * i for i in range(8)]]),
     "columns of half the circle": changed(azimuth_rad=[[1.5 - 0.4 * i for i in range(8)]]),
+    "columns of each pixel that turn the other way": changed(
+        azimuth_rad=[[0.1 + 0.7 * i for i in range(8)]] * 3, elevation_rad=[[0.2] * 8, [0.0] * 8, [-0.2] * 8]
+    ),
     "too many rows": changed(elevation_rad=[[1 - 1e-4 * i] for i in range(5000)], azimuth_offset_rad=None),
     "too many pixels": changed(
         elevation_rad=[[1 - 1e-3 * i] for i in range(2000)], azimuth_rad=[[0.0] * 10_000], azimuth_offset_rad=None

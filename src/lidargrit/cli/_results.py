@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from lidargrit.errors import UsageError
+from lidargrit.errors import OutputError, UsageError
 from lidargrit.files import plain, refuse_to_overwrite, write_json
 from lidargrit.untrusted import check_path
 
@@ -27,10 +27,12 @@ def add_json(parser: argparse.ArgumentParser, files: str = "the file of --json")
     parser.add_argument("--overwrite", action="store_true", help=f"replace {files} if already there")
 
 
-def refuse_taken(options: argparse.Namespace) -> None:
-    """Refuse, before any work, to replace a file that ``--json`` names, with OutputError."""
+def refuse_taken(options: argparse.Namespace, *others: Path) -> None:
+    """Refuse, before any work, to replace a file that ``--json`` names, or ``others`` of the verb, with OutputError."""
     if options.json in (None, STANDARD_OUTPUT):
         return
+    if options.json.absolute() in {other.absolute() for other in others}:
+        raise OutputError(f"{options.json} for two files", "a name for each", "choose another name for --json")
     refuse_to_overwrite(options.json, options.overwrite, ".json")
 
 

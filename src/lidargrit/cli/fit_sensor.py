@@ -35,7 +35,7 @@ def run(options: argparse.Namespace) -> None:
 
     refuse_to_overwrite(options.out, options.overwrite, ".json")
     refuse_to_overwrite(options.picture, options.overwrite, ".png")
-    refuse_taken(options)
+    refuse_taken(options, options.out)
     name = options.out.stem if options.name is None else options.name
     dataset = open_source(options.source, options.bad_points).scans()
     fit = fit_sensor_to_dataset(dataset, name, options.max_scans)

@@ -15,6 +15,8 @@ from lidargrit.formats import BadPoints
 from lidargrit.structures import Scan
 from lidargrit.untrusted import user_path
 
+_SHARE = re.compile(r"\[[^\]/]*\]$")
+
 
 @dataclass(frozen=True)
 class SplitScheme:
@@ -97,6 +99,10 @@ class ScanDataset(ABC):
         """Return the file that holds a scan; None where scans are not in files."""
         return None
 
+    def companions(self, index: int) -> tuple[Path, ...]:
+        """Return the other files that a scan is read from, such as a calibration, where they are there."""
+        return ()
+
     @classmethod
     def splits(cls) -> dict[str, tuple[str, ...]]:
         """Return the sequences of every named split: "train" of the first scheme, "SCHEME/train" of each."""
@@ -138,7 +144,10 @@ def open_dataset(source: str, bad_points: BadPoints = "refuse") -> ScanDataset:
     """
     if not source.strip():
         raise DataError("an empty source", "a folder, or NAME:ROOT", "name one; a comma at the end leaves an empty one")
+    share = _SHARE.search(source)
     head, colon, rest = source.partition(":")
+    if share and share.start() < len(head):  # the first colon is that of the share
+        head, colon, rest = source[: share.start()], "", ""
     is_path = "/" in head or _is_there(head)
     if head in _discovery.names("datasets") and (colon or not is_path):
         if not rest:
@@ -208,7 +217,7 @@ def _is_there(text: str) -> bool:
 def _root_and_split(text: str) -> tuple[Path, str]:
     if _is_there(text):  # colons and brackets of a folder that exists are its own
         return user_path(text), "all"
-    share = re.search(r"\[[^\]/]*\]$", text)
+    share = _SHARE.search(text)
     before = text[: share.start()] if share else text
     root, colon, split = before.rpartition(":")
     if not colon:

@@ -83,6 +83,12 @@ class FileDataset(ScanDataset):
         """Return the file that holds a scan."""
         return self._scans[index][0]
 
+    def companions(self, index: int) -> tuple[Path, ...]:
+        """Return the other files that a scan is read from; tells formats apart by the ending, without opening any."""
+        path = self.path(index)
+        forms = [formats.load(self.format)] if self.format else formats.candidates(path)
+        return tuple(companion for form in forms for companion in form.companions(path))
+
     def recording(self, index: int) -> str:
         """Name the recording that a scan was cut from, the same in every data set that has it."""
         return self.recording_of(self._scans[index][0])

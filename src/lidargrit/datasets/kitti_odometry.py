@@ -67,7 +67,7 @@ class KittiOdometry(FileDataset):
     def scan(self, index: int) -> Scan:
         """Read one scan, with its labels if there are any."""
         scan, path = super().scan(index), self.path(index)
-        labels = path.parents[1] / "labels" / f"{path.stem}.label"
+        (labels,) = self.companions(index)
         if not labels.is_file():
             return scan
         data = np.frombuffer(read_bytes(labels, _LABEL_BYTES_AT_MOST, _LABELS), dtype=np.uint8)
@@ -82,6 +82,11 @@ class KittiOdometry(FileDataset):
         if len(scan) != len(label):  # points were dropped, and their labels go with them
             label = label[torch.from_numpy(np.isfinite(points).all(axis=1) & points.any(axis=1))]
         return replace(scan, label=label)
+
+    def companions(self, index: int) -> tuple[Path, ...]:
+        """Return the file of a scan's labels."""
+        path = self.path(index)
+        return (path.parents[1] / "labels" / f"{path.stem}.label",)
 
     def sequence_of(self, relative: Path) -> str:
         """Name the sequence: "00"."""

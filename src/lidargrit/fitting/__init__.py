@@ -18,6 +18,7 @@ from lidargrit.fitting.limits import quantum_m, range_limits_m
 from lidargrit.fitting.points import Points
 from lidargrit.fitting.rings import Method, Rings, recover_rings
 from lidargrit.sensors import ProjectionName, SensorModel, column_azimuths_rad
+from lidargrit.sensors._checks import NAME_AT_MOST
 from lidargrit.structures import Scan
 
 __all__ = ["SensorFit", "fit_sensor", "fit_sensor_to_dataset"]
@@ -144,6 +145,8 @@ def fit_sensor_to_dataset(dataset: ScanDataset, name: str = "fitted", num_scans:
         raise ConfigError(f"-n {num_scans}", "at least 1 scan, or 0 for all", "raise it")
     if not name.strip():
         raise ConfigError(f"--name {name!r}", "a name that is not blank", "choose another")
+    if len(name) > NAME_AT_MOST:
+        raise ConfigError(f"a name of {len(name)} letters", f"at most {NAME_AT_MOST}", "choose a shorter --name")
     indices = evenly_spaced(num_scans or len(dataset), len(dataset))
     return fit_sensor([dataset.scan(index) for index in indices], name)
 

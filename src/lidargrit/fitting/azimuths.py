@@ -45,6 +45,8 @@ def columns_of_scans(
     smooth = np.convolve(counts, np.ones(5), mode="same")
     commonest_deg = float(np.exp(edges[int(np.argmax(smooth))] + 0.01))
     alike = (steps_deg > _PART_AT_LEAST * commonest_deg) & (steps_deg < _PART_AT_MOST * commonest_deg)
+    if not alike.any():  # all steps are wider than the coarsest that is looked for
+        return None
     usual = 360 / float(steps_deg[alike].mean())
     power, total = np.zeros(_BINS // 2 + 1), 0
     for points, ring in list(zip(scans, rings, strict=True))[:: max(1, len(scans) // _SCANS_FOR_COLUMNS)]:

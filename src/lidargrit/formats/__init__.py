@@ -76,6 +76,11 @@ class ScanFormat(ABC):
     def read(path: Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
         """Read one scan of a file, or raise ScanError."""
 
+    @staticmethod
+    def companions(path: Path) -> tuple[Path, ...]:
+        """Return the other files that :meth:`read` reads, where they are there."""
+        return ()
+
     @classmethod
     def write(cls, path: Path, scan: Scan) -> None:
         """Write a scan to a new file."""

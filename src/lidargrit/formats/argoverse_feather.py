@@ -91,6 +91,11 @@ class ArgoverseFeather(ScanFormat):
             bad_points,
         )
 
+    @staticmethod
+    def companions(path: Path) -> tuple[Path, ...]:
+        """Return the calibration of the file's log."""
+        return (path.absolute().parent.parent.parent / "calibration" / "egovehicle_SE3_sensor.feather",)
+
     @classmethod
     def write(cls, path: Path, scan: Scan) -> None:
         """Write a scan of 32 rings as a sweep of the upright sensor at its published pose.
@@ -153,7 +158,7 @@ def _rings(
 
 def _pose(path: Path, name: str) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]]:
     """Return the pose of a sensor in the car, from the log's calibration if the file lies in a log that has one."""
-    calibration = path.absolute().parent.parent.parent / "calibration" / "egovehicle_SE3_sensor.feather"
+    (calibration,) = ArgoverseFeather.companions(path)
     if not calibration.is_file():
         return _axes_and_origin(_NOMINAL[name])
     wanted = f"the columns sensor_name, {', '.join(_POSE_COLUMNS)}"

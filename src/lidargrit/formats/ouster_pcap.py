@@ -74,6 +74,11 @@ class OusterPcap(ScanFormat):
             points_xyz_m = torch.from_numpy(xyz_m.astype(np.float32))
         return scan_of(points_xyz_m, reflectance, ring, str(path), bad_points)
 
+    @staticmethod
+    def companions(path: Path) -> tuple[Path, ...]:
+        """Return the file of the sensor's metadata."""
+        return (path.with_suffix(".json"),)
+
 
 def sensor_of(path: Path) -> SensorModel:
     """Make a sensor of an Ouster's metadata: its beams' own elevations and azimuths; needs no Ouster software.
@@ -122,13 +127,16 @@ def sensor_of(path: Path) -> SensorModel:
 
 def _open(path: Path) -> tuple[Any, Any, float, np.ndarray]:
     """Return the revolutions of a recording, what turns one into points, and the height of the beams over the base."""
-    with open_file(path, _FORMAT) as file:
-        stat = os.fstat(file.fileno())
-    return _open_once(path, _metadata_of(path), stat.st_size, stat.st_mtime_ns)
+    metadata, states = _metadata_of(path), []
+    for each in (path, metadata):
+        with open_file(each, _FORMAT) as file:
+            stat = os.fstat(file.fileno())
+        states.append((stat.st_size, stat.st_mtime_ns))
+    return _open_once(path, metadata, tuple(states))
 
 
 @functools.lru_cache(maxsize=2)
-def _open_once(path: Path, metadata: Path, size: int, time_ns: int) -> tuple[Any, Any, float, np.ndarray]:
+def _open_once(path: Path, metadata: Path, states: tuple[tuple[int, int], ...]) -> tuple[Any, Any, float, np.ndarray]:
     if not OusterPcap.recognises(path):
         raise ScanError(f"{path}, which is no recording of packets", _FORMAT, _CURE)
     text = json.dumps(_read_json(metadata))

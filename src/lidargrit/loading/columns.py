@@ -12,7 +12,8 @@ from lidargrit.sensors import SensorModel
 class FewerColumns:
     """Images of a store whose columns are gathered into fewer: of each new pixel, the nearest return stays.
 
-    Where the number of columns falls to a whole part, these are the pixels that a projection of the points gives.
+    Where the number of columns falls to a whole part, these are the pixels that a projection of the points gives, but
+    that of two returns in one step of the stored ranges either may stay.
     Otherwise a return goes to the new column in which the centre of its old one lies, up to half an old column from
     where its point lay.
 
@@ -35,13 +36,17 @@ class FewerColumns:
         """Return the pixels of one image."""
         range_m, reflectance, label = self._images.read(index)
         nearest_m = np.minimum.reduceat(np.where(range_m > 0, range_m, np.inf), self._first, axis=1)
+        returned = np.isfinite(nearest_m)
         if reflectance is not None or label is not None:
+            column = np.arange(range_m.shape[1])
             is_nearest = range_m == np.repeat(nearest_m, self._counts, axis=1)
+            # Stored ranges have steps, so that several may be the nearest: the first gives reflectance and label.
+            found = np.minimum.reduceat(np.where(is_nearest, column, column[-1]), self._first, axis=1)
             reflectance, label = (
-                None if pixels is None else np.maximum.reduceat(np.where(is_nearest, pixels, 0), self._first, axis=1)
+                None if pixels is None else np.where(returned, np.take_along_axis(pixels, found, axis=1), 0)
                 for pixels in (reflectance, label)
             )
-        return Pixels(np.where(np.isfinite(nearest_m), nearest_m, 0).astype(np.float32), reflectance, label)
+        return Pixels(np.where(returned, nearest_m, 0).astype(np.float32), reflectance, label)
 
 
 def has_fewer_columns(sensor: SensorModel, other: SensorModel) -> bool:

@@ -185,13 +185,15 @@ def _spec(
     source: str, dataset: ScanDataset, sensor: SensorModel, config: DataConfig
 ) -> tuple[PreparedSpec, list[tuple[str, str, int, int]]]:
     """Return the specification of the folder, and for every scan its name, drive, file size and time."""
-    fine, scans = sensor.fine(), []
+    fine, scans, beside = sensor.fine(), [], []
     for index in evenly_spaced(config.max_scans or len(dataset), len(dataset)):
         path = dataset.path(index)
         try:
             status = None if path is None else path.stat()
         except OSError:
-            raise DataError(f"{path}, which cannot be read", "files that are there", "remove the link") from None
+            if config.bad_scans == "refuse":
+                raise DataError(f"{path}, which cannot be read", "files that are there", "remove the link") from None
+            status = None  # it is left out, and named, when it is read
         name = (
             dataset.name(index)
             if path is None
@@ -199,8 +201,11 @@ def _spec(
         )
         size, time_ns = (status.st_size, status.st_mtime_ns) if status else (0, 0)
         scans.append((name, dataset.recording(index), size, time_ns))
+        beside += [_state(companion) for companion in dataset.companions(index) if companion.exists()]
+    others = json.dumps(beside) if beside else ""
     # A file of a sensor by which scans are simulated may change, and its name stays the same.
-    of_file = json.dumps(load_sensor(dataset.sensor).to_json()) if dataset.sensor.endswith(".json") else ""
+    if dataset.sensor.lower().endswith(".json"):
+        others += json.dumps(load_sensor(dataset.sensor).to_json())
     spec = PreparedSpec(
         format=FORMAT,
         version=__version__,
@@ -213,9 +218,15 @@ def _spec(
         range_step_m=range_step_m(fine),
         shard_scans=_SHARD_SCANS,
         num_scans=len(scans),
-        digest=hashlib.sha256((json.dumps(scans) + of_file).encode()).hexdigest(),
+        digest=hashlib.sha256((json.dumps(scans) + others).encode()).hexdigest(),
     )
     return spec, scans
+
+
+def _state(path: Path) -> tuple[str, int, int]:
+    """Return the name, the size and the time of a file that is read beside a scan."""
+    status = path.stat()
+    return path.name, status.st_size, status.st_mtime_ns
 
 
 def _claim(folder: Path, spec: PreparedSpec, scans: list[tuple[str, str, int, int]]) -> None:
@@ -223,8 +234,11 @@ def _claim(folder: Path, spec: PreparedSpec, scans: list[tuple[str, str, int, in
     if (folder / PLAN_FILE).exists():
         planned = PreparedFolder(str(folder)).read_spec()
         differing = spec.differences(planned)
-        # Nothing bad was met so far, so all that is there is as the more lenient treatment would have it.
-        if differing and all(name in _BAD and getattr(planned, name) == "refuse" for name in differing):
+        # No scan was left out so far, and none was bad, so all that is there is as a more lenient treatment has it.
+        lenient = planned.bad_scans == "refuse" and all(
+            name in _BAD and getattr(planned, name) == "refuse" for name in differing
+        )
+        if differing and lenient:
             write_json(folder / PLAN_FILE, asdict(spec))
         elif differing:
             raise OutputError(

@@ -233,7 +233,8 @@ def _is_misplaced(scan: Scan, sensor: SensorModel, row: Int[np.ndarray, "n"]) ->
     some = row[::step]
     off_deg = np.abs(elevations_deg(scan.points_xyz_m[::step]) - rays_deg[np.clip(some, 0, sensor.height - 1)])
     off_deg[(some < 0) | (some >= sensor.height)] = np.inf
-    return bool(np.median(off_deg) > _MISPLACED_AT_MOST * (rays_deg[0] - rays_deg[-1]))
+    bottom_deg, top_deg = _span_of_rows_deg(sensor)
+    return bool(np.median(off_deg) > _MISPLACED_AT_MOST * (top_deg - bottom_deg))
 
 
 def _is_ring_by_ring(scan: Scan, ring: Int[np.ndarray, "n"]) -> bool:

@@ -144,7 +144,7 @@ def load_sensor(name: str) -> SensorModel:
         UnknownNameError: no sensor of that name; names its nearest neighbours.
         ConfigError: the file cannot be read, or does not hold a sensor.
     """
-    if not name.endswith(".json"):
+    if not name.lower().endswith(".json"):
         return _discovery.load_instance("sensors", name, SensorModel)
     wanted, cure = "the JSON of a sensor", "write one with: lidargrit fit-sensor, or SensorModel.to_json"
     data = read_json(user_path(name, ConfigError), error=ConfigError, wanted=wanted, cure=cure)

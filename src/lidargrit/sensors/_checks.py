@@ -23,7 +23,8 @@ _PIXELS_AT_MOST = (
     2**24
 )  # 128 rows of 4096 columns have a thirtieth; images of a stranger's sensor would fill the memory
 _APART_AT_MOST = 0.75  # of a column: published programs take the edges of columns, half a column from the centres
-_NAME_AT_MOST = 200  # letters: a name is part of messages
+_MEASURED_APART_AT_MOST_RAD = math.radians(5)
+NAME_AT_MOST = 200  # letters: a name is part of messages
 _CURE = "compare it with what SensorModel.to_json writes"
 
 
@@ -69,16 +70,22 @@ def check_tables(name: str, elevation: Tensor, azimuth: Tensor, offset: Tensor |
             "row 0 the highest ray, every next row lower",
             "sort the rows of the sensor",
         )
-    if len(azimuth) == 1:
-        _check_columns(name, azimuth[0], column_stride)
+    _check_columns(name, azimuth, column_stride)
 
 
 def _check_columns(name: str, azimuth_rad: Tensor, stride: int) -> None:
-    """Refuse azimuths of columns other than those into which points are projected: equal ones, from +pi down."""
-    columns = len(azimuth_rad) * stride
+    """Refuse azimuths of columns other than those into which points are projected: equal ones, from +pi down.
+
+    Azimuths of every pixel are measured ones: the mean of each column may lie somewhat further off.
+    """
+    columns = azimuth_rad.shape[1] * stride
+    at_most_rad = _APART_AT_MOST * 2 * math.pi / columns
+    if len(azimuth_rad) > 1:
+        at_most_rad = max(at_most_rad, _MEASURED_APART_AT_MOST_RAD)
+    azimuth_rad = torch.atan2(azimuth_rad.double().sin().mean(dim=0), azimuth_rad.double().cos().mean(dim=0))
     centres_rad = column_azimuths_rad(columns, stride)[0].double()
-    apart_rad = (azimuth_rad.double() - centres_rad + math.pi).remainder(2 * math.pi) - math.pi
-    if float(apart_rad.abs().max()) > _APART_AT_MOST * 2 * math.pi / columns:
+    apart_rad = (azimuth_rad - centres_rad + math.pi).remainder(2 * math.pi) - math.pi
+    if float(apart_rad.abs().max()) > at_most_rad:
         raise ConfigError(
             f"azimuths of the sensor {name!r} that are not those of equal columns from +pi down",
             f"the centres of {columns} columns around the circle, clockwise from behind",
@@ -126,9 +133,9 @@ def checked_entries(data: Any, projections: Sequence[str]) -> dict[str, Any]:
 
 def _checked(key: str, value: Any) -> Any:
     if key in _WORDS:
-        if not isinstance(value, str) or (key == "name" and not 0 < len(value) <= _NAME_AT_MOST):
+        if not isinstance(value, str) or (key == "name" and not 0 < len(value) <= NAME_AT_MOST):
             what = f"a {type(value).__name__}" if not isinstance(value, str) else f"{len(value)} letters"
-            raise ConfigError(f"{what} for a sensor's {key}", f"words, a name of 1 to {_NAME_AT_MOST} letters", _CURE)
+            raise ConfigError(f"{what} for a sensor's {key}", f"words, a name of 1 to {NAME_AT_MOST} letters", _CURE)
         return value
     if key in _NUMBERS:
         # A whole number of any length is JSON, and printing a long one is refused by Python itself: so no value here.

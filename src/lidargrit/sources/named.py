@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from lidargrit.datasets import ScanDataset
@@ -112,6 +113,8 @@ def named_scans(source: Source, config: DataConfig, sensor: SensorModel | None =
     """
     if isinstance(source, DatasetSource):
         return PointScans(source.scans(), config.max_scans)
+    # Scans that are images already keep the variant that they were projected by.
+    config = replace(config, projection_variant=source.projection_variant(config) or config.projection_variant)
     images = source.images(sensor, config)
     if isinstance(source, ImageFileSource):
         return ImageScans(images, [_name_of(Path(name)) for name in images.provenance.names])

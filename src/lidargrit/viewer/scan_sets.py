@@ -142,6 +142,7 @@ def _joined(batches: Iterable[RangeImage]) -> RangeImage:
 def _of_images(
     source: Source, count: int, sensor: SensorModel | None, config: DataConfig, reporter: Reporter
 ) -> ScanSet:
+    config = replace(config, projection_variant=source.projection_variant(config) or config.projection_variant)
     images = source.images(sensor, config, reporter)
     indices = evenly_spaced(count, len(images))
     names = images.provenance.names

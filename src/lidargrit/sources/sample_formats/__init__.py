@@ -132,7 +132,7 @@ def read_tensor(path: Path) -> Tensor:
     except Exception as error:  # damaged bytes make torch raise many kinds, for one cause
         reason = str(error).partition("\n")[0][:120]
         raise ScanError(f"{path}, which cannot be used ({type(error).__name__}: {reason})", wanted, cure) from None
-    return tensor.float()
+    return tensor.detach().float()
 
 
 class _Tensors:
@@ -147,10 +147,12 @@ class _Tensors:
             if first.ndim == 3:
                 self._scans.append((path, None))
             else:
-                self._scans += [(path, index) for index in range(len(self._tensor(path)))][:_SCANS_AT_MOST]
-            if count and len(self._scans) >= count:
+                self._scans += [(path, index) for index in range(len(self._batch(path)))]
+            if len(self._scans) >= (count or _SCANS_AT_MOST):
                 break
-        self._scans = self._scans[:count]
+        self._scans = self._scans[: count or _SCANS_AT_MOST]
+        if not self._scans:
+            raise DataError(f"no scan in {paths[0].parent}", "samples as tensors", "remove empty files, or sample anew")
         self.provenance = Provenance(tuple(f"{path} {index or 0}" for path, index in self._scans))
 
     def __len__(self) -> int:
@@ -173,6 +175,13 @@ class _Tensors:
         if known != path:
             tensor = read_tensor(path)
             self._last = (path, tensor)
+        return tensor
+
+    def _batch(self, path: Path) -> Tensor:
+        tensor = self._tensor(path)
+        if tensor.ndim != 4:
+            wanted = "a batch of scans, as the first"
+            raise ScanError(f"a tensor of {tuple(tensor.shape)} in {path}", wanted, "remove the file")
         return tensor
 
     def _sensor(self, first: Tensor, path: Path) -> SensorModel:

@@ -1,0 +1,83 @@
+"""Files that a scan is read from beside its own: prepared images are stale when one comes, goes or changes."""
+
+import json
+import os
+
+import numpy as np
+import pytest
+
+from lidargrit import formats
+from lidargrit._discovery import names
+from lidargrit.datasets import open_dataset
+from lidargrit.datasets.argoverse2 import Argoverse2
+from lidargrit.datasets.kitti_odometry import KittiOdometry
+from lidargrit.errors import OutputError
+from lidargrit.formats import ouster_pcap, read_scan
+from lidargrit.loading import DataConfig, prepare
+
+CONFIG = DataConfig(workers=1)
+
+
+def test_every_format_that_tells_of_a_companion_names_its_file(tmp_path):
+    for name in names("formats"):
+        form = formats.load(name)
+        assert bool(form.companion) <= bool(form.companions(tmp_path / f"a{form.suffixes[0]}"))
+
+
+def test_labels_that_come_later_make_prepared_scans_stale(tmp_path):
+    tree = tmp_path / "tree"
+    KittiOdometry.write_example(tree, 1)
+    source, out = f"kitti_odometry:{tree}", tmp_path / "out"
+    cached = prepare(source, CONFIG)
+    prepare(source, CONFIG, out)
+    dataset = KittiOdometry(tree)
+    (labels,) = dataset.companions(0)
+    labels.parent.mkdir()
+    np.full(len(dataset.scan(0)), 40, "<u4").tofile(labels)
+    with pytest.raises(OutputError, match="stale"):
+        prepare(source, CONFIG, out)
+    labelled = prepare(source, CONFIG)
+    assert labelled != cached
+    assert prepare(source, CONFIG) == labelled
+    os.utime(labels, ns=(0, 0))
+    assert prepare(source, CONFIG) not in {cached, labelled}
+    labels.unlink()
+    assert prepare(source, CONFIG) == cached
+
+
+@pytest.mark.parametrize("named", ["argoverse2", "folder"])
+def test_a_calibration_belongs_to_the_scans_of_its_log(named, tmp_path):
+    pytest.importorskip("pyarrow")
+    Argoverse2.write_example(tmp_path / "tree", 1)
+    dataset = open_dataset(f"{named}:{tmp_path / 'tree'}")
+    (calibration,) = dataset.companions(0)
+    assert calibration.parent.name == "calibration"
+    assert calibration.parent.parent == dataset.path(0).parents[2]
+
+
+def test_metadata_that_changes_opens_a_recording_anew(tmp_path, monkeypatch):
+    """The packets stay as they are; what is read of both is kept in memory until one of the files changes."""
+    opened = []
+    monkeypatch.setattr(ouster_pcap, "_open_once", lambda *key: opened.append(key) or (None, None, 0.0, np.zeros(1)))
+    recording, metadata = tmp_path / "a.pcap", tmp_path / "a.json"
+    recording.write_bytes(b"packets")
+    assert ouster_pcap.OusterPcap.companions(recording) == (metadata,)
+    for text in (json.dumps({"a": 1}), json.dumps({"a": 1}), json.dumps({"a": 10})):
+        if not metadata.exists() or metadata.read_text() != text:
+            metadata.write_text(text)
+        ouster_pcap._open(recording)
+    assert opened[0] == opened[1] != opened[2]
+
+
+def test_elevations_that_change_move_the_points(real, tmp_path):
+    pytest.importorskip("ouster.sdk")
+    (source,) = (real / "other_sensors" / "ouster").glob("*.pcap")
+    for ending in (".pcap", ".json"):
+        (tmp_path / f"a{ending}").write_bytes(source.with_suffix(ending).read_bytes())
+    before = read_scan(tmp_path / "a.pcap").points_xyz_m
+    metadata = json.loads((tmp_path / "a.json").read_text())
+    beams = metadata.get("beam_intrinsics", metadata)
+    beams["beam_altitude_angles"] = [angle + 3 for angle in beams["beam_altitude_angles"]]
+    (tmp_path / "a.json").write_text(json.dumps(metadata))
+    after = read_scan(tmp_path / "a.pcap").points_xyz_m
+    assert float((after - before)[:, 2].median()) > 0.05

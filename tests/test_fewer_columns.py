@@ -1,0 +1,42 @@
+"""Columns of prepared images gathered into fewer: every pixel is of one return, against a slow loop."""
+
+import numpy as np
+
+from lidargrit.loading.columns import FewerColumns
+from lidargrit.loading.images import Pixels, Provenance
+
+
+class OneImage:
+    """A store of one image."""
+
+    provenance = Provenance(("one",))
+
+    def __init__(self, pixels):
+        self.read = lambda index: pixels
+
+    def __len__(self):
+        return 1
+
+
+def test_range_reflectance_and_label_are_of_one_return():
+    rng = np.random.default_rng(0)
+    # Few different ranges, so that many returns of a pixel are equally near.
+    range_m = rng.integers(0, 3, (4, 60)).astype(np.float32)
+    reflectance = (rng.random((4, 60)) * (range_m > 0)).astype(np.float32)
+    label = rng.integers(1, 99, (4, 60)) * (range_m > 0)
+    pixels = Pixels(range_m, reflectance, label)
+    for wanted in (60, 20, 17):
+        got = FewerColumns(OneImage(pixels), 60, wanted).read(0)
+        assert got.reflectance is not None
+        assert got.label is not None
+        assert got.reflectance.dtype == np.float32
+        new_column = [int((column + 0.5) * wanted / 60) for column in range(60)]
+        for row in range(4):
+            for column in range(wanted):
+                olds = [old for old in range(60) if new_column[old] == column and range_m[row, old] > 0]
+                pixel = (got.range_m[row, column], got.reflectance[row, column], got.label[row, column])
+                if not olds:
+                    assert pixel == (0, 0, 0)
+                    continue
+                first = min(olds, key=lambda old: (range_m[row, old], old))
+                assert pixel == (range_m[row, first], reflectance[row, first], label[row, first])
