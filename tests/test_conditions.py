@@ -84,15 +84,15 @@ def test_patterns_choose_rows_sectors_pixels_and_files(tmp_path):
         ("pixels:nan", "--observed pixels:nan; wanted pixels:SHARE"),
         ("nowhere.npy", r"--observed nowhere.npy, which cannot be used \(it is no file\); wanted an .npy of 64x32"),
         ("small.npy", "--observed .*small.npy, a mask of 3x4 bool; wanted an .npy of 64x32"),
-        ("all.npy", "--observed .*all.npy, by which all pixels are observed; wanted some returns"),
-        ("none.npy", "--observed .*none.npy, by which no return is observed; wanted some returns"),
+        ("all.npy", "--observed .*all.npy, by which all pixels are observed; wanted some pixels that are not"),
+        ("none.npy", "a scan, of which --observed .*none.npy observes no return; wanted some returns"),
     ],
 )
 def test_observed_words_that_cannot_be_are_refused_in_one_line(text, message, tmp_path):
     for name, mask in (("small", np.ones((3, 4), bool)), ("all", np.ones((64, 32))), ("none", np.zeros((64, 32)))):
         np.save(tmp_path / f"{name}.npy", mask)
     text = f"{tmp_path}/{text}" if text.endswith(".npy") and text != "nowhere.npy" else text
-    with pytest.raises(UsageError, match=f"^got {message}"):
+    with pytest.raises((UsageError, ScanError), match=f"^got {message}"):
         Pattern(text).mask(scans(1)[0])
 
 

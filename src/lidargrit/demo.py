@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, replace
@@ -224,7 +225,8 @@ def _packaged_samples(folder: Path, clock: _Clock, reporter: Reporter) -> RangeI
 def divided(data: str, reporter: Reporter) -> DataConfig:
     """Divide a user's scans into train and val, by whole drives where there are several.
 
-    The same drive in both would leak. Where there is only one, its last scans are held out, and a warning says so.
+    The same drive in both would leak. Held out is the drive that is nearest to 15 % of the scans; where there is only
+    one, its last scans are held out, and a warning says so.
 
     Raises:
         DataError: too few scans to hold any out.
@@ -233,10 +235,13 @@ def divided(data: str, reporter: Reporter) -> DataConfig:
     if len(dataset) < 4:
         raise DataError(f"{len(dataset)} scans in {data}", "at least 4, to hold one out", "add scans")
     source, split = f"{dataset.public_name()}:{dataset.root}", dataset.split
-    drives = sorted({dataset.name(index).rpartition("/")[0] for index in range(len(dataset))})
+    scans = Counter(dataset.name(index).rpartition("/")[0] for index in range(len(dataset)))
+    drives = sorted(scans)
     has_drives = dataset.public_name() != "folder" and all(drive and "/" not in drive for drive in drives)
     if has_drives and len(drives) > 1 and "[" not in split:
-        train, val = f"{source}:{'+'.join(drives[:-1])}", f"{source}:{drives[-1]}"
+        held_out = min(reversed(drives), key=lambda drive: abs(scans[drive] / len(dataset) - 0.15))
+        train = f"{source}:{'+'.join(drive for drive in drives if drive != held_out)}"
+        val = f"{source}:{held_out}"
     elif "[" in split:
         raise DataError(
             f"{data} with a share", "whole drives, or a folder", "leave the brackets out: demo divides the scans"

@@ -224,7 +224,7 @@ def _claim(manifest: Path, facts: dict[str, Any]) -> None:
     if manifest.is_file():
         there = read_json(manifest)
         known = there.get("scans") if isinstance(there, dict) else None
-        if not isinstance(known, dict) or any(there.get(name) != of for name, of in facts.items() if name != "scans"):
+        if not isinstance(known, dict) or {**there, "scans": None} != {**facts, "scans": None}:
             raise OutputError(
                 f"{out}, which holds other scans or another format", "an empty folder", "choose another one"
             )

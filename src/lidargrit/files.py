@@ -12,7 +12,8 @@ import socket
 import stat
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +24,7 @@ if TYPE_CHECKING:  # quick start of commands that only read and write JSON
     from torch import Tensor, nn
 
 _PARTIALS = f".lidargrit-partial-{os.getuid()}"  # one a user: a shared folder such as /tmp has files of many
+_ATTEMPTS = 1000  # to make a file that others may sweep away; some file systems can make none, and say so each time
 _LOCK = "lock"  # among the partial files, held by the commands that write into the folder
 
 
@@ -107,8 +109,9 @@ def _partial_file(folder: Path) -> Iterator[Path]:
     """Yield the path of a new file among the partial ones, locked while it is written."""
     path, lock = None, None
     try:
+        attempts = count(1)
         while path is None:
-            with suppress(FileNotFoundError):  # another process has just removed the hidden folder, empty
+            with _missing(next(attempts)):  # another process has just removed the hidden folder, empty
                 new = _hidden(folder) / f"{secrets.token_hex(8)}.partial"
                 lock = os.open(new, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
                 try:
@@ -139,8 +142,9 @@ def _lock(folder: Path, kind: int) -> int:
     Raises:
         OutputError: another process holds it.
     """
+    attempts = count(1)
     while True:
-        with suppress(FileNotFoundError):  # as in _partial_file
+        with _missing(next(attempts)):  # as in _partial_file
             lock = os.open(_hidden(folder) / _LOCK, os.O_RDWR | os.O_CREAT, 0o666)
             try:
                 fcntl.flock(lock, kind | fcntl.LOCK_NB)
@@ -163,6 +167,11 @@ def _lock(folder: Path, kind: int) -> int:
                     os.pwrite(lock, holder.encode(), 0)
                 return lock
             os.close(lock)  # it was removed between the two calls
+
+
+def _missing(attempt: int) -> AbstractContextManager[object]:
+    """Ignore that a file or a folder has vanished; not for ever, where a file system cannot make one."""
+    return suppress(FileNotFoundError) if attempt < _ATTEMPTS else nullcontext()
 
 
 def _hidden(folder: Path) -> Path:

@@ -40,13 +40,14 @@ def complete_scans(
         Number of files.
 
     Raises:
-        UsageError: all pixels or no return are observed, or a mask of another size.
-        ScanError: a scan that cannot be used, or of another sensor.
+        UsageError: all pixels are observed, or a mask of another size.
+        ScanError: a scan that cannot be used, of another sensor, or without a return among the observed pixels.
     """
     config = config or DataConfig()
 
     def condition_of(scan: InputScan, seed: int) -> Condition:
-        return Condition.of_pixels(_batch(scan.image), pattern.mask(scan.image, seed)[None])
+        source = "a range image" if scan.points is None else scan.points.source
+        return Condition.of_pixels(_batch(scan.image), pattern.mask(scan.image, seed, source)[None])
 
     inputs = open_inputs(source, _reader(completer, pattern.partial), config)
     facts = {"verb": "complete", "source": source, "observed": pattern.text}

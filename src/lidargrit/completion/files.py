@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import chain, islice
+from itertools import chain, groupby, islice
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +23,12 @@ from lidargrit.files import claim_folder
 from lidargrit.formats import ScanFormat
 from lidargrit.loading import DataConfig
 from lidargrit.reporting import Reporter
+from lidargrit.sensors import SensorModel
 from lidargrit.sources.image_files import PROBABILITY
 from lidargrit.structures import RangeImage
 
 _FILES_AT_MOST = 400_000  # as many as the largest data set has scans; the manifest names each
-_UNWRITABLE = ".npz"  # for scans whose own format cannot be written, and for range images
+_UNWRITABLE = ".npz"  # for range images, and for scans whose own format cannot be written, or is of another sensor
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class OutputConfig:
         seed: seed of the first completion of a scan; each further completion has the next seed.
         format: name or ending of a format, ``image`` for range images (H, W) in metres as ``.npy``, or
             ``kitti_odometry`` for its tree, with SemanticKITTI's files of labels. If empty, each file has the format of
-            its scan where that can be written, and ``.npz`` elsewhere.
+            its scan where that can be written and takes the completer's sensor, and ``.npz`` elsewhere.
         probability: number of samples of the mask from which ``NAME.probability.npy`` gives each pixel's share of
             returns; 0 for no such files.
     """
@@ -59,6 +60,7 @@ class OutputConfig:
 @dataclass(frozen=True, eq=False)
 class _Job:
     index: int
+    number: int
     turn: int
     scan: InputScan
     condition: Condition
@@ -99,7 +101,7 @@ def write_completions(
         ScanError: a scan that cannot be used.
         DataError: no usable scan.
     """
-    manifest, files = facts | _facts(completer, output), _files(inputs, output)
+    manifest, files = facts | _facts(completer, output), _files(inputs, output, completer.sensor)
     scans = {file: inputs.name(index) for (index, _), file in files.items()}
     left_out, labels_lost = set[int](), False
     missing = [job for job, file in files.items() if not (out / file).exists()]
@@ -112,7 +114,7 @@ def write_completions(
         claimed_scans(out / "completed.json", {**manifest, "scans": scans}),
         reporter.progress("completing", len(files), len(files) - len(missing)) as progress,
     ):
-        while batch := list(islice(jobs, completer.batch)):
+        for batch in _batches(jobs, completer.batch):
             for job, image in zip(batch, _completed(completer, batch, output.seed), strict=True):
                 file = files[job.index, job.turn]
                 if output.probability and job.turn == 0:
@@ -138,7 +140,7 @@ def _facts(completer: Completer, output: OutputConfig) -> dict[str, Any]:
     return made
 
 
-def _files(inputs: Inputs, output: OutputConfig) -> dict[tuple[int, int], str]:
+def _files(inputs: Inputs, output: OutputConfig, sensor: SensorModel) -> dict[tuple[int, int], str]:
     """Return the name of each file below the folder, by the index of its scan and the number of the completion."""
     if len(inputs) * output.count > _FILES_AT_MOST:
         got = f"{output.count:,} completions of each of {len(inputs):,} scans"
@@ -147,7 +149,7 @@ def _files(inputs: Inputs, output: OutputConfig) -> dict[tuple[int, int], str]:
     if output.format == TREE:
         names = KittiTree(Path()).files(names)
     else:
-        names = [name + _suffix(inputs.suffix(index), output.format) for index, name in enumerate(names)]
+        names = [name + _suffix(inputs.suffix(index), output.format, sensor) for index, name in enumerate(names)]
     return {
         (index, turn): _folder(turn, output.count) + name
         for index, name in enumerate(names)
@@ -170,7 +172,7 @@ def _jobs(
             last, scan = index, None
             try:
                 scan = inputs.read(index)
-                condition = condition_of(scan, derive_seed(seed, index))
+                condition = condition_of(scan, derive_seed(seed, inputs.number(index)))
                 if scan.doubt and not doubted:
                     reporter.message(f"WARNING: {scan.doubt}")
                     doubted = True
@@ -181,7 +183,14 @@ def _jobs(
                 skipped.add(index)
                 scan = None
         if scan is not None and condition is not None:
-            yield _Job(index, turn, scan, condition, inputs.form(index))
+            yield _Job(index, inputs.number(index), turn, scan, condition, inputs.form(index))
+
+
+def _batches(jobs: Iterable[_Job], at_most: int) -> Iterator[list[_Job]]:
+    """Group jobs that follow one another; a batch has reflectance, or labels, only if all of its scans have them."""
+    for _, alike in groupby(jobs, lambda job: (job.condition.reflectance is None, job.condition.label is None)):
+        while batch := list(islice(alike, at_most)):
+            yield batch
 
 
 def _completed(completer: Completer, jobs: Sequence[_Job], seed: int) -> list[RangeImage]:
@@ -196,27 +205,28 @@ def _return_share(completer: Completer, job: _Job, output: OutputConfig) -> Floa
     remaining = iter(range(output.probability))
     while turns := list(islice(remaining, completer.batch)):
         condition = Condition.cat([job.condition] * len(turns))
-        seeds = [derive_seed(output.seed, job.index, turn, 1) for turn in turns]
+        seeds = [derive_seed(output.seed, job.number, turn, 1) for turn in turns]
         total += completer.complete(condition, seeds).return_mask.float().sum(0)
     return total / output.probability
 
 
 def _seed(seed: int, job: _Job) -> int:
-    return derive_seed(seed + job.turn, job.index)
+    return derive_seed(seed + job.turn, job.number)
 
 
 def _folder(turn: int, count: int) -> str:
     return f"completion_{turn}/" if count > 1 else ""
 
 
-def _suffix(of_input: str, kind: str) -> str:
+def _suffix(of_input: str, kind: str, sensor: SensorModel) -> str:
     """Return the ending of a scan's file."""
     if kind == IMAGE:
         return ".npy"
     if kind:
         return writable_format(kind, IMAGE, TREE)[1]
     known = formats.candidates(Path(f"scan{of_input}")) if of_input else ()
-    return of_input if any(one.can_write() and of_input in one.suffixes for one in known) else _UNWRITABLE
+    fits = any(one.can_write() and of_input in one.suffixes and one.sensor in {"", sensor.name} for one in known)
+    return of_input if fits else _UNWRITABLE
 
 
 def _write(path: Path, kind: str, image: RangeImage, job: _Job) -> bool:

@@ -89,6 +89,10 @@ class Inputs:
         """Return the name of its file, without the ending."""
         return self._scans.name(index)
 
+    def number(self, index: int) -> int:
+        """Return its number in the source, whatever other scans are taken."""
+        return self._scans.number(index)
+
     def suffix(self, index: int) -> str:
         """Return the ending of its file; "" where it is not in a file of points."""
         path = self._scans.path(index)

@@ -35,30 +35,51 @@ class SparseReader(ScanReader):
         self._rows()
 
     def read(self, scan: Scan) -> InputScan:
-        """Project a scan by its own sensor, and put each of its rows into the wanted row of the nearest elevation."""
+        """Project a scan by its own sensor, and put each of its rows into the wanted row of the nearest elevation.
+
+        A sensor that fires in fewer columns keeps its own: each gives its pixels to the wanted column of the nearest
+        azimuth. A wanted column that is the nearest to none stays unknown, since no ray went there.
+        """
         wanted = self.sensor
-        seen = ScanReader(self._source_like_wanted(), self.variant, self.partial).read(scan)
+        seen = ScanReader(self._imaged, self.variant, self.partial).read(scan)
         assert seen.point_of_pixel is not None
+        rows, of_column = self._rows(), self._columns()
+        own, target, fired = (rows >= 0).nonzero()[:, 0], rows[rows >= 0], of_column >= 0
+
+        def taken(pixels: Tensor, nothing: int = 0) -> Tensor:
+            return torch.where(fired, pixels[own][:, of_column.clamp(min=0)], nothing)
+
         size = (wanted.height, wanted.width)
         range_m, on_grid = torch.zeros(size), torch.zeros(size, dtype=torch.bool)
         at = torch.full(size, -1, dtype=torch.int64)
         reflectance = None if seen.image.reflectance is None else torch.zeros(size)
         label = None if seen.image.label is None else torch.zeros(size, dtype=torch.int64)
-        rows = self._rows()
-        own, target = (rows >= 0).nonzero()[:, 0], rows[rows >= 0]
-        range_m[target], at[target], on_grid[target] = seen.image.range_m[own], seen.point_of_pixel[own], True
+        range_m[target], at[target], on_grid[target] = taken(seen.image.range_m), taken(seen.point_of_pixel, -1), fired
         if reflectance is not None and seen.image.reflectance is not None:
-            reflectance[target] = seen.image.reflectance[own]
+            reflectance[target] = taken(seen.image.reflectance)
         if label is not None and seen.image.label is not None:
-            label[target] = seen.image.label[own]
+            label[target] = taken(seen.image.label)
         within = (range_m >= wanted.range_min_m) & (range_m <= wanted.range_max_m)
         return InputScan(RangeImage.masked(range_m, within, wanted, reflectance, label), scan, at, on_grid, seen.doubt)
 
-    def _source_like_wanted(self) -> SensorModel:
-        """Return the scans' sensor with as many columns as the wanted one."""
+    @property
+    def _imaged(self) -> SensorModel:
+        """The scans' sensor with the columns of the wanted one, or with its own if it fires in fewer."""
         assert self.source is not None
-        stride = self.sensor.column_stride
-        return self.source.with_columns(self.sensor.width * stride, stride)
+        own, stride = self.source.fine(), self.sensor.column_stride
+        columns = self.sensor.width * stride
+        return own if own.width < columns else own.with_columns(columns, stride)
+
+    def _columns(self) -> Int64[Tensor, " W"]:
+        """Return for each wanted column that of the scans' image; -1 where this one is nearer to another wanted column.
+
+        A pixel that lies between two rays of the same sensor was not seen, which is not the same as a lost return.
+        """
+        own, wanted = (sensor.azimuth_rad.double().mean(0) for sensor in (self._imaged, self.sensor))
+        apart = (wanted[:, None] - own).abs().remainder(2 * math.pi)
+        apart = torch.minimum(apart, 2 * math.pi - apart)
+        nearest = apart.argmin(1)
+        return torch.where(apart.argmin(0)[nearest] == torch.arange(len(wanted)), nearest, -1)
 
     def _rows(self) -> Int64[Tensor, " rows"]:
         """Return for each row of the scans' sensor the wanted row; -1 where none lies within three quarters of

@@ -73,13 +73,14 @@ def compress_scans(
             for index in range(done, len(inputs)):
                 try:
                     image = inputs.read(index).image
+                    data, returns = codec.compress(image), int(image.return_mask.sum())
                 except ScanError as error:
                     if config.bad_scans == "refuse":
                         raise
                     reporter.message(f"left out: {error}")
                     writer.add(inputs.name(index), b"", 0)
                 else:
-                    writer.add(inputs.name(index), codec.compress(image), int(image.return_mask.sum()))
+                    writer.add(inputs.name(index), data, returns)
                 progress.advance(1)
         if not writer.num_scans:
             raise DataError(f"no usable scan in {source}", "at least one", "see the messages above")

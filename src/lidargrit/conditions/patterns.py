@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lidargrit.arrays import parse_array
 from lidargrit.determinism import derive_seed
-from lidargrit.errors import UsageError
+from lidargrit.errors import ScanError, UsageError
 from lidargrit.structures import RangeImage
 
 FORMS = "rows:4, sector:45,315, pixels:0.1, returns or a mask.npy"
@@ -43,24 +43,25 @@ class Pattern:
         """Whether scans of a part of the circle are accepted, because pixels without a return count as unobserved."""
         return self.text == "returns"
 
-    def mask(self, image: RangeImage, seed: int = 0) -> Bool[Tensor, "H W"]:
+    def mask(self, image: RangeImage, seed: int = 0, source: str = "a scan") -> Bool[Tensor, "H W"]:
         """Return the mask of the observed pixels of one range image.
 
         Args:
             image: range image (H, W).
             seed: seed of the pixels that ``pixels:SHARE`` chooses.
+            source: name of the scan, for messages.
 
         Raises:
-            UsageError: a mask of another size, or one by which all pixels are observed, or no return is.
+            UsageError: a mask of another size, or one by which all pixels are observed.
+            ScanError: no return of this scan is observed.
         """
         mask = self._mask(image, seed)
-        seen = int((mask & image.return_mask).sum())
-        if not seen or bool(mask.all()):
-            raise UsageError(
-                f"--observed {self.text}, by which {'all pixels are' if seen else 'no return is'} observed",
-                "some returns that are observed, and some pixels that are not",
-                "choose other pixels",
-            )
+        if bool(mask.all()):
+            got = f"--observed {self.text}, by which all pixels are observed"
+            raise UsageError(got, "some pixels that are not", "choose other pixels")
+        if not bool((mask & image.return_mask).any()):
+            got = f"{source}, of which --observed {self.text} observes no return"
+            raise ScanError(got, "some returns that are observed", "choose other pixels, or leave the scan out")
         return mask
 
     def _mask(self, image: RangeImage, seed: int) -> Bool[Tensor, "H W"]:

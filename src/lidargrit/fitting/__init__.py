@@ -211,7 +211,7 @@ def _model(
         range_min_m=near_m,
         range_max_m=far_m,
         projection=_projection(rows, rings),
-        source=f"lidargrit fit-sensor, from {num_scans} scans, rings by {rings.method}",
+        source=f"lidargrit fit-sensor, from {num_scans} scans (rings: {rings.method})",
         azimuth_offset_rad=None if offsets is None else torch.from_numpy(np.radians(offsets)).float(),
     )
 

@@ -32,6 +32,10 @@ class NamedScans(ABC):
     def identity(self, index: int) -> str:
         """Return what identifies a scan, so that another scan is not taken for it."""
 
+    def number(self, index: int) -> int:
+        """Return the number of a scan in its source, whatever other scans are taken."""
+        return index
+
     @abstractmethod
     def scan(self, index: int) -> Scan:
         """Return the points of a scan; those of a range image lie on the rays of its pixels."""
@@ -63,6 +67,10 @@ class PointScans(NamedScans):
         """Return its name in the data set."""
         return self.name(index)
 
+    def number(self, index: int) -> int:
+        """Return its number in the data set."""
+        return self._indices[index]
+
     def scan(self, index: int) -> Scan:
         """Read its points."""
         return self._dataset.scan(self._indices[index])
@@ -78,10 +86,11 @@ class ImageScans(NamedScans):
     Args:
         images: range images.
         names: name of each.
+        numbers: number of each in its source.
     """
 
-    def __init__(self, images: RangeImages, names: Sequence[str]) -> None:
-        self.images, self._names = images, names
+    def __init__(self, images: RangeImages, names: Sequence[str], numbers: Sequence[int]) -> None:
+        self.images, self._names, self._numbers = images, names, numbers
 
     def __len__(self) -> int:
         return len(self.images)
@@ -93,6 +102,10 @@ class ImageScans(NamedScans):
     def identity(self, index: int) -> str:
         """Return which file it is, which model's seed, or whose scan it was projected from."""
         return self.images.provenance.names[index]
+
+    def number(self, index: int) -> int:
+        """Return its number in the source."""
+        return self._numbers[index]
 
     def image(self, index: int) -> RangeImage:
         """Return its pixels (H, W)."""
@@ -117,8 +130,9 @@ def named_scans(source: Source, config: DataConfig, sensor: SensorModel | None =
     config = replace(config, projection_variant=source.projection_variant(config) or config.projection_variant)
     images = source.images(sensor, config)
     if isinstance(source, ImageFileSource):
-        return ImageScans(images, [_name_of(Path(name)) for name in images.provenance.names])
-    return ImageScans(images, [f"{index:06d}" for index in range(len(images))])
+        names = [_name_of(Path(name)) for name in images.provenance.names]
+        return ImageScans(images, names, source.chosen(config.max_scans))
+    return ImageScans(images, [f"{index:06d}" for index in range(len(images))], range(len(images)))
 
 
 def _name_of(image: Path) -> str:

@@ -1,0 +1,156 @@
+"""Whole sets of scans: what a completed scan may depend on, scans that cannot be used, and sensors of fewer columns."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from lidargrit.cli import main
+from lidargrit.completion.files import _suffix
+from lidargrit.completion.inputs import ScanReader
+from lidargrit.completion.sparse import SparseReader
+from lidargrit.demo import divided
+from lidargrit.errors import OutputError
+from lidargrit.files import write_text
+from lidargrit.formats.numpy_array import NumpyArray
+from lidargrit.generators.lidargrit import LidarGrit
+from lidargrit.nn.pixel_networks import PixelDecoderConfig
+from lidargrit.projection import unproject
+from lidargrit.reporting import Reporter
+from lidargrit.sensors import load_sensor
+from lidargrit.structures import RangeImage, Scan
+
+SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
+
+
+def wall(sensor, seed: int, reflectance: bool = True) -> RangeImage:
+    """Return a wall around the sensor with holes, no two alike."""
+    rng = torch.Generator().manual_seed(seed)
+    size = (sensor.height, sensor.width)
+    range_m = 10 + 5 * torch.rand(size, generator=rng)
+    returned = torch.rand(size, generator=rng) < 0.9
+    return RangeImage.masked(range_m, returned, sensor, torch.rand(size, generator=rng) if reflectance else None)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run") / "run"
+    torch.manual_seed(0)
+    pixels = PixelDecoderConfig(mask_features=2, range_features=2, mask_width=4, range_width=4, blocks=1)
+    LidarGrit(replace(LidarGrit.smallest_config(SENSOR), pixels=pixels), SENSOR).eval().save(folder)
+    return folder
+
+
+def scan_files(folder, count: int, **settings):
+    for number in range(count):
+        NumpyArray.write(folder / f"{number}.npz", unproject(wall(SENSOR, number, **settings)))
+    return str(folder)
+
+
+def complete(run, source, out, *words) -> int:
+    observed = () if "--observed" in words else ("--observed", "sector:90,270")
+    model = () if "--model" in words else ("--model", str(run))
+    return main(["complete", source, str(out), *observed, *model, "--device", "cpu", *words])
+
+
+def test_more_scans_of_a_set_change_none(run, tmp_path):
+    source = scan_files(tmp_path / "scans", 4)
+    for words in (("--max-scans", "2"), ()):
+        assert complete(run, source, tmp_path / "grown", *words) == 0
+    assert complete(run, source, tmp_path / "whole") == 0
+    for number in range(4):
+        grown, whole = (tmp_path / name / f"{number}.npz" for name in ("grown", "whole"))
+        assert grown.read_bytes() == whole.read_bytes()
+
+
+def test_images_of_a_set_keep_their_seeds_too(run, tmp_path):
+    (tmp_path / "images").mkdir()
+    for number in range(4):
+        np.save(tmp_path / "images" / f"{number}.npy", wall(SENSOR, 0).range_m.numpy())
+    words = ("--format", "image")
+    assert complete(run, str(tmp_path / "images"), tmp_path / "some", "--max-scans", "2", *words) == 0
+    assert complete(run, str(tmp_path / "images"), tmp_path / "all", *words) == 0
+    for path in (tmp_path / "some").glob("*.npy"):
+        assert np.array_equal(np.load(path), np.load(tmp_path / "all" / path.name))
+    first, second = (np.load(tmp_path / "all" / f"{number}.npy") for number in (0, 1))
+    assert not np.array_equal(first, second)
+
+
+@pytest.mark.parametrize("what", ["reflectance", "label"])
+def test_a_scan_that_lacks_something_takes_it_from_no_other(tmp_path, what):
+    folder = tmp_path / "scans"
+    for number in range(3):
+        scan = unproject(wall(SENSOR, number))
+        scan = replace(scan, label=torch.full((len(scan),), 40))
+        NumpyArray.write(folder / f"{number}.npz", replace(scan, **({what: None} if number == 1 else {})))
+    assert complete(None, str(folder), tmp_path / "out", "--model", "nearest") == 0
+    written = [getattr(NumpyArray.read(tmp_path / "out" / f"{number}.npz"), what) for number in range(3)]
+    assert [each is None for each in written] == [False, True, False]
+
+
+def test_a_scan_with_nothing_observed_is_left_out(run, tmp_path, capsys):
+    source = scan_files(tmp_path / "scans", 2)
+    behind = unproject(wall(SENSOR, 0))
+    kept = behind.points_xyz_m[:, 0] < 0.5 * behind.points_xyz_m[:, 1].abs()
+    NumpyArray.write(
+        tmp_path / "scans" / "2.npz", Scan(behind.points_xyz_m[kept], behind.reflectance[kept], behind.ring[kept])
+    )
+    words = ("--observed", "sector:350,10", "--bad-scans", "skip")
+    assert complete(run, source, tmp_path / "out", *words) == 0
+    assert "left out: " in capsys.readouterr().err
+    assert sorted(path.name for path in (tmp_path / "out").glob("*.npz")) == ["0.npz", "1.npz"]
+
+
+def test_columns_in_which_a_sensor_never_fires_are_unknown():
+    """All rays of the sensor return, so that no drop may be told of its scan."""
+    source = load_sensor("vlp16").with_columns(100)
+    wanted = load_sensor("hdl64e_kitti_odometry")  # 256 columns
+    image = RangeImage.masked(
+        torch.full((16, 100), 20.0), torch.ones(16, 100, dtype=torch.bool), source, torch.rand(16, 100)
+    )
+    scan = unproject(image)
+    seen = SparseReader(wanted, source=source).read(scan)
+    assert seen.on_grid is not None
+    assert seen.point_of_pixel is not None
+    assert bool(seen.image.return_mask[seen.on_grid].all())
+    assert int(seen.on_grid.any(dim=0).sum()) == 100
+    taken = seen.point_of_pixel[seen.on_grid]
+    assert len(taken.unique()) == len(taken)
+    apart = torch.atan2(*scan.points_xyz_m[taken].T[[1, 0]]) - wanted.azimuth_rad.expand(64, 256)[seen.on_grid]
+    assert float(torch.atan2(apart.sin(), apart.cos()).abs().max()) <= np.pi / 256 + 1e-3
+    assert seen.image.reflectance is not None
+    assert torch.allclose(seen.image.reflectance[seen.on_grid], scan.reflectance[taken])
+
+
+def test_a_sensor_that_fires_less_often_is_doubted():
+    source = load_sensor("hdl64e_kitti_odometry").with_columns(870)
+    scan = unproject(wall(source, 0))
+    assert "fires less often" in ScanReader(load_sensor("hdl64e_kitti_odometry")).read(scan).doubt
+    assert ScanReader(source).read(scan).doubt == ""
+
+
+def test_a_format_of_another_sensor_is_not_taken():
+    assert _suffix(".pcd.bin", "", load_sensor("hdl64e_kitti_odometry")) == ".npz"
+    assert _suffix(".pcd.bin", "", load_sensor("hdl32e")) == ".pcd.bin"
+    assert _suffix(".ply", "", load_sensor("hdl64e_kitti_odometry")) == ".ply"
+
+
+def test_a_file_system_that_makes_no_folder_is_told_of(tmp_path, monkeypatch):
+    def vanishing(folder):
+        raise FileNotFoundError(2, "No such file or directory")
+
+    monkeypatch.setattr("lidargrit.files._hidden", vanishing)
+    with pytest.raises(OutputError, match="No such file"):
+        write_text(tmp_path / "a.txt", "a")
+
+
+def test_a_demo_holds_out_a_drive_of_a_seventh(tmp_path):
+    for drive, count in (("00", 2), ("01", 9), ("02", 6)):
+        for number in range(count):
+            path = tmp_path / "sequences" / drive / "velodyne" / f"{number:06d}.bin"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            np.ones((200, 4), "<f4").tofile(path)
+    config = divided(f"kitti_odometry:{tmp_path}", Reporter())
+    assert config.train[0].endswith(":01+02")
+    assert config.val[0].endswith(":00")
