@@ -189,7 +189,8 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     ) -> RangeImage:
         """Return scans that keep all observed values, bit for bit, and generate the rest (capability ``complete``).
 
-        Reflectance and labels that the generator does not write are filled in from the observed returns.
+        Reflectance and labels that the generator does not write are filled in from the observed returns; a batch has
+        them if any of its scans has observed some.
 
         Args:
             condition: observed part of each scan, such as ``Condition.of_pixels(images, observed)``, of the kinds in
