@@ -75,7 +75,8 @@ class SparseReader(ScanReader):
 
         A pixel that lies between two rays of the same sensor was not seen, which is not the same as a lost return.
         """
-        own, wanted = (sensor.azimuth_rad.double().mean(0) for sensor in (self._imaged, self.sensor))
+        tables = (sensor.azimuth_rad.double() for sensor in (self._imaged, self.sensor))
+        own, wanted = (torch.atan2(table.sin().mean(0), table.cos().mean(0)) for table in tables)
         apart = (wanted[:, None] - own).abs().remainder(2 * math.pi)
         apart = torch.minimum(apart, 2 * math.pi - apart)
         nearest = apart.argmin(1)
