@@ -36,7 +36,7 @@ def model():
 @pytest.mark.parametrize(("folder", "megabytes"), [(FOLDER, 11.8), (WIDE, 12.0)])
 def test_all_of_it_is_small_and_its_card_is_whole(folder, megabytes):
     assert (folder / "model.safetensors").stat().st_size < megabytes * 1e6
-    assert sum(path.stat().st_size for path in folder.iterdir()) < (megabytes + 1.4) * 1e6, "with what it learned from"
+    assert sum(path.stat().st_size for path in folder.iterdir()) < (megabytes + 4.1) * 1e6, "with what it learned from"
     card = (folder / "README.md").read_text(encoding="utf-8")
     for part in ("## How to sample", "## Data", "## Licence", "## Training", "## Scores", "## Where it fails"):
         assert part in card
@@ -48,7 +48,7 @@ def test_it_is_what_its_recipe_makes(model):
     assert model.config == replace(recipe.model, completion=completing.model.completion)
     trained = json.loads((FOLDER / "run.json").read_text(encoding="utf-8"))["recipe"]
     seen = {stage: fit["scans"] for stage, fit in trained["training"].items()}
-    seen["transformer"] += 18_000 + 36_000  # before they were trained further, as the card says
+    seen["transformer"] += 18_000 + 36_000 + 30_000  # before they were trained further, as the card says
     seen["pixels"] += 17_000 + 9000
     assert seen == {stage: fit.scans for stage, fit in {**completing.training, **recipe.training}.items()}
 
@@ -61,7 +61,7 @@ def test_the_wide_one_is_what_its_recipe_makes():
     assert (wide.sensor.height, wide.sensor.width) == (64, 1024)
     trained = json.loads((WIDE / "run.json").read_text(encoding="utf-8"))["recipe"]
     seen = {stage: fit["scans"] for stage, fit in trained["training"].items()}
-    seen["transformer"] += 3600  # before they were trained further, as the card says
+    seen["transformer"] += 3600 + 6000  # before they were trained further, as the card says
     seen["pixels"] += 9000 + 1600
     assert seen.pop("raydrop") == 2500  # of 1,024 columns, which are as much to learn from as 10,000 of 256
     assert seen == {stage: fit.scans for stage, fit in {**completing.training, **recipe.training}.items()}
@@ -89,7 +89,7 @@ def test_its_networks_compute_what_they_did_when_they_were_scored(model, capsys)
     bits = model.bits(one)
     found = {name: value.item() for name, value in bits.per_scan().items()}
     pixels, returns = 64 * 256, int(one.return_mask.sum())
-    assert found["tokens"] / pixels == pytest.approx(0.0927, abs=0.001)  # 4.1 nats a token; untrained 6.9
+    assert found["tokens"] / pixels == pytest.approx(0.0890, abs=0.001)  # 3.95 nats a token; untrained 6.9
     assert found["mask"] / pixels == pytest.approx(0.2691, abs=0.003)
     assert found["range"] / returns == pytest.approx(4.729, abs=0.02)
 
@@ -99,7 +99,7 @@ def test_the_wide_one_computes_what_it_did_when_it_was_scored():
     one = RangeImage.stack([project(simulate(seed=0), wide.sensor)])
     found = {name: value.item() for name, value in wide.bits(one).per_scan().items()}
     pixels, returns = 64 * 1024, int(one.return_mask.sum())
-    assert found["tokens"] / pixels == pytest.approx(0.0900, abs=0.001)
+    assert found["tokens"] / pixels == pytest.approx(0.0877, abs=0.001)
     assert found["mask"] / pixels == pytest.approx(0.2463, abs=0.003)
     assert found["range"] / returns == pytest.approx(4.259, abs=0.01)
     (scan,) = wide.sample(seeds=[0])

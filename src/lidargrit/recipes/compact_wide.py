@@ -8,12 +8,12 @@ _STAGES = compact_pixels.RECIPE.training
 
 RECIPE = replace(
     compact_pixels.RECIPE,
-    title="LidarGRIT with a pixel decoder: 64x1024 in 1,024 tokens, for one CPU core and four hours",
+    title="LidarGRIT with a pixel decoder: 64x1024 in 1,024 tokens, for one CPU core and five hours",
     data=replace(multiscale_wide.RECIPE.data, train=compact_pixels.RECIPE.data.train),
     training={
         # An image of 64x1024 is as much to learn from as four of 64x256.
         "tokenizer": replace(_STAGES["tokenizer"], scans=800, batch_size=1, learning_rate=5e-4, validate_every=400),
-        "transformer": replace(_STAGES["transformer"], scans=9600, batch_size=4, validate_every=1200),
+        "transformer": replace(_STAGES["transformer"], scans=17_600, batch_size=4, validate_every=1200),
         "pixels": replace(_STAGES["pixels"], scans=12_200, batch_size=1, learning_rate=1e-3, validate_every=1000),
     },
     stages_from="pretrained",
