@@ -16,6 +16,14 @@ from lidargrit.errors import Terminated
 SIGNALS = {signal.SIGTERM: Terminated, signal.SIGINT: KeyboardInterrupt}
 
 
+@pytest.fixture(autouse=True)
+def _heard():
+    """Let Ctrl-C be heard: where the tests run in the background of a shell, it is ignored from the start."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def interrupted(action: Callable[[], object]) -> None:
     """Do something during which a signal comes, and then wait for it."""
     with raising_on_signals():

@@ -127,16 +127,21 @@ def sensor_of(path: Path) -> SensorModel:
 
 def _open(path: Path) -> tuple[Any, Any, float, np.ndarray]:
     """Return the revolutions of a recording, what turns one into points, and the height of the beams over the base."""
-    metadata, states = _metadata_of(path), []
-    for each in (path, metadata):
-        with open_file(each, _FORMAT) as file:
-            stat = os.fstat(file.fileno())
-        states.append((stat.st_size, stat.st_mtime_ns))
-    return _open_once(path, metadata, tuple(states))
+    recorded, metadata = _state_of(path), _metadata_of(path)
+    return _open_once(path, metadata, (recorded, _state_of(metadata)))
+
+
+def _state_of(path: Path) -> tuple[int, int]:
+    """Return the size and the time of a file."""
+    with open_file(path, _FORMAT) as file:
+        stat = os.fstat(file.fileno())
+    return stat.st_size, stat.st_mtime_ns
 
 
 @functools.lru_cache(maxsize=2)
-def _open_once(path: Path, metadata: Path, states: tuple[tuple[int, int], ...]) -> tuple[Any, Any, float, np.ndarray]:
+def _open_once(
+    path: Path, metadata: Path, states: tuple[tuple[int, int], tuple[int, int]]
+) -> tuple[Any, Any, float, np.ndarray]:
     if not OusterPcap.recognises(path):
         raise ScanError(f"{path}, which is no recording of packets", _FORMAT, _CURE)
     text = json.dumps(_read_json(metadata))

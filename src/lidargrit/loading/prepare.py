@@ -201,7 +201,7 @@ def _spec(
         )
         size, time_ns = (status.st_size, status.st_mtime_ns) if status else (0, 0)
         scans.append((name, dataset.recording(index), size, time_ns))
-        beside += [_state(companion) for companion in dataset.companions(index) if companion.exists()]
+        beside += filter(None, map(_state, dataset.companions(index)))
     others = json.dumps(beside) if beside else ""
     # A file of a sensor by which scans are simulated may change, and its name stays the same.
     if dataset.sensor.lower().endswith(".json"):
@@ -223,9 +223,12 @@ def _spec(
     return spec, scans
 
 
-def _state(path: Path) -> tuple[str, int, int]:
-    """Return the name, the size and the time of a file that is read beside a scan."""
-    status = path.stat()
+def _state(path: Path) -> tuple[str, int, int] | None:
+    """Return the name, the size and the time of a file that is read beside a scan; None if it is not there."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
     return path.name, status.st_size, status.st_mtime_ns
 
 
