@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lidargrit.completion.inputs import InputScan, ScanReader
 from lidargrit.errors import ConfigError, ScanError
-from lidargrit.sensors import SensorModel
+from lidargrit.sensors import SensorModel, mean_azimuths_rad
 from lidargrit.structures import RangeImage, Scan
 
 _ROWS_AT_LEAST = 2
@@ -75,8 +75,7 @@ class SparseReader(ScanReader):
 
         A pixel that lies between two rays of the same sensor was not seen, which is not the same as a lost return.
         """
-        tables = (sensor.azimuth_rad.double() for sensor in (self._imaged, self.sensor))
-        own, wanted = (torch.atan2(table.sin().mean(0), table.cos().mean(0)) for table in tables)
+        own, wanted = (mean_azimuths_rad(sensor.azimuth_rad) for sensor in (self._imaged, self.sensor))
         apart = (wanted[:, None] - own).abs().remainder(2 * math.pi)
         apart = torch.minimum(apart, 2 * math.pi - apart)
         nearest = apart.argmin(1)

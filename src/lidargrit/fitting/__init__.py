@@ -17,8 +17,7 @@ from lidargrit.fitting.elevations import FittedRows, cluster_rows, nearest_row, 
 from lidargrit.fitting.limits import quantum_m, range_limits_m
 from lidargrit.fitting.points import Points
 from lidargrit.fitting.rings import Method, Rings, recover_rings
-from lidargrit.sensors import ProjectionName, SensorModel, column_azimuths_rad
-from lidargrit.sensors._checks import NAME_AT_MOST
+from lidargrit.sensors import NAME_AT_MOST, ProjectionName, SensorModel, column_azimuths_rad
 from lidargrit.structures import Scan
 
 __all__ = ["SensorFit", "fit_sensor", "fit_sensor_to_dataset"]

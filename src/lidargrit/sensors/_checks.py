@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from lidargrit.errors import ConfigError, nearest_names
-from lidargrit.sensors._columns import column_azimuths_rad
+from lidargrit.sensors._columns import column_azimuths_rad, mean_azimuths_rad
 
 _WORDS = ("name", "source", "projection")
 _NUMBERS: dict[str, Any] = {"range_min_m": (int, float), "range_max_m": (int, float), "column_stride": int}
@@ -82,9 +82,8 @@ def _check_columns(name: str, azimuth_rad: Tensor, stride: int) -> None:
     at_most_rad = _APART_AT_MOST * 2 * math.pi / columns
     if len(azimuth_rad) > 1:
         at_most_rad = max(at_most_rad, _MEASURED_APART_AT_MOST_RAD)
-    azimuth_rad = torch.atan2(azimuth_rad.double().sin().mean(dim=0), azimuth_rad.double().cos().mean(dim=0))
     centres_rad = column_azimuths_rad(columns, stride)[0].double()
-    apart_rad = (azimuth_rad - centres_rad + math.pi).remainder(2 * math.pi) - math.pi
+    apart_rad = (mean_azimuths_rad(azimuth_rad) - centres_rad + math.pi).remainder(2 * math.pi) - math.pi
     if float(apart_rad.abs().max()) > at_most_rad:
         raise ConfigError(
             f"azimuths of the sensor {name!r} that are not those of equal columns from +pi down",

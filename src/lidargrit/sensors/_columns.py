@@ -1,4 +1,4 @@
-"""A number of columns around the circle → the azimuths of their centres."""
+"""Azimuths of columns: of the centres of a number of equal ones, and the means of a table of all pixels."""
 
 from __future__ import annotations
 
@@ -13,3 +13,9 @@ def column_azimuths_rad(columns: int, stride: int = 1) -> Float[Tensor, "1 W"]:
     """Return the azimuths of the centres of every ``stride``-th of ``columns`` equal columns, from +pi down to -pi."""
     index = torch.arange(0, columns, stride, dtype=torch.float64)
     return (math.pi - 2 * math.pi * (index + 0.5) / columns).float()[None]
+
+
+def mean_azimuths_rad(azimuth_rad: Float[Tensor, "H W"]) -> Float[Tensor, " W"]:
+    """Return the mean azimuth of every column around the circle, in 64 bits, from -pi to +pi."""
+    table = azimuth_rad.double()
+    return torch.atan2(table.sin().mean(dim=0), table.cos().mean(dim=0))

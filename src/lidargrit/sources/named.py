@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from lidargrit.datasets import ScanDataset
@@ -126,9 +125,7 @@ def named_scans(source: Source, config: DataConfig, sensor: SensorModel | None =
     """
     if isinstance(source, DatasetSource):
         return PointScans(source.scans(), config.max_scans)
-    # Scans that are images already keep the variant that they were projected by.
-    config = replace(config, projection_variant=source.projection_variant(config) or config.projection_variant)
-    images = source.images(sensor, config)
+    images = source.images(sensor, source.as_projected(config))
     if isinstance(source, ImageFileSource):
         names = [_name_of(Path(name)) for name in images.provenance.names]
         return ImageScans(images, names, source.chosen(config.max_scans))

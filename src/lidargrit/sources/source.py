@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import replace
 from typing import ClassVar
 
 from lidargrit.datasets import ScanDataset
@@ -39,6 +40,10 @@ class Source(ABC):
     @abstractmethod
     def projection_variant(self, config: DataConfig) -> str:
         """Return the variant of the projection by which scans become, or became, images; "" where it is not known."""
+
+    def as_projected(self, config: DataConfig) -> DataConfig:
+        """Return a configuration with the variant by which scans that are images already were projected."""
+        return replace(config, projection_variant=self.projection_variant(config) or config.projection_variant)
 
     @abstractmethod
     def images(

@@ -142,8 +142,7 @@ def _joined(batches: Iterable[RangeImage]) -> RangeImage:
 def _of_images(
     source: Source, count: int, sensor: SensorModel | None, config: DataConfig, reporter: Reporter
 ) -> ScanSet:
-    config = replace(config, projection_variant=source.projection_variant(config) or config.projection_variant)
-    images = source.images(sensor, config, reporter)
+    images = source.images(sensor, source.as_projected(config), reporter)
     indices = evenly_spaced(count, len(images))
     names = images.provenance.names
     return ScanSet(source.text, images.batch(indices), tuple(names[index].rpartition("/")[2] for index in indices))

@@ -147,10 +147,10 @@ class _Tensors:
             if first.ndim == 3:
                 self._scans.append((path, None))
             else:
-                self._scans += [(path, index) for index in range(len(self._batch(path)))]
-            if len(self._scans) >= (count or _SCANS_AT_MOST):
+                self._scans += [(path, index) for index in range(min(len(self._batch(path)), _SCANS_AT_MOST))]
+            if count and len(self._scans) >= count:
                 break
-        self._scans = self._scans[: count or _SCANS_AT_MOST]
+        self._scans = self._scans[:count]
         if not self._scans:
             raise DataError(f"no scan in {paths[0].parent}", "samples as tensors", "remove empty files, or sample anew")
         self.provenance = Provenance(tuple(f"{path} {index or 0}" for path, index in self._scans))
