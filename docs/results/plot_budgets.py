@@ -28,6 +28,7 @@ NAMES = {
     "multiscale_small": "pixel decoder without tokens",
     "maskgit_small": "MaskGIT",
     "dusty_small": "DUSty-I",
+    "dusty2_small": "DUSty-II",
     "dcgan_small": "DCGAN",
     "lidargan_small": "LidarGAN",
     "lidarvae_small": "LidarGAN's VAE",
@@ -38,8 +39,8 @@ NAMES = {
     "lidm_small": "LiDM",
     "lidm_shared_small": "LiDM over LidarGRIT's tokens",
 }
-MARKERS = "osD^v<>PX*hdp8"
-COLOURS = colormaps["tab20"].colors[:14]  # one for each name
+MARKERS = "osD^v8<>PX*hdpH"
+COLOURS = colormaps["tab20"].colors[:15]  # one for each name
 
 
 class Cell(NamedTuple):
