@@ -279,6 +279,7 @@ def test_processes_make_a_table_that_can_be_extended(tmp_path, capfd):
     assert (tmp_path / "table.html").read_text().count("<tr>") == 1 + 3 + 1
     for wrong, got in (
         (["--add", "small", "-n", "5"], "--add with settings of its own (-n)"),
+        (["--add", "small", "--against", "simulated:256:test"], "--add with settings of its own (--against)"),
         (["small", "--add", "demo"], "--add with systems before it"),
     ):
         capfd.readouterr()
@@ -288,15 +289,55 @@ def test_processes_make_a_table_that_can_be_extended(tmp_path, capfd):
     assert "none, which holds no table.json" in the_one_line(capfd.readouterr().err, "compare")
 
 
-def test_a_page_of_foreign_names_holds_no_code_of_theirs():
-    score = {"metric": "<b>", "variant": "x", "higher_is_better": False, "value": 0.5, "interval": None}
+def cell_of(system, sha256="ab", metric="bev_jsd", source="real"):
+    score = {"metric": metric, "variant": "x", "higher_is_better": False, "value": 0.5, "interval": None}
     score["real_against_real"] = {"value": 0.25, "num_scans": 4, "halvings": 2}
-    scores = {"scores": [score], "inputs": {"reference": {"scans_used": 4}}}
-    page = table_page([{"system": "<script>alert(1)</script>", "costs": {"parameters": 3}, "scores": scores}], 0.0)
+    reference = {"scans_used": 4, "sha256": sha256, "source": source, "sensor": "s 8x8"}
+    scores = {"scores": [score], "inputs": {"reference": reference}, "protocol": {"name": "exact"}}
+    return {"system": system, "costs": {"parameters": 3}, "scores": scores}
+
+
+def test_a_page_has_a_table_for_each_reference():
+    page = table_page([cell_of("a"), cell_of("b", "cd"), cell_of("c")], 0.0)
+    first, second = page.split("<table>")[1:]
+    assert [name in first for name in (">a<", ">b<", ">c<")] == [True, False, True]
+    assert ">b<" in second
+    assert first.count("real against real") == second.count("real against real") == 1
+
+
+def test_a_page_of_foreign_names_holds_no_code_of_theirs():
+    page = table_page([cell_of("<script>alert(1)</script>", metric="<b>", source="<i>")], 0.0)
+    assert "<i>" not in page
     assert "<script>alert" not in page
     assert "&lt;script&gt;alert" in page
     assert page.count("<script>") == 1
     assert "0.25" in page
+
+
+def test_the_time_of_many_scans_outlives_that_of_one(tmp_path):
+    run_benchmark(["marginal"], tmp_path, BENCHMARK)
+    costs = tmp_path / "marginal" / benchmark.COSTS
+    before = json.loads(costs.read_text())
+    assert before["scans"] == 8
+    (tmp_path / "marginal" / "samples" / "00000003.npz").unlink()
+    run_benchmark(["marginal"], tmp_path, BENCHMARK)
+    assert json.loads(costs.read_text())["seconds_per_scan"] == before["seconds_per_scan"]
+
+
+def test_metrics_of_which_none_can_be_made_are_refused_before_training(tmp_path, monkeypatch):
+    monkeypatch.setattr(benchmark, "train", lambda *_: pytest.fail("trained"))
+
+    def no_weights(*_args, **_options):
+        raise LidarGritError("no weights", "weights", "get them")
+
+    monkeypatch.setattr(benchmark, "MetricFactory", lambda *_args, **_options: no_weights)
+    with pytest.raises(LidarGritError, match="no weights"):
+        run_benchmark(["marginal"], tmp_path / "table", BENCHMARK)
+
+
+def test_json_is_not_written_over_the_table(tmp_path, capsys):
+    assert main(["compare", str(tmp_path), "marginal", "--json", str(tmp_path / "table.json")]) == 2
+    assert "table.json for two files" in the_one_line(capsys.readouterr().err, "compare")
 
 
 @pytest.mark.parametrize("change", [{"parameters": "many"}, {"training_flops": [1]}, {"flops_per_scan": None}, None])

@@ -194,6 +194,8 @@ def test_a_seed_gives_the_same_sample_whatever_is_drawn_beside_it(run_folder, sa
     assert torch.allclose(later.batch([0, 1]).range_m, earlier.batch([1, 2]).range_m, atol=1e-3)
     typed("sample", run_folder, tmp_path / "later", "--seed", 0, "-n", 5)
     assert len(read_samples(tmp_path / "later")) == 5
+    names = read_samples(tmp_path / "later", 2).provenance.names
+    assert [name[-1] for name in names] == ["0", "2"], "evenly spaced"
 
 
 def test_sampling_options_reach_the_model(run_folder, tmp_path, typed):

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from lidargrit import _discovery
-from lidargrit.cli import main
-from lidargrit.errors import ConfigError, DataError, LidarGritError, UnknownNameError
+from lidargrit.cli import _results, main
+from lidargrit.errors import ConfigError, DataError, LidarGritError, OutputError, UnknownNameError
 from lidargrit.evaluation.command import read_config
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair, compare_sources
 from lidargrit.evaluation.intervals import Resampling
@@ -141,6 +141,27 @@ def test_no_intervals_where_none_are_wanted(card, sets):
     assert "0.0" in plain.as_table()
 
 
+def test_scores_are_printed_where_no_file_can_be_written(sets, monkeypatch, capsys, tmp_path):
+    def no_space(*_):
+        raise OutputError("a full disk", "space", "make some")
+
+    monkeypatch.setattr(_results, "write_json", no_space)
+    words = ["evaluate", *sets, "--metrics", "bev_jsd", "--intervals", "0", "--json", str(tmp_path / "a.json")]
+    assert main(words) == 2
+    printed = capsys.readouterr()
+    assert "bev_jsd" in printed.out
+    assert "a full disk" in printed.err
+
+
+def test_a_foreign_name_reaches_no_terminal_as_code(card, tmp_path):
+    (first, *_) = card.scores
+    strange = replace(first, result=replace(first.result, metric="bev\x1b[31m"))
+    write_json(tmp_path / "theirs.json", replace(card, scores=(strange,)).to_json())
+    table = side_by_side([tmp_path / "theirs.json"])
+    assert "\x1b" not in table
+    assert "bev\\x1b[31m" in table
+
+
 def test_a_metric_that_cannot_be_had_leaves_the_others(monkeypatch, tmp_path, sets):
     monkeypatch.setenv("LIDARGRIT_WEIGHTS", str(tmp_path))
     missing = tmp_path / "none.pth"
@@ -211,6 +232,7 @@ def test_options_that_change_no_score_are_refused(sets, tmp_path, capsys):
     for words, got in (
         ([ours, sets[1], "--sensor", "vlp16"], f"--sensor vlp16 for {ours}, which holds generated range images"),
         ([*sets, "--sensor", "vlp16"], f"--sensor vlp16 for {sets[0]}, which holds generated range images"),
+        ([*sets, "--set", "data.columns=1024"], "--set data.columns=1024 data.column_stride=1 for"),
         ([*sets, *weights], "weights.pth, which none of the chosen metrics needs; wanted no weights"),
         (
             [*sets, *weights, "--metrics", "frechet_range_distance"],
@@ -283,6 +305,11 @@ def test_metrics_by_name_take_the_protocols_definitions():
         ({"protocol": "r2mm"}, UnknownNameError, "r2dm"),
         ({"variant": "exakt"}, ConfigError, "exact"),
         ({"seed": -1}, ConfigError, "wanted 0 to"),
+        (
+            {"pixel_statistics": True, "resampling": Resampling(halves=0)},
+            ConfigError,
+            "--intervals 0; wanted intervals",
+        ),
     ],
 )
 def test_wrong_words_are_refused_before_anything_is_opened(words, error, why):

@@ -91,9 +91,10 @@ def test_points_of_r2dm_lie_half_a_cell_from_its_own(tmp_path):
 
 def test_a_file_may_hold_a_batch_of_scans(tmp_path):
     torch.save(torch.stack([lidargen(*scan(i)) for i in range(3)]), tmp_path / "samples.pth")
+    torch.save(torch.stack([lidargen(*scan(i)) for i in range(3, 4)]), tmp_path / "samples2.pth")
     images = read_tensor_folder(tmp_path, count=2)
     assert len(images) == 2
-    assert torch.allclose(images.batch([1]).range_m[0], scan(1)[0], atol=0.01)
+    assert torch.allclose(images.batch([1]).range_m[0], scan(2)[0], atol=0.01), "evenly spaced over the files"
 
 
 def test_a_tensor_with_a_gradient_is_read(tmp_path):

@@ -24,7 +24,8 @@ FACTS = EvalSetRecord("a", "samples", "", 9, 9, "s 8x8", "spherical, exact", "ab
 def score(value, real=None, pixels=None, *, noise=0.1, metric="bev_jsd", higher=False, variant="exact"):
     result = MetricResult(metric, value, higher, 9, 9, variant)
     interval = Interval(value - noise, value + noise, noise / 2, 20) if noise else None
-    return Score(result, interval, None if real is None else RealAgainstReal(real, 9, 5), pixel_statistics=pixels)
+    among_real = None if real is None else RealAgainstReal(real, 9, 5, noise / 2)
+    return Score(result, interval, among_real, pixel_statistics=pixels)
 
 
 def card(*scores):
@@ -56,6 +57,12 @@ def test_metrics_that_do_not_see_pixel_statistics_are_set_apart_last_in_the_tabl
     assert lines[:2] == list(words)
     assert [line.split()[0] for line in lines[4:]] == ["bev_mmd", "set", "bev_jsd"]
     assert lines[4].split()[-6:] == ["(n=9)", "0.9000", "lower", "9", "v", "9"]
+
+
+def test_a_noisy_model_is_not_excused_from_a_metric():
+    """Noise of the model itself says nothing of what the metric can tell."""
+    noisy = replace(score(0.9, 0.1, 0.5), interval=Interval(0.1, 1.7, 0.4, 20))
+    assert counted_first([noisy]) == ([noisy], [])
 
 
 def test_values_below_zero_and_better_than_real_are_explained():
@@ -100,7 +107,7 @@ def test_both_bounds_are_read_as_they_were_written(tmp_path):
     write_json(tmp_path / "scores.json", data)
     found = Scorecard.read(tmp_path / "scores.json").scores
     assert [(each.real_against_real, each.pixel_statistics) for each in found] == [
-        (RealAgainstReal(0.1, 9, 5), 0.9),
+        (RealAgainstReal(0.1, 9, 5, 0.05), 0.9),
         (None, None),
     ]
     del data["scores"][0]["real_against_real"]

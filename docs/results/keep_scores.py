@@ -16,8 +16,11 @@ def kept(scores: dict, further: list[dict], costs: dict, system: str) -> dict:
     """Return the scores of a system without what only plots need, and without the folders of the machine."""
     inputs = {name: dict(each) for name, each in scores["inputs"].items()}
     inputs["samples"]["source"] = system
+    reference = Path(inputs["reference"]["source"]).name  # without its folders, if it is one
+    inputs["reference"]["source"] = reference
     return scores | {
         "samples": system,
+        "reference": reference,
         "inputs": inputs,
         "scores": [score | {"details": {}} for score in [*scores["scores"], *further]],
         "costs": costs,

@@ -9,11 +9,11 @@ seconds stands a system's largest budget, with an open marker if others had a la
 
 import argparse
 import io
-import json
 from collections import defaultdict
 from pathlib import Path
 from typing import NamedTuple
 
+from fair_cells import NAMES, read_cell
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -22,23 +22,6 @@ from matplotlib.ticker import LogLocator
 from PIL import Image
 
 METRICS = ("sliced_wasserstein", "point_cloud_jsd", "range_histogram_per_ring", "return_rate_per_ring")
-NAMES = {
-    "small_pixels": "LidarGRIT with a pixel decoder",
-    "small": "LidarGRIT",
-    "multiscale_small": "pixel decoder without tokens",
-    "maskgit_small": "MaskGIT",
-    "dusty_small": "DUSty-I",
-    "dusty2_small": "DUSty-II",
-    "dcgan_small": "DCGAN",
-    "lidargan_small": "LidarGAN",
-    "lidarvae_small": "LidarGAN's VAE",
-    "ultralidar_small": "UltraLiDAR",
-    "r2dm_small.steps32": "R2DM, 32 steps",
-    "r2flow_small.steps16": "R2Flow, 16 steps",
-    "r2flow_reflow_small": "R2Flow, 1 step",
-    "lidm_small": "LiDM",
-    "lidm_shared_small": "LiDM over LidarGRIT's tokens",
-}
 MARKERS = "osD^v8<>PX*hdpH"
 COLOURS = colormaps["tab20"].colors[:15]  # one for each name
 
@@ -63,12 +46,12 @@ def read(folders: list[Path]) -> dict[str, dict[str, list[Cell]]]:
     cells: dict[str, dict[str, list[Cell]]] = defaultdict(lambda: defaultdict(list))
     counts = set()
     for path in sorted(path for folder in folders for path in folder.glob("*.json") if path.stem in NAMES):
-        of = json.loads(path.read_text(encoding="utf-8"))
+        of = read_cell(path)
         counts.add(of["inputs"]["samples"]["scans_used"])
-        for score in of["scores"]:
+        for metric, score in of["scores"].items():
             about = score["interval"]["low"], score["interval"]["high"], score["real_against_real"]["value"]
             costs = of["costs"]["training_flops"], of["costs"]["seconds_per_scan"]
-            cells[score["metric"]][path.stem].append(Cell(*costs, score["value"], *about))
+            cells[metric][path.stem].append(Cell(*costs, score["value"], *about))
     if len(counts) != 1:
         raise SystemExit(f"got scores of {sorted(counts)} scans; wanted those of equally many; score them again")
     return {metric: {name: sorted(of) for name, of in systems.items()} for metric, systems in cells.items()}

@@ -8,24 +8,20 @@ those that it lacks in the order of the one before.
 """
 
 import argparse
-import json
 from pathlib import Path
 
-from plot_budgets import NAMES
+from fair_cells import NAMES, rank_key, read_cell, short
 
 
 def ranked(folder: Path, metric: str) -> dict[str, str]:
     """Return the value of each system in a folder, with its rank."""
-    found = []
-    for system in NAMES:
-        path = folder / f"{system}.json"
-        scores = json.loads(path.read_text(encoding="utf-8"))["scores"] if path.exists() else []
-        found += [(each["value"], each["interval"], system) for each in scores if each["metric"] == metric]
-    found.sort(key=lambda one: one[0])
-    cells, before = {}, -1.0
-    for rank, (value, interval, system) in enumerate(found, start=1):
-        overlaps = "=" if interval["low"] <= before else ""
-        cells[system], before = f"{value:.3f}{overlaps} ({rank})".removeprefix("0"), interval["high"]
+    files = {system: path for system in NAMES if (path := folder / f"{system}.json").exists()}
+    found = {system: score for system, path in files.items() if (score := read_cell(path)["scores"].get(metric))}
+    cells, before = {}, None
+    for rank, (system, score) in enumerate(sorted(found.items(), key=lambda one: rank_key(one[1])), start=1):
+        interval = score["interval"]
+        apart = before is None or interval["low"] > before["high"] or interval["high"] < before["low"]
+        cells[system], before = f"{short(score['value'])}{'' if apart else '='} ({rank})", interval
     return cells
 
 

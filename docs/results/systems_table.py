@@ -9,58 +9,51 @@ with none of theirs.
 """
 
 import argparse
-import json
 import statistics
-from collections import defaultdict
 from pathlib import Path
 from typing import NamedTuple
 
-from plot_budgets import NAMES
+from fair_cells import NAMES, read_cell, short
 
 BOUNDS = {"marginal": "`marginal`", "memorised": "`memorised`"}  # not trained
 ORDER_BY = "sliced_wasserstein"
-DEFAULT = ("sliced_wasserstein", "bev_jsd", "point_cloud_jsd", "range_histogram_per_ring", "return_rate_per_ring")
+DEFAULT = (ORDER_BY, "bev_jsd", "point_cloud_jsd", "range_histogram_per_ring", "return_rate_per_ring")
 
 
-class Cell(NamedTuple):
+class Score(NamedTuple):
     """A score over all seeds of a system."""
 
     value: float
     low: float
     high: float
+    higher_is_better: bool
 
     def text(self, bold: bool) -> str:
         """Return value and interval."""
         value = f"**{short(self.value)}**" if bold else short(self.value)
         return f"{value} [{short(self.low)}, {short(self.high)}]"
 
-
-def short(value: float) -> str:
-    """Return a score with three decimals, or two digits if it is smaller than they can tell."""
-    return f"{value:.1e}".replace("e-0", "e-") if 0 < abs(value) < 0.0005 else f"{value:.3f}".replace("0.", ".", 1)
-
-
-def read(folders: list[Path]) -> tuple[dict[str, int], dict[str, dict[str, Cell]], dict[str, float]]:
-    """Return the number of seeds of each system, the cells by metric and system, and real against real by metric."""
-    seeds: dict[str, int] = {}
-    cells: dict[str, dict[str, Cell]] = defaultdict(dict)
-    real = {}
-    for system in [*NAMES, *BOUNDS]:
-        files = [path for folder in folders if (path := folder / f"{system}.json").exists()]
-        scores = [score for path in files for score in json.loads(path.read_text(encoding="utf-8"))["scores"]]
-        seeds |= {system: len(files)} if files else {}
-        real |= {score["metric"]: score["real_against_real"]["value"] for score in scores}
-        for metric in {score["metric"] for score in scores}:
-            of = [score for score in scores if score["metric"] == metric]
-            low, high = (f(score["interval"][end] for score in of) for f, end in ((min, "low"), (max, "high")))
-            cells[metric][system] = Cell(statistics.mean(score["value"] for score in of), low, high)
-    return seeds, cells, real
+    def nearer_than(self, other: "Score") -> bool:
+        """Return whether this score is better, with intervals apart."""
+        return self.low > other.high if self.higher_is_better else self.high < other.low
 
 
-def nearest(cells: dict[str, Cell]) -> str:
+def over_seeds(cells: list[dict], metric: str) -> Score | None:
+    """Return the score of a system by one metric; None where it has none."""
+    of = [cell["scores"][metric] for cell in cells if metric in cell["scores"]]
+    if not of:
+        return None
+    low, high = (f(score["interval"][end] for score in of) for f, end in ((min, "low"), (max, "high")))
+    return Score(statistics.mean(score["value"] for score in of), low, high, of[0]["higher_is_better"])
+
+
+def nearest(scores: dict[str, Score | None]) -> str:
     """Return the trained system that is nearer than all others with intervals apart, or nothing."""
-    first, *others = sorted((cell, system) for system, cell in cells.items() if system not in BOUNDS)
-    return first[1] if all(first[0].high < cell.low for cell, _ in others) else ""
+    found = {system: score for system, score in scores.items() if score and system not in BOUNDS}
+    for system, score in found.items():
+        if all(score.nearer_than(other) for name, other in found.items() if name != system):
+            return system
+    return ""
 
 
 def main() -> None:
@@ -69,15 +62,25 @@ def main() -> None:
     parser.add_argument("folders", type=Path, nargs="+", help="scores of one seed each")
     parser.add_argument("--metrics", nargs="+", default=DEFAULT)
     options = parser.parse_args()
-    seeds, cells, real = read(options.folders)
-    bold = {metric: nearest(cells[metric]) for metric in options.metrics}
-    trained = sorted(seeds.keys() - BOUNDS.keys(), key=lambda system: cells[ORDER_BY][system])
-    print(f"| lower is better | seeds | {' | '.join(f'`{metric}`' for metric in options.metrics)} |")
+    files = {
+        name: [f for folder in options.folders if (f := folder / f"{name}.json").exists()] for name in NAMES | BOUNDS
+    }
+    cells = {system: [read_cell(path) for path in paths] for system, paths in files.items() if paths}
+    scores = {metric: {system: over_seeds(of, metric) for system, of in cells.items()} for metric in options.metrics}
+    if missing := [metric for metric, of in scores.items() if not any(of.values())]:
+        raise SystemExit(f"got --metrics {missing[0]}, of which no file has a score; wanted one that they have")
+    real = {
+        m: score["real_against_real"]["value"] for of in cells.values() for c in of for m, score in c["scores"].items()
+    }
+    bold = {metric: nearest(scores[metric]) for metric in options.metrics}
+    order = {system: over_seeds(of, ORDER_BY) for system, of in cells.items()}
+    trained = sorted(cells.keys() - BOUNDS.keys(), key=lambda system: (order[system] is None, order[system]))
+    print(f"| | seeds | {' | '.join(f'`{metric}`' for metric in options.metrics)} |")
     print("|---|---|" + "---|" * len(options.metrics))
-    for system in [*trained, *(system for system in BOUNDS if system in seeds)]:
-        of = [(cells[metric].get(system), bold[metric] == system) for metric in options.metrics]
-        row = [cell.text(is_bold) if cell else "not applicable" for cell, is_bold in of]
-        print(f"| {(NAMES | BOUNDS)[system]} | {seeds[system]} | {' | '.join(row)} |")
+    for system in [*trained, *(system for system in BOUNDS if system in cells)]:
+        of = [(scores[metric][system], bold[metric] == system) for metric in options.metrics]
+        row = [score.text(is_bold) if score else "not applicable" for score, is_bold in of]
+        print(f"| {(NAMES | BOUNDS)[system]} | {len(cells[system])} | {' | '.join(row)} |")
     print(f"| real against real | | {' | '.join(short(real[metric]) for metric in options.metrics)} |")
 
 

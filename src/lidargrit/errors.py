@@ -89,6 +89,11 @@ def one_line(text: str) -> str:
     """
     if len(text) > _LETTERS_AT_MOST:
         text = f"{text[: _LETTERS_AT_MOST * 2 // 3]} [...] {text[-_LETTERS_AT_MOST // 3 :]}"
+    return printable(text)
+
+
+def printable(text: str) -> str:
+    """Return a text with escapes such as ``\\n`` for whatever a terminal would not show as it is, like one_line."""
     return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in text)
 
 

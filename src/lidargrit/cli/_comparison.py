@@ -16,7 +16,7 @@ DEFAULTS: dict[str, Any] = {
     "flops": 0.0,
     "set": [],
 }
-"""Settings that all systems share; a table that is extended keeps its own."""
+"""Settings that all systems share where the user gives none; a table that is extended keeps its own."""
 
 
 def wanted(options: argparse.Namespace) -> tuple[list[str], Benchmark]:
@@ -26,10 +26,10 @@ def wanted(options: argparse.Namespace) -> tuple[list[str], Benchmark]:
     from lidargrit.evaluation.comparison import EvalConfig
     from lidargrit.evaluation.table_folder import read_table
 
+    given = {name: value for name in DEFAULTS if (value := getattr(options, name)) not in (None, [])}
     if options.add:
-        changed = [name for name, default in DEFAULTS.items() if getattr(options, name) != default]
-        if options.systems or changed:
-            own = [f"--{name}" if name != "count" else "-n" for name in changed]
+        if options.systems or given:
+            own = [f"--{name}" if name != "count" else "-n" for name in given]
             raise ConfigError(
                 f"--add with {'systems before it' if options.systems else f'settings of its own ({own[0]})'}",
                 "--add SYSTEM ... alone: all else is as in the table",
@@ -37,10 +37,11 @@ def wanted(options: argparse.Namespace) -> tuple[list[str], Benchmark]:
             )
         systems, benchmark = read_table(options.out)
         return [*systems, *(system for system in options.add if system not in systems)], benchmark
+    chosen = DEFAULTS | given
     return options.systems, Benchmark(
-        reference=options.against,
-        num_samples=options.count,
-        settings=EvalConfig(protocol=options.protocol, metrics=tuple(options.metrics)),
-        recipe_settings=tuple(options.set),
-        flops=options.flops,
+        reference=chosen["against"],
+        num_samples=chosen["count"],
+        settings=EvalConfig(protocol=chosen["protocol"], metrics=tuple(chosen["metrics"])),
+        recipe_settings=tuple(chosen["set"]),
+        flops=chosen["flops"],
     )

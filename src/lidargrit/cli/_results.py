@@ -48,9 +48,10 @@ def print_result(options: argparse.Namespace, text: str, result: Any, done: str 
     if options.json == STANDARD_OUTPUT:
         print(json.dumps(plain(result), indent=2, allow_nan=False))
     else:
+        print(text)  # first: what was computed is not lost where the file cannot be written
         if options.json:
+            sys.stdout.flush()
             write_json(options.json, result)
-        print(text)
     if done:
         print(done, file=sys.stderr if options.json == STANDARD_OUTPUT else sys.stdout)
 

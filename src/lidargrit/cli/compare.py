@@ -27,15 +27,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--add", nargs="+", default=[], metavar="SYSTEM", help=added)
     at_once = "number of systems to make at the same time, each in a process of its own"
     parser.add_argument("--processes", type=int, default=1, help=at_once)
-    parser.add_argument("--against", default=DEFAULTS["against"], metavar="SOURCE", help="real scans to compare with")
-    parser.add_argument("-n", "--count", type=int, default=DEFAULTS["count"], help="number of samples of each system")
-    protocol, metrics = DEFAULTS["protocol"], "metrics instead of the protocol's, see: lidargrit list metrics"
-    parser.add_argument("--protocol", default=protocol, help="name of a protocol, see: lidargrit list protocols")
-    parser.add_argument("--metrics", nargs="+", default=DEFAULTS["metrics"], help=metrics)
+    # No defaults here: beside --add any of these is refused.
+    of = {name: f"(default: {value})" for name, value in DEFAULTS.items()}
+    parser.add_argument("--against", metavar="SOURCE", help=f"real scans to compare with {of['against']}")
+    parser.add_argument("-n", "--count", type=int, help=f"number of samples of each system {of['count']}")
+    protocol, metrics = "name of a protocol, see: lidargrit list protocols", "metrics instead of the protocol's"
+    parser.add_argument("--protocol", help=f"{protocol} {of['protocol']}")
+    parser.add_argument("--metrics", nargs="+", help=f"{metrics}, see: lidargrit list metrics")
     settings = "settings to change in every recipe, such as data.train=/data/scans"
     add_settings(parser, settings)
     budget = "training budget of each system in floating-point operations (default: each recipe's own)"
-    parser.add_argument("--flops", type=float, default=DEFAULTS["flops"], help=budget)
+    parser.add_argument("--flops", type=float, help=budget)
     parser.add_argument("--format", choices=["text", "markdown", "latex"], default="text", help="format of the table")
     add_json(parser)
 
@@ -44,12 +46,12 @@ def run(options: argparse.Namespace) -> None:
     """Run the benchmark, write the table and its page, and print it."""
     from lidargrit.evaluation.benchmark import as_json, as_table
     from lidargrit.evaluation.benchmark import run as run_benchmark
-    from lidargrit.evaluation.table_folder import write_table
+    from lidargrit.evaluation.table_folder import TABLE, write_table
     from lidargrit.files import write_text
     from lidargrit.reporting import TerminalReporter
     from lidargrit.viewer.table_page import table_page
 
-    refuse_taken(options)
+    refuse_taken(options, options.out / TABLE)
     systems, benchmark = wanted(options)
     scores = run_benchmark(systems, options.out, benchmark, TerminalReporter(), options.processes)
     write_table(options.out, systems, benchmark, scores)

@@ -56,5 +56,8 @@ def run(options: argparse.Namespace) -> None:
         return print_result(options, *read_tables(options.tables, options.format))
     names = "protocol metrics variant max_scans seed samples_format device weights groups intervals pixel_statistics"
     config = read_config(scan_settings(options), **{name: vars(options)[name] for name in names.split()})
-    sets, report = (options.samples, options.reference), (options.report, write_report, options.overwrite)
-    print_result(options, *evaluate(*sets, config, TerminalReporter(), *report))
+    sets, report = (options.samples, options.reference), (options.report, options.overwrite)
+    text, values, scored = evaluate(*sets, config, TerminalReporter(), *report)
+    print_result(options, text, values)
+    if options.report and scored:
+        write_report(*scored, options.report)

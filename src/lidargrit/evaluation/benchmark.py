@@ -17,12 +17,13 @@ import torch
 
 from lidargrit import __version__
 from lidargrit.configuration import name_and_settings, override
-from lidargrit.errors import CheckpointError, ConfigError
+from lidargrit.errors import CheckpointError, ConfigError, LidarGritError
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair, open_pair
 from lidargrit.evaluation.likelihood import bits_per_return
 from lidargrit.evaluation.pairs import EvalPair, EvalSet, require_same_rays
 from lidargrit.evaluation.protocols import public_name
 from lidargrit.evaluation.scorecard import Scorecard
+from lidargrit.evaluation.scoring import MetricFactory
 from lidargrit.evaluation.tables import Format, TableBlock, render, side_by_side
 from lidargrit.evaluation.verdict import MEMORISED, PIXEL_STATISTICS
 from lidargrit.files import claim_folder, read_json, write_json
@@ -139,6 +140,7 @@ def run(
     by_run: dict[Path, list[_Plan]] = {}  # systems of one run one after the other: it is trained once
     for plan in plans:
         by_run.setdefault(plan.run, []).append(plan)
+    _require_a_metric(benchmark.evaluation(), reporter)
     _warn_of_bounds(plans, reference, reporter)
     _check_reference(reference, plans, benchmark, reporter)
     processes = min(processes, len(by_run))  # more would only take cores from one another
@@ -157,6 +159,19 @@ def run(
                 for done in as_completed(begun):
                     remaining.without([plan.system for plan in begun[done]], done.result())
     return [folder / name / f"{name}.json" for name in names]
+
+
+def _require_a_metric(settings: EvalConfig, reporter: Reporter) -> None:
+    """Refuse metrics none of which can be made, as for want of weights, with the reason of the first."""
+    errors = []
+    for choice in settings.chosen_metrics():
+        try:
+            MetricFactory(choice, settings.seed, reporter=reporter)()
+        except LidarGritError as error:
+            errors.append(error)
+        else:
+            return
+    raise errors[0]
 
 
 def _check_reference(reference: Source, plans: Sequence[_Plan], benchmark: Benchmark, reporter: Reporter) -> None:
@@ -201,9 +216,9 @@ def _finish(
         )
         generator.to(usable_device(""))
         samples = folder / name / "samples"
-        seconds = _sample(generator, plan.run, samples, plan.sampling, benchmark, reporter)
-        sampled += seconds is not None
-        _write_costs(folder / name / COSTS, plan, generator, seconds, benchmark.num_samples)
+        timed = _sample(generator, plan.run, samples, plan.sampling, benchmark, reporter)
+        sampled += timed is not None
+        _write_costs(folder / name / COSTS, plan, generator, timed)
         pair = open_pair(open_source(str(samples)), reference, settings, reporter)
         _add_bits(folder / name / COSTS, generator, pair.reference, reporter)
         _score(pair, settings, folder / name / f"{name}.json", reporter)
@@ -316,13 +331,13 @@ class _Plan:
 
 def _sample(
     generator: Generator, run: Path, folder: Path, sampling: object, benchmark: Benchmark, reporter: Reporter
-) -> float | None:
-    """Sample what is not there yet, and return the seconds for a scan; None if all was there."""
+) -> tuple[int, float] | None:
+    """Sample what is not there yet, and return how many scans and the seconds for each; None if all was there."""
     before = len(list(folder.glob("[!.]*.npz"))) if folder.is_dir() else 0
     begun = time.perf_counter()
     write_samples(generator, run, folder, range(benchmark.num_samples), sampling, reporter)
     sampled = benchmark.num_samples - before
-    return (time.perf_counter() - begun) / sampled if sampled > 0 else None
+    return (sampled, (time.perf_counter() - begun) / sampled) if sampled > 0 else None
 
 
 def _score(pair: EvalPair, settings: EvalConfig, path: Path, reporter: Reporter) -> None:
@@ -337,9 +352,10 @@ def _score(pair: EvalPair, settings: EvalConfig, path: Path, reporter: Reporter)
     write_json(path, compare_pair(pair, settings, reporter).to_json())
 
 
-def _write_costs(path: Path, plan: _Plan, generator: Generator, seconds: float | None, num_samples: int) -> None:
-    """Write what a system costs, once: a later call that samples nothing has measured no time."""
-    if seconds is None and path.is_file():
+def _write_costs(path: Path, plan: _Plan, generator: Generator, timed: tuple[int, float] | None) -> None:
+    """Write what a system costs, unless it is there, with the time of at least as many scans."""
+    scans, seconds = timed or (0, None)
+    if path.is_file() and scans <= read_json(path).get("scans", 0):
         return
     cost = generator.cost(plan.sampling)
     write_json(
@@ -350,7 +366,7 @@ def _write_costs(path: Path, plan: _Plan, generator: Generator, seconds: float |
             "network_evaluations": cost.network_evaluations,
             "flops_per_scan": cost.flops,
             "seconds_per_scan": seconds,
-            "scans": num_samples,
+            "scans": scans,  # over which the time was taken
         },
     )
 

@@ -17,7 +17,7 @@ from lidargrit.evaluation.reconstruction import score_run
 from lidargrit.evaluation.reference_rows import with_pixel_statistics
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.files import refuse_to_overwrite
-from lidargrit.loading.config import ScanSettings
+from lidargrit.loading.config import DataConfig, ScanSettings
 from lidargrit.metrics import load_metric
 from lidargrit.nn.devices import usable_device
 from lidargrit.reporting import Reporter
@@ -32,19 +32,20 @@ def evaluate(
     config: EvalConfig,
     reporter: Reporter,
     report: Path | None = None,
-    write_report: Callable[[Scorecard, EvalPair, Path], None] | None = None,
     overwrite: bool = False,
-) -> tuple[str, dict[str, Any]]:
-    """Score samples against a reference, or the reconstructions of a run, and return a table and its plain values.
+) -> tuple[str, dict[str, Any], tuple[Scorecard, EvalPair] | None]:
+    """Score samples against a reference, or measure the reconstructions of a run.
 
     Args:
         samples: name of the first set: samples, any source of scans, or a finished run.
         reference: name of the second set.
         config: metrics, protocol and projection of the comparison.
         reporter: receiver of progress and warnings.
-        report: file for a report; none is written for a run.
-        write_report: function that writes the report.
+        report: file for a report, which the caller writes; a run has none.
         overwrite: whether a report that is there already is replaced.
+
+    Returns:
+        a table, its plain values, and what a report is made of: the scorecard and the two sets, None for a run.
 
     Raises:
         ConfigError: a name is missing, or an option has no meaning for these sets or metrics.
@@ -59,7 +60,7 @@ def evaluate(
     second = open_source(reference, config.data.bad_points)
     if isinstance(first, RunSource):
         _refuse_options_of_samples(samples, config, report)
-        return _reconstruction(first, second, config, reporter)
+        return *_reconstruction(first, second, config, reporter), None
     _refuse_unused(first, config)
     pair = open_pair(first, second, config, reporter)
     card = compare_pair(pair, config, reporter)
@@ -67,9 +68,7 @@ def evaluate(
         card = with_pixel_statistics(card, pair, config)
     for warning in card.warnings[len(pair.warnings) :]:
         reporter.message(f"WARNING: {warning}")
-    if report and write_report:
-        write_report(card, pair, report)
-    return card.as_table(), card.to_json()
+    return card.as_table(), card.to_json(), (card, pair)
 
 
 def check_modes(options: Mapping[str, Any], default_of: Callable[[str], Any]) -> None:
@@ -155,6 +154,7 @@ def _refuse_options_of_samples(run: str, config: EvalConfig, report: Path | None
         "--weights": bool(config.weights),
         "--pixel-statistics": config.pixel_statistics,
         "--sensor": bool(config.sensor),
+        "--set data.columns or data.column_stride": _has_columns(config),
         "--intervals or --groups": replace(config.resampling, seed=0) != Resampling(),
         "--seed": config.resampling.seed != 0,
     }
@@ -166,8 +166,14 @@ def _refuse_options_of_samples(run: str, config: EvalConfig, report: Path | None
         )
 
 
+def _has_columns(config: EvalConfig) -> bool:
+    """Return whether columns are chosen, which only scans that are still to be projected can have."""
+    default = DataConfig()
+    return (config.data.columns, config.data.column_stride) != (default.columns, default.column_stride)
+
+
 def _refuse_unused(samples: Source, config: EvalConfig) -> None:
-    """Refuse a sensor for generated images, which keep their own, and weights of networks that no metric needs.
+    """Refuse a sensor or columns for generated images, which keep their own, and weights that no metric needs.
 
     Raises:
         ConfigError: one of them is given.
@@ -177,6 +183,13 @@ def _refuse_unused(samples: Source, config: EvalConfig) -> None:
             f"--sensor {config.sensor} for {samples.text}, which holds {samples.kind}",
             "a sensor for scans, or for range images in .npy files",
             "leave --sensor out: the reference is projected with the sensor of the samples",
+        )
+    if _has_columns(config) and isinstance(samples, (SampleSource, TensorSource)):
+        raise ConfigError(
+            f"--set data.columns={config.data.columns} data.column_stride={config.data.column_stride} for "
+            f"{samples.text}, which holds {samples.kind}",
+            "columns for scans, or for range images in .npy files",
+            "leave them out: the reference is projected to the columns of the samples",
         )
     needed = {load_metric(choice.metric).needs_weights for choice in config.chosen_metrics()}
     if unused := sorted(config.weights.keys() - needed):

@@ -66,6 +66,12 @@ class EvalConfig:
             raise ConfigError(
                 f"-n {str(self.max_scans)[:25]}, --seed {str(self.seed)[:25]}", "0 to 2^63 - 1", "correct the number"
             )
+        if self.pixel_statistics and not self.resampling.halves:
+            raise ConfigError(
+                "--pixel-statistics with --intervals 0",
+                "intervals: pixel statistics stand beside the halves that they are taken from",
+                "leave one of the two out",
+            )
         self.chosen_metrics()  # refuses unknown names before anything is opened
 
     def chosen_metrics(self) -> list[MetricChoice]:

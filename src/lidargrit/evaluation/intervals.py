@@ -84,14 +84,17 @@ class RealAgainstReal:
 
     Args:
         value: mean over halvings of the reference, one half against the other; or score of held-out scans.
-        num_scans: number of scans in each set. Most metrics fall as sets grow, some by a third where they double: so
-            compare it with ``Interval.mean_of_halves``, unless the scans were held out.
+        num_scans: number of scans in each set, on average. Most metrics fall as sets grow, some by a third where they
+            double: so compare it with ``Interval.mean_of_halves``, unless the scans were held out.
         halvings: number of halvings; 0 for held-out scans.
+        spread: standard deviation of the scores of single halvings; 0 for held-out scans and in files of earlier
+            versions.
     """
 
     value: float
     num_scans: int
     halvings: int
+    spread: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -103,8 +106,8 @@ class Score:
         interval: 95 % interval; None if it was not wanted or cannot be computed.
         real_against_real: score of real scans in place of the samples; None if it was not computed.
         seconds: time that the metric, its interval and real against real took.
-        pixel_statistics: score of the generator ``marginal`` in place of the samples, on sets of the size of the halves
-            where intervals were wanted; None if it was not computed.
+        pixel_statistics: score of the generator ``marginal`` in place of the samples, on sets of the size of the
+            halves; None if it was not computed.
     """
 
     result: MetricResult
@@ -225,7 +228,7 @@ def real_against_real(
     if len(real) < _AT_LEAST:
         return None
     rng = np.random.default_rng((resampling.seed, 2))
-    values, scans = [], []
+    values = []
     for _ in range(_HALVINGS):
         order = rng.permutation(len(real))
         half, other = sorted(order[: len(order) // 2]), sorted(order[len(order) // 2 :])
@@ -234,5 +237,4 @@ def real_against_real(
             values.append(metric.compute().value)
         except DataError:
             return None
-        scans.append(sum(sizes[index] for index in half))
-    return RealAgainstReal(float(np.mean(values)), min(scans), _HALVINGS)
+    return RealAgainstReal(float(np.mean(values)), sum(sizes) // 2, _HALVINGS, float(np.std(values, ddof=1)))

@@ -82,8 +82,9 @@ def _values_of(
 ) -> tuple[dict[tuple[str, str], float], tuple[str, ...]]:
     """Score the metrics that a scorecard has, without intervals; return values, and a warning if there are none."""
     metrics = tuple(dict.fromkeys(score.result.metric for score in card.scores))
+    values_alone = replace(settings, metrics=metrics, pixel_statistics=False, resampling=Resampling(halves=0))
     try:
-        found = compare_pair(pair, replace(settings, metrics=metrics, resampling=Resampling(halves=0)))
+        found = compare_pair(pair, values_alone)
     except DataError as error:  # not one of them, as metrics of reflectance of scans without any
         return {}, (f"no reference row: {error}",)
     return {(score.result.metric, score.result.variant): score.result.value for score in found.scores}, ()

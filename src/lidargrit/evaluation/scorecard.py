@@ -221,7 +221,11 @@ def _score(data: dict[str, Any]) -> Score:
             int(interval["halves"]),
             None if interval.get("mean_of_halves") is None else float(interval["mean_of_halves"]),
         ),
-        None if real is None else RealAgainstReal(float(real["value"]), int(real["num_scans"]), int(real["halvings"])),
+        None
+        if real is None
+        else RealAgainstReal(
+            float(real["value"]), int(real["num_scans"]), int(real["halvings"]), float(real.get("spread", 0.0))
+        ),
         float(data["seconds"]),
         None if pixels is None else float(pixels),
     )

@@ -10,7 +10,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
-from lidargrit.errors import DataError
+from lidargrit.errors import DataError, printable
 from lidargrit.evaluation.intervals import Score
 from lidargrit.evaluation.scorecard import NOT_APPLICABLE, LeftOut, Scorecard, format_value
 from lidargrit.evaluation.verdict import MEMORISED, PIXEL_STATISTICS, value_of_halves, verdict
@@ -60,10 +60,14 @@ def side_by_side(paths: Sequence[Path], form: Format = "text") -> str:
     measured: dict[tuple[str, str, int], list[tuple[str, Scorecard]]] = {}
     for path, name in zip(paths, _names(paths), strict=True):
         card = Scorecard.read(path)
-        key = (card.protocol, card.reference.sha256, card.reference.scans_used)
-        measured.setdefault(key, []).append((name, card))
+        measured.setdefault(comparable(card), []).append((name, card))
     blocks = [block for cards in measured.values() for block in (_measured(cards), *_published(cards))]
     return render(blocks, form)
+
+
+def comparable(card: Scorecard) -> tuple[str, str, int]:
+    """Return what two scorecards must have in common to stand in one table: protocol, and scans of the reference."""
+    return card.protocol, card.reference.sha256, card.reference.scans_used
 
 
 def render(blocks: Sequence[TableBlock], form: Format = "text") -> str:
@@ -196,16 +200,17 @@ def _cell(score: Score) -> str:
 
 def _grid(block: TableBlock) -> list[list[str]]:
     heads = ["system", *(f"{metric} ({variant})" for metric, variant in block.columns)]
-    return [heads, *([name, *(cell or "-" for cell in cells)] for name, cells in block.rows)]
+    rows = [heads, *([name, *(cell or "-" for cell in cells)] for name, cells in block.rows)]
+    return [[printable(text) for text in row] for row in rows]
 
 
 def _as_text(block: TableBlock) -> str:
-    lines = [block.title, *block.verdicts]
+    lines = [printable(text) for text in (block.title, *block.verdicts)]
     if block.columns:
         grid = _grid(block)
         widths = [max(len(row[column]) for row in grid) for column in range(len(grid[0]))]
         lines += ["  ".join(t.ljust(w) for t, w in zip(row, widths, strict=True)).rstrip() for row in grid]
-    return "\n".join([*lines, *block.notes])
+    return "\n".join([*lines, *map(printable, block.notes)])
 
 
 def _as_markdown(block: TableBlock) -> str:

@@ -16,6 +16,7 @@ from lidargrit.evaluation.intervals import RealAgainstReal, Score
 PIXEL_STATISTICS, MEMORISED = "marginal", "memorised"
 """The generators whose scans are the second and the third bound."""
 
+_SPREADS = 2.8  # Student's 97.5 % quantile for the five halvings of real against real
 _OR_MORE = ", or the sets of that row are smaller, which makes most scores worse"
 
 
@@ -41,10 +42,14 @@ def is_like_real(score: Score) -> bool | None:
 
 
 def tells_apart(score: Score) -> bool | None:
-    """Return whether the metric separates pixel statistics from real scans by more than chance; None if not known."""
-    if score.pixel_statistics is None or score.real_against_real is None:
+    """Return whether the metric separates pixel statistics from real scans by more than chance; None if not known.
+
+    Chance is that of real against real, since the model's own noise must not decide which scores count.
+    """
+    real = score.real_against_real
+    if score.pixel_statistics is None or real is None:
         return None
-    return _worse_by(score, score.pixel_statistics, score.real_against_real.value) > noise(score)
+    return _worse_by(score, score.pixel_statistics, real.value) > _SPREADS * real.spread
 
 
 def counted_first(scores: Sequence[Score]) -> tuple[list[Score], list[Score]]:

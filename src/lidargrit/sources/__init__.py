@@ -25,7 +25,13 @@ from lidargrit.reporting import Reporter
 from lidargrit.run_folder import is_run, is_unfinished, locate, recorded_projection, trained_on
 from lidargrit.sensors import SensorModel, load_sensor
 from lidargrit.sources.image_files import ImageFileSource, image_files
-from lidargrit.sources.sample_formats import is_tensor_folder, load_sample_format, read_tensor_folder, recognise
+from lidargrit.sources.sample_formats import (
+    is_tensor_folder,
+    load_sample_format,
+    read_tensor_folder,
+    recognise,
+    sensor_of_tensors,
+)
 from lidargrit.sources.samples import is_sample_folder, projection_of, read_samples, weights_of
 from lidargrit.sources.source import Source
 
@@ -137,7 +143,7 @@ class SampleSource(Source):
     def images(
         self, sensor: SensorModel | None = None, config: DataConfig | None = None, reporter: Reporter | None = None
     ) -> RangeImages:
-        """Read the samples of the first seeds."""
+        """Read the samples, or so many of them, evenly spaced."""
         return read_samples(self.folder, (config or DataConfig()).max_scans or None)
 
     def learned_from(self) -> Provenance:
@@ -168,7 +174,7 @@ class TensorSource(Source):
     @property
     def sensor(self) -> SensorModel:
         """Sensor that the size of the first tensor fits."""
-        return read_tensor_folder(self._folder, self.split, 1).sensor
+        return sensor_of_tensors(self._folder, self.split)
 
     def projection_variant(self, config: DataConfig) -> str:
         """Return the variant that the program projects its training scans by."""
@@ -177,7 +183,7 @@ class TensorSource(Source):
     def images(
         self, sensor: SensorModel | None = None, config: DataConfig | None = None, reporter: Reporter | None = None
     ) -> RangeImages:
-        """Read the first samples."""
+        """Read the samples, or so many of them, evenly spaced."""
         return read_tensor_folder(self._folder, self.split, (config or DataConfig()).max_scans or None)
 
 

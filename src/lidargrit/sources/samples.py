@@ -17,6 +17,7 @@ import numpy as np
 
 from lidargrit import configuration
 from lidargrit.arrays import HEADER_BYTES_AT_MOST, read_arrays
+from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import CheckpointError, ConfigError, DataError, OutputError, ScanError
 from lidargrit.files import (
     atomic_path,
@@ -130,7 +131,7 @@ def read_samples(folder: Path, count: int | None = None) -> RangeImages:
 
     Args:
         folder: folder that :func:`write_samples` wrote.
-        count: largest number of scans; those of the lowest seeds are taken, since the order of seeds has no meaning.
+        count: largest number of scans, evenly spaced over the seeds; all if not given.
 
     Raises:
         DataError: no samples in the folder.
@@ -144,7 +145,9 @@ def read_samples(folder: Path, count: int | None = None) -> RangeImages:
             f"{folder / MANIFEST}, in which {reason}", "what lidargrit wrote", "sample anew"
         ) from None
     files = folder.glob("[!.]*.npz")  # not what a killed process left half-written
-    paths = sorted(files, key=lambda path: (len(path.stem), path.stem))[:count]  # seeds above eight digits come last
+    paths = sorted(files, key=lambda path: (len(path.stem), path.stem))  # seeds above eight digits come last
+    if count:
+        paths = [paths[index] for index in evenly_spaced(count, len(paths))]
     if not paths:
         raise DataError(
             f"no sample in {folder}", "at least one", "generate some with: lidargrit sample RUN " + str(folder)

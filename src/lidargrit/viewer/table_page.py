@@ -21,7 +21,7 @@ _COSTS = {
 }
 _SCRIPT = """
 for (const button of document.querySelectorAll("th button")) button.addEventListener("click", () => {
-  const head = button.parentElement, body = document.querySelector("tbody"), index = head.cellIndex;
+  const head = button.parentElement, body = head.closest("table").tBodies[0], index = head.cellIndex;
   const up = head.getAttribute("aria-sort") !== "ascending";
   for (const other of head.parentElement.children) other.removeAttribute("aria-sort");
   head.setAttribute("aria-sort", up ? "ascending" : "descending");
@@ -54,21 +54,37 @@ def table_page(cells: Sequence[dict[str, Any]], flops: float) -> str:
         cells: name, costs and scores of each system, as the comparison wrote them.
         flops: floating-point operations of the training of each; 0 where each had its own budget.
     """
+    budget = f"each recipe trained with {flops:.2g} floating-point operations" if flops else "each with its own budget"
+    tables: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
+    for cell in cells:
+        tables.setdefault(_comparable(cell), []).append(cell)
+    apart = "" if len(tables) < 2 else " Systems compared with other scans, or by another sensor, have their own table."
+    content = (
+        f"<h1>{len(cells)} systems</h1>\n"
+        f"<p>{escape(budget)}. Brackets hold 95 % intervals over scans. Click on a head to sort. Lower is better where "
+        f"nothing else is said.{apart}</p>\n{''.join(map(_table, tables.values()))}"
+    )
+    return document(f"{len(cells)} systems compared", STYLE + _LOOKS, content, _SCRIPT)
+
+
+def _comparable(cell: dict[str, Any]) -> tuple[str, str, int]:
+    """Return what the systems of one table have in common: protocol, and scans of the reference."""
+    reference = cell["scores"]["inputs"]["reference"]
+    return str(cell["scores"]["protocol"]["name"]), str(reference["sha256"]), int(reference["scans_used"])
+
+
+def _table(cells: Sequence[dict[str, Any]]) -> str:
     columns = list(dict.fromkeys(_column(score) for cell in cells for score in cell["scores"]["scores"]))
     heads = ["system", *(f"{metric}<br><small>{variant}</small>" for metric, variant in columns), *_COSTS.values()]
     head = "".join(f'<th scope="col"><button type="button">{name}</button></th>' for name in heads)
     body = "".join(_row(cell, columns) for cell in cells)
-    foot = _real_against_real(cells, columns)
-    reference = cells[0]["scores"]["inputs"]["reference"] if cells else {"scans_used": 0}
-    budget = f"each trained with {flops:.2g} floating-point operations" if flops else "each trained with its own budget"
-    content = (
-        f"<h1>{len(cells)} systems, compared alike</h1>\n"
-        f"<p>{int(reference['scans_used']):,} samples of each against as many real scans; {escape(budget)}. Brackets "
-        "hold 95 % intervals over scans. Click on a head to sort. Lower is better where nothing else is said.</p>\n"
+    reference = cells[0]["scores"]["inputs"]["reference"]
+    return (
+        f"<p>{int(reference['scans_used']):,} samples of each against as many scans of "
+        f"{escape(str(reference['source']))}, {escape(str(reference['sensor']))}</p>\n"
         '<div class="wide" tabindex="0" role="region" aria-label="scores and costs"><table><thead><tr>'
-        f"{head}</tr></thead><tbody>{body}</tbody><tfoot>{foot}</tfoot></table></div>"
+        f"{head}</tr></thead><tbody>{body}</tbody><tfoot>{_real_against_real(cells, columns)}</tfoot></table></div>\n"
     )
-    return document(f"{len(cells)} systems compared", STYLE + _LOOKS, content, _SCRIPT)
 
 
 def _column(score: dict[str, Any]) -> tuple[str, str]:

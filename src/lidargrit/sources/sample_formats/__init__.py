@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidargrit import _discovery, formats
+from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import DataError, ScanError, UnknownNameError, nearest_names
 from lidargrit.loading import Pixels, Provenance, RangeImages
 from lidargrit.sensors import SensorModel, load_sensor
@@ -97,7 +98,7 @@ def read_tensor_folder(folder: Path, name: str = "", count: int | None = None) -
     Args:
         folder: folder of ``.pth`` files, with one scan or one batch of scans each.
         name: name of the sample format; recognised from the number of channels if empty.
-        count: largest number of scans; the first are taken.
+        count: largest number of scans, evenly spaced; all if not given.
 
     Raises:
         DataError: no tensor in the folder.
@@ -106,6 +107,11 @@ def read_tensor_folder(folder: Path, name: str = "", count: int | None = None) -
     form = load_sample_format(name or recognise(folder))
     store = _Tensors(_paths(folder), form, count)
     return RangeImages(store.sensor, [store])
+
+
+def sensor_of_tensors(folder: Path, name: str = "") -> SensorModel:
+    """Return the sensor that the first file of :func:`read_tensor_folder` fits, with the same errors."""
+    return _Tensors(_paths(folder)[:1], load_sample_format(name or recognise(folder)), None).sensor
 
 
 def read_tensor(path: Path) -> Tensor:
@@ -148,9 +154,8 @@ class _Tensors:
                 self._scans.append((path, None))
             else:
                 self._scans += [(path, index) for index in range(min(len(self._batch(path)), _SCANS_AT_MOST))]
-            if count and len(self._scans) >= count:
-                break
-        self._scans = self._scans[:count]
+        if count:
+            self._scans = [self._scans[index] for index in evenly_spaced(count, len(self._scans))]
         if not self._scans:
             raise DataError(f"no scan in {paths[0].parent}", "samples as tensors", "remove empty files, or sample anew")
         self.provenance = Provenance(tuple(f"{path} {index or 0}" for path, index in self._scans))
