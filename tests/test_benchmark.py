@@ -9,6 +9,7 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
 from lidargrit.cli import main
+from lidargrit.conditions.marks import read_marks
 from lidargrit.datasets import load
 from lidargrit.errors import CheckpointError, ConfigError, LidarGritError, OutputError
 from lidargrit.evaluation import benchmark
@@ -161,12 +162,21 @@ def test_a_budget_scales_all_stages_alike():
     for stage, fit in recipe.training.items():
         assert half.training[stage].scans == pytest.approx(fit.scans / 2, abs=fit.batch_size)
     assert with_budget(load_recipe("marginal"), 1.0) == load_recipe("marginal")
+    vae = load_recipe("lidarvae_small")
+    short = with_budget(vae, sum(training_flops(vae).values()) / 4)
+    assert short.model.warmup_scans == pytest.approx(vae.model.warmup_scans / 4, rel=0.01)
     with pytest.raises(ConfigError, match="at least one batch"):
         with_budget(recipe, 1e6)
     lacking = load_recipe("r2flow_small", ["model.reflow={}"])
     for count in (training_flops, lambda recipe: with_budget(recipe, 1e13)):
         with pytest.raises(ConfigError, match=r"without training\.reflow, a stage of model=r2flow"):
             count(lacking)
+
+
+def test_images_that_only_count_mark_surfaces_that_return():
+    marked = read_marks(uniform_images(load_recipe("demo", MODEL).data.load_sensor(), 1).reflectance)
+    assert marked.is_clear
+    assert marked.has_reflectance
 
 
 def test_stages_that_are_taken_from_another_run_are_not_counted():

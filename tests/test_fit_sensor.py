@@ -118,6 +118,22 @@ def test_finds_rings_turning_and_offsets_in_files_written_column_by_column(name,
         assert float(aside.max() - aside.min()) < 0.01  # what is common to all lasers cannot be told from the column
 
 
+def test_a_laser_that_never_returns_leaves_the_offsets_of_the_others():
+    """Files keep its entries, so a firing has as many as before."""
+    sensor = load_sensor("os1_128").with_columns(360)
+    scans = []
+    for seed in range(2):
+        points_xyz_m = room(sensor, seed).points_xyz_m.view(360, sensor.height, 3)
+        points_xyz_m[:, 5] *= 0.5 / points_xyz_m[:, 5].norm(dim=-1, keepdim=True)  # a placeholder
+        scans.append(Scan(points_xyz_m.view(-1, 3), source="a room"))
+    dead = int(np.random.default_rng(0).permutation(sensor.height)[5])
+    made = np.delete(sensor.azimuth_offset_rad.double().numpy(), dead)
+    found = fit_sensor(scans).sensor.azimuth_offset_rad
+    assert found is not None
+    aside = np.degrees(found.double().numpy() - made)
+    assert aside.max() - aside.min() < 0.01
+
+
 def test_finds_the_heights_of_lasers_above_the_origin():
     """KITTI's lasers sit up to 21 cm above the origin of its scans; a slow loop of lines tells the same."""
     rng = np.random.default_rng(0)

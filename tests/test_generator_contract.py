@@ -3,6 +3,7 @@
 import functools
 import itertools
 import re
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -102,6 +103,16 @@ def test_a_seed_gives_the_same_scan_bit_for_bit_whatever_the_batch(name):
     assert not torch.equal(together.range_m[0], together.range_m[1])
 
 
+def test_threads_and_inference_mode_change_no_scan(name):
+    generator, sampling = made(name)
+    together = sampled_together(name)
+    with torch.inference_mode():
+        assert same(generator.sample([3], sampling), together[:1])
+    with ThreadPoolExecutor(2) as pool:
+        found = list(pool.map(lambda seed: generator.sample([seed], sampling), range(3, 7)))
+    assert same(RangeImage.cat(found), together[:4])
+
+
 def test_streams_the_same_scans_without_end(name):
     generator, sampling = made(name)
     streamed = list(itertools.islice(generator.stream(itertools.count(3), sampling), 11))
@@ -114,6 +125,7 @@ def test_seeds_and_settings_that_cannot_be_are_refused(name):
         ([], "no seeds"),
         ([0, -1], "the seed -1"),
         ([1 << 63], "the seed 9223372036854775808"),
+        ([True], "the seed True"),
         ([10**99], "the seed 1000"),
     ):
         with pytest.raises(ConfigError, match=f"^got {message}.*"):

@@ -85,6 +85,11 @@ def test_the_published_recipe_has_the_published_size():
 
 
 @pytest.mark.shared
+def test_no_recipe_of_it_trains_in_16_bits():
+    for name in ("lidargen", "lidargen_small", "lidargen_kitti_360"):
+        assert {fit.precision for fit in load_recipe(name).training.values()} == {"fp32"}
+
+
 def test_noise_levels_and_the_norm_are_the_programs(numbers):
     agree(sigma_table(50.0, 0.01, 232), numbers["sigmas_232"], 1e-6)
     agree(sigma_table(50.0, 0.01, 232) / torch.from_numpy(numbers["sigmas_232"]), torch.ones(232), 1e-6)

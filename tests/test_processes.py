@@ -114,6 +114,13 @@ def play():
     return game.state_dict(), engine.rank
 
 
+def test_a_batch_queue_is_not_taken_for_a_launcher(monkeypatch):
+    for name, value in {"SLURM_NTASKS": "4", "SLURM_JOB_NAME": "train", "SLURM_JOB_ID": "7"}.items():
+        monkeypatch.setenv(name, value)
+    engine = Engine("fp32")
+    assert (engine.rank, engine.world_size) == (0, 1)
+
+
 def steps_with_a_bad_process():
     """Return whether each of two steps, whose loss is not a number in the second process alone, was finite."""
     plain, engine = Plain(), Engine("fp32")

@@ -17,18 +17,22 @@ import yaml
 from PIL import Image
 
 import lidargrit
+from lidargrit import configuration
 from lidargrit.cli import main
 from lidargrit.datasets import _files, data_set_and_split, load, open_dataset
 from lidargrit.datasets import folder as folder_of_scans
 from lidargrit.datasets.kitti_odometry import KittiOdometry
 from lidargrit.errors import CheckpointError
+from lidargrit.files import write_json
 from lidargrit.generators import Generator
 from lidargrit.generators.lidargrit import LidarGrit
 from lidargrit.generators.marginal import Marginal
 from lidargrit.loading import Provenance
 from lidargrit.publishing import publish
 from lidargrit.publishing.card import model_card
+from lidargrit.recipes import load_recipe
 from lidargrit.sources import data_set_of
+from lidargrit.training.taken_stages import taken_facts
 from tiny_runs import MODEL, SHORT, contents, the_one_line
 
 
@@ -269,6 +273,30 @@ def test_the_licence_is_what_the_data_demand(sources, licence):
     assert ("non-commercial" in body) == any(name in " ".join(sources) for name in ("kitti", "nuscenes", "argo"))
     assert "/data" not in body
     assert "example.org" not in body
+
+
+def test_terms_of_weights_that_were_taken_over_stay(tmp_path):
+    """The scans of a donor bind the model as its own do, however many runs lie between."""
+    data = {"data": {"train": ["kitti_odometry:/data/k"]}}
+    fit = {"scans": 8, "batch_size": 2, "learning_rate": 0.1}
+    imported = {"files": [{"name": "vq.pth", "sha256": "ab" * 32}]}
+    write_json(tmp_path / "first" / "run.json", {"recipe": {**data, "training": {"tokenizer": fit}}, **imported})
+    recipe = replace(load_recipe("demo"), tokenizer_from=str(tmp_path / "first"))
+    about = {"recipe": configuration.to_json(recipe), "taken": taken_facts(recipe, {"tokenizer": "first"})}
+    write_json(tmp_path / "second" / "run.json", about)
+    again = replace(recipe, tokenizer_from=None, stages_from=str(tmp_path / "second"), fine_tune=("transformer",))
+    taken = taken_facts(again, {"tokenizer": "second"})
+    assert taken["training"] == {"tokenizer": fit}
+    head, body = head_of(model_card(marginal(), {"recipe": configuration.to_json(again), "taken": taken}, Provenance()))
+    assert head["license"] == "cc-by-nc-sa-3.0"
+    assert "Some of the weights, or those that they were trained from, belong to their authors" in body
+    assert "| train, of the weights that it took | kitti_odometry | all |" in body
+    assert "| tokenizer, taken from another run | 8 | 2 | 0.1 |" in body
+
+
+def test_a_run_of_before_that_does_not_tell_what_it_took_claims_no_free_terms():
+    recipe = {"stages_from": "gone", "data": {"train": ["simulated:8:train"]}}
+    assert head_of(model_card(marginal(), {"recipe": recipe}, Provenance()))[0]["license"] == "other"
 
 
 def test_a_card_of_which_nothing_is_known_claims_nothing():

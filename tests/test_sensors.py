@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from lidargrit import _discovery
 from lidargrit.errors import ConfigError, LidarGritError
 from lidargrit.projection import project, unproject
-from lidargrit.sensors import SensorModel, column_azimuths_rad, load_sensor
+from lidargrit.sensors import SensorModel, column_azimuths_rad, continuous_azimuths_rad, load_sensor
 from lidargrit.structures import RangeImage, Scan
 
 NAMES = _discovery.names("sensors")
@@ -253,3 +253,13 @@ def test_any_value_anywhere_is_read_or_refused(key, value):
     except LidarGritError as error:
         refused = str(error)
     assert "\n" not in refused
+
+
+def test_azimuths_go_on_over_the_seam():
+    """A table from atan2 jumps by a turn where a column lies on both sides of the back."""
+    turn = torch.linspace(3.13, -3.13, 64, dtype=torch.float64)
+    table = turn + torch.tensor([[0.03], [-0.03], [0.0]], dtype=torch.float64)
+    wrapped = torch.atan2(table.sin(), table.cos())
+    assert float((wrapped - table).abs().max()) > 6
+    assert torch.allclose(continuous_azimuths_rad(wrapped), table, atol=1e-12)
+    assert torch.allclose(continuous_azimuths_rad(wrapped.roll(-1, 1))[:, -1], table[:, 0] - 2 * torch.pi, atol=1e-12)

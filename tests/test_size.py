@@ -3,6 +3,7 @@
 import json
 import resource
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from torch import nn
@@ -21,6 +22,12 @@ def test_weights_and_buffers_of_all_modules_are_counted():
         with numbers_at_most(150):
             nn.Sequential(nn.Linear(10, 10), nn.BatchNorm1d(10))
     nn.Linear(100, 100)  # afterwards nothing is counted
+
+
+def test_networks_of_other_threads_are_not_counted():
+    with numbers_at_most(110), ThreadPoolExecutor(1) as pool:
+        pool.submit(nn.Linear, 100, 100).result()
+        nn.Linear(10, 10)
 
 
 def test_modules_are_counted_too_however_small_they_are():

@@ -14,6 +14,9 @@ from lidargrit.untrusted import SEED_AT_MOST
 
 T = TypeVar("T")
 
+COUNTS_SCANS = "counts_scans"
+"""Key of a field's metadata: its number counts scans of the training, and falls with a smaller budget."""
+
 _VALUES_AT_MOST = 1000  # of one setting; the parser takes a second for ten thousand
 _LETTERS_AT_MOST = 100_000  # of one value on the command line: a list of as many long paths
 _RENAMED = {"data.variant": "data.projection_variant"}  # run folders have the former name, and users may type it

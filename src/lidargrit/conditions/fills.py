@@ -16,7 +16,7 @@ from torch import Tensor
 
 from lidargrit.conditions import Condition
 from lidargrit.errors import ScanError
-from lidargrit.sensors import SensorModel
+from lidargrit.sensors import SensorModel, continuous_azimuths_rad
 from lidargrit.structures import RangeImage
 
 EDGE = 0.8  # of ln(1 + range in metres): two observed returns further apart lie on two surfaces
@@ -336,7 +336,7 @@ def _nearest(
 
 def _angles(sensor: SensorModel) -> tuple[Float64[np.ndarray, " H"], Float64[np.ndarray, " W"]]:
     elevation_rad = sensor.elevation_rad.double().mean(1).cpu().numpy()
-    return elevation_rad, sensor.azimuth_rad.double().mean(0).cpu().numpy()
+    return elevation_rad, continuous_azimuths_rad(sensor.azimuth_rad).mean(0).cpu().numpy()
 
 
 def _thrice(azimuth_rad: Float64[np.ndarray, " W"]) -> Float64[np.ndarray, " W*3"]:

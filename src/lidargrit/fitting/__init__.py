@@ -197,9 +197,8 @@ def _model(
 ) -> SensorModel:
     near_m, far_m = range_limits_m(np.concatenate([points.range_m for points in used]))
     offsets = None
-    lasers = len(rows.number)
-    if rings.by_column:
-        offsets = offsets_deg(used, row_of_point, lasers)
+    if rings.lasers:
+        offsets = offsets_deg(used, row_of_point, len(rows.number), rings.lasers)
         if offsets is not None and float(np.ptp(offsets)) < _SHIFT_ASIDE_DEG:
             offsets = None
     return SensorModel(

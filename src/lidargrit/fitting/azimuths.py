@@ -62,24 +62,30 @@ def columns_of_scans(
 
 
 def offsets_deg(
-    scans: Sequence[Points], rings: Sequence[Int64[np.ndarray, "_"]], lasers: int
+    scans: Sequence[Points], rings: Sequence[Int64[np.ndarray, "_"]], count: int, lasers: int
 ) -> Float64[np.ndarray, "H"] | None:
     """Return each laser's azimuth offset from its firing, counter-clockwise, for files written column by column.
 
     Only files that keep an entry for every laser of a firing show it: the firing of a point is then its index in the
     file divided by the number of lasers.
 
+    Args:
+        scans: points of each scan.
+        rings: ring of each point, counted from 0; -1 for none.
+        count: number of rings.
+        lasers: number of entries of a firing in the files; some may never have returned.
+
     Returns:
         one number a ring, in the order of the rings' numbers; None if a laser has too few far points.
     """
-    aside: list[list[np.ndarray]] = [[] for _ in range(lasers)]
+    aside: list[list[np.ndarray]] = [[] for _ in range(count)]
     for points, ring in zip(scans, rings, strict=True):
         firing = points.index // lasers
         far = (points.range_m > _FAR_M) & (ring >= 0)
         azimuth = np.radians(points.azimuth_deg[far])
         east, north = (np.bincount(firing[far], part)[firing[far]] for part in (np.cos(azimuth), np.sin(azimuth)))
         off = (np.degrees(azimuth - np.arctan2(north, east)) + 180) % 360 - 180
-        for number in range(lasers):
+        for number in range(count):
             aside[number].append(off[ring[far] == number])
     merged = [np.concatenate(parts) for parts in aside]
     if any(len(values) < 20 for values in merged):

@@ -36,7 +36,7 @@ class Rings:
         counter_clockwise: whether the sensor turns counter-clockwise, seen from above; None if the order of points does
             not show it.
         start_deg: azimuth where a file begins its rings or its first column; None if unknown.
-        by_column: whether files keep an entry for every laser of every firing, one firing after another.
+        lasers: number of entries of a firing, where files keep one for every laser, one firing after another; else 0.
     """
 
     method: Method
@@ -44,7 +44,7 @@ class Rings:
     used: tuple[int, ...]
     counter_clockwise: bool | None = None
     start_deg: float | None = None
-    by_column: bool = False
+    lasers: int = 0
 
 
 def recover_rings(scans: Sequence[Points]) -> Rings | None:
@@ -57,7 +57,7 @@ def recover_rings(scans: Sequence[Points]) -> Rings | None:
         field = tuple(points.ring for points in scans if points.ring is not None)
         columns = _column_by_column(scans)
         turning, start = _turning(scans, field)
-        return Rings("ring field", field, tuple(range(len(scans))), turning, start, columns is not None)
+        return Rings("ring field", field, tuple(range(len(scans))), turning, start, columns.lasers if columns else 0)
     return _ring_by_ring(scans) or _column_by_column(scans)
 
 
@@ -108,7 +108,7 @@ def _column_by_column(scans: Sequence[Points]) -> Rings | None:
         return None
     numbers = tuple(points.index % lasers for points in scans)
     turning, start = _turning(scans, numbers)
-    return Rings("column by column", numbers, tuple(range(len(scans))), turning, start, by_column=True)
+    return Rings("column by column", numbers, tuple(range(len(scans))), turning, start, lasers)
 
 
 def _turning(scans: Sequence[Points], numbers: Sequence[Int64[np.ndarray, "_"]]) -> tuple[bool | None, float | None]:

@@ -22,6 +22,7 @@ from lidargrit.generators._hub import download
 from lidargrit.generators._saved import ConfigT, SavedModel
 from lidargrit.loading import RangeImages
 from lidargrit.nn.objective import Objective
+from lidargrit.nn.precision import Precision
 from lidargrit.nn.quantization import without_quantized
 from lidargrit.nn.range_steps import RangeSteps
 from lidargrit.nn.size import numbers_at_most
@@ -67,6 +68,9 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     Sampling: ClassVar[type] = NoSampling
     capabilities: ClassVar[frozenset[str]] = frozenset()
     facts: ClassVar[SystemFacts] = SystemFacts(generates="range images")
+    training_precision: ClassVar[Precision] = "auto"
+    """Precision in which stages are trained where no recipe names one."""
+
     published_files: ClassVar[tuple[str, ...]] = ()
     """Contents of the files in which the system's authors published weights, in order; empty if we read none."""
 

@@ -44,5 +44,5 @@ def in_batches(seeds: Sequence[int], size: int, compute: Callable[[list[int], Ba
     for first in range(0, len(seeds), size):
         wanted = range(first, min(first + size, len(seeds)))
         indices = [*wanted, *[wanted[-1]] * (size - len(wanted))]
-        parts.append(compute(indices, BatchSeeds([seeds[index] for index in wanted], size))[: len(wanted)])
+        parts.append(compute(indices, BatchSeeds([int(seeds[index]) for index in wanted], size))[: len(wanted)])
     return RangeImage.cat(parts)

@@ -24,7 +24,7 @@ def check_seeds(seeds: Sequence[int], count: int | None = None) -> None:
     if not len(seeds):
         raise ConfigError("no seeds", "at least one, such as seeds=[0]", "name a seed for each scan")
     for seed in seeds:
-        if not isinstance(seed, Integral) or not 0 <= seed <= SEED_AT_MOST:
+        if not isinstance(seed, Integral) or isinstance(seed, bool) or not 0 <= seed <= SEED_AT_MOST:
             raise ConfigError(f"the seed {str(seed)[:30]}", "a whole number from 0 to 2^63 - 1", "choose another seed")
 
 

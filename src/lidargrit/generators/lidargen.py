@@ -108,6 +108,7 @@ class LidarGen(Generator[LidarGenConfig, LangevinSampling]):
     """
 
     Config = LidarGenConfig
+    training_precision = "fp32"  # 16 bits round away the noise of the last levels
     facts = SystemFacts(
         generates="range and reflectance; a range outside a window is no return",
         paper="Zyrianov, Zhu and Wang, Learning to Generate Realistic LiDAR Point Clouds, ECCV 2022",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -145,6 +146,7 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         height, width = self.tokenizer.grid_size
         self.transformer = CausalTransformer(config.transformer, self.tokenizer.num_codes, height * width)
         self._prepared: _Prepared | None = None
+        self._one_at_a_time = threading.Lock()
         self.completion: CompletionNetwork | None = None
         if config.completion is not None:
             self.completion = CompletionNetwork(config.completion, sensor)
@@ -214,10 +216,11 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         """
         self.check_choice(sampling.mask)
         uniform = torch.stack([torch.rand(self.transformer.context_length, generator=rng) for rng in rngs])
-        decoder, tokenizer = self._prepare(len(rngs), sampling)
         tokens = None if condition is None else self.observed_tokens(condition)
-        if tokens is None or bool((tokens < 0).any()):
-            tokens = decoder.generate(uniform.to(self.device), tokens)
+        with self._one_at_a_time:  # threads would write into one cache
+            decoder, tokenizer = self._prepare(len(rngs), sampling)
+            if tokens is None or bool((tokens < 0).any()):
+                tokens = decoder.generate(uniform.to(self.device), tokens)
         return self.decode(tokens, count, rngs, sampling.mask, sampling.pixels(), tokenizer, condition)
 
     def _completing_network(
@@ -254,9 +257,11 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         decoding = self.decoding_cost((sampling or TokenSampling()).mask)
         return Cost(tokens + decoding.network_evaluations, products + head + decoding.flops)
 
+    @torch.inference_mode(False)  # what is kept may be used outside of it, too
+    @torch.no_grad()
     def _prepare(self, batch_size: int, sampling: TokenSampling) -> tuple[CachedDecoder, Tokenizer]:
         """Return what generates tokens and what decodes them, kept from the last call if nothing has changed since."""
-        weights = tuple((weight.data_ptr(), weight._version) for weight in self.parameters())
+        weights = tuple((each.data_ptr(), -1 if each.is_inference() else each._version) for each in self.parameters())
         choices = (sampling.temperature, sampling.top_k, sampling.top_p, sampling.weights, sampling.decoder)
         key = (batch_size, choices, weights)
         if self._prepared is None or self._prepared.key != key:
@@ -267,8 +272,13 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         return self._prepared.decoder, self._prepared.tokenizer
 
     def __getstate__(self) -> dict[str, object]:
-        """Leave out what can be prepared again: it holds functions that cannot be pickled."""
-        return {**self.__dict__, "_prepared": None}
+        """Leave out what can be made again: functions and locks cannot be pickled."""
+        return {name: value for name, value in self.__dict__.items() if name not in ("_prepared", "_one_at_a_time")}
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        """Make again what was left out."""
+        super().__setstate__(state)
+        self._prepared, self._one_at_a_time = None, threading.Lock()
 
     @classmethod
     def from_published(cls, files: Sequence[Path], config: LidarGritConfig, sensor: SensorModel) -> LidarGrit:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidargrit.conditions import Condition
+from lidargrit.configuration import COUNTS_SCANS
 from lidargrit.errors import CheckpointError, ConfigError
 from lidargrit.files import load_exactly
 from lidargrit.generators import Cost, Generator, SystemFacts
@@ -59,7 +60,7 @@ class LidarVaeConfig:
     channels: int = 64
     rows: int = 40
     first_row: int = 17
-    warmup_scans: int = 0
+    warmup_scans: int = field(default=0, metadata={COUNTS_SCANS: True})
     free_nats: float = 5.0
     initial_std: float = 0.02
 

@@ -19,7 +19,7 @@ from lidargrit.nn.hdit import Hdit, HditConfig
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.r2flow_checkpoint import read_r2flow_checkpoint
 from lidargrit.nn.size import numbers_of_file
-from lidargrit.sensors import SensorModel
+from lidargrit.sensors import SensorModel, continuous_azimuths_rad
 from lidargrit.structures import RangeImage
 
 _COST_SEED = 0
@@ -64,7 +64,7 @@ class R2flow(Generator[R2flowConfig, FlowSampling]):
     def __init__(self, config: R2flowConfig, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
         self.shape = (1 + config.reflectance, sensor.height, sensor.width)
-        angles = torch.broadcast_tensors(sensor.elevation_rad, sensor.azimuth_rad)
+        angles = torch.broadcast_tensors(sensor.elevation_rad, continuous_azimuths_rad(sensor.azimuth_rad).float())
         self.network = Hdit(config.hdit, self.shape[0], *(angle.contiguous() for angle in angles))
 
     @classmethod

@@ -144,7 +144,7 @@ class UltraLidar(Generator[UltraLidarConfig, VoxelSampling]):
         check_seeds(seeds)
         settings = self._settings(sampling, self.Sampling)
         self.eval()
-        return torch.cat([self._voxels(seed, settings) for seed in seeds])
+        return torch.cat([self._voxels(int(seed), settings) for seed in seeds])
 
     def _sample(self, seeds: Sequence[int], sampling: VoxelSampling) -> RangeImage:
         occupied = torch.cat([self._voxels(seed, sampling) for seed in seeds])

@@ -27,7 +27,7 @@ from lidargrit.nn.pixel_networks import LOGIT_BOUND, Guide, MaskNetwork
 from lidargrit.nn.reflectance import TYPICAL_REFLECTANCE
 from lidargrit.nn.semantic_classes import NUM_CLASSES, ClassMaps, class_indices, labels_of, votes
 from lidargrit.nn.small_unet import Part, SmallUnet, SmallUnetConfig, check_image
-from lidargrit.sensors import SensorModel
+from lidargrit.sensors import SensorModel, mean_azimuths_rad
 from lidargrit.structures import RangeImage
 
 _TRUST = 3.0  # logit by which triangulation is preferred to the other candidates at first
@@ -112,7 +112,7 @@ class CompletionNetwork(nn.Module):
         self.config = config
         self.limits_v = (math.log1p(sensor.range_min_m), math.log1p(sensor.range_max_m))
         self.rows = nn.Parameter(torch.zeros(config.row_channels, sensor.height))
-        azimuth_rad = sensor.azimuth_rad.double().mean(0).float()
+        azimuth_rad = mean_azimuths_rad(sensor.azimuth_rad).float()
         self.register_buffer("azimuth", torch.stack((azimuth_rad.sin(), azimuth_rad.cos())), persistent=False)
         sizes = SmallUnetConfig(config.widths, config.blocks, config.attention_layers, config.heads)
         self.classes = ClassMaps(_CLASS_CHANNELS) if config.labels else None

@@ -82,6 +82,7 @@ class CachedDecoder:
         # The products of a step: four projections and a perceptron of four times the width in each block, and the head.
         self._step_flops = 2 * batch_size * (12 * len(self._blocks) * width**2 + self._head.numel())
 
+    @torch.inference_mode(False)  # its tensors are written to in later calls, which may be outside of it
     @torch.no_grad()
     def generate(self, uniform: Float[Tensor, "B T"], observed: Int[Tensor, "B T"] | None = None) -> Int[Tensor, "B T"]:
         """Generate one sequence for each row of uniform numbers in [0, 1), one number a token.

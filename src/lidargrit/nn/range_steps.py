@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from numbers import Integral
 
 import torch
 from jaxtyping import Float, Int
@@ -35,7 +36,7 @@ class RangeSteps:
     step_mm: int
 
     def __post_init__(self) -> None:
-        if not (isinstance(self.step_mm, int) and 1 <= self.step_mm <= _COARSEST_MM):
+        if not (isinstance(self.step_mm, Integral) and 1 <= self.step_mm <= _COARSEST_MM):
             raise ConfigError(
                 f"a step of {self.step_mm} mm",
                 f"a whole number of millimetres from 1 to {_COARSEST_MM}",

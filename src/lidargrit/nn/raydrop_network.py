@@ -17,7 +17,7 @@ from lidargrit.nn.pixel_networks import LOGIT_BOUND, Guide, MaskNetwork
 from lidargrit.nn.reflectance import TYPICAL_REFLECTANCE
 from lidargrit.nn.semantic_classes import ClassMaps, class_indices
 from lidargrit.nn.small_unet import Part, SmallUnet, SmallUnetConfig, check_image
-from lidargrit.sensors import SensorModel
+from lidargrit.sensors import SensorModel, mean_azimuths_rad
 from lidargrit.structures import TYPICAL_LOG_RANGE, RangeImage
 
 _EDGE = 0.5  # of ln(range): neighbours further apart lie on two surfaces
@@ -93,7 +93,7 @@ class RaydropNetwork(nn.Module):
         check_image(sensor, "a network of raydrop")
         self.config = config
         self.rows = nn.Parameter(torch.zeros(config.row_channels, sensor.height))
-        azimuth_rad = sensor.azimuth_rad.double().mean(0).float()
+        azimuth_rad = mean_azimuths_rad(sensor.azimuth_rad).float()
         self.register_buffer("azimuth", torch.stack((azimuth_rad.sin(), azimuth_rad.cos())), persistent=False)
         elevation_rad = sensor.elevation_rad.double().mean(1).float()
         self.register_buffer("elevation_rad", elevation_rad, persistent=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
@@ -30,6 +31,8 @@ def numbers_at_most(
 ) -> Iterator[None]:
     """Refuse to build networks of more than ``count`` numbers within the ``with`` block, before memory is filled.
 
+    Networks that other threads build meanwhile do not count.
+
     Weights and buffers are counted as modules register them, which they do before they fill them. More than
     20,000 modules are refused, too, however small they are.
 
@@ -41,10 +44,12 @@ def numbers_at_most(
     Raises:
         ConfigError: there are more, or the system has no memory for one of them.
     """
-    found = 0
+    found, own = 0, threading.get_ident()  # the hooks see the networks of all threads
 
     def add(module: nn.Module, name: str, tensor: Tensor | None) -> None:
         nonlocal found
+        if threading.get_ident() != own:
+            return
         found += 0 if tensor is None else tensor.numel()
         if found > count:
             raise ConfigError(f"{what} of more than {count:,} numbers", "fewer", cure)
@@ -53,6 +58,8 @@ def numbers_at_most(
 
     def add_module(module: nn.Module, name: str, part: nn.Module | None) -> None:
         nonlocal modules
+        if threading.get_ident() != own:
+            return
         modules += 1
         if modules > _MODULES_AT_MOST:
             raise ConfigError(f"{what} of more than {_MODULES_AT_MOST:,} modules", "fewer", cure)

@@ -129,16 +129,20 @@ def _refuse_taken(folder: Path, begun: dict[str, Any] | None) -> None:
 
 def _public_facts(about: dict[str, Any], generator: Generator) -> dict[str, Any]:
     """Return the facts of ``run.json`` without the command, and with data sets and splits in place of sources."""
-    recipe = about.get("recipe", {})
-    data = recipe.get("data", {})
+    settings = about.get("recipe", {})
+    data = settings.get("data", {})
     sources = {part: ["::".join(data_set_of(source)) for source in data.get(part, ())] for part in ("train", "val")}
     recipe = {
-        **recipe,
+        **settings,
         "tokenizer_from": None,
         "stages_from": None,
         "data": {**data, **sources, "sensor": generator.sensor.name},
     }
     kept = {name: about[name] for name in ("files", "lidargrit", "commit", "torch", "python") if name in about}
+    if taken := about.get("taken", {}):
+        kept["taken"] = {**taken, "train": ["::".join(data_set_of(source)) for source in taken["train"]]}
+    elif settings.get("tokenizer_from") or settings.get("stages_from"):
+        kept["taken"] = {"train": ["::"], "files": [], "training": {}}  # a run of before does not say what it took
     return {"origin": "published", **kept, "recipe": recipe}
 
 

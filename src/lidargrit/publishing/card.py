@@ -5,7 +5,6 @@ from __future__ import annotations
 import html
 import json
 import re
-from collections.abc import Iterable
 from typing import Any
 
 from lidargrit import _discovery
@@ -110,6 +109,10 @@ def _data(about: dict[str, Any], learned: Provenance) -> str:
             licence = load_dataset(name).licence if name else "not known"
             lines.append(f"| {part} | {name or 'unnamed scans'} | {_text(split) or '-'} | {licence} |")
             leaks += _leaks(name, split)
+    own = {data_set_of(source) for source in data.get("train", ())}
+    for name, split in sorted({data_set_of(source) for source in about.get("taken", {}).get("train", ())} - own):
+        cells = (name or "unnamed scans", _text(split) or "-", load_dataset(name).licence if name else "not known")
+        lines.append(f"| train, of the weights that it took | {' | '.join(cells)} |")
     lines += ["", *dict.fromkeys(leaks)]
     if variant := recipe_settings(about).get("data.projection_variant"):
         lines.append(f"The training scans were projected by the {_code(variant)} variant; project others by the same.")
@@ -130,8 +133,9 @@ def _leaks(name: str, split: str) -> list[str]:
 
 def _licence(about: dict[str, Any], licences: list[str]) -> str:
     lines = ["## Licence", ""]
-    if _imported(about):
-        lines.append("The weights belong to their authors; ask them whether the weights may be used and passed on.")
+    if _has_imported(about):
+        whose = "The weights" if _imported(about) else "Some of the weights, or those that they were trained from,"
+        lines.append(f"{whose} belong to their authors; ask them whether they may be used and passed on.")
     if any("non-commercial" in licence for licence in licences):
         lines.append("The training data are for non-commercial use only: treat the weights as non-commercial too.")
     lines += [f"Terms of the training data: {licence}." for licence in licences]
@@ -155,8 +159,10 @@ def _training(about: dict[str, Any]) -> str:
         )
     lines = ["## Training", "", f"Recipe: {_text(recipe.get('title', 'unknown'))}.", ""]
     lines += ["| stage | scans seen | batch | learning rate |", "|---|---|---|---|"]
-    for stage, fit in recipe.get("training", {}).items():
-        lines.append(f"| {_text(stage)} | {fit['scans']:,} | {fit['batch_size']:,} | {fit['learning_rate']:g} |")
+    taken = about.get("taken", {}).get("training", {})
+    for stage, fit in {**recipe.get("training", {}), **taken}.items():
+        name = f"{_text(stage)}{', taken from another run' if stage in taken else ''}"
+        lines.append(f"| {name} | {fit['scans']:,} | {fit['batch_size']:,} | {fit['learning_rate']:g} |")
     if not recipe.get("training"):
         lines = ["## Training", "", "The run does not say how the model was trained."]
     software = [f"{name} {_text(about[name])}" for name in ("lidargrit", "commit", "torch", "python") if name in about]
@@ -211,8 +217,16 @@ def _imported(about: dict[str, Any]) -> bool:
     return bool(about.get("files"))
 
 
+def _has_imported(about: dict[str, Any]) -> bool:
+    """Return whether weights of the model, or those that it began with, were imported."""
+    return _imported(about) or bool(about.get("taken", {}).get("files"))
+
+
 def _licences(about: dict[str, Any]) -> list[str]:
-    sources: Iterable[str] = about.get("recipe", {}).get("data", {}).get("train", ())
+    recipe, taken = about.get("recipe", {}), about.get("taken", {})
+    sources: set[str] = {*recipe.get("data", {}).get("train", ()), *taken.get("train", ())}
+    if not taken and (recipe.get("tokenizer_from") or recipe.get("stages_from")):
+        sources.add("")  # a run of before does not say what it took
     names = {data_set_of(source)[0] for source in sources}
     return sorted({load_dataset(name).licence if name else "not known" for name in names})
 

@@ -49,7 +49,7 @@ def default_recipe(generator: str) -> Recipe:
         schedule="cosine",
         warmup_scans=100,
         average_over_scans=100,
-        precision="auto",
+        precision=cls.training_precision,
         validate_every=500,
         validation_scans=16,
         checkpoint_every=500,

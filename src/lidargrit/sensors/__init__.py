@@ -16,6 +16,7 @@ from lidargrit.files import read_json
 from lidargrit.sensors._checks import FINE_COLUMNS_AT_MOST, check_projection, check_tables, checked_entries
 from lidargrit.sensors._checks import NAME_AT_MOST as NAME_AT_MOST
 from lidargrit.sensors._columns import column_azimuths_rad
+from lidargrit.sensors._columns import continuous_azimuths_rad as continuous_azimuths_rad
 from lidargrit.sensors._columns import mean_azimuths_rad as mean_azimuths_rad
 from lidargrit.untrusted import user_path
 

@@ -19,3 +19,12 @@ def mean_azimuths_rad(azimuth_rad: Float[Tensor, "H W"]) -> Float[Tensor, " W"]:
     """Return the mean azimuth of every column around the circle, in 64 bits, from -pi to +pi."""
     table = azimuth_rad.double()
     return torch.atan2(table.sin().mean(dim=0), table.cos().mean(dim=0))
+
+
+def continuous_azimuths_rad(azimuth_rad: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
+    """Return azimuths without a jump of a full turn from one column or row to the next, in 64 bits."""
+    of_columns = mean_azimuths_rad(azimuth_rad)
+    turns = ((of_columns.diff(prepend=of_columns[:1]) + math.pi) / (2 * math.pi)).floor().cumsum(0)
+    of_columns = of_columns - 2 * math.pi * turns
+    aside = azimuth_rad.double() - of_columns
+    return of_columns + torch.atan2(aside.sin(), aside.cos())

@@ -5,12 +5,14 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from itertools import product
+from typing import Any
 
 import torch
 
+from lidargrit.configuration import COUNTS_SCANS
 from lidargrit.errors import ConfigError
 from lidargrit.generators import Generator
 from lidargrit.nn.flops import FlopCounter
@@ -130,7 +132,8 @@ def with_budget(recipe: Recipe, flops: float) -> Recipe:
 
     Stages that are taken from another run stay as they are: they are not trained.
 
-    Warm-up and the distance between validations are scaled by the same factor; the half-life of averages only falls.
+    Warm-up and the distance between validations are scaled by the same factor; the half-life of averages and settings
+    of the model that count scans only fall.
 
     Args:
         recipe: recipe to scale.
@@ -149,7 +152,7 @@ def with_budget(recipe: Recipe, flops: float) -> Recipe:
         # What is prepared once, such as a reflow's pairs, does not grow or shrink in proportion.
         share *= flops / spent
         trained = {name: _scaled(recipe.settings_of(name), share) for name in costs}
-        scaled = replace(recipe, training={**recipe.training, **trained})
+        scaled = replace(recipe, training={**recipe.training, **trained}, model=_with_fewer_scans(recipe.model, share))
         spent = _flops_of(costs, scaled)
         if best_spent < spent <= flops * (1 + _OVERSPENT_AT_MOST):  # whole batches may come no nearer
             best, best_spent = scaled, spent
@@ -179,11 +182,20 @@ def _scaled(config: FitConfig, share: float) -> FitConfig:
     )
 
 
+def _with_fewer_scans(model: Any, share: float) -> Any:
+    """Return a generator's configuration with the settings that count training scans lowered to a share."""
+    counted = [each.name for each in fields(model) if COUNTS_SCANS in each.metadata]
+    return replace(model, **{name: round(getattr(model, name) * min(share, 1)) for name in counted})
+
+
 def uniform_images(sensor: SensorModel, count: int) -> RangeImage:
-    """Return range images whose every pixel returns at 10 m, for counting operations and measuring speed."""
+    """Return range images whose every pixel returns at 10 m, for counting operations and measuring speed.
+
+    Their reflectance is also a mark of surfaces that return; see lidargrit.conditions.marks.
+    """
     range_m = torch.full((count, sensor.height, sensor.width), 10.0).clamp(sensor.range_min_m, sensor.range_max_m)
     mask, label = torch.ones_like(range_m, dtype=torch.bool), torch.full(range_m.shape, 40)
-    return RangeImage(range_m, mask, sensor, torch.full_like(range_m, 0.3), label)
+    return RangeImage(range_m, mask, sensor, torch.full_like(range_m, 0.65), label)
 
 
 class _SeedOfNoValues(torch.Generator):

@@ -35,12 +35,13 @@ class Engine:
 
     def __init__(self, precision: Precision, reaches_all_weights: bool = True) -> None:
         from lightning_fabric import Fabric  # noqa: PLC0415  takes a second, and only training needs it
+        from lightning_fabric.plugins.environments.lightning import LightningEnvironment  # noqa: PLC0415
         from lightning_fabric.plugins.environments.torchelastic import TorchElasticEnvironment  # noqa: PLC0415
         from lightning_fabric.strategies.ddp import DDPStrategy  # noqa: PLC0415
 
         logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # it prints the precision at every start
         # One device, unless a launcher such as torchrun began this process as one of several.
-        where: dict[str, Any] = {"devices": 1}
+        where: dict[str, Any] = {"devices": 1, "plugins": [LightningEnvironment()]}  # whatever a batch queue has set
         _, processes = rank_and_world_size(None, None)
         if "LOCAL_RANK" in os.environ and processes > 1:
             here = int(os.environ.get("LOCAL_WORLD_SIZE", processes))

@@ -31,8 +31,9 @@ from lidargrit.training.config import FitConfig, Recipe
 from lidargrit.training.engine import Engine
 from lidargrit.training.fit import Fit
 from lidargrit.training.plan import check_stages
-from lidargrit.training.taken_stages import check_donor, taken_stages
+from lidargrit.training.taken_stages import check_donor, taken_facts, taken_stages
 
+_IMAGES = "_images"  # of a hash of images, in place of their names
 # Settings of a recipe that change nothing that is computed, the last two of each stage.
 _NO_CHANGE, _NO_CHANGE_OF_STAGES = {"title", "published", "data.workers"}, ("checkpoint_every", "pictures_every")
 
@@ -87,7 +88,7 @@ def _train(
         torch.manual_seed(derive_seed(recipe.seed, 9))
         generator = recipe.build_generator()
         taken = taken_stages(recipe, generator)
-        engine.by_first(lambda: _claim(folder, recipe, train_images, val_images))
+        engine.by_first(lambda: _claim(folder, recipe, donors, train_images, val_images))
         generator.fit_statistics(train_images)
         built_on = ""
         for number, stage in enumerate(generator.stages):
@@ -157,12 +158,17 @@ def _defaults(recipe: Recipe) -> dict[str, Any]:
     return configuration.leaves(configuration.to_json(plain))
 
 
-def _claim(folder: Path, recipe: Recipe, train_images: RangeImages, val_images: RangeImages) -> None:
+def _claim(
+    folder: Path, recipe: Recipe, donors: Mapping[str, str], train_images: RangeImages, val_images: RangeImages
+) -> None:
     """Write ``run.json``, or check that a resumed run has the data with which it began."""
     data = {
         "sensor": train_images.sensor.to_json(),
-        "train": hashlib.sha256("\n".join(train_images.provenance.names).encode()).hexdigest(),
-        "val": hashlib.sha256("\n".join(val_images.provenance.names).encode()).hexdigest(),
+        **{
+            f"{part}{what}": hashlib.sha256("\n".join(values).encode()).hexdigest()
+            for part, images in (("train", train_images), ("val", val_images))
+            for what, values in (("", images.provenance.names), (_IMAGES, images.provenance.fingerprints))
+        },
     }
     if (folder / RUN_FILE).exists():
         before = read_json(folder / RUN_FILE).get("data", data)
@@ -171,9 +177,10 @@ def _claim(folder: Path, recipe: Recipe, train_images: RangeImages, val_images: 
                 f"{folder / RUN_FILE}, whose 'data' hold no names", "what lidargrit wrote", "restore it"
             )
         for name, value in data.items():
-            if before.get(name) != value:
+            if before.get(name, value if name.endswith(_IMAGES) else None) != value:  # runs of before lack images
+                part = name.removesuffix(_IMAGES)
                 raise OutputError(
-                    f"{folder}, whose run began with {'another sensor' if name == 'sensor' else f'other {name} scans'}",
+                    f"{folder}, whose run began with {'another sensor' if name == 'sensor' else f'other {part} scans'}",
                     "what it began with",
                     "restore it, or choose another folder",
                 )
@@ -182,6 +189,7 @@ def _claim(folder: Path, recipe: Recipe, train_images: RangeImages, val_images: 
     about: dict[str, Any] = {
         "recipe": configuration.to_json(recipe),
         "data": data,
+        **({"taken": taken_facts(recipe, donors)} if donors or recipe.fine_tune else {}),
         "command": sys.argv,
         "lidargrit": __version__,
         "commit": _commit(),

@@ -11,10 +11,13 @@ from torch import Tensor
 
 from lidargrit import configuration
 from lidargrit.errors import ConfigError
+from lidargrit.files import read_json
 from lidargrit.generators import Generator, load
 from lidargrit.nn.objective import Objective
-from lidargrit.run_folder import is_run, locate
+from lidargrit.run_folder import RUN_FILE, is_run, locate
 from lidargrit.training.config import Recipe
+
+_UNKNOWN = "a run that does not say on which scans it was trained"
 
 
 def check_donor(recipe: Recipe) -> None:
@@ -45,6 +48,28 @@ def donors_of_stages(recipe: Recipe, stages: Sequence[str]) -> dict[str, str]:
     theirs = load(Path(recipe.stages_from)).stages
     trained = {*recipe.train_anew, *recipe.fine_tune}
     return {stage: recipe.stages_from for stage in stages if stage in theirs and stage not in trained}
+
+
+def taken_facts(recipe: Recipe, donors: Mapping[str, str]) -> dict[str, Any]:
+    """Return what a run must tell of the weights that it takes: training scans and files of all before it.
+
+    Args:
+        recipe: recipe that takes them.
+        donors: run from which a stage is taken as it is, by the name of the stage.
+
+    Returns:
+        sources of training scans (``train``), files of imported weights (``files``), and the settings by which the
+        stages that are not trained here were trained (``training``).
+    """
+    folder = locate(recipe.tokenizer_from or recipe.stages_from or "")
+    about = read_json(folder / RUN_FILE) if (folder / RUN_FILE).is_file() else {}
+    before, theirs = about.get("taken", {}), about.get("recipe", {})
+    trained = {**theirs.get("training", {}), **before.get("training", {})}
+    return {
+        "train": sorted({*theirs.get("data", {}).get("train", [_UNKNOWN]), *before.get("train", ())}),
+        "files": [*about.get("files", ()), *before.get("files", ())],
+        "training": {stage: trained[stage] for stage in donors if stage in trained},
+    }
 
 
 def taken_stages(recipe: Recipe, generator: Generator) -> dict[str, Objective]:
