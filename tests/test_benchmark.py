@@ -8,6 +8,7 @@ import torch
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
+from lidargrit import configuration
 from lidargrit.cli import main
 from lidargrit.conditions.marks import read_marks
 from lidargrit.datasets import load
@@ -17,7 +18,7 @@ from lidargrit.evaluation.benchmark import Benchmark, as_table
 from lidargrit.evaluation.benchmark import run as run_benchmark
 from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.evaluation.intervals import Resampling
-from lidargrit.files import claim_folder
+from lidargrit.files import claim_folder, write_json
 from lidargrit.generators import load_class
 from lidargrit.loading import DataConfig, prepare
 from lidargrit.nn.flops import flops_of
@@ -334,13 +335,35 @@ def test_the_time_of_many_scans_outlives_that_of_one(tmp_path):
     assert json.loads(costs.read_text())["seconds_per_scan"] == before["seconds_per_scan"]
 
 
+def test_a_time_that_is_lacking_is_added(tmp_path):
+    """Earlier versions wrote the number of samples beside a time that they had not taken."""
+    run_benchmark(["marginal"], tmp_path, BENCHMARK)
+    costs = tmp_path / "marginal" / benchmark.COSTS
+    costs.write_text(json.dumps(json.loads(costs.read_text()) | {"seconds_per_scan": None, "scans": 256}))
+    (tmp_path / "marginal" / "samples" / "00000003.npz").unlink()
+    run_benchmark(["marginal"], tmp_path, BENCHMARK)
+    assert json.loads(costs.read_text())["seconds_per_scan"] > 0
+
+
+def test_a_finished_run_of_before_keeps_its_warm_up(tmp_path, monkeypatch):
+    """Budgets once left settings of a model that count scans as they were."""
+    recipe = load_recipe("lidarvae_small", FEW)
+    flops = sum(training_flops(recipe).values()) / 4
+    trained = tmp_path / "runs" / "lidarvae_small"
+    before = replace(with_budget(recipe, flops), model=recipe.model)
+    write_json(trained / "run.json", {"recipe": configuration.to_json(before)})
+    monkeypatch.setattr(benchmark, "is_run", lambda folder: folder == trained)
+    plan = benchmark._Plan.of("lidarvae_small", tmp_path, Benchmark("simulated:8:test", 8, QUICK, FEW, flops))
+    assert plan.recipe.model.warmup_scans == recipe.model.warmup_scans
+
+
 def test_metrics_of_which_none_can_be_made_are_refused_before_training(tmp_path, monkeypatch):
     monkeypatch.setattr(benchmark, "train", lambda *_: pytest.fail("trained"))
 
     def no_weights(*_args, **_options):
         raise LidarGritError("no weights", "weights", "get them")
 
-    monkeypatch.setattr(benchmark, "MetricFactory", lambda *_args, **_options: no_weights)
+    monkeypatch.setattr(benchmark, "metric_factory", lambda *_args, **_options: no_weights)
     with pytest.raises(LidarGritError, match="no weights"):
         run_benchmark(["marginal"], tmp_path / "table", BENCHMARK)
 

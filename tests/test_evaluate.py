@@ -1,5 +1,6 @@
 """Protocols, scorecards and tables: what is compared, what is told of it, and what never stands side by side."""
 
+import argparse
 import itertools
 import json
 import re
@@ -151,6 +152,17 @@ def test_scores_are_printed_where_no_file_can_be_written(sets, monkeypatch, caps
     printed = capsys.readouterr()
     assert "bev_jsd" in printed.out
     assert "a full disk" in printed.err
+
+
+def test_the_file_is_written_though_nobody_reads_the_table(monkeypatch, tmp_path):
+    def gone(*_args, **_options):
+        raise BrokenPipeError
+
+    monkeypatch.setattr(_results, "print", gone, raising=False)
+    options = argparse.Namespace(json=tmp_path / "a.json")
+    with pytest.raises(BrokenPipeError):
+        _results.print_result(options, "table", {"a": 1})
+    assert json.loads(options.json.read_text()) == {"a": 1}
 
 
 def test_a_foreign_name_reaches_no_terminal_as_code(card, tmp_path):

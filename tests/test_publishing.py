@@ -286,16 +286,20 @@ def test_terms_of_weights_that_were_taken_over_stay(tmp_path):
     write_json(tmp_path / "second" / "run.json", about)
     again = replace(recipe, tokenizer_from=None, stages_from=str(tmp_path / "second"), fine_tune=("transformer",))
     taken = taken_facts(again, {"tokenizer": "second"})
-    assert taken["training"] == {"tokenizer": fit}
+    assert taken["training"] == {"tokenizer": None}, "no run of ours trained it"
     head, body = head_of(model_card(marginal(), {"recipe": configuration.to_json(again), "taken": taken}, Provenance()))
     assert head["license"] == "cc-by-nc-sa-3.0"
     assert "Some of the weights, or those that they were trained from, belong to their authors" in body
     assert "| train, of the weights that it took | kitti_odometry | all |" in body
-    assert "| tokenizer, taken from another run | 8 | 2 | 0.1 |" in body
+    assert "| tokenizer, taken from another run | not known | - | - |" in body
+    assert f"- `vq.pth`, SHA-256 `{'ab' * 32}`" in body
 
 
-def test_a_run_of_before_that_does_not_tell_what_it_took_claims_no_free_terms():
+def test_a_run_of_before_that_does_not_tell_what_it_took_claims_no_free_terms(tmp_path):
     recipe = {"stages_from": "gone", "data": {"train": ["simulated:8:train"]}}
+    write_json(tmp_path / "run.json", {"recipe": recipe})
+    over = taken_facts(replace(load_recipe("demo"), stages_from=str(tmp_path)), {"tokenizer": "it"})
+    assert head_of(model_card(marginal(), {"recipe": {}, "taken": over}, Provenance()))[0]["license"] == "other"
     assert head_of(model_card(marginal(), {"recipe": recipe}, Provenance()))[0]["license"] == "other"
 
 

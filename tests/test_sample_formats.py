@@ -20,6 +20,7 @@ from lidargrit.sources.sample_formats import (
     read_tensor,
     read_tensor_folder,
     recognise,
+    sensor_of_tensors,
 )
 
 SIZE = (64, 1024)
@@ -95,6 +96,13 @@ def test_a_file_may_hold_a_batch_of_scans(tmp_path):
     images = read_tensor_folder(tmp_path, count=2)
     assert len(images) == 2
     assert torch.allclose(images.batch([1]).range_m[0], scan(2)[0], atol=0.01), "evenly spaced over the files"
+
+
+def test_an_empty_first_file_tells_the_sensor_too(tmp_path):
+    whole = torch.stack([lidargen(*scan(i)) for i in range(2)])
+    torch.save(whole[:0], tmp_path / "samples_0.pth")
+    torch.save(whole, tmp_path / "samples_1.pth")
+    assert sensor_of_tensors(tmp_path).same_rays(read_tensor_folder(tmp_path).sensor)
 
 
 def test_a_tensor_with_a_gradient_is_read(tmp_path):

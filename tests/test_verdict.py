@@ -65,6 +65,11 @@ def test_a_noisy_model_is_not_excused_from_a_metric():
     assert counted_first([noisy]) == ([noisy], [])
 
 
+def test_files_of_before_are_judged_by_the_interval():
+    old = replace(score(0.9, 0.1, 0.15), real_against_real=RealAgainstReal(0.1, 9, 5))
+    assert counted_first([old]) == ([], [old])
+
+
 def test_values_below_zero_and_better_than_real_are_explained():
     words = " ".join(verdict([score(-0.01, 0.0, 0.9, metric="bev_mmd"), score(0.1, 0.5, 0.9)]))
     assert "bev_mmd below 0: the unbiased estimate" in words

@@ -50,7 +50,7 @@ def over_seeds(cells: list[dict], metric: str) -> Score | None:
 def nearest(scores: dict[str, Score | None]) -> str:
     """Return the trained system that is nearer than all others with intervals apart, or nothing."""
     found = {system: score for system, score in scores.items() if score and system not in BOUNDS}
-    for system, score in found.items():
+    for system, score in found.items() if len(found) > 1 else ():
         if all(score.nearer_than(other) for name, other in found.items() if name != system):
             return system
     return ""

@@ -48,10 +48,11 @@ def print_result(options: argparse.Namespace, text: str, result: Any, done: str 
     if options.json == STANDARD_OUTPUT:
         print(json.dumps(plain(result), indent=2, allow_nan=False))
     else:
-        print(text)  # first: what was computed is not lost where the file cannot be written
-        if options.json:
-            sys.stdout.flush()
-            write_json(options.json, result)
+        try:
+            print(text, flush=True)  # first: what was computed is not lost where the file cannot be written
+        finally:  # nor is the file where nobody reads
+            if options.json:
+                write_json(options.json, result)
     if done:
         print(done, file=sys.stderr if options.json == STANDARD_OUTPUT else sys.stdout)
 

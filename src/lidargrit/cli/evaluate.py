@@ -58,6 +58,8 @@ def run(options: argparse.Namespace) -> None:
     config = read_config(scan_settings(options), **{name: vars(options)[name] for name in names.split()})
     sets, report = (options.samples, options.reference), (options.report, options.overwrite)
     text, values, scored = evaluate(*sets, config, TerminalReporter(), *report)
-    print_result(options, text, values)
-    if options.report and scored:
-        write_report(*scored, options.report)
+    try:
+        print_result(options, text, values)
+    finally:
+        if options.report and scored:
+            write_report(*scored, options.report)

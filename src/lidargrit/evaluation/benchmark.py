@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Sequence
 from concurrent.futures import as_completed
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
@@ -17,13 +18,12 @@ import torch
 
 from lidargrit import __version__
 from lidargrit.configuration import name_and_settings, override
-from lidargrit.errors import CheckpointError, ConfigError, LidarGritError
-from lidargrit.evaluation.comparison import EvalConfig, compare_pair, open_pair
+from lidargrit.errors import CheckpointError, ConfigError, LidarGritError, OutputError
+from lidargrit.evaluation.comparison import EvalConfig, compare_pair, metric_factory, open_pair
 from lidargrit.evaluation.likelihood import bits_per_return
 from lidargrit.evaluation.pairs import EvalPair, EvalSet, require_same_rays
 from lidargrit.evaluation.protocols import public_name
 from lidargrit.evaluation.scorecard import Scorecard
-from lidargrit.evaluation.scoring import MetricFactory
 from lidargrit.evaluation.tables import Format, TableBlock, render, side_by_side
 from lidargrit.evaluation.verdict import MEMORISED, PIXEL_STATISTICS
 from lidargrit.files import claim_folder, read_json, write_json
@@ -166,7 +166,7 @@ def _require_a_metric(settings: EvalConfig, reporter: Reporter) -> None:
     errors = []
     for choice in settings.chosen_metrics():
         try:
-            MetricFactory(choice, settings.seed, reporter=reporter)()
+            metric_factory(choice, settings, reporter)()
         except LidarGritError as error:
             errors.append(error)
         else:
@@ -289,8 +289,8 @@ def _read_costs(path: Path) -> dict[str, Any]:
     Raises:
         CheckpointError: the file cannot be read, or an entry lacks or is no number.
     """
-    of = {"bits_per_return": None} | read_json(path)  # files of before lack it
-    for name, (_, may_lack) in _COSTS.items():
+    of = {"bits_per_return": None, "scans": 0} | read_json(path)  # files of before lack the first
+    for name, may_lack in (*((name, may) for name, (_, may) in _COSTS.items()), ("scans", False)):
         if name not in of or not (type(of[name]) in (int, float) or (may_lack and of[name] is None)):
             cure = "remove the folder of this system, and compare again"
             raise CheckpointError(f"{path}, whose {name} is no number", "what lidargrit compare wrote", cure)
@@ -325,7 +325,17 @@ class _Plan:
             return cls(system, run, None, override(generator.Sampling(), settings, owner, cure), generator.sensor)
         recipe = benchmark.recipe(name, check=not is_run(trained))
         sampling = override(load_class(recipe.generator).Sampling(), settings, owner, cure)
-        check_folder(trained, recipe)
+        try:
+            check_folder(trained, recipe)
+        except OutputError as error:
+            # In tables of before, a budget did not shorten what settings of a model count in scans.
+            before = replace(recipe, model=load_recipe(name, benchmark.recipe_settings).model)
+            if not is_run(trained) or before == recipe:
+                raise
+            with suppress(OutputError):
+                check_folder(trained, before)
+                return cls(system, trained, before, sampling, recipe.data.load_sensor())
+            raise error from None
         return cls(system, trained, recipe, sampling, recipe.data.load_sensor())
 
 
@@ -355,8 +365,10 @@ def _score(pair: EvalPair, settings: EvalConfig, path: Path, reporter: Reporter)
 def _write_costs(path: Path, plan: _Plan, generator: Generator, timed: tuple[int, float] | None) -> None:
     """Write what a system costs, unless it is there, with the time of at least as many scans."""
     scans, seconds = timed or (0, None)
-    if path.is_file() and scans <= read_json(path).get("scans", 0):
-        return
+    if path.is_file():
+        there = _read_costs(path)
+        if timed is None or (there["seconds_per_scan"] is not None and scans <= there["scans"]):
+            return
     cost = generator.cost(plan.sampling)
     write_json(
         path,

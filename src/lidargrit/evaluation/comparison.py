@@ -166,7 +166,7 @@ def compare_pair(pair: EvalPair, settings: EvalConfig, reporter: Reporter | None
     """
     reporter, protocol = reporter or Reporter(), load_protocol(settings.protocol)
     wanted, not_applicable = _applicable(settings.chosen_metrics(), pair)
-    factories = [_factory(choice, settings, reporter) for choice in wanted]
+    factories = [metric_factory(choice, settings, reporter) for choice in wanted]
     found = score_metrics(factories, pair, settings.resampling, reporter)
     scores = [score for score in found if isinstance(score, Score)]
     errors = [error for error in found if isinstance(error, LidarGritError)]
@@ -224,7 +224,8 @@ def _require_known(variant: str, wanted: Sequence[MetricChoice]) -> None:
         raise ConfigError(f"variant {variant!r}", f"one such as {nearest_names(variant, known)}", "choose one of these")
 
 
-def _factory(choice: MetricChoice, settings: EvalConfig, reporter: Reporter) -> MetricFactory:
+def metric_factory(choice: MetricChoice, settings: EvalConfig, reporter: Reporter) -> MetricFactory:
+    """Return what makes empty metrics of one definition, by the settings of an evaluation."""
     weights = settings.weights.get(load_metric(choice.metric).needs_weights)
     return MetricFactory(choice, settings.seed, weights, settings.device, reporter)
 

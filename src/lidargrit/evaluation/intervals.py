@@ -87,14 +87,14 @@ class RealAgainstReal:
         num_scans: number of scans in each set, on average. Most metrics fall as sets grow, some by a third where they
             double: so compare it with ``Interval.mean_of_halves``, unless the scans were held out.
         halvings: number of halvings; 0 for held-out scans.
-        spread: standard deviation of the scores of single halvings; 0 for held-out scans and in files of earlier
+        spread: standard deviation of the scores of single halvings; None for held-out scans and in files of earlier
             versions.
     """
 
     value: float
     num_scans: int
     halvings: int
-    spread: float = 0.0
+    spread: float | None = None
 
 
 @dataclass(frozen=True)

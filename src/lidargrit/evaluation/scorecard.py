@@ -224,7 +224,10 @@ def _score(data: dict[str, Any]) -> Score:
         None
         if real is None
         else RealAgainstReal(
-            float(real["value"]), int(real["num_scans"]), int(real["halvings"]), float(real.get("spread", 0.0))
+            float(real["value"]),
+            int(real["num_scans"]),
+            int(real["halvings"]),
+            None if real.get("spread") is None else float(real["spread"]),
         ),
         float(data["seconds"]),
         None if pixels is None else float(pixels),

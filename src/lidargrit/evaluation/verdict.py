@@ -44,12 +44,14 @@ def is_like_real(score: Score) -> bool | None:
 def tells_apart(score: Score) -> bool | None:
     """Return whether the metric separates pixel statistics from real scans by more than chance; None if not known.
 
-    Chance is that of real against real, since the model's own noise must not decide which scores count.
+    Chance is that of real against real, since the model's own noise must not decide which scores count; that noise
+    stands in where it is not known.
     """
     real = score.real_against_real
     if score.pixel_statistics is None or real is None:
         return None
-    return _worse_by(score, score.pixel_statistics, real.value) > _SPREADS * real.spread
+    chance = noise(score) if real.spread is None else _SPREADS * real.spread
+    return _worse_by(score, score.pixel_statistics, real.value) > chance
 
 
 def counted_first(scores: Sequence[Score]) -> tuple[list[Score], list[Score]]:

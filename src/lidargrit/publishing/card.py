@@ -162,9 +162,15 @@ def _training(about: dict[str, Any]) -> str:
     taken = about.get("taken", {}).get("training", {})
     for stage, fit in {**recipe.get("training", {}), **taken}.items():
         name = f"{_text(stage)}{', taken from another run' if stage in taken else ''}"
-        lines.append(f"| {name} | {fit['scans']:,} | {fit['batch_size']:,} | {fit['learning_rate']:g} |")
+        if fit is None:  # imported, or of a run that does not say
+            lines.append(f"| {name} | not known | - | - |")
+        else:
+            lines.append(f"| {name} | {fit['scans']:,} | {fit['batch_size']:,} | {fit['learning_rate']:g} |")
     if not recipe.get("training"):
         lines = ["## Training", "", "The run does not say how the model was trained."]
+    if files := about.get("taken", {}).get("files", ()):
+        named = [f"- {_code(file['name'])}, SHA-256 {_code(file['sha256'])}" for file in files]
+        lines += ["", "Weights that were taken over had been imported from these files:", "", *named]
     software = [f"{name} {_text(about[name])}" for name in ("lidargrit", "commit", "torch", "python") if name in about]
     lines += ["", f"Seed {_text(recipe.get('seed', 'unknown'))}; {', '.join(software) or 'software unknown'}."]
     return "\n".join([*lines, "Every setting is in `run.json`."])

@@ -59,16 +59,19 @@ def taken_facts(recipe: Recipe, donors: Mapping[str, str]) -> dict[str, Any]:
 
     Returns:
         sources of training scans (``train``), files of imported weights (``files``), and the settings by which the
-        stages that are not trained here were trained (``training``).
+        stages that are not trained here were trained, None where they are not known (``training``).
     """
     folder = locate(recipe.tokenizer_from or recipe.stages_from or "")
     about = read_json(folder / RUN_FILE) if (folder / RUN_FILE).is_file() else {}
-    before, theirs = about.get("taken", {}), about.get("recipe", {})
-    trained = {**theirs.get("training", {}), **before.get("training", {})}
+    theirs: dict[str, Any] = about.get("recipe") or {}
+    took = theirs.get("tokenizer_from") or theirs.get("stages_from")
+    unsaid = {"train": [_UNKNOWN]} if took else {}  # runs of before do not say what they took
+    before: dict[str, Any] = about.get("taken") or unsaid
+    trained = {} if about.get("files") else {**theirs.get("training", {}), **before.get("training", {})}
     return {
         "train": sorted({*theirs.get("data", {}).get("train", [_UNKNOWN]), *before.get("train", ())}),
         "files": [*about.get("files", ()), *before.get("files", ())],
-        "training": {stage: trained[stage] for stage in donors if stage in trained},
+        "training": {stage: trained.get(stage) for stage in donors},
     }
 
 

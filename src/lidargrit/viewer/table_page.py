@@ -54,7 +54,11 @@ def table_page(cells: Sequence[dict[str, Any]], flops: float) -> str:
         cells: name, costs and scores of each system, as the comparison wrote them.
         flops: floating-point operations of the training of each; 0 where each had its own budget.
     """
-    budget = f"each recipe trained with {flops:.2g} floating-point operations" if flops else "each with its own budget"
+    budget = (
+        f"Each recipe was trained with {flops:.2g} floating-point operations"
+        if flops
+        else "Each recipe was trained with its own budget"
+    )
     tables: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
     for cell in cells:
         tables.setdefault(_comparable(cell), []).append(cell)

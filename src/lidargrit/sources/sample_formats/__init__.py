@@ -110,8 +110,14 @@ def read_tensor_folder(folder: Path, name: str = "", count: int | None = None) -
 
 
 def sensor_of_tensors(folder: Path, name: str = "") -> SensorModel:
-    """Return the sensor that the first file of :func:`read_tensor_folder` fits, with the same errors."""
-    return _Tensors(_paths(folder)[:1], load_sample_format(name or recognise(folder)), None).sensor
+    """Return the sensor that the first file of a folder of tensors fits.
+
+    Raises:
+        DataError: no tensor in the folder.
+        ScanError: a file that is damaged, too large, more than a tensor, or not of this sample format.
+    """
+    path = _paths(folder)[0]
+    return _sensor_of(read_tensor(path), path, load_sample_format(name or recognise(folder)))
 
 
 def read_tensor(path: Path) -> Tensor:
@@ -147,7 +153,7 @@ class _Tensors:
     def __init__(self, paths: list[Path], form: SampleFormat, count: int | None) -> None:
         self._format, self._last = form, (Path(), torch.empty(0))
         first = self._tensor(paths[0])
-        self.sensor = self._sensor(first, paths[0])
+        self.sensor = _sensor_of(first, paths[0], form)
         self._scans: list[tuple[Path, int | None]] = []
         for path in paths:
             if first.ndim == 3:
@@ -189,21 +195,24 @@ class _Tensors:
             raise ScanError(f"a tensor of {tuple(tensor.shape)} in {path}", wanted, "remove the file")
         return tensor
 
-    def _sensor(self, first: Tensor, path: Path) -> SensorModel:
-        shape = tuple(first.shape)
-        fits = len(shape) in {3, 4} and shape[-3] == self._format.channels
-        sensor = self._format.sensor_of(*shape[-2:]) if fits else None
-        if sensor is None:
-            sizes = " or ".join(f"{self._format.channels}x{h}x{w}" for h, w in self._sizes())
-            raise ScanError(f"a tensor of {shape} in {path}", f"{sizes}: {self._format.title}", "check the format")
-        return sensor
 
-    def _sizes(self) -> list[tuple[int, int]]:
-        found = []
-        for name, fine_columns, stride in self._format.sensors:
-            sensor = load_sensor(name)
-            found.append((sensor.height, fine_columns // stride if fine_columns else sensor.width))
-        return found
+def _sensor_of(first: Tensor, path: Path, form: SampleFormat) -> SensorModel:
+    """Return the sensor whose images are as large as the tensor of a folder's first file."""
+    shape = tuple(first.shape)
+    fits = len(shape) in {3, 4} and shape[-3] == form.channels
+    sensor = form.sensor_of(*shape[-2:]) if fits else None
+    if sensor is None:
+        sizes = " or ".join(f"{form.channels}x{h}x{w}" for h, w in _sizes(form))
+        raise ScanError(f"a tensor of {shape} in {path}", f"{sizes}: {form.title}", "check the format")
+    return sensor
+
+
+def _sizes(form: SampleFormat) -> list[tuple[int, int]]:
+    found = []
+    for name, fine_columns, stride in form.sensors:
+        sensor = load_sensor(name)
+        found.append((sensor.height, fine_columns // stride if fine_columns else sensor.width))
+    return found
 
 
 def _array(values: Tensor) -> np.ndarray[Any, np.dtype[np.float32]]:
