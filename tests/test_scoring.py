@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from lidargrit.errors import LidarGritError
+from lidargrit.errors import ConfigError, LidarGritError, UnknownNameError
+from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.evaluation.intervals import Resampling, Score
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
 from lidargrit.evaluation.protocols import MetricChoice
@@ -117,3 +118,22 @@ def test_a_metric_that_fails_leaves_the_others_their_scores(passes):
     assert "without reflectance" in str(found[2])
     assert "'no_metric', which is not among the metrics" in str(found[3])
     assert "nowhere.pth" in str(found[5])
+
+
+@pytest.mark.parametrize(
+    ("words", "error", "why"),
+    [
+        ({"metrics": ("bev_jds",)}, UnknownNameError, "bev_jsd"),
+        ({"protocol": "r2mm"}, UnknownNameError, "r2dm"),
+        ({"variant": "exakt"}, ConfigError, "exact"),
+        ({"seed": -1}, ConfigError, "wanted 0 to"),
+        (
+            {"pixel_statistics": True, "resampling": Resampling(halves=0)},
+            ConfigError,
+            "--intervals 0; wanted intervals",
+        ),
+    ],
+)
+def test_wrong_words_are_refused_before_anything_is_opened(words, error, why):
+    with pytest.raises(error, match=why):
+        EvalConfig(**words)

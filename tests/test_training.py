@@ -19,7 +19,6 @@ from lidargrit.nn.objective import Objective
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import load_sensor
-from lidargrit.simulator import simulate
 from lidargrit.sources import load_range_images
 from lidargrit.tokenizers.vqvae import Vqvae
 from lidargrit.training import FitConfig, check_folder, measure, train, training_flops
@@ -136,24 +135,6 @@ def test_a_finished_run_is_not_trained_again(whole):
     before = (folder / "tokenizer" / "checkpoint.safetensors").stat().st_mtime_ns
     train(load_recipe("demo", TINY), folder)
     assert (folder / "tokenizer" / "checkpoint.safetensors").stat().st_mtime_ns == before
-
-
-def test_a_run_is_not_continued_with_other_scans_of_the_same_names(tmp_path):
-    def write(seed):
-        for index in range(2):
-            scan = simulate(seed + index, load_sensor("hdl64e_kitti_odometry").with_columns(64))
-            points = torch.cat((scan.points_xyz_m, scan.reflectance[:, None]), 1)
-            (tmp_path / "scans" / f"{index}.bin").write_bytes(points.numpy().astype("<f4").tobytes())
-
-    (tmp_path / "scans").mkdir()
-    write(0)
-    data = ["data.columns=64", f"data.train={tmp_path / 'scans'}", "data.val=simulated:1:val"]
-    recipe = load_recipe("marginal", data)
-    train(recipe, tmp_path / "run")
-    train(recipe, tmp_path / "run")
-    write(7)
-    with pytest.raises(OutputError, match="whose run began with other train scans; wanted what it began with"):
-        train(recipe, tmp_path / "run")
 
 
 def test_batches_depend_on_the_scans_seen_alone(images):

@@ -9,6 +9,8 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +38,9 @@ def refuse_taken(options: argparse.Namespace, *others: Path) -> None:
     refuse_to_overwrite(options.json, options.overwrite, ".json")
 
 
-def print_result(options: argparse.Namespace, text: str, result: Any, done: str = "") -> None:
+def print_result(
+    options: argparse.Namespace, text: str, result: Any, done: str = "", also: Callable[[], None] | None = None
+) -> None:
     """Print what was found as the user wants it, and write it where the user wants it.
 
     Args:
@@ -44,15 +48,17 @@ def print_result(options: argparse.Namespace, text: str, result: Any, done: str 
         text: result as people read it.
         result: result as programs read it; numbers that are NaN or infinite become null.
         done: last line, on standard error if JSON is printed.
+        also: writes a further file.
     """
-    if options.json == STANDARD_OUTPUT:
-        print(json.dumps(plain(result), indent=2, allow_nan=False))
-    else:
-        try:
-            print(text, flush=True)  # first: what was computed is not lost where the file cannot be written
-        finally:  # nor is the file where nobody reads
+    with ExitStack() as files:  # written last and in any case: nothing is lost for a full disk, or where nobody reads
+        if also:
+            files.callback(also)
+        if options.json == STANDARD_OUTPUT:
+            print(json.dumps(plain(result), indent=2, allow_nan=False), flush=True)
+        else:
             if options.json:
-                write_json(options.json, result)
+                files.callback(write_json, options.json, result)
+            print(text, flush=True)
     if done:
         print(done, file=sys.stderr if options.json == STANDARD_OUTPUT else sys.stdout)
 

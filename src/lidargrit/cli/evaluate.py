@@ -32,8 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("-n", "--max-scans", type=int, default=0, help="largest number of scans of each; 0 for the protocol's")
     add("--intervals", type=int, default=20, metavar="B", help="number of half-samples for 95 %% intervals; 0 for none")
     add("--pixel-statistics", action="store_true", help="also score pixel statistics, which any model has to beat")
-    groups = "number of blocks of consecutive scans that --intervals halves; an odd number is lowered by one"
-    add("--groups", type=int, default=16, metavar="G", help=groups)
+    add("--groups", type=int, default=16, metavar="G", help="number of blocks that --intervals halves; odd: one fewer")
     add("--seed", type=seed_number, default=0, help="seed of all random choices")
     add("--device", default="cpu", help="device of networks: cpu, or cuda, which changes the last digits of scores")
     add_scans(parser)
@@ -56,10 +55,6 @@ def run(options: argparse.Namespace) -> None:
         return print_result(options, *read_tables(options.tables, options.format))
     names = "protocol metrics variant max_scans seed samples_format device weights groups intervals pixel_statistics"
     config = read_config(scan_settings(options), **{name: vars(options)[name] for name in names.split()})
-    sets, report = (options.samples, options.reference), (options.report, options.overwrite)
-    text, values, scored = evaluate(*sets, config, TerminalReporter(), *report)
-    try:
-        print_result(options, text, values)
-    finally:
-        if options.report and scored:
-            write_report(*scored, options.report)
+    sets, report = (options.samples, options.reference), (options.report, write_report, options.overwrite)
+    text, values, also = evaluate(*sets, config, TerminalReporter(), *report)
+    print_result(options, text, values, also=also)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +33,9 @@ def evaluate(
     config: EvalConfig,
     reporter: Reporter,
     report: Path | None = None,
+    write_report: Callable[[Scorecard, EvalPair, Path], None] | None = None,
     overwrite: bool = False,
-) -> tuple[str, dict[str, Any], tuple[Scorecard, EvalPair] | None]:
+) -> tuple[str, dict[str, Any], Callable[[], None] | None]:
     """Score samples against a reference, or measure the reconstructions of a run.
 
     Args:
@@ -41,11 +43,12 @@ def evaluate(
         reference: name of the second set.
         config: metrics, protocol and projection of the comparison.
         reporter: receiver of progress and warnings.
-        report: file for a report, which the caller writes; a run has none.
+        report: file for a report; a run has none.
+        write_report: function that writes the report.
         overwrite: whether a report that is there already is replaced.
 
     Returns:
-        a table, its plain values, and what a report is made of: the scorecard and the two sets, None for a run.
+        a table, its plain values, and a function that writes the report, None where none is wanted.
 
     Raises:
         ConfigError: a name is missing, or an option has no meaning for these sets or metrics.
@@ -68,7 +71,8 @@ def evaluate(
         card = with_pixel_statistics(card, pair, config)
     for warning in card.warnings[len(pair.warnings) :]:
         reporter.message(f"WARNING: {warning}")
-    return card.as_table(), card.to_json(), (card, pair)
+    also = partial(write_report, card, pair, report) if report and write_report else None
+    return card.as_table(), card.to_json(), also
 
 
 def check_modes(options: Mapping[str, Any], default_of: Callable[[str], Any]) -> None:
