@@ -15,6 +15,7 @@ CONFIG_FILE, WEIGHTS_FILE, CARD_FILE = "config.json", "model.safetensors", "READ
 RUN_FILE = "run.json"  # ``origin`` in it says that the weights beside it were not trained in this folder
 CHECKPOINT_FILE = "checkpoint.safetensors"  # of a stage, in its own folder
 TRAINED_ON_FILE = "trained_on.json"  # in a run's folder and beside its samples: which drives, which pixels
+UNKNOWN_SCANS = "a run that does not say on which scans it was trained"  # in the place of a source
 PRETRAINED = Path(__file__).parent / "pretrained"
 PACKAGED = (PRETRAINED, PRETRAINED.with_name("pretrained_wide"))  # their names go wherever a run is wanted
 
@@ -43,6 +44,18 @@ def weights_sha256(folder: Path) -> str:
 def recipe_settings(about: Any) -> dict[str, Any]:
     """Return every setting of the recipe in a ``run.json`` by its name of today; none where there is no recipe."""
     return configuration.leaves(about.get("recipe") if isinstance(about, dict) else {})
+
+
+def taken_over(about: Any) -> dict[str, Any]:
+    """Return what a ``run.json`` says of weights that came from other runs: ``train``, ``files`` and ``training``.
+
+    Those are the sources of their training scans, the files of imported weights, and the settings of stages that were
+    not trained in the run. Runs of earlier versions do not say on which scans the weights were trained.
+    """
+    recipe = about.get("recipe") or {}
+    took = recipe.get("tokenizer_from") or recipe.get("stages_from")
+    unsaid = {"train": [UNKNOWN_SCANS] if took else [], "files": [], "training": {}}
+    return {**unsaid, **about.get("taken", {})}
 
 
 def recorded_projection(folder: Path) -> str:

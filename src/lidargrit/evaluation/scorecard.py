@@ -219,16 +219,17 @@ def _score(data: dict[str, Any]) -> Score:
             float(interval["high"]),
             float(interval["standard_error"]),
             int(interval["halves"]),
-            None if interval.get("mean_of_halves") is None else float(interval["mean_of_halves"]),
+            _optional(interval.get("mean_of_halves")),
         ),
         None
         if real is None
         else RealAgainstReal(
-            float(real["value"]),
-            int(real["num_scans"]),
-            int(real["halvings"]),
-            None if real.get("spread") is None else float(real["spread"]),
+            float(real["value"]), int(real["num_scans"]), int(real["halvings"]), _optional(real.get("spread"))
         ),
         float(data["seconds"]),
-        None if pixels is None else float(pixels),
+        _optional(pixels),
     )
+
+
+def _optional(number: float | None) -> float | None:
+    return None if number is None else float(number)

@@ -60,14 +60,10 @@ def side_by_side(paths: Sequence[Path], form: Format = "text") -> str:
     measured: dict[tuple[str, str, int], list[tuple[str, Scorecard]]] = {}
     for path, name in zip(paths, _names(paths), strict=True):
         card = Scorecard.read(path)
-        measured.setdefault(comparable(card), []).append((name, card))
+        key = (card.protocol, card.reference.sha256, card.reference.scans_used)
+        measured.setdefault(key, []).append((name, card))
     blocks = [block for cards in measured.values() for block in (_measured(cards), *_published(cards))]
     return render(blocks, form)
-
-
-def comparable(card: Scorecard) -> tuple[str, str, int]:
-    """Return what two scorecards must have in common to stand in one table: protocol, and scans of the reference."""
-    return card.protocol, card.reference.sha256, card.reference.scans_used
 
 
 def render(blocks: Sequence[TableBlock], form: Format = "text") -> str:

@@ -17,7 +17,7 @@ from lidargrit.generators import Generator, load, load_class
 from lidargrit.nn.quantization import WeightBits, without_quantized
 from lidargrit.publishing.card import model_card
 from lidargrit.recipes import load_recipe
-from lidargrit.run_folder import CARD_FILE, RUN_FILE, TRAINED_ON_FILE, locate, trained_on, weights_sha256
+from lidargrit.run_folder import CARD_FILE, RUN_FILE, TRAINED_ON_FILE, locate, taken_over, trained_on, weights_sha256
 from lidargrit.sources import data_set_of
 from lidargrit.sources.samples import is_sample_folder, weights_of
 
@@ -129,20 +129,18 @@ def _refuse_taken(folder: Path, begun: dict[str, Any] | None) -> None:
 
 def _public_facts(about: dict[str, Any], generator: Generator) -> dict[str, Any]:
     """Return the facts of ``run.json`` without the command, and with data sets and splits in place of sources."""
-    settings = about.get("recipe", {})
-    data = settings.get("data", {})
+    recipe = about.get("recipe", {})
+    data = recipe.get("data", {})
     sources = {part: ["::".join(data_set_of(source)) for source in data.get(part, ())] for part in ("train", "val")}
     recipe = {
-        **settings,
+        **recipe,
         "tokenizer_from": None,
         "stages_from": None,
         "data": {**data, **sources, "sensor": generator.sensor.name},
     }
     kept = {name: about[name] for name in ("files", "lidargrit", "commit", "torch", "python") if name in about}
-    if taken := about.get("taken", {}):
+    if (taken := taken_over(about))["train"]:
         kept["taken"] = {**taken, "train": ["::".join(data_set_of(source)) for source in taken["train"]]}
-    elif settings.get("tokenizer_from") or settings.get("stages_from"):
-        kept["taken"] = {"train": ["::"], "files": [], "training": {}}  # a run of before does not say what it took
     return {"origin": "published", **kept, "recipe": recipe}
 
 

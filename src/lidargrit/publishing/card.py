@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import json
 import re
+from collections.abc import Iterable
 from typing import Any
 
 from lidargrit import _discovery
@@ -15,7 +16,7 @@ from lidargrit.evaluation.verdict import verdict
 from lidargrit.generators import Generator
 from lidargrit.loading import Provenance
 from lidargrit.nn.quantization import WeightBits
-from lidargrit.run_folder import recipe_settings
+from lidargrit.run_folder import recipe_settings, taken_over
 from lidargrit.sources import data_set_of
 
 _PIPELINE = "unconditional-image-generation"  # of the hub's tasks the nearest; it has none for scans
@@ -106,19 +107,26 @@ def _data(about: dict[str, Any], learned: Provenance) -> str:
     leaks: list[str] = []
     for part in ("train", "val"):
         for name, split in map(data_set_of, data.get(part, ())):
-            licence = load_dataset(name).licence if name else "not known"
-            lines.append(f"| {part} | {name or 'unnamed scans'} | {_text(split) or '-'} | {licence} |")
+            lines.append(_data_row(part, name, split))
             leaks += _leaks(name, split)
     own = {data_set_of(source) for source in data.get("train", ())}
-    for name, split in sorted({data_set_of(source) for source in about.get("taken", {}).get("train", ())} - own):
-        cells = (name or "unnamed scans", _text(split) or "-", load_dataset(name).licence if name else "not known")
-        lines.append(f"| train, of the weights that it took | {' | '.join(cells)} |")
+    taken = {data_set_of(source) for source in taken_over(about)["train"]}
+    lines += [_data_row("train, of the weights that it took", *of) for of in sorted(taken - own)]
     lines += ["", *dict.fromkeys(leaks)]
     if variant := recipe_settings(about).get("data.projection_variant"):
         lines.append(f"The training scans were projected by the {_code(variant)} variant; project others by the same.")
     if learned.fingerprints:
         lines.append(f"The model was trained on {len(learned.fingerprints):,} different images.")
     return "\n".join(lines)
+
+
+def _data_row(part: str, name: str, split: str) -> str:
+    return f"| {part} | {name or 'unnamed scans'} | {_text(split) or '-'} | {_terms(name)} |"
+
+
+def _terms(name: str) -> str:
+    """Return the licence of a data set; "" stands for one that is not known."""
+    return load_dataset(name).licence if name else "not known"
 
 
 def _leaks(name: str, split: str) -> list[str]:
@@ -146,7 +154,7 @@ def _licence(about: dict[str, Any], licences: list[str]) -> str:
 
 def _training(about: dict[str, Any]) -> str:
     recipe = about.get("recipe", {})
-    files = [f"- {_code(file['name'])}, SHA-256 {_code(file['sha256'])}" for file in about.get("files", ())]
+    taken = taken_over(about)
     if _imported(about):
         return "\n".join(
             [
@@ -154,26 +162,28 @@ def _training(about: dict[str, Any]) -> str:
                 "",
                 "The weights were not trained by lidargrit. They were imported from these files:",
                 "",
-                *files,
+                *_files(about["files"]),
             ]
         )
     lines = ["## Training", "", f"Recipe: {_text(recipe.get('title', 'unknown'))}.", ""]
     lines += ["| stage | scans seen | batch | learning rate |", "|---|---|---|---|"]
-    taken = about.get("taken", {}).get("training", {})
-    for stage, fit in {**recipe.get("training", {}), **taken}.items():
-        name = f"{_text(stage)}{', taken from another run' if stage in taken else ''}"
+    for stage, fit in {**recipe.get("training", {}), **taken["training"]}.items():
+        name = f"{_text(stage)}{', taken from another run' if stage in taken['training'] else ''}"
         if fit is None:  # imported, or of a run that does not say
             lines.append(f"| {name} | not known | - | - |")
         else:
             lines.append(f"| {name} | {fit['scans']:,} | {fit['batch_size']:,} | {fit['learning_rate']:g} |")
     if not recipe.get("training"):
         lines = ["## Training", "", "The run does not say how the model was trained."]
-    if files := about.get("taken", {}).get("files", ()):
-        named = [f"- {_code(file['name'])}, SHA-256 {_code(file['sha256'])}" for file in files]
-        lines += ["", "Weights that were taken over had been imported from these files:", "", *named]
+    if taken["files"]:
+        lines += ["", "Weights that were taken over had been imported from these files:", "", *_files(taken["files"])]
     software = [f"{name} {_text(about[name])}" for name in ("lidargrit", "commit", "torch", "python") if name in about]
     lines += ["", f"Seed {_text(recipe.get('seed', 'unknown'))}; {', '.join(software) or 'software unknown'}."]
     return "\n".join([*lines, "Every setting is in `run.json`."])
+
+
+def _files(files: Iterable[dict[str, Any]]) -> list[str]:
+    return [f"- {_code(file['name'])}, SHA-256 {_code(file['sha256'])}" for file in files]
 
 
 def _scores(card: Scorecard) -> str:
@@ -225,16 +235,12 @@ def _imported(about: dict[str, Any]) -> bool:
 
 def _has_imported(about: dict[str, Any]) -> bool:
     """Return whether weights of the model, or those that it began with, were imported."""
-    return _imported(about) or bool(about.get("taken", {}).get("files"))
+    return _imported(about) or bool(taken_over(about)["files"])
 
 
 def _licences(about: dict[str, Any]) -> list[str]:
-    recipe, taken = about.get("recipe", {}), about.get("taken", {})
-    sources: set[str] = {*recipe.get("data", {}).get("train", ()), *taken.get("train", ())}
-    if not taken and (recipe.get("tokenizer_from") or recipe.get("stages_from")):
-        sources.add("")  # a run of before does not say what it took
-    names = {data_set_of(source)[0] for source in sources}
-    return sorted({load_dataset(name).licence if name else "not known" for name in names})
+    sources = (*about.get("recipe", {}).get("data", {}).get("train", ()), *taken_over(about)["train"])
+    return sorted({_terms(data_set_of(source)[0]) for source in sources})
 
 
 def _hub_licence(licences: list[str]) -> str:

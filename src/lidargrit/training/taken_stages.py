@@ -14,10 +14,8 @@ from lidargrit.errors import ConfigError
 from lidargrit.files import read_json
 from lidargrit.generators import Generator, load
 from lidargrit.nn.objective import Objective
-from lidargrit.run_folder import RUN_FILE, is_run, locate
+from lidargrit.run_folder import RUN_FILE, UNKNOWN_SCANS, is_run, locate, taken_over
 from lidargrit.training.config import Recipe
-
-_UNKNOWN = "a run that does not say on which scans it was trained"
 
 
 def check_donor(recipe: Recipe) -> None:
@@ -63,14 +61,11 @@ def taken_facts(recipe: Recipe, donors: Mapping[str, str]) -> dict[str, Any]:
     """
     folder = locate(recipe.tokenizer_from or recipe.stages_from or "")
     about = read_json(folder / RUN_FILE) if (folder / RUN_FILE).is_file() else {}
-    theirs: dict[str, Any] = about.get("recipe") or {}
-    took = theirs.get("tokenizer_from") or theirs.get("stages_from")
-    unsaid = {"train": [_UNKNOWN]} if took else {}  # runs of before do not say what they took
-    before: dict[str, Any] = about.get("taken") or unsaid
-    trained = {} if about.get("files") else {**theirs.get("training", {}), **before.get("training", {})}
+    theirs, before = about.get("recipe") or {}, taken_over(about)
+    trained = {} if about.get("files") else {**theirs.get("training", {}), **before["training"]}
     return {
-        "train": sorted({*theirs.get("data", {}).get("train", [_UNKNOWN]), *before.get("train", ())}),
-        "files": [*about.get("files", ()), *before.get("files", ())],
+        "train": sorted({*theirs.get("data", {}).get("train", [UNKNOWN_SCANS]), *before["train"]}),
+        "files": [*about.get("files", ()), *before["files"]],
         "training": {stage: trained.get(stage) for stage in donors},
     }
 
