@@ -1,4 +1,4 @@
-"""Activations computed twice, and compiled networks: the same gradients, less memory, the same bits after a break."""
+"""Activations computed twice, compiled networks, and columns that wrap: the same gradients as by the plain way."""
 
 import json
 import os
@@ -14,6 +14,7 @@ from torch import nn
 from lidargrit.errors import ConfigError, OutputError
 from lidargrit.generators import load_class
 from lidargrit.nn.blocks import Block, Network, prepare_for_training
+from lidargrit.nn.convolution import wrapped
 from lidargrit.recipes import load_recipe
 from lidargrit.training import FitConfig, train
 from lidargrit.training.compute import uniform_images
@@ -154,3 +155,14 @@ def test_both_are_off_unless_asked_for():
     assert not config.compile
     assert not Block().recomputed
     assert Network()._compiled_call_impl is None
+
+
+@pytest.mark.parametrize(("left", "right"), [(1, 1), (0, 1), (2, 3), (0, 0), (4, 4)])
+def test_the_gradient_of_wrapped_columns_is_that_of_their_copies(left, right):
+    x = torch.rand(2, 3, 4, dtype=torch.float64, requires_grad=True)
+    copies = (torch.arange(-left, 4 + right) % 4).tolist()
+    assert torch.equal(wrapped(x, left, right), x[..., copies])
+    (got,) = torch.autograd.grad((wrapped(x, left, right) ** 3).sum(), x)
+    (wanted,) = torch.autograd.grad((x[..., copies] ** 3).sum(), x)
+    assert torch.allclose(got, wanted, rtol=1e-12)
+    assert torch.autograd.gradgradcheck(lambda x: wrapped(x, left, right) ** 3, (x,))

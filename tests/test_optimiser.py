@@ -75,7 +75,7 @@ def test_muon_moves_the_matrices_of_blocks_and_adamw_all_else():
     head = [p for p in others if p is theirs.head.weight]
     rest = [p for p in others if p is not theirs.head.weight]
     groups = [{"params": head, "weight_decay": 0.3}, {"params": rest, "weight_decay": 0.0}]
-    adamw = torch.optim.AdamW(groups, lr=0.1, betas=(0.9, 0.95))
+    adamw = torch.optim.AdamW(groups, lr=0.1, betas=(0.9, 0.95), fused=True)
     together = make_optimiser(ours, config(optimiser="muon", weight_decay=0.3))
     for seed in range(3):
         muon_step(together, ours, seed)

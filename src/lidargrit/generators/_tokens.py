@@ -16,7 +16,7 @@ from lidargrit.conditions import Condition
 from lidargrit.conditions.fills import fill_from_nearest
 from lidargrit.errors import ConfigError
 from lidargrit.generators import Cost, Generator
-from lidargrit.nn.encoding_cache import EncodingCache
+from lidargrit.nn.encoding_cache import EncodingCache, Frozen
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.pixel_decoder import PixelDecoder, PixelSampling, nats_to_range_bits
 from lidargrit.nn.pixel_networks import PixelDecoderConfig
@@ -242,6 +242,7 @@ class PixelObjective(Objective):
         super().__init__(pixels.sensor)
         self.pixels = pixels
         self._tokens = None if tokenizer is None else EncodingCache(tokenizer, _tokens)
+        self._decoding = None if tokenizer is None else Frozen(tokenizer.for_decoding("fp32"))
         self.over = () if tokenizer is None else ("tokenizer",)
 
     def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
@@ -250,8 +251,8 @@ class PixelObjective(Objective):
         In training some phases of each scan stand for all; in validation all are counted.
         """
         decoded = None
-        if self._tokens is not None:
-            tokenizer = self._tokens.network(images.range_m.device)
+        if self._tokens is not None and self._decoding is not None:
+            tokenizer = self._decoding.network(images.range_m.device)
             with torch.no_grad(), without_autocast(images.range_m.device):  # as when scans are sampled
                 decoded = tokenizer.decode(TokenGrid(self._tokens(images).long(), tokenizer.num_codes))
         if self.training:

@@ -5,7 +5,7 @@ Parameter names follow the reference's state dict, so that published weights loa
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -19,8 +19,34 @@ Padding = Literal["zero", "wrap"]
 
 def wrapped(x: Shaped[Tensor, "*B W"], left: int = 1, right: int = 1) -> Shaped[Tensor, "*B w"]:
     """Return maps with their last columns also before the first, and their first ones behind the last."""
+    if torch.is_grad_enabled() and x.requires_grad:
+        wide: Tensor = _Wrapped.apply(x, left, right)
+        return wide
+    return _wrapped(x, left, right)
+
+
+def _wrapped(x: Tensor, left: int, right: int) -> Tensor:
     # Not by F.pad: its circular mode takes several times as long, most of all backwards.
     return torch.cat((x[..., x.shape[-1] - left :], x, x[..., :right]), dim=-1)
+
+
+class _Wrapped(torch.autograd.Function):
+    """:func:`wrapped` with a gradient of two sums, where that of slices and their concatenation fills three maps."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, left: int, right: int) -> Tensor:
+        ctx.columns = left, right
+        return _wrapped(x, left, right)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
+        (wide,), (left, right) = gradients, ctx.columns
+        inner = wide[..., left : wide.shape[-1] - right].clone()
+        if left:
+            inner[..., -left:] += wide[..., :left]
+        if right:
+            inner[..., :right] += wide[..., -right:]
+        return inner, None, None
 
 
 class Convolution(nn.Conv2d):

@@ -62,14 +62,14 @@ class PhaseNoise(nn.Module):
             returned: True where a pixel returned.
         """
         seen = self.sums.new_zeros(*self.sums.shape[:2], 2 + _TERMS)  # the sums, then the number of scans
-        for phase, of_phase, truth in zip(phases, logits.detach().double(), returned, strict=True):
-            factors = _hermite_factors(of_phase, truth)
-            pairs = [(factors[..., :-1, :], factors[..., 1:, :])]
-            if factors.shape[-1] > 1:  # one column alone would be its own neighbour
-                pairs.append((factors, factors.roll(-1, -1)))
-            for direction, (one, other) in enumerate(pairs):
-                seen[self.phases.index(phase), direction, :-1] = (one * other).sum((1, 2, 3)).to(seen)
-                seen[self.phases.index(phase), direction, -1] = logits.shape[1]
+        factors = _hermite_factors(logits.detach().double(), returned)
+        pairs = [(factors[..., :-1, :], factors[..., 1:, :])]
+        if factors.shape[-1] > 1:  # one column alone would be its own neighbour
+            pairs.append((factors, factors.roll(-1, -1)))
+        numbers = torch.tensor([self.phases.index(phase) for phase in phases], device=seen.device)
+        for direction, (one, other) in enumerate(pairs):
+            seen[numbers, direction, :-1] = (one * other).sum((2, 3, 4)).T.to(seen)
+            seen[numbers, direction, -1] = logits.shape[1]
         seen, scans = sum_over_processes(seen).split((1 + _TERMS, 1), -1)  # which may each have taken other phases
         kept = 0.5 ** ((seen[:, :, 1:2] > 0) * (scans / _HALF_LIFE_SCANS))
         self.sums.mul_(kept).add_(seen)
@@ -117,7 +117,7 @@ class PhaseNoise(nn.Module):
         return torch.special.ndtr(normal).to(uniform.dtype).clamp(max=1 - torch.finfo(uniform.dtype).eps)
 
 
-def _hermite_factors(logits: Float64[Tensor, "B h w"], returned: Bool[Tensor, "B h w"]) -> Float64[Tensor, "F B h w"]:
+def _hermite_factors(logits: Float64[Tensor, "*P"], returned: Bool[Tensor, "*P"]) -> Float64[Tensor, "F *P"]:
     """Return the residuals, and one factor of each term of the covariance of two of them; 0 for pixels left out.
 
     For thresholds s and t of two normal numbers of correlation r it is the sum over k of r^k / k! times the product of

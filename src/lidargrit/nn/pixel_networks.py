@@ -174,12 +174,12 @@ class PhaseNetwork(nn.Module):
         return {lattice: network.guide(cells_of(maps, lattice)) for lattice, network in self._networks()}
 
     def outputs(
-        self, phases: list[Phase], guided: dict[Lattice, Tensor], contexts: Sequence[Float[Tensor, "B D h w"]]
+        self, phases: list[Phase], guided: dict[Lattice, Tensor], contexts: Float[Tensor, "P B D h w"]
     ) -> Float[Tensor, "P B O h w"]:
         """Return the network's outputs for consecutive phases of one lattice, from what is known before each."""
         lattice = phases[0].lattice
         first = [phase for phase in self.phases if phase.lattice == lattice].index(phases[0])
-        return self.networks[lattice.name](guided[lattice], torch.stack(tuple(contexts)), first)
+        return self.networks[lattice.name](guided[lattice], contexts, first)
 
     def flops(self) -> int:
         """Return the floating-point operations of all phases of one scan: two for each multiplication and addition."""
@@ -224,16 +224,19 @@ class MaskNetwork(PhaseNetwork):
         """
         return cls(PixelDecoderConfig(mask_features=features, mask_width=width), sensor, features)
 
-    def context(self, phase: Phase, guide: Guide, return_mask: Bool[Tensor, "B H W"]) -> Float[Tensor, "B D h w"]:
+    def context(
+        self, phases: list[Phase], guide: Guide, return_mask: Bool[Tensor, "B H W"]
+    ) -> Float[Tensor, "P B D h w"]:
         """Return for each pixel of a cell whether it is known to have returned, and whether it is known not to.
 
         Later pixels have no influence.
         """
-        returned = cells_of(return_mask[:, None].to(guide.v.dtype), phase.lattice)
-        certain = generated_before(phase).to(returned)[:, None, None]
+        lattice = phases[0].lattice
+        returned = cells_of(return_mask[:, None].to(guide.v.dtype), lattice)
+        certain = generated_before(phases, returned)
         if guide.observed is not None:
-            certain = torch.maximum(certain, cells_of(guide.observed[:, None].to(guide.v.dtype), phase.lattice))
-        return torch.cat((certain * returned, certain * (1 - returned)), 1)
+            certain = torch.maximum(certain, cells_of(guide.observed[:, None].to(guide.v.dtype), lattice))
+        return torch.cat((certain * returned, certain * (1 - returned)), 2)
 
     def uniform(self, rngs: Sequence[torch.Generator]) -> Float[Tensor, "B H W"]:
         """Return random numbers for one mask of each generator, correlated as learned, on the device of the network."""
@@ -261,7 +264,7 @@ class MaskNetwork(PhaseNetwork):
         self, phases: list[Phase], guided: dict[Lattice, Tensor], guide: Guide, return_mask: Bool[Tensor, "B H W"]
     ) -> Float[Tensor, "P B h w"]:
         """Return the logits of the pixels of phases of one lattice; later pixels of the mask have no influence."""
-        output = self.outputs(phases, guided, [self.context(phase, guide, return_mask) for phase in phases])
+        output = self.outputs(phases, guided, self.context(phases, guide, return_mask))
         decoded = guide.return_logits + self.row_bias[:, None]
         return output[:, :, 0] + at_phases(decoded, phases)
 
@@ -335,28 +338,29 @@ class RangeNetwork(PhaseNetwork):
     ) -> RangeMixture:
         """Return the distributions of the ranges at phases of one lattice; later ranges have no influence."""
         candidates = self.candidates(phases, guide, return_mask, v)
-        pairs = zip(phases, candidates, strict=True)
-        contexts = [self.context(phase, guide, return_mask, v, suggested) for phase, suggested in pairs]
+        contexts = self.context(phases, guide, return_mask, v, candidates)
         return self.mixture(self.outputs(phases, guided, contexts), candidates)
 
     def context(
         self,
-        phase: Phase,
+        phases: list[Phase],
         guide: Guide,
         return_mask: Bool[Tensor, "B H W"],
         v: Float[Tensor, "B H W"],
-        candidates: Float[Tensor, "B K h w"],
-    ) -> Float[Tensor, "B D h w"]:
+        candidates: Float[Tensor, "P B K h w"],
+    ) -> Float[Tensor, "P B D h w"]:
         """Return the mask, the known ranges beside the decoded ones, and how far the candidates are apart."""
-        candidates, expected = candidates[:, :-1], candidates[:, -1:]
-        returned, beside = cells_of(torch.stack((return_mask.to(v.dtype), v - guide.v), 1), phase.lattice).chunk(2, 1)
-        generated = generated_before(phase).to(returned)[:, None, None] * returned
-        apart = self.suggest.differences(candidates)
-        maps = [generated, 1 - returned, generated * beside, (candidates - expected).clamp(-2, 2), apart]
+        candidates, expected = candidates[:, :, :-1], candidates[:, :, -1:]
+        maps = cells_of(torch.stack((return_mask.to(v.dtype), v - guide.v), 1), phases[0].lattice)
+        returned, beside = maps.chunk(2, 1)
+        generated = generated_before(phases, returned) * returned
+        apart = self.suggest.differences(candidates.flatten(0, 1)).unflatten(0, candidates.shape[:2])
+        dropped = (1 - returned).expand_as(generated)
+        parts = [generated, dropped, generated * beside, (candidates - expected).clamp(-2, 2), apart]
         if not self.guided_by_tokens:
-            maps[2] = generated * (beside - (expected - TYPICAL_LOG_RANGE)).clamp(-2, 2)
-            maps.append(expected - TYPICAL_LOG_RANGE)
-        return torch.cat(maps, 1)
+            parts[2] = generated * (beside - (expected - TYPICAL_LOG_RANGE)).clamp(-2, 2)
+            parts.append(expected - TYPICAL_LOG_RANGE)
+        return torch.cat(parts, 2)
 
     def candidates(
         self, phases: list[Phase], guide: Guide, return_mask: Bool[Tensor, "B H W"], v: Float[Tensor, "B H W"]

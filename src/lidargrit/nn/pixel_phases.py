@@ -148,12 +148,16 @@ def one_of_phases(phases: list[Phase], rng: torch.Generator) -> list[Phase]:
     return [phases[0 if index.is_meta else int(index)]]  # all take as many operations, where they are counted
 
 
-def generated_before(phase: Phase) -> Bool[Tensor, "4"]:
-    """Return which of the 2x2 pixels, row by row, are generated before a phase's."""
-    before = torch.zeros(2, 2, dtype=torch.bool)
-    for row, column in phase.lattice.order[: phase.rank]:
-        before[row, column] = True
-    return before.flatten()
+def generated_before(phases: Sequence[Phase], like: Float[Tensor, "*shape"]) -> Float[Tensor, "P 1 4 1 1"]:
+    """Return 1 for those of the 2x2 pixels, row by row, that are generated before each phase's, and 0 for others.
+
+    Args:
+        phases: phases of one lattice.
+        like: tensor whose number type and device the result has.
+    """
+    pixels = [(row, column) for row in (0, 1) for column in (0, 1)]
+    before = [[pixel in phase.lattice.order[: phase.rank] for pixel in pixels] for phase in phases]
+    return torch.tensor(before, dtype=like.dtype, device=like.device)[:, None, :, None, None]
 
 
 def cells_of(maps: Float[Tensor, "B C H W"], lattice: Lattice) -> Float[Tensor, "B C*4 h w"]:
@@ -174,15 +178,17 @@ def pixels_around(
         known: True where a pixel holds a value.
         offsets: rows and columns of the lattice from the pixel in the middle to others, all of earlier phases.
     """
-    values, known = (maps[(..., *phase.lattice.pixels)] for maps in (values, known))
-    (rows, columns), farthest = known.shape[-2:], max(abs(step) for offset in offsets for step in offset)
-    around = torch.arange(-farthest, columns + farthest, device=known.device) % columns
-    values, known = (F.pad(maps[..., around], (0, 0, farthest, farthest)) for maps in (values, known))
+    # Together they take half as many slices.
+    maps = torch.stack([of_image[(..., *phase.lattice.pixels)].to(values.dtype) for of_image in (values, known)], 1)
+    (rows, columns), farthest = maps.shape[-2:], max(abs(step) for offset in offsets for step in offset)
+    around = torch.arange(-farthest, columns + farthest, device=maps.device) % columns
+    maps = F.pad(maps[..., around], (0, 0, farthest, farthest))
     parts = []
     for down, right in offsets:
         top, left = farthest + phase.row + down, farthest + phase.column + right
         parts.append((..., slice(top, top + rows, 2), slice(left, left + columns, 2)))
-    return torch.stack([values[part] for part in parts], 1), torch.stack([known[part] for part in parts], 1)
+    values, known = torch.stack([maps[part] for part in parts], 2).unbind(1)
+    return values, known > 0
 
 
 def plane_weights(phase: Phase, elevation_rad: Float[Tensor, "H"]) -> Float[Tensor, "h 1 2"]:

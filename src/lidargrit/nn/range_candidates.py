@@ -69,6 +69,8 @@ class RangeCandidates(nn.Module):
             if phase.rank and (surfaces or gravity):
                 for name, table in zip(("pixels", "weights", "fallback"), self._tables(phase), strict=True):
                     self.register_buffer(f"{name}_{number}", table, persistent=False)
+            if phase.rank:
+                self.register_buffer(f"of_rows_{number}", plane_weights(phase, elevation), persistent=False)
         self.count = _OF_PAIRS + len(self.surfaces_of(self.phases[0]))
         self.distances = self.differences(torch.zeros(1, self.count, 1, 1)).shape[1]
 
@@ -110,7 +112,7 @@ class RangeCandidates(nn.Module):
             return expected[:, None].expand(-1, self.count, -1, -1)
         number = self.phases.index(phase)
         values, has = pixels_around(phase, v, known, self.offsets[number])
-        of_rows = plane_weights(phase, self.elevation_rad)
+        of_rows = self.get_buffer(f"of_rows_{number}")
         found = []
         for first, (down, _) in zip((0, 2), phase.pairs, strict=True):
             (one, other), (has_one, has_other) = (maps[:, first : first + 2].unbind(1) for maps in (values, has))

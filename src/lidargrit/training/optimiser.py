@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from torch import nn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from lidargrit.errors import ConfigError
 from lidargrit.nn.blocks import Block
@@ -34,7 +35,7 @@ def make_optimiser(objective: nn.Module, config: FitConfig) -> torch.optim.Optim
         {"params": [p for p in others if id(p) not in decaying], "weight_decay": 0.0},
     ]
     adamw = torch.optim.AdamW(
-        [group for group in groups if group["params"]], lr=config.learning_rate, betas=config.betas
+        [group for group in groups if group["params"]], lr=config.learning_rate, betas=config.betas, fused=True
     )
     if config.optimiser == "adamw":
         return adamw
@@ -131,10 +132,9 @@ class WeightAverage:
         """
         half_life = min(self.half_life_scans, 0.1 * scans_seen)
         keep = 0.5 ** (batch_size / half_life) if half_life > 0 else 0.0
-        for average, current in zip(self.objective.parameters(), objective.parameters(), strict=True):
-            if current.requires_grad:
-                average.lerp_(current, 1 - keep)
-            else:
-                average.copy_(current)
-        for average, current in zip(self.objective.buffers(), objective.buffers(), strict=True):
+        pairs = list(zip(self.objective.parameters(), objective.parameters(), strict=True))
+        averages, learned = zip(*(pair for pair in pairs if pair[1].requires_grad), strict=True)
+        get_ema_multi_avg_fn(keep)(averages, learned, None)
+        fixed = [pair for pair in pairs if not pair[1].requires_grad]
+        for average, current in (*fixed, *zip(self.objective.buffers(), objective.buffers(), strict=True)):
             average.copy_(current)
