@@ -83,7 +83,7 @@ def test_kitti_rows_are_kept_in_their_order(file):
         (with_cell(1, 2, np.inf), "got 1 of 3 points with NaN or infinite coordinates in .*bad_points=drop"),
         (with_cell(1, slice(0, 3), 0), "got 1 of 3 points at the origin .* in .*bad_points=drop"),
         (with_cell(1, 3, 200), "got reflectance from 0.5 to 200 in .*; wanted values in .*divide an intensity"),
-        (with_cell(1, 3, np.nan), "got reflectance from nan to nan in "),
+        (with_cell(1, 3, np.nan), "got 1 of 3 points with NaN for reflectance in "),
     ],
 )
 def test_kitti_rows_are_refused_in_one_line_that_names_the_file(file, content, text):
@@ -231,7 +231,7 @@ def test_half_precision_will_do(tmp_path):
     assert torch.allclose(scan.reflectance, torch.arange(6) / 255)
 
 
-@pytest.mark.parametrize("values", [[0, 70_000], [-1, 1], [0, np.nan], [0, np.inf]])
+@pytest.mark.parametrize("values", [[0, 70_000], [-1, 1], [0, np.inf]])
 def test_reflectance_beyond_all_scales_is_refused(tmp_path, values):
     np.savez(tmp_path / "a.npz", points=np.ones((2, 3)), reflectance=np.array(values))
     assert "got reflectance from " in refusal(tmp_path / "a.npz")
@@ -360,7 +360,7 @@ def test_real_scan_as_pcd_is_the_same_scan_as_bin(real):
 @pytest.mark.parametrize(
     ("file", "text"),
     [
-        ("incomplete_sweep_39_rings", "got 39 rings in .*; wanted the 64 rings .*remove the file if the sweep was cut"),
+        ("incomplete_sweep_39_rings", "got 39 rings in .*; wanted the 64 rings .*remove the file if the scan was cut"),
         ("cropped_to_camera", "got returns in only .* of 360 degrees of azimuth in .*; wanted a full revolution"),
         ("all_columns_times_1p1_plus_0p1", "got reflectance from .* to 1.* in .*; wanted values in"),
     ],

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from lidargrit import _discovery, formats
 from lidargrit.errors import ConfigError, DataError, OutputError, ScanError, UnknownNameError, one_of
-from lidargrit.files import atomic_path, claim_folder, is_partial, is_taken, read_json, write_json
+from lidargrit.files import atomic_path, claim_folder, claimed_manifest, is_partial, is_taken, read_json, write_json
 from lidargrit.formats import ScanFormat
 from lidargrit.formats.kitti_bin import KittiBin
 from lidargrit.loading import DataConfig
@@ -70,6 +70,9 @@ def export_scans(
     layout = KittiTree(out) if kind == TREE else _Flat(out, *writable_format(kind, TREE))
     scans, of_images = _open(source, config, sensor)
     files = layout.files([scans.name(index) for index in range(len(scans))])
+    if twice := sorted(file for file, count in Counter(files).items() if count > 1):
+        what = f"{len(twice)} names that several scans of {source} have, such as {twice[0]}"
+        raise DataError(what, "a name for each scan, as each becomes a file", "rename some, or export them apart")
     identities = [scans.identity(index) for index in range(len(scans))]
     facts = {"source": source, "format": kind, **of_images, "scans": dict(zip(files, identities, strict=True))}
     with claim_folder(out), claimed_scans(out / MANIFEST, facts):
@@ -190,8 +193,8 @@ def writable_format(kind: str, *others: str) -> tuple[type[ScanFormat], str]:
 def claimed_scans(manifest: Path, facts: dict[str, Any]) -> Iterator[None]:
     """Write the manifest of a folder of scans, or add to the one that the same command wrote before.
 
-    A new manifest is removed again if no scan was written after all. Otherwise the folder would be refused to a
-    corrected command, of another format or model.
+    A new manifest is removed again if no scan was written after all; see
+    :func:`~lidargrit.files.claimed_manifest`.
 
     Args:
         manifest: file in the folder that says how its scans were made.
@@ -200,14 +203,9 @@ def claimed_scans(manifest: Path, facts: dict[str, Any]) -> Iterator[None]:
     Raises:
         OutputError: the folder holds something else, or another scan in one of the files.
     """
-    is_new = not manifest.exists()
-    _claim(manifest, facts)
-    try:
+    with claimed_manifest(manifest):
+        _claim(manifest, facts)
         yield
-    finally:
-        with suppress(OSError):  # the folder was removed meanwhile
-            if is_new and all(path == manifest or is_partial(path.name) for path in manifest.parent.iterdir()):
-                manifest.unlink()
 
 
 def _claim(manifest: Path, facts: dict[str, Any]) -> None:

@@ -250,6 +250,21 @@ def write_json(path: Path, data: Any) -> None:
     write_text(path, json.dumps(plain(data), indent=2, allow_nan=False) + "\n")
 
 
+@contextmanager
+def claimed_manifest(manifest: Path) -> Iterator[None]:
+    """Remove a new manifest again if nothing was written beside it within the ``with`` block.
+
+    Otherwise the folder would be refused to a corrected command, which does it in another way.
+    """
+    is_new = not manifest.exists()
+    try:
+        yield
+    finally:
+        with suppress(OSError):  # the folder was removed meanwhile
+            if is_new and all(path == manifest or is_partial(path.name) for path in manifest.parent.iterdir()):
+                manifest.unlink()
+
+
 def plain(value: Any) -> Any:
     """Return a value of dicts and lists with null for every number that is NaN or infinite."""
     if isinstance(value, dict):

@@ -6,6 +6,7 @@ tensors live inside one model.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
@@ -47,7 +48,7 @@ class Scan:
 
     def __post_init__(self) -> None:
         if len(self) == 0:
-            raise ScanError(f"no point in {self.source}", "a full revolution", "remove the file")
+            raise ScanError(f"no point in {self.source}", "a full revolution", "leave this scan out")
         object.__setattr__(self, "points_xyz_m", self.points_xyz_m.float())  # those of NumPy often have 64 bits
         if self.reflectance is not None:
             object.__setattr__(self, "reflectance", self.reflectance.float())
@@ -66,8 +67,10 @@ class Scan:
         if self.points_xyz_m.count_nonzero() < self.points_xyz_m.numel():
             self._refuse((self.points_xyz_m == 0).all(dim=1), "at the origin (placeholders for no return)")
         if self.reflectance is not None:
-            low, high = (float(v) for v in self.reflectance.aminmax())
-            if not (low >= 0 and high <= 1):  # also refuses NaN
+            low, high = (float(v) for v in self.reflectance.aminmax())  # NaN where any is
+            if math.isnan(low):
+                self._refuse(self.reflectance.isnan(), "with NaN for reflectance", "a number for each")
+            if not (low >= 0 and high <= 1):
                 raise ScanError(
                     f"reflectance from {low:g} to {high:g} in {self.source}",
                     "values in [0, 1]",
@@ -76,11 +79,13 @@ class Scan:
                     else "check the layout: the file may have three or five columns, not x, y, z, reflectance",
                 )
 
-    def _refuse(self, bad: Bool[Tensor, "n"], what: str) -> None:
+    def _refuse(
+        self, bad: Bool[Tensor, "n"], what: str, wanted: str = "finite coordinates away from the origin"
+    ) -> None:
         if bool(bad.any()):
             raise ScanError(
                 f"{int(bad.sum())} of {len(self)} points {what} in {self.source}",
-                "finite coordinates away from the origin",
+                wanted,
                 "remove these points, or drop them by --set data.bad_points=drop (train) or --bad-points drop",
             )
 

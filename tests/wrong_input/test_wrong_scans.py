@@ -80,7 +80,7 @@ def test_bad_scans_are_left_out_by_the_setting_that_the_message_names(refused, r
 
 
 REAL_DAMAGE = {
-    "incomplete_sweep_39_rings": r"got 39 rings in .*; wanted the 64 rings .*; remove the file if the sweep was cut",
+    "incomplete_sweep_39_rings": r"got 39 rings in .*; wanted the 64 rings .*; remove the file if the scan was cut",
     "cropped_to_camera": r"got returns in only .* of 360 degrees of azimuth in .*; wanted a full revolution",
     "all_columns_times_1p1_plus_0p1": r"got reflectance from .* to 1.* in .*; wanted values in \[0, 1\]",
 }

@@ -14,7 +14,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from lidargrit.errors import OutputError, UsageError
+from lidargrit.errors import OutputError, UsageError, printable
 from lidargrit.files import plain, refuse_to_overwrite, write_json
 from lidargrit.untrusted import check_path
 
@@ -58,7 +58,7 @@ def print_result(
         else:
             if options.json:
                 files.callback(write_json, options.json, result)
-            print(text, flush=True)
+            print("\n".join(map(printable, text.splitlines())), flush=True)  # names of files may hold anything
     if done:
         print(done, file=sys.stderr if options.json == STANDARD_OUTPUT else sys.stdout)
 

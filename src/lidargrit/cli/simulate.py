@@ -54,6 +54,6 @@ def run(options: argparse.Namespace) -> None:
         wet=options.wet,
         clean=options.clean,
     )
-    write_drives(options.out, options.num_scans, config, options.workers, TerminalReporter())
+    there = write_drives(options.out, options.num_scans, config, options.workers, TerminalReporter())
     theirs = f", with the sensor {options.sensor}" if options.sensor != _SENSOR else ""
-    print(f"{options.num_scans} scans in {options.out}: read them as kitti_odometry:{options.out}{theirs}")
+    print(f"{there} scans in {options.out}: read them as kitti_odometry:{options.out}{theirs}")

@@ -55,6 +55,12 @@ class Condition:
     def __post_init__(self) -> None:
         check_observed(self.range_observed, self.range_m)
         check_observed(self.return_observed, self.range_m)
+        check_observed(self.return_mask, self.range_m, "a mask of returns")
+        size = (len(self.range_m), self.sensor.height, self.sensor.width)
+        for name in ("range_m", "reflectance", "label"):
+            pixels: Tensor | None = getattr(self, name)
+            if pixels is not None and pixels.shape != size:
+                raise ConfigError(f"{name} of {tuple(pixels.shape)}", f"{size}, of the sensor", "give all one shape")
         range_m = self.range_m[self.range_observed]
         if not bool(((range_m > 0) & range_m.isfinite()).all()):
             raise ScanError("an observed range of 0 metres, NaN or infinity", "positive metres", "mark it as unknown")
@@ -175,11 +181,11 @@ class Condition:
         return RangeImage.masked(range_m, returned, self.sensor, reflectance, label)
 
 
-def check_observed(observed: Bool[Tensor, "..."], range_m: Float[Tensor, "..."]) -> None:
-    """Refuse a mask of observed pixels whose shape is not that of the ranges, with ConfigError."""
+def check_observed(observed: Bool[Tensor, "..."], range_m: Float[Tensor, "..."], what: str = "observed pixels") -> None:
+    """Refuse a mask whose shape is not that of the ranges, with ConfigError that says ``what`` it is."""
     if observed.shape != range_m.shape or observed.dtype != torch.bool or range_m.ndim != 3:
         raise ConfigError(
-            f"observed pixels of shape {tuple(observed.shape)} and type {observed.dtype}",
+            f"{what} of shape {tuple(observed.shape)} and type {observed.dtype}",
             f"{tuple(range_m.shape)} and torch.bool, one for each pixel of a batch of images",
             "give a mask for each image",
         )

@@ -148,7 +148,7 @@ def open_dataset(source: str, bad_points: BadPoints = "refuse") -> ScanDataset:
     head, colon, rest = source.partition(":")
     if share and share.start() < len(head):  # the first colon is that of the share
         head, colon, rest = source[: share.start()], "", ""
-    is_path = "/" in head or _is_there(head)
+    is_path = "/" in head or _is_there(head) or _is_there(source)  # a name may have a colon, as a time of day has
     if head in _discovery.names("datasets") and (colon or not is_path):
         if not rest:
             raise DataError(

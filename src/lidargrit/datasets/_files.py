@@ -138,7 +138,7 @@ class FileDataset(ScanDataset):
     @classmethod
     def _pattern_in(cls, root: Path) -> str | None:
         """Return the first pattern that finds a file, if that is of this tree's format."""
-        firsts = ((pattern, next(root.glob(pattern), None)) for pattern in cls.patterns)
+        firsts = ((pattern, next(filter(_is_scan_file, root.glob(pattern)), None)) for pattern in cls.patterns)
         pattern, first = next((found for found in firsts if found[1]), (None, None))
         return pattern if first and cls._format(first).recognises(first) else None
 
@@ -150,7 +150,7 @@ class FileDataset(ScanDataset):
 
     @classmethod
     def _find(cls, root: Path) -> list[Path]:
-        found = (sorted(root.glob(pattern)) for pattern in cls.patterns)
+        found = (sorted(filter(_is_scan_file, root.glob(pattern))) for pattern in cls.patterns)
         return next((paths for paths in found if paths), [])
 
     def _choose(self, split: Split, sequences: set[str]) -> set[str]:
@@ -208,14 +208,31 @@ def _check_names(paths: Iterable[Path]) -> None:
         raise DataError(error.got, error.wanted, error.cure) from None
 
 
+def _is_scan_file(path: Path) -> bool:
+    """Return whether a path that a pattern finds may be a scan: no folder, nor a hidden file such as macOS's ._NAME."""
+    return not path.name.startswith(".") and not path.is_dir()
+
+
 def scans_below(root: Path) -> Iterator[Path]:
-    """Find all files that are called like a scan, in no order, leaving out hidden ones and links to folders."""
+    """Find all files that are called like a scan, in no order, leaving out hidden ones and links to folders.
+
+    Raises:
+        DataError: a folder below that cannot be read, whose scans would be missing.
+    """
     if root.is_file():
         yield from [root] if formats.candidates(root) else []
-    for folder, below, names in os.walk(root):
+        return
+    for folder, below, names in os.walk(root, onerror=_refuse_folder):
         below[:] = (name for name in below if not name.startswith("."))
         paths = (Path(folder, name) for name in names if not name.startswith("."))
         yield from (path for path in paths if formats.candidates(path))
+
+
+def _refuse_folder(error: OSError) -> None:
+    if isinstance(error, (FileNotFoundError, NotADirectoryError)):  # a root that is not there has no scan
+        return
+    what = f"{error.filename}, which cannot be read ({error.strerror})"
+    raise DataError(what, "a folder that you may read", "change its permissions, or move it elsewhere") from None
 
 
 def unnamed_recording(path: Path) -> str:

@@ -1,4 +1,4 @@
-"""Argoverse 2: ROOT/{train,val,test}/LOG/sensors/lidar/*.feather → sweeps of the upright one of two VLP-32C."""
+"""Argoverse 2: ROOT/{train,val,test}/LOG/sensors/lidar/*.feather → scans of the upright one of two VLP-32C."""
 
 from __future__ import annotations
 

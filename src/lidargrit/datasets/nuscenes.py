@@ -1,4 +1,4 @@
-"""nuScenes: ROOT/{samples,sweeps}/LIDAR_TOP/*.pcd.bin → sweeps of 1000 scenes of 20 s, in the order of time."""
+"""nuScenes: ROOT/{samples,sweeps}/LIDAR_TOP/*.pcd.bin → scans of 1000 scenes of 20 s, in the order of time."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lidargrit import formats
 from lidargrit.datasets import SplitScheme
 from lidargrit.datasets._files import FileDataset, unnamed_recording
 from lidargrit.datasets._splits import Split
-from lidargrit.errors import DataError
+from lidargrit.errors import DataError, LidarGritError
 from lidargrit.files import read_json
 from lidargrit.formats import BadPoints
 
@@ -39,14 +39,14 @@ def _scenes(numbers: Iterable[int]) -> tuple[str, ...]:
 
 
 class Nuscenes(FileDataset):
-    """The sweeps of nuScenes' LIDAR_TOP, keyframes (2 a second) and those between (20 a second) together.
+    """The scans of nuScenes' LIDAR_TOP, keyframes (2 a second) and those between (20 a second) together.
 
     A sequence is a scene where the tables of the data set lie beside the scans (scene.json, sample.json and log.json in
     ``v1.0-trainval``, ``v1.0-test`` or ``v1.0-mini``), and a log (a drive, the first part of a file's name) where they
-    do not. The official splits are by scene and need the tables. A sweep belongs to the scene of its log whose samples
-    surround it in time; sweeps of no scene make a sequence of their log. A folder of .pcd.bin alone is read, too.
+    do not. The official splits are by scene and need the tables. A scan belongs to the scene of its log whose samples
+    surround it in time; scans of no scene make a sequence of their log. A folder of .pcd.bin alone is read, too.
 
-    The sweeps are corrected for the car's motion, which lifts near points out of their rows by a degree: rows by ring
+    The scans are corrected for the car's motion, which lifts near points out of their rows by a degree: rows by ring
     (``--set data.projection=unfolding``) hold them all, rows by elevation leave an arc of the ground empty.
 
     Source:
@@ -103,14 +103,13 @@ class Nuscenes(FileDataset):
 
     @classmethod
     def _find(cls, root: Path) -> list[Path]:
-        found = (sorted(root.glob(pattern), key=lambda path: path.name) for pattern in cls.patterns)
-        return next((paths for paths in found if paths), [])  # samples and sweeps together in the order of time
+        return sorted(super()._find(root), key=lambda path: path.name)  # both folders together in the order of time
 
     def _none_of(self, split: Split, sequences: set[str], wanted: list[str]) -> DataError:
         if self._scenes_of_log or not wanted[0].startswith("scene-"):
             return super()._none_of(split, sequences, wanted)
         return DataError(
-            f"the split {split.text!r} of {self.root} without the tables that tell which sweep is of which scene",
+            f"the split {split.text!r} of {self.root} without the tables that tell which scan is of which scene",
             f"scene.json, sample.json and log.json in {self.root / 'v1.0-*'}",
             f"unpack the data set's metadata there, or choose logs: {'+'.join(sorted(sequences)[:2])}",
         )
@@ -135,6 +134,8 @@ def _read_scenes(root: Path) -> dict[str, list[tuple[int, int, str]]]:
                 if known := times.get(scene["token"]):
                     span = (min(known), max(known), str(scene["name"]))
                     logs.setdefault(log_files[scene["log_token"]], []).append(span)
+        except LidarGritError:
+            raise
         except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
             what = " ".join(str(error).split())[:200]
             raise DataError(

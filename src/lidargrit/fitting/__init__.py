@@ -216,11 +216,15 @@ def _model(
 
 def _projection(rows: FittedRows, rings: Rings) -> ProjectionName:
     """Choose unfolding if the files give the ring of every point, by a field or by KITTI's order of points."""
-    top_down = bool((np.diff(rows.number) > 0).all())
     if rings.method == "ring field":
-        return "unfolding" if top_down else "spherical"
+        return "unfolding" if _are_rows(rows) else "spherical"
     as_kitti = rings.method == "ring by ring" and rings.counter_clockwise and rings.start_deg == 0.0
-    return "unfolding" if top_down and as_kitti else "spherical"
+    return "unfolding" if _are_rows(rows) and as_kitti else "spherical"
+
+
+def _are_rows(rows: FittedRows) -> bool:
+    """Return whether the numbers of the rings are those of the rows: from 0 for the highest, none left out."""
+    return bool((rows.number == np.arange(len(rows.number))).all())
 
 
 def _warnings(rows: FittedRows, rings: Rings, num_scans: int, columns: int | None) -> tuple[str, ...]:
@@ -244,6 +248,6 @@ def _warnings(rows: FittedRows, rings: Rings, num_scans: int, columns: int | Non
         found.append(
             f"{blurred} rings are blurred by more than half the way to the next: are the scans in their own frame?"
         )
-    if rings.method == "ring field" and not bool((np.diff(rows.number) > 0).all()):
-        found.append("the rings of the files are not numbered from the top, so rows go by elevation")
+    if rings.method == "ring field" and not _are_rows(rows):
+        found.append("the rings of the files are not numbered from 0 at the top without a gap, so rows go by elevation")
     return tuple(found)

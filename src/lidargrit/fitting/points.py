@@ -51,10 +51,15 @@ class Points:
         index = np.flatnonzero(range_m > _NOISE_RANGE_M)
         azimuth_deg = np.degrees(np.arctan2(y[index], x[index]))
         sectors = len(np.unique(np.floor(azimuth_deg * (_SECTORS / 360))))
-        if len(index) < _POINTS_AT_LEAST or sectors < _SECTORS_AT_LEAST:
+        if len(index) < _POINTS_AT_LEAST:
             raise ScanError(
-                f"{len(index)} points beyond {_NOISE_RANGE_M:g} m, in {sectors * 360 // _SECTORS} of 360 degrees of "
-                f"azimuth, in {scan.source}",
+                f"{len(index)} points beyond {_NOISE_RANGE_M:g} m in {scan.source}",
+                f"at least {_POINTS_AT_LEAST}",
+                "use scans with more points, in metres",
+            )
+        if sectors < _SECTORS_AT_LEAST:
+            raise ScanError(
+                f"points in {sectors * 360 // _SECTORS} of 360 degrees of azimuth, in {scan.source}",
                 "a full revolution in the sensor's own frame",
                 "use uncropped scans",
             )

@@ -176,6 +176,8 @@ def scan_of(
     """Make a scan of what a file holds, without points that are no returns if ``bad_points`` is ``drop``."""
     if bad_points == "drop":
         kept = points_xyz_m.isfinite().all(dim=1) & (points_xyz_m != 0).any(dim=1)
+        if reflectance is not None:
+            kept &= ~reflectance.isnan()
         points_xyz_m = points_xyz_m[kept]
         reflectance, ring, label = (None if one is None else one[kept] for one in (reflectance, ring, label))
     return Scan(points_xyz_m.contiguous(), reflectance, ring, label, source)
@@ -226,5 +228,9 @@ def first_bytes(path: Path, at_most: int) -> bytes:
 
 def damaged(path: Path, wanted: str, error: Exception) -> ScanError:
     """Return the error of a file that a library could not read, with the library's reason in one line."""
-    reason = "".join(filter(str.isprintable, " ".join(str(error).split())))[:120] or type(error).__name__
-    return ScanError(f"{path}, a damaged file ({reason})", wanted, "download it again, or remove it")
+    return ScanError(f"{path}, a damaged file ({first_words(error)})", wanted, "download it again, or remove it")
+
+
+def first_words(error: Exception) -> str:
+    """Return what a library says of an error, in one line of at most 120 letters."""
+    return "".join(filter(str.isprintable, " ".join(str(error).split())))[:120] or type(error).__name__

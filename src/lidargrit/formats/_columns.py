@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Mapping
 from io import BytesIO
@@ -26,6 +27,7 @@ _RING = ("ring", "channel")
 _LABEL = ("label",)
 _FULL_SCALES = (1, 255, 65_535)
 _LASERS = (16, 32, 40, 64, 80, 128, 256)  # that sensors have; the top ring may have no return, and not be in the file
+_ONE_RING_AT_MOST_RAD = math.radians(5)  # that the elevations of a sensor with one ring may span
 _RING_AT_MOST = 65_535  # 16 bits, as ROS drivers store it
 _LABEL_AT_MOST = 2**32 - 1  # SemanticKITTI's: class and instance in 16 bits each
 
@@ -34,7 +36,7 @@ def scan_of_columns(columns: Mapping[str, Num[np.ndarray, "n"]], path: Path, bad
     """Make a scan of columns that are known by their names; others are left alone.
 
     Reflectance is divided by 1, 255 or 65535: the smallest that no value exceeds. Rings are counted from the top: where
-    the file's rise with elevation, they are turned round.
+    the file's rise with elevation, they are turned round. A ring that all points have is none.
 
     Raises:
         ScanError: x, y or z is not there, rings or labels are not whole numbers, or the points are unfit.
@@ -46,8 +48,10 @@ def scan_of_columns(columns: Mapping[str, Num[np.ndarray, "n"]], path: Path, bad
     points_xyz_m = torch.stack([_floats(named[axis]) for axis in "xyz"], dim=1)
     reflectance, ring, label = (_first(named, names) for names in (_REFLECTANCE, _RING, _LABEL))
     good = points_xyz_m.isfinite().all(dim=1) & (points_xyz_m != 0).any(dim=1)
-    if ring is not None:
+    if ring is not None and _tells_rows(ring, points_xyz_m, good):
         ring = _from_the_top(_whole(ring, good, _RING_AT_MOST, "ring", path), points_xyz_m, good)
+    else:
+        ring = None
     return scan_of(
         points_xyz_m,
         None if reflectance is None else _to_unit(_floats(reflectance)),
@@ -137,6 +141,15 @@ def _whole(values: np.ndarray, good: Tensor, at_most: int, what: str, path: Path
             f"a {what} that is not whole or out of bounds in {path}", f"0 to {at_most:,}", "correct the file"
         )
     return torch.from_numpy(values.astype(np.int64))
+
+
+def _tells_rows(ring: np.ndarray, points_xyz_m: Tensor, good: Tensor) -> bool:
+    """Return whether a column of rings tells points apart: some drivers write 0 for all."""
+    x, y, z = points_xyz_m[good].double().unbind(dim=1)
+    if not len(z) or (ring != ring.flat[0]).any():
+        return True
+    low, high = torch.atan2(z, torch.hypot(x, y)).aminmax()
+    return float(high - low) < _ONE_RING_AT_MOST_RAD
 
 
 def _from_the_top(ring: Tensor, points_xyz_m: Tensor, good: Tensor) -> Tensor:

@@ -206,7 +206,7 @@ def _columns(path: Path, wanted: tuple[str, ...], data: bytes) -> dict[str, np.n
                 raise ValueError(f"{kind} in the column {name}")
         messages = ipc.MessageReader.open_stream(body)
         if sum(_unpacked_bytes(message) for message in messages) > _MEMORY_BYTES_AT_MOST:
-            raise ValueError("far more points than a sweep has")
+            raise ValueError("far more points than a scan has")
         options = ipc.IpcReadOptions(included_fields=[schema.get_field_index(name) for name in wanted])
         table = ipc.open_stream(body, options=options).read_all()
         table.validate(full=True)
@@ -215,7 +215,8 @@ def _columns(path: Path, wanted: tuple[str, ...], data: bytes) -> dict[str, np.n
         return {name: table[name].to_numpy() for name in wanted}
     except Exception as error:  # the library meets a damaged file with whatever it stumbles over
         what = " ".join(str(error).split())[:200]
-        raise ScanError(f"{path}, which cannot be used ({what})", _FORMAT, _CURE) from None
+        columns = f"an Arrow feather file with the columns {', '.join(wanted)}"
+        raise ScanError(f"{path}, which cannot be used ({what})", columns, _CURE) from None
 
 
 def _is_number(pa: Any, kind: Any) -> bool:

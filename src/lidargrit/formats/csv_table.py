@@ -10,7 +10,7 @@ import numpy as np
 
 from lidargrit.errors import ScanError
 from lidargrit.files import atomic_path
-from lidargrit.formats import POINTS_AT_MOST, BadPoints, ScanFormat, damaged, first_bytes, read_bytes
+from lidargrit.formats import POINTS_AT_MOST, BadPoints, ScanFormat, first_bytes, first_words, read_bytes
 from lidargrit.formats._columns import BYTES_AT_MOST, REFLECTANCE_RULE, columns_of, known_name, scan_of_columns
 from lidargrit.structures import Scan
 
@@ -22,8 +22,8 @@ _SEPARATORS = (",", ";", "\t", " ")
 class CsvTable(ScanFormat):
     """Text with a first line of names, such as ``x,y,z,intensity``; separated by commas, semicolons, tabs or blanks.
 
-    Names may stand in quotation marks and in capitals. Numbers have a decimal point. Columns of other names are left
-    alone.
+    Names may stand in quotation marks and in capitals, and "#" or "//" before the first of them. Numbers have a decimal
+    point. Columns of other names are left alone.
     """
 
     title = "table of text with a header (.csv)"
@@ -41,9 +41,10 @@ class CsvTable(ScanFormat):
         """Read the scan in a file."""
         data = read_bytes(path, BYTES_AT_MOST, _FORMAT)
         names, separator = _names(data[:_HEADER_BYTES])
-        wanted = {
-            name: index for index, name in enumerate(names) if name.lower() in {"x", "y", "z"} or known_name(name)
-        }
+        wanted: dict[str, int] = {}
+        for number, name in enumerate(names):
+            if name.lower() in {"x", "y", "z"} or known_name(name):
+                wanted.setdefault(name, number)
         if not {"x", "y", "z"} <= {name.lower() for name in wanted}:
             there = ", ".join(map(ascii, names[:8]))[:120] or "nothing"
             raise ScanError(
@@ -63,7 +64,8 @@ class CsvTable(ScanFormat):
                     encoding="latin1",
                 )
         except Exception as error:  # whatever the text makes the parser stumble over
-            raise damaged(path, _FORMAT, error) from None
+            what = f"{path}, whose lines cannot be read ({first_words(error)})"
+            raise ScanError(what, _FORMAT, "give every line a number in each column, with a decimal point") from None
         if not 1 <= len(table) <= POINTS_AT_MOST:
             raise ScanError(f"{len(table):,} lines in {path}", f"1 to {POINTS_AT_MOST:,}", "give one revolution a file")
         return scan_of_columns(dict(zip(wanted, table.T, strict=True)), path, bad_points)
@@ -81,6 +83,7 @@ class CsvTable(ScanFormat):
 def _names(start: bytes) -> tuple[list[str], str]:
     """Return the names in the first line, and what separates them."""
     line = start.partition(b"\n")[0].decode("latin1").removeprefix("\u00ef\u00bb\u00bf").strip()
+    line = line.removeprefix("#").removeprefix("//").strip()  # numpy.savetxt and CloudCompare write them there
     separator = next((each for each in _SEPARATORS if each in line), ",")
     names = line.split() if separator == " " else line.split(separator)
     return [name.strip().strip("\"'").strip() for name in names], separator

@@ -72,7 +72,7 @@ class OusterPcap(ScanFormat):
         ring = torch.from_numpy(row_to_ring[np.nonzero(returned)[0]])
         with np.errstate(over="ignore"):  # infinite, and so refused or dropped
             points_xyz_m = torch.from_numpy(xyz_m.astype(np.float32))
-        return scan_of(points_xyz_m, reflectance, ring, str(path), bad_points)
+        return scan_of(points_xyz_m, reflectance, ring, f"{path}#{index}", bad_points)
 
     @staticmethod
     def companions(path: Path) -> tuple[Path, ...]:
@@ -93,7 +93,7 @@ def sensor_of(path: Path) -> SensorModel:
         Ouster's metadata: beam_altitude_angles and beam_azimuth_angles in degrees, the latter clockwise. Limits are
         those of our model of the same line, if there is one, and else the widest of any Ouster sensor.
     """
-    metadata = _metadata_of(path) if path.suffix == ".pcap" else path
+    metadata = _metadata_of(path) if path.suffix.lower() == ".pcap" else path
     data = _read_json(metadata)
     beams = {**data, **_section(data, "beam_intrinsics")}
     layout = {**_section(data, "data_format"), **_section(data, "lidar_data_format")}
@@ -101,7 +101,9 @@ def sensor_of(path: Path) -> SensorModel:
     try:
         altitude_deg = np.asarray(beams["beam_altitude_angles"], dtype=np.float64)
         azimuth_deg = np.asarray(beams["beam_azimuth_angles"], dtype=np.float64)
-        columns = int(layout.get("columns_per_frame", 1024))
+        mode = {**data, **_section(data, "config_params")}.get("lidar_mode")
+        in_mode = str(mode).partition("x")[0] if mode else 1024  # 2048x10 has 2,048 columns, ten times a second
+        columns = int(layout.get("columns_per_frame", in_mode))
         if altitude_deg.shape != azimuth_deg.shape or not (1 <= altitude_deg.size <= _BEAMS_AT_MOST):
             raise ValueError(f"{altitude_deg.shape} altitudes, {azimuth_deg.shape} azimuths")
         if not 1 <= columns <= _COLUMNS_AT_MOST:

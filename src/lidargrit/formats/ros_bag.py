@@ -67,9 +67,11 @@ class RosBag(ScanFormat):
             raise ScanError(what, f"one of its {len(recording.times)}, counted from 0", "take another")
         try:
             columns = _columns(recording.message(index))
+        except ScanError:
+            raise
         except Exception as error:  # the libraries meet damaged bytes with whatever they stumble over
             raise damaged(path, _FORMAT, error) from None
-        return scan_of_columns(columns, path, bad_points)
+        return scan_of_columns(columns, path.with_name(f"{path.name}#{index}"), bad_points)
 
 
 @runtime_checkable
@@ -96,6 +98,8 @@ def _open(path: Path) -> _Recording:
             recording = _opened(kind, path, (status.st_size, status.st_mtime_ns))
     except ImportError as error:
         raise ScanError(f"{path}, which takes {error.name or 'rosbags'} to read", "it installed", _INSTALL) from None
+    except ScanError:
+        raise
     except Exception as error:
         raise damaged(path, _FORMAT, error) from None
     if not 1 <= len(recording.times) <= _MESSAGES_AT_MOST:
@@ -108,10 +112,12 @@ def _opened(kind: str, path: Path, _version: tuple[int, int]) -> _Recording:
     return {".bag": _Ros1, ".mcap": _Mcap, ".db3": _Sqlite}[kind](path)
 
 
-def _busiest(topics: Counter[str]) -> str:
+def _busiest(topics: Counter[str], path: Path) -> str:
     """Return the topic with the most point clouds."""
     if not topics:
-        raise ValueError("no topic with PointCloud2")
+        raise ScanError(
+            f"{path}, which has no topic of PointCloud2", _FORMAT, "record the lidar's topic, or leave it out"
+        )
     return min(topics, key=lambda topic: (-topics[topic], topic))
 
 
@@ -121,7 +127,7 @@ class _Ros1:
         with _bag(path) as reader:
             clouds = [each for each in reader.connections if each.msgtype in _TYPES]
             topic = _busiest(
-                Counter({each.topic: sum(c.msgcount for c in clouds if c.topic == each.topic) for each in clouds})
+                Counter({each.topic: sum(c.msgcount for c in clouds if c.topic == each.topic) for each in clouds}), path
             )
             self._ids = {each.id for each in clouds if each.topic == topic}
             if sum(each.msgcount for each in clouds if each.id in self._ids) > _MESSAGES_AT_MOST:
@@ -135,7 +141,8 @@ class _Ros1:
         with _bag(self._path) as reader:
             for position, chunk in reader.chunks.items():
                 if chunk.datasize > _CHUNK_BYTES_AT_MOST or chunk.decompressor.__module__ == "bz2":
-                    raise ValueError("chunks of bzip2 or of more than 64 MB: unpack it with rosbag decompress")
+                    what = f"{self._path}, whose chunks are packed by bzip2 or larger than 64 MB"
+                    raise ScanError(what, "chunks of lz4, or unpacked ones", "unpack it with: rosbag decompress")
                 if chunk.decompressor.__module__.startswith("lz4"):  # which would unpack whatever is there
                     reader.chunks[position] = chunk._replace(decompressor=unpack)
             clouds = [each for each in reader.connections if each.id in self._ids]
@@ -185,7 +192,7 @@ class _Mcap:
             topics: Counter[str] = Counter()
             for each in clouds:
                 topics[each.topic] += counts.get(each.id, 0)
-            topic = _busiest(topics)
+            topic = _busiest(topics, path)
             if topics[topic] > _MESSAGES_AT_MOST:
                 raise ValueError("more messages than a recording can have")
             self._encoding = next(each.message_encoding for each in clouds if each.topic == topic)
@@ -264,6 +271,10 @@ def _unpacked_chunk(file: BinaryIO, index: Any) -> bytes:
 class _Sqlite:
     def __init__(self, path: Path) -> None:
         self._path = path
+        log = path.with_name(f"{path.name}-wal")
+        if log.is_file() and log.stat().st_size:
+            what = f"{path}, whose last messages lie in {log.name}: the recorder did not close it"
+            raise ScanError(what, "a closed recording", f"sqlite3 {path.name} 'PRAGMA wal_checkpoint(TRUNCATE)'")
         topics: Counter[str] = Counter()
         with closing(self._connected()) as database:
             kinds = dict(database.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'"))
@@ -278,7 +289,7 @@ class _Sqlite:
                         "SELECT COUNT(*) FROM messages WHERE topic_id = ?", (number,)
                     ).fetchone()
                     topics[str(name)] = count
-            number = numbers[_busiest(topics)]
+            number = numbers[_busiest(topics, path)]
             query = "SELECT rowid FROM messages WHERE topic_id = ? ORDER BY timestamp, rowid LIMIT ?"
             self.times = [row for (row,) in database.execute(query, (number, _MESSAGES_AT_MOST + 1))]
 

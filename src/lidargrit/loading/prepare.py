@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -72,7 +72,7 @@ def prepare(
     rank, world_size = rank_and_world_size(rank, world_size)
     dataset = open_dataset(source, config.bad_points) if dataset is None else dataset
     spec, scans = _spec(source, dataset, sensor, config)
-    facts = json.dumps(asdict(spec), sort_keys=True).encode()
+    facts = json.dumps({**asdict(spec), "source": ""}, sort_keys=True).encode()  # the digest names the scans
     folder = folder or cache_folder() / hashlib.sha256(facts).hexdigest()[:24]
     _claim(folder, spec, scans)
     missing = [shard for shard in range(spec.num_shards) if not _is_whole(folder, shard)]
@@ -155,6 +155,8 @@ def prepare_and_describe(
     images, seconds = PreparedImages(str(folder)), time.monotonic() - begun
     for why in images.left_out.values():
         reporter.message(f"left out: {why}")
+    if not len(images):
+        raise DataError(f"no usable scan in {source}", "at least one", "see the messages above")
     size = sum(path.stat().st_size for path in folder.glob("*.shard"))
     shape = images.sensor.height, images.sensor.width
     return Prepared(folder, len(images), *shape, size, seconds, tuple(images.left_out.values()))
@@ -236,19 +238,21 @@ def _claim(folder: Path, spec: PreparedSpec, scans: list[tuple[str, str, int, in
     """Write the plan into a free folder, or check that the folder's plan is the same."""
     if (folder / PLAN_FILE).exists():
         planned = PreparedFolder(str(folder)).read_spec()
-        differing = spec.differences(planned)
+        # The digest tells whether these are other scans; the same folder may be named in another way.
+        differing = [name for name in spec.differences(planned) if name != "source"]
         # No scan was left out so far, and none was bad, so all that is there is as a more lenient treatment has it.
         lenient = planned.bad_scans == "refuse" and all(
             name in _BAD and getattr(planned, name) == "refuse" for name in differing
         )
-        if differing and lenient:
-            write_json(folder / PLAN_FILE, asdict(spec))
-        elif differing:
+        if differing and not lenient:
             raise OutputError(
                 f"{folder}, which is stale: prepared with another {', '.join(differing)}",
                 "an empty folder, or what was prepared from these very scans in this very way",
                 "prepare into another folder, or remove this one",
             )
+        if spec != planned:
+            with nullcontext() if differing else suppress(OutputError):  # a complete folder may not be ours to change
+                write_json(folder / PLAN_FILE, asdict(spec))
         return
     listing, path = json.dumps(scans), folder / SCANS_FILE
     # In this order: another process may be claiming the folder for the same scans at this moment.

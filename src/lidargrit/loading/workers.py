@@ -139,14 +139,14 @@ def _error_of(line: str) -> LidarGritError:
 def make_some_shards(folder: Path, parent: int, shards: list[int]) -> int:
     """Make shards until the parent process ends; print a line for every scan, or the error."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that a half-written file is removed
-    spec = PreparedFolder(str(folder)).read_spec()
-    dataset = open_dataset(spec.source, "drop" if spec.bad_points == "drop" else "refuse")
-    for shard in shards:
-        if os.getppid() != parent:
-            return 1  # whoever wanted the shards is gone
-        try:
+    try:
+        spec = PreparedFolder(str(folder)).read_spec()
+        dataset = open_dataset(spec.source, "drop" if spec.bad_points == "drop" else "refuse")
+        for shard in shards:
+            if os.getppid() != parent:
+                return 1  # whoever wanted the shards is gone
             make_shard(folder, spec, shard, dataset, lambda count: print(count, flush=True))
-        except LidarGritError as error:
-            print(json.dumps({"error": [type(error).__name__, error.got, error.wanted, error.cure]}), flush=True)
-            return 2
+    except LidarGritError as error:
+        print(json.dumps({"error": [type(error).__name__, error.got, error.wanted, error.cure]}), flush=True)
+        return 2
     return 0

@@ -212,7 +212,7 @@ def _wrong_rows(scan: Scan, sensor: SensorModel, method: ProjectionName, pixels:
     return ScanError(
         f"{rings} rings in {scan.source}",
         f"the {sensor.height} rings of the sensor {sensor.name!r}, in firing order",
-        f"remove the file if the sweep was cut; {_BY_ELEVATION}; {FIT_SENSOR}",
+        f"remove the file if the scan was cut; {_BY_ELEVATION}; {FIT_SENSOR}",
     )
 
 

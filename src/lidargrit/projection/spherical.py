@@ -59,7 +59,8 @@ def reference_rows(
     """
     # Python floats, so that the arithmetic below stays in single precision as in the program.
     top, bottom = math.radians(_REFERENCE_TOP_DEG), math.radians(_REFERENCE_BOTTOM_DEG)
-    elevation = np.arcsin(xyz_m[2] / range_m)
+    with np.errstate(divide="ignore", invalid="ignore"):  # of a range that is 0 in single precision
+        elevation = np.nan_to_num(np.arcsin(xyz_m[2] / range_m))
     share = 1.0 - (elevation + abs(bottom)) / (abs(top) + abs(bottom))
     return np.clip(np.round(height * share), 0, height - 1).astype(np.int16)
 

@@ -20,6 +20,8 @@ from lidargrit.sensors._columns import continuous_azimuths_rad as continuous_azi
 from lidargrit.sensors._columns import mean_azimuths_rad as mean_azimuths_rad
 from lidargrit.untrusted import user_path
 
+_REACH_AT_MOST_M = 1000  # beyond, steps in which ranges are kept are coarser than 16 mm
+
 ProjectionName = Literal["spherical", "unfolding"]
 
 
@@ -59,11 +61,11 @@ class SensorModel:
     def __post_init__(self) -> None:
         check_tables(self.name, self.elevation_rad, self.azimuth_rad, self.azimuth_offset_rad, self.column_stride)
         check_projection(self.name, self.projection, get_args(ProjectionName))
-        if not 0 < self.range_min_m < self.range_max_m < math.inf:
+        if not 0 < self.range_min_m < self.range_max_m <= _REACH_AT_MOST_M:
             raise ConfigError(
-                f"range limits {self.range_min_m} to {self.range_max_m} m for the sensor {self.name!r}",
-                "0 < range_min_m < range_max_m",
-                "correct the sensor's limits",
+                f"range limits {self.range_min_m:g} to {self.range_max_m:g} m for the sensor {self.name!r}",
+                f"0 < range_min_m < range_max_m <= {_REACH_AT_MOST_M:,} m",
+                "correct the sensor's limits; if scans are in millimetres, divide them by 1000",
             )
 
     @property

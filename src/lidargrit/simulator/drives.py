@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from lidargrit.errors import ConfigError, OutputError
-from lidargrit.files import atomic_path, claim_folder, is_taken, read_json, write_json, write_text
+from lidargrit.errors import ConfigError, DataError, OutputError
+from lidargrit.files import atomic_path, claim_folder, claimed_manifest, is_taken, read_json, write_json, write_text
 from lidargrit.formats.kitti_bin import KittiBin
 from lidargrit.processes import process_pool
 from lidargrit.reporting import Reporter
@@ -68,7 +68,7 @@ class DriveConfig:
 
 def write_drives(
     out: Path, num_scans: int, config: DriveConfig, workers: int = 1, reporter: Reporter | None = None
-) -> None:
+) -> int:
     """Write scans, labels and poses; scans that are there already are not simulated again.
 
     The tree is ``sequences/SS/{velodyne/NNNNNN.bin, labels/NNNNNN.label, poses.txt, times.txt, calib.txt}``. The poses
@@ -81,12 +81,16 @@ def write_drives(
         workers: number of parallel processes.
         reporter: receiver of progress messages.
 
+    Returns:
+        Number of scans that are there now.
+
     Raises:
         OutputError: the folder holds something else.
+        DataError: a street of which no ray returns.
     """
     if num_scans < 1 or workers < 1:
         raise ConfigError(f"{num_scans} scans by {workers} processes", "at least one of each", "correct it")
-    with claim_folder(out):
+    with claim_folder(out), claimed_manifest(out / MANIFEST):
         _claim(out, config)
         missing = [scan for scan in range(num_scans) if not _label_file(out, config, scan).exists()]
         write = partial(_write_scan, out, config)
@@ -101,6 +105,7 @@ def write_drives(
                         progress.advance(1)
         there = sum(1 for _ in out.glob("sequences/*/labels/[!.]*.label"))  # an earlier call may have made more
         _write_sequence_files(out, config, max(num_scans, there))
+    return max(num_scans, there)
 
 
 def _claim(out: Path, config: DriveConfig) -> None:
@@ -120,6 +125,12 @@ def _write_scan(out: Path, config: DriveConfig, scan: int) -> None:
     """Write one scan's files; its labels come last and say that the others are there."""
     seed, frame = config.street_of(scan)
     seen = observe(seed, config.sensor, theme=config.theme, frame=frame, motion=config.motion, wet=config.wet)
+    if not seen.return_mask.any():
+        raise DataError(
+            f"no return in the simulated street {seed} by the sensor {config.sensor.name!r}",
+            "rays that meet the street within the sensor's range limits",
+            "choose another sensor",
+        )
     points = seen.scan(f"simulated scan {seed}")
     assert points.label is not None
     label_file = _label_file(out, config, scan)

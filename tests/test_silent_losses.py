@@ -1,0 +1,199 @@
+"""Sources whose scans would be lost, mixed up or read wrongly without a word: refused in one line, or read whole."""
+
+import json
+import os
+import sqlite3
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from lidargrit.cli import main
+from lidargrit.conditions import Condition
+from lidargrit.datasets import open_dataset
+from lidargrit.errors import ConfigError, DataError, OutputError, ScanError
+from lidargrit.fitting import fit_sensor
+from lidargrit.formats import read_scan
+from lidargrit.formats.kitti_bin import KittiBin
+from lidargrit.formats.ouster_pcap import sensor_of
+from lidargrit.loading import DataConfig, prepare
+from lidargrit.loading.workers import make_some_shards
+from lidargrit.sensors import load_sensor
+from lidargrit.simulator import simulate
+from lidargrit.simulator.drives import DriveConfig, write_drives
+from lidargrit.structures import Scan
+
+K360 = load_sensor("hdl64e_kitti_360")
+
+
+@pytest.fixture
+def kitti(tmp_path):
+    """A folder of two scans."""
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    for seed in (0, 1):
+        KittiBin.write(folder / f"{seed:06d}.bin", simulate(seed, K360.with_columns(128)))
+    return folder
+
+
+def xyz(count: int) -> np.ndarray:
+    angle = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    return np.stack((10 * np.cos(angle), 10 * np.sin(angle), np.linspace(-2, 1, count)), 1).astype(np.float32)
+
+
+def test_a_reach_in_millimetres_is_refused():
+    with pytest.raises(ConfigError, match="<= 1,000 m") as refusal:
+        replace(K360, range_max_m=80_000.0)
+    assert "divide them by 1000" in refusal.value.cure
+
+
+def test_a_folder_that_cannot_be_read_is_not_left_out(kitti, monkeypatch):
+    (kitti / "b").mkdir()
+    listed = os.scandir
+
+    def scandir(path):
+        if str(path).endswith("/b"):
+            raise PermissionError(13, "Permission denied", str(path))
+        return listed(path)
+
+    monkeypatch.setattr(os, "scandir", scandir)
+    with pytest.raises(DataError, match="b, which cannot be read"):
+        open_dataset(str(kitti))
+
+
+def test_hidden_files_and_folders_are_no_scans(tmp_path):
+    folder = tmp_path / "sequences" / "00" / "velodyne"
+    folder.mkdir(parents=True)
+    KittiBin.write(folder / "000000.bin", simulate(0, K360.with_columns(128)))
+    (folder / "._000000.bin").write_bytes(bytes(16 * 256))
+    (folder / "copies.bin").mkdir()
+    assert len(open_dataset(f"kitti_odometry:{tmp_path}")) == 1
+
+
+def test_a_name_with_a_colon_is_a_path_where_it_exists(kitti, monkeypatch):
+    (kitti / "000000.bin").rename(kitti / "12:30:00.bin")
+    monkeypatch.chdir(kitti)
+    assert len(open_dataset("12:30:00.bin")) == 1
+
+
+def test_a_recording_that_was_not_closed_is_refused(tmp_path):
+    with sqlite3.connect(tmp_path / "drive.db3") as database:
+        database.execute("CREATE TABLE topics (id INTEGER, name TEXT, type TEXT)")
+    (tmp_path / "drive.db3-wal").write_bytes(b"pages")
+    with pytest.raises(ScanError, match=r"last messages lie in drive\.db3-wal") as refusal:
+        read_scan(tmp_path / "drive.db3")
+    assert "wal_checkpoint" in refusal.value.cure
+
+
+def test_two_scans_of_one_name_are_not_exported_over_each_other(tmp_path, monkeypatch):
+    folder = tmp_path / "samples" / "LIDAR_TOP"
+    other = tmp_path / "sweeps" / "LIDAR_TOP"
+    for each in (folder, other):
+        each.mkdir(parents=True)
+        rows = np.zeros((64, 5), np.float32)
+        rows[:, :3] = xyz(64)
+        rows[:, 4] = np.arange(64) % 32
+        (each / "n008-2018-08-01-15-16-36-0400__LIDAR_TOP__1533151603547590.pcd.bin").write_bytes(rows.tobytes())
+    assert main(["export", str(tmp_path), str(tmp_path / "out"), "--format", "ply"]) != 0
+
+
+@pytest.mark.parametrize(("before", "separator"), [("# ", " "), ("#", ","), ("//", " ")])
+def test_a_header_behind_a_comment_sign_names_the_columns(tmp_path, before, separator):
+    path = tmp_path / "scan.csv"
+    table = np.column_stack((xyz(64), np.full(64, 0.5), np.zeros(64)))
+    header = separator.join(("x", "y", "z", "intensity", "x"))
+    np.savetxt(path, table, "%.9g", separator, header=header, comments=before)
+    scan = read_scan(path)
+    np.testing.assert_array_equal(scan.points_xyz_m.numpy(), xyz(64))
+    assert scan.reflectance is not None
+    assert bool((scan.reflectance == 0.5).all())
+
+
+def test_an_empty_cell_is_no_damaged_file(tmp_path):
+    path = tmp_path / "scan.csv"
+    path.write_text("x,y,z\n1,2,3\n1,,3\n")
+    with pytest.raises(ScanError, match="lines cannot be read") as refusal:
+        read_scan(path)
+    assert "decimal point" in refusal.value.cure
+
+
+def test_the_mode_of_an_old_ouster_tells_its_columns(tmp_path):
+    path = tmp_path / "drive.json"
+    beams = {"beam_altitude_angles": [10.0, 0.0], "beam_azimuth_angles": [1.0, -1.0]}
+    for mode, columns in (({"lidar_mode": "2048x10"}, 2048), ({}, 1024)):
+        path.write_text(json.dumps(beams | mode))
+        assert sensor_of(path).width == columns
+
+
+@pytest.mark.parametrize("rings", ["from 1", "without the highest"])
+def test_a_sensor_fitted_to_rings_with_a_gap_takes_the_scans_it_was_fitted_to(rings):
+    scans = []
+    for seed in range(3):
+        scan = simulate(seed, load_sensor("vlp16").with_columns(450))
+        assert scan.ring is not None
+        if rings == "from 1":
+            scans.append(replace(scan, ring=scan.ring + 1))
+        else:
+            kept = scan.ring > 0
+            scans.append(Scan(scan.points_xyz_m[kept], None, scan.ring[kept]))
+    assert fit_sensor(scans, "ours").sensor.projection == "spherical"
+
+
+def test_a_ring_that_all_points_have_is_none(tmp_path):
+    np.savetxt(tmp_path / "scan.csv", np.column_stack((xyz(400), np.zeros(400))), header="x y z ring", comments="")
+    assert read_scan(tmp_path / "scan.csv").ring is None
+    np.savetxt(tmp_path / "flat.csv", [(1, 2, 0, 0), (2, 1, 0, 0)], header="x y z ring", comments="")
+    assert read_scan(tmp_path / "flat.csv").ring is not None
+
+
+def test_reflectance_that_is_nan_is_named_and_can_be_dropped(tmp_path):
+    reflectance = np.full(400, 0.5, np.float32)
+    reflectance[7] = np.nan
+    table = np.column_stack((xyz(400), reflectance))
+    np.savetxt(tmp_path / "scan.csv", table, header="x y z intensity", comments="")
+    with pytest.raises(ScanError, match="1 of 400 points with NaN for reflectance"):
+        read_scan(tmp_path / "scan.csv")
+    assert len(read_scan(tmp_path / "scan.csv", bad_points="drop")) == 399
+
+
+def test_a_source_may_be_named_in_another_way_when_it_is_prepared_again(kitti, tmp_path):
+    prepare(str(kitti), DataConfig(), tmp_path / "prepared")
+    prepare(f"{kitti}/", DataConfig(), tmp_path / "prepared")
+    KittiBin.write(kitti / "000002.bin", simulate(2, K360.with_columns(128)))
+    with pytest.raises(OutputError, match="stale"):
+        prepare(str(kitti), DataConfig(), tmp_path / "prepared")
+
+
+def test_nothing_prepared_is_no_success(tmp_path, capsys):
+    (tmp_path / "bad.bin").write_bytes(bytes(160))
+    assert main(["prepare", str(tmp_path / "bad.bin"), "--bad-scans", "skip", "-o", str(tmp_path / "prepared")]) != 0
+    assert "no usable scan" in capsys.readouterr().err
+
+
+def test_a_process_whose_source_has_gone_says_so_in_one_line(kitti, tmp_path, capsys):
+    prepared = prepare(str(kitti), DataConfig(), tmp_path / "prepared")
+    kitti.rename(tmp_path / "elsewhere")
+    assert make_some_shards(prepared, os.getppid(), [0]) == 2
+    assert json.loads(capsys.readouterr().out)["error"][0] == "DataError"
+
+
+def test_a_simulation_without_a_return_leaves_its_folder_free(tmp_path):
+    up = replace(load_sensor("vlp16").with_columns(32), elevation_rad=torch.linspace(1.2, 1.0, 16)[:, None])
+    with pytest.raises(DataError, match="no return in the simulated street"):
+        write_drives(tmp_path / "drive", 1, DriveConfig(up))
+    config = DriveConfig(load_sensor("vlp16").with_columns(32))
+    assert write_drives(tmp_path / "drive", 2, config) == 2
+    assert write_drives(tmp_path / "drive", 1, config) == 2
+
+
+def test_names_of_files_do_not_reach_the_terminal_as_they_are(tmp_path, capsys):
+    KittiBin.write(tmp_path / "e\x1b[31mRED.bin", simulate(0, K360.with_columns(128)))
+    assert main(["inspect", str(tmp_path / "e\x1b[31mRED.bin")]) == 0
+    assert "\x1b" not in capsys.readouterr().out
+
+
+def test_a_condition_of_another_size_than_its_sensor_is_refused():
+    known, range_m = torch.zeros(1, 64, 32, dtype=torch.bool), torch.zeros(1, 64, 32)
+    with pytest.raises(ConfigError, match="range_m of"):
+        Condition(range_m, known, known, known, K360.with_columns(64))
