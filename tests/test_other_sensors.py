@@ -152,7 +152,7 @@ def test_nuscenes_without_tables_goes_by_logs_and_says_what_splits_need(nuscenes
 @pytest.mark.parametrize("table", ["scene", "sample", "log"])
 def test_nuscenes_with_damaged_tables_is_refused_in_one_line(nuscenes, table, text):
     (nuscenes / "v1.0-trainval" / f"{table}.json").write_text(text)
-    with pytest.raises(DataError, match=r"tables cannot be used|\.json, which cannot be") as refusal:
+    with pytest.raises(DataError, match="whose tables cannot be used") as refusal:
         open_dataset(str(nuscenes))
     assert len(one_line(refusal)) < 600
 

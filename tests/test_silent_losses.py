@@ -86,7 +86,7 @@ def test_a_recording_that_was_not_closed_is_refused(tmp_path):
     assert "wal_checkpoint" in refusal.value.cure
 
 
-def test_two_scans_of_one_name_are_not_exported_over_each_other(tmp_path, monkeypatch):
+def test_two_scans_of_one_name_are_not_exported_over_each_other(tmp_path, capsys):
     folder = tmp_path / "samples" / "LIDAR_TOP"
     other = tmp_path / "sweeps" / "LIDAR_TOP"
     for each in (folder, other):
@@ -96,6 +96,7 @@ def test_two_scans_of_one_name_are_not_exported_over_each_other(tmp_path, monkey
         rows[:, 4] = np.arange(64) % 32
         (each / "n008-2018-08-01-15-16-36-0400__LIDAR_TOP__1533151603547590.pcd.bin").write_bytes(rows.tobytes())
     assert main(["export", str(tmp_path), str(tmp_path / "out"), "--format", "ply"]) != 0
+    assert "got several scans of " in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("before", "separator"), [("# ", " "), ("#", ","), ("//", " ")])

@@ -10,6 +10,8 @@ from io import BufferedReader, BytesIO
 
 import numpy as np
 
+from lidargrit.errors import first_words
+
 ARRAY_BYTES_AT_MOST = 512 * 2**20  # unpacked; four million points of 16 columns
 HEADER_BYTES_AT_MOST = 1024  # of an array; numpy writes 118, and reads it as a Python expression
 DIRECTORY_BYTES_AT_MOST = 65_536  # of an archive: a thousand arrays
@@ -39,7 +41,7 @@ def parse_array(data: bytes) -> np.ndarray:
         with warnings.catch_warnings(action="ignore"):  # of headers that Python 2 wrote
             shape, by_column, dtype = read(file, max_header_size=HEADER_BYTES_AT_MOST)
     except Exception as error:  # a damaged header is met with errors of many kinds
-        raise ValueError(f"a damaged array ({_first_words(error)})") from None
+        raise ValueError(f"a damaged array ({first_words(error)})") from None
     # True is an int to numpy's reader, but not to those that then use the shape.
     plain = all(type(size) is int and size >= 0 for size in shape)
     if dtype.kind not in "fiub" or not plain or len(shape) > DIMENSIONS_AT_MOST:
@@ -70,7 +72,7 @@ def open_archive(file: BytesIO | BufferedReader) -> zipfile.ZipFile:
             raise ValueError(f"no directory of at most {DIRECTORY_BYTES_AT_MOST} bytes at its end")
         return zipfile.ZipFile(file)
     except Exception as error:  # a damaged directory is met with errors of many kinds
-        raise ValueError(_first_words(error)) from None
+        raise ValueError(first_words(error)) from None
 
 
 def read_member(
@@ -92,7 +94,7 @@ def read_member(
         with archive.open(info) as file:
             data = file.read(info.file_size)  # never more, whatever the packed bytes would unpack to
     except Exception as error:  # a damaged archive is met with errors of many kinds
-        raise ValueError(f"a damaged array ({_first_words(error)})") from None
+        raise ValueError(f"a damaged array ({first_words(error)})") from None
     return parse_array(data)
 
 
@@ -112,7 +114,3 @@ def read_arrays(
     with open_archive(file) as archive:
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
         return {name: read_member(archive, members[name], bytes_at_most) for name in names if name in members}
-
-
-def _first_words(error: Exception) -> str:
-    return "".join(filter(str.isprintable, " ".join(str(error).split())))[:120] or type(error).__name__

@@ -97,6 +97,11 @@ def printable(text: str) -> str:
     return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in text)
 
 
+def first_words(error: Exception) -> str:
+    """Return what a library says of an error, in one line of at most 120 letters."""
+    return "".join(filter(str.isprintable, " ".join(str(error).split())))[:120] or type(error).__name__
+
+
 def without_folders(text: str) -> str:
     """Return a text in which absolute paths have lost their folders, for pages and files that others will read.
 

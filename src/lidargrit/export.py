@@ -71,7 +71,7 @@ def export_scans(
     scans, of_images = _open(source, config, sensor)
     files = layout.files([scans.name(index) for index in range(len(scans))])
     if twice := sorted(file for file, count in Counter(files).items() if count > 1):
-        what = f"{len(twice)} names that several scans of {source} have, such as {twice[0]}"
+        what = f"several scans of {source} that would be {twice[0]}"
         raise DataError(what, "a name for each scan, as each becomes a file", "rename some, or export them apart")
     identities = [scans.identity(index) for index in range(len(scans))]
     facts = {"source": source, "format": kind, **of_images, "scans": dict(zip(files, identities, strict=True))}

@@ -15,8 +15,6 @@ from lidargrit.errors import DataError, LidarGritError
 from lidargrit.files import read_json
 from lidargrit.formats import BadPoints
 
-_TABLES = "scene.json, sample.json and log.json as nuScenes has them"
-_TABLES_CURE = "unpack the data set's metadata again, or move that folder away to go by logs"
 _TABLE_BYTES_AT_MOST = 50_000_000  # sample.json, the largest, has 9 MB
 _BESIDE_US = 600_000  # sweeps before a scene's first sample or after its last one, which lie half a second apart
 _LAST_SCENE = 1110
@@ -136,14 +134,12 @@ def _read_scenes(root: Path) -> dict[str, list[tuple[int, int, str]]]:
                 if known := times.get(scene["token"]):
                     span = (min(known), max(known), str(scene["name"]))
                     logs.setdefault(log_files[scene["log_token"]], []).append(span)
-        except LidarGritError as error:
-            raise DataError(error.got, _TABLES, _TABLES_CURE) from None
         except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
-            what = " ".join(str(error).split())[:200]
+            what = error.got if isinstance(error, LidarGritError) else " ".join(str(error).split())
             raise DataError(
-                f"{table.parent}, whose tables cannot be used ({what})",
-                _TABLES,
-                _TABLES_CURE,
+                f"{table.parent}, whose tables cannot be used ({what[:200]})",
+                "scene.json, sample.json and log.json as nuScenes has them",
+                "unpack the data set's metadata again, or move that folder away to go by logs",
             ) from None
     return {log: sorted(set(scenes)) for log, scenes in logs.items()}
 

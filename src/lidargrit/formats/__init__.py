@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lidargrit import _discovery
-from lidargrit.errors import OutputError, ScanError
+from lidargrit.errors import OutputError, ScanError, first_words
 from lidargrit.structures import Scan
 
 BadPoints = Literal["refuse", "drop"]
@@ -229,8 +229,3 @@ def first_bytes(path: Path, at_most: int) -> bytes:
 def damaged(path: Path, wanted: str, error: Exception) -> ScanError:
     """Return the error of a file that a library could not read, with the library's reason in one line."""
     return ScanError(f"{path}, a damaged file ({first_words(error)})", wanted, "download it again, or remove it")
-
-
-def first_words(error: Exception) -> str:
-    """Return what a library says of an error, in one line of at most 120 letters."""
-    return "".join(filter(str.isprintable, " ".join(str(error).split())))[:120] or type(error).__name__

@@ -145,20 +145,22 @@ def _whole(values: np.ndarray, good: Tensor, at_most: int, what: str, path: Path
 
 def _tells_rows(ring: np.ndarray, points_xyz_m: Tensor, good: Tensor) -> bool:
     """Return whether a column of rings tells points apart: some drivers write 0 for all."""
-    x, y, z = points_xyz_m[good].double().unbind(dim=1)
-    if not len(z) or (ring != ring.flat[0]).any():
+    if not good.any() or (ring != ring.flat[0]).any():
         return True
-    low, high = torch.atan2(z, torch.hypot(x, y)).aminmax()
+    low, high = _elevation_rad(points_xyz_m[good]).aminmax()
     return float(high - low) < _ONE_RING_AT_MOST_RAD
 
 
 def _from_the_top(ring: Tensor, points_xyz_m: Tensor, good: Tensor) -> Tensor:
     """Return rings counted from the highest, whichever way round the file counts them."""
-    x, y, z = points_xyz_m[good].double().unbind(dim=1)
-    elevation_rad = torch.atan2(z, torch.hypot(x, y))
     centred = ring[good].double() - ring[good].double().mean()
-    if not bool((centred * elevation_rad).sum() > 0):
+    if not bool((centred * _elevation_rad(points_xyz_m[good])).sum() > 0):
         return ring
     highest = int(ring.max())
     lasers = next((count for count in _LASERS if highest < count), highest + 1)
     return torch.where(good, lasers - 1 - ring, 0)
+
+
+def _elevation_rad(points_xyz_m: Tensor) -> Tensor:
+    x, y, z = points_xyz_m.double().unbind(dim=1)
+    return torch.atan2(z, torch.hypot(x, y))

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from lidargrit.errors import ScanError
+from lidargrit.errors import ScanError, first_words
 from lidargrit.files import atomic_path
-from lidargrit.formats import POINTS_AT_MOST, BadPoints, ScanFormat, first_bytes, first_words, read_bytes
+from lidargrit.formats import POINTS_AT_MOST, BadPoints, ScanFormat, first_bytes, read_bytes
 from lidargrit.formats._columns import BYTES_AT_MOST, REFLECTANCE_RULE, columns_of, known_name, scan_of_columns
 from lidargrit.structures import Scan
 

@@ -103,9 +103,10 @@ def write_drives(
                 with process_pool(workers) as pool:
                     for _ in pool.map(write, missing, chunksize=4):
                         progress.advance(1)
-        there = sum(1 for _ in out.glob("sequences/*/labels/[!.]*.label"))  # an earlier call may have made more
-        _write_sequence_files(out, config, max(num_scans, there))
-    return max(num_scans, there)
+        # An earlier call may have made more.
+        there = max(num_scans, sum(1 for _ in out.glob("sequences/*/labels/[!.]*.label")))
+        _write_sequence_files(out, config, there)
+    return there
 
 
 def _claim(out: Path, config: DriveConfig) -> None:
