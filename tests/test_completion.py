@@ -17,6 +17,7 @@ from lidargrit.conditions.fills import FILLS, fill
 from lidargrit.errors import ConfigError, DataError, ScanError
 from lidargrit.evaluation.raydrop import RAYDROP_CURVES, decoded_surfaces, raydrop_table, score_raydrop
 from lidargrit.formats import read_scan
+from lidargrit.formats.kitti_bin import KittiBin
 from lidargrit.formats.numpy_array import NumpyArray
 from lidargrit.formats.ply import Ply
 from lidargrit.generators import load, load_class
@@ -116,7 +117,7 @@ def test_complete_keeps_names_and_observed_points_and_goes_on(folders, tmp_path,
     assert (tmp_path / "out/drive/1.npz").stat().st_mtime_ns == before
     assert (tmp_path / "out/drive/2.npz").exists()
     assert main([*words[:-3], "linear", *words[-2:]]) == 2
-    assert "which holds other scans or another format" in capsys.readouterr().err
+    assert "which was begun with another model" in capsys.readouterr().err
 
 
 def test_a_model_completes_in_several_ways_and_into_any_format(folders, tmp_path):
@@ -158,7 +159,7 @@ def test_an_image_whose_name_is_no_text_is_refused(tmp_path):
 def test_two_images_whose_names_differ_in_letters_alone_are_two_files(tmp_path, recwarn):
     folder = tmp_path / "images"
     folder.mkdir()
-    for name, factor in (("scan.npy", 1), ("scan.NPY", 1e300)):
+    for name, factor in (("scan.npy", 1), ("scan.NPY", 0.5), ("huge.npy", 1e300)):  # the last is left out
         with (folder / name).open("wb") as file:
             np.save(file, street(SENSOR).range_m.double().numpy() * factor)
     words = ["complete", str(folder), str(tmp_path / "out"), "--model", "nearest", "--observed", "rows:4"]
@@ -179,6 +180,19 @@ def test_completions_of_no_scan_leave_the_folder_to_a_corrected_command(folders,
     (tmp_path / "scans/1.bin").unlink()
     NumpyArray.write(tmp_path / "scans/1.npz", unproject(street(SENSOR)))
     assert main([*words, f"{folders}/run"]) == 0
+
+
+def test_every_fourth_ring_in_firing_order_is_told_of_upsample(tmp_path, capsys):
+    whole = simulate(0, load_sensor("hdl64e_kitti_odometry"))
+    azimuth_rad = torch.atan2(whole.points_xyz_m[:, 1], whole.points_xyz_m[:, 0]) % (2 * torch.pi)
+    fired = torch.argsort(whole.ring * 10 + azimuth_rad)
+    fired = fired[whole.ring[fired] % 4 == 0]
+    KittiBin.write(tmp_path / "scans" / "0.bin", Scan(whole.points_xyz_m[fired], whole.reflectance[fired]))
+    words = ["complete", str(tmp_path / "scans"), str(tmp_path / "out"), "--model", "linear", "--observed", "rows:4"]
+    assert main([*words, "--sensor", "hdl64e_kitti_odometry"]) == 2
+    told = capsys.readouterr().err
+    assert "got 16 rings in" in told
+    assert "add the missing rows with: lidargrit upsample" in told
 
 
 def test_upsample_adds_the_rows_that_lack(folders, tmp_path):
@@ -237,6 +251,8 @@ def test_models_and_settings_are_compared_on_hidden_parts(folders, tmp_path, cap
     assert run["diversity_m"]["value"] > 0.1
     difference = nearest["mae_m"]["value"] - triangles["mae_m"]["value"]
     assert nearest["beside_triangulation_m"]["value"] == pytest.approx(difference)
+    assert main([*words[:2], "nearest", "--observed", "returns", "--sensor", f"{folders}/sensor.json"]) == 2
+    assert "got --observed returns, which hides no return of these scans" in capsys.readouterr().err
     assert main([*words[:2], f"{folders}/run:completion=guess"]) == 2
     assert "completion=guess" in capsys.readouterr().err
 

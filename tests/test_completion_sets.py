@@ -1,5 +1,6 @@
 """Whole sets of scans: what a completed scan may depend on, scans that cannot be used, and sensors of fewer columns."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -100,6 +101,15 @@ def test_a_scan_with_nothing_observed_is_left_out(run, tmp_path, capsys):
     assert complete(run, source, tmp_path / "out", *words) == 0
     assert "left out: " in capsys.readouterr().err
     assert sorted(path.name for path in (tmp_path / "out").glob("*.npz")) == ["0.npz", "1.npz"]
+    assert sorted(json.loads((tmp_path / "out" / "completed.json").read_text())["scans"]) == ["0.npz", "1.npz"]
+
+
+def test_a_scan_is_never_called_as_its_return_probabilities_are(run, tmp_path, capsys):
+    source = scan_files(tmp_path / "scans", 1)
+    (tmp_path / "scans" / "0.npz").rename(tmp_path / "scans" / "0.probability.npz")
+    assert complete(run, source, tmp_path / "out", "--observed", "rows:4", "--format", "image") == 2
+    assert "got a scan that would be 0.probability.npy" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_columns_in_which_a_sensor_never_fires_are_unknown():

@@ -96,7 +96,7 @@ def test_names_do_not_depend_on_the_split(cls, dataset):
 
 def test_refuses_an_unknown_split_and_names_the_nearest(cls, dataset):
     known = next(iter(cls.splits()), "all")
-    with pytest.raises(DataError, match=rf"'{known}x'.*wanted one of .*{known}"):
+    with pytest.raises(DataError, match=rf"'{known}x'.*wanted one such as .*{known}"):
         cls(ROOT, known + "x")
 
 

@@ -57,7 +57,7 @@ def test_kitti_odometry_splits(bin_file, tmp_path, sequences):
     assert set.union(*names.values()) == set(names_of(open_dataset(str(tmp_path))))
     assert names_of(open_dataset(f"{tmp_path}:03+00")) == ["00/000000", "03/000000"]
     assert len(open_dataset(f"{tmp_path}:train+val")) == 11
-    with pytest.raises(DataError, match=r"'00\+3' .*'3' neither a split nor a sequence there; wanted one of .*03"):
+    with pytest.raises(DataError, match=r"'00\+3' .*'3' neither a split nor a sequence there; wanted one such as .*03"):
         open_dataset(f"{tmp_path}:00+3")
 
 

@@ -210,6 +210,7 @@ def test_bad_scans_are_refused_or_left_out(samples, tmp_path):
     with pytest.raises(ScanError, match=r"000000\.bin"):
         export_scans(str(scans), tmp_path / "out", "ply")
     assert export_scans(str(scans), tmp_path / "out", "ply", DataConfig(bad_scans="skip")) == 1
+    assert list(json.loads((tmp_path / "out" / MANIFEST).read_text(encoding="utf-8"))["scans"]) == ["000001.ply"]
     (scans / "000001.bin").unlink()
     with pytest.raises(DataError, match="no usable scan"):
         export_scans(str(scans), tmp_path / "none", "ply", DataConfig(bad_scans="skip"))

@@ -6,10 +6,12 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+import safetensors
 import torch
 
 from lidargrit.errors import CheckpointError, OutputError, ScanError
@@ -258,6 +260,31 @@ def test_the_command_that_finishes_a_killed_one_leaves_whole_files_alone(tmp_pat
 def test_a_folder_is_never_taken_for_a_file_to_replace(tmp_path):
     with pytest.raises(OutputError, match="which is a folder; wanted a file"):
         refuse_to_overwrite(tmp_path, overwrite=True)
+
+
+def test_tensors_are_read_where_no_interrupt_is_taken_for_damage(tmp_path, monkeypatch):
+    write_tensors(tmp_path / "a.safetensors", {"a": torch.zeros(2)})
+    opened, threads = safetensors.safe_open, []
+
+    def safe_open(*given, **named):
+        threads.append(threading.current_thread())
+        return opened(*given, **named)
+
+    monkeypatch.setattr(safetensors, "safe_open", safe_open)
+    read_tensors(tmp_path / "a.safetensors")
+    assert threads
+    assert threading.main_thread() not in threads
+
+
+def test_tensors_that_may_not_be_read_are_not_called_missing(tmp_path, monkeypatch):
+    write_tensors(tmp_path / "a.safetensors", {"a": torch.zeros(2)})
+
+    def refuse(path, *_):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "open", refuse)
+    with pytest.raises(CheckpointError, match=r"cannot be read \(Permission denied\); .*; change its permissions"):
+        read_tensors(tmp_path / "a.safetensors")
 
 
 @pytest.mark.parametrize(("read", "error"), [(read_tensors, CheckpointError), (read_tensor, ScanError)])

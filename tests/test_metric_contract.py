@@ -204,7 +204,7 @@ def test_other_options_are_not_merged(name, variant):
 
 
 def test_unknown_names_are_refused_with_neighbours(name, variant):
-    with pytest.raises(UnknownNameError, match=f"wanted one of .*{name}"):
+    with pytest.raises(UnknownNameError, match=f"wanted one such as .*{name}"):
         load_metric(name + "x")
 
     class Known(Metric):

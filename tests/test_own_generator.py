@@ -1,5 +1,6 @@
 """The page on a generator of one's own: its file is trained, sampled and compared without a recipe."""
 
+import inspect
 import json
 import re
 import shutil
@@ -9,6 +10,7 @@ import pytest
 
 import lidargrit.generators
 import lidargrit.recipes
+import test_generator_contract as contract
 from lidargrit import _discovery
 from lidargrit.cli import main
 from lidargrit.errors import ConfigError, UnknownNameError
@@ -17,6 +19,7 @@ from lidargrit.recipes import default_recipe, load_recipe
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs/how-to/own-generator.md").read_text(encoding="utf-8")
+CONTRACT = [name for name in dir(contract) if name.startswith("test_")]
 QUICK = ["data.train=[simulated:2:train]", "data.val=[simulated:2:val]", "data.workers=1"]
 
 
@@ -25,9 +28,7 @@ def code(tmp_path, monkeypatch):
     """Add a folder to the generators in which the page's file lies, and return the path of the file."""
     ours = _discovery._folder("generators")
     folder = tmp_path / "generators"
-    folder.mkdir()
-    for name in ("marginal", "__init__"):
-        shutil.copy(ours / f"{name}.py", folder)
+    shutil.copytree(ours, folder, ignore=shutil.ignore_patterns("__pycache__"))
     find = _discovery._folder
     monkeypatch.setattr(_discovery, "_folder", lambda package: folder if package == "generators" else find(package))
     monkeypatch.setattr(lidargrit.generators, "__path__", [*lidargrit.generators.__path__, str(folder)])
@@ -49,6 +50,13 @@ def test_the_file_of_the_page_is_compared_without_a_recipe(code, tmp_path, capsy
     systems = json.loads((tmp_path / "table.json").read_text())
     assert [each["system"] for each in systems] == ["marginal", "mean_street"]
     assert float(load(tmp_path / "table" / "runs" / "mean_street").mean.range_m.detach().std()) > 0, "it has learned"
+
+
+@pytest.mark.parametrize("test", CONTRACT)
+def test_the_file_of_the_page_keeps_the_contract(test, code, tmp_path):
+    asked = getattr(contract, test)
+    given = {"name": "mean_street", "tmp_path": tmp_path}
+    asked(**{name: given[name] for name in inspect.signature(asked).parameters})
 
 
 def test_a_default_recipe_needs_defaults_and_a_known_name(code):

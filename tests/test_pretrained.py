@@ -139,12 +139,12 @@ def test_every_verb_that_takes_a_run_takes_the_word(tmp_path, monkeypatch, capsy
 
 
 def test_they_are_served_after_the_users_own(model, tmp_path, monkeypatch):
-    assert finished_runs(tmp_path) == [FOLDER, WIDE]
+    assert finished_runs(tmp_path, print) == [FOLDER, WIDE]
     model.save(tmp_path / "zebra")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "pretrained").mkdir()
     (tmp_path / "pretrained" / "samples.json").write_text("{}")  # what a user calls so is no run
-    assert finished_runs(tmp_path) == [tmp_path / "zebra", FOLDER, WIDE]
+    assert finished_runs(tmp_path, print) == [tmp_path / "zebra", FOLDER, WIDE]
 
 
 def test_half_as_many_bytes_keep_what_networks_compute(model, tmp_path):

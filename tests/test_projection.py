@@ -1,6 +1,8 @@
 """The exact projection as mathematics: round trips, turns of the car, who wins a pixel, which scans are refused."""
 
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -158,6 +160,13 @@ def test_images_that_contradict_themselves_are_refused():
         RangeImage(good[:, :3], good[:, :3] > 0, sensor)
     with pytest.raises(ScanError, match="one by one"):
         unproject(RangeImage.stack([RangeImage(good, good > 0, sensor)]))
+
+
+def test_a_word_that_names_no_projection_is_refused():
+    """In a process of its own, for in the tests the types of the arguments are checked."""
+    code = "import lidargrit\nlidargrit.project(lidargrit.simulate(0), lidargrit.load_sensor('vlp16'), variant='exat')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert "ConfigError: got variant='exat'; wanted exact or reference; correct it" in done.stderr
 
 
 def test_points_of_64_bits_are_those_of_32():

@@ -371,13 +371,15 @@ def test_the_command_says_where_and_to_whom(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     made("marginal")[0].save(tmp_path / "runs" / "tiny")
     (tmp_path / "runs" / "tiny" / "model.safetensors").write_bytes(b"no weights")
-    assert main(["serve", "--port", "0"]) == 2, "told by the worker process"
+    assert main(["serve", "runs/tiny", "--port", "0"]) == 2, "told by the worker process"
     assert re.fullmatch(r"lidargrit serve: got \S*model.safetensors.*; wanted .*; .*\n", capsys.readouterr().err)
     monkeypatch.setattr(server, "JobQueue", Idle)
     monkeypatch.setattr(TcpWSGIServer, "run", lambda self: None)
     assert main(["serve", "--port", "0", "--host", "0.0.0.0"]) == 0
     said = capsys.readouterr().out
-    assert said.startswith("WARNING: everybody who reaches 0.0.0.0 can use this machine")
+    assert re.match(
+        r"left out: runs/tiny: got \S*model.safetensors.*; wanted .*\nWARNING: everybody who reaches 0", said
+    )
     assert re.search(r"open http://0\.0\.0\.0:\d+ in a browser", said)
     for wrong in (
         ["--seconds", "-1"],

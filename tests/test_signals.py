@@ -46,6 +46,16 @@ def test_a_signal_during_an_import_is_raised_after_it(number, tmp_path, monkeypa
 
 
 @pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_during_the_last_import_is_not_lost(number, tmp_path, monkeypatch):
+    name = f"last_{number.name.lower()}"
+    (tmp_path / f"{name}.py").write_text(f"import os\nos.kill(os.getpid(), {int(number)})\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(SIGNALS[number]), raising_on_signals():
+        __import__(name)
+    assert signal.getitimer(signal.ITIMER_REAL) == (0, 0)
+
+
+@pytest.mark.parametrize("number", SIGNALS)
 def test_elsewhere_it_is_raised_at_once(number):
     with pytest.raises(SIGNALS[number]):
         interrupted(lambda: os.kill(os.getpid(), number))

@@ -108,7 +108,7 @@ def test_a_vqvae_is_written_without_a_name_and_read_with_or_without(generator):
 @pytest.mark.parametrize(
     ("tokenizer", "message"),
     [
-        ({"name": "vqvea"}, r"got 'vqvea', which is not among the tokenizers; wanted one of vqvae or curve_vqvae"),
+        ({"name": "vqvea"}, r"got 'vqvea', which is not among the tokenizers; wanted one such as vqvae or curve_vqvae"),
         ({"name": ["vqvae"]}, r"which is not among the tokenizers"),
         ({"name": "../vqvae"}, r"which is not among the tokenizers"),
         ({"name": NAME, "channels": 32}, r"that does not fit \(.*channels"),

@@ -32,10 +32,10 @@ MISTAKES = {
     "sample nowhere out --device cuda:99": "got device 'cuda:99'; wanted one that PyTorch finds",
     "evaluate nowhere nowhere --device abacus": "got device 'abacus'; wanted one that PyTorch finds",
     "evaluate nowhere nowhere --variant exakt": "got variant 'exakt'; wanted one such as exact or textbook; choose one",
-    "evaluate nowhere nowhere --metrics slicd_wasserstein": "wanted one of sliced_wasserstein; see all",
+    "evaluate nowhere nowhere --metrics slicd_wasserstein": "wanted one such as sliced_wasserstein; see all",
     "view .": "got ., which is an empty folder; wanted one with scans in it;",
     "sample nowhere out --device meta": "try cpu",
-    "inspect simulated:1 --sensor hdl64": "wanted one of hdl64e_kitti_360, hdl64e_kitti_odometry or",
+    "inspect simulated:1 --sensor hdl64": "wanted one such as hdl64e_kitti_360, hdl64e_kitti_odometry or",
 }
 FACTS = {
     "doctor": "processors",

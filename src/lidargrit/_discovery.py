@@ -60,7 +60,7 @@ def _the_one(package: str, name: str, chosen: Callable[[object, str], T | None])
     if name not in known:
         raise UnknownNameError(
             f"{name!r}, which is not among the {package}",
-            f"one of {nearest_names(name, known)}",
+            f"one such as {nearest_names(name, known)}",
             f"see all with: lidargrit list {package}",
         )
     module = importlib.import_module(f"lidargrit.{package}.{name}")

@@ -75,9 +75,8 @@ def export_scans(
         raise DataError(what, "a name for each scan, as each becomes a file", "rename some, or export them apart")
     identities = [scans.identity(index) for index in range(len(scans))]
     facts = {"source": source, "format": kind, **of_images, "scans": dict(zip(files, identities, strict=True))}
-    with claim_folder(out), claimed_scans(out / MANIFEST, facts):
+    with claim_folder(out), claimed_scans(out / MANIFEST, facts) as left_out:
         missing = [index for index, file in enumerate(files) if not layout.is_there(file)]
-        left_out = 0
         with reporter.progress("exporting", len(files), len(files) - len(missing)) as progress:
             for index in missing:
                 try:
@@ -86,11 +85,11 @@ def export_scans(
                     if config.bad_scans == "refuse":
                         raise
                     reporter.message(f"left out: {error}")
-                    left_out += 1
+                    left_out.add(files[index])
                 progress.advance(1)
-        if left_out == len(files):
+        if len(left_out) == len(files):
             raise DataError(f"no usable scan in {source}", "at least one", "see the messages above")
-        return len(files) - left_out
+        return len(files) - len(left_out)
 
 
 def write_array(path: Path, pixels: Float[Tensor, "H W"]) -> None:
@@ -190,8 +189,10 @@ def writable_format(kind: str, *others: str) -> tuple[type[ScanFormat], str]:
 
 
 @contextmanager
-def claimed_scans(manifest: Path, facts: dict[str, Any]) -> Iterator[None]:
+def claimed_scans(manifest: Path, facts: dict[str, Any]) -> Iterator[set[str]]:
     """Write the manifest of a folder of scans, or add to the one that the same command wrote before.
+
+    Yields a set for the files that are left out after all: at the end the manifest lists them no more.
 
     A new manifest is removed again if no scan was written after all; see
     :func:`~lidargrit.files.claimed_manifest`.
@@ -205,7 +206,12 @@ def claimed_scans(manifest: Path, facts: dict[str, Any]) -> Iterator[None]:
     """
     with claimed_manifest(manifest):
         _claim(manifest, facts)
-        yield
+        left_out = set[str]()
+        yield left_out
+        if left_out:
+            there = read_json(manifest)
+            kept = {file: name for file, name in there["scans"].items() if file not in left_out}
+            write_json(manifest, {**there, "scans": kept})
 
 
 def _claim(manifest: Path, facts: dict[str, Any]) -> None:
@@ -217,14 +223,18 @@ def _claim(manifest: Path, facts: dict[str, Any]) -> None:
             raise OutputError(f"a scan that would lie outside, in {file}", "names below a folder", "rename it")
         user_path(str((out / file).absolute()), OutputError)  # refuses names that no file can have
     if is_taken(out) and not manifest.is_file():
-        got = f"{out}, which is not empty and holds no {manifest.stem}"
-        raise OutputError(got, "an empty folder", "choose another one")
+        got = f"{out}, which is not empty and holds no {manifest.name}"
+        raise OutputError(got, "an empty folder, or one that this very command began", "choose another one")
     if manifest.is_file():
         there = read_json(manifest)
-        known = there.get("scans") if isinstance(there, dict) else None
-        if not isinstance(known, dict) or {**there, "scans": None} != {**facts, "scans": None}:
+        known = there.get("scans")
+        if not isinstance(known, dict):
+            raise OutputError(f"{manifest}, which lists no scans", "what lidargrit wrote", "choose another folder")
+        if other := [name for name in sorted({*there, *facts} - {"scans"}) if there.get(name) != facts.get(name)]:
             raise OutputError(
-                f"{out}, which holds other scans or another format", "an empty folder", "choose another one"
+                f"{out}, which was begun with another {other[0].replace('_', ' ')}",
+                "an empty folder, or one that this very command began",
+                "choose another folder",
             )
         changed = [file for file, name in facts["scans"].items() if known.get(file, name) != name]
         if changed:

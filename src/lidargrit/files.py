@@ -251,8 +251,8 @@ def write_json(path: Path, data: Any) -> None:
 
 
 @contextmanager
-def claimed_manifest(manifest: Path) -> Iterator[None]:
-    """Remove a new manifest again if nothing was written beside it within the ``with`` block.
+def claimed_manifest(manifest: Path, *companions: Path) -> Iterator[None]:
+    """Remove a new manifest, and its companions, again if nothing else was written beside it in the ``with`` block.
 
     Otherwise the folder would be refused to a corrected command, which does it in another way.
     """
@@ -261,8 +261,10 @@ def claimed_manifest(manifest: Path) -> Iterator[None]:
         yield
     finally:
         with suppress(OSError):  # the folder was removed meanwhile
-            if is_new and all(path == manifest or is_partial(path.name) for path in manifest.parent.iterdir()):
-                manifest.unlink()
+            ours = {manifest, *companions}
+            if is_new and all(path in ours or is_partial(path.name) for path in manifest.parent.iterdir()):
+                for path in ours:
+                    path.unlink(missing_ok=True)
 
 
 def plain(value: Any) -> Any:
@@ -305,9 +307,14 @@ def _read_bytes(path: Path, error: type[LidarGritError], wanted: str, cure: str,
         if not data and path.suffix == ".json":
             raise OSError("an empty file")
     except (OSError, ValueError) as why:
-        reason = why.strerror if isinstance(why, OSError) and why.strerror else why
-        raise error(f"{path}, which cannot be read ({reason})", wanted, cure) from None
+        raise _unreadable(error, path, why, wanted, cure) from None
     return data
+
+
+def _unreadable(error: type[LidarGritError], path: Path, why: Exception, wanted: str, cure: str) -> LidarGritError:
+    reason = why.strerror if isinstance(why, OSError) and why.strerror else why
+    cure = "change its permissions" if isinstance(why, PermissionError) else cure
+    return error(f"{path}, which cannot be read ({reason})", wanted, cure)
 
 
 def sha256_of(path: Path) -> str:
@@ -336,22 +343,29 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Read tensors and what is known about them from a safetensors file.
 
     Raises:
-        CheckpointError: the file is missing, cut short, or not one of ours.
+        CheckpointError: the file is missing, may not be read, is cut short, or is not one of ours.
     """
-    from safetensors import SafetensorError, safe_open  # noqa: PLC0415
+    from concurrent.futures import ThreadPoolExecutor  # noqa: PLC0415
 
+    from safetensors import SafetensorError  # noqa: PLC0415
+
+    cure = "restore the file, or remove it and train again"
     try:
         if not path.is_file():  # a pipe would hang
             raise OSError("no such file" if not path.exists() else "not a file")
-        with safe_open(path, framework="pt") as opened:
-            about = parse_json((opened.metadata() or {}).get("about", "{}"), str(path))
-            return {name: opened.get_tensor(name) for name in opened.keys()}, about  # noqa: SIM118  not a dict
-    except (OSError, SafetensorError, ValueError) as error:
-        raise CheckpointError(
-            f"{path}, which cannot be read ({error})",
-            "a complete safetensors file",
-            "restore the file, or remove it and train again",
-        ) from None
+        path.open("rb").close()  # the library calls a file that may not be read a missing one
+        with ThreadPoolExecutor(1) as thread:  # the library takes an interrupt, which only the main thread gets, for
+            return thread.submit(_opened_tensors, path).result()  # a damaged file
+    except (OSError, SafetensorError, ValueError) as why:
+        raise _unreadable(CheckpointError, path, why, "a complete safetensors file", cure) from None
+
+
+def _opened_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    from safetensors import safe_open  # noqa: PLC0415
+
+    with safe_open(path, framework="pt") as opened:
+        about = parse_json((opened.metadata() or {}).get("about", "{}"), str(path))
+        return {name: opened.get_tensor(name) for name in opened.keys()}, about  # noqa: SIM118  not a dict
 
 
 def load_exactly(

@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 import torch
 
+import lidargrit
 from lidargrit.cli import main
+from lidargrit.formats.numpy_array import NumpyArray
 from lidargrit.loading import DataConfig
 from lidargrit.sources import load_range_images
 from lidargrit.sources.samples import read_samples
+from lidargrit.structures import Scan
 from tiny_runs import the_one_line, train_words
 
 
@@ -36,6 +39,19 @@ def test_a_folder_with_foreign_files(refused, run_folder, tmp_path):
         (["sample", run_folder, tmp_path / "thesis" / "chapter.tex"], "which is not empty and holds no samples"),
     ):
         assert what in refused(*words)
+
+
+def test_a_training_that_is_refused_leaves_its_folder_to_the_corrected_command(refused, tmp_path):
+    for number in range(4):
+        scan = lidargrit.simulate(seed=number)
+        NumpyArray.write(tmp_path / "scans" / f"{number}.npz", Scan(scan.points_xyz_m, None, scan.ring))
+    words = train_words(tmp_path / "new", f"data.train=[{tmp_path}/scans]", "model.tokenizer.reflectance=true")
+    assert "without reflectance, for a model of model.tokenizer.reflectance=true" in refused(*words)
+
+
+def test_samples_of_a_run_whose_recordings_are_damaged(refused, run_folder, tmp_path):
+    (run_folder / "trained_on.json").write_text("{")
+    assert "trained_on.json" in refused("sample", run_folder, tmp_path / "new", "-n", "1")
 
 
 def test_samples_of_another_model_or_drawn_otherwise(refused, finished, samples):

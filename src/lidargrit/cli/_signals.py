@@ -19,32 +19,37 @@ def raising_on_signals() -> Iterator[None]:
     """Let SIGTERM, which batch schedulers send before they kill, end a verb as Ctrl-C does: with its files in order.
 
     A module that an exception leaves half imported fails later, with an error that hides the signal. So a signal that
-    comes during an import is raised as soon as the import is done.
+    comes during an import is raised as soon as the import is done, or else at the end of the ``with`` block.
     """
     raised: dict[int, type[BaseException]] = {signal.SIGTERM: Terminated}
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # ignored in the background of a script
         raised[signal.SIGINT] = KeyboardInterrupt
+    befores: dict[int, Any] = {}
+    waiting: list[int] = []  # came during an import
 
     def receive(number: int, frame: FrameType | None) -> None:
-        if not _is_importing(frame):
-            raise raised[number]
-        before = signal.getsignal(signal.SIGALRM)
+        if number in raised:
+            waiting.append(number)
+        if waiting and _is_importing(frame):
+            if signal.SIGALRM not in befores:
+                befores[signal.SIGALRM] = signal.signal(signal.SIGALRM, receive)
+            signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
+        elif waiting:
+            first = waiting[0]
+            waiting.clear()
+            raise raised[first]
 
-        def again(_: int, later: FrameType | None) -> None:
-            signal.signal(signal.SIGALRM, before)
-            receive(number, later)
-
-        signal.signal(signal.SIGALRM, again)
-        signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
-
-    befores: dict[int, Any] = {}
     with suppress(ValueError):  # a caller's thread: signals are the caller's
-        befores = {number: signal.signal(number, receive) for number in raised}
+        befores.update({number: signal.signal(number, receive) for number in raised})
     try:
         yield
     finally:
+        if signal.SIGALRM in befores:
+            signal.setitimer(signal.ITIMER_REAL, 0)
         for number, before in befores.items():
             signal.signal(number, before)
+        if waiting:
+            raise raised[waiting[0]]
 
 
 def _is_importing(frame: FrameType | None) -> bool:

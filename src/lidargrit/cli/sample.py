@@ -44,9 +44,8 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.run_folder import locate
     from lidargrit.sources.samples import write_samples
 
-    if options.count < 1 or options.seed < 0:
-        got = f"-n {options.count}, --seed {options.seed}"
-        raise ConfigError(got, "at least one scan, and no negative seed", "correct the number")
+    if options.count < 1:
+        raise ConfigError(f"-n {options.count}", "at least one scan", "raise it")
     rank, world_size = rank_and_world_size(options.rank, options.world_size)
     own = f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu"
     device = usable_device(options.device or own)

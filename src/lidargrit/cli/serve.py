@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from pathlib import Path
 
 from lidargrit.cli._options import add_device
@@ -35,6 +36,7 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.run_folder import locate
     from lidargrit.serving import Limits, finished_runs, serve
 
-    runs = [locate(run) for run in options.runs] or finished_runs(Path("runs"))
+    say = partial(print, flush=True)
+    runs = [locate(run) for run in options.runs] or finished_runs(Path("runs"), say)
     limits = Limits(seconds=options.seconds)
-    serve(runs, lambda text: print(text, flush=True), options.host, options.port, options.device, limits)
+    serve(runs, say, options.host, options.port, options.device, limits)

@@ -17,7 +17,7 @@ from lidargrit.completion import Completer
 from lidargrit.completion.inputs import Inputs, InputScan
 from lidargrit.conditions import Condition
 from lidargrit.determinism import derive_seed
-from lidargrit.errors import ConfigError, DataError, ScanError
+from lidargrit.errors import ConfigError, DataError, OutputError, ScanError
 from lidargrit.export import IMAGE, TREE, KittiTree, claimed_scans, writable_format, write_array, write_with_labels
 from lidargrit.files import claim_folder
 from lidargrit.formats import ScanFormat
@@ -111,7 +111,7 @@ def write_completions(
     jobs = chain(first, remaining)
     with (
         claim_folder(out),
-        claimed_scans(out / "completed.json", {**manifest, "scans": scans}),
+        claimed_scans(out / "completed.json", {**manifest, "scans": scans}) as files_left_out,
         reporter.progress("completing", len(files), len(files) - len(missing)) as progress,
     ):
         for batch in _batches(jobs, completer.batch):
@@ -124,6 +124,7 @@ def write_completions(
                     labels_lost = True
                     reporter.message(f"{Path(file).suffix} keeps no labels; --format {TREE} or npz keeps them")
                 progress.advance(1)
+        files_left_out.update(file for (index, _), file in files.items() if index in left_out)
     if len(left_out) == len(inputs):
         raise DataError("no usable scan", "at least one", "see the messages above")
     return len(files) - len(left_out) * output.count
@@ -150,6 +151,9 @@ def _files(inputs: Inputs, output: OutputConfig, sensor: SensorModel) -> dict[tu
         names = KittiTree(Path()).files(names)
     else:
         names = [name + _suffix(inputs.suffix(index), output.format, sensor) for index, name in enumerate(names)]
+    if taken := [name for name in names if name.endswith(PROBABILITY)]:
+        got = f"a scan that would be {taken[0]}, as files of return probabilities are called"
+        raise OutputError(got, "another name", "rename the scan, or choose another --format")
     return {
         (index, turn): _folder(turn, output.count) + name
         for index, name in enumerate(names)

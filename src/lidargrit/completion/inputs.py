@@ -19,7 +19,7 @@ from lidargrit.formats import ScanFormat
 from lidargrit.loading import DataConfig, RangeImages
 from lidargrit.loading.config import ScanSettings
 from lidargrit.projection import ProjectionVariant, doubts_about_rays, index_map, project, unproject
-from lidargrit.projection.fit import projection_that_fits, told_doubt
+from lidargrit.projection.fit import has_few_rings, projection_that_fits, ring_count, told_doubt
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import ProjectionName, SensorModel, load_sensor
 from lidargrit.sources import open_images, open_source
@@ -130,10 +130,9 @@ class ScanReader:
 
     def read(self, scan: Scan) -> InputScan:
         """Project a scan; by elevation if its rings or its firing order do not fit, but not a file that was cut off."""
-        rings = self.sensor.height if scan.ring is None else int(scan.ring.max()) + 1
-        if 2 * rings <= self.sensor.height:
+        if has_few_rings(scan, self.sensor):
             raise ScanError(
-                f"{rings} rings in {scan.source}",
+                f"{ring_count(scan)} rings in {scan.source}",
                 f"the {self.sensor.height} of the sensor {self.sensor.name!r}",
                 "add the missing rows with: lidargrit upsample",
             )

@@ -183,7 +183,9 @@ class Condition:
 
 def check_observed(observed: Bool[Tensor, "..."], range_m: Float[Tensor, "..."], what: str = "observed pixels") -> None:
     """Refuse a mask whose shape is not that of the ranges, with ConfigError that says ``what`` it is."""
-    if observed.shape != range_m.shape or observed.dtype != torch.bool or range_m.ndim != 3:
+    if range_m.ndim != 3:
+        raise ConfigError(f"ranges of shape {tuple(range_m.shape)}", "(B, H, W), a batch of images", "add a batch axis")
+    if observed.shape != range_m.shape or observed.dtype != torch.bool:
         raise ConfigError(
             f"{what} of shape {tuple(observed.shape)} and type {observed.dtype}",
             f"{tuple(range_m.shape)} and torch.bool, one for each pixel of a batch of images",

@@ -91,7 +91,7 @@ class Pattern:
         name, _, rest = self.text.partition(":")
         wanted, count = {
             "rows": ("rows:N with a whole N from 2 to 64", 1),
-            "sector": ("sector:A,B with degrees from -360 to 360", 2),
+            "sector": ("sector:A,B with two different angles, in degrees from -360 to 360", 2),
             "pixels": ("pixels:SHARE between 0 and 1", 1),
         }[name]
         try:

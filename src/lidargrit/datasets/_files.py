@@ -159,7 +159,7 @@ class FileDataset(ScanDataset):
             if part not in named and part not in sequences and part != "all":
                 raise DataError(
                     f"the split {split.text!r} of {self.root}, with {part!r} neither a split nor a sequence there",
-                    f"one of {nearest_names(part, {'all', *named, *sequences})}",
+                    f"one such as {nearest_names(part, {'all', *named, *sequences})}",
                     f"join several with '+', as in {'+'.join(sorted(sequences)[:2])}",
                 )
         if "all" in split.parts:

@@ -61,7 +61,7 @@ class Streets(ScanDataset):
         if name not in first_seeds:
             raise DataError(
                 f"the split {split!r} of simulated scans",
-                f"one of {nearest_names(name, first_seeds)}",
+                f"one such as {nearest_names(name, first_seeds)}",
                 f"type for example {self.public_name()}:1000:val",
             )
         first_seed = int(first_seeds[name][0])

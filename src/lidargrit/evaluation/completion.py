@@ -17,7 +17,7 @@ from lidargrit.completion import Completer
 from lidargrit.conditions import Condition
 from lidargrit.conditions.patterns import Pattern
 from lidargrit.determinism import derive_seed
-from lidargrit.errors import ConfigError, DataError
+from lidargrit.errors import ConfigError, DataError, UsageError
 from lidargrit.evaluation.estimates import Estimate
 from lidargrit.loading import RangeImages
 from lidargrit.metrics import load_metric
@@ -100,6 +100,7 @@ def compare_completion(
     Raises:
         ConfigError: a model of another sensor.
         DataError: no scan.
+        UsageError: a pattern that hides no return, so that there is nothing to compare.
     """
     reporter = reporter or Reporter()
     if not len(images) or completions < 1:
@@ -111,6 +112,9 @@ def compare_completion(
     with reporter.progress("completing", len(patterns) * len(completers)) as progress:
         for pattern in patterns:
             masks = [pattern.mask(whole[index], derive_seed(seed, index)) for index in range(len(whole))]
+            if not bool((whole.return_mask.cpu() & ~torch.stack(masks)).any()):
+                got = f"--observed {pattern.text}, which hides no return of these scans"
+                raise UsageError(got, "pixels that leave some returns out", "observe others, as rows:4")
             condition = Condition.of_pixels(whole, torch.stack(masks))
             of_pattern = []
             for completer in completers:

@@ -81,11 +81,25 @@ def projection_that_fits(scan: Scan, sensor: SensorModel) -> ProjectionName:
     """
     if sensor.projection == "spherical" or scan.ring is not None or len(scan) < _POINTS_FOR_ORDER:
         return sensor.projection
-    ring = unfolding.rings_from_firing_order(np.ascontiguousarray(scan.points_xyz_m.numpy().T))
-    if not _is_ring_by_ring(scan, ring):
+    ring = _rings_in_order(scan)
+    if ring is None:
         return "spherical"
     other_count = int(ring[-1]) + 1 != sensor.height
     return sensor.projection if other_count or not _is_misplaced(scan, sensor, ring) else "spherical"
+
+
+def has_few_rings(scan: Scan, sensor: SensorModel) -> bool:
+    """Return whether a scan has at most half the rings of a sensor, but spread over its elevations.
+
+    The upper rings alone, of points in firing order, are a file that was cut off.
+    """
+    if not 1 < ring_count(scan) <= sensor.height // 2:
+        return False
+    if scan.ring is not None:
+        return True
+    bottom_deg, top_deg = _span_of_rows_deg(sensor)
+    low_deg, _ = elevation_span_deg(scan)
+    return _rings_in_order(scan) is not None and low_deg < bottom_deg + (top_deg - bottom_deg) / 4
 
 
 def doubts_about_rays(scan: Scan, sensor: SensorModel, method: ProjectionName) -> str:
@@ -253,6 +267,12 @@ def _is_misplaced(scan: Scan, sensor: SensorModel, row: Int[np.ndarray, "n"]) ->
     off_deg[(some < 0) | (some >= sensor.height)] = np.inf
     bottom_deg, top_deg = _span_of_rows_deg(sensor)
     return bool(np.median(off_deg) > _MISPLACED_AT_MOST * (top_deg - bottom_deg))
+
+
+def _rings_in_order(scan: Scan) -> Int[np.ndarray, "n"] | None:
+    """Return the ring of each point of a scan that is stored as it was fired; None where it is not."""
+    ring = unfolding.rings_from_firing_order(np.ascontiguousarray(scan.points_xyz_m.numpy().T))
+    return ring if _is_ring_by_ring(scan, ring) else None
 
 
 def _is_ring_by_ring(scan: Scan, ring: Int[np.ndarray, "n"]) -> bool:

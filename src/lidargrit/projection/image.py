@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import numpy as np
 import torch
 from jaxtyping import Float32, Int32
 
-from lidargrit.errors import ScanError
+from lidargrit.errors import ConfigError, ScanError, one_of
 from lidargrit.projection.fit import fit_problems
 from lidargrit.projection.pixel_coordinates import ProjectionVariant, pixel_coordinates, within_limits
 from lidargrit.sensors import ProjectionName, SensorModel
@@ -41,6 +43,7 @@ def project(
         range_m (H, W) in metres and return_mask (H, W), with reflectance and label if the scan has them.
 
     Raises:
+        ConfigError: no method or variant of that name.
         ScanError: the scan does not fit the sensor, or its points are not in firing order; names the sensors that
             would fit, or the projection.
 
@@ -94,6 +97,9 @@ def _nearest(
     refuse: bool,
 ) -> tuple[Int32[np.ndarray, "H fine_W"], Float32[np.ndarray, "H fine_W"]]:
     method = method or sensor.projection
+    for name, value, hint in (("method", method, ProjectionName), ("variant", variant, ProjectionVariant)):
+        if value not in get_args(hint):
+            raise ConfigError(f"{name}={value!r}", one_of(get_args(hint)), "correct it")
     pixels = pixel_coordinates(scan, sensor, method, variant)
     for problem in fit_problems(scan, sensor, method, pixels, partial, variant) if refuse else ():
         raise problem

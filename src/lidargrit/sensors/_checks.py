@@ -121,7 +121,7 @@ def checked_entries(data: Any, projections: Sequence[str]) -> dict[str, Any]:
         raise ConfigError(f"a sensor without {', '.join(missing)}", "every entry", _CURE)
     if unknown := sorted(str(key) for key in data if key not in known):
         what = f"a sensor with the entry {unknown[0][:40]!r}"
-        raise ConfigError(what, f"one of {nearest_names(unknown[0], known)}", _CURE)
+        raise ConfigError(what, f"one such as {nearest_names(unknown[0], known)}", _CURE)
     entries = {key: value for key, value in data.items() if not (key == "azimuth_offset_rad" and value is None)}
     checked = {key: _checked(key, value) for key, value in entries.items()}
     check_projection(checked["name"], checked["projection"], projections)

@@ -12,7 +12,8 @@ from typing import NamedTuple
 
 from waitress.server import create_server
 
-from lidargrit.errors import ConfigError, OutputError
+from lidargrit.errors import ConfigError, LidarGritError, OutputError
+from lidargrit.generators import load
 from lidargrit.run_folder import PACKAGED, is_run
 from lidargrit.serving.application import LOOPBACK_NAMES, Application
 from lidargrit.serving.jobs import JobQueue
@@ -104,9 +105,21 @@ def open_server(
             server.close()
 
 
-def finished_runs(folder: Path) -> list[Path]:
-    """Return the finished runs in a folder, sorted by name, and then the models in the package."""
-    return [*sorted(path for path in folder.glob("*") if is_run(path)), *PACKAGED]
+def finished_runs(folder: Path, say: Callable[[str], object]) -> list[Path]:
+    """Return the finished runs in a folder, sorted by name, and then the models in the package.
+
+    Args:
+        folder: folder of runs; may be missing.
+        say: function that prints why a run is left out, as it cannot be read.
+    """
+    found = []
+    for path in sorted(path for path in folder.glob("*") if is_run(path)):
+        try:
+            load(path)
+            found.append(path)
+        except LidarGritError as error:
+            say(f"left out: {path}: {error}")
+    return [*found, *PACKAGED]
 
 
 def _temporary_folder() -> tempfile.TemporaryDirectory[str]:

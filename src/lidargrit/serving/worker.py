@@ -51,8 +51,7 @@ def run_worker(runs: Sequence[Path], device: str) -> None:
     sys.stdout = sys.stderr  # whatever a library prints is no answer
     try:
         chosen = usable_device(device)
-        generators = [load(run).to(chosen) for run in runs]
-        variants: list[ProjectionVariant] = [projection_variant(locate(run)) for run in runs]
+        loaded = [_load(run, chosen) for run in runs]
     except LidarGritError as error:
         _send(write_line, {"refused": [type(error).__name__, error.got, error.wanted, error.cure]})
         return
@@ -61,13 +60,24 @@ def run_worker(runs: Sequence[Path], device: str) -> None:
         cure = "name fewer models, or another --device"
         _send(write_line, {"refused": ["ConfigError", got, "a device with room for all of them", cure]})
         return
-    models = [describe_model(run.resolve().name, model) for run, model in zip(runs, generators, strict=True)]
+    names = [run.resolve().name for run in runs]
+    names = [name if names.count(name) == 1 else str(run) for name, run in zip(names, runs, strict=True)]
+    models = [describe_model(name, model) for name, (model, _) in zip(names, loaded, strict=True)]
     _send(write_line, {"models": models})
     for line in sys.stdin:
         message = json.loads(line)
         request = SampleRequest(**message["request"])
-        generator, variant = generators[request.model], variants[request.model]
+        generator, variant = loaded[request.model]
         _send(write_line, _answer_request(generator, variant, request, Path(message["folder"])))
+
+
+def _load(run: Path, device: torch.device) -> tuple[Generator, ProjectionVariant]:
+    try:
+        return load(run).to(device), projection_variant(locate(run))
+    except LidarGritError as error:
+        if str(run) in error.got:
+            raise
+        raise type(error)(f"{run}: {error.got}", error.wanted, error.cure) from None
 
 
 def describe_model(name: str, generator: Generator) -> dict[str, Any]:

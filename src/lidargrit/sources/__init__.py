@@ -250,6 +250,10 @@ def open_source(text: str, bad_points: BadPoints = "refuse", samples_format: str
         here = folder.is_dir()
     except RuntimeError:  # what pathlib raises
         raise DataError(f"{text[:40]!r}, in a home folder that is not there", "another user's", "check it") from None
+    except PermissionError:
+        raise DataError(
+            f"{text}, which may not be read", "a source that you may read", "change its permissions"
+        ) from None
     except (OSError, ValueError) as error:  # a name too long, or with NUL
         if ":" not in text:
             raise DataError(f"{text[:40]!r}, which names no folder ({error})", "a source", "check the path") from None

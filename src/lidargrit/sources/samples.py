@@ -77,6 +77,7 @@ def write_samples(
     if generator.full_rows is not None:
         manifest["full_rows"] = [generator.full_rows.start, generator.full_rows.stop]
     defaults = configuration.to_json(generator.Sampling())
+    trained_on = _trained_on(run_folder)
     begun = _is_begun(folder, manifest, defaults)
     missing = _missing(folder, seeds)
     images = generator.stream(missing, sampling)
@@ -87,7 +88,8 @@ def write_samples(
         first = list(islice(images, 1))  # what the model refuses is told before anything is written
         if missing and not begun:
             _begin(folder, manifest, defaults)
-        _copy_trained_on(run_folder, folder)
+        if trained_on is not None and not (folder / TRAINED_ON_FILE).exists() and is_sample_folder(folder):
+            write_text(folder / TRAINED_ON_FILE, trained_on)
         for seed, image in zip(missing, chain(first, images), strict=True):
             if not is_sample_folder(folder):  # or the write would make the folder anew, without the earlier samples
                 raise removed_meanwhile(folder)
@@ -119,11 +121,10 @@ def _begin(folder: Path, manifest: dict[str, Any], defaults: dict[str, Any]) -> 
         write_json(folder / MANIFEST, manifest)
 
 
-def _copy_trained_on(run_folder: Path, folder: Path) -> None:
-    """Copy what the model learned from into a folder of samples."""
-    source, target = run_folder / TRAINED_ON_FILE, folder / TRAINED_ON_FILE
-    if is_sample_folder(folder) and source.is_file() and not target.exists():
-        write_text(target, json.dumps(read_json(source)) + "\n")
+def _trained_on(run_folder: Path) -> str | None:
+    """Return what the model learned from, as it is to lie beside its samples; None where the run does not tell."""
+    source = run_folder / TRAINED_ON_FILE
+    return json.dumps(read_json(source)) + "\n" if source.is_file() else None
 
 
 def read_samples(folder: Path, count: int | None = None) -> RangeImages:

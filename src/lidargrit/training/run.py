@@ -19,7 +19,7 @@ import torch
 from lidargrit import __version__, configuration
 from lidargrit.determinism import derive_seed
 from lidargrit.errors import CheckpointError, OutputError
-from lidargrit.files import claim_folder, is_taken, read_json, write_json, write_text
+from lidargrit.files import claim_folder, claimed_manifest, is_taken, read_json, write_json, write_text
 from lidargrit.generators import Generator
 from lidargrit.loading import DataConfig, RangeImages
 from lidargrit.nn.objective import Objective
@@ -70,6 +70,8 @@ def train(
         engine.by_first(lambda: check_donor(recipe))
         donors = check_stages(recipe, engine.world_size).donors
         engine.by_first(lambda: held.enter_context(claim_folder(folder)))
+        begun = claimed_manifest(folder / RUN_FILE, folder / TRAINED_ON_FILE)
+        engine.by_first(lambda: held.enter_context(begun))
         return _train(recipe, donors, folder, reporter, plot, engine)
 
 
