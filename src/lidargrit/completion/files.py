@@ -101,8 +101,8 @@ def write_completions(
         ScanError: a scan that cannot be used.
         DataError: no usable scan.
     """
-    manifest, files = facts | _facts(completer, output), _files(inputs, output, completer.sensor)
-    scans = {file: inputs.name(index) for (index, _), file in files.items()}
+    files = _files(inputs, output, completer.sensor)
+    manifest = facts | _facts(completer, output) | {"scans": {file: inputs.name(at) for (at, _), file in files.items()}}
     left_out, labels_lost = set[int](), False
     missing = [job for job, file in files.items() if not (out / file).exists()]
     skipped = left_out if config.bad_scans == "skip" else None
@@ -111,7 +111,7 @@ def write_completions(
     jobs = chain(first, remaining)
     with (
         claim_folder(out),
-        claimed_scans(out / "completed.json", {**manifest, "scans": scans}) as files_left_out,
+        claimed_scans(out / "completed.json", manifest) as files_left_out,
         reporter.progress("completing", len(files), len(files) - len(missing)) as progress,
     ):
         for batch in _batches(jobs, completer.batch):
