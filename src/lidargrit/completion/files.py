@@ -106,15 +106,14 @@ def write_completions(
     left_out, labels_lost = set[int](), False
     missing = [job for job, file in files.items() if not (out / file).exists()]
     skipped = left_out if config.bad_scans == "skip" else None
-    remaining = _jobs(inputs, missing, condition_of, output.seed, skipped, reporter)
-    first = list(islice(remaining, 1))  # a mistake in it is told before anything is written
-    jobs = chain(first, remaining)
+    jobs = _jobs(inputs, missing, condition_of, output.seed, skipped, reporter)
+    first = list(islice(jobs, 1))  # a mistake in it is told before anything is written
     with (
         claim_folder(out),
         claimed_scans(out / "completed.json", manifest) as files_left_out,
         reporter.progress("completing", len(files), len(files) - len(missing)) as progress,
     ):
-        for batch in _batches(jobs, completer.batch):
+        for batch in _batches(chain(first, jobs), completer.batch):
             for job, image in zip(batch, _completed(completer, batch, output.seed), strict=True):
                 file = files[job.index, job.turn]
                 if output.probability and job.turn == 0:
