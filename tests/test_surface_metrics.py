@@ -1,4 +1,4 @@
-"""Flying points and the straightness of walls: against slow loops, and on scenes whose answer is known."""
+"""Edges, thin objects, flying points and walls: against slow loops, and on scenes whose answer is known."""
 
 import math
 
@@ -173,3 +173,62 @@ def test_a_line_at_any_angle_is_straight():
     corner = np.stack((along[0, 0, 44:52], along[0, 0, 44:52].abs()), axis=1)
     off_m = float(walls.distance_from_line(along, along.abs())[0, 0, 44])
     assert off_m == pytest.approx(np.linalg.svd(corner - corner.mean(axis=0))[1][1] / math.sqrt(8))
+
+
+def slow_edges(images, edges_m):
+    """Pairs of returns side by side, and those on two surfaces, in bins of the nearer range."""
+    counts = np.zeros((2, 24), dtype=int)
+    for row, returned in zip(images.range_m.flatten(0, 1).tolist(), images.return_mask.flatten(0, 1), strict=True):
+        for column, one_m in enumerate(row):
+            beside = (column + 1) % len(row)
+            if returned[column] and returned[beside]:
+                near_m, far_m = sorted((one_m, row[beside]))
+                at = np.searchsorted(edges_m, near_m, side="right") - 1
+                counts[:, at] += (1, far_m - near_m > 0.1 * far_m)
+    return counts
+
+
+def slow_thin_objects(images, edges_m):
+    """Returns between two of one surface, and those that stand before it, in bins of the range behind."""
+    counts = np.zeros((2, 24), dtype=int)
+    for row, returned in zip(images.range_m.flatten(0, 1).tolist(), images.return_mask.flatten(0, 1), strict=True):
+        for column, one_m in enumerate(row):
+            sides = [(column + step) % len(row) for step in (-1, 1)]
+            near_m, far_m = sorted(row[side] for side in sides)
+            if returned[column] and all(returned[side] for side in sides) and far_m - near_m <= 0.1 * far_m:
+                at = np.searchsorted(edges_m, near_m, side="right") - 1
+                counts[:, at] += (1, one_m < 0.9 * near_m)
+    return counts
+
+
+@pytest.mark.parametrize(
+    ("name", "slow"), [("edge_rate_per_range", slow_edges), ("thin_object_rate_per_range", slow_thin_objects)]
+)
+def test_edges_and_thin_objects_are_those_of_a_slow_loop(name, slow):
+    images = smeared(street(0, noise_m=0.5), 0.1)
+    edges_m = np.geomspace(SENSOR.range_min_m, SENSOR.range_max_m, 25)
+    counted = load_metric(name)().count(images)
+    assert np.abs(counted - slow(images, edges_m)).sum() <= 2  # single precision, at the limits
+    assert counted[1].sum() > 50
+
+
+@pytest.mark.parametrize("name", ["edge_rate_per_range", "thin_object_rate_per_range"])
+def test_a_scene_that_is_smoothed_lacks_edges_and_thin_objects(name):
+    """What hides from the share of flying points: it is of the edges that are left."""
+    real, other = (street(seed, noise_m=0.3) for seed in (0, 1))
+    smooth = RangeImage.masked(
+        torch.nn.functional.avg_pool1d(other.range_m.flatten(0, 1), 5, stride=1, padding=2).reshape_as(other.range_m),
+        other.return_mask & (other.range_m > 0),
+        SENSOR,
+    )
+    assert score(name, smooth, real).value > 2 * score(name, other, real).value
+
+
+def test_a_pole_before_a_wall_is_one_thin_object_and_two_edges():
+    range_m = torch.full((1, SENSOR.height, SENSOR.width), 20.0)
+    range_m[:, :, 40] = 10.0
+    images = RangeImage.masked(range_m, torch.ones_like(range_m, dtype=torch.bool), SENSOR)
+    pairs, edges = load_metric("edge_rate_per_range")().count(images).sum(axis=1)
+    assert (pairs, edges) == (SENSOR.height * SENSOR.width, 2 * SENSOR.height)
+    asked, thin = load_metric("thin_object_rate_per_range")().count(images).sum(axis=1)
+    assert (asked, thin) == (SENSOR.height * (SENSOR.width - 2), SENSOR.height)

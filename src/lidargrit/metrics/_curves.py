@@ -20,6 +20,7 @@ from lidargrit.structures import RangeImage
 _LEAST = 500  # pixels in a bin: the standard error of a share stays below 0.5 / sqrt(500) = 0.022
 _COLUMNS = 256  # neighbours are at least as far away as in an image of so many columns: 25 cm at 10 m,
 _ROWS = 32  # and of so many rows: 15 cm at 10 m, against the noise of 2 cm that a range has
+_RANGE_BINS = 24  # of 120 m / 0.9 m: each reaches a fifth farther than the one before
 _REACH = 8  # times that far they may be: 11 degrees, across the window of a car 5 m away
 ONE_SURFACE = 0.1  # two surfaces nearer to one another than that share of their range are taken for one
 
@@ -121,25 +122,30 @@ def normalised(counts: Float[np.ndarray, "*rows n"] | Int64[np.ndarray, "*rows n
 
 
 def compare_shares(
-    generated: Int64[np.ndarray, "2 n"], real: Int64[np.ndarray, "2 n"], axis: Float64[np.ndarray, " n"]
+    generated: Int64[np.ndarray, "2 n"],
+    real: Int64[np.ndarray, "2 n"],
+    axis: Float64[np.ndarray, " n"],
+    by_trials: bool = False,
 ) -> Curves:
     """Compare how often something happens, bin by bin: the mean divergence of the bins' yes and no.
 
-    Every bin has the same weight, but bins with fewer than 500 trials in either set are left out. If that leaves none,
-    all bins with a trial in both sets count. If there are none of these either, the result is 0 for two sets without
-    any trial, else 1.
+    Every bin has the same weight unless asked otherwise, but bins with fewer than 500 trials in either set are left
+    out. If that leaves none, all bins with a trial in both sets count. If there are none of these either, the result is
+    0 for two sets without any trial, else 1.
 
     Args:
         generated: numbers of trials and of successes in the generated set.
         real: numbers of trials and of successes in the real set.
         axis: position of each bin along the axis.
+        by_trials: give each bin the weight of its share of the trials, the mean of both sets.
     """
     trials = np.minimum(generated[0], real[0])
     kept = trials >= _LEAST if (trials >= _LEAST).any() else trials > 0
     yes_and_no = [np.stack((counts[1], counts[0] - counts[1]), axis=-1) for counts in (generated, real)]
     each = divergence(*yes_and_no)[kept]
     alike = not (generated[0].any() or real[0].any())
-    mean = float(each.mean()) if len(each) else float(not alike)
+    weights = sum(normalised(counts[0, kept]) for counts in (generated, real)) if by_trials else None
+    mean = float(np.average(each, weights=weights)) if len(each) else float(not alike)
     plotted = [np.where(kept, normalised(counts)[:, 0], np.nan) for counts in yes_and_no]
     return Curves(mean, axis, *plotted)
 
@@ -154,6 +160,11 @@ def compare_histograms(
 def log_edges(low: float, high: float, bins: int) -> Float64[np.ndarray, " edges"]:
     """Return the edges of bins that are equally wide on a logarithmic axis."""
     return np.geomspace(low, high, bins + 1)
+
+
+def range_edges(kind: ImageKind) -> Float64[np.ndarray, " edges"]:
+    """Return the edges of the bins of range, equally wide on a logarithmic axis."""
+    return log_edges(kind.range_min_m, kind.range_max_m, _RANGE_BINS)
 
 
 def middles(edges: Float64[np.ndarray, " edges"]) -> Float64[np.ndarray, " n"]:

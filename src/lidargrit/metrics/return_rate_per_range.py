@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Int64
 
 from lidargrit.metrics import ImageKind
 from lidargrit.metrics._curves import (
@@ -12,12 +12,10 @@ from lidargrit.metrics._curves import (
     LocalSurface,
     compare_shares,
     count_shares,
-    log_edges,
     middles,
+    range_edges,
 )
 from lidargrit.structures import RangeImage
-
-_BINS = 24  # of 120 m / 0.9 m: each reaches a fifth farther than the one before
 
 
 class ReturnRatePerRange(CurveMetric):
@@ -36,14 +34,12 @@ class ReturnRatePerRange(CurveMetric):
 
     def count(self, images: RangeImage) -> Int64[np.ndarray, "2 bins"]:
         """Count the pixels whose range is known and, among them, the returns."""
-        return count_shares(LocalSurface.of(images).range_m, images.return_mask, _edges(ImageKind.of(images.sensor)))
+        return count_shares(
+            LocalSurface.of(images).range_m, images.return_mask, range_edges(ImageKind.of(images.sensor))
+        )
 
     def curves(
         self, generated: Int64[np.ndarray, "2 bins"], real: Int64[np.ndarray, "2 bins"], kind: ImageKind
     ) -> Curves:
         """Return the share of returns over the range."""
-        return compare_shares(generated, real, middles(_edges(kind)))
-
-
-def _edges(kind: ImageKind) -> Float64[np.ndarray, " edges"]:
-    return log_edges(kind.range_min_m, kind.range_max_m, _BINS)
+        return compare_shares(generated, real, middles(range_edges(kind)))
