@@ -117,7 +117,7 @@ def test_complete_keeps_names_and_observed_points_and_goes_on(folders, tmp_path,
     assert (tmp_path / "out/drive/1.npz").stat().st_mtime_ns == before
     assert (tmp_path / "out/drive/2.npz").exists()
     assert main([*words[:-3], "linear", *words[-2:]]) == 2
-    assert "which was begun with another model" in capsys.readouterr().err
+    assert "completed.json has another 'model'" in capsys.readouterr().err
 
 
 def test_a_model_completes_in_several_ways_and_into_any_format(folders, tmp_path):

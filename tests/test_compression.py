@@ -326,7 +326,7 @@ def test_another_file_of_the_same_name_is_not_taken_for_the_one_before(two_sourc
     assert main(["decompress", "a/scans.lgz", *command]) == 0, "the same goes on"
     capsys.readouterr()
     assert main(["decompress", "b/scans.lgz", *command]) == 2
-    assert "out, which holds other scans" in the_one_line(capsys.readouterr().err, "decompress")
+    assert "has another 'index_crc32'" in the_one_line(capsys.readouterr().err, "decompress")
 
 
 def test_a_first_scan_that_is_not_restored_leaves_the_folder_to_a_corrected_command(two_sources, capsys, monkeypatch):

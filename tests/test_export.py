@@ -182,9 +182,9 @@ def test_what_is_not_ours_is_left_alone(samples, tmp_path):
         export_scans(str(samples), tmp_path, "ply")
     out = tmp_path / "out"
     export_scans(str(samples), out, "ply")
-    with pytest.raises(OutputError, match="other scans or another format"):
+    with pytest.raises(OutputError, match=r"export\.json has another 'format'"):
         export_scans(str(samples), out, "pcd")
-    with pytest.raises(OutputError, match="other scans or another format"):
+    with pytest.raises(OutputError, match=r"export\.json has another '"):
         export_scans("simulated:1", out, "ply")
     about = json.loads((samples / "samples.json").read_text(encoding="utf-8"))
     (tmp_path / "new").mkdir()
@@ -249,7 +249,7 @@ def test_range_images_of_one_sensor_are_not_taken_for_those_of_another(samples, 
     assert main([*words, "vlp16"]) == 0, "the same command"
     assert (tmp_path / "out" / "image.bin").is_file(), "an image keeps its name"
     assert main([*words, str(tmp_path / "other.json")]) == 2
-    assert "which holds other scans or another format" in capsys.readouterr().err
+    assert "export.json has another 'sensor'" in capsys.readouterr().err
     for source, kind in (("simulated:1", "scans"), (str(samples), "generated range images")):
         with pytest.raises(ConfigError, match=f"--sensor vlp16 for .*, which holds {kind}; .*; leave --sensor out"):
             export_scans(source, tmp_path / "none", "ply", sensor=vlp16)

@@ -232,7 +232,7 @@ def _claim(manifest: Path, facts: dict[str, Any]) -> None:
             raise OutputError(f"{manifest}, which lists no scans", "what lidargrit wrote", "choose another folder")
         if other := [name for name in sorted({*there, *facts} - {"scans"}) if there.get(name) != facts.get(name)]:
             raise OutputError(
-                f"{out}, which was begun with another {other[0].replace('_', ' ')}",
+                f"{out}, whose {manifest.name} has another {other[0]!r}",
                 "an empty folder, or one that this very command began",
                 "choose another folder",
             )
