@@ -9,7 +9,7 @@ from typing import Any, ClassVar, final
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, Int64
+from jaxtyping import Bool, Float, Float64, Int64
 from scipy.special import rel_entr
 from torch import Tensor
 
@@ -247,3 +247,27 @@ def count_shares(
     """Count, in bins of a quantity (NaN where it is unknown), all pixels and those where something happened."""
     finite = ~quantity.isnan()
     return np.stack((histogram(quantity[finite], edges), histogram(quantity[finite & happened], edges)))
+
+
+class SharePerRangeMetric(CurveMetric):
+    """Compares how often something happens in the pixels of every image, in bins of range."""
+
+    axis_label = "range [m]"
+    by_trials: ClassVar[bool] = False
+    """Whether a bin has the weight of its share of the pixels asked; see :func:`compare_shares`."""
+
+    @abstractmethod
+    def ask(self, images: RangeImage) -> tuple[Float[Tensor, "B H W"], Bool[Tensor, "B H W"]]:
+        """Return the range of each pixel, NaN where it is not asked, and where it happened."""
+
+    @final
+    def count(self, images: RangeImage) -> Int64[np.ndarray, "2 bins"]:
+        """Count the pixels asked and, among them, those where it happened."""
+        return count_shares(*self.ask(images), range_edges(ImageKind.of(images.sensor)))
+
+    @final
+    def curves(
+        self, generated: Int64[np.ndarray, "2 bins"], real: Int64[np.ndarray, "2 bins"], kind: ImageKind
+    ) -> Curves:
+        """Return the share over the range."""
+        return compare_shares(generated, real, middles(range_edges(kind)), self.by_trials)

@@ -2,23 +2,14 @@
 
 from __future__ import annotations
 
-import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Bool, Float
+from torch import Tensor
 
-from lidargrit.metrics import ImageKind
-from lidargrit.metrics._curves import (
-    CurveMetric,
-    Curves,
-    LocalSurface,
-    compare_shares,
-    count_shares,
-    middles,
-    range_edges,
-)
+from lidargrit.metrics._curves import LocalSurface, SharePerRangeMetric
 from lidargrit.structures import RangeImage
 
 
-class ReturnRatePerRange(CurveMetric):
+class ReturnRatePerRange(SharePerRangeMetric):
     """Compare the share of returns in bins of range, by the divergence in each bin, and the mean over bins.
 
     A drop has no range of its own. Every pixel, returned or not, gets the range of its neighbours along the row, if
@@ -29,17 +20,8 @@ class ReturnRatePerRange(CurveMetric):
 
     title = "Share of returns against range"
     measures_raydrop = True
-    axis_label = "range [m]"
     curve_label = "share of returns"
 
-    def count(self, images: RangeImage) -> Int64[np.ndarray, "2 bins"]:
-        """Count the pixels whose range is known and, among them, the returns."""
-        return count_shares(
-            LocalSurface.of(images).range_m, images.return_mask, range_edges(ImageKind.of(images.sensor))
-        )
-
-    def curves(
-        self, generated: Int64[np.ndarray, "2 bins"], real: Int64[np.ndarray, "2 bins"], kind: ImageKind
-    ) -> Curves:
-        """Return the share of returns over the range."""
-        return compare_shares(generated, real, middles(range_edges(kind)))
+    def ask(self, images: RangeImage) -> tuple[Float[Tensor, "B H W"], Bool[Tensor, "B H W"]]:
+        """Return the range that each pixel should meet, and which return."""
+        return LocalSurface.of(images).range_m, images.return_mask

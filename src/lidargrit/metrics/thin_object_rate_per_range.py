@@ -2,24 +2,15 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
-from jaxtyping import Int64
+from jaxtyping import Bool, Float
+from torch import Tensor
 
-from lidargrit.metrics import ImageKind
-from lidargrit.metrics._curves import (
-    ONE_SURFACE,
-    CurveMetric,
-    Curves,
-    compare_shares,
-    count_shares,
-    middles,
-    range_edges,
-)
+from lidargrit.metrics._curves import ONE_SURFACE, SharePerRangeMetric
 from lidargrit.structures import RangeImage
 
 
-class ThinObjectRatePerRange(CurveMetric):
+class ThinObjectRatePerRange(SharePerRangeMetric):
     """Compare how often a return stands before the one surface to its left and right, as that of a pole does.
 
     Asked are returns whose two neighbours in the row return, too, and lie on one surface: their ranges differ by at
@@ -34,18 +25,12 @@ class ThinObjectRatePerRange(CurveMetric):
     title = "Share of returns from objects one pixel wide"
     axis_label = "range of the surface behind [m]"
     curve_label = "share of thin objects"
+    by_trials = True
 
-    def count(self, images: RangeImage) -> Int64[np.ndarray, "2 bins"]:
-        """Count the returns between two of one surface and, among them, those that stand before it."""
+    def ask(self, images: RangeImage) -> tuple[Float[Tensor, "B H W"], Bool[Tensor, "B H W"]]:
+        """Return the range behind each return between two of one surface, and which stand before it."""
         left_m, right_m = images.range_m.roll(1, -1), images.range_m.roll(-1, -1)
         near_m, far_m = torch.minimum(left_m, right_m), torch.maximum(left_m, right_m)
         all_return = images.return_mask & images.return_mask.roll(1, -1) & images.return_mask.roll(-1, -1)
         behind_m = torch.where(all_return & (far_m - near_m <= ONE_SURFACE * far_m), near_m, torch.nan)
-        before = images.range_m < (1 - ONE_SURFACE) * near_m
-        return count_shares(behind_m, before, range_edges(ImageKind.of(images.sensor)))
-
-    def curves(
-        self, generated: Int64[np.ndarray, "2 bins"], real: Int64[np.ndarray, "2 bins"], kind: ImageKind
-    ) -> Curves:
-        """Return the share of thin objects over the range."""
-        return compare_shares(generated, real, middles(range_edges(kind)), by_trials=True)
+        return behind_m, images.range_m < (1 - ONE_SURFACE) * near_m
