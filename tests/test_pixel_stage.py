@@ -31,7 +31,6 @@ from lidargrit.generators.maskgit import MaskedSampling, MaskGit, MaskGitConfig
 from lidargrit.loading import DataConfig
 from lidargrit.nn.decoding import CachedDecoder
 from lidargrit.nn.pixel_networks import PixelDecoderConfig
-from lidargrit.nn.range_mixture import RangeMixture
 from lidargrit.nn.range_steps import RangeSteps
 from lidargrit.nn.transformer import TransformerConfig
 from lidargrit.sensors import load_sensor
@@ -157,30 +156,6 @@ def test_the_bits_are_those_of_tokens_mask_and_ranges():
     density = generator.pixels(generator.tokenizer.decode(generator.tokenizer.encode(rounded)), rounded).range
     expected = (density.sum() / math.log(2) - math.log2(0.001) * images.return_mask.sum()).item()
     assert float(generator.bits(images, 1).per_scan()["range"].sum()) == pytest.approx(expected, rel=2e-3)
-
-
-def test_all_steps_of_a_range_are_sure_to_hold_it():
-    steps = RangeSteps(SENSOR, 500)
-    every = torch.arange(steps.first, steps.last + 1).expand(4, -1)
-    rng = torch.Generator().manual_seed(0)
-    logits, centres, scales = (torch.randn(4, 1, 3, generator=rng).expand(*every.shape, 3) for _ in range(3))
-    limits_m = (SENSOR.range_min_m, SENSOR.range_max_m)
-    mixture = RangeMixture(logits, 2.5 + centres, scales - 3, limits_m)
-    mass = mixture.log_mass(*steps.edges_m(every)).exp()
-    assert torch.allclose(mass.sum(-1), torch.ones(4, dtype=mass.dtype), atol=1e-5)
-    assert torch.equal(steps.indices(steps.range_m(every)), every)
-
-
-def test_the_expected_bits_are_the_mean_over_all_steps():
-    steps, rng = RangeSteps(SENSOR, 500), torch.Generator().manual_seed(0)
-    logits, centres, scales = (torch.randn(5, 3, generator=rng) for _ in range(3))
-    limits_m = (SENSOR.range_min_m, SENSOR.range_max_m)
-    mixture = RangeMixture(logits, 2.5 + centres.clamp(-1, 1), scales - 3, limits_m)
-    every = torch.arange(steps.first, steps.last + 1).expand(5, -1)
-    parts = mixture.logits, mixture.centres, mixture.log_scales
-    logits, centres, scales = (part[:, None].expand(*every.shape, 3) for part in parts)
-    nats = -RangeMixture(logits, centres, scales, limits_m).log_mass(*steps.edges_m(every))
-    assert torch.allclose(mixture.entropy(steps).double(), (nats.exp().reciprocal() * nats).sum(-1), atol=0.15)
 
 
 def test_surprise_is_what_exceeds_the_expected_bits(tmp_path, capsys):

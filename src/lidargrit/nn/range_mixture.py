@@ -13,6 +13,8 @@ from lidargrit.nn.random_choices import sample_index
 from lidargrit.nn.range_steps import RangeSteps
 
 _QUANTILES = (0.05, 0.2, 0.4, 0.6, 0.8, 0.95)
+_SURFACE_V = 0.1  # half the width of a surface in v: a tenth of its range
+_LARGEST_EXPONENT = 80.0  # its exponential stays finite in 32 bits
 _LEAST_MASS = 1e-6  # of a component within the limits; the logarithm stays finite
 
 
@@ -85,7 +87,8 @@ class RangeMixture:
         Args:
             component: uniform random numbers in [0, 1) that choose a component.
             within: uniform random numbers in [0, 1) that choose a range of the component.
-            temperature: temperature of the density; 1 leaves it unchanged, below 1 prefers the likelier surfaces.
+            temperature: temperature of the density on one surface; 1 leaves it unchanged, below 1 prefers the densest
+                of the components there. Surfaces keep their probabilities.
             noise: multiplier of the components' scales.
         """
         scaled = RangeMixture(
@@ -102,24 +105,40 @@ class RangeMixture:
         return (centre + scale * level.logit()).expm1().clamp(*self.limits_m).float()
 
     def _tempered_logits(self, temperature: float) -> Float[Tensor, "*P K"]:
-        """Return the logits of the weights with which the components approximate the density to the power 1 / T.
+        """Return the logits of the components' weights at a temperature T of the density on each surface.
 
-        A component keeps its shape, and its weight is multiplied by the density at its centre to the power 1 / T - 1.
-        So components on one surface count together: the weights alone to that power would prefer one broad component to
-        many narrow ones that share a surface.
+        The surface of a component is what lies within ``_SURFACE_V`` of its centre. The component's weight is
+        multiplied by d^(1/T - 1) of the density d at its centre, and divided by the mean of that power over the
+        surface: over all components, each counted by its probability there. So only components on one surface compete
+        with each other. A temperature of the whole density would take the probability from a pole, since narrower
+        components describe the wall behind it.
         """
         if temperature == 1:
             return self.logits
+        log_weights = self.logits.log_softmax(-1)
         inverse = (-self.log_scales).exp()
-        heights = self.logits.log_softmax(-1) - self.log_scales - self._mass().clamp(min=_LEAST_MASS).log()
-        of_components = zip(*(part.split(1, -1) for part in (self.centres, inverse, heights.exp())), strict=True)
+        power = (1 / temperature - 1) * self._log_density_at_centres(log_weights)
+        parts = (self.centres, inverse, log_weights.exp(), power)
+        mass, total = torch.zeros_like(self.centres), torch.zeros_like(self.centres)
+        for centre, steepness, weight, of_other in zip(*(part.split(1, -1) for part in parts), strict=True):
+            z, half = (self.centres - centre) * steepness, _SURFACE_V * steepness
+            there = (z + half).sigmoid_().sub_((z - half).sigmoid_()).mul_(weight)  # the other's probability there
+            mass += there
+            total += there.mul_((of_other - power).clamp_(max=_LARGEST_EXPONENT).exp_())
+        least = torch.finfo(mass.dtype).tiny  # the logarithm stays finite
+        return log_weights + mass.clamp(min=least).log() - total.clamp(min=least).log()
+
+    def _log_density_at_centres(self, log_weights: Float[Tensor, "*P K"]) -> Float[Tensor, "*P K"]:
+        """Return the natural logarithm of the density of v at every component's centre."""
+        inverse = (-self.log_scales).exp()
+        heights = (log_weights - self.log_scales - self._mass().clamp(min=_LEAST_MASS).log()).exp()
+        parts = (self.centres, inverse, heights)
         density = torch.zeros_like(self.centres)
-        for centre, steepness, height in of_components:  # one after the other takes less memory, and half the time
+        # One component after the other takes less memory than all pairs at once, and half the time.
+        for centre, steepness, height in zip(*(part.split(1, -1) for part in parts), strict=True):
             s = ((self.centres - centre) * steepness).sigmoid_()
             density += s.addcmul_(s, s, value=-1).mul_(height)  # the logistic density is s (1 - s) / scale
-        least = torch.finfo(density.dtype).tiny  # the logarithm stays finite
-        density_per_m = density.clamp(min=least).log() - self.centres  # dv / d range = exp(-v)
-        return self.logits.log_softmax(-1) + (1 / temperature - 1) * density_per_m
+        return density.clamp(min=torch.finfo(density.dtype).tiny).log()
 
     def _bounds(self) -> tuple[Float[Tensor, "*P K"], Float[Tensor, "*P K"]]:
         """Return each component's distribution function at the two limits."""

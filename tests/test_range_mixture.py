@@ -1,0 +1,159 @@
+"""The mixture of a range: a density between the sensor's limits, its steps, and samples at a temperature."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from lidargrit.nn.range_mixture import RangeMixture
+from lidargrit.nn.range_steps import RangeSteps
+from lidargrit.sensors import load_sensor
+
+SENSOR = load_sensor("hdl64e_kitti_odometry")
+
+
+def mixture_of(seed: int, count: int = 1) -> RangeMixture:
+    rng = torch.Generator().manual_seed(seed)
+    size = (count, 6)
+    centres = torch.linspace(math.log1p(1.0), math.log1p(80.0), 6).expand(size)
+    log_scales = torch.empty(size).uniform_(-4, 0.5, generator=rng)
+    return RangeMixture(torch.randn(size, generator=rng), centres, log_scales, (1.0, 80.0))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_density_integrates_to_one_between_the_sensors_limits(seed: int) -> None:
+    mixture = mixture_of(seed)
+    range_m = torch.linspace(1, 80, 200_001)
+    many = expanded(mixture, len(range_m))
+    density = many.log_density(range_m).double().exp()
+    assert float(torch.trapezoid(density, range_m.double())) == pytest.approx(1, abs=2e-3)
+    cdf = distribution_function(many, range_m).double()
+    assert float(cdf[0]) == pytest.approx(0, abs=1e-5)
+    assert float(cdf[-1]) == pytest.approx(1, abs=1e-5)
+    for first, last in ((1000, 1400), (20_000, 60_000), (100_000, 199_000)):
+        area = torch.trapezoid(density[first : last + 1], range_m[first : last + 1].double())
+        assert float(cdf[last] - cdf[first]) == pytest.approx(float(area), abs=1e-3)
+
+
+def distribution_function(mixture: RangeMixture, range_m: Tensor) -> Tensor:
+    v = torch.stack([torch.full_like(range_m, limit) for limit in mixture.limits_m] + [range_m]).double().log1p()
+    low, high, below = ((v[..., None] - mixture.centres) / mixture.log_scales.exp()).sigmoid()
+    return (mixture.logits.softmax(-1) * (below - low) / (high - low)).sum(-1)
+
+
+def expanded(mixture: RangeMixture, count: int) -> RangeMixture:
+    logits, centres, log_scales = (
+        part.expand(count, -1) for part in (mixture.logits, mixture.centres, mixture.log_scales)
+    )
+    return RangeMixture(logits, centres, log_scales, mixture.limits_m)
+
+
+def test_sampled_ranges_follow_the_distribution_function() -> None:
+    count = 20_000
+    mixture = mixture_of(1)
+    many = expanded(mixture, count)
+    rng = torch.Generator().manual_seed(5)
+    component, within = torch.rand(2, count, generator=rng)
+    range_m = many.sample(component, within)
+    assert float(range_m.min()) >= 1
+    assert float(range_m.max()) <= 80
+    level = distribution_function(many, range_m).sort().values
+    expected = (torch.arange(count) + 0.5) / count
+    assert float((level - expected).abs().max()) < 1.63 / math.sqrt(count)  # Kolmogorov and Smirnov, 1 %
+
+
+def test_sharpening_narrows_the_spread_and_leaves_surfaces_their_probabilities() -> None:
+    mixture = RangeMixture(
+        torch.tensor([[1.0, 0.0]]).expand(4000, -1),
+        torch.tensor([[2.0, 3.0]]).expand(4000, -1),
+        torch.tensor([[-4.0, -8.0]]).expand(4000, -1),  # a broad one, and behind it a wall that is known exactly
+        (1.0, 80.0),
+    )
+    component, within = torch.rand(2, 4000, generator=torch.Generator().manual_seed(0))
+    plain, sharp = mixture.sample(component, within), mixture.sample(component, within, temperature=0.3, noise=0.5)
+    near_plain, near_sharp = plain.log1p() < 2.5, sharp.log1p() < 2.5
+    assert float(near_plain.float().mean()) == pytest.approx(1 / (1 + math.exp(-1)), abs=0.03)
+    assert torch.equal(near_sharp, near_plain)
+    assert float(sharp[near_sharp].std()) == pytest.approx(0.5 * float(plain[near_plain].std()), rel=0.1)
+
+
+def test_sharpening_prefers_the_denser_component_of_a_surface() -> None:
+    mixture = expanded(
+        RangeMixture(
+            torch.zeros(1, 3), torch.tensor([[2.03, 2.0, 3.0]]), torch.tensor([[-4.0, -7.0, -5.0]]), (1.0, 80.0)
+        ),
+        8000,
+    )
+    component, within = torch.rand(2, 8000, generator=torch.Generator().manual_seed(0))
+    at_dense = [
+        float(((mixture.sample(component, within, temperature, noise=1e-9).log1p() - 2).abs() < 0.01).float().mean())
+        for temperature in (1.0, 0.4)
+    ]
+    assert at_dense == pytest.approx([1 / 3, 2 / 3], abs=0.02)
+
+
+@pytest.mark.parametrize("temperature", [0.4, 0.6, 2.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_components_are_sharpened_by_their_density_beside_that_of_their_surface(seed: int, temperature: float) -> None:
+    rng = torch.Generator().manual_seed(seed)
+    steps = torch.tensor([[0.0, 0.04, 0.09, 0.15, 0.9, 2.0]])
+    log_scales = torch.empty(1, 6).uniform_(-5, -1, generator=rng)
+    mixture = RangeMixture(torch.randn(1, 6, generator=rng), 1.5 + steps, log_scales, (1.0, 80.0))
+    centres, scales = mixture.centres[0].tolist(), mixture.log_scales[0].exp().tolist()
+    weights, power = mixture.logits[0].double().softmax(-1).tolist(), 1 / temperature - 1
+    range_m = mixture.centres[0].double().expm1()
+    density = (expanded(mixture, 6).log_density(range_m).exp() * (1 + range_m)).tolist()  # of v = ln(1 + range)
+    tempered = []
+    for j, centre in enumerate(centres):
+        there = [
+            weight * (logistic((centre + 0.1 - c) / scale) - logistic((centre - 0.1 - c) / scale))
+            for weight, c, scale in zip(weights, centres, scales, strict=True)
+        ]
+        mean = sum(m * d**power for m, d in zip(there, density, strict=True)) / sum(there)
+        tempered.append(weights[j] * density[j] ** power / mean)
+    # Without noise every range is the centre of its component.
+    count = 20_000
+    component, within = (torch.arange(count) + 0.5) / count, torch.full((count,), 0.5)
+    v = expanded(mixture, count).sample(component, within, temperature, noise=1e-9).log1p()
+    found = [float(((v - centre).abs() < 0.01).float().mean()) for centre in centres]
+    np.testing.assert_allclose(found, np.array(tempered) / sum(tempered), atol=2e-4)
+
+
+def test_a_component_of_no_weight_is_not_sampled_at_any_temperature() -> None:
+    parts = torch.tensor([[0.0, -200.0]]), torch.tensor([[2.0, 3.0]]), torch.tensor([[-4.0, -4.0]])
+    component, within = torch.rand(2, 1000, generator=torch.Generator().manual_seed(0))
+    for temperature in (0.5, 1.0, 2.0):
+        v = expanded(RangeMixture(*parts, (1.0, 80.0)), 1000).sample(component, within, temperature).log1p()
+        assert float(v.max()) < 2.5
+
+
+def test_all_steps_of_a_range_are_sure_to_hold_it():
+    steps = RangeSteps(SENSOR, 500)
+    every = torch.arange(steps.first, steps.last + 1).expand(4, -1)
+    rng = torch.Generator().manual_seed(0)
+    logits, centres, scales = (torch.randn(4, 1, 3, generator=rng).expand(*every.shape, 3) for _ in range(3))
+    limits_m = (SENSOR.range_min_m, SENSOR.range_max_m)
+    mixture = RangeMixture(logits, 2.5 + centres, scales - 3, limits_m)
+    mass = mixture.log_mass(*steps.edges_m(every)).exp()
+    assert torch.allclose(mass.sum(-1), torch.ones(4, dtype=mass.dtype), atol=1e-5)
+    assert torch.equal(steps.indices(steps.range_m(every)), every)
+
+
+def test_the_expected_bits_are_the_mean_over_all_steps():
+    steps, rng = RangeSteps(SENSOR, 500), torch.Generator().manual_seed(0)
+    logits, centres, scales = (torch.randn(5, 3, generator=rng) for _ in range(3))
+    limits_m = (SENSOR.range_min_m, SENSOR.range_max_m)
+    mixture = RangeMixture(logits, 2.5 + centres.clamp(-1, 1), scales - 3, limits_m)
+    every = torch.arange(steps.first, steps.last + 1).expand(5, -1)
+    parts = mixture.logits, mixture.centres, mixture.log_scales
+    logits, centres, scales = (part[:, None].expand(*every.shape, 3) for part in parts)
+    nats = -RangeMixture(logits, centres, scales, limits_m).log_mass(*steps.edges_m(every))
+    assert torch.allclose(mixture.entropy(steps).double(), (nats.exp().reciprocal() * nats).sum(-1), atol=0.15)
+
+
+def logistic(z: float) -> float:
+    return 1 / (1 + math.exp(-z)) if z > -700 else 0.0
