@@ -96,31 +96,66 @@ def test_sharpening_prefers_the_denser_component_of_a_surface() -> None:
     assert at_dense == pytest.approx([1 / 3, 2 / 3], abs=0.02)
 
 
-@pytest.mark.parametrize("temperature", [0.4, 0.6, 2.0])
+@pytest.mark.parametrize("apart", [-0.3, 0.3])
+def test_a_thin_object_keeps_its_probability_before_and_behind_a_wall(apart: float) -> None:
+    logits, log_scales = torch.tensor([[0.1, 0.9]]).log(), torch.tensor([[0.02, 0.003]]).log()
+    mixture = RangeMixture(logits, torch.tensor([[3.0 + apart, 3.0]]), log_scales, (1.0, 80.0))
+    assert shares_of_components(mixture, 0.35)[0] == pytest.approx(0.1, abs=0.005)
+    # Much colder, one that is so vague that the wall lies within its spread is lost: in front as well as behind.
+    vague = RangeMixture(logits, mixture.centres, torch.tensor([[0.1, 0.01]]).log(), (1.0, 80.0))
+    assert shares_of_components(vague, 0.1)[0] == 0
+    assert tempered_by_a_loop(vague, 0.1)[0] < 1e-6
+
+
+@pytest.mark.parametrize("temperature", [0.1, 0.35, 0.6, 2.0])
 @pytest.mark.parametrize("seed", range(3))
 def test_components_are_sharpened_by_their_density_beside_that_of_their_surface(seed: int, temperature: float) -> None:
     rng = torch.Generator().manual_seed(seed)
-    steps = torch.tensor([[0.0, 0.04, 0.09, 0.15, 0.9, 2.0]])
-    log_scales = torch.empty(1, 6).uniform_(-5, -1, generator=rng)
-    mixture = RangeMixture(torch.randn(1, 6, generator=rng), 1.5 + steps, log_scales, (1.0, 80.0))
-    centres, scales = mixture.centres[0].tolist(), mixture.log_scales[0].exp().tolist()
-    weights, power = mixture.logits[0].double().softmax(-1).tolist(), 1 / temperature - 1
-    range_m = mixture.centres[0].double().expm1()
-    density = (expanded(mixture, 6).log_density(range_m).exp() * (1 + range_m)).tolist()  # of v = ln(1 + range)
-    tempered = []
-    for j, centre in enumerate(centres):
-        there = [
-            weight * (logistic((centre + 0.1 - c) / scale) - logistic((centre - 0.1 - c) / scale))
-            for weight, c, scale in zip(weights, centres, scales, strict=True)
-        ]
-        mean = sum(m * d**power for m, d in zip(there, density, strict=True)) / sum(there)
-        tempered.append(weights[j] * density[j] ** power / mean)
-    # Without noise every range is the centre of its component.
+    centres = torch.tensor([[math.log1p(1.0), 1.5, 1.54, 1.59, 1.65, 2.4, 3.5, math.log1p(80.0)]])
+    log_scales = torch.cat(
+        [torch.tensor([[-3.0]]), torch.empty(1, 6).uniform_(-5, -1, generator=rng), torch.ones(1, 1)], -1
+    )
+    logits = torch.randn(1, 8, generator=rng)
+    logits[0, 5] -= 10
+    mixture = RangeMixture(logits, centres, log_scales, (1.0, 80.0))
+    found = shares_of_components(mixture, temperature)
+    np.testing.assert_allclose(found, tempered_by_a_loop(mixture, temperature), atol=1e-3)
+
+
+def shares_of_components(mixture: RangeMixture, temperature: float) -> list[float]:
+    """How often each component is sampled: without noise every range is the centre of its component."""
     count = 20_000
     component, within = (torch.arange(count) + 0.5) / count, torch.full((count,), 0.5)
     v = expanded(mixture, count).sample(component, within, temperature, noise=1e-9).log1p()
-    found = [float(((v - centre).abs() < 0.01).float().mean()) for centre in centres]
-    np.testing.assert_allclose(found, np.array(tempered) / sum(tempered), atol=2e-4)
+    return [float(((v - centre).abs() < 0.01).float().mean()) for centre in mixture.centres[0].tolist()]
+
+
+def tempered_by_a_loop(mixture: RangeMixture, temperature: float) -> list[float]:
+    weights, power = mixture.logits[0].double().softmax(-1).tolist(), 1 / temperature - 1
+    parts = list(zip(weights, mixture.centres[0].tolist(), mixture.log_scales[0].exp().tolist(), strict=True))
+    low, high = (math.log1p(limit) for limit in mixture.limits_m)
+
+    def density(v: float) -> float:
+        each = [
+            weight * logistic((v - c) / scale) * logistic((c - v) / scale) / scale / mass_between(low, high, c, scale)
+            for weight, c, scale in parts
+        ]
+        return sum(each)
+
+    tempered = []
+    for weight, centre, _ in parts:
+        there = [w * mass_between(centre - 0.1, centre + 0.1, c, scale) for w, c, scale in parts]
+        mean = sum(m * density(c) ** power for m, (_, c, _) in zip(there, parts, strict=True)) / sum(there)
+        tempered.append(weight * density(centre) ** power / mean)
+    return [one / sum(tempered) for one in tempered]
+
+
+def mass_between(low: float, high: float, centre: float, scale: float) -> float:
+    """Probability of a logistic distribution between two numbers, exact in both tails."""
+    first, last = (low - centre) / scale, (high - centre) / scale
+    if first > 0:
+        first, last = -last, -first
+    return logistic(last) - logistic(first)
 
 
 def test_a_component_of_no_weight_is_not_sampled_at_any_temperature() -> None:

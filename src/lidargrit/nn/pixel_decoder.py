@@ -34,12 +34,12 @@ BITS_STEP_M = 0.01  # bits of a return are those of naming its range to a centim
 class PixelSampling:
     """Settings of sampling masks, and ranges from their mixtures.
 
-    The defaults are sharper than the mixtures themselves, which have speckles where a surface is uncertain. Only scans
+    The defaults are sharper than the mixtures themselves, which are ragged where a surface is uncertain. Only scans
     that are sampled with 1, 1 and a correlation of 0 follow the distribution whose likelihood the model computes.
 
     Args:
         range_temperature: temperature of the mixture's density on one surface; 1 leaves it unchanged, below 1 prefers
-            the densest of the components there. Surfaces keep their probabilities.
+            the densest of the components there. Surfaces that lie apart keep their probabilities.
         range_noise: multiplier of the components' scales; 1 takes them as they are.
         mask_correlation: multiplier of how much of their noise close pixels of a mask share that are sampled at once,
             so that drops cluster; 1 takes what was learned in training, 0 samples them independently.
@@ -47,7 +47,7 @@ class PixelSampling:
             ``auto`` is ``bf16`` where the machine has instructions for it.
     """
 
-    range_temperature: float = 0.4
+    range_temperature: float = 0.35
     range_noise: float = 0.7
     mask_correlation: float = 2.0
     precision: Precision = "fp32"

@@ -88,7 +88,7 @@ class RangeMixture:
             component: uniform random numbers in [0, 1) that choose a component.
             within: uniform random numbers in [0, 1) that choose a range of the component.
             temperature: temperature of the density on one surface; 1 leaves it unchanged, below 1 prefers the densest
-                of the components there. Surfaces keep their probabilities.
+                of the components there. Surfaces that lie apart keep their probabilities.
             noise: multiplier of the components' scales.
         """
         scaled = RangeMixture(
@@ -109,9 +109,9 @@ class RangeMixture:
 
         The surface of a component is what lies within ``_SURFACE_V`` of its centre. The component's weight is
         multiplied by d^(1/T - 1) of the density d at its centre, and divided by the mean of that power over the
-        surface: over all components, each counted by its probability there. So only components on one surface compete
-        with each other. A temperature of the whole density would take the probability from a pole, since narrower
-        components describe the wall behind it.
+        surface: over all components, each counted by its probability there, cut-offs left out. So components compete
+        with those that reach the same surface: a pole loses little to the wall behind it, and only where it is so broad
+        that the wall lies within its spread. A temperature of the whole density would take half of all poles away.
         """
         if temperature == 1:
             return self.logits
@@ -121,8 +121,9 @@ class RangeMixture:
         parts = (self.centres, inverse, log_weights.exp(), power)
         mass, total = torch.zeros_like(self.centres), torch.zeros_like(self.centres)
         for centre, steepness, weight, of_other in zip(*(part.split(1, -1) for part in parts), strict=True):
-            z, half = (self.centres - centre) * steepness, _SURFACE_V * steepness
-            there = (z + half).sigmoid_().sub_((z - half).sigmoid_()).mul_(weight)  # the other's probability there
+            z, half = (self.centres - centre).abs_().mul_(-steepness), _SURFACE_V * steepness
+            # The other's probability there. A negative z keeps its digits where it is next to nothing.
+            there = (z + half).sigmoid_().sub_((z - half).sigmoid_()).mul_(weight)
             mass += there
             total += there.mul_((of_other - power).clamp_(max=_LARGEST_EXPONENT).exp_())
         least = torch.finfo(mass.dtype).tiny  # the logarithm stays finite
