@@ -165,7 +165,7 @@ def test_a_plan_tells_which_stages_are_taken_and_not_trained(tmp_path, capsys, m
     assert main(["train", "compact_raydrop", str(tmp_path / "none"), *words]) == 0
     text = capsys.readouterr().out
     assert "transformer: 4,539,136 parameters, taken from pretrained and not trained" in text
-    assert "pixels: 1,019,023 parameters, 42,000 scans" in text
+    assert "pixels: 1,019,023 parameters, 58,000 scans" in text
     words = ["--dry-run", "--set", "model.pixels.coarsest_cell=8"]
     assert main(["train", "compact_raydrop", str(tmp_path / "none"), *words]) == 2
     assert "whose pixels is another (model.pixels.coarsest_cell=64)" in the_one_line(capsys.readouterr().err, "train")

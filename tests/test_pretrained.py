@@ -36,7 +36,7 @@ def model():
 @pytest.mark.parametrize(("folder", "megabytes"), [(FOLDER, 11.8), (WIDE, 12.0)])
 def test_all_of_it_is_small_and_its_card_is_whole(folder, megabytes):
     assert (folder / "model.safetensors").stat().st_size < megabytes * 1e6
-    assert sum(path.stat().st_size for path in folder.iterdir()) < (megabytes + 4.1) * 1e6, "with what it learned from"
+    assert sum(path.stat().st_size for path in folder.iterdir()) < (megabytes + 4.5) * 1e6, "with what it learned from"
     card = (folder / "README.md").read_text(encoding="utf-8")
     for part in ("## How to sample", "## Data", "## Licence", "## Training", "## Scores", "## Where it fails"):
         assert part in card
@@ -49,7 +49,7 @@ def test_it_is_what_its_recipe_makes(model):
     trained = json.loads((FOLDER / "run.json").read_text(encoding="utf-8"))["recipe"]
     seen = {stage: fit["scans"] for stage, fit in trained["training"].items()}
     seen["transformer"] += 18_000 + 36_000 + 30_000  # before they were trained further, as the card says
-    seen["pixels"] += 17_000 + 9000
+    seen["pixels"] += 17_000 + 9000 + 16_000
     assert seen == {stage: fit.scans for stage, fit in {**completing.training, **recipe.training}.items()}
 
 

@@ -16,7 +16,7 @@ TRANSFORMER = replace(
 
 RECIPE = replace(
     compact.RECIPE,
-    title="LidarGRIT with a pixel decoder: 64x256 in 256 tokens, for one CPU core and nine hours",
+    title="LidarGRIT with a pixel decoder: 64x256 in 256 tokens, for one CPU core and ten hours",
     model=replace(
         compact.RECIPE.model,
         # No image comes often enough that dropout would prevent anything.
@@ -33,13 +33,13 @@ RECIPE = replace(
             gravity_components=True,
         ),
     ),
-    data=replace(compact.RECIPE.data, train=("simulated:60000:train",)),
+    data=replace(compact.RECIPE.data, train=("simulated:70000:train",)),
     training={
         **compact.RECIPE.training,
         # Scans are not symmetric: the car hides rays on one side. From mirrored ones, half of the samples are mirrored.
         "transformer": replace(TRANSFORMER, scans=220_000, average_over_scans=1000, augmentations=()),
         "pixels": FitConfig(
-            scans=42_000,
+            scans=58_000,
             batch_size=2,
             learning_rate=2e-3,
             schedule="cosine",
