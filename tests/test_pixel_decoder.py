@@ -208,14 +208,15 @@ def test_16_bits_move_few_pixels_and_leave_32_bits_as_they_were() -> None:
 
     def sample(precision: Precision) -> RangeImage:
         rngs = [torch.Generator().manual_seed(seed) for seed in range(4)]
-        return decoder.sample(decoded, rngs, PixelSampling(precision=precision))
+        # Random networks have many components at one range, between which a temperature would choose by rounding.
+        return decoder.sample(decoded, rngs, PixelSampling(range_temperature=1.0, precision=precision))
 
     exact, quick = sample("fp32"), sample("bf16")
     assert quick.range_m.dtype == torch.float32
     assert not torch.equal(quick.range_m, exact.range_m)
     assert (quick.return_mask != exact.return_mask).float().mean() < 0.02
     both = quick.return_mask & exact.return_mask
-    assert ((quick.range_m - exact.range_m).abs() < 0.3)[both].float().mean() > 0.85
+    assert ((quick.range_m - exact.range_m).abs() < 0.3)[both].float().mean() > 0.95
     assert torch.equal(sample("fp32").range_m, exact.range_m)
 
 
