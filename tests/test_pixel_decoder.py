@@ -17,6 +17,7 @@ from lidargrit.nn.pixel_phases import at_phases, completed_lattices, generated_b
 from lidargrit.nn.precision import Precision
 from lidargrit.sensors import load_sensor
 from lidargrit.structures import Decoded, RangeImage
+from mixture_loops import density_of_v
 from pixel_decoder_examples import FEATURES, random_decoded, random_decoder, random_images, tiny_sensor
 
 
@@ -148,7 +149,7 @@ def test_a_range_is_as_likely_as_a_loop_over_components_says() -> None:
     nll = decoder(decoded, images).range[0]
     guide, v = Guide.of(decoded), images.range_m.log1p()
     guided = decoder.range.guided(guide)
-    low, high = math.log1p(sensor.range_min_m), math.log1p(sensor.range_max_m)
+    assert decoder.range.limits_m == (sensor.range_min_m, sensor.range_max_m)
     for phase in decoder.range.phases:
         mixture = decoder.range.distributions([phase], guided, guide, images.return_mask, v)
         rows, columns = torch.arange(4)[phase.pixels[0]].tolist(), torch.arange(8)[phase.pixels[1]].tolist()
@@ -156,18 +157,12 @@ def test_a_range_is_as_likely_as_a_loop_over_components_says() -> None:
             if not images.return_mask[0, row, column]:
                 assert nll[row, column] == 0
                 continue
-            range_m, density = float(images.range_m[0, row, column]), 0.0
+            range_m = float(images.range_m[0, row, column])
             weights = mixture.logits[0, 0, i, j].double().softmax(0).tolist()
             centres, scales = mixture.centres[0, 0, i, j].tolist(), mixture.log_scales[0, 0, i, j].exp().tolist()
-            for weight, centre, scale in zip(weights, centres, scales, strict=True):
-                z = (math.log1p(range_m) - centre) / scale
-                mass = logistic((high - centre) / scale) - logistic((low - centre) / scale)
-                density += weight * logistic(z) * logistic(-z) / scale / mass / (1 + range_m)
+            components = list(zip(weights, centres, scales, strict=True))
+            density = density_of_v(components, mixture.limits_m, math.log1p(range_m)) / (1 + range_m)
             assert float(nll[row, column]) == pytest.approx(-math.log(density), abs=1e-3)
-
-
-def logistic(z: float) -> float:
-    return 1 / (1 + math.exp(-z)) if z > -700 else 0.0
 
 
 @torch.no_grad()

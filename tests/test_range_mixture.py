@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,13 +13,14 @@ from torch import Tensor
 from lidargrit.nn.range_mixture import RangeMixture
 from lidargrit.nn.range_steps import RangeSteps
 from lidargrit.sensors import load_sensor
+from mixture_loops import density_of_v, mass_between
 
 SENSOR = load_sensor("hdl64e_kitti_odometry")
 
 
-def mixture_of(seed: int, count: int = 1) -> RangeMixture:
+def mixture_of(seed: int) -> RangeMixture:
     rng = torch.Generator().manual_seed(seed)
-    size = (count, 6)
+    size = (1, 6)
     centres = torch.linspace(math.log1p(1.0), math.log1p(80.0), 6).expand(size)
     log_scales = torch.empty(size).uniform_(-4, 0.5, generator=rng)
     return RangeMixture(torch.randn(size, generator=rng), centres, log_scales, (1.0, 80.0))
@@ -133,29 +135,13 @@ def shares_of_components(mixture: RangeMixture, temperature: float) -> list[floa
 def tempered_by_a_loop(mixture: RangeMixture, temperature: float) -> list[float]:
     weights, power = mixture.logits[0].double().softmax(-1).tolist(), 1 / temperature - 1
     parts = list(zip(weights, mixture.centres[0].tolist(), mixture.log_scales[0].exp().tolist(), strict=True))
-    low, high = (math.log1p(limit) for limit in mixture.limits_m)
-
-    def density(v: float) -> float:
-        each = [
-            weight * logistic((v - c) / scale) * logistic((c - v) / scale) / scale / mass_between(low, high, c, scale)
-            for weight, c, scale in parts
-        ]
-        return sum(each)
-
+    density = partial(density_of_v, parts, mixture.limits_m)
     tempered = []
     for weight, centre, _ in parts:
         there = [w * mass_between(centre - 0.1, centre + 0.1, c, scale) for w, c, scale in parts]
         mean = sum(m * density(c) ** power for m, (_, c, _) in zip(there, parts, strict=True)) / sum(there)
         tempered.append(weight * density(centre) ** power / mean)
     return [one / sum(tempered) for one in tempered]
-
-
-def mass_between(low: float, high: float, centre: float, scale: float) -> float:
-    """Probability of a logistic distribution between two numbers, exact in both tails."""
-    first, last = (low - centre) / scale, (high - centre) / scale
-    if first > 0:
-        first, last = -last, -first
-    return logistic(last) - logistic(first)
 
 
 def test_a_component_of_no_weight_is_not_sampled_at_any_temperature() -> None:
@@ -188,7 +174,3 @@ def test_the_expected_bits_are_the_mean_over_all_steps():
     logits, centres, scales = (part[:, None].expand(*every.shape, 3) for part in parts)
     nats = -RangeMixture(logits, centres, scales, limits_m).log_mass(*steps.edges_m(every))
     assert torch.allclose(mixture.entropy(steps).double(), (nats.exp().reciprocal() * nats).sum(-1), atol=0.15)
-
-
-def logistic(z: float) -> float:
-    return 1 / (1 + math.exp(-z)) if z > -700 else 0.0
