@@ -33,10 +33,10 @@ def model():
     return load("pretrained")
 
 
-@pytest.mark.parametrize(("folder", "megabytes"), [(FOLDER, 11.8), (WIDE, 12.0)])
-def test_all_of_it_is_small_and_its_card_is_whole(folder, megabytes):
-    assert (folder / "model.safetensors").stat().st_size < megabytes * 1e6
-    assert sum(path.stat().st_size for path in folder.iterdir()) < (megabytes + 4.5) * 1e6, "with what it learned from"
+@pytest.mark.parametrize("folder", [FOLDER, WIDE])
+def test_all_of_it_is_small_and_its_card_is_whole(folder):
+    assert (folder / "model.safetensors").stat().st_size < 12e6
+    assert sum(path.stat().st_size for path in folder.iterdir()) < 16e6
     card = (folder / "README.md").read_text(encoding="utf-8")
     for part in ("## How to sample", "## Data", "## Licence", "## Training", "## Scores", "## Where it fails"):
         assert part in card

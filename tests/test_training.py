@@ -26,7 +26,6 @@ from lidargrit.training.checkpoint import load_checkpoint, save_checkpoint
 from lidargrit.training.fit import Fit
 from lidargrit.training.log import Log, read_log
 from lidargrit.training.optimiser import WeightAverage, learning_rate_at, make_optimiser, memory_of_weights
-from lidargrit.training.run import _write_trained_on
 from lidargrit.viewer import plot_progress
 from tiny_runs import MODEL
 
@@ -279,21 +278,6 @@ def test_a_folder_is_trained_in_by_one_process_at_a_time(tmp_path):
         train(load_recipe("demo", TINY), tmp_path / "run")
     train(load_recipe("demo", TINY), tmp_path / "run")
     assert not [path for path in (tmp_path / "run").rglob("*") if path.name.startswith(".")]
-
-
-def test_a_run_that_gives_its_stages_tells_what_it_learned_from_if_it_is_known(tmp_path, images):
-    """Imported weights do not tell it, and a file that was edited by hand may hold anything."""
-    (tmp_path / "donor").mkdir()
-    _write_trained_on(tmp_path / "first", images, str(tmp_path / "donor"))
-    known = json.loads((tmp_path / "first" / "trained_on.json").read_text())["fingerprints"]
-    assert len(known) == 6
-    (tmp_path / "donor" / "trained_on.json").write_text('{"recordings": [], "fingerprints": ["ab"]}')
-    _write_trained_on(tmp_path / "second", images, str(tmp_path / "donor"))
-    assert json.loads((tmp_path / "second" / "trained_on.json").read_text())["fingerprints"] == sorted([*known, "ab"])
-    for number, bad in enumerate(('{"recordings": [[1]]}', '{"fingerprints": 3}', '{"drives": []}', "[]")):
-        (tmp_path / "donor" / "trained_on.json").write_text(bad)
-        with pytest.raises(CheckpointError, match=r"trained_on\.json, "):
-            _write_trained_on(tmp_path / f"bad{number}", images, str(tmp_path / "donor"))
 
 
 def test_pictures_change_nothing(tmp_path, whole):

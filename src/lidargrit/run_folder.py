@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
+import string
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 from lidargrit import configuration
 from lidargrit.errors import CheckpointError
-from lidargrit.files import is_taken, read_json, sha256_of
+from lidargrit.files import is_taken, read_json, sha256_of, write_text
 from lidargrit.loading import Provenance
 from lidargrit.projection import ProjectionVariant
 
@@ -16,6 +19,7 @@ RUN_FILE = "run.json"  # ``origin`` in it says that the weights beside it were n
 CHECKPOINT_FILE = "checkpoint.safetensors"  # of a stage, in its own folder
 TRAINED_ON_FILE = "trained_on.json"  # in a run's folder and beside its samples: which drives, which pixels
 UNKNOWN_SCANS = "a run that does not say on which scans it was trained"  # in the place of a source
+_NAMES_AT_MOST = 10_000_000  # that a file stands for by their first and last
 PRETRAINED = Path(__file__).parent / "pretrained"
 PACKAGED = (PRETRAINED, PRETRAINED.with_name("pretrained_wide"))  # their names go wherever a run is wanted
 
@@ -71,15 +75,76 @@ def projection_variant(folder: Path) -> ProjectionVariant:
 
 
 def trained_on(folder: Path) -> Provenance:
-    """Return what the model of a run, or of a folder of samples, learned from; empty where that is not known."""
+    """Return what the model of a run, or of a folder of samples, learned from; empty where that is not known.
+
+    Raises:
+        CheckpointError: a file that lidargrit did not write.
+    """
     if not (folder / TRAINED_ON_FILE).is_file():
         return Provenance()
     try:
         facts = {name: tuple(of) for name, of in read_json(folder / TRAINED_ON_FILE).items()}
+        if "recordings" in facts:
+            facts["recordings"] = tuple(_each_name(facts["recordings"]))
         if not all(isinstance(each, str) for of in facts.values() for each in of):
             raise TypeError("something is no text")
         return Provenance(**facts)
-    except (TypeError, AttributeError) as error:
+    except (TypeError, KeyError, ValueError, AttributeError) as error:
         raise CheckpointError(
             f"{folder / TRAINED_ON_FILE}, in which {error}", "what lidargrit wrote", "restore it, or remove it"
         ) from None
+
+
+def write_trained_on(folder: Path, provenance: Provenance) -> None:
+    """Write what a model learned from, without names of the user's files, so that its samples can tell it, too.
+
+    Names of recordings that differ in a number alone, as those of simulated streets do, are written as the first and
+    the last of them.
+    """
+    listed = {
+        "recordings": _first_and_last({*provenance.recordings} - {""}),
+        "fingerprints": sorted({*provenance.fingerprints}),
+        "range_fingerprints": sorted({*provenance.range_fingerprints} - {""}),
+    }
+    write_text(folder / TRAINED_ON_FILE, json.dumps(listed, separators=(",", ":")) + "\n")
+
+
+def _first_and_last(names: Iterable[str]) -> list[str | dict[str, str]]:
+    """Return sorted names, with the first and the last in place of three or more that are numbered consecutively."""
+    groups: list[list[str]] = []
+    for name in sorted(names):
+        if groups and name == _next_name(groups[-1][-1]):
+            groups[-1].append(name)
+        else:
+            groups.append([name])
+    written: list[str | dict[str, str]] = []
+    for group in groups:
+        written += [{"first": group[0], "last": group[-1]}] if len(group) > 2 else group
+    return written
+
+
+def _next_name(name: str) -> str | None:
+    """Return the name that ends in the next number, of as many digits; None if there is none."""
+    stem, digits = _split(name)
+    following = f"{int(digits) + 1:0{len(digits)}d}" if digits else ""
+    return stem + following if digits and len(following) == len(digits) else None
+
+
+def _each_name(written: Iterable[object]) -> Iterator[object]:
+    """Yield the names that :func:`_first_and_last` wrote."""
+    left = _NAMES_AT_MOST
+    for each in written:
+        if not isinstance(each, dict):
+            yield each
+            continue
+        (stem, first), (other_stem, last) = _split(each["first"]), _split(each["last"])
+        left -= int(last or 0) - int(first or 0)
+        if stem != other_stem or len(first) != len(last) or not first < last or left < 0:
+            raise ValueError(f"{each['first']} to {each['last']} are no numbered names, or more than {_NAMES_AT_MOST}")
+        yield from (f"{stem}{number:0{len(first)}d}" for number in range(int(first), int(last) + 1))
+
+
+def _split(name: str) -> tuple[str, str]:
+    """Return a name without the digits at its end, and these digits."""
+    stem = name.rstrip(string.digits)
+    return stem, name[len(stem) :]

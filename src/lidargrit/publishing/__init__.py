@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from lidargrit.generators import Generator, load, load_class
 from lidargrit.nn.quantization import WeightBits, without_quantized
 from lidargrit.publishing.card import model_card
 from lidargrit.recipes import load_recipe
-from lidargrit.run_folder import CARD_FILE, RUN_FILE, TRAINED_ON_FILE, locate, taken_over, trained_on, weights_sha256
+from lidargrit.run_folder import CARD_FILE, RUN_FILE, locate, taken_over, trained_on, weights_sha256, write_trained_on
 from lidargrit.sources import data_set_of
 from lidargrit.sources.samples import is_sample_folder, weights_of
 
@@ -110,10 +111,8 @@ def publish(run: Path, folder: Path, scores: Path | None = None, notes: str = ""
             # A recording that has no name of its own is named by its folder, which is the user's; by its path, in runs
             # of an earlier version.
             named = (each for each in learned.recordings if not each.startswith("#"))
-            drives = [recording for recording in named if not Path(recording).is_absolute()]
-            found = {"fingerprints": learned.fingerprints, "range_fingerprints": learned.range_fingerprints}
-            hashes = {name: list(of) for name, of in found.items()}
-            write_json(folder / TRAINED_ON_FILE, {"recordings": drives, **hashes})
+            drives = tuple(recording for recording in named if not Path(recording).is_absolute())
+            write_trained_on(folder, replace(learned, recordings=drives))
         generator.save_pretrained(folder, card, bits)  # the card last: it says that the folder is finished
     return card
 

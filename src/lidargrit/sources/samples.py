@@ -124,7 +124,7 @@ def _begin(folder: Path, manifest: dict[str, Any], defaults: dict[str, Any]) -> 
 def _trained_on(run_folder: Path) -> str | None:
     """Return what the model learned from, as it is to lie beside its samples; None where the run does not tell."""
     source = run_folder / TRAINED_ON_FILE
-    return json.dumps(read_json(source)) + "\n" if source.is_file() else None
+    return json.dumps(read_json(source), separators=(",", ":")) + "\n" if source.is_file() else None
 
 
 def read_samples(folder: Path, count: int | None = None) -> RangeImages:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import hashlib
-import json
 import platform
 import subprocess
 import sys
@@ -19,12 +18,12 @@ import torch
 from lidargrit import __version__, configuration
 from lidargrit.determinism import derive_seed
 from lidargrit.errors import CheckpointError, OutputError
-from lidargrit.files import claim_folder, claimed_manifest, is_taken, read_json, write_json, write_text
+from lidargrit.files import claim_folder, claimed_manifest, is_taken, read_json, write_json
 from lidargrit.generators import Generator
-from lidargrit.loading import DataConfig, RangeImages
+from lidargrit.loading import DataConfig, Provenance, RangeImages
 from lidargrit.nn.objective import Objective
 from lidargrit.reporting import Reporter
-from lidargrit.run_folder import RUN_FILE, TRAINED_ON_FILE, locate, recipe_settings, trained_on
+from lidargrit.run_folder import RUN_FILE, TRAINED_ON_FILE, locate, recipe_settings, trained_on, write_trained_on
 from lidargrit.sources import load_range_images
 from lidargrit.training.checkpoint import fingerprint
 from lidargrit.training.config import FitConfig, Recipe
@@ -203,23 +202,19 @@ def _claim(
 
 
 def _write_trained_on(folder: Path, train_images: RangeImages, donor: str | None) -> None:
-    """Write hashes of the training scans, without names of the user's files, so that samples can name them, too."""
-    if not (folder / TRAINED_ON_FILE).exists():
-        came_from = train_images.provenance
-        facts = {
-            "recordings": {*came_from.recordings} - {""},
-            "fingerprints": {*came_from.fingerprints},
-            "range_fingerprints": {*came_from.range_fingerprints} - {""},
-        }
-        if donor is not None:  # the model has learned from the scans of the stages that it takes, too
-            theirs = trained_on(locate(donor))
-            facts = {
-                "recordings": facts["recordings"] | {*theirs.recordings},
-                "fingerprints": facts["fingerprints"] | {*theirs.fingerprints},
-                "range_fingerprints": facts["range_fingerprints"] | {*theirs.range_fingerprints},
-            }
-        listed = {name: sorted(values) for name, values in facts.items()}
-        write_text(folder / TRAINED_ON_FILE, json.dumps(listed) + "\n")
+    """Write what the model learns from: the training scans, and those of the stages that it takes."""
+    if (folder / TRAINED_ON_FILE).exists():
+        return
+    ours = train_images.provenance
+    theirs = trained_on(locate(donor)) if donor is not None else Provenance()
+    write_trained_on(
+        folder,
+        Provenance(
+            recordings=ours.recordings + theirs.recordings,
+            fingerprints=ours.fingerprints + theirs.fingerprints,
+            range_fingerprints=ours.range_fingerprints + theirs.range_fingerprints,
+        ),
+    )
 
 
 def _warn_of_overlap(train_images: RangeImages, val_images: RangeImages, reporter: Reporter) -> None:
