@@ -58,7 +58,8 @@ def parts(numbers, groups, real):
 def interval(generated, real, resampling):
     groups = blocks(len(generated), resampling.groups)
     sides = parts(generated, groups, False), parts(real, groups, True)
-    return interval_of(merged(*sides).compute(), *sides, resampling, Ratio.bounds)
+    whole = merged(*sides)
+    return interval_of(whole.compute().value, whole, *sides, resampling)
 
 
 def test_the_interval_covers_the_true_value_about_as_often_as_it_says():
@@ -126,7 +127,9 @@ def test_real_against_real_is_the_mean_of_halves_against_halves():
     rng = np.random.default_rng(3)
     numbers = rng.gamma(4, 1, 400)
     groups = blocks(400, 16)
-    found = real_against_real(parts(numbers, groups, True), parts(numbers, groups, False), [25] * 16, Resampling())
+    found = real_against_real(
+        Ratio(), parts(numbers, groups, True), parts(numbers, groups, False), [25] * 16, Resampling()
+    )
     assert found.num_scans == 200
     assert found.halvings == 5
     assert found.value == pytest.approx(1.0, abs=0.1)
@@ -136,9 +139,9 @@ def test_too_few_scans_have_neither():
     groups = blocks(3, 16)
     numbers = np.ones(3)
     sides = parts(numbers, groups, False), parts(numbers, groups, True)
-    result = merged(*sides).compute()
-    assert interval_of(result, *sides, Resampling(), Ratio.bounds) is None
-    assert real_against_real(sides[1], sides[0], [1, 1], Resampling()) is None
+    whole = merged(*sides)
+    assert interval_of(whole.compute().value, whole, *sides, Resampling()) is None
+    assert real_against_real(whole, sides[1], sides[0], [1, 1], Resampling()) is None
 
 
 @pytest.mark.parametrize(("groups", "halves"), [(2, 20), (16, 1), (0, 5)])
@@ -172,3 +175,35 @@ def test_every_metric_can_be_merged_from_parts_of_one_side_only(name, packed, mo
     result = merged(pieces[False], pieces[True]).compute()
     assert math.isclose(result.value, whole.compute().value, rel_tol=1e-4, abs_tol=1e-7)
     assert (result.num_generated, result.num_reference) == (8, 8)
+
+
+@pytest.mark.parametrize("name", ["flying_points", "edge_rate_per_range", "thin_object_rate_per_range"])
+def test_halves_compare_the_bins_of_the_whole_sets(name, monkeypatch):
+    """Half as many pixels leave fewer bins with 500, and none where all are rare, so that all of them count."""
+    monkeypatch.setattr("lidargrit.metrics._curves._LEAST", 300)
+    whole, half = load_metric(name)(), load_metric(name)()
+    for real in (False, True):
+        whole.update(images(int(real), 8), real=real)
+        half.update(images(int(real), 8)[:4], real=real)
+    alone = half.compute().details["real"]
+    half.choose_as(whole)
+    chosen = [share is not None for share in whole.compute().details["real"]]
+    assert [share is not None for share in half.compute().details["real"]] == chosen
+    assert [share is not None for share in alone] != chosen
+    monkeypatch.undo()
+    assert whole.kept(real=True).shape == half.kept(real=True).shape
+
+
+def test_intervals_and_real_against_real_are_of_the_score_s_bins(monkeypatch):
+    seen = []
+    monkeypatch.setattr(
+        "lidargrit.metrics._curves.enough_trials", lambda generated, real: seen.append(1) or (generated[0] >= 0)
+    )
+    sides = {real: [] for real in (False, True)}
+    for real, start in ((real, start) for real in sides for start in range(0, 8, 2)):
+        part = load_metric("flying_points")()
+        part.update(images(int(real), 8)[start : start + 2], real=real)
+        sides[real].append(Part(part))
+    whole = merged(sides[False], sides[True])
+    interval_of(whole.compute().value, whole, sides[False], sides[True], Resampling(4, 20))
+    assert len(seen) == 1 + 20

@@ -75,6 +75,14 @@ class ScanDataset(ABC):
         """Return the name that a user types: the file that defines the class."""
         return cls.__module__.rpartition(".")[2]
 
+    @classmethod
+    def origin_of(cls, root: Path) -> str:
+        """Return the data set that made the scans of a tree; "" if it is not known.
+
+        It is another one where the program itself wrote the tree, as ``simulate`` and ``export`` do.
+        """
+        return cls.public_name()
+
     @abstractmethod
     def __len__(self) -> int:
         """Count the scans."""
@@ -180,10 +188,12 @@ def data_set_and_split(source: str) -> tuple[str, str]:
     """
     head, colon, rest = source.partition(":")
     if colon and head in _discovery.names("datasets"):
-        name, (_, split) = head, _root_and_split(rest)
+        name, (root, split) = head, _root_and_split(rest)
     else:
         root, split = _root_and_split(source)
         name = (recognise(root, crawl=False) or "folder") if root.is_dir() else ""
+    if name and load(name).origin_of(root) != name:
+        return load(name).origin_of(root), ""
     known = load(name).splits() if name else {}
     part = split.partition("[")[0]
     return name, split if part in known or "/" not in part else ""

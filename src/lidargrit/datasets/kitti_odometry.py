@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -64,24 +63,29 @@ class KittiOdometry(FileDataset):
     patterns = ("sequences/*/velodyne/*.bin", "dataset/sequences/*/velodyne/*.bin")
     examples = ("sequences/00/velodyne/{index:06d}.bin", "sequences/08/velodyne/{index:06d}.bin")
 
+    @classmethod
+    def origin_of(cls, root: Path) -> str:
+        """Return ``simulated`` for a tree of ``simulate``, and "" for one of ``export``, whatever its source."""
+        if (root / "simulated.json").is_file():
+            return "simulated"
+        return "" if (root / "export.json").is_file() else cls.public_name()
+
     def scan(self, index: int) -> Scan:
         """Read one scan, with its labels if there are any."""
-        scan, path = super().scan(index), self.path(index)
+        path = self.path(index)
         (labels,) = self.companions(index)
         if not labels.is_file():
-            return scan
-        data = np.frombuffer(read_bytes(labels, _LABEL_BYTES_AT_MOST, _LABELS), dtype=np.uint8)
-        points = np.fromfile(path, dtype="<f4").reshape(-1, 4)[:, :3]
-        if len(data) != _LABEL_BYTES * len(points):
+            return super().scan(index)
+        scan = KittiBin.read(path)
+        data = np.frombuffer(read_bytes(labels, _LABEL_BYTES_AT_MOST, _LABELS), dtype="<u1")
+        if len(data) != _LABEL_BYTES * len(scan):
             raise ScanError(
-                f"{len(data)} bytes of labels in {labels}, and {len(points)} points in {path}",
-                f"{_LABELS}: {_LABEL_BYTES * len(points)} bytes",
+                f"{len(data)} bytes of labels in {labels}, and {len(scan)} points in {path}",
+                f"{_LABELS}: {_LABEL_BYTES * len(scan)} bytes",
                 "download both again, or move the labels away",
             )
         label = torch.from_numpy(data.view("<u4").astype(np.int64))
-        if len(scan) != len(label):  # points were dropped, and their labels go with them
-            label = label[torch.from_numpy(np.isfinite(points).all(axis=1) & points.any(axis=1))]
-        return replace(scan, label=label)
+        return scan_of(scan.points_xyz_m, scan.reflectance, scan.ring, scan.source, self.bad_points, label)
 
     def companions(self, index: int) -> tuple[Path, ...]:
         """Return the file of a scan's labels."""

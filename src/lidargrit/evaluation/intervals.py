@@ -152,29 +152,37 @@ class Part:
         return pickle.loads(zlib.decompress(self._packed) if self._metric is None else pickle.dumps(self._metric))
 
 
-def merged(generated: Sequence[Part], real: Sequence[Part]) -> Metric:
-    """Return a new metric that has seen what the parts of both sets were fed, in their order."""
-    whole = real[0].copy()
+def merged(generated: Sequence[Part], real: Sequence[Part], whole: Metric | None = None) -> Metric:
+    """Return a new metric that has seen what the parts of both sets were fed, in their order.
+
+    Args:
+        generated: parts of the generated set.
+        real: parts of the real set.
+        whole: metric of larger sets whose choices are to be made; see :meth:`Metric.choose_as`.
+    """
+    metric = real[0].copy()
     for part in (*generated, *real[1:]):
-        whole.merge(part.metric())
-    return whole
+        metric.merge(part.metric())
+    if whole is not None:
+        metric.choose_as(whole)
+    return metric
 
 
 def interval_of(
-    result: MetricResult,
+    value: float,
+    whole: Metric,
     generated: Sequence[Part],
     real: Sequence[Part],
     resampling: Resampling,
-    bounds: tuple[float, float],
 ) -> Interval | None:
     """Return the confidence interval of the score of the whole sets; None if there are too few scans.
 
     Args:
-        result: score of the whole sets.
+        value: score of the whole sets.
+        whole: metric that was fed the whole sets.
         generated: metrics that were fed one group of generated scans each.
         real: metrics that were fed one group of real scans each.
         resampling: number of halves and seed.
-        bounds: least and greatest value that the metric can have.
     """
     if min(len(generated), len(real)) < _AT_LEAST:
         return None
@@ -186,10 +194,10 @@ def interval_of(
             for features in (generated, real)
         ]
         try:
-            values.append(merged(*halves).compute().value)
+            values.append(merged(*halves, whole).compute().value)
         except DataError:  # half of the scans are too few for this metric
             return None
-    return around(result.value, values, min(len(generated), len(real)), bounds)
+    return around(value, values, min(len(generated), len(real)), whole.bounds)
 
 
 def around(value: float, half_values: Sequence[float], groups: int, bounds: tuple[float, float]) -> Interval:
@@ -212,6 +220,7 @@ def around(value: float, half_values: Sequence[float], groups: int, bounds: tupl
 
 
 def real_against_real(
+    whole: Metric,
     real: Sequence[Part],
     real_as_generated: Sequence[Part],
     sizes: Sequence[int],
@@ -220,6 +229,7 @@ def real_against_real(
     """Return the mean score of one half of the reference against the other; None if there are too few scans.
 
     Args:
+        whole: metric that was fed the whole sets, generated and real.
         real: metrics that were fed one group of real scans each.
         real_as_generated: metrics that were fed the same scans as generated ones.
         sizes: number of scans in each group.
@@ -232,7 +242,7 @@ def real_against_real(
     for _ in range(_HALVINGS):
         order = rng.permutation(len(real))
         half, other = sorted(order[: len(order) // 2]), sorted(order[len(order) // 2 :])
-        metric = merged([real_as_generated[index] for index in half], [real[index] for index in other])
+        metric = merged([real_as_generated[index] for index in half], [real[index] for index in other], whole)
         try:
             values.append(metric.compute().value)
         except DataError:

@@ -75,8 +75,8 @@ class _FedMetric:
         result = metric.compute()
         interval = reference_row = None
         if resampling.halves:
-            interval = interval_of(result, self.generated, self.real, resampling, metric.bounds)
-            reference_row = real_against_real(self.real, self.real_as_generated, group_sizes, resampling)
+            interval = interval_of(result.value, metric, self.generated, self.real, resampling)
+            reference_row = real_against_real(metric, self.real, self.real_as_generated, group_sizes, resampling)
         seconds = time.perf_counter() - begun_s
         return Score(result, interval, reference_row, seconds)
 

@@ -171,7 +171,7 @@ class Metric(ABC, Generic[Features, Kept]):
                 f"at least {self.fewest_images} of each",
                 "sample more scans, or check the folder",
             )
-        value, details = self.compare(self._kept[False].value(), self._kept[True].value())
+        value, details = self.compare(self.kept(real=False), self.kept(real=True))
         return MetricResult(self.name, value, self.higher_is_better, *counts, self.variant, details)
 
     @final
@@ -188,6 +188,17 @@ class Metric(ABC, Generic[Features, Kept]):
         for real, kept in other._kept.items():
             self._kept[real].merge(kept)
             self.num_images[real] += other.num_images[real]
+
+    @final
+    def kept(self, *, real: bool) -> Kept:
+        """Return what has been kept of one set."""
+        return self._kept[real].value()
+
+    def choose_as(self, whole: Metric[Features, Kept]) -> None:
+        """Make the choices that depend on the size of the sets, if any, as a metric of larger ones makes them.
+
+        A score of half of the scans then is of the same statistic as that of all.
+        """
 
     def reduce(self) -> None:
         """Take in what all other processes of ``torch.distributed``'s group have gathered, in the order of their ranks.

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Float64, Int64
 from scipy.special import rel_entr
 from torch import Tensor
 
-from lidargrit.metrics import ImageKind, ImageMetric
+from lidargrit.metrics import ImageKind, ImageMetric, Metric
 from lidargrit.metrics._accumulators import SumAccumulator
 from lidargrit.structures import RangeImage
 
@@ -125,22 +125,22 @@ def compare_shares(
     generated: Int64[np.ndarray, "2 n"],
     real: Int64[np.ndarray, "2 n"],
     axis: Float64[np.ndarray, " n"],
+    bins: Bool[np.ndarray, " n"] | None = None,
     by_trials: bool = False,
 ) -> Curves:
     """Compare how often something happens, bin by bin: the mean divergence of the bins' yes and no.
 
-    Every bin has the same weight unless asked otherwise, but bins with fewer than 500 trials in either set are left
-    out. If that leaves none, all bins with a trial in both sets count. If there are none of these either, the result is
-    0 for two sets without any trial, else 1.
+    Every bin has the same weight unless asked otherwise. Bins without a trial in either set are left out. If no bin is
+    left, the result is 0 for two sets without any trial, else 1.
 
     Args:
         generated: numbers of trials and of successes in the generated set.
         real: numbers of trials and of successes in the real set.
         axis: position of each bin along the axis.
+        bins: bins that count; those with enough trials (:func:`enough_trials`) if not given.
         by_trials: give each bin the weight of its share of the trials, the mean of both sets.
     """
-    trials = np.minimum(generated[0], real[0])
-    kept = trials >= _LEAST if (trials >= _LEAST).any() else trials > 0
+    kept = (enough_trials(generated, real) if bins is None else bins) & (generated[0] > 0) & (real[0] > 0)
     yes_and_no = [np.stack((counts[1], counts[0] - counts[1]), axis=-1) for counts in (generated, real)]
     each = divergence(*yes_and_no)[kept]
     alike = not (generated[0].any() or real[0].any())
@@ -148,6 +148,12 @@ def compare_shares(
     mean = float(np.average(each, weights=weights)) if len(each) else float(not alike)
     plotted = [np.where(kept, normalised(counts)[:, 0], np.nan) for counts in yes_and_no]
     return Curves(mean, axis, *plotted)
+
+
+def enough_trials(generated: Int64[np.ndarray, "2 n"], real: Int64[np.ndarray, "2 n"]) -> Bool[np.ndarray, " n"]:
+    """Return which bins have at least 500 trials in both sets; if none has, those with any."""
+    trials = np.minimum(generated[0], real[0])
+    return trials >= _LEAST if (trials >= _LEAST).any() else trials > 0
 
 
 def compare_histograms(
@@ -162,9 +168,11 @@ def log_edges(low: float, high: float, bins: int) -> Float64[np.ndarray, " edges
     return np.geomspace(low, high, bins + 1)
 
 
-def range_edges(kind: ImageKind) -> Float64[np.ndarray, " edges"]:
-    """Return the edges of the bins of range, equally wide on a logarithmic axis."""
-    return log_edges(kind.range_min_m, kind.range_max_m, _RANGE_BINS)
+def range_edges(kind: ImageKind, bins: int = _RANGE_BINS) -> Float64[np.ndarray, " edges"]:
+    """Return the edges of bins of range, equally wide on a logarithmic axis, with ranges at the limits inside."""
+    edges = log_edges(kind.range_min_m, kind.range_max_m, bins)
+    edges[0], edges[-1] = edges[0] * 0.999, edges[-1] * 1.001  # a limit as float32 may lie a little beyond
+    return edges
 
 
 def middles(edges: Float64[np.ndarray, " edges"]) -> Float64[np.ndarray, " n"]:
@@ -249,12 +257,38 @@ def count_shares(
     return np.stack((histogram(quantity[finite], edges), histogram(quantity[finite & happened], edges)))
 
 
-class SharePerRangeMetric(CurveMetric):
+class ShareMetric(CurveMetric):
+    """Compares how often something happens, bin by bin (:func:`compare_shares`)."""
+
+    by_trials: ClassVar[bool] = False
+    """Whether a bin has the weight of its share of the trials."""
+
+    def __init__(self, *, variant: str | None = None, seed: int = 0) -> None:
+        super().__init__(variant=variant, seed=seed)
+        self._bins: Bool[np.ndarray, " n"] | None = None  # that count; None: those with enough trials in our own sets
+
+    @abstractmethod
+    def count(self, images: RangeImage) -> Int64[np.ndarray, "2 n"]:
+        """Count the trials of each bin in a batch and, among them, those in which it happened."""
+
+    @abstractmethod
+    def axis(self, kind: ImageKind) -> Float64[np.ndarray, " n"]:
+        """Return the position of each bin along the axis."""
+
+    @final
+    def curves(self, generated: Int64[np.ndarray, "2 n"], real: Int64[np.ndarray, "2 n"], kind: ImageKind) -> Curves:
+        """Return the shares of both sets, and how far they are apart."""
+        return compare_shares(generated, real, self.axis(kind), self._bins, self.by_trials)
+
+    def choose_as(self, whole: Metric[RangeImage, np.ndarray]) -> None:
+        """Compare the bins that have enough trials in larger sets."""
+        self._bins = enough_trials(*(whole.kept(real=real) for real in (False, True)))
+
+
+class SharePerRangeMetric(ShareMetric):
     """Compares how often something happens in the pixels of every image, in bins of range."""
 
     axis_label = "range [m]"
-    by_trials: ClassVar[bool] = False
-    """Whether a bin has the weight of its share of the pixels asked; see :func:`compare_shares`."""
 
     @abstractmethod
     def ask(self, images: RangeImage) -> tuple[Float[Tensor, "B H W"], Bool[Tensor, "B H W"]]:
@@ -266,8 +300,6 @@ class SharePerRangeMetric(CurveMetric):
         return count_shares(*self.ask(images), range_edges(ImageKind.of(images.sensor)))
 
     @final
-    def curves(
-        self, generated: Int64[np.ndarray, "2 bins"], real: Int64[np.ndarray, "2 bins"], kind: ImageKind
-    ) -> Curves:
-        """Return the share over the range."""
-        return compare_shares(generated, real, middles(range_edges(kind)), self.by_trials)
+    def axis(self, kind: ImageKind) -> Float64[np.ndarray, " bins"]:
+        """Return the middle of each bin of range."""
+        return middles(range_edges(kind))

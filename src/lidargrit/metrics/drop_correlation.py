@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Float64, Int64
 
 from lidargrit.metrics import ImageKind
-from lidargrit.metrics._curves import CurveMetric, Curves, compare_shares
+from lidargrit.metrics._curves import ShareMetric
 from lidargrit.structures import RangeImage
 
 _COLUMN_LAGS = (1, 2, 4, 8, 16)
 _ROW_LAGS = (1, 2)
 
 
-class DropCorrelation(CurveMetric):
+class DropCorrelation(ShareMetric):
     """Compare the probability that the pixel at a lag has no return either, by the divergence at each lag.
 
     The lags are 1, 2, 4, 8 and 16 columns, rows being circular, and 1 and 2 rows, where there is such a row. Along the
@@ -32,9 +32,6 @@ class DropCorrelation(CurveMetric):
         pairs += [(dropped, dropped.roll(-lag, dims=2)) for lag in _COLUMN_LAGS]
         return np.array([[int(one.sum()) for one, _ in pairs], [int((one & other).sum()) for one, other in pairs]])
 
-    def curves(
-        self, generated: Int64[np.ndarray, "2 lags"], real: Int64[np.ndarray, "2 lags"], kind: ImageKind
-    ) -> Curves:
-        """Return the probability over the lag."""
-        axis = np.array([-lag for lag in _ROW_LAGS[::-1]] + list(_COLUMN_LAGS), dtype=float)
-        return compare_shares(generated, real, axis)
+    def axis(self, kind: ImageKind) -> Float64[np.ndarray, " lags"]:
+        """Return the lags: rows, negative, then columns."""
+        return np.array([-lag for lag in _ROW_LAGS[::-1]] + list(_COLUMN_LAGS), dtype=float)

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
 from lidargrit.metrics import ImageKind
-from lidargrit.metrics._curves import ONE_SURFACE, CurveMetric, Curves, compare_shares, log_edges, middles
+from lidargrit.metrics._curves import ONE_SURFACE, ShareMetric, log_edges, middles
 from lidargrit.structures import RangeImage
 
 _OFF_M = 0.3  # 15 times the range noise of an HDL-64E, and less than the depth of a person
 _EDGES_M = log_edges(1.0, 64.0, 12)  # of the gap: three times the distance above, to the ends of a street
 
 
-class FlyingPoints(CurveMetric):
+class FlyingPoints(ShareMetric):
     """Compare how often a return at an edge lies in mid-air, by the width of the gap between the two surfaces.
 
     A pixel is at an edge if the two returns on its left lie on one surface (their ranges agree within a tenth), the two
@@ -46,11 +46,9 @@ class FlyingPoints(CurveMetric):
         ]
         return np.stack(counts)[:, : len(_EDGES_M) - 1]
 
-    def curves(
-        self, generated: Int64[np.ndarray, "2 bins"], real: Int64[np.ndarray, "2 bins"], kind: ImageKind
-    ) -> Curves:
-        """Return the share of flying points over the width of the gap."""
-        return compare_shares(generated, real, middles(_EDGES_M))
+    def axis(self, kind: ImageKind) -> Float64[np.ndarray, " bins"]:
+        """Return the middle of each bin of the width of the gap."""
+        return middles(_EDGES_M)
 
 
 def extended_surface(images: RangeImage, side: int) -> Float[Tensor, "B H W"]:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Int64
 
 from lidargrit.metrics import ImageKind
-from lidargrit.metrics._curves import CurveMetric, Curves, compare_histograms, histogram, log_edges, middles
+from lidargrit.metrics._curves import CurveMetric, Curves, compare_histograms, histogram, middles, range_edges
 from lidargrit.structures import RangeImage
 
 _BINS = 32  # of 120 m / 0.9 m: each reaches a sixth farther than the one before
@@ -24,7 +24,7 @@ class RangeHistogramPerRing(CurveMetric):
 
     def count(self, images: RangeImage) -> Int64[np.ndarray, "H bins"]:
         """Count the returns of every row in bins of range."""
-        edges = _edges(ImageKind.of(images.sensor))
+        edges = range_edges(ImageKind.of(images.sensor), _BINS)
         rows = zip(images.range_m.transpose(0, 1), images.return_mask.transpose(0, 1), strict=True)
         return np.stack([histogram(range_m[returned], edges) for range_m, returned in rows])
 
@@ -32,10 +32,4 @@ class RangeHistogramPerRing(CurveMetric):
         self, generated: Int64[np.ndarray, "H bins"], real: Int64[np.ndarray, "H bins"], kind: ImageKind
     ) -> Curves:
         """Return one histogram a row."""
-        return compare_histograms(generated, real, middles(_edges(kind)))
-
-
-def _edges(kind: ImageKind) -> Float64[np.ndarray, " edges"]:
-    edges = log_edges(kind.range_min_m, kind.range_max_m, _BINS)
-    edges[0], edges[-1] = edges[0] * 0.999, edges[-1] * 1.001  # float32 ranges at the limits lie inside
-    return edges
+        return compare_histograms(generated, real, middles(range_edges(kind, _BINS)))

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Float64, Int64
 
 from lidargrit.metrics import ImageKind
-from lidargrit.metrics._curves import CurveMetric, Curves, LocalSurface, compare_shares, count_shares
+from lidargrit.metrics._curves import LocalSurface, ShareMetric, count_shares
 from lidargrit.structures import RangeImage
 
 _EDGES_DEG = np.linspace(0, 90, 19)  # 5 degrees each: what noise of 2 cm does to a plane through points 25 cm apart
 
 
-class ReturnRateByIncidence(CurveMetric):
+class ReturnRateByIncidence(ShareMetric):
     """Compare the share of returns in bins of incidence, by the divergence in each bin, and the mean over bins.
 
     Every pixel, returned or not, gets the plane of its neighbours: the nearest return on either side along the row and
@@ -29,8 +29,6 @@ class ReturnRateByIncidence(CurveMetric):
         """Count the pixels whose plane is known and, among them, the returns."""
         return count_shares(LocalSurface.of(images).incidence_rad.rad2deg(), images.return_mask, _EDGES_DEG)
 
-    def curves(
-        self, generated: Int64[np.ndarray, "2 bins"], real: Int64[np.ndarray, "2 bins"], kind: ImageKind
-    ) -> Curves:
-        """Return the share of returns over the incidence."""
-        return compare_shares(generated, real, (_EDGES_DEG[1:] + _EDGES_DEG[:-1]) / 2)
+    def axis(self, kind: ImageKind) -> Float64[np.ndarray, " bins"]:
+        """Return the middle of each bin of incidence."""
+        return (_EDGES_DEG[1:] + _EDGES_DEG[:-1]) / 2

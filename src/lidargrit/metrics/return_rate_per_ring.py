@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Float64, Int64
 
 from lidargrit.metrics import ImageKind
-from lidargrit.metrics._curves import CurveMetric, Curves, compare_shares
+from lidargrit.metrics._curves import ShareMetric
 from lidargrit.structures import RangeImage
 
 
-class ReturnRatePerRing(CurveMetric):
+class ReturnRatePerRing(ShareMetric):
     """Compare the share of pixels that return in every row, by the divergence in each row."""
 
     title = "Share of returns in every row"
@@ -23,6 +23,6 @@ class ReturnRatePerRing(CurveMetric):
         returned = images.return_mask.sum(dim=(0, 2)).numpy()
         return np.stack((np.full_like(returned, len(images) * images.sensor.width), returned))
 
-    def curves(self, generated: Int64[np.ndarray, "2 H"], real: Int64[np.ndarray, "2 H"], kind: ImageKind) -> Curves:
-        """Return the share of returns over the rows."""
-        return compare_shares(generated, real, np.arange(kind.height, dtype=float))
+    def axis(self, kind: ImageKind) -> Float64[np.ndarray, " H"]:
+        """Return the number of each row."""
+        return np.arange(kind.height, dtype=float)
