@@ -1,6 +1,7 @@
 """Simulated drives as files: every reader's tree, labels and poses that fit the points, taken up where stopped."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -8,8 +9,9 @@ import pytest
 import torch
 
 from lidargrit.cli import main
-from lidargrit.datasets import open_dataset
+from lidargrit.datasets import data_set_and_split, open_dataset
 from lidargrit.errors import ConfigError, OutputError
+from lidargrit.export import export_scans
 from lidargrit.sensors import load_sensor
 from lidargrit.simulator import simulate
 from lidargrit.simulator.drives import DriveConfig, write_drives
@@ -26,6 +28,22 @@ def drive(tmp_path_factory):
 
 def files(folder):
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def test_its_scans_are_not_those_of_kitti(drive, tmp_path):
+    """Other trees of the layout hold KITTI's drives, with KITTI's terms; ours would seem to overlap with them."""
+    write_drives(tmp_path / "other", 1, DriveConfig(SENSOR, seed=99))
+    export_scans(f"kitti_odometry:{drive}:01", tmp_path / "exported", "kitti_odometry")
+    shutil.copytree(drive / "sequences", tmp_path / "copied" / "sequences")
+    roots = {name: tmp_path / name for name in ("other", "exported", "copied")} | {"drive": drive}
+    sources = {name: open_dataset(f"kitti_odometry:{root}") for name, root in roots.items()}
+    assert sources["copied"].recording(0) == "kitti/2011_10_03_drive_0027"
+    ours = [sources[name].recording(0) for name in ("drive", "other", "exported")] + [sources["drive"].recording(3)]
+    assert len(set(ours)) == 4
+    assert all(name.startswith("#") for name in ours)
+    assert data_set_and_split(f"kitti_odometry:{drive}:00") == ("simulated", "")
+    assert data_set_and_split(str(tmp_path / "exported")) == ("", "")
+    assert data_set_and_split(f"kitti_odometry:{tmp_path / 'copied'}:00") == ("kitti_odometry", "00")
 
 
 def test_it_reads_as_kitti_odometry_with_labels(drive):

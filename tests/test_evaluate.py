@@ -250,6 +250,19 @@ def test_pixel_statistics_without_reflectance_leave_its_scores_alone():
     assert score.pixel_statistics is None
 
 
+def test_pixel_statistics_compute_what_the_scorecard_has_and_no_other_variant(sets, monkeypatch):
+    plain = EvalConfig(metrics=("bev_mmd",), variant="exact", resampling=Resampling(halves=0))
+    scored, pair = compare_sources(*sets, plain)
+    computed = []
+    monkeypatch.setattr(
+        "lidargrit.evaluation.reference_rows.compare_pair",
+        lambda pair, settings, choices: computed.append(choices) or compare_pair(pair, settings, choices=choices),
+    )
+    (score,) = with_pixel_statistics(scored, pair, EvalConfig(resampling=Resampling(halves=0))).scores
+    assert computed == [[MetricChoice("bev_mmd", "exact")]] * 2
+    assert score.pixel_statistics is not None
+
+
 def test_sets_that_overlap_and_projections_that_differ_are_told(sets, tmp_path):
     plain = EvalConfig(metrics=CHEAP, resampling=Resampling(halves=0))
     samples = write_scans(tmp_path / "samples", 3, 7, variant="exact")

@@ -163,6 +163,29 @@ def test_prepared_scans_are_exported_with_the_points_of_their_pixels(streets, tm
     assert all(scan.endswith(f"velodyne/{file}") for file, scan in manifest.items())
 
 
+@pytest.mark.parametrize("kind", ["prepared", "npy"])
+def test_fewer_scans_have_the_names_that_they_have_among_all(kind, tmp_path):
+    """So that the others can be added: every second scan is number 0 and 2, not 0 and 1."""
+    sensor = load_sensor("hdl64e_kitti_odometry")
+    prepare("simulated:4:val", DataConfig(), tmp_path / "prepared", sensor=sensor)
+    source = tmp_path / "prepared"
+    if kind == "npy":
+        source = tmp_path / "arrays"
+        source.mkdir()
+        for index, range_m in enumerate(open_images(str(tmp_path / "prepared")).batch(range(4)).range_m):
+            np.save(source / f"{index:06d}.npy", range_m[:, ::8].numpy())
+    whole = {name: of for name, of in contents_of_export(source, tmp_path / "whole", 0).items() if name != MANIFEST}
+    some = contents_of_export(source, tmp_path / "out", 2)
+    assert sorted(some) == ["000000.bin", "000002.bin", MANIFEST]
+    assert some["000002.bin"] == whole["000002.bin"]
+    assert contents_of_export(source, tmp_path / "out", 0).keys() == {*whole, MANIFEST}
+
+
+def contents_of_export(source, out, max_scans):
+    export_scans(str(source), out, "bin", DataConfig(max_scans=max_scans))
+    return {path.name: path.read_bytes() for path in out.iterdir()}
+
+
 def test_the_same_command_goes_on_and_adds(samples, tmp_path):
     out = tmp_path / "out"
     assert export_scans(str(samples), out, "ply", DataConfig(max_scans=1)) == 1

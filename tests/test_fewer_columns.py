@@ -2,8 +2,12 @@
 
 import numpy as np
 
+from lidargrit.evaluation.pairs import EvalSet
+from lidargrit.loading import DataConfig, prepare
 from lidargrit.loading.columns import FewerColumns
 from lidargrit.loading.images import Pixels, Provenance
+from lidargrit.sensors import load_sensor
+from lidargrit.sources import open_source
 
 
 class OneImage:
@@ -40,3 +44,13 @@ def test_range_reflectance_and_label_are_of_one_return():
                     continue
                 first = min(olds, key=lambda old: (range_m[row, old], old))
                 assert pixel == (range_m[row, first], reflectance[row, first], label[row, first])
+
+
+def test_images_of_other_columns_of_the_same_scans_are_another_set(tmp_path):
+    """Every 8th of 2048 columns, and all of them gathered into 256, of one prepared folder."""
+    prepare("simulated:2:test", DataConfig(columns=2048, column_stride=8), tmp_path / "prepared")
+    sensor = load_sensor("hdl64e_kitti_odometry")
+    sensors = sensor, sensor.with_columns(256)
+    source = open_source(str(tmp_path / "prepared"))
+    records = [EvalSet("a", source.images(each), range(2)).record() for each in sensors]
+    assert records[0].sha256 != records[1].sha256

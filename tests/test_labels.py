@@ -231,3 +231,17 @@ def test_right_classes_are_counted_where_both_scans_return(folders, tmp_path, ca
     nearest = next(line for line in table.splitlines() if line.startswith("nearest")).split()
     assert 0.9 < float(nearest[-2]) < 1  # wrong only where road and wall meet
     assert 0.8 < float(nearest[-1]) < 1
+
+
+@pytest.mark.parametrize("bad", [(0, np.nan), (3, np.nan), (slice(0, 3), 0.0)])
+def test_labels_of_dropped_points_are_dropped(bad, tmp_path):
+    """Of a coordinate that is not finite, of a reflectance that is not, and of the origin."""
+    rows = np.random.default_rng(0).uniform(0.1, 1, (9, 4)).astype("<f4")
+    rows[4, bad[0]] = bad[1]
+    folder = tmp_path / "sequences" / "00"
+    for name, data in (("velodyne/000000.bin", rows), ("labels/000000.label", np.arange(9, dtype="<u4"))):
+        (folder / name).parent.mkdir(parents=True)
+        (folder / name).write_bytes(data.tobytes())
+    scan = KittiOdometry(tmp_path, bad_points="drop").scan(0)
+    assert scan.label is not None
+    assert scan.label.tolist() == [0, 1, 2, 3, 5, 6, 7, 8]

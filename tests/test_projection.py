@@ -189,3 +189,12 @@ def test_a_sensor_of_one_row_is_projected_by_ring():
     raised = Scan(points + torch.tensor([0.0, 0.0, 3.0]), ring=scan.ring)
     with pytest.raises(ScanError, match="lie elsewhere"):
         project(raised, one)
+
+
+@pytest.mark.parametrize("variant", ["exact", "reference"])
+def test_a_scan_beyond_the_limits_is_refused_by_both_variants(variant):
+    """As of a file in millimetres: its image would be empty."""
+    scan = simulate(seed=1)
+    far = Scan(scan.points_xyz_m * 1000)
+    with pytest.raises(ScanError, match=r"no point between 0\.9 and 120 m in .*check that the file is in metres"):
+        project(far, load_sensor("hdl64e_kitti_odometry"), variant=variant)

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from matplotlib.axes import Axes
 
 from lidargrit.cli import main
 from lidargrit.errors import ConfigError, DataError
@@ -111,6 +112,20 @@ def test_the_picture_has_every_panel(scores, tmp_path):
     assert heights[0] > heights[1] > 300
     with pytest.raises(ConfigError, match=r"^got no curve; wanted at least one"):
         plot_curves([], tmp_path / "none.png")
+
+
+@pytest.mark.parametrize("rows", [32, 64])
+def test_only_views_from_above_are_plotted_as_maps(rows, tmp_path, monkeypatch):
+    """The histograms of a sensor of 32 rows are 32x32, too."""
+    sensor = load_sensor({32: "hdl32e", 64: "hdl64e_kitti_odometry"}[rows])
+    simulated = SimulatedScans(*(RangeImage.stack([side, side]) for side in simulate_pair(0, sensor)))
+    labels = []
+    monkeypatch.setattr(Axes, "imshow", lambda *args, **settings: labels.append(settings["extent"]))
+    scores = compare(simulated, load_range_images((f"simulated:2@{sensor.name}",), DataConfig(sensor=sensor.name)), CURVES)
+    plot_curves([score for score in scores if score.simulated.metric != "bev_occupancy"], tmp_path / "none.png")
+    assert not labels
+    plot_curves([score for score in scores if score.simulated.metric == "bev_occupancy"], tmp_path / "maps.png")
+    assert len(labels) == 3
 
 
 def test_the_verb(tmp_path, capsys):

@@ -294,3 +294,10 @@ def test_images_of_two_kinds_are_refused():
     wide = load_sensor("hdl64e_kitti_odometry")
     with pytest.raises(ConfigError, match=r"got range images of 64x256 between 0\.9 and 120 m; wanted 24x32"):
         metric.update(RangeImage(torch.ones(64, 256), torch.ones(64, 256, dtype=torch.bool), wide), real=False)
+
+
+def test_returns_at_the_limits_are_asked():
+    """0.9 as float32 is a little below 0.9, and generators clamp to it."""
+    for limit in (SENSOR.range_min_m, SENSOR.range_max_m):
+        near = RangeImage.masked(torch.full((1, 64, SENSOR.width), limit), torch.ones(1, 64, SENSOR.width) > 0, SENSOR)
+        assert load_metric("edge_rate_per_range")().count(near)[0].sum() > 0

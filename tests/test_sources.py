@@ -86,6 +86,9 @@ def test_range_images_in_npy_files_are_a_set_of_a_named_sensor(tmp_path, capsys)
     np.save(folder / "4.npy", np.ones((16, 91), np.float32))
     with pytest.raises(ScanError, match=r"4.npy, a range image of 16x91; wanted 16x90, as the sensor 'vlp16' has"):
         open_source(str(folder)).images(sensor).batch([4])
+    np.save(folder / "4.npy", np.ones((16, 90), bool))
+    with pytest.raises(ScanError, match=r"4.npy, an array of truth values; wanted a range image"):
+        open_source(str(folder)).images(sensor).batch([4])
     np.save(tmp_path / "points.npy", np.ones((100, 4), np.float32))
     assert type(open_source(str(tmp_path / "points.npy"))) is DatasetSource
 

@@ -240,7 +240,7 @@ def _claim(manifest: Path, facts: dict[str, Any]) -> None:
         if changed:
             raise OutputError(
                 f"{out}, where {changed[0]} is another scan of {facts['source']}",
-                "as many scans as before, or all",
+                "as many scans as before",
                 "choose another folder",
             )
         if facts["scans"].keys() <= known.keys():

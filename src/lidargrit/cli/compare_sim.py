@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Simulate, compare, print a table and plot the curves."""
     from lidargrit.errors import ConfigError
-    from lidargrit.evaluation.raydrop import raydrop_json, raydrop_table, scores_of_model
+    from lidargrit.evaluation.raydrop import raydrop_json, raydrop_model, raydrop_table, scores_of_model
     from lidargrit.evaluation.realism import as_json, as_table, compare, scans_of_both
     from lidargrit.files import refuse_to_overwrite
     from lidargrit.reporting import TerminalReporter
@@ -46,13 +46,14 @@ def run(options: argparse.Namespace) -> None:
         raise ConfigError(f"--device {options.device} without --model", "a run that computes", "leave --device out")
     refuse_to_overwrite(options.out, options.overwrite, ".png")
     refuse_taken(options)
+    model = raydrop_model(options.model, options.device) if options.model else None  # before scans are simulated
     settings = scan_settings(options)
     about = {"real": options.real, "count": options.count, "sensor": settings.sensor, "fine": options.fine}
     simulated, real = scans_of_both(
         options.real, options.count, settings.sensor, options.fine, options.seed, settings.data, TerminalReporter()
     )
+    drops = scores_of_model(model, simulated, real) if model else []
     scores = compare(simulated, real)
-    drops = scores_of_model(options.model, simulated, real, device=options.device) if options.model else []
     plot_curves(scores, options.out, f"real: {options.real}")
     result = {**about, "seed": options.seed, "curves": as_json(scores), "raydrop": raydrop_json(drops)}
     tables = "\n\n".join([as_table(scores), *([raydrop_table(drops)] if drops else [])])

@@ -27,11 +27,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run the demo and say where its results lie."""
+    from lidargrit.datasets import root_of
     from lidargrit.demo import PAGE, demo
     from lidargrit.reporting import TerminalReporter
 
-    out = options.out or Path("runs") / (
-        "demo" if not options.data else f"demo-{Path(options.data.rpartition(':')[0] or options.data).resolve().name}"
-    )
+    out = options.out or Path("runs") / (f"demo-{root_of(options.data).resolve().name}" if options.data else "demo")
     folder = demo(options.data, out, options.set, TerminalReporter(), options.anew)
     print(f"done: look at {folder / PAGE}; everything lies in {folder}")

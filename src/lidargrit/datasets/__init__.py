@@ -199,6 +199,12 @@ def data_set_and_split(source: str) -> tuple[str, str]:
     return name, split if part in known or "/" not in part else ""
 
 
+def root_of(source: str) -> Path:
+    """Return the folder of a source, without its data set and split."""
+    head, colon, rest = source.partition(":")
+    return _root_and_split(rest if colon and head in _discovery.names("datasets") else source)[0]
+
+
 def load(name: str) -> type[ScanDataset]:
     """Return a data set's class by its name, or raise UnknownNameError."""
     return _discovery.load_class("datasets", name, ScanDataset)

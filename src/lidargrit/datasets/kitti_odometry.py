@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -9,9 +10,9 @@ import numpy as np
 import torch
 
 from lidargrit.datasets import SplitScheme
-from lidargrit.datasets._files import FileDataset
+from lidargrit.datasets._files import FileDataset, unnamed_recording
 from lidargrit.errors import ScanError
-from lidargrit.formats import read_bytes
+from lidargrit.formats import read_bytes, usable_points
 from lidargrit.structures import Scan
 
 _LABEL_BYTES = 4  # uint32: class in the lower 16 bits, instance in the upper
@@ -72,20 +73,23 @@ class KittiOdometry(FileDataset):
 
     def scan(self, index: int) -> Scan:
         """Read one scan, with its labels if there are any."""
-        path = self.path(index)
+        scan, path = super().scan(index), self.path(index)
         (labels,) = self.companions(index)
         if not labels.is_file():
-            return super().scan(index)
-        scan = KittiBin.read(path)
-        data = np.frombuffer(read_bytes(labels, _LABEL_BYTES_AT_MOST, _LABELS), dtype="<u1")
-        if len(data) != _LABEL_BYTES * len(scan):
+            return scan
+        data = np.frombuffer(read_bytes(labels, _LABEL_BYTES_AT_MOST, _LABELS), dtype=np.uint8)
+        rows = np.fromfile(path, dtype="<f4").reshape(-1, 4)
+        if len(data) != _LABEL_BYTES * len(rows):
             raise ScanError(
-                f"{len(data)} bytes of labels in {labels}, and {len(scan)} points in {path}",
-                f"{_LABELS}: {_LABEL_BYTES * len(scan)} bytes",
+                f"{len(data)} bytes of labels in {labels}, and {len(rows)} points in {path}",
+                f"{_LABELS}: {_LABEL_BYTES * len(rows)} bytes",
                 "download both again, or move the labels away",
             )
         label = torch.from_numpy(data.view("<u4").astype(np.int64))
-        return scan_of(scan.points_xyz_m, scan.reflectance, scan.ring, scan.source, self.bad_points, label)
+        if len(scan) != len(label):  # points were dropped, and their labels go with them
+            points = torch.from_numpy(rows)
+            label = label[usable_points(points[:, :3], points[:, 3])]
+        return replace(scan, label=label)
 
     def companions(self, index: int) -> tuple[Path, ...]:
         """Return the file of a scan's labels."""
@@ -98,5 +102,7 @@ class KittiOdometry(FileDataset):
 
     def recording_of(self, path: Path) -> str:
         """Name the drive of KITTI raw that a sequence was cut from, if it is known."""
+        if self.origin_of(self.root) != self.public_name():
+            return unnamed_recording(path)
         sequence = self.sequence_of(path.relative_to(self.root))
         return f"kitti/{_RAW_DRIVES[sequence]}" if sequence in _RAW_DRIVES else f"kitti_odometry/{sequence}"

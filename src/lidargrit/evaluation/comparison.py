@@ -158,14 +158,25 @@ def open_pair(samples: Source, reference: Source, settings: EvalConfig, reporter
     return pair
 
 
-def compare_pair(pair: EvalPair, settings: EvalConfig, reporter: Reporter | None = None) -> Scorecard:
+def compare_pair(
+    pair: EvalPair,
+    settings: EvalConfig,
+    reporter: Reporter | None = None,
+    choices: Sequence[MetricChoice] | None = None,
+) -> Scorecard:
     """Score two opened sets.
+
+    Args:
+        pair: the two sets.
+        settings: protocol and its changes.
+        reporter: receives the progress.
+        choices: metrics and variants; those of the settings if not given.
 
     Raises:
         LidarGritError: not one metric could be computed; the reason of the first.
     """
     reporter, protocol = reporter or Reporter(), load_protocol(settings.protocol)
-    wanted, not_applicable = _applicable(settings.chosen_metrics(), pair)
+    wanted, not_applicable = _applicable(choices or settings.chosen_metrics(), pair)
     factories = [metric_factory(choice, settings, reporter) for choice in wanted]
     found = score_metrics(factories, pair, settings.resampling, reporter)
     scores = [score for score in found if isinstance(score, Score)]

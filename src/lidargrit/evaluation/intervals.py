@@ -194,7 +194,7 @@ def interval_of(
             for features in (generated, real)
         ]
         try:
-            values.append(merged(*halves, whole).compute().value)
+            values.append(merged(halves[0], halves[1], whole).compute().value)
         except DataError:  # half of the scans are too few for this metric
             return None
     return around(value, values, min(len(generated), len(real)), whole.bounds)

@@ -81,7 +81,8 @@ class EvalSet:
         fingerprints = self.images.provenance.fingerprints
         if len(fingerprints) == len(self.images):  # of the images with all fine columns: of which some were compared
             sensor = self.images.sensor
-            content.update(f"{sensor.height}x{sensor.width} {sensor.projection} {self.projection_variant} ".encode())
+            size = f"{sensor.height}x{sensor.width}, every {sensor.column_stride}th column"
+            content.update(f"{size} {sensor.projection} {self.projection_variant} ".encode())
             for index in self.indices:
                 content.update(fingerprints[index].encode())
         else:

@@ -88,22 +88,36 @@ def score_raydrop(
     ]
 
 
-def scores_of_model(
-    word: str, simulated: SimulatedScans, real: RangeImages, seed: int = 0, device: str = ""
-) -> list[RaydropScore]:
-    """Score the drops of a run: on simulated scans, whose clean ranges are known, and on real ones, estimated twice.
+def raydrop_model(word: str, device: str = "") -> Generator:
+    """Load a run that drops returns of clean scans, and has a tokenizer to estimate those of real scans.
 
     Args:
         word: folder of a finished run, or ``pretrained``.
-        simulated: simulated scans of the run's sensor, before and after drops.
-        real: real scans of its sensor.
-        seed: seed of the first scan's drops.
         device: device to compute on; a GPU if there is one and none is named.
 
     Raises:
-        ConfigError: a run that does not drop returns of clean scans, or of another sensor; no such device.
+        ConfigError: a run that cannot do one of both; no such device.
     """
     generator = load(locate(word)).to(usable_device(device))
+    _check(generator)
+    _check_tokenizer(generator)
+    return generator
+
+
+def scores_of_model(
+    generator: Generator, simulated: SimulatedScans, real: RangeImages, seed: int = 0
+) -> list[RaydropScore]:
+    """Score a model's drops: on simulated scans, whose clean ranges are known, and on real ones, estimated twice.
+
+    Args:
+        generator: model of :func:`raydrop_model`.
+        simulated: simulated scans of the run's sensor, before and after drops.
+        real: real scans of its sensor.
+        seed: seed of the first scan's drops.
+
+    Raises:
+        ConfigError: a model of another sensor.
+    """
     decoded, true = decoded_surfaces(generator, real)
     pairs = {
         "simulated": (simulated.clean, simulated.measured),
@@ -126,9 +140,7 @@ def decoded_surfaces(generator: Generator, real: RangeImages) -> tuple[RangeImag
     Raises:
         ConfigError: a model without a tokenizer, or of another sensor.
     """
-    if "encode" not in generator.capabilities:
-        got = f"{generator.public_name()!r}, which has no tokenizer to decode clean ranges by"
-        raise ConfigError(got, "a model with one, such as pretrained", "name another model")
+    _check_tokenizer(generator)
     if not generator.sensor.same_rays(real.sensor):
         raise ConfigError(
             f"a model of {generator.sensor.name!r}", f"one of {real.sensor.name!r}", "name a model of the scans' sensor"
@@ -183,6 +195,12 @@ def _check(generator: Generator) -> None:
     if "surfaces" not in generator.conditions:
         got = f"{generator.public_name()!r}, which drops no returns of clean scans"
         raise ConfigError(got, "a model that does, such as pretrained", "name another model")
+
+
+def _check_tokenizer(generator: Generator) -> None:
+    if "encode" not in generator.capabilities:
+        got = f"{generator.public_name()!r}, which has no tokenizer to decode clean ranges by"
+        raise ConfigError(got, "a model with one, such as pretrained", "name another model")
 
 
 def _only(images: RangeImage) -> Iterator[RangeImage]:

@@ -9,6 +9,7 @@ from lidargrit.errors import DataError
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair
 from lidargrit.evaluation.intervals import RealAgainstReal, Resampling, blocks
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
+from lidargrit.evaluation.protocols import MetricChoice
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.generators.marginal import Marginal, MarginalConfig
 from lidargrit.loading import Pixels, Provenance, RangeImages
@@ -81,10 +82,10 @@ def _values_of(
     pair: EvalPair, settings: EvalConfig, card: Scorecard
 ) -> tuple[dict[tuple[str, str], float], tuple[str, ...]]:
     """Score the metrics that a scorecard has, without intervals; return values, and a warning if there are none."""
-    metrics = tuple(dict.fromkeys(score.result.metric for score in card.scores))
-    values_alone = replace(settings, metrics=metrics, pixel_statistics=False, resampling=Resampling(halves=0))
+    choices = [MetricChoice(score.result.metric, score.result.variant) for score in card.scores]
+    values_alone = replace(settings, pixel_statistics=False, resampling=Resampling(halves=0))
     try:
-        found = compare_pair(pair, values_alone)
+        found = compare_pair(pair, values_alone, choices=choices)
     except DataError as error:  # not one of them, as metrics of reflectance of scans without any
         return {}, (f"no reference row: {error}",)
     return {(score.result.metric, score.result.variant): score.result.value for score in found.scores}, ()

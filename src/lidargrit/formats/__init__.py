@@ -9,7 +9,7 @@ from io import BufferedReader
 from pathlib import Path
 from typing import ClassVar, Literal
 
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidargrit import _discovery
@@ -175,12 +175,16 @@ def scan_of(
 ) -> Scan:
     """Make a scan of what a file holds, without points that are no returns if ``bad_points`` is ``drop``."""
     if bad_points == "drop":
-        kept = points_xyz_m.isfinite().all(dim=1) & (points_xyz_m != 0).any(dim=1)
-        if reflectance is not None:
-            kept &= ~reflectance.isnan()
+        kept = usable_points(points_xyz_m, reflectance)
         points_xyz_m = points_xyz_m[kept]
         reflectance, ring, label = (None if one is None else one[kept] for one in (reflectance, ring, label))
     return Scan(points_xyz_m.contiguous(), reflectance, ring, label, source)
+
+
+def usable_points(points_xyz_m: Float[Tensor, "n 3"], reflectance: Float[Tensor, "n"] | None) -> Bool[Tensor, "n"]:
+    """Return which points are returns: finite, away from the origin, and with a reflectance if any has one."""
+    usable = points_xyz_m.isfinite().all(dim=1) & (points_xyz_m != 0).any(dim=1)
+    return usable if reflectance is None else usable & ~reflectance.isnan()
 
 
 def open_file(path: Path, wanted: str) -> BufferedReader:

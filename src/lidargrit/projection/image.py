@@ -53,15 +53,15 @@ def project(
     nearest = _nearest(scan, sensor, method, variant, partial, refuse=True)
     point_of_pixel, range_m = (array[:, :: sensor.column_stride] for array in nearest)
     filled = point_of_pixel >= 0
+    if variant == "reference":  # there the limits are applied to the winner, and strictly
+        filled &= (range_m > sensor.range_min_m) & (range_m < sensor.range_max_m)
+        point_of_pixel = np.where(filled, point_of_pixel, -1)
     if not filled.any():
         raise ScanError(
             f"no point between {sensor.range_min_m:g} and {sensor.range_max_m:g} m in {scan.source}",
             "returns within the sensor's range limits",
             "check that the file is in metres, or choose another sensor",
         )
-    if variant == "reference":  # there the limits are applied to the winner, and strictly
-        filled &= (range_m > sensor.range_min_m) & (range_m < sensor.range_max_m)
-        point_of_pixel = np.where(filled, point_of_pixel, -1)
     range_m = np.where(filled, range_m, np.float32(0))
     reflectance = None
     if scan.reflectance is not None:

@@ -76,7 +76,7 @@ class JobQueue:
         with self._changed:
             self._closed = True
             self._changed.notify()
-        self._worker.end()
+            self._worker.end()  # no other is started from here on
         self._thread.join()
 
     def settings(self) -> list[list[SamplingSetting]]:
@@ -139,9 +139,8 @@ class JobQueue:
         No exception leaves this method: it would end the thread, and every later job would wait for ever.
         """
         try:
-            if not self._worker.is_alive():
-                self._worker = WorkerProcess(self._options)
-                self._loaded_models()
+            if not self._restart_if_ended():
+                return "got a job while the server stops; wanted one before; ask again when it runs"
             job.started = time.monotonic()
             self._worker.send({"request": dataclasses.asdict(job.request), "folder": str(job.folder)})
             return str(self._worker.receive(self.limits.seconds).get("error", ""))
@@ -158,6 +157,17 @@ class JobQueue:
             "got a job during which the program ended, perhaps for lack of memory; wanted a result; "
             "ask for fewer scans, or try again"
         )
+
+    def _restart_if_ended(self) -> bool:
+        """Start a worker process anew if the last one ended; return False where the server stops and none is wanted."""
+        with self._changed:
+            if self._closed:
+                return False
+            if self._worker.is_alive():
+                return True
+            self._worker = WorkerProcess(self._options)
+        self._loaded_models()
+        return True
 
     def _finish(self, job: Job, error: str) -> None:
         if job.request.file:

@@ -122,8 +122,11 @@ class _ImageFiles:
 
 def _array(path: Path) -> np.ndarray:
     try:
-        return parse_array(read_bytes(path, ARRAY_BYTES_AT_MOST, _IMAGE))
+        array = parse_array(read_bytes(path, ARRAY_BYTES_AT_MOST, _IMAGE))
     except LidarGritError:
         raise
     except ValueError as error:
         raise ScanError(f"{path}, which cannot be read ({error})", _IMAGE, "save it anew") from None
+    if array.dtype == bool:  # such as a mask for complete --observed
+        raise ScanError(f"{path}, an array of truth values", _IMAGE, "move masks to another folder")
+    return array

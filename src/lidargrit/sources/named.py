@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from lidargrit.datasets import ScanDataset
@@ -83,24 +84,24 @@ class ImageScans(NamedScans):
     """Range images as scans.
 
     Args:
-        images: range images.
+        images: range images of the source.
         names: name of each.
-        numbers: number of each in its source.
+        numbers: numbers of those that are taken.
     """
 
     def __init__(self, images: RangeImages, names: Sequence[str], numbers: Sequence[int]) -> None:
         self.images, self._names, self._numbers = images, names, numbers
 
     def __len__(self) -> int:
-        return len(self.images)
+        return len(self._numbers)
 
     def name(self, index: int) -> str:
         """Return its name."""
-        return self._names[index]
+        return self._names[self._numbers[index]]
 
     def identity(self, index: int) -> str:
         """Return which file it is, which model's seed, or whose scan it was projected from."""
-        return self.images.provenance.names[index]
+        return self.images.provenance.names[self._numbers[index]]
 
     def number(self, index: int) -> int:
         """Return its number in the source."""
@@ -108,7 +109,7 @@ class ImageScans(NamedScans):
 
     def image(self, index: int) -> RangeImage:
         """Return its pixels (H, W)."""
-        return self.images.batch([index])[0]
+        return self.images.batch([self._numbers[index]])[0]
 
     def scan(self, index: int) -> Scan:
         """Return a point for each return."""
@@ -125,11 +126,11 @@ def named_scans(source: Source, config: DataConfig, sensor: SensorModel | None =
     """
     if isinstance(source, DatasetSource):
         return PointScans(source.scans(), config.max_scans)
-    images = source.images(sensor, source.as_projected(config))
+    images = source.images(sensor, source.as_projected(replace(config, max_scans=0)))
+    names = [f"{number:06d}" for number in range(len(images))]
     if isinstance(source, ImageFileSource):
         names = [_name_of(Path(name)) for name in images.provenance.names]
-        return ImageScans(images, names, source.chosen(config.max_scans))
-    return ImageScans(images, [f"{index:06d}" for index in range(len(images))], range(len(images)))
+    return ImageScans(images, names, evenly_spaced(config.max_scans or len(images), len(images)))
 
 
 def _name_of(image: Path) -> str:

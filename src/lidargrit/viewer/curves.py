@@ -25,6 +25,7 @@ _SIDES = {
     "simulated": "#d1495b",
     "Bernoulli": "#2a8fbd",
 }  # dark, warm, cold: told apart when printed grey
+_MAPS = ("bev_occupancy",)  # metrics whose curves are views from above: both axes are metres
 _TICKS_M = (1, 2, 5, 10, 20, 50, 100)
 
 
@@ -106,7 +107,7 @@ def _plot_images(figure: Figure, cell: SubplotSpec, score: CurveScore) -> None:
     details = score.simulated.details
     axis = np.array(details["axis"], dtype=float)
     images = {which: _curve(score, which) for which in _SIDES}
-    is_map = images["real"].shape == (len(axis), len(axis))  # a view from above: both axes are metres
+    is_map = score.simulated.metric in _MAPS
     grid = cell.subgridspec(1, 4, wspace=0.25)
     norm = PowerNorm(0.5, 0, np.nanmax([np.nanmax(image, initial=0) for image in images.values()]) or 1)
     for index, (which, image) in enumerate(images.items()):

@@ -16,7 +16,7 @@ lidargrit_kitti_odometry = Protocol(
     range_m=(0.9, 120.0),
     num_scans=5000,
     data_set="kitti_odometry",
-    splits=("test",),
+    splits=("test", "paper/test"),
     departures=(
         "the program shuffles the test scans by a seed and takes the first 5,000; here they are evenly spaced",
         "the program unprojects both sets along a measured table of angles; here along the sensor's rays",
