@@ -65,7 +65,9 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("model", help="a run with tokens and a pixel decoder")
     parser.add_argument("--scans", default="simulated:256:val", help="source of scans (default: %(default)s)")
     parser.add_argument("-n", type=int, default=96, help="number of scans, and of others to compare with")
-    parser.add_argument("--range-temperature", type=float, default=PixelSampling.range_temperature)
+    parser.add_argument(
+        "--range-temperature", type=float, default=PixelSampling.range_temperature, help="0: the model's own"
+    )
     parser.add_argument("--range-noise", type=float, default=PixelSampling.range_noise)
     choices = parser.parse_args(words)
     model = load(choices.model)

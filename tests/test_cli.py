@@ -210,7 +210,7 @@ def test_sampling_options_reach_the_model(run_folder, tmp_path, typed):
         "top_k": 0,
         "top_p": 1.0,
         "mask": "threshold",
-        "range_temperature": 0.35,
+        "range_temperature": 0.0,
         "range_noise": 0.7,
         "mask_correlation": 2.0,
         "completion": "auto",

@@ -121,7 +121,9 @@ def test_only_views_from_above_are_plotted_as_maps(rows, tmp_path, monkeypatch):
     simulated = SimulatedScans(*(RangeImage.stack([side, side]) for side in simulate_pair(0, sensor)))
     labels = []
     monkeypatch.setattr(Axes, "imshow", lambda *args, **settings: labels.append(settings["extent"]))
-    scores = compare(simulated, load_range_images((f"simulated:2@{sensor.name}",), DataConfig(sensor=sensor.name)), CURVES)
+    scores = compare(
+        simulated, load_range_images((f"simulated:2@{sensor.name}",), DataConfig(sensor=sensor.name)), CURVES
+    )
     plot_curves([score for score in scores if score.simulated.metric != "bev_occupancy"], tmp_path / "none.png")
     assert not labels
     plot_curves([score for score in scores if score.simulated.metric == "bev_occupancy"], tmp_path / "maps.png")

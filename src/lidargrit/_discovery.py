@@ -22,7 +22,7 @@ def names(package: str) -> list[str]:
 def summary(package: str, name: str) -> str:
     """Return the first line of a file's docstring, without importing it."""
     docstring = ast.get_docstring(ast.parse((_folder(package) / f"{name}.py").read_text(encoding="utf-8")))
-    return (docstring or "").partition("\n")[0]
+    return (docstring or "").partition("\n")[0].replace("``", "")
 
 
 def load_class(package: str, name: str, base: type[T]) -> type[T]:

@@ -68,8 +68,8 @@ class TokenSampling:
             return that is at least as likely as not (the paper's eq. 1). ``auto`` is ``pixels`` where there is a pixel
             decoder, and ``bernoulli`` elsewhere.
         range_temperature: temperature of the pixel decoder's density of ranges on one surface; below 1 ranges keep to
-            the surface more precisely. Only scans sampled with 1, a noise of 1 and a correlation of 0 follow the
-            distribution whose likelihood the model gives.
+            the surface more precisely; 0 takes the model's own (``model.pixels.range_temperature``). Only scans sampled
+            with 1, a noise of 1 and a correlation of 0 follow the distribution whose likelihood the model gives.
         range_noise: multiplier of the pixel decoder's spread of ranges about a surface.
         mask_correlation: multiplier of how much of their noise close pixels of the pixel decoder's mask share that are
             sampled at once; 0 samples them independently. The networks for completion and raydrop always take 1.

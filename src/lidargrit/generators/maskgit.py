@@ -49,7 +49,7 @@ class MaskedSampling:
             decoded ranges. ``threshold`` keeps a return that is at least as likely as not. ``auto`` is ``pixels`` where
             there is a pixel decoder, and ``bernoulli`` elsewhere.
         range_temperature: temperature of the pixel decoder's density of ranges on one surface; below 1 ranges keep to
-            the surface more precisely.
+            the surface more precisely; 0 takes the model's own (``model.pixels.range_temperature``).
         range_noise: multiplier of the pixel decoder's spread of ranges about a surface.
         mask_correlation: multiplier of how much of their noise close pixels of the pixel decoder's mask share that are
             sampled at once; 0 samples them independently.

@@ -34,12 +34,13 @@ BITS_STEP_M = 0.01  # bits of a return are those of naming its range to a centim
 class PixelSampling:
     """Settings of sampling masks, and ranges from their mixtures.
 
-    The defaults are sharper than the mixtures themselves, which are ragged where a surface is uncertain. Only scans
-    that are sampled with 1, 1 and a correlation of 0 follow the distribution whose likelihood the model computes.
+    By default samples are sharper than the mixtures themselves, which are ragged where a surface is uncertain. Only
+    scans that are sampled with 1, 1 and a correlation of 0 follow the distribution whose likelihood the model computes.
 
     Args:
         range_temperature: temperature of the mixture's density on one surface; 1 leaves it unchanged, below 1 prefers
-            the densest of the components there. Surfaces that lie apart keep their probabilities.
+            the densest of the components there. Surfaces that lie apart keep their probabilities. 0 takes the model's
+            own temperature (``model.pixels.range_temperature``).
         range_noise: multiplier of the components' scales; 1 takes them as they are.
         mask_correlation: multiplier of how much of their noise close pixels of a mask share that are sampled at once,
             so that drops cluster; 1 takes what was learned in training, 0 samples them independently.
@@ -47,16 +48,16 @@ class PixelSampling:
             ``auto`` is ``bf16`` where the machine has instructions for it.
     """
 
-    range_temperature: float = 0.35
+    range_temperature: float = 0.0
     range_noise: float = 0.7
     mask_correlation: float = 2.0
     precision: Precision = "fp32"
 
     def __post_init__(self) -> None:
-        if not (0 < self.range_temperature < math.inf and 0 < self.range_noise < math.inf):
+        if not (0 <= self.range_temperature < math.inf and 0 < self.range_noise < math.inf):
             raise ConfigError(
                 f"range_temperature={self.range_temperature}, range_noise={self.range_noise}",
-                "positive numbers",
+                "positive numbers, or a temperature of 0 for the model's own",
                 "take 1 for both, and mask_correlation=0, to sample from the model's own distribution",
             )
         if not 0 <= self.mask_correlation < math.inf:
@@ -255,6 +256,7 @@ class PixelDecoder(nn.Module):
         sampling: PixelSampling,
     ) -> Float[Tensor, "B H W"]:
         """Return the ranges of a whole mask, sampled phase by phase around the observed ones."""
+        temperature = sampling.range_temperature or self.config.range_temperature
         guided = self.range.guided(guide)
         range_m, v = torch.zeros_like(guide.v), torch.zeros_like(guide.v)
         for phase in self.range.phases:
@@ -262,9 +264,7 @@ class PixelDecoder(nn.Module):
             mixture = self.range.distributions([phase], guided, guide, mask, v)
             unknown = mask[pixels] & ~condition.range_observed[pixels]
             component, within = (random[unknown] for random in uniform[pixels].unbind(1))
-            sampled = mixture.at(unknown[None]).sample(
-                component, within, sampling.range_temperature, sampling.range_noise
-            )
+            sampled = mixture.at(unknown[None]).sample(component, within, temperature, sampling.range_noise)
             found = torch.where(mask[pixels], condition.range_m[pixels], 0.0)
             found[unknown] = sampled
             range_m[pixels] = found

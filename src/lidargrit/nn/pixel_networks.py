@@ -66,6 +66,9 @@ class PixelDecoderConfig:
         gravity_components: whether 8 more components begin on vertical planes through two earlier pixels and on
             horizontal ones through a neighbour, so that walls and the ground are continued from fewer pixels. They
             assume that the sensor is level.
+        range_temperature: temperature at which ranges are sampled where the caller names none; see
+            :class:`~lidargrit.nn.pixel_decoder.PixelSampling`. What suits a model depends on its columns and its
+            training: choose it by samples against validation scans.
     """
 
     coarsest_cell: int = 8
@@ -81,10 +84,13 @@ class PixelDecoderConfig:
     free_components: int = 4
     surface_components: bool = False
     gravity_components: bool = False
+    range_temperature: float = 0.35
 
     def __post_init__(self) -> None:
+        if not 0 < self.range_temperature < math.inf:
+            raise ConfigError(f"range_temperature={self.range_temperature}", "a positive number", "correct it")
         for name, value in vars(self).items():
-            least = 0 if isinstance(value, bool) or name in _MAY_BE_0 else 1
+            least = 0 if isinstance(value, (bool, float)) or name in _MAY_BE_0 else 1
             if value < least:
                 raise ConfigError(f"{name}={value}", f"at least {least}", "raise it")
             if name.endswith("halvings") and value > _HALVINGS_AT_MOST:
@@ -381,11 +387,7 @@ class RangeNetwork(PhaseNetwork):
             expected = torch.where(count > 0, total / count.clamp(min=1), expected)
         return torch.cat((self.suggest(phase, v, return_mask, expected), expected[:, None]), 1)
 
-    def mixture(
-        self,
-        output: Float[Tensor, "P B O h w"],
-        candidates: Float[Tensor, "P B K h w"],
-    ) -> RangeMixture:
+    def mixture(self, output: Float[Tensor, "P B O h w"], candidates: Float[Tensor, "P B K h w"]) -> RangeMixture:
         """Return the distributions of the ranges of the pixels of phases of one lattice."""
         logits, moved, scales = output.chunk(3, 2)
         free = candidates[:, :, -1:] + 2 * (moved[:, :, : self.free] + self.begin)
