@@ -131,6 +131,16 @@ def test_fine_tuning_takes_a_run_of_fewer_columns_and_another_dropout(tmp_path):
     assert torch.allclose(fine[:, :, 2], 0.75 * coarse[:, :, 1] + 0.25 * coarse[:, :, 0])
 
 
+@pytest.mark.parametrize("fine_tune", [(), ("tokenizer", "transformer", "pixels")])
+def test_settings_of_sampling_alone_are_the_recipe_s_own(fine_tune, tmp_path):
+    made().save(tmp_path / "donor")
+    recipe = recipe_of(replace(PIXELS, range_temperature=0.1), stages_from=str(tmp_path / "donor"))
+    recipe = replace(recipe, fine_tune=fine_tune)
+    generator = recipe.build_generator()
+    assert "pixels" in taken_stages(recipe, generator)
+    assert generator.pixels.config.range_temperature == 0.1
+
+
 def test_a_run_of_other_sizes_or_another_kind_gives_no_stages(tmp_path):
     train(recipe_of(None), tmp_path / "first")
     recipe = recipe_of(PIXELS, stages_from=str(tmp_path / "first"))

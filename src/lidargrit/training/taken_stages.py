@@ -17,6 +17,8 @@ from lidargrit.nn.objective import Objective
 from lidargrit.run_folder import RUN_FILE, UNKNOWN_SCANS, is_run, locate, taken_over
 from lidargrit.training.config import Recipe
 
+_OF_SAMPLING = ("range_temperature",)  # settings that no training reads
+
 
 def check_donor(recipe: Recipe) -> None:
     """Refuse a run to take stages from that is none, before any scan is read.
@@ -142,11 +144,11 @@ def _check_base(recipe: Recipe, stage: _Stage) -> None:
 def _check(setting: str, mine: _Stage, given: _Stage, trained: bool = False) -> None:
     """Refuse a stage whose sizes or sensor are not the generator's.
 
-    One that is trained further may lack its additions, may have had another dropout, and may be of another sensor if
+    Settings that sampling alone reads may differ. One that is trained further may lack its additions, may have had another dropout, and may be of another sensor if
     its weights fit this one.
     """
     stage, ours, theirs = mine.name, mine.settings, given.settings
-    differing = [name for name in ours if ours[name] != theirs.get(name)]
+    differing = [name for name in ours if name not in _OF_SAMPLING and ours[name] != theirs.get(name)]
     same_sensor = mine.objective.sensor.same_rays(given.objective.sensor)
     if trained:
         added = {name for name in mine.objective.additions if ours.get(name) and not theirs.get(name)}
