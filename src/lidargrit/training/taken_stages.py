@@ -144,8 +144,8 @@ def _check_base(recipe: Recipe, stage: _Stage) -> None:
 def _check(setting: str, mine: _Stage, given: _Stage, trained: bool = False) -> None:
     """Refuse a stage whose sizes or sensor are not the generator's.
 
-    Settings that sampling alone reads may differ. One that is trained further may lack its additions, may have had another dropout, and may be of another sensor if
-    its weights fit this one.
+    Settings that sampling alone reads may differ. One that is trained further may lack its additions, may have had
+    another dropout, and may be of another sensor if its weights fit this one.
     """
     stage, ours, theirs = mine.name, mine.settings, given.settings
     differing = [name for name in ours if name not in _OF_SAMPLING and ours[name] != theirs.get(name)]
