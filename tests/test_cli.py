@@ -182,7 +182,7 @@ def test_sample_writes_one_file_a_seed_and_draws_no_seed_twice(run_folder, sampl
         raise AssertionError("drew what was there")
 
     monkeypatch.setattr("lidargrit.generators.lidargrit.LidarGrit.sample", draws_nothing)
-    assert "done: 3 scans lie in" in typed("sample", run_folder, samples, "-n", 3)
+    assert "done: 3 scans in" in typed("sample", run_folder, samples, "-n", 3)
     assert contents(samples) == before
 
 

@@ -70,7 +70,7 @@ def test_the_wide_one_is_what_its_recipe_makes():
 def test_a_word_gives_scans(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["sample", "pretrained", "first"]) == 0
-    assert "16 scans lie in first" in capsys.readouterr().out
+    assert "done: 16 scans in first" in capsys.readouterr().out
     drawn = read_samples(tmp_path / "first")
     images = drawn.batch(range(len(drawn)))
     assert images.range_m.shape == (16, 64, 256)

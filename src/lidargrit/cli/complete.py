@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from lidargrit.cli._options import add_bad_scans, add_completion
+from lidargrit.cli._results import counted_scans
 
 EXAMPLES = """\
   lidargrit complete /data/scans whole                             fill in every ray without a point
@@ -43,4 +44,4 @@ def run(options: argparse.Namespace) -> None:
     output = OutputConfig(options.count, options.seed, options.format)
     config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)
     count = complete_scans(options.scans, options.out, completer, pattern, output, config, TerminalReporter())
-    print(f"done: {count} completed scans in {options.out}; completed.json says how they were made")
+    print(f"done: {counted_scans(count, 'completed')} in {options.out}; completed.json says how they were made")

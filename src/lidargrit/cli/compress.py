@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from lidargrit.cli._options import add_bad_scans
+from lidargrit.cli._results import counted_scans
 
 EXAMPLES = """\
   lidargrit compress /data/kitti_odometry scans.lgz
@@ -39,4 +40,4 @@ def run(options: argparse.Namespace) -> None:
     named = (options.scans, options.out, options.model, options.step_mm)
     found = compress_scans(*named, config, TerminalReporter())
     size = f"{found.num_bytes:,} bytes, {found.bits_per_return:.2f} bits a return in steps of {options.step_mm} mm"
-    print(f"done: {found.num_scans} scans in {options.out}: {size}")
+    print(f"done: {counted_scans(found.num_scans)} in {options.out}: {size}")

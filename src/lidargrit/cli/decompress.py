@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from lidargrit.cli._results import counted_scans
 from lidargrit.untrusted import whole_number
 
 EXAMPLES = """\
@@ -34,4 +35,4 @@ def run(options: argparse.Namespace) -> None:
 
     named = (options.file, options.out, options.model, options.format, options.only)
     count = decompress_scans(*named, TerminalReporter())
-    print(f"done: {count} scans in {options.out}; decompressed.json says where they come from")
+    print(f"done: {counted_scans(count)} in {options.out}; decompressed.json says where they come from")

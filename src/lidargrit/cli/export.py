@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from lidargrit.cli._options import add_bad_scans
+from lidargrit.cli._results import counted_scans
 
 EXAMPLES = """\
   lidargrit export samples clouds --format pcd                what a model generated, a file a scan
@@ -46,4 +47,4 @@ def run(options: argparse.Namespace) -> None:
     sensor = load_sensor(options.sensor) if options.sensor else None
     config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)
     count = export_scans(options.source, options.out, options.format, config, TerminalReporter(), sensor)
-    print(f"done: {count} scans in {options.out}; export.json says which file holds which scan")
+    print(f"done: {counted_scans(count)} in {options.out}; export.json says which file holds which scan")

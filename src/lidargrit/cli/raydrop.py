@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from lidargrit.cli._options import add_bad_scans, add_completion
+from lidargrit.cli._results import counted_scans
 
 EXAMPLES = """\
   lidargrit raydrop /data/carla_scans dropped
@@ -34,4 +35,4 @@ def run(options: argparse.Namespace) -> None:
     output = OutputConfig(options.count, options.seed, options.format, options.probability)
     config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)
     count = raydrop_scans(options.scans, options.out, completer, output, config, TerminalReporter())
-    print(f"done: {count} scans with raydrop in {options.out}")
+    print(f"done: {counted_scans(count)} with raydrop in {options.out}")

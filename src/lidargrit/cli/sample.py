@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 
 from lidargrit.cli._options import add_device, add_rank, add_settings
+from lidargrit.cli._results import counted_scans
 from lidargrit.untrusted import seed_number
 
 EXAMPLES = """\
@@ -55,4 +56,4 @@ def run(options: argparse.Namespace) -> None:
     sampling = override(generator.Sampling(), options.set, owner, "see all with: lidargrit list generators")
     seeds = range(options.seed, options.seed + options.count)[rank::world_size]
     write_samples(generator, run_folder, options.out, seeds, sampling, TerminalReporter())
-    print(f"done: {len(seeds)} scans lie in {options.out}; look at them with: lidargrit view {options.out}")
+    print(f"done: {counted_scans(len(seeds))} in {options.out}; look at them with: lidargrit view {options.out}")

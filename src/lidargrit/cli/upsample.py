@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from lidargrit.cli._options import add_bad_scans, add_completion
+from lidargrit.cli._results import counted_scans
 
 EXAMPLES = """\
   lidargrit upsample /data/vlp16 dense --sensor vlp16                          by pretrained, a model in the package
@@ -38,4 +39,4 @@ def run(options: argparse.Namespace) -> None:
     output = OutputConfig(options.count, options.seed, options.format)
     config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)
     count = upsample_scans(options.scans, options.out, completer, scans_sensor, output, config, TerminalReporter())
-    print(f"done: {count} scans of {completer.sensor.name} in {options.out}")
+    print(f"done: {counted_scans(count)} of {completer.sensor.name} in {options.out}")
