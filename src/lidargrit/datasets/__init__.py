@@ -186,14 +186,12 @@ def data_set_and_split(source: str) -> tuple[str, str]:
         >>> data_set_and_split("kitti_360:/data/kitti_360:train")
         ('kitti_360', 'train')
     """
-    head, colon, rest = source.partition(":")
-    if colon and head in _discovery.names("datasets"):
-        name, (root, split) = head, _root_and_split(rest)
-    else:
-        root, split = _root_and_split(source)
-        name = (recognise(root, crawl=False) or "folder") if root.is_dir() else ""
-    if name and load(name).origin_of(root) != name:
-        return load(name).origin_of(root), ""
+    name, root, split = _name_root_and_split(source)
+    if not name and root.is_dir():
+        name = recognise(root, crawl=False) or "folder"
+    origin = load(name).origin_of(root) if name else ""
+    if origin != name:
+        return origin, ""
     known = load(name).splits() if name else {}
     part = split.partition("[")[0]
     return name, split if part in known or "/" not in part else ""
@@ -201,8 +199,14 @@ def data_set_and_split(source: str) -> tuple[str, str]:
 
 def root_of(source: str) -> Path:
     """Return the folder of a source, without its data set and split."""
+    return _name_root_and_split(source)[1]
+
+
+def _name_root_and_split(source: str) -> tuple[str, Path, str]:
+    """Take a source apart; the name is "" where none is typed."""
     head, colon, rest = source.partition(":")
-    return _root_and_split(rest if colon and head in _discovery.names("datasets") else source)[0]
+    name = head if colon and head in _discovery.names("datasets") else ""
+    return name, *_root_and_split(rest if name else source)
 
 
 def load(name: str) -> type[ScanDataset]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import ClassVar
 
@@ -71,6 +72,10 @@ class KittiOdometry(FileDataset):
             return "simulated"
         return "" if (root / "export.json").is_file() else cls.public_name()
 
+    @cached_property
+    def _is_of_kitti(self) -> bool:
+        return self.origin_of(self.root) == self.public_name()  # asked for every scan, and looked up once
+
     def scan(self, index: int) -> Scan:
         """Read one scan, with its labels if there are any."""
         scan, path = super().scan(index), self.path(index)
@@ -102,7 +107,7 @@ class KittiOdometry(FileDataset):
 
     def recording_of(self, path: Path) -> str:
         """Name the drive of KITTI raw that a sequence was cut from, if it is known."""
-        if self.origin_of(self.root) != self.public_name():
+        if not self._is_of_kitti:
             return unnamed_recording(path)
         sequence = self.sequence_of(path.relative_to(self.root))
         return f"kitti/{_RAW_DRIVES[sequence]}" if sequence in _RAW_DRIVES else f"kitti_odometry/{sequence}"

@@ -64,12 +64,9 @@ class ImageFileSource(Source):
         self, sensor: SensorModel | None = None, config: DataConfig | None = None, reporter: Reporter | None = None
     ) -> RangeImages:
         """Read the images, which have the rows and columns of the sensor."""
-        sensor, chosen = sensor or self.sensor, self.chosen((config or DataConfig()).max_scans)
+        sensor, count = sensor or self.sensor, len(self._paths)
+        chosen = evenly_spaced((config or DataConfig()).max_scans or count, count)
         return RangeImages(sensor, [_ImageFiles([self._paths[index] for index in chosen], sensor)])
-
-    def chosen(self, max_scans: int) -> list[int]:
-        """Return the numbers of the files that are taken, evenly spaced; of all of them for 0."""
-        return evenly_spaced(max_scans or len(self._paths), len(self._paths))
 
 
 def image_files(path: Path) -> list[Path]:
