@@ -215,6 +215,15 @@ def test_what_it_cannot_do_is_told_with_who_can(name):
         assert "lidargrit list generators" in refusal.value.cure
 
 
+def test_scans_of_which_nothing_is_known_are_generated(name):
+    generator, sampling = made(name)
+    if "complete" not in generator.capabilities:
+        return
+    generated = generator.complete(Condition.nothing(SENSOR, 2), [0, 1], sampling)
+    assert generated.range_m.shape == (2, 64, 32)
+    assert generated.return_mask.any()
+
+
 def test_what_it_can_do_besides_keeps_to_the_seeds_and_the_sensor(name):
     generator, sampling = made(name)
     images = IMAGES.batch([0, 1])

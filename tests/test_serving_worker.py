@@ -7,12 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 import lidargrit
 from lidargrit.completion.inputs import ScanReader
+from lidargrit.errors import ScanError
 from lidargrit.formats import load, read_scan
-from lidargrit.serving.requests import SampleRequest
+from lidargrit.serving.requests import TASKS, SampleRequest
 from lidargrit.serving.worker import PIXELS_FILE, compute_result, describe_model, run_worker
+from lidargrit.structures import Scan
 from test_generator_contract import made
 
 
@@ -64,3 +67,39 @@ def test_an_uploaded_scan_is_projected_as_those_that_the_model_learned_from(scan
         wanted = ScanReader(model.sensor, run.name, partial=True).read(read_scan(scan_file, bad_points="drop"))
         assert np.array_equal(images[-1], wanted.image.range_m.numpy())
     assert not np.array_equal(*images)
+
+
+@pytest.fixture(scope="module")
+def part_file(tmp_path_factory) -> Path:
+    path, scan = tmp_path_factory.mktemp("scans") / "behind.ply", lidargrit.simulate(seed=5)
+    behind = scan.points_xyz_m[:, 0] < -scan.points_xyz_m[:, 1].abs()
+    load("ply").write(path, Scan(scan.points_xyz_m[behind], scan.reflectance[behind]))
+    return path
+
+
+@pytest.mark.parametrize("task", [task for task in TASKS if task != "returns"])
+def test_a_part_of_the_circle_is_taken_only_where_lost_returns_are_completed(task, part_file):
+    # elsewhere rays outside of it would count as observed, and lost
+    with pytest.raises(ScanError, match=r"degrees of azimuth in mine\.ply|rings in mine\.ply"):
+        compute_result(made("lidargrit")[0], SampleRequest(0, task=task, file=str(part_file), name="mine.ply"))
+
+
+def test_models_that_do_not_complete_have_no_task(scan_file):
+    model = made("maskgit")[0]
+    assert describe_model("tiny", model)["tasks"] == []
+    assert "vlp16" in describe_model("tiny", made("lidargrit")[0])["tasks"]
+    plain, chosen = (
+        compute_result(model, SampleRequest(0, task=task, file=str(scan_file))) for task in ("returns", "vlp16")
+    )
+    assert np.array_equal(plain[0].images.range_m, chosen[0].images.range_m), "the task of another model"
+
+
+def test_messages_of_tasks_name_no_option_of_the_command_line(tmp_path):
+    scan = lidargrit.simulate(seed=5)
+    ahead = scan.points_xyz_m[:, 0] > scan.points_xyz_m[:, 1].abs()
+    points_xyz_m = torch.where(ahead[:, None], scan.points_xyz_m, scan.points_xyz_m * 1e-3)  # others below all limits
+    load("ply").write(tmp_path / "ahead.ply", Scan(points_xyz_m, scan.reflectance, scan.ring))
+    request = SampleRequest(0, task="ahead", file=str(tmp_path / "ahead.ply"), name="mine.ply")
+    with pytest.raises(ScanError, match=r"^got mine\.ply without a return outside the part to fill in") as refused:
+        compute_result(made("lidargrit")[0], request)
+    assert "--" not in str(refused.value)

@@ -12,10 +12,11 @@ from lidargrit.generators import load_class
 from lidargrit.generators.lidargrit import TokenSampling
 from lidargrit.generators.maskgit import MaskGitConfig
 from lidargrit.loading import DataConfig
+from lidargrit.recipes import load_recipe
 from lidargrit.training import FitConfig, plan_training, train
 from lidargrit.training.plan import check_stages
 from lidargrit.training.taken_stages import taken_stages
-from test_pixel_stage import PIXELS, TOKENIZER, TRANSFORMER, made, recipe_of
+from test_pixel_stage import PIXELS, SENSOR, TOKENIZER, TRANSFORMER, made, recipe_of
 
 
 def test_only_the_pixel_decoder_is_trained_over_a_finished_run(tmp_path):
@@ -157,3 +158,29 @@ def test_a_run_of_other_sizes_or_another_kind_gives_no_stages(tmp_path):
         taken_stages(unknown, unknown.build_generator())
     with pytest.raises(ConfigError, match="tokenizer_from and stages_from together"):
         replace(recipe, tokenizer_from="pretrained")
+
+
+def test_a_stage_whose_settings_do_not_have_its_name_is_compared_by_all_of_them(tmp_path):
+    small = ("model.unet.channel_multipliers=[1,1,1,1]", "data.column_stride=1", "data.columns=64")
+    donor = load_recipe("r2dm_small", small).build_generator()
+    donor.save(tmp_path)
+    recipe = load_recipe("r2dm_small", (*small, f"stages_from={tmp_path}"))
+    assert taken_stages(recipe, recipe.build_generator()).keys() == {"diffusion"}
+    other = load_recipe("r2dm_small", (*small, "model.unet.norm_groups=2", f"stages_from={tmp_path}"))
+    with pytest.raises(ConfigError, match=r"whose diffusion is another \(model\.unet\.norm_groups="):
+        taken_stages(other, other.build_generator())
+    columns = (small[0], "data.column_stride=2", "data.columns=128", f"stages_from={tmp_path}")
+    taken = load_recipe("r2dm_small", columns)
+    with pytest.raises(ConfigError, match=r"whose diffusion is another \(data\.sensor\)"):
+        taken_stages(taken, taken.build_generator())
+    tuned = load_recipe("r2dm_small", (*columns, "fine_tune=[diffusion]"))
+    assert taken_stages(tuned, tuned.build_generator()).keys() == {"diffusion"}
+
+
+@pytest.mark.parametrize("name", ["lidargan", "lidarvae"])
+def test_a_taken_network_keeps_the_scale_of_its_images(name):
+    donor, generator = (load_class(name)(load_class(name).smallest_config(SENSOR), SENSOR) for _ in range(2))
+    donor.image.scale_m.fill_(37)
+    (stage,) = donor.stages
+    generator.load_stage(stage, donor.objective(stage))
+    assert float(generator.image.scale_m) == 37

@@ -83,7 +83,7 @@ def test_the_page_holds_all_pixels_and_nothing_foreign(shown):
             error_m = np.abs(steps * source["rangeStepM"] - one.images.range_m[index].numpy())
             assert error_m.max() <= source["rangeStepM"] / 2 + 1e-6
     scan = data["sources"][0]["scans"][1]
-    named = np.array([one["number"] for one in data["classes"]])
+    named = np.array([one["number"] for one in data["sources"][0]["classes"]])
     returned = shown[0].images.return_mask[1].numpy()
     assert set(named) == {40, 50}
     label = named[unpacked(scan["label"], "u1").reshape(64, 256)]

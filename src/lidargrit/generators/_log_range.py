@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lidargrit.errors import ConfigError
-from lidargrit.nn.reflectance import required_reflectance
+from lidargrit.nn.reflectance import reflectance_of_returns
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
@@ -30,7 +30,7 @@ def encode(images: RangeImage, with_reflectance: bool) -> Float[Tensor, "B C H W
     level = torch.log2(1 + images.range_m.clamp(max=far)) * (2 / math.log2(1 + far)) - 1
     if not with_reflectance:
         return level[:, None]
-    reflectance = required_reflectance(images.reflectance, "model.reflectance")
+    reflectance = reflectance_of_returns(images, "model.reflectance")
     return torch.stack((level, 2 * reflectance * images.return_mask - 1), dim=1)
 
 

@@ -115,8 +115,9 @@ class LidarGan(Generator[LidarGanConfig, NoSampling]):
         return LidarGanObjective(self.decoder, self.image, self.config)
 
     def load_stage(self, stage: str, objective: Objective) -> None:
-        """Take over the trained network; its discriminator has done its work."""
+        """Take over the trained network and the scale of its images; its discriminator has done its work."""
         assert isinstance(objective, LidarGanObjective)
+        self.image.load_state_dict(objective.image.state_dict())
         self.decoder.load_state_dict(objective.decoder.state_dict())
 
     def _sample(self, seeds: Sequence[int], sampling: NoSampling) -> RangeImage:

@@ -21,7 +21,7 @@ from lidargrit.nn.flops import flops_of
 from lidargrit.nn.lidargen_checkpoint import read_lidargen_checkpoint
 from lidargrit.nn.ncsn import SIDE_AT_LEAST, Ncsn
 from lidargrit.nn.objective import Objective
-from lidargrit.nn.reflectance import required_reflectance
+from lidargrit.nn.reflectance import reflectance_of_returns
 from lidargrit.nn.score_matching import langevin, pull_towards, score_matching_errors, sigma_table
 from lidargrit.nn.size import numbers_of_file
 from lidargrit.sensors import SensorModel
@@ -254,9 +254,8 @@ def encode(images: RangeImage, config: LidarGenConfig) -> Float[Tensor, "B C H W
     level = (torch.log2(images.range_m + _NOTHING_M + 1) / config.log2_scale).clamp(0, 1)
     if not config.reflectance:
         return level[:, None]
-    return torch.stack(
-        (level, required_reflectance(images.reflectance, "model.reflectance").clamp(0, 1) * images.return_mask), dim=1
-    )
+    reflectance = reflectance_of_returns(images, "model.reflectance")
+    return torch.stack((level, reflectance.clamp(0, 1) * images.return_mask), dim=1)
 
 
 def _check_counts(levels: int, steps_each: int) -> None:

@@ -153,8 +153,9 @@ class LidarVae(Generator[LidarVaeConfig, VaeSampling]):
         return LidarVaeObjective(self.encode, self.decode, self.image, self.config)
 
     def load_stage(self, stage: str, objective: Objective) -> None:
-        """Take over the trained networks."""
+        """Take over the trained networks and the scale of their images."""
         assert isinstance(objective, LidarVaeObjective)
+        self.image.load_state_dict(objective.image.state_dict())
         self.encode.load_state_dict(objective.encode.state_dict())
         self.decode.load_state_dict(objective.decode.state_dict())
 

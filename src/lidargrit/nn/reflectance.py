@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import Final
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lidargrit.errors import ConfigError
+from lidargrit.structures import RangeImage
 
 TYPICAL_REFLECTANCE: Final = 0.25  # of roads and walls in KITTI; what a network begins with, and 0 among its inputs
 
@@ -26,6 +28,13 @@ def required_reflectance(reflectance: Float[Tensor, "*B H W"] | None, setting: s
             f"name or prepare scans with reflectance, or train with --set {setting}=false",
         )
     return reflectance
+
+
+def reflectance_of_returns(images: RangeImage, setting: str) -> Float[Tensor, "*B H W"]:
+    """Return the reflectance of images as :func:`required_reflectance` does, and 0 where none of them has a return."""
+    if images.reflectance is None and not bool(images.return_mask.any()):
+        return torch.zeros_like(images.range_m)
+    return required_reflectance(images.reflectance, setting)
 
 
 def reflectance_error(

@@ -27,7 +27,7 @@ from lidargrit.completion.inputs import InputScan, ScanReader
 from lidargrit.completion.sparse import SparseReader, observed_rows
 from lidargrit.conditions import Condition
 from lidargrit.conditions.patterns import Pattern
-from lidargrit.errors import ConfigError, LidarGritError, OutputError
+from lidargrit.errors import ConfigError, LidarGritError, OutputError, ScanError, UsageError
 from lidargrit.files import atomic_path, write_text
 from lidargrit.generators import Generator, load
 from lidargrit.nn.devices import usable_device
@@ -88,10 +88,22 @@ def describe_model(name: str, generator: Generator) -> dict[str, Any]:
         "generator": generator.public_name(),
         "sensor": f"{sensor.name}, {sensor.height} x {sensor.width}",
         "upload": next((able for able in ("complete", "encode") if able in generator.capabilities), ""),
-        "tasks": [task for task in TASKS if task != "raydrop" or "surfaces" in generator.conditions],
+        "tasks": [task for task in TASKS if _can(generator, task)],
         "settings": _settings_of(generator),
         "rays": sensor.to_json(),
     }
+
+
+def _can(generator: Generator, task: str) -> bool:
+    """Return whether a model can do a task: one of upsampling wants rows between those of the other sensor."""
+    if "complete" not in generator.capabilities:
+        return False
+    if task in UPSAMPLED:
+        try:
+            SparseReader(generator.sensor, source=load_sensor(task))
+        except ConfigError:
+            return False
+    return task != "raydrop" or "surfaces" in generator.conditions
 
 
 def _settings_of(generator: Generator) -> list[dict[str, Any]]:
@@ -142,11 +154,11 @@ def compute_result(generator: Generator, request: SampleRequest, variant: Projec
 
 
 def _reader(request: SampleRequest, generator: Generator, variant: ProjectionVariant) -> ScanReader:
-    """Return what projects an uploaded scan; it may be a part of the circle if the model completes it."""
-    partial = "complete" in generator.capabilities and request.task != "raydrop"
-    if request.task in UPSAMPLED:
-        return SparseReader(generator.sensor, variant, partial, load_sensor(request.task))
-    return ScanReader(generator.sensor, variant, partial)
+    """Return what projects an uploaded scan, which may be a part of the circle where lost returns are completed."""
+    completes = "complete" in generator.capabilities  # a model that does not has no task
+    if completes and request.task in UPSAMPLED:
+        return SparseReader(generator.sensor, variant, source=load_sensor(request.task))
+    return ScanReader(generator.sensor, variant, partial=completes and request.task == "returns")
 
 
 def _read_upload(request: SampleRequest, reader: ScanReader) -> InputScan:
@@ -171,7 +183,13 @@ def _observed(request: SampleRequest, seen: InputScan) -> Bool[Tensor, "H W"]:
         observed[rows, math.floor(left * width) : math.ceil(right * width)] = False
         return observed
     pattern = {"returns": "returns", "ahead": "sector:45,315", "rows": "rows:4"}[request.task]
-    return Pattern(pattern).mask(seen.image)
+    try:
+        return Pattern(pattern).mask(seen.image)
+    except UsageError:  # the messages of patterns name options of the command line
+        got, wanted = f"{request.name}, in which every ray has a return", "some rays to fill in"
+    except ScanError:
+        got, wanted = f"{request.name} without a return outside the part to fill in", "some returns there"
+    raise ScanError(got, wanted, "choose another task, or another scan")
 
 
 def _answer_request(

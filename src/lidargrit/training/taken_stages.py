@@ -121,12 +121,21 @@ def _learn_alike(generator: Generator, donor: Generator, stages: Sequence[str]) 
 
 
 class _Stage:
-    """A stage of a generator: its name, its objective, and the settings of its networks."""
+    """A stage of a generator: its name, its objective, the settings of its networks, and what their names begin with.
+
+    Where no setting has the stage's name, its settings are all that have no other stage's.
+    """
 
     def __init__(self, name: str, generator: Generator) -> None:
         self.name, self.objective = name, generator.objective(name)
-        self.settings = _settings(generator, name)
         self.shapes = _shapes(self.objective.state_dict())
+        settings = configuration.leaves(configuration.to_json(generator.config))
+        own = {key.removeprefix(f"{name}."): value for key, value in settings.items() if key.startswith(f"{name}.")}
+        self.prefix = f"model.{name}" if own else "model"
+        others = {key: value for key, value in settings.items() if key.partition(".")[0] not in generator.stages}
+        self.settings = own or others
+        if name == "tokenizer":
+            self.settings["name"] = generator.get_tokenizer().config.name()
 
 
 def _check_base(recipe: Recipe, stage: _Stage) -> None:
@@ -154,27 +163,14 @@ def _check(setting: str, mine: _Stage, given: _Stage, trained: bool = False) -> 
         added = {name for name in mine.objective.additions if ours.get(name) and not theirs.get(name)}
         differing = [name for name in differing if name not in added and not name.endswith("dropout")]
         same_sensor |= mine.shapes.items() >= _shapes(mine.objective.weights_from(given.objective)).items()
-    if not ours and mine.shapes != given.shapes:  # its settings have no stage's name
-        raise ConfigError(
-            f"{setting}, whose {stage} has weights of other sizes",
-            "one of this recipe's model and sensor",
-            "set them as there, or choose another run",
-        )
     if differing or not same_sensor:
-        other = f"model.{stage}.{differing[0]}={theirs.get(differing[0])}" if differing else "data.sensor"
+        other = f"{mine.prefix}.{differing[0]}={theirs.get(differing[0])}" if differing else "data.sensor"
         raise ConfigError(
             f"{setting}, whose {stage} is another ({other})",
-            f"one of this recipe's model.{stage} and sensor",
+            f"one of this recipe's {mine.prefix} and sensor",
             "set them as there, or choose another run",
         )
 
 
 def _shapes(weights: Mapping[str, Tensor]) -> dict[str, torch.Size]:
     return {name: weight.shape for name, weight in weights.items()}
-
-
-def _settings(generator: Generator, stage: str) -> dict[str, Any]:
-    """Return every setting of a stage's networks by its name, and the kind of tokenizer under ``name``."""
-    settings = configuration.leaves(configuration.to_json(generator.config))
-    found = {name.removeprefix(f"{stage}."): value for name, value in settings.items() if name.startswith(f"{stage}.")}
-    return {"name": generator.get_tokenizer().config.name(), **found} if stage == "tokenizer" else found

@@ -129,14 +129,8 @@ def _read(name: str) -> str:
 
 def page_data(sets: Sequence[ScanSet]) -> dict[str, Any]:
     """Return all that a page needs to show sets of scans, as JSON values."""
-    labels = [one.label[one.return_mask] for one in (each.images for each in sets) if one.label is not None]
-    numbers = sorted({int(number) for label in labels for number in label.unique()})
-    if len(numbers) > _CLASSES_AT_MOST:
-        raise ConfigError(f"{len(numbers)} classes of labels", f"at most {_CLASSES_AT_MOST}", "show fewer scans")
-    named = [(number, *name_and_colour(number)) for number in numbers]
     return {
-        "sources": [_source(one, numbers) for one in sets],
-        "classes": [{"number": number, "name": name, "colour": colour} for number, name, colour in named],
+        "sources": [_source(one) for one in sets],
         "scales": _scales(sets),
         "reachM": _reach_m(sets),
         "looks": {
@@ -150,12 +144,16 @@ def page_data(sets: Sequence[ScanSet]) -> dict[str, Any]:
     }
 
 
-def _source(scan_set: ScanSet, numbers: list[int]) -> dict[str, Any]:
-    """Return one set: its rays once, and the pixels of every scan."""
+def _source(scan_set: ScanSet) -> dict[str, Any]:
+    """Return one set: its rays and its classes once, and the pixels of every scan."""
     images = scan_set.images.to("cpu")
     step_m = _far_m(scan_set) / _RANGE_STEPS
     steps = (images.range_m.detach() / step_m).round().clamp(1, _RANGE_STEPS) * images.return_mask
     reflectance, label = images.reflectance, images.label
+    numbers = [] if label is None else label[images.return_mask].unique().tolist()
+    if len(numbers) > _CLASSES_AT_MOST:
+        raise ConfigError(f"{len(numbers)} classes of labels", f"at most {_CLASSES_AT_MOST}", "show fewer scans")
+    named = [(number, *name_and_colour(number)) for number in numbers]
     scans: list[dict[str, Any]] = []
     for index, name in enumerate(scan_set.scan_names):
         scan = {"name": name, "range": _packed(steps[index].numpy().astype("<u2"))}
@@ -176,6 +174,7 @@ def _source(scan_set: ScanSet, numbers: list[int]) -> dict[str, Any]:
         "rangeStepM": step_m,
         "columnStride": images.sensor.column_stride,
         "endM": min(images.sensor.range_max_m, _far_m(scan_set)),  # a ray ends where returns do: the rest is empty
+        "classes": [{"number": number, "name": name, "colour": colour} for number, name, colour in named],
         "scans": scans,
     }
 

@@ -24,7 +24,7 @@ function binFile(source, scan, points) {
 }
 
 // PLY, with the ring of every point, and reflectance and label where they are known.
-function plyFile(source, scan, points, classes) {
+function plyFile(source, scan, points) {
   const pixels = returnsOf(source, scan);
   const rowBytes = 14 + (scan.reflectance ? 4 : 0) + (scan.label ? 4 : 0);
   const lines = [
@@ -50,7 +50,7 @@ function plyFile(source, scan, points, classes) {
     }
     rows.setUint16(offset, Math.floor(pixel / source.width), true);
     if (scan.label) {
-      rows.setUint32(offset + 2, classes[scan.label[pixel]].number, true);
+      rows.setUint32(offset + 2, source.classes[scan.label[pixel]].number, true);
     }
   });
   return [lines.join("\n"), rows];

@@ -5,7 +5,6 @@ const DENSE = 50000; // pixels of a scan whose points would cover one another if
 class Page {
   constructor(data) {
     this.data = data;
-    this.classes = data.classes;
     this.camera = new Camera(data.reachM);
     this.control = Object.fromEntries(
       ["previous", "next", "position", "counter", "mode", "dropped", "size", "light", "reset", "legend"].map((id) => [
@@ -18,8 +17,6 @@ class Page {
     this.area = document.getElementById("panes");
     document.getElementById("slow").hidden = hasGraphicsCard();
     this.arrange(data.sources.map((source) => new Pane(new Source(source), this)));
-    const most = Math.max(0, ...data.sources.map((source) => source.width * source.height));
-    this.control.size.value = most > DENSE ? "1.5" : "3";
     this.listen();
   }
 
@@ -36,6 +33,10 @@ class Page {
     this.panes.filter((pane) => !panes.includes(pane)).forEach((pane) => pane.close());
     panes.filter((pane) => !this.panes.includes(pane)).forEach((pane) => this.area.append(pane.element));
     this.panes = panes;
+    if (!this.sizeChosen) {
+      const most = Math.max(0, ...panes.map((pane) => pane.source.size));
+      this.control.size.value = most > DENSE ? "1.5" : "3";
+    }
     this.count = Math.max(1, ...panes.map((pane) => pane.source.count));
     this.index = Math.min(this.index, this.count - 1);
     this.offerModes();
@@ -64,7 +65,10 @@ class Page {
     position.addEventListener("input", () => this.go(Number(position.value) - 1));
     mode.addEventListener("change", () => this.paint());
     dropped.addEventListener("change", () => this.redraw());
-    size.addEventListener("input", () => this.redraw());
+    size.addEventListener("input", () => {
+      this.sizeChosen = true;
+      this.redraw();
+    });
     reset.addEventListener("click", () => this.lookAgain());
     light.addEventListener("change", () => this.paint());
     window.addEventListener("keydown", (event) => this.press(event));
@@ -84,8 +88,9 @@ class Page {
       "-": () => this.camera.zoom(1.15),
       0: () => this.camera.reset(),
     };
-    // Sliders and lists have these keys for themselves, and the browser has those with Ctrl.
-    const taken = event.target.matches?.("input[type=range], select") || event.ctrlKey || event.metaKey || event.altKey;
+    // Sliders, lists and fields have these keys for themselves, and the browser has those with Ctrl.
+    const own = event.target.matches?.("input:not([type=checkbox]), select, textarea");
+    const taken = own || event.ctrlKey || event.metaKey || event.altKey;
     if (!taken && event.key in keys) {
       event.preventDefault();
       keys[event.key]();
@@ -126,7 +131,7 @@ class Page {
     this.area.classList.toggle("on-light", this.control.light.checked);
     return {
       ...this.data.looks[theme],
-      classes: this.classes,
+      classes: classesOf(this.panes),
       scales: this.data.scales,
       mode: this.control.mode.value,
     };
@@ -153,6 +158,12 @@ class Page {
       pane.mark(alike ? pixel : -1);
     }
   }
+}
+
+// The classes of all panes, each once: those of a source are indexed from 0, whatever others have.
+function classesOf(panes) {
+  const classes = panes.flatMap((pane) => pane.source.classes).map((one) => [one.number, one]);
+  return [...new Map(classes).values()].sort((one, other) => one.number - other.number);
 }
 
 // What the colours mean: a ramp with its ends, or the classes by name.

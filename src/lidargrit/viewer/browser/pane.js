@@ -160,7 +160,7 @@ class Pane {
   // The position comes last: it is what may be cut off where panes are narrow.
   describe(pixel) {
     const { source, scan } = this;
-    const facts = scan.label && scan.steps[pixel] ? [this.page.classes[scan.label[pixel]].name] : [];
+    const facts = scan.label && scan.steps[pixel] ? [source.classes[scan.label[pixel]].name] : [];
     if (scan.steps[pixel] === 0) {
       facts.push("no return");
     } else {
@@ -177,7 +177,7 @@ class Pane {
   }
 
   save(ending, write) {
-    const parts = write(this.source, this.scan, this.points, this.page.classes);
+    const parts = write(this.source, this.scan, this.points);
     save(parts, `${this.source.name}-${this.scan.name}.${ending}`);
   }
 }

@@ -9,6 +9,7 @@ class Source {
     this.size = data.height * data.width;
     this.rangeStepM = data.rangeStepM;
     this.endM = data.endM;
+    this.classes = data.classes;
     this.columns = data.columnStride > 1 ? `, one in ${data.columnStride} columns` : "";
     this.data = data;
     this.unpacked = new Map();
@@ -107,7 +108,7 @@ function coloursOf(source, scan, points, look) {
   const colours = new Uint8ClampedArray(4 * source.size).fill(255);
   const ramp = look.ramps[look.mode];
   const position = look.mode === "label" ? null : POSITIONS[look.mode](source, scan, points, look.scales[look.mode]);
-  const classOf = look.mode === "label" && scan.label && ((pixel) => look.classes[scan.label[pixel]].colour);
+  const classOf = look.mode === "label" && scan.label && ((pixel) => source.classes[scan.label[pixel]].colour);
   for (let pixel = 0; pixel < source.size; pixel++) {
     let colour = look.unknown;
     if (scan.steps[pixel] === 0) {
