@@ -384,3 +384,10 @@ def test_damaged_costs_are_refused_in_one_line(change, tmp_path):
 def test_a_second_comparison_in_the_same_folder_is_refused(tmp_path):
     with claim_folder(tmp_path), pytest.raises(OutputError, match=r"which process \d+ on .* is writing"):
         run_benchmark(["marginal"], tmp_path, BENCHMARK)
+
+
+def test_a_folder_that_cannot_be_is_refused_before_the_reference_is_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(benchmark, "_check_reference", lambda *_: pytest.fail("it read the reference first"))
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="File exists"):
+        run_benchmark(["marginal"], tmp_path / "file", BENCHMARK)

@@ -1,5 +1,6 @@
 """Scans whose points are in no firing order, or of another sensor: recognised, projected by elevation, or refused."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,7 @@ import torch
 
 from lidargrit import cli, formats
 from lidargrit.datasets import open_dataset
-from lidargrit.errors import ScanError
+from lidargrit.errors import ConfigError, ScanError
 from lidargrit.evaluation.pairs import EvalSet, pair_for_protocol
 from lidargrit.evaluation.protocols import load_protocol
 from lidargrit.loading import DataConfig
@@ -177,6 +178,12 @@ def test_settings_of_reading_scans_mean_the_same_by_word_and_by_option():
     assert word.load_sensor().width == 900
     assert word.load_sensor().projection == "spherical"
     assert ScanSettings.read().load_sensor() is None
+    for word in ("data.nope=3", "data.train=x", "sensor=vlp16"):
+        with pytest.raises(
+            ConfigError, match=r"which reading scans does not have; wanted one such as data\."
+        ) as refusal:
+            ScanSettings.read([word])
+        assert not re.search(r"data\.(train|val)|projection_variant,", refusal.value.wanted)
     assert ScanSettings.read([], projection_variant="reference").projection_variant == "reference"
     for words in (["projection=spherical"], ["data.train=x"], ["data.nothing=1"]):
         with pytest.raises(Exception, match="setting"):

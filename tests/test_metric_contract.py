@@ -1,5 +1,6 @@
 """What every metric promises, asked of every file in ``metrics/`` and each of its variants."""
 
+import contextlib
 import functools
 import pickle
 import sys
@@ -137,6 +138,15 @@ def test_fed_in_pieces_is_fed_at_once(name, variant):
         pieces.update(real[start:stop], real=True)
         pieces.update(generated[start:stop], real=False)
     assert close(pieces.compute(), at_once(name, variant))
+
+
+@pytest.mark.parametrize("columns", [1, 4])
+def test_few_columns_are_scored_or_refused(name, variant, columns, monkeypatch):
+    monkeypatch.setattr(sys.modules[__name__], "SENSOR", SENSOR.with_columns(columns))
+    found = 0.0
+    with contextlib.suppress(ConfigError, DataError):  # any other error would be a traceback for the user
+        found = score(name, variant, scenes(0, walls=1), scenes(1, walls=1)).value
+    assert np.isfinite(found)
 
 
 def test_one_image_without_a_batch_axis_is_a_batch_of_one(name, variant):

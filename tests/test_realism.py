@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 
 from lidargrit.cli import main
 from lidargrit.errors import ConfigError, DataError
+from lidargrit.evaluation import realism
 from lidargrit.evaluation.realism import CURVES, SimulatedScans, as_table, compare, drop_independently, simulate_pair
 from lidargrit.generators.lidargrit import LidarGrit
 from lidargrit.loading import DataConfig
@@ -45,6 +46,18 @@ def test_what_is_measured_is_part_of_what_is_clean(simulated):
     assert not (measured.return_mask & ~clean.return_mask).any()
     assert torch.equal(measured.range_m[measured.return_mask], clean.range_m[measured.return_mask])
     assert 0.7 < measured.return_mask.float().mean() < clean.return_mask.float().mean() < 1
+
+
+def test_other_columns_than_are_fired_get_the_nearest_of_several_points_as_real_scans_do():
+    rays = SENSOR.with_columns(256)
+    real = load_range_images((f"simulated:{COUNT}",), DataConfig(columns=256)).batch(range(COUNT))
+    images = [simulate_pair(seed, rays, SENSOR)[1] for seed in range(COUNT)]
+    agree = [
+        float((image.return_mask == mask).float().mean()) for image, mask in zip(images, real.return_mask, strict=True)
+    ]
+    single = simulate_pair(0, rays)[1].return_mask == real.return_mask[0]  # one ray for each pixel
+    assert min(agree) > 0.98
+    assert float(single.float().mean()) < 0.95
 
 
 def test_independent_drops_keep_a_share_whatever_it_meets(simulated):
@@ -130,7 +143,7 @@ def test_only_views_from_above_are_plotted_as_maps(rows, tmp_path, monkeypatch):
     assert len(labels) == 3
 
 
-def test_the_verb(tmp_path, capsys):
+def test_the_verb(tmp_path, capsys, monkeypatch):
     picture, file = tmp_path / "curves.png", tmp_path / "curves.json"
     torch.manual_seed(0)
     LidarGrit(LidarGrit.smallest_config(SENSOR), SENSOR).save(tmp_path / "run")
@@ -148,5 +161,9 @@ def test_the_verb(tmp_path, capsys):
     assert "add --overwrite" in capsys.readouterr().err
     assert main([*words, "--overwrite", "--device", "cuda:99"]) == 2
     assert "device 'cuda:99'" in capsys.readouterr().err
+    monkeypatch.setattr(realism, "simulate_pair", lambda *_: pytest.fail("it simulates before it looks"))
+    one = ["compare-sim", "simulated:2", "-o", str(tmp_path / "one.png"), "--set", "data.max_scans=1"]
+    assert main(one) == 2
+    assert "got 1 real scan; wanted at least 2" in capsys.readouterr().err
     assert main(["compare-sim", "simulated:2", "-n", "1", "-o", str(tmp_path / "new.png")]) == 2
     assert "at least 2" in capsys.readouterr().err

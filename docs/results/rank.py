@@ -17,6 +17,10 @@ def ranked(folder: Path, metric: str) -> dict[str, str]:
     """Return the value of each system in a folder, with its rank."""
     files = {system: path for system in NAMES if (path := folder / f"{system}.json").exists()}
     found = {system: score for system, path in files.items() if (score := read_cell(path)["scores"].get(metric))}
+    if not found:
+        raise SystemExit(
+            f"got no score by {metric} in {folder}; wanted a folder of docs/results/fair; correct the name"
+        )
     cells, before = {}, None
     for rank, (system, score) in enumerate(sorted(found.items(), key=lambda one: rank_key(one[1])), start=1):
         interval = score["interval"]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Iterable
+import re
+from collections.abc import Collection, Iterable
 from typing import Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from lidargrit import _discovery
@@ -19,6 +20,7 @@ COUNTS_SCANS = "counts_scans"
 
 _VALUES_AT_MOST = 1000  # of one setting; the parser takes a second for ten thousand
 _LETTERS_AT_MOST = 100_000  # of one value on the command line: a list of as many long paths
+_OTHER_BASES = re.compile(r":|(^|[\[,\s])[-+]?0\d")  # YAML 1.1 reads 1:30 as 90, and 010 in a list as 8
 _RENAMED = {"data.variant": "data.projection_variant"}  # run folders have the former name, and users may type it
 
 
@@ -84,7 +86,13 @@ def defaults(config: T) -> T:
     return type(config)(**nested)
 
 
-def override(config: T, settings: Iterable[str], owner: str = "this recipe", cure: str = "see all with --dry-run") -> T:
+def override(
+    config: T,
+    settings: Iterable[str],
+    owner: str = "this recipe",
+    cure: str = "see all with --dry-run",
+    fixed: Collection[str] = (),
+) -> T:
     """Return the configuration with settings of the form ``a.b=value`` changed.
 
     Values are read as YAML. A list needs no brackets: ``data.train=/data/one,/data/two``.
@@ -94,11 +102,12 @@ def override(config: T, settings: Iterable[str], owner: str = "this recipe", cur
         settings: words of the form NAME=VALUE.
         owner: name of what has these settings, for a message.
         cure: hint on how to find the names of the settings, for a message.
+        fixed: names of fields that are no settings.
 
     Raises:
         ConfigError: an unknown name (names its nearest neighbours) or a value of another type.
     """
-    known: dict[str, Any] = leaves(config)
+    known = {name: value for name, value in leaves(config).items() if name not in fixed}
     values: dict[str, Any] = {}
     for setting in settings:
         path, equals, text = setting.partition("=")
@@ -170,6 +179,8 @@ def _parsed(hint: Any, path: str, text: str) -> Any:
         )
     if hint == tuple[str, ...] and not text.startswith("["):
         return tuple(text.split(","))
+    if _is_numeric(hint) and _OTHER_BASES.search(text):
+        raise ConfigError(f"{path}={text}", _in_words(hint), "correct the value")
     if get_origin(hint) is tuple and not text.startswith("["):
         text = f"[{text}]"
     parser = _parser()
@@ -180,6 +191,12 @@ def _parsed(hint: Any, path: str, text: str) -> Any:
         raise ConfigError(f"{path}={text}", _in_words(hint), "correct the value") from None
     _check_numbers(value, path)
     return tuple(value) if isinstance(value, list) else value
+
+
+def _is_numeric(hint: Any) -> bool:
+    """Return whether a type is a number, a tuple of numbers, or one of these or None."""
+    parts = [part for part in get_args(hint) if part not in (type(None), Ellipsis)]
+    return hint in (int, float) or (get_origin(hint) is not Literal and bool(parts) and all(map(_is_numeric, parts)))
 
 
 def _check_numbers(value: Any, where: str) -> None:

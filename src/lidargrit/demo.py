@@ -13,7 +13,7 @@ import torch
 
 from lidargrit.configuration import override
 from lidargrit.determinism import evenly_spaced
-from lidargrit.errors import CheckpointError, DataError
+from lidargrit.errors import CheckpointError, DataError, counted_scans
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
 from lidargrit.evaluation.reconstruction import ReconstructionErrors, score_reconstruction
@@ -233,7 +233,7 @@ def divided(data: str, reporter: Reporter) -> DataConfig:
     """
     dataset = open_source(data).scans()
     if len(dataset) < 4:
-        raise DataError(f"{len(dataset)} scans in {data}", "at least 4, to hold one out", "add scans")
+        raise DataError(f"{counted_scans(len(dataset))} in {data}", "at least 4, to hold one out", "add scans")
     source, split = f"{dataset.public_name()}:{dataset.root}", dataset.split
     scans = Counter(dataset.name(index).rpartition("/")[0] for index in range(len(dataset)))
     drives = sorted(scans)

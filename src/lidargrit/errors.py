@@ -132,3 +132,8 @@ def nearest_names(name: str, known: Iterable[str], at_most: int = 3) -> str:
 def one_of(names: Sequence[str]) -> str:
     """Return names as a message offers them: "a, b or c"."""
     return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " or " + names[-1]
+
+
+def counted_scans(count: int, kind: str = "") -> str:
+    """Say a number of scans: "1 scan", "3 completed scans"."""
+    return f"{count:,} {kind}{' ' if kind else ''}{'scan' if count == 1 else 'scans'}"

@@ -29,11 +29,6 @@ def add_json(parser: argparse.ArgumentParser, files: str = "the file of --json")
     parser.add_argument("--overwrite", action="store_true", help=f"replace {files} if already there")
 
 
-def counted_scans(count: int, kind: str = "") -> str:
-    """Say a number of scans: "1 scan", "3 completed scans"."""
-    return f"{count} {kind}{' ' if kind else ''}{'scan' if count == 1 else 'scans'}"
-
-
 def refuse_taken(options: argparse.Namespace, *others: Path) -> None:
     """Refuse, before any work, to replace a file that ``--json`` names, or ``others`` of the verb, with OutputError."""
     if options.json in (None, STANDARD_OUTPUT):

@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("models", nargs="*", metavar="MODEL", help=models)
     patterns = "what is kept, as of lidargrit complete (default: rows:4 sector:45,315 pixels:0.1)"
     parser.add_argument("--observed", nargs="+", default=[], metavar="PATTERN", help=patterns)
-    parser.add_argument("-n", "--count", type=int, default=32, help="largest number of scans, evenly spaced")
+    parser.add_argument("-n", "--count", type=int, default=32, help="largest number of scans, evenly spaced; 0 for all")
     each = "number of completions of each scan by a model that is random"
     parser.add_argument("--completions", type=int, default=2, help=each)
     parser.add_argument("--seed", type=seed_number, default=0, help="seed of the completions and of random pixels")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from lidargrit.cli._options import add_bad_scans, add_completion
-from lidargrit.cli._results import counted_scans
+from lidargrit.errors import counted_scans
 
 EXAMPLES = """\
   lidargrit complete /data/scans whole                             fill in every ray without a point

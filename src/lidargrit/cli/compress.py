@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from lidargrit.cli._options import add_bad_scans
-from lidargrit.cli._results import counted_scans
+from lidargrit.errors import counted_scans
 
 EXAMPLES = """\
   lidargrit compress /data/kitti_odometry scans.lgz

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from lidargrit.cli._results import counted_scans
+from lidargrit.errors import counted_scans
 from lidargrit.untrusted import whole_number
 
 EXAMPLES = """\

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from lidargrit.cli._options import add_bad_scans
-from lidargrit.cli._results import counted_scans
+from lidargrit.errors import counted_scans
 
 EXAMPLES = """\
   lidargrit export samples clouds --format pcd                what a model generated, a file a scan

@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 
 from lidargrit.cli._options import add_device, add_rank, add_settings
-from lidargrit.cli._results import counted_scans
+from lidargrit.errors import counted_scans
 from lidargrit.untrusted import seed_number
 
 EXAMPLES = """\

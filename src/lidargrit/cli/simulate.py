@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from lidargrit.errors import counted_scans
 from lidargrit.untrusted import seed_number
 
 EXAMPLES = """\
@@ -56,4 +57,4 @@ def run(options: argparse.Namespace) -> None:
     )
     there = write_drives(options.out, options.num_scans, config, options.workers, TerminalReporter())
     theirs = f", with the sensor {options.sensor}" if options.sensor != _SENSOR else ""
-    print(f"{there} scans in {options.out}: read them as kitti_odometry:{options.out}{theirs}")
+    print(f"{counted_scans(there)} in {options.out}: read them as kitti_odometry:{options.out}{theirs}")

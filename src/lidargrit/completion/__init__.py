@@ -128,6 +128,7 @@ def open_completer(
     Raises:
         ConfigError: a run that cannot complete such scans, or one of another sensor than the named one.
     """
+    chosen = usable_device(device)  # refused whether or not anything is computed there
     if is_classical(word):
         if kind != "pixels":
             got = f"--model {word}, a classical method, which takes {KINDS['pixels']}"
@@ -139,7 +140,7 @@ def open_completer(
             raise ConfigError(got, "its name or .json file", "name it with --to (in Python: sensor=...)")
         return ClassicalCompleter(word, sensor)
     folder = locate(word)
-    generator = load(folder).to(usable_device(device))
+    generator = load(folder).to(chosen)
     if kind not in generator.conditions:
         takes = " or ".join(KINDS[one] for one in sorted(generator.conditions)) or "no condition at all"
         raise ConfigError(

@@ -142,10 +142,10 @@ def run(
         by_run.setdefault(plan.run, []).append(plan)
     _require_a_metric(benchmark.evaluation(), reporter)
     _warn_of_bounds(plans, reference, reporter)
-    _check_reference(reference, plans, benchmark, reporter)
     processes = min(processes, len(by_run))  # more would only take cores from one another
     remaining = _Remaining(list(systems), reporter)
     with claim_folder(folder):
+        _check_reference(reference, plans, benchmark, reporter)
         if processes == 1:
             for plan in chain.from_iterable(by_run.values()):
                 sampled = _finish([plan], folder, benchmark, reporter, reference)

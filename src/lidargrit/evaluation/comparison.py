@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from lidargrit import __version__
-from lidargrit.errors import ConfigError, LidarGritError, nearest_names
+from lidargrit.errors import ConfigError, LidarGritError, counted_scans, nearest_names
 from lidargrit.evaluation.intervals import Resampling, Score
 from lidargrit.evaluation.pairs import EvalPair, pair_for_protocol
 from lidargrit.evaluation.protocols import DEFAULT, MetricChoice, load_protocol, public_name
@@ -246,7 +246,7 @@ def _doubts(pair: EvalPair, scores: Sequence[Score], resampling: Resampling) -> 
     found = []
     count = len(pair.samples)
     if count < _FEW:
-        found.append(f"{count} scans in each set: too few for reliable scores and intervals")
+        found.append(f"{counted_scans(count)} in each set: too few for reliable scores and intervals")
     if resampling.halves and any(score.interval is None for score in scores):
         without = [score.result.metric for score in scores if score.interval is None]
         found.append(f"too few scans for the intervals of {', '.join(dict.fromkeys(without))}")

@@ -17,7 +17,7 @@ from lidargrit.completion import Completer
 from lidargrit.conditions import Condition
 from lidargrit.conditions.patterns import Pattern
 from lidargrit.determinism import derive_seed
-from lidargrit.errors import ConfigError, DataError, UsageError
+from lidargrit.errors import ConfigError, DataError, UsageError, counted_scans
 from lidargrit.evaluation.estimates import Estimate
 from lidargrit.loading import RangeImages
 from lidargrit.metrics import load_metric
@@ -104,7 +104,9 @@ def compare_completion(
     """
     reporter = reporter or Reporter()
     if not len(images) or completions < 1:
-        raise DataError(f"{len(images)} scans, {completions} completions", "at least 1 of both", "raise the number")
+        raise DataError(
+            f"{counted_scans(len(images))}, {completions} completions of each", "at least 1 of both", "raise the number"
+        )
     for completer in completers:
         _check(completer, images, reporter)
     whole = images.batch(range(len(images)))

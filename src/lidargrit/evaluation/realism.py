@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from lidargrit.errors import ConfigError, DataError
+from lidargrit.errors import ConfigError, DataError, counted_scans
 from lidargrit.loading import DataConfig, RangeImages
 from lidargrit.metrics import load_metric
+from lidargrit.projection import project, unproject
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel, load_sensor
 from lidargrit.simulator import Observation, observe
@@ -79,8 +80,7 @@ def compare(simulated: SimulatedScans, real: RangeImages, curves: Sequence[str] 
         ConfigError: the two look along different rays.
         DataError: fewer than two real scans.
     """
-    if len(real) < 2:
-        raise DataError(f"{len(real)} real scan", "at least 2: one half is compared with the other", "name more scans")
+    _require_two(real)
     if not simulated.clean.sensor.same_rays(real.sensor):
         got, wanted = simulated.clean.sensor.name, real.sensor.name
         raise ConfigError(f"simulated scans of {got!r}", f"the rays of {wanted!r}", "simulate the sensor of the scans")
@@ -102,6 +102,13 @@ def compare(simulated: SimulatedScans, real: RangeImages, curves: Sequence[str] 
             )
         )
     return scores
+
+
+def _require_two(real: RangeImages) -> None:
+    if len(real) < 2:
+        raise DataError(
+            counted_scans(len(real), "real"), "at least 2: one half is compared with the other", "name more scans"
+        )
 
 
 def drop_independently(clean: RangeImage, return_share: float, seed: int = 0) -> RangeImage:
@@ -139,25 +146,40 @@ def scans_of_both(
         reporter: receiver of the progress.
     """
     if count < 2 or seed < 0:
-        raise ConfigError(f"{count} scans from seed {seed}", "at least 2, and no negative seed", "correct the number")
+        got = f"{counted_scans(count)} from seed {seed}"
+        raise ConfigError(got, "at least 2, and no negative seed", "correct the number")
     config, reporter = config or DataConfig(), reporter or Reporter()
     scans = open_source(source, config.bad_points)
-    rays = config.imaged(load_sensor(sensor) if sensor else scans.sensor)
+    firing = load_sensor(sensor) if sensor else scans.sensor
+    rays = config.imaged(firing)
     rays = rays.fine() if fine else rays
-    real = scans.images(rays, replace(config, max_scans=count), reporter)
+    real = scans.images(rays, replace(config, max_scans=min(count, config.max_scans or count)), reporter)
+    _require_two(real)
     rays = real.sensor
     pairs = []
     with reporter.progress("simulating", count) as progress:
         for each in range(seed, seed + count):
-            pairs.append(simulate_pair(each, rays))
+            pairs.append(simulate_pair(each, rays, firing))
             progress.advance(1)
     clean, measured = (RangeImage.stack(list(images)) for images in zip(*pairs, strict=True))
     return SimulatedScans(clean, measured), real
 
 
-def simulate_pair(seed: int, sensor: SensorModel) -> tuple[RangeImage, RangeImage]:
-    """Simulate one scan and return both of its images: see :func:`pair_of`."""
-    return pair_of(observe(seed, sensor, kept_columns_only=True), sensor)
+def simulate_pair(seed: int, rays: SensorModel, firing: SensorModel | None = None) -> tuple[RangeImage, RangeImage]:
+    """Simulate one scan and return both of its images: see :func:`pair_of`.
+
+    Args:
+        seed: seed of the scan.
+        rays: rays of the images.
+        firing: sensor that fires. If it has other columns than ``rays``, all of its points are projected, so that the
+            nearest of several may fill a pixel, as in a real scan. If not given, it fires once for each pixel.
+    """
+    if firing is None or firing.fine().width == rays.fine().width:
+        return pair_of(observe(seed, rays, kept_columns_only=True), rays)
+    clean, measured = (
+        project(unproject(image), rays) for image in pair_of(observe(seed, firing.fine()), firing.fine())
+    )
+    return clean, measured
 
 
 def pair_of(seen: Observation, sensor: SensorModel) -> tuple[RangeImage, RangeImage]:

@@ -91,10 +91,8 @@ class ScanSettings:
         """
         words = [*settings, *(f"data.{name}={value}" for name, value in options.items() if value not in (None, ""))]
         owner, cure = "reading scans", "name one with data. before it, as data.projection=spherical"
-        data = override(cls(), words, owner, cure).data
+        data = override(cls(), words, owner, cure, ("data.train", "data.val", "sensor", "projection_variant")).data
         named = {setting_name(word.partition("=")[0]) for word in words}
-        if taken := {"data.train", "data.val", "sensor", "projection_variant"} & named:
-            raise ConfigError(f"the setting {min(taken)}", "a setting of reading scans", cure)
         variant = data.projection_variant if "data.projection_variant" in named else None
         return cls(data, data.sensor if "data.sensor" in named else "", variant)
 

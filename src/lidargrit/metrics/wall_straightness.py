@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
+from lidargrit.errors import ConfigError
 from lidargrit.metrics import ImageKind
 from lidargrit.metrics._curves import ONE_SURFACE, CurveMetric, Curves, compare_histograms, log_edges, middles
 from lidargrit.projection import points_of_pixels
@@ -40,6 +41,9 @@ class WallStraightness(CurveMetric):
 
     def count(self, images: RangeImage) -> Int64[np.ndarray, " bins"]:
         """Count the runs on upright surfaces in bins of their distance from a line."""
+        if images.sensor.width < _RUN:
+            got = f"range images of {images.sensor.width} columns for wall_straightness"
+            raise ConfigError(got, f"at least {_RUN}, the returns of a run", "choose other metrics")
         points_xyz_m = points_of_pixels(images).double()
         runs = unbroken_runs(images) & upright_runs(points_xyz_m, images.return_mask)
         off_m = distance_from_line(points_xyz_m[..., 0], points_xyz_m[..., 1])[runs]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from lidargrit.errors import ConfigError, DataError, OutputError
+from lidargrit.errors import ConfigError, DataError, OutputError, counted_scans
 from lidargrit.files import atomic_path, claim_folder, claimed_manifest, is_taken, read_json, write_json, write_text
 from lidargrit.formats.kitti_bin import KittiBin
 from lidargrit.processes import process_pool
@@ -89,7 +89,11 @@ def write_drives(
         DataError: a street of which no ray returns.
     """
     if num_scans < 1 or workers < 1:
-        raise ConfigError(f"{num_scans} scans by {workers} processes", "at least one of each", "correct it")
+        raise ConfigError(
+            f"{counted_scans(num_scans)} by {workers} process{'' if workers == 1 else 'es'}",
+            "at least one of each",
+            "correct it",
+        )
     with claim_folder(out), claimed_manifest(out / MANIFEST):
         _claim(out, config)
         missing = [scan for scan in range(num_scans) if not _label_file(out, config, scan).exists()]
