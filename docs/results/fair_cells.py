@@ -18,6 +18,7 @@ NAMES = {
     "r2dm_small.steps32": "R2DM, 32 steps",
     "r2flow_small.steps16": "R2Flow, 16 steps",
     "r2flow_reflow_small": "R2Flow, 1 step",
+    "lidargen_small": "LiDARGen",
     "lidm_small": "LiDM",
     "lidm_shared_small": "LiDM over LidarGRIT's tokens",
 }

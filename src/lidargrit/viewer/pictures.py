@@ -156,8 +156,8 @@ def _plot_row(figure: Figure, height: float, bottom: float, panel: _Panel, scale
         return figure.add_axes((left / _WIDTH, (bottom + up) / height, wide / _WIDTH, tall / height))
 
     # A revolution is 13 times as wide as the rows are high; rows are plotted about twice as tall, to be seen.
-    top, bottom = panel.elevation_deg
-    extent = (180.0, -180.0, bottom if bottom < top else top - 1, top)  # a single row has a height, too
+    highest, lowest = panel.elevation_deg
+    extent = (180.0, -180.0, min(lowest, highest - 1), highest)  # a single row has a height, too
     ranges = axes(0.75, 1.55, 9.9, 1.05)
     shown = np.ma.masked_where(~panel.return_mask, panel.range_m)
     colours, norm = scales.range_colours, scales.range_norm
