@@ -3,11 +3,14 @@
 import struct
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib as mpl
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from lidargrit.cli import main
 from lidargrit.errors import ConfigError, OutputError
@@ -41,6 +44,16 @@ def test_picture_of_two_groups(images, tmp_path):
     assert width == 1400
     assert 900 < height < 1300  # three rows: two real, one generated
     assert [p.name for p in (tmp_path / "new").iterdir()] == ["a.png"]
+    picture = np.asarray(Image.open(tmp_path / "new" / "a.png").convert("RGB"))
+    for row in np.array_split(picture[: int(0.9 * height)], 3):  # a noisy range image, its mask and its points
+        assert len(np.unique(row.reshape(-1, 3), axis=0)) > 100
+        assert (row < 250).any(axis=2).mean() > 0.4
+
+
+def test_an_image_of_one_row_has_a_height(images, tmp_path, recwarn):
+    sensor = replace(images.sensor, elevation_rad=images.sensor.elevation_rad[:1])
+    plot_comparison({"one": RangeImage(images.range_m[:1, :1], images.return_mask[:1, :1], sensor)}, tmp_path / "a.png")
+    assert not recwarn.list
 
 
 def test_other_sensors_labels_and_empty_images(images, tmp_path):
