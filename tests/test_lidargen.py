@@ -13,7 +13,7 @@ from lidargrit.conditions import Condition
 from lidargrit.errors import CheckpointError, ConfigError
 from lidargrit.generators.lidargen import LangevinSampling, LidarGen, LidarGenConfig, encode
 from lidargrit.nn.ncsn import InstanceNormPlus, Ncsn
-from lidargrit.nn.score_matching import langevin, pull_towards, score_matching_errors, sigma_table
+from lidargrit.nn.score_matching import langevin, noise_left, pull_towards, score_matching_errors, sigma_table
 from lidargrit.projection import project
 from lidargrit.recipes import load_recipe
 from lidargrit.sensors import load_sensor
@@ -202,6 +202,33 @@ def test_levels_steps_and_their_size_are_choices_and_are_counted():
         assert not torch.equal(generator.sample([0], replace(settings, **other)).range_m, first.range_m)
     one, two = (generator.cost(LangevinSampling(levels=levels, steps_each=1)).flops for levels in (2, 5))
     assert one == two / 2 > 0
+
+
+@pytest.mark.parametrize(("levels", "steps_each", "step_lr"), [(232, 5, 6.2e-6), (58, 3, 4e-5), (20, 2, 3e-4)])
+def test_noise_left_is_what_langevin_leaves(levels, steps_each, step_lr):
+    rng, sigmas = torch.Generator().manual_seed(0), sigma_table(50.0, 0.01, levels)
+
+    def direction(image, sigma):  # of a network that knows the clean image, which is 0
+        return -image / image.std() / sigma[0]
+
+    size = (1, 1, 64, 256)
+    start = 1e-3 * torch.randn(size, generator=rng)  # next to nothing, but with a direction
+    left = langevin(direction, start, lambda: torch.randn(size, generator=rng), sigmas, steps_each, step_lr)
+    found = abs(float(left.std()) / 0.01 + 1)  # the last pass removes one level's noise
+    assert found == pytest.approx(noise_left(sigmas, steps_each, step_lr), rel=0.03)
+
+
+def test_steps_grow_where_the_published_ones_would_leave_noise():
+    generator = made(reflectance=False)
+    for levels, steps_each, wanted in ((232, 5, 6.2e-6), (58, 3, 4e-5), (50, 1, 1.2e-4)):
+        sigmas, count, step_lr = generator._schedule(LangevinSampling(levels=levels, steps_each=steps_each))
+        assert (len(sigmas), count) == (levels, steps_each)
+        assert step_lr == pytest.approx(wanted, rel=1e-4)
+        assert noise_left(sigmas, steps_each, step_lr) <= noise_left(sigmas, steps_each, 6.2e-6)
+    small = sigma_table(50.0, 0.01, 58)
+    assert noise_left(small, 3, 6.2e-6) > 1000
+    assert noise_left(small, 3, 4e-5) < 1.4
+    assert generator._schedule(LangevinSampling(step_lr=1e-7))[2] == 1e-7
 
 
 def test_the_cost_of_a_pass_at_the_small_size_is_that_counted_in_the_program():

@@ -22,13 +22,22 @@ from lidargrit.nn.lidargen_checkpoint import read_lidargen_checkpoint
 from lidargrit.nn.ncsn import SIDE_AT_LEAST, Ncsn
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.reflectance import reflectance_of_returns
-from lidargrit.nn.score_matching import langevin, pull_towards, score_matching_errors, sigma_table
+from lidargrit.nn.score_matching import (
+    langevin,
+    noise_left,
+    pull_towards,
+    score_matching_errors,
+    sigma_table,
+    step_that_leaves_least,
+)
 from lidargrit.nn.size import numbers_of_file
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
 _LEVELS_AT_MOST = 100_000
 _STEPS_AT_MOST = 100_000
+_PUBLISHED_STEP = 6.2e-6
+_NOISE_LEFT_AT_MOST = 1.5  # over the last level's; the published levels and steps leave 1.18
 _NOTHING_M = 1e-4  # is added to every range, and is what a missing return is encoded as
 _WINDOWS_M = {"frd": (0.5, 63.0), "bev": (3.0, 70.0), "sensor": (0.0, math.inf)}
 
@@ -78,7 +87,10 @@ class LangevinSampling:
     Args:
         levels: number of noise levels; the model's own number if not given, 232 as published.
         steps_each: number of Langevin steps at each level; the model's own number if not given, 5 as published.
-        step_lr: size of a step at the last level; at the others it grows with the square of the noise.
+        step_lr: size of a step at the last level; at the others it grows with the square of the noise. If not given, it
+            is 6.2e-6, as published, where the levels and steps remove the noise by such steps, as the published ones
+            do, and else the size that leaves the least noise: with few levels and steps, samples by the published size
+            would be noise.
         raydrop: window of ranges in which a pixel is a return; the sensor's own limits hold besides. The program has no
             rule for its samples, but its scores have: ``frd`` is 0.5 to 63 m, as for its Fréchet distance, ``bev`` 3 to
             70 m, as for its scores from above, and ``sensor`` the sensor's limits alone.
@@ -87,13 +99,13 @@ class LangevinSampling:
 
     levels: int | None = None
     steps_each: int | None = None
-    step_lr: float = 6.2e-6
+    step_lr: float | None = None
     raydrop: Literal["frd", "bev", "sensor"] = "frd"
     pull: float = 1.0
 
     def __post_init__(self) -> None:
         _check_counts(2 if self.levels is None else self.levels, 1 if self.steps_each is None else self.steps_each)
-        if not 0 < self.step_lr < 1:
+        if self.step_lr is not None and not 0 < self.step_lr < 1:
             raise ConfigError(f"step_lr={self.step_lr}", "a number between 0 and 1", "6.2e-6 is published")
         if not 0 < self.pull <= 1:
             raise ConfigError(f"pull={self.pull}", "above 0, at most 1", "1 is published")
@@ -157,22 +169,20 @@ class LidarGen(Generator[LidarGenConfig, LangevinSampling]):
 
     def _sample(self, seeds: Sequence[int], sampling: LangevinSampling) -> RangeImage:
         noise = SeededNoise(seeds, self.shape, self.device)
-        levels, steps_each = self._counts(sampling)
-        images = langevin(self.network, noise.uniform(), noise, levels, steps_each, sampling.step_lr)
+        images = langevin(self.network, noise.uniform(), noise, *self._schedule(sampling))
         return self._decoded(images, sampling)
 
     def _complete(self, condition: Condition, seeds: Sequence[int], sampling: LangevinSampling) -> RangeImage:
         """Generate scans that agree with the observed pixels, as the paper densifies sparse scans."""
         noise = SeededNoise(seeds, self.shape, self.device)
-        levels, steps_each = self._counts(sampling)
         observed, images = condition.return_observed[:, None], condition.images
         pull = pull_towards(observed, encode(images, self.config), sampling.pull)
-        generated = langevin(self.network, noise.uniform(), noise, levels, steps_each, sampling.step_lr, pull)
+        generated = langevin(self.network, noise.uniform(), noise, *self._schedule(sampling), pull)
         return self._decoded(generated, sampling)
 
     def cost(self, sampling: LangevinSampling | None = None) -> Cost:
         """Return the network's passes: one a step, and one that removes the noise of the last level."""
-        levels, steps_each = self._counts(sampling or LangevinSampling())
+        levels, steps_each, _ = self._schedule(sampling or LangevinSampling())
         passes = len(levels) * steps_each + 1
         return Cost(passes, passes * flops_of(self.network, (1, *self.shape), (1,)))
 
@@ -208,11 +218,16 @@ class LidarGen(Generator[LidarGenConfig, LangevinSampling]):
         load_exactly(generator, {f"network.{name}": tensor for name, tensor in read.weights.items()}, path)
         return generator.eval()
 
-    def _counts(self, sampling: LangevinSampling) -> tuple[Float[Tensor, "levels"], int]:
-        """Return the noise levels and the number of steps at each."""
+    def _schedule(self, sampling: LangevinSampling) -> tuple[Float[Tensor, "levels"], int, float]:
+        """Return the noise levels, the number of steps at each, and the size of a step at the last."""
         levels = self.config.levels if sampling.levels is None else sampling.levels
         steps_each = self.config.steps_each if sampling.steps_each is None else sampling.steps_each
-        return sigma_table(self.config.sigma_largest, self.config.sigma_smallest, levels), steps_each
+        sigmas = sigma_table(self.config.sigma_largest, self.config.sigma_smallest, levels)
+        step_lr = sampling.step_lr
+        if step_lr is None:
+            suits = noise_left(sigmas, steps_each, _PUBLISHED_STEP) < _NOISE_LEFT_AT_MOST
+            step_lr = _PUBLISHED_STEP if suits else step_that_leaves_least(sigmas, steps_each)
+        return sigmas, steps_each, step_lr
 
     def _decoded(self, images: Float[Tensor, "B C H W"], sampling: LangevinSampling) -> RangeImage:
         values = images.clamp(0, 1)

@@ -76,6 +76,30 @@ def langevin(
     return image + pull(image)
 
 
+def noise_left(sigmas: Float[Tensor, "levels"], steps_each: int, step_lr: float) -> float:
+    """Return the standard deviation of the noise that :func:`langevin` ends with, over that of the last level.
+
+    It is computed for a network that knows all noise of an image and answers, as NCSNv2 does, with its direction alone.
+    Where levels fall faster than steps remove noise, the noise of the images stays behind and is never removed.
+
+    Args:
+        sigmas: noise levels, the largest first.
+        steps_each: number of steps at each level.
+        step_lr: size of a step at the last level.
+    """
+    share, left = step_lr / float(sigmas[-1]) ** 2, 0.0
+    for sigma in sigmas.tolist():
+        for _ in range(steps_each):
+            left = math.hypot(left - share * sigma, math.sqrt(2 * share) * sigma)
+    return left / float(sigmas[-1])
+
+
+def step_that_leaves_least(sigmas: Float[Tensor, "levels"], steps_each: int) -> float:
+    """Return the size of a step, in tenths of the last level's variance, by which the least noise is left."""
+    sizes = [share / 10 * float(sigmas[-1]) ** 2 for share in range(1, 21)]
+    return min(sizes, key=lambda step_lr: noise_left(sigmas, steps_each, step_lr))
+
+
 def pull_towards(
     observed: Bool[Tensor, "B 1 H W"], reference: Float[Tensor, "B C H W"], strength: float
 ) -> Callable[[Float[Tensor, "B C H W"]], Float[Tensor, "B C H W"]]:

@@ -1,6 +1,7 @@
 """LiDARGen at a size that two CPU cores can train in an hour, on simulated or on your own scans.
 
 It is sampled with 58 levels of 3 steps, 175 passes of the network; ``levels=232 steps_each=5`` are the paper's 1,161.
+Steps of the published size would leave nothing but noise at so few levels, so they are larger by default.
 The largest noise, 50 as published, is above the largest distance between two of 24 simulated scans of this size, 41.6,
 as Song and Ermon (2020) want it.
 """
