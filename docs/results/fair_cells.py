@@ -21,6 +21,7 @@ NAMES = {
     "lidargen_small": "LiDARGen",
     "lidm_small": "LiDM",
     "lidm_shared_small": "LiDM over LidarGRIT's tokens",
+    "lidm_shared_small.all_channels": "LiDM over LidarGRIT's tokens, noise in all channels",
 }
 """Systems that are trained, by the name of their file."""
 

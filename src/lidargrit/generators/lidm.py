@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from lidargrit.nn import latent_diffusion
 from lidargrit.nn.diffusion import SeededNoise
 from lidargrit.nn.encoding_cache import EncodingCache
 from lidargrit.nn.flops import flops_of
+from lidargrit.nn.latent_axes import LatentAxes
 from lidargrit.nn.latent_unet import LatentUnet, LatentUnetConfig
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.published import read_checkpoint
@@ -41,6 +43,8 @@ class LidmConfig:
         beta_last: variance of the noise that the last step adds.
         scale_latents: whether latents are divided by the standard deviation of the codebook's numbers before noise is
             added. LiDM takes its own latents as they are; those of another tokenizer may be of any size.
+        latent_axes: number of principal axes of the codebook along which noise is added and removed, each divided by
+            its own standard deviation; 0 takes the channels of the latents as they are.
     """
 
     tokenizer: TokenizerConfig = field(default_factory=CurveVqvaeConfig)
@@ -48,6 +52,7 @@ class LidmConfig:
     beta_first: float = 0.0015
     beta_last: float = 0.0195
     scale_latents: bool = False
+    latent_axes: int = 0
 
     def __post_init__(self) -> None:
         latent_diffusion.signal_shares(self.beta_first, self.beta_last)
@@ -106,7 +111,12 @@ class Lidm(Generator[LidmConfig, LidmSampling]):
                 f"a tokenizer {config.tokenizer.name()!r} for lidm", "one with a codebook", "e.g. curve_vqvae or vqvae"
             )
         self.tokenizer = tokenizer
-        self.latent_shape = (tokenizer.quantize.embedding.embedding_dim, *tokenizer.grid_size)
+        code_dim, axes = tokenizer.quantize.embedding.embedding_dim, config.latent_axes
+        if not 0 <= axes <= code_dim or (axes and config.scale_latents):
+            got = f"latent_axes={axes}, scale_latents={config.scale_latents} for latents of {code_dim} channels"
+            raise ConfigError(got, "0 to as many axes, and one of the two", "correct them")
+        self.axes = LatentAxes(code_dim, axes) if axes else None
+        self.latent_shape = (axes or code_dim, *tokenizer.grid_size)
         self.denoiser = LatentUnet(config.denoiser, self.latent_shape[0], tokenizer.grid_size)
         self.register_buffer("latent_scale", torch.ones(()))
 
@@ -131,13 +141,18 @@ class Lidm(Generator[LidmConfig, LidmSampling]):
         if stage == "tokenizer":
             return self.tokenizer
         scale = self.tokenizer.quantize.spread() if self.config.scale_latents else self.latent_scale
-        return LatentDenoising(self.tokenizer, self.denoiser, scale, self._shares())
+        axes = copy.deepcopy(self.axes)
+        if axes is not None:
+            axes.fit(self.tokenizer.quantize.embedding.weight, self.tokenizer.quantize.share())
+        return LatentDenoising(self.tokenizer, self.denoiser, scale, self._shares(), axes)
 
     def load_stage(self, stage: str, objective: Objective) -> None:
         """Take over a stage's trained weights."""
         if isinstance(objective, LatentDenoising):
             self.denoiser.load_state_dict(objective.denoiser.state_dict())
             self.latent_scale.copy_(objective.latent_scale)
+            if self.axes is not None and objective.axes is not None:
+                self.axes.load_state_dict(objective.axes.state_dict())
         else:
             self.tokenizer.load_state_dict(objective.state_dict())
 
@@ -152,7 +167,8 @@ class Lidm(Generator[LidmConfig, LidmSampling]):
     def _sample(self, seeds: Sequence[int], sampling: LidmSampling) -> RangeImage:
         noise = SeededNoise(seeds, self.latent_shape, self.device)
         latents = latent_diffusion.ddim(self.denoiser, noise, self._shares(), sampling.steps, sampling.eta)
-        return self.tokenizer.sample(self.tokenizer.quantised(latents * self.latent_scale), noise.rngs, sampling.mask)
+        latents = latents * self.latent_scale if self.axes is None else self.axes.latents(latents)
+        return self.tokenizer.sample(self.tokenizer.quantised(latents), noise.rngs, sampling.mask)
 
     def cost(self, sampling: LidmSampling | None = None) -> Cost:
         """Return the denoiser's passes, one a step, and one of the decoder."""
@@ -203,16 +219,18 @@ class LatentDenoising(Objective):
         denoiser: LatentUnet,
         latent_scale: Float[Tensor, ""],
         shares: Float[Tensor, "1000"],
+        axes: LatentAxes | None = None,
     ) -> None:
         super().__init__(tokenizer.sensor)
         self.denoiser = denoiser
         self._latents = EncodingCache(tokenizer, _latents)
-        self._shares = shares
+        self._shares, self.axes = shares, axes
         self.register_buffer("latent_scale", latent_scale.clone())
 
     def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the mean squared error as ``loss``, and the standard deviation of the scaled latents beside it."""
-        clean = self._latents(images) / self.latent_scale
+        latents = self._latents(images)
+        clean = latents / self.latent_scale if self.axes is None else self.axes(latents)
         step = torch.randint(latent_diffusion.TIME_STEPS, (len(clean),), generator=rng, device=clean.device)
         noise = torch.randn(clean.shape, generator=rng, device=clean.device)
         noisy = latent_diffusion.noised(clean, self._shares.to(clean.device)[step], noise)

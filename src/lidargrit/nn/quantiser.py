@@ -93,13 +93,18 @@ class VectorQuantiser(nn.Module):
         return float((self.usage > self._dead_below()).float().mean())
 
     @torch.no_grad()
+    def share(self) -> Float[Tensor, "K"]:
+        """Return how often each code is used; before any training, all alike."""
+        share = self.usage / self.usage.sum().clamp(min=1e-9)
+        return torch.where(share.any(), share, 1 / len(share))
+
+    @torch.no_grad()
     def spread(self) -> Float[Tensor, ""]:
         """Return the standard deviation of the numbers in codes, each as often as its code is used.
 
         Before any training, all codes count alike.
         """
-        codes, share = self.embedding.weight, self.usage / self.usage.sum().clamp(min=1e-9)
-        share = torch.where(share.any(), share, 1 / len(codes))
+        codes, share = self.embedding.weight, self.share()
         means = [(share[:, None] * power).sum() / codes.shape[1] for power in (codes, codes.square())]
         return (means[1] - means[0].square()).sqrt()
 
