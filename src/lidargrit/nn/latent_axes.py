@@ -12,8 +12,8 @@ _LEAST_SHARE = 1e-3  # of the largest variance: axes along which codes do not di
 class LatentAxes(nn.Module):
     """The axes along which the codes of a codebook differ most, each in its own standard deviation.
 
-    Codes may differ along a few of their axes only; noise of one size in all channels then hides little of what they say,
-    and most of a network's loss is spent on channels that say nothing.
+    Codes may differ along a few of their axes only; noise of one size in all channels then hides little of what they
+    say, and most of a network's loss is spent on channels that say nothing.
 
     Args:
         code_dim: number of channels of a latent.
