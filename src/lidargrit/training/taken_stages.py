@@ -133,9 +133,8 @@ class _Stage:
         own = {key.removeprefix(f"{name}."): value for key, value in settings.items() if key.startswith(f"{name}.")}
         self.prefix = f"model.{name}" if own else "model"
         others = {key: value for key, value in settings.items() if key.partition(".")[0] not in generator.stages}
-        self.settings = own or others
-        if name == "tokenizer":
-            self.settings["name"] = generator.get_tokenizer().config.name()
+        kind = {"name": generator.get_tokenizer().config.name()} if name == "tokenizer" else {}
+        self.settings = {**kind, **(own or others)}  # the kind comes first: what differs first is told
 
 
 def _check_base(recipe: Recipe, stage: _Stage) -> None:
