@@ -11,6 +11,7 @@ import torch
 
 from lidargrit import formats
 from lidargrit.cli import main
+from lidargrit.completion import open_completer, open_completers
 from lidargrit.completion.inputs import ScanReader, open_inputs
 from lidargrit.conditions import Condition
 from lidargrit.conditions.fills import FILLS, fill
@@ -333,3 +334,13 @@ def test_mistakes_are_told_in_one_line_and_nothing_is_written(words, message, fo
     assert error.count("\n") == 1
     assert message.split("; ")[0].replace(".*", "").split(" in ")[0] in error
     assert not (tmp_path / "out").exists()
+
+
+def test_a_device_that_is_none_is_refused_for_methods_that_compute_on_none():
+    assert open_completers(["nearest"], SENSOR)[0].sensor is SENSOR
+    for open_them in (
+        lambda: open_completers(["nearest"], SENSOR, "nope"),
+        lambda: open_completer("linear", "pixels", SENSOR, device="nope"),
+    ):
+        with pytest.raises(ConfigError, match="got device 'nope'"):
+            open_them()

@@ -128,8 +128,9 @@ def open_completer(
     Raises:
         ConfigError: a run that cannot complete such scans, or one of another sensor than the named one.
     """
-    chosen = usable_device(device)  # refused whether or not anything is computed there
     if is_classical(word):
+        if device:  # a typing error is refused, although nothing is computed there
+            usable_device(device)
         if kind != "pixels":
             got = f"--model {word}, a classical method, which takes {KINDS['pixels']}"
             raise ConfigError(got, f"a run that takes {KINDS[kind]}", "name one, such as pretrained")
@@ -140,7 +141,7 @@ def open_completer(
             raise ConfigError(got, "its name or .json file", "name it with --to (in Python: sensor=...)")
         return ClassicalCompleter(word, sensor)
     folder = locate(word)
-    generator = load(folder).to(chosen)
+    generator = load(folder).to(usable_device(device))
     if kind not in generator.conditions:
         takes = " or ".join(KINDS[one] for one in sorted(generator.conditions)) or "no condition at all"
         raise ConfigError(
@@ -176,7 +177,7 @@ def open_completers(words: Sequence[str], sensor: SensorModel | None = None, dev
             runs[word] = open_completer(folder, "pixels", sensor, settings, device)
             runs[word].name = word
     own = next((run.sensor for run in runs.values()), sensor)
-    return [runs[word] if word in runs else open_completer(word, "pixels", own) for word in words]
+    return [runs[word] if word in runs else open_completer(word, "pixels", own, device=device) for word in words]
 
 
 def is_classical(word: str) -> bool:

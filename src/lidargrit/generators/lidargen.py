@@ -182,7 +182,7 @@ class LidarGen(Generator[LidarGenConfig, LangevinSampling]):
 
     def cost(self, sampling: LangevinSampling | None = None) -> Cost:
         """Return the network's passes: one a step, and one that removes the noise of the last level."""
-        levels, steps_each, _ = self._schedule(sampling or LangevinSampling())
+        levels, steps_each = self._counts(sampling or LangevinSampling())
         passes = len(levels) * steps_each + 1
         return Cost(passes, passes * flops_of(self.network, (1, *self.shape), (1,)))
 
@@ -218,12 +218,15 @@ class LidarGen(Generator[LidarGenConfig, LangevinSampling]):
         load_exactly(generator, {f"network.{name}": tensor for name, tensor in read.weights.items()}, path)
         return generator.eval()
 
-    def _schedule(self, sampling: LangevinSampling) -> tuple[Float[Tensor, "levels"], int, float]:
-        """Return the noise levels, the number of steps at each, and the size of a step at the last."""
+    def _counts(self, sampling: LangevinSampling) -> tuple[Float[Tensor, "levels"], int]:
+        """Return the noise levels and the number of steps at each."""
         levels = self.config.levels if sampling.levels is None else sampling.levels
         steps_each = self.config.steps_each if sampling.steps_each is None else sampling.steps_each
-        sigmas = sigma_table(self.config.sigma_largest, self.config.sigma_smallest, levels)
-        step_lr = sampling.step_lr
+        return sigma_table(self.config.sigma_largest, self.config.sigma_smallest, levels), steps_each
+
+    def _schedule(self, sampling: LangevinSampling) -> tuple[Float[Tensor, "levels"], int, float]:
+        """Return the noise levels, the number of steps at each, and the size of a step at the last."""
+        (sigmas, steps_each), step_lr = self._counts(sampling), sampling.step_lr
         if step_lr is None:
             suits = noise_left(sigmas, steps_each, _PUBLISHED_STEP) < _NOISE_LEFT_AT_MOST
             step_lr = _PUBLISHED_STEP if suits else step_that_leaves_least(sigmas, steps_each)
