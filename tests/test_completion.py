@@ -26,6 +26,7 @@ from lidargrit.generators.lidargrit import LidarGrit
 from lidargrit.loading import DataConfig
 from lidargrit.nn.pixel_networks import PixelDecoderConfig
 from lidargrit.projection import unproject
+from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel, load_sensor
 from lidargrit.simulator import simulate
 from lidargrit.sources import open_images
@@ -154,7 +155,7 @@ def test_an_image_whose_name_is_no_text_is_refused(tmp_path):
     with Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff.npy")).open("wb") as file:
         np.save(file, np.full((64, 32), 9, np.float32))
     with pytest.raises(DataError, match="which is not UTF-8"):
-        open_inputs(str(tmp_path), ScanReader(SENSOR), DataConfig())
+        open_inputs(str(tmp_path), ScanReader(SENSOR), DataConfig(), Reporter())
 
 
 def test_two_images_whose_names_differ_in_letters_alone_are_two_files(tmp_path, recwarn):

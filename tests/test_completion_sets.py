@@ -9,13 +9,14 @@ import torch
 
 from lidargrit.cli import main
 from lidargrit.completion.files import _suffix
-from lidargrit.completion.inputs import ScanReader
+from lidargrit.completion.inputs import ScanReader, open_inputs
 from lidargrit.completion.sparse import SparseReader
 from lidargrit.demo import divided
 from lidargrit.errors import OutputError
 from lidargrit.files import write_text
 from lidargrit.formats.numpy_array import NumpyArray
 from lidargrit.generators.lidargrit import LidarGrit
+from lidargrit.loading import DataConfig
 from lidargrit.nn.pixel_networks import PixelDecoderConfig
 from lidargrit.projection import unproject
 from lidargrit.reporting import Reporter
@@ -138,6 +139,20 @@ def test_a_sensor_that_fires_less_often_is_doubted():
     scan = unproject(wall(source, 0))
     assert "fires less often" in ScanReader(load_sensor("hdl64e_kitti_odometry")).read(scan).doubt
     assert ScanReader(source).read(scan).doubt == ""
+
+
+def test_a_doubt_about_the_sensor_is_told_once(tmp_path):
+    sensor, told = load_sensor("hdl64e_kitti_odometry"), []
+    for name in ("0.npz", "1.npz"):
+        NumpyArray.write(tmp_path / name, unproject(wall(sensor.with_columns(870), 0)))
+    reporter = Reporter()
+    reporter.message = told.append
+    inputs = open_inputs(str(tmp_path), ScanReader(sensor), DataConfig(), reporter)
+    assert inputs.read(0).doubt
+    assert inputs.read(1).doubt
+    assert len(told) == 1
+    assert told[0].startswith("WARNING: ")
+    assert "take a model of that one" in told[0]
 
 
 def test_a_format_of_another_sensor_is_not_taken():

@@ -95,14 +95,30 @@ def test_sources_with_colons_brackets_and_places_that_do_not_exist(bin_file, tmp
     bin_file(ROWS, "a:b[:50%]/000000.bin")
     for source in ("folder:{}", "{}", "folder:{}:all", "{}:all[:100%]", "{}:."):
         assert names_of(open_dataset(source.format(tmp_path / "a:b[:50%]"))) == ["000000"]
+    bin_file(ROWS, "at 12:30/drive/000000.bin")
+    assert names_of(open_dataset(f"{tmp_path / 'at 12:30'}:drive")) == ["drive/000000"]
+    monkeypatch.chdir(tmp_path)
+    assert names_of(open_dataset("at 12:30:drive")) == ["drive/000000"]
     (tmp_path / "empty").mkdir()
     with pytest.raises(DataError, match="nowhere, which does not exist; wanted the root of a data set"):
         open_dataset(str(tmp_path / "nowhere"))
     with pytest.raises(DataError, match="empty, which is an empty folder"):
         open_dataset(str(tmp_path / "empty"))
-    monkeypatch.chdir(tmp_path)
     bin_file(ROWS, "kitti_raw/000000.bin")
     assert names_of(open_dataset("kitti_raw")) == ["000000"], "a folder that is called as a data set is"
+
+
+def test_links_to_folders_are_followed_once_and_not_around(bin_file, tmp_path):
+    bin_file(ROWS, "disk/drive/000000.bin")
+    bin_file(ROWS, "disk/drive/more/000001.bin")
+    bin_file(ROWS, "mine/0.bin")
+    for name, target in (("a", "disk/drive"), ("b", "disk/drive"), ("loop", "mine"), ("up", "."), ("sub/top", "mine")):
+        (tmp_path / "mine" / name).parent.mkdir(exist_ok=True)
+        (tmp_path / "mine" / name).symlink_to(tmp_path / target)
+    assert names_of(open_dataset(str(tmp_path / "mine"))) == ["0", "a/000000", "a/more/000001"]
+    (tmp_path / "links").mkdir()
+    (tmp_path / "links" / "drive").symlink_to(tmp_path / "disk" / "drive")
+    assert names_of(open_dataset(str(tmp_path / "links"))) == ["drive/000000", "drive/more/000001"]
 
 
 def test_the_wish_to_drop_points_reaches_the_reader(bin_file):

@@ -4,6 +4,7 @@ import json
 import os
 import re
 import signal
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ import torch
 from lidargrit.cli import main
 from lidargrit.datasets import open_dataset
 from lidargrit.errors import ConfigError, DataError, OutputError, ScanError, UnknownNameError
-from lidargrit.export import MANIFEST, export_scans
+from lidargrit.export import MANIFEST, KittiTree, export_scans
 from lidargrit.formats import read_scan
 from lidargrit.loading import DataConfig, prepare
 from lidargrit.projection import unproject
@@ -149,6 +150,7 @@ def test_a_tree_keeps_the_numbers_of_a_tree_and_numbers_folders(streets, samples
     export_scans(f"folder:{tmp_path / 'drives'}", tmp_path / "tree", "kitti_odometry")
     tree = open_dataset(f"kitti_odometry:{tmp_path / 'tree'}")
     assert [tree.name(index) for index in range(len(tree))] == ["00/000000", "00/000001", "01/000000"]
+    assert KittiTree(tmp_path).files(["99/000000", "100/000007"])[1] == "sequences/100/velodyne/000007.bin"
     assert not list((tmp_path / "tree").rglob("labels")), "there are none"
 
 
@@ -218,6 +220,22 @@ def test_what_is_not_ours_is_left_alone(samples, tmp_path):
     with pytest.raises(OutputError, match=r"000000\.ply is another scan"):
         export_scans(str(tmp_path / "new"), out, "ply")
     assert (tmp_path / "000000.ply").read_bytes() == b"somebody's"
+
+
+@pytest.mark.parametrize("below", ["", "out", "a/b"])
+def test_a_folder_in_the_source_is_refused_where_its_scans_would_be_read_again(samples, streets, tmp_path, below):
+    drives = tmp_path / "drives"
+    export_scans(str(samples), drives, "ply")
+    (tmp_path / "link").symlink_to(drives)
+    for out in (drives / below, tmp_path / "link" / below):
+        with pytest.raises(OutputError, match=r"lies in .* would be read as further scans"):
+            export_scans(str(drives), out, "pcd")
+        run = ["complete", str(drives), str(out), "--observed", "rows:4", "--model", "nearest"]
+        assert main(run) == 2
+    assert len(open_dataset(str(drives))) == 2
+    tree = Path(streets.partition(":")[2])
+    export_scans(streets, tree / f"out_{below.replace('/', '_')}", "ply")  # its layout says where scans are
+    assert len(open_dataset(streets)) == 2
 
 
 def test_images_of_another_projection_are_exported_as_they_are(tmp_path, capsys):

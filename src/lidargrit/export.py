@@ -30,7 +30,7 @@ from lidargrit.untrusted import user_path
 MANIFEST = "export.json"
 TREE = "kitti_odometry"  # the data set that reads such a tree back
 IMAGE = "image"  # the word for range images as .npy, in place of a format
-_KITTI_NAME = re.compile(r"\d{2}/\d{6}")  # sequence and number
+_KITTI_NAME = re.compile(r"\d{2,}/\d{6}")  # sequence and number
 
 
 def export_scans(
@@ -62,13 +62,14 @@ def export_scans(
     Raises:
         UnknownNameError: no such format.
         ConfigError: a sensor for a source that has its own.
-        OutputError: the folder holds something else, or cannot be written.
+        OutputError: the folder holds something else, lies in the source, or cannot be written.
         DataError: no such source, or no usable scan in it.
         ScanError: a scan that cannot be used.
     """
     config, reporter = config or DataConfig(), reporter or Reporter()
     layout = KittiTree(out) if kind == TREE else _Flat(out, *writable_format(kind, TREE))
     scans, of_images = _open(source, config, sensor)
+    scans.check_output(out)
     files = layout.files([scans.name(index) for index in range(len(scans))])
     if twice := sorted(file for file, count in Counter(files).items() if count > 1):
         what = f"several scans of {source} that would be {twice[0]}"

@@ -43,15 +43,15 @@ def complete_scans(
         UsageError: all pixels are observed, or a mask of another size.
         ScanError: a scan that cannot be used, of another sensor, or without a return among the observed pixels.
     """
-    config = config or DataConfig()
+    config, reporter = config or DataConfig(), reporter or Reporter()
 
     def condition_of(scan: InputScan, seed: int) -> Condition:
         source = "a range image" if scan.points is None else scan.points.source
         return Condition.of_pixels(_batch(scan.image), pattern.mask(scan.image, seed, source)[None])
 
-    inputs = open_inputs(source, _reader(completer, pattern.partial), config)
+    inputs = open_inputs(source, _reader(completer, pattern.partial), config, reporter)
     facts = {"verb": "complete", "source": source, "observed": pattern.text}
-    return write_completions(inputs, out, completer, condition_of, output, facts, config, reporter or Reporter())
+    return write_completions(inputs, out, completer, condition_of, output, facts, config, reporter)
 
 
 def upsample_scans(
@@ -73,15 +73,15 @@ def upsample_scans(
         ConfigError: sensors whose rows hardly look the same ways.
         ScanError: a scan that cannot be used, or of another sensor.
     """
-    config = config or DataConfig()
+    config, reporter = config or DataConfig(), reporter or Reporter()
 
     def condition_of(scan: InputScan, seed: int) -> Condition:
         return Condition.of_pixels(_batch(scan.image), observed_rows(scan)[None])
 
     reader = SparseReader(completer.sensor, completer.projection_variant, source=scans_sensor)
-    inputs = open_inputs(source, reader, config)
+    inputs = open_inputs(source, reader, config, reporter)
     facts = {"verb": "upsample", "source": source, "scans_sensor": scans_sensor.to_json()}
-    return write_completions(inputs, out, completer, condition_of, output, facts, config, reporter or Reporter())
+    return write_completions(inputs, out, completer, condition_of, output, facts, config, reporter)
 
 
 def raydrop_scans(
@@ -98,14 +98,14 @@ def raydrop_scans(
         source, out, completer, output, config, reporter: the arguments of :func:`complete_scans`; the completer takes
             ranges of surfaces.
     """
-    config = config or DataConfig()
+    config, reporter = config or DataConfig(), reporter or Reporter()
 
     def condition_of(scan: InputScan, seed: int) -> Condition:
         return Condition.of_surfaces(_batch(scan.image))
 
-    inputs = open_inputs(source, _reader(completer, partial=False), config)
+    inputs = open_inputs(source, _reader(completer, partial=False), config, reporter)
     facts = {"verb": "raydrop", "source": source}
-    return write_completions(inputs, out, completer, condition_of, output, facts, config, reporter or Reporter())
+    return write_completions(inputs, out, completer, condition_of, output, facts, config, reporter)
 
 
 def _reader(completer: Completer, partial: bool) -> ScanReader:

@@ -97,10 +97,11 @@ def write_completions(
 
     Raises:
         ConfigError: several completions by what completes a scan in one way.
-        OutputError: the folder holds something else, or cannot be written.
+        OutputError: the folder holds something else, lies in the source, or cannot be written.
         ScanError: a scan that cannot be used.
         DataError: no usable scan.
     """
+    inputs.check_output(out)
     files = _files(inputs, output, completer.sensor)
     manifest = facts | _facts(completer, output) | {"scans": {file: inputs.name(at) for (at, _), file in files.items()}}
     left_out, labels_lost = set[int](), False
@@ -169,16 +170,13 @@ def _jobs(
     reporter: Reporter,
 ) -> Iterator[_Job]:
     """Read each scan of missing files once; note those that cannot be used in a set, or refuse them without one."""
-    last, scan, condition, doubted = -1, None, None, False
+    last, scan, condition = -1, None, None
     for index, turn in missing:
         if index != last:
             last, scan = index, None
             try:
                 scan = inputs.read(index)
                 condition = condition_of(scan, derive_seed(seed, inputs.number(index)))
-                if scan.doubt and not doubted:
-                    reporter.message(f"WARNING: {scan.doubt}")
-                    doubted = True
             except ScanError as error:
                 if skipped is None:
                     raise

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -77,10 +78,11 @@ class Inputs:
     Args:
         scans: scans of the source.
         reader: projection of points to range images.
+        reporter: receiver of the first doubt about the sensor of the scans.
     """
 
-    def __init__(self, scans: PointScans | ImageScans, reader: ScanReader) -> None:
-        self._scans, self._reader = scans, reader
+    def __init__(self, scans: PointScans | ImageScans, reader: ScanReader, reporter: Reporter) -> None:
+        self._scans, self._reader, self._reporter, self._doubted = scans, reader, reporter, False
 
     def __len__(self) -> int:
         return len(self._scans)
@@ -93,6 +95,10 @@ class Inputs:
         """Return its number in the source, whatever other scans are taken."""
         return self._scans.number(index)
 
+    def check_output(self, out: Path) -> None:
+        """Refuse a folder whose files would become scans of the source, with an OutputError."""
+        self._scans.check_output(out)
+
     def suffix(self, index: int) -> str:
         """Return the ending of its file; "" where it is not in a file of points."""
         path = self._scans.path(index)
@@ -104,14 +110,18 @@ class Inputs:
         return None if path is None or not formats.candidates(path) else formats.recognise(path)
 
     def read(self, index: int) -> InputScan:
-        """Read one scan.
+        """Read one scan, and warn once if another sensor than the reader's seems to have made it.
 
         Raises:
             ScanError: a scan that cannot be used, or of another sensor.
         """
         if isinstance(self._scans, ImageScans):
             return InputScan(self._scans.image(index))
-        return self._reader.read(self._scans.scan(index))
+        scan = self._reader.read(self._scans.scan(index))
+        if scan.doubt and not self._doubted:
+            self._reporter.message(f"WARNING: {scan.doubt}")
+            self._doubted = True
+        return scan
 
 
 @dataclass(frozen=True)
@@ -177,13 +187,14 @@ def images_for(completers: Sequence[Completer], source: str, settings: ScanSetti
     return open_images(source, data.imaged(completers[0].sensor), data, reporter)
 
 
-def open_inputs(source: str, reader: ScanReader, config: DataConfig) -> Inputs:
+def open_inputs(source: str, reader: ScanReader, config: DataConfig, reporter: Reporter) -> Inputs:
     """Open the scans that a user named.
 
     Args:
         source: a file, a folder or another source of scans, samples, prepared scans, or range images as ``.npy``.
         reader: projection of points to range images.
         config: number of scans, and what to do with unusable points.
+        reporter: receiver of a warning about scans that another sensor seems to have made.
 
     Raises:
         ConfigError: range images of other rays than the reader's sensor.
@@ -196,7 +207,7 @@ def open_inputs(source: str, reader: ScanReader, config: DataConfig) -> Inputs:
             f"images of the model's {wanted.height}x{wanted.width} of {wanted.name!r}, with the same rays",
             "name a model for such images with --model, or give the scans as points",
         )
-    return Inputs(scans, reader)
+    return Inputs(scans, reader, reporter)
 
 
 def sensor_of(source: str, name: str = "") -> SensorModel:

@@ -64,7 +64,8 @@ def compress_scans(
         ScanError: a scan that cannot be used.
     """
     codec = ScanCodec(load(model), step_mm)
-    inputs = open_inputs(source, ScanReader(codec.sensor, projection_variant(locate(model))), config)
+    reader = ScanReader(codec.sensor, projection_variant(locate(model)))
+    inputs = open_inputs(source, reader, config, reporter)
     chosen = {"source": source, "max_scans": config.max_scans}
     chosen |= {"bad_points": config.bad_points, "bad_scans": config.bad_scans}
     with writing(out, _header(codec, model), chosen) as writer:

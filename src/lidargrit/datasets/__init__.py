@@ -111,6 +111,10 @@ class ScanDataset(ABC):
         """Return the other files that a scan is read from, such as a calibration, where they are there."""
         return ()
 
+    def takes_files_in(self, folder: Path) -> bool:
+        """Return whether scans that are written to a folder would become scans of this data set."""
+        return False
+
     @classmethod
     def splits(cls) -> dict[str, tuple[str, ...]]:
         """Return the sequences of every named split: "train" of the first scheme, "SCHEME/train" of each."""
@@ -156,7 +160,7 @@ def open_dataset(source: str, bad_points: BadPoints = "refuse") -> ScanDataset:
     head, colon, rest = source.partition(":")
     if share and share.start() < len(head):  # the first colon is that of the share
         head, colon, rest = source[: share.start()], "", ""
-    is_path = "/" in head or _is_there(head) or _is_there(source)  # a name may have a colon, as a time of day has
+    is_path = "/" in head or any(map(_is_there, (head, source, source.rpartition(":")[0])))  # a name may have a colon
     if head in _discovery.names("datasets") and (colon or not is_path):
         if not rest:
             raise DataError(

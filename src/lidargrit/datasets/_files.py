@@ -214,7 +214,10 @@ def _is_scan_file(path: Path) -> bool:
 
 
 def scans_below(root: Path) -> Iterator[Path]:
-    """Find all files that are called like a scan, in no order, leaving out hidden ones and links to folders.
+    """Find all files that are called like a scan, in no order, leaving out hidden ones.
+
+    Links to folders are followed, once each, unless they lead to a folder that is already being searched or contains
+    one.
 
     Raises:
         DataError: a folder below that cannot be read, whose scans would be missing.
@@ -222,8 +225,15 @@ def scans_below(root: Path) -> Iterator[Path]:
     if root.is_file():
         yield from [root] if formats.candidates(root) else []
         return
-    for folder, below, names in os.walk(root, onerror=_refuse_folder):
-        below[:] = (name for name in below if not name.startswith("."))
+    here = root.resolve()
+    seen = {*here.parents}
+    for folder, below, names in os.walk(root, onerror=_refuse_folder, followlinks=True):
+        place = Path(folder).resolve()
+        if place in seen:  # a link to what another way leads to
+            below.clear()
+            continue
+        seen.add(place)
+        below[:] = sorted(name for name in below if not name.startswith("."))
         paths = (Path(folder, name) for name in names if not name.startswith("."))
         yield from (path for path in paths if formats.candidates(path))
 

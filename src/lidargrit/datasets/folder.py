@@ -30,6 +30,10 @@ class Folder(FileDataset):
         sensors = [one.sensor for one in formats.candidates(self.path(0)) if one.sensor]
         self.sensor = sensors[0] if sensors else type(self).sensor
 
+    def takes_files_in(self, folder: Path) -> bool:
+        """Return whether a folder is the root or lies below it, at whatever depth."""
+        return self.root.is_dir() and folder.resolve().is_relative_to(self.root.resolve())
+
     @classmethod
     def matches(cls, root: Path) -> bool:
         """Return whether a folder holds a file with the ending of a scan, or a single file has one."""

@@ -147,7 +147,8 @@ def _empty_between(has_points: Bool[np.ndarray, "H W"]) -> float:
 
 def told_doubt(source: str, sensor: SensorModel, doubt: str) -> str:
     """Return what a person reads of a doubt about the sensor of a source; "" without one."""
-    return f"{source}, imaged as {sensor.name}: {doubt}; name that sensor, {FIT_SENSOR}" if doubt else ""
+    cure = f"name that sensor, {FIT_SENSOR}; where a model decides the sensor, take a model of that one"
+    return f"{source}, imaged as {sensor.name}: {doubt}; {cure}" if doubt else ""
 
 
 def sensors_that_fit(scan: Scan) -> list[str]:

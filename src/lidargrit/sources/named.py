@@ -9,6 +9,7 @@ from pathlib import Path
 
 from lidargrit.datasets import ScanDataset
 from lidargrit.determinism import evenly_spaced
+from lidargrit.errors import OutputError
 from lidargrit.loading import DataConfig, RangeImages
 from lidargrit.projection import unproject
 from lidargrit.sensors import SensorModel
@@ -43,6 +44,14 @@ class NamedScans(ABC):
     def path(self, index: int) -> Path | None:
         """Return the file that holds the points of a scan; None where there is none."""
         return None
+
+    @abstractmethod
+    def check_output(self, out: Path) -> None:
+        """Refuse a folder whose files would become scans of the source.
+
+        Raises:
+            OutputError: the folder is the source, or lies in it.
+        """
 
 
 class PointScans(NamedScans):
@@ -79,6 +88,12 @@ class PointScans(NamedScans):
         """Return its file."""
         return self._dataset.path(self._indices[index])
 
+    def check_output(self, out: Path) -> None:
+        """Refuse a folder in which the data set would find the written files."""
+        if self._dataset.takes_files_in(out):
+            got = f"{out}, which lies in {self._dataset.root}: what is written there would be read as further scans"
+            raise OutputError(got, "a folder outside the source", "choose another folder")
+
 
 class ImageScans(NamedScans):
     """Range images as scans.
@@ -114,6 +129,9 @@ class ImageScans(NamedScans):
     def scan(self, index: int) -> Scan:
         """Return a point for each return."""
         return unproject(self.image(index))
+
+    def check_output(self, out: Path) -> None:
+        """Accept every folder: images are looked for in one folder alone, by names that are not written there."""
 
 
 def named_scans(source: Source, config: DataConfig, sensor: SensorModel | None = None) -> PointScans | ImageScans:
