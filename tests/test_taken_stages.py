@@ -184,3 +184,40 @@ def test_a_taken_network_keeps_the_scale_of_its_images(name):
     (stage,) = donor.stages
     generator.load_stage(stage, donor.objective(stage))
     assert float(generator.image.scale_m) == 37
+
+
+@pytest.mark.parametrize("setting", ["beta_last=0.1", "latent_axes=8", "latent_axes=2", "scale_latents=false"])
+def test_a_denoiser_is_compared_by_the_noise_and_the_latents_that_it_learned(tmp_path, setting):
+    small = ("model.tokenizer.channels=32", "model.denoiser.channels=32", "model.tokenizer.num_codes=16")
+    donor = load_recipe("lidm_small", small).build_generator()
+    donor.save(tmp_path)
+    changed = [*small, f"model.{setting}", f"stages_from={tmp_path}"]
+    changed += ["model.scale_latents=false"] if "axes" in setting else []
+    for further in ("fine_tune=[]", "fine_tune=[denoiser]"):
+        other = load_recipe("lidm_small", (*changed, further))
+        name = "scale_latents" if "axes" in setting else setting.partition("=")[0]
+        with pytest.raises(ConfigError, match=rf"denoiser is another \(model\.{name}=.*one of this recipe's model "):
+            taken_stages(other, other.build_generator())
+    anew = load_recipe("lidm_small", (*changed, "train_anew=[denoiser]"))
+    assert taken_stages(anew, anew.build_generator()).keys() == {"tokenizer"}
+
+
+def test_a_denoiser_that_is_trained_further_takes_the_scale_of_its_own_codebook():
+    small = ("model.tokenizer.channels=32", "model.denoiser.channels=32", "model.tokenizer.num_codes=16")
+    axes = ("model.scale_latents=false", "model.latent_axes=2")
+    for sets in (small, (*small, *axes)):
+        donor, generator = (load_recipe("lidm_small", sets).build_generator() for _ in range(2))
+        trained = donor.objective("denoiser")
+        generator.tokenizer.load_state_dict(donor.tokenizer.state_dict())
+        whole = generator.objective("denoiser").weights_from(trained)
+        assert whole.keys() == trained.state_dict().keys(), "of the same codebook all is taken"
+        with torch.no_grad():
+            generator.tokenizer.quantize.embedding.weight.mul_(50)
+        objective = generator.objective("denoiser")
+        weights = objective.weights_from(trained)
+        assert weights.keys() == {name for name in trained.state_dict() if name.startswith("denoiser.")}
+        objective.load_state_dict({**objective.state_dict(), **weights})
+        generator.load_stage("denoiser", objective)
+        own = generator.tokenizer.quantize.spread() if generator.axes is None else objective.axes.scale
+        assert torch.equal(generator.latent_scale if generator.axes is None else generator.axes.scale, own)
+        assert all(torch.equal(weight, generator.denoiser.state_dict()[name[9:]]) for name, weight in weights.items())

@@ -211,6 +211,7 @@ class LatentDenoising(Objective):
     """The objective: the squared error of the predicted noise in the latents of a frozen tokenizer, at random steps."""
 
     over = ("tokenizer",)
+    settings = ("beta_first", "beta_last", "scale_latents", "latent_axes")
     latent_scale: Tensor
 
     def __init__(
@@ -236,6 +237,16 @@ class LatentDenoising(Objective):
         noisy = latent_diffusion.noised(clean, self._shares.to(clean.device)[step], noise)
         error = (self.denoiser(noisy, step.float()).float() - noise).square().mean()
         return {"loss": error, "latent_std": clean.std()}
+
+    def weights_from(self, trained: Objective) -> dict[str, Tensor]:
+        """Return the weights of a trained denoiser, without the scale and the axes of another codebook."""
+        weights = super().weights_from(trained)
+        if isinstance(trained, LatentDenoising) and not torch.equal(self._codebook(), trained._codebook()):
+            return {name: weight for name, weight in weights.items() if name.startswith("denoiser.")}
+        return weights
+
+    def _codebook(self) -> Float[Tensor, "K D"]:
+        return self._latents.network(self.latent_scale.device).quantize.embedding.weight
 
 
 def _latents(tokenizer: CodebookTokenizer, images: RangeImage) -> Float[Tensor, "B D h w"]:

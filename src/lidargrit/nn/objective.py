@@ -35,6 +35,8 @@ class Objective(nn.Module, ABC):
     """Names of buffers that hold the angles of the sensor's rays: they are not taken over from another sensor."""
     additions: frozenset[str] = frozenset()
     """Settings of the stage that, if true, add weights; training may start from a stage that lacks them."""
+    settings: tuple[str, ...] = ()
+    """Settings of the generator that it learns by, beside those that begin with the name of the stage."""
     over: tuple[str, ...] = ()
     """Names of earlier stages whose networks compute what it learns from; it is of no use with other networks."""
     period: int = 1

@@ -135,6 +135,7 @@ class _Stage:
         others = {key: value for key, value in settings.items() if key.partition(".")[0] not in generator.stages}
         kind = {"name": generator.get_tokenizer().config.name()} if name == "tokenizer" else {}
         self.settings = {**kind, **(own or others)}  # the kind comes first: what differs first is told
+        self.of_generator = {key: settings[key] for key in self.objective.settings if key in settings}
 
 
 def _check_base(recipe: Recipe, stage: _Stage) -> None:
@@ -162,11 +163,16 @@ def _check(setting: str, mine: _Stage, given: _Stage, trained: bool = False) -> 
         added = {name for name in mine.objective.additions if ours.get(name) and not theirs.get(name)}
         differing = [name for name in differing if name not in added and not name.endswith("dropout")]
         same_sensor |= mine.shapes.items() >= _shapes(mine.objective.weights_from(given.objective)).items()
-    if differing or not same_sensor:
-        other = f"{mine.prefix}.{differing[0]}={theirs.get(differing[0])}" if differing else "data.sensor"
+    others = [f"{mine.prefix}.{name}={theirs.get(name)}" for name in differing]
+    others += [
+        f"model.{name}={given.of_generator.get(name)}"
+        for name, value in mine.of_generator.items()
+        if value != given.of_generator.get(name)
+    ]
+    if others or not same_sensor:
         raise ConfigError(
-            f"{setting}, whose {stage} is another ({other})",
-            f"one of this recipe's {mine.prefix} and sensor",
+            f"{setting}, whose {stage} is another ({[*others, 'data.sensor'][0]})",
+            f"one of this recipe's model{'' if mine.of_generator else mine.prefix.removeprefix('model')} and sensor",
             "set them as there, or choose another run",
         )
 
