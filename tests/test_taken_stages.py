@@ -8,12 +8,13 @@ import pytest
 import torch
 
 from lidargrit.errors import ConfigError
+from lidargrit.files import read_tensors
 from lidargrit.generators import load_class
 from lidargrit.generators.lidargrit import TokenSampling
 from lidargrit.generators.maskgit import MaskGitConfig
 from lidargrit.loading import DataConfig
 from lidargrit.recipes import load_recipe
-from lidargrit.training import FitConfig, plan_training, train
+from lidargrit.training import FitConfig, Recipe, plan_training, train
 from lidargrit.training.plan import check_stages
 from lidargrit.training.taken_stages import taken_stages
 from test_pixel_stage import PIXELS, SENSOR, TOKENIZER, TRANSFORMER, made, recipe_of
@@ -221,3 +222,59 @@ def test_a_denoiser_that_is_trained_further_takes_the_scale_of_its_own_codebook(
         own = generator.tokenizer.quantize.spread() if generator.axes is None else objective.axes.scale
         assert torch.equal(generator.latent_scale if generator.axes is None else generator.axes.scale, own)
         assert all(torch.equal(weight, generator.denoiser.state_dict()[name[9:]]) for name, weight in weights.items())
+
+
+def test_a_gan_that_is_trained_further_keeps_its_discriminator(tmp_path):
+    fit = FitConfig(scans=2, batch_size=2, learning_rate=1e-3, validation_scans=1)
+    data = DataConfig(train=("simulated:4:train",), val=("simulated:1:val",), columns=512, column_stride=8)
+    model = load_class("dusty").smallest_config(SENSOR)
+    recipe = Recipe("a test", "dusty", model, data, {"adversarial": fit})
+    train(recipe, tmp_path / "gan")
+    tuned = replace(recipe, stages_from=str(tmp_path / "gan"), fine_tune=("adversarial",))
+    taken = taken_stages(tuned, tuned.build_generator())["adversarial"].state_dict()
+    saved, _ = read_tensors(tmp_path / "gan" / "adversarial" / "checkpoint.safetensors")
+    of_discriminator = [name for name in taken if name.startswith("discriminator")]
+    assert of_discriminator
+    assert all(torch.equal(taken[name], saved[f"average.{name}"]) for name in taken)
+    (tmp_path / "gan" / "adversarial" / "checkpoint.safetensors").unlink()
+    with pytest.raises(ConfigError, match=r"fine_tune=adversarial without .*trained discriminator"):
+        check_stages(tuned)
+    assert not check_stages(replace(tuned, fine_tune=(), train_anew=("adversarial",))).donors
+
+
+def test_a_stage_whose_sizes_another_stage_decides_is_refused_before_any_training(tmp_path):
+    made().save(tmp_path)
+    recipe = recipe_of(None, stages_from=str(tmp_path))
+    recipe = replace(recipe, train_anew=("tokenizer",), fine_tune=("transformer",))
+    check_stages(recipe)
+    other = replace(recipe.model, tokenizer=replace(TOKENIZER, num_codes=TOKENIZER.num_codes // 2))
+    with pytest.raises(ConfigError, match=r"whose transformer is another \(\S+ of \d+"):
+        check_stages(replace(recipe, model=other))
+
+
+def test_plans_of_a_denoiser_that_is_trained_further_need_no_values(tmp_path):
+    small = ("model.tokenizer.channels=32", "model.denoiser.channels=32", "model.tokenizer.num_codes=16")
+    load_recipe("lidm_small", small).build_generator().save(tmp_path)
+    tuned = load_recipe("lidm_small", (*small, f"stages_from={tmp_path}", "fine_tune=[denoiser]"))
+    assert check_stages(tuned).donors.keys() == {"tokenizer"}
+
+
+def test_one_reflow_is_distilled_to_several_numbers_of_steps(tmp_path):
+    small = ("model.hdit.depths=[1,1]", "model.hdit.heads=[1,2]")
+    load_recipe("r2flow_reflow_small", (*small, "model.reflow.distilled_steps=4")).build_generator().save(tmp_path)
+    taken = (*small, f"stages_from={tmp_path}", "model.reflow.distilled_steps=2")
+    recipe = load_recipe("r2flow_reflow_small", (*taken, "train_anew=[distillation]"))
+    assert check_stages(recipe).donors.keys() == {"flow", "reflow"}
+    with pytest.raises(ConfigError, match=r"whose distillation is another \(model\.reflow\.distilled_steps=4\)"):
+        check_stages(load_recipe("r2flow_reflow_small", taken))
+
+
+def test_runs_that_are_no_donors(tmp_path):
+    made().save(tmp_path)
+    with pytest.raises(ConfigError, match="for 'multiscale', which has no tokenizer"):
+        check_stages(load_recipe("multiscale_small", (f"tokenizer_from={tmp_path}",)))
+    with pytest.raises(ConfigError, match=r"a run of 'r2dm'; choose another run$"):
+        check_stages(load_recipe("r2dm_small", (f"stages_from={tmp_path}",)))
+    nothing = load_recipe("small", ("stages_from=", "tokenizer_from="))
+    assert nothing.stages_from is None
+    assert nothing.tokenizer_from is None

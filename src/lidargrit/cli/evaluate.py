@@ -32,13 +32,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("-n", "--max-scans", type=int, default=0, help="largest number of scans of each; 0 for the protocol's")
     add("--intervals", type=int, default=20, metavar="B", help="number of half-samples for 95 %% intervals; 0 for none")
     add("--pixel-statistics", action="store_true", help="also score pixel statistics, which any model has to beat")
-    add("--groups", type=int, default=16, metavar="G", help="number of blocks that --intervals halves; odd: one fewer")
+    add("--groups", type=int, default=16, metavar="G", help="groups of scans in half-samples; odd: rounded down")
     add("--seed", type=seed_number, default=0, help="seed of all random choices")
     add("--device", default="cpu", help="device of networks: cpu, or cuda, which changes the last digits of scores")
     add_scans(parser)
     add("--report", type=Path, metavar="FILE.html", help="also write a page with scores and pictures")
     add_json(parser, "the files of --json and --report")
-    add("--tables", nargs="+", type=Path, metavar="JSON", help="only print these files of --json side by side")
+    add("--tables", nargs="+", type=Path, metavar="JSON", help="only print saved scores side by side")
     add("--format", choices=["text", "markdown", "latex"], default="text", help="format of the table")
 
 

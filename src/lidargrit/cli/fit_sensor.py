@@ -10,7 +10,8 @@ from lidargrit.cli._results import add_json, print_result, refuse_taken
 
 EXAMPLES = """\
   lidargrit fit-sensor /data/scans -o my_sensor.json --picture fit.png
-  lidargrit train small runs/mine --set data.train=/data/scans data.sensor=my_sensor.json
+  lidargrit train small runs/mine --set data.sensor=my_sensor.json data.columns=1024 data.column_stride=4 \\
+    data.train=/data/scans data.val=/data/held_out
 """
 
 
@@ -18,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
     parser.add_argument("source", help="folder, data set or file of scans that one sensor made")
     parser.add_argument("-o", "--out", type=Path, default=Path("my_sensor.json"), help="sensor file to write")
-    parser.add_argument("--picture", type=Path, metavar="PNG", help="also plot the evidence for and against the fit")
+    parser.add_argument("--picture", type=Path, metavar="PNG", help="also plot the fitted rows beside the points")
     some = "number of scans to fit, evenly spaced; 0 for all"
     parser.add_argument("-n", "--max-scans", type=int, default=20, help=some)
     parser.add_argument("--name", help="name of the sensor (default: the name of the sensor file)")

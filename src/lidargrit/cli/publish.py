@@ -7,7 +7,7 @@ from pathlib import Path
 
 EXAMPLES = """\
   lidargrit publish runs/mine to_share
-  lidargrit publish runs/mine to_share --scores scores.json        which lidargrit evaluate --json wrote
+  lidargrit publish runs/mine to_share --scores scores.json        scores written by: lidargrit evaluate --json
   lidargrit publish runs/mine to_share --notes failures.md --bits 8    a quarter of the size
 """
 

@@ -98,8 +98,7 @@ def write_completions(
     Raises:
         ConfigError: several completions by what completes a scan in one way.
         OutputError: the folder holds something else, lies in the source, or cannot be written.
-        ScanError: a scan that cannot be used.
-        DataError: no usable scan.
+        ScanError, DataError: a scan that cannot be used, or no usable one.
     """
     inputs.check_output(out)
     files = _files(inputs, output, completer.sensor)

@@ -1,4 +1,4 @@
-"""Seeds → scans that are computed in batches of one size, so that a seed gives the same scan in any company."""
+"""Seeds → scans that are computed in batches of one size, so that a scan depends on its seed alone."""
 
 from __future__ import annotations
 

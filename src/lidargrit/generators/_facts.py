@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 CAPABILITIES = {  # name → what a generator with it can do besides sampling, for messages
     "tokens": "turn scans into tokens and back",
-    "encode": "give scans back from a code of its own",
+    "encode": "encode scans and reconstruct them",
     "complete": "fill in the pixels of a scan that were not observed",
-    "invert": "search the scan nearest to a given one among those it can generate",
-    "likelihood": "tell how likely a scan is",
+    "invert": "invert a scan: search the latent whose scan is nearest to it",
+    "likelihood": "compute the likelihood of a scan",
 }
 
 

@@ -154,6 +154,7 @@ class PairMatching(Objective):
     ) -> None:
         super().__init__(sensor)
         self.network, self._count, self._distilled_steps = network, pairs, distilled_steps
+        self.settings = ("reflow.distilled_steps", "reflow.distilled_pairs") if distilled_steps else ()
         self._pairs = FlowPairs(network, sensor, solving)
 
     def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:

@@ -241,12 +241,15 @@ class LatentDenoising(Objective):
     def weights_from(self, trained: Objective) -> dict[str, Tensor]:
         """Return the weights of a trained denoiser, without the scale and the axes of another codebook."""
         weights = super().weights_from(trained)
-        if isinstance(trained, LatentDenoising) and not torch.equal(self._codebook(), trained._codebook()):
+        if isinstance(trained, LatentDenoising) and not self._has_codebook_of(trained):
             return {name: weight for name, weight in weights.items() if name.startswith("denoiser.")}
         return weights
 
-    def _codebook(self) -> Float[Tensor, "K D"]:
-        return self._latents.network(self.latent_scale.device).quantize.embedding.weight
+    def _has_codebook_of(self, other: LatentDenoising) -> bool:
+        own, others = (
+            one._latents.network(one.latent_scale.device).quantize.embedding.weight for one in (self, other)
+        )
+        return not own.is_meta and torch.equal(own.cpu(), others.cpu())  # without values where a training is planned
 
 
 def _latents(tokenizer: CodebookTokenizer, images: RangeImage) -> Float[Tensor, "B D h w"]:

@@ -1,4 +1,4 @@
-"""How many real clouds are the nearest to some generated one: two sets → a share of the real set."""
+"""Coverage (COV): the share of real clouds that are the nearest to some generated one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether a cloud's nearest neighbour tells which set it is from: two sets → the accuracy of that guess."""
+"""Accuracy of the nearest neighbour (1-NNA) at telling generated clouds from real ones; 0.5 is the best."""
 
 from __future__ import annotations
 

@@ -50,7 +50,8 @@ class UnetConfig:
         if min(*numbers, self.attention_heads) < 1 or len(self.channel_multipliers) != len(self.residual_blocks):
             raise ConfigError(
                 f"channels={self.channels}, channel_multipliers={self.channel_multipliers}, "
-                f"residual_blocks={self.residual_blocks}",
+                f"residual_blocks={self.residual_blocks}, norm_groups={self.norm_groups}, "
+                f"attention_heads={self.attention_heads}",
                 "positive numbers, as many residual_blocks as channel_multipliers",
                 "correct them",
             )

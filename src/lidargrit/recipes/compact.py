@@ -1,4 +1,4 @@
-"""LidarGRIT with an image an eighth as high and wide in tokens, trained on the simulator."""
+"""LidarGRIT with 8x32 tokens for an image of 64x256, trained on the simulator."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The pixel decoder of ``pretrained`` without tokens: what these are worth, and a codec that needs none."""
+"""A pixel decoder without tokens at 64x256, for compression and to measure what tokens contribute."""
 
 from dataclasses import replace
 

@@ -72,6 +72,16 @@ def load_checkpoint(
     return scans_seen
 
 
+def load_average(path: Path, objective: nn.Module) -> None:
+    """Load the averaged weights of a checkpoint, with all that a finished generator does not keep of its objective.
+
+    Raises:
+        CheckpointError: the file is damaged, or of another configuration.
+    """
+    kept = objective.state_dict()  # of what a file of an earlier version lacks
+    load_exactly(objective, {**kept, **_below(read_tensors(path)[0], "average.")}, path)
+
+
 def _optimiser_state(tensors: dict[str, Tensor], optimiser: torch.optim.Optimizer) -> dict[int, dict[str, Tensor]]:
     """Return the state of each weight by the weight's number.
 

@@ -120,6 +120,9 @@ class Recipe:
     fine_tune: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        for setting in ("tokenizer_from", "stages_from"):
+            if getattr(self, setting) == "":  # not the current folder
+                object.__setattr__(self, setting, None)
         if self.tokenizer_from is not None and self.stages_from is not None:
             raise ConfigError(
                 "tokenizer_from and stages_from together",

@@ -14,10 +14,11 @@ from lidargrit.errors import ConfigError
 from lidargrit.files import read_json
 from lidargrit.generators import Generator, load
 from lidargrit.nn.objective import Objective
-from lidargrit.run_folder import RUN_FILE, UNKNOWN_SCANS, is_run, locate, taken_over
+from lidargrit.run_folder import CHECKPOINT_FILE, RUN_FILE, UNKNOWN_SCANS, is_run, locate, taken_over
+from lidargrit.training.checkpoint import load_average
 from lidargrit.training.config import Recipe
 
-_OF_SAMPLING = ("range_temperature",)  # settings that no training reads
+_NOT_LEARNED = ("range_temperature", "distilled_steps", "distilled_pairs")  # of sampling, and of another stage
 
 
 def check_donor(recipe: Recipe) -> None:
@@ -86,6 +87,9 @@ def taken_stages(recipe: Recipe, generator: Generator) -> dict[str, Objective]:
         CheckpointError: no finished run.
     """
     if recipe.tokenizer_from is not None:
+        if "tokenizer" not in generator.stages:
+            got = f"tokenizer_from={recipe.tokenizer_from} for {generator.public_name()!r}, which has no tokenizer"
+            raise ConfigError(got, "a generator with one, such as lidargrit, maskgit or lidm", "leave it out")
         donor = load(Path(recipe.tokenizer_from))
         _check(f"tokenizer_from={recipe.tokenizer_from}", _Stage("tokenizer", generator), _Stage("tokenizer", donor))
         return {"tokenizer": donor.get_tokenizer()}
@@ -97,7 +101,8 @@ def taken_stages(recipe: Recipe, generator: Generator) -> dict[str, Objective]:
         raise ConfigError(
             f"stages_from={recipe.stages_from}, a run of the generator {donor.public_name()!r}",
             f"a run of {generator.public_name()!r}",
-            "choose another run, or set tokenizer_from to take its tokenizer alone",
+            "choose another run"
+            + (", or set tokenizer_from to take its tokenizer alone" if "tokenizer" in generator.stages else ""),
         )
     if unknown := sorted({*recipe.train_anew} - {*generator.stages}):
         raise ConfigError(f"train_anew={unknown[0]}", f"one of {', '.join(generator.stages)}", "name a stage")
@@ -111,6 +116,8 @@ def taken_stages(recipe: Recipe, generator: Generator) -> dict[str, Objective]:
         _check(f"stages_from={recipe.stages_from}", ours, theirs, name in recipe.fine_tune)
         if name not in recipe.fine_tune:
             _check_base(recipe, ours)
+        else:
+            _restore(recipe.stages_from, theirs)
         found[name] = theirs.objective
     return found
 
@@ -138,6 +145,23 @@ class _Stage:
         self.of_generator = {key: settings[key] for key in self.objective.settings if key in settings}
 
 
+def _restore(run: str, stage: _Stage) -> None:
+    """Give an objective what a finished generator does not keep of it, such as a discriminator, where the run has it.
+
+    Raises:
+        ConfigError: an adversarial stage without its checkpoint, whose discriminator would be an untrained one.
+    """
+    checkpoint = locate(run) / stage.name / CHECKPOINT_FILE
+    if checkpoint.is_file():
+        load_average(checkpoint, stage.objective)
+    elif stage.objective.players:
+        raise ConfigError(
+            f"fine_tune={stage.name} without {checkpoint}, which has the trained discriminator",
+            "the folder of the training with its checkpoints",
+            f"name that folder, or set train_anew={stage.name}",
+        )
+
+
 def _check_base(recipe: Recipe, stage: _Stage) -> None:
     """Refuse a stage taken as it is whose training rested on networks that are to be trained."""
     trained = {"train_anew": recipe.train_anew, "fine_tune": recipe.fine_tune}
@@ -157,18 +181,26 @@ def _check(setting: str, mine: _Stage, given: _Stage, trained: bool = False) -> 
     another dropout, and may be of another sensor if its weights fit this one.
     """
     stage, ours, theirs = mine.name, mine.settings, given.settings
-    differing = [name for name in ours if name not in _OF_SAMPLING and ours[name] != theirs.get(name)]
+    differing = [name for name in ours if name not in _NOT_LEARNED and ours[name] != theirs.get(name)]
     same_sensor = mine.objective.sensor.same_rays(given.objective.sensor)
+    given_shapes = given.shapes
     if trained:
         added = {name for name in mine.objective.additions if ours.get(name) and not theirs.get(name)}
         differing = [name for name in differing if name not in added and not name.endswith("dropout")]
-        same_sensor |= mine.shapes.items() >= _shapes(mine.objective.weights_from(given.objective)).items()
+        given_shapes = _shapes(mine.objective.weights_from(given.objective))
+        same_sensor |= mine.shapes.items() >= given_shapes.items()
     others = [f"{mine.prefix}.{name}={theirs.get(name)}" for name in differing]
     others += [
         f"model.{name}={given.of_generator.get(name)}"
         for name, value in mine.of_generator.items()
         if value != given.of_generator.get(name)
     ]
+    if same_sensor:  # sizes that settings of other stages decide, such as the number of codes
+        others += [
+            f"{name} of {'x'.join(map(str, shape))}"
+            for name, shape in given_shapes.items()
+            if mine.shapes.get(name, shape) != shape
+        ]
     if others or not same_sensor:
         raise ConfigError(
             f"{setting}, whose {stage} is another ({[*others, 'data.sensor'][0]})",

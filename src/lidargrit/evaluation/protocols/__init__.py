@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from lidargrit import _discovery
-from lidargrit.errors import UnknownNameError, nearest_names
+from lidargrit.errors import UnknownNameError, one_of
 from lidargrit.projection import ProjectionVariant
 from lidargrit.sensors import SensorModel, load_sensor
 
@@ -86,7 +86,7 @@ def load_protocol(name: str) -> Protocol:
     """
     name, known = public_name(name), _discovery.names("evaluation.protocols")
     if name not in known:
-        raise UnknownNameError(f"the protocol {name!r}", f"one of {nearest_names(name, known, 6)}", "choose one")
+        raise UnknownNameError(f"the protocol {name!r}", f"one of {one_of(sorted(known))}", "choose one")
     return _discovery.load_instance("evaluation.protocols", name, Protocol)
 
 
