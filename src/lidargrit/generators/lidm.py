@@ -246,9 +246,7 @@ class LatentDenoising(Objective):
         return weights
 
     def _has_codebook_of(self, other: LatentDenoising) -> bool:
-        own, others = (
-            one._latents.network(one.latent_scale.device).quantize.embedding.weight for one in (self, other)
-        )
+        own, others = (one._latents.network(one.latent_scale.device).quantize.embedding.weight for one in (self, other))
         return not own.is_meta and torch.equal(own.cpu(), others.cpu())  # without values where a training is planned
 
 
