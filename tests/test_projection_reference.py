@@ -34,8 +34,16 @@ def test_reference_index_map_is_the_programs(golden, shared, name, method, key):
     ours, theirs = index_map(scan, sensor, method, "reference"), golden(name)[key]
     range_m = np.linalg.norm(scan.points_xyz_m.numpy(), axis=1)
     same = (ours == theirs) | ((ours >= 0) & (theirs >= 0) & (range_m[ours] == range_m[theirs]))  # ties may swap
-    # The hand-made points sit on the borders of cells, where the last bit of the arc functions decides.
-    assert (~same).sum() <= (4 if name == "projection_corner" else 0)
+    # On the border of a cell the last bit of the arc functions decides, which differs from processor to processor.
+    assert (~same).sum() <= 4
+    x, y, _ = scan.points_xyz_m.double().numpy().T
+    exact_column = 2048 * (-np.arctan2(y, x) / np.pi + 1) / 2
+    to_border = np.abs(exact_column % 1 - 0.5)
+    if name != "projection_corner":  # whose hand-made points sit on the borders of rows, too
+        nearest = [
+            to_border[[at for at in pair if at >= 0]].min() for pair in zip(ours[~same], theirs[~same], strict=True)
+        ]
+        assert max(nearest, default=0) < 3e-4
 
 
 @pytest.mark.shared

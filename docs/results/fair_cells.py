@@ -20,6 +20,7 @@ NAMES = {
     "r2flow_reflow_small": "R2Flow, 1 step",
     "lidargen_small": "LiDARGen",
     "lidm_small": "LiDM",
+    "lidm_small.latent_axes2": "LiDM, noise along two axes of its codes",
     "lidm_shared_small": "LiDM over LidarGRIT's tokens",
     "lidm_shared_small.all_channels": "LiDM over LidarGRIT's tokens, noise in all channels",
 }

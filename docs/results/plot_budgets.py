@@ -22,7 +22,7 @@ from matplotlib.ticker import LogLocator
 from PIL import Image
 
 METRICS = ("sliced_wasserstein", "point_cloud_jsd", "range_histogram_per_ring", "return_rate_per_ring")
-MARKERS = "osD^v8<>PX*hdpH1x"
+MARKERS = "osD^v8<>PX*hdpH12x"
 COLOURS = colormaps["tab20"].colors[: len(MARKERS)]  # one for each name
 
 
