@@ -98,7 +98,8 @@ def test_sources_with_colons_brackets_and_places_that_do_not_exist(bin_file, tmp
     bin_file(ROWS, "at 12:30/drive/000000.bin")
     assert names_of(open_dataset(f"{tmp_path / 'at 12:30'}:drive")) == ["drive/000000"]
     monkeypatch.chdir(tmp_path)
-    assert names_of(open_dataset("at 12:30:drive")) == ["drive/000000"]
+    for split in ("drive", "drive[:100%]", "all[:100%]"):
+        assert names_of(open_dataset(f"at 12:30:{split}")) == ["drive/000000"]
     (tmp_path / "empty").mkdir()
     with pytest.raises(DataError, match="nowhere, which does not exist; wanted the root of a data set"):
         open_dataset(str(tmp_path / "nowhere"))

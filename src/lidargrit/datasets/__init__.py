@@ -160,7 +160,8 @@ def open_dataset(source: str, bad_points: BadPoints = "refuse") -> ScanDataset:
     head, colon, rest = source.partition(":")
     if share and share.start() < len(head):  # the first colon is that of the share
         head, colon, rest = source[: share.start()], "", ""
-    is_path = "/" in head or any(map(_is_there, (head, source, source.rpartition(":")[0])))  # a name may have a colon
+    root, split = _root_and_split(source)
+    is_path = "/" in head or _is_there(head) or (head != "" and root.exists())  # a name may have a colon
     if head in _discovery.names("datasets") and (colon or not is_path):
         if not rest:
             raise DataError(
@@ -172,7 +173,6 @@ def open_dataset(source: str, bad_points: BadPoints = "refuse") -> ScanDataset:
         return load(head)(root, split, bad_points)
     if colon and not is_path:
         load(head)  # raises: no such name
-    root, split = _root_and_split(source)
     name = recognise(root)
     if name is None:
         cure = "check the path, or see the layouts with: lidargrit list datasets"

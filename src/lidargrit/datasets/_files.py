@@ -225,8 +225,7 @@ def scans_below(root: Path) -> Iterator[Path]:
     if root.is_file():
         yield from [root] if formats.candidates(root) else []
         return
-    here = root.resolve()
-    seen = {*here.parents}
+    seen = {*root.resolve().parents}
     for folder, below, names in os.walk(root, onerror=_refuse_folder, followlinks=True):
         place = Path(folder).resolve()
         if place in seen:  # a link to what another way leads to

@@ -128,7 +128,7 @@ def _learn_alike(generator: Generator, donor: Generator, stages: Sequence[str]) 
 
 
 class _Stage:
-    """A stage of a generator: its name, its objective, the settings of its networks, and what their names begin with.
+    """A stage of a generator: its name, its objective, the settings that it learns by, and what their names begin with.
 
     Where no setting has the stage's name, its settings are all that have no other stage's.
     """
@@ -137,12 +137,13 @@ class _Stage:
         self.name, self.objective = name, generator.objective(name)
         self.shapes = _shapes(self.objective.state_dict())
         settings = configuration.leaves(configuration.to_json(generator.config))
-        own = {key.removeprefix(f"{name}."): value for key, value in settings.items() if key.startswith(f"{name}.")}
-        self.prefix = f"model.{name}" if own else "model"
+        begun = {key: value for key, value in settings.items() if key.startswith(f"{name}.")}
+        own = {key: value for key, value in begun.items() if key.rpartition(".")[2] not in _NOT_LEARNED}
         others = {key: value for key, value in settings.items() if key.partition(".")[0] not in generator.stages}
-        kind = {"name": generator.get_tokenizer().config.name()} if name == "tokenizer" else {}
-        self.settings = {**kind, **(own or others)}  # the kind comes first: what differs first is told
-        self.of_generator = {key: settings[key] for key in self.objective.settings if key in settings}
+        further = {key: settings[key] for key in self.objective.settings if key in settings}
+        kind = {"tokenizer.name": generator.get_tokenizer().config.name()} if name == "tokenizer" else {}
+        self.prefix = f"model.{name}" if own and not further else "model"
+        self.settings = {**kind, **(own or others), **further}  # the kind comes first: what differs first is told
 
 
 def _restore(run: str, stage: _Stage) -> None:
@@ -181,20 +182,16 @@ def _check(setting: str, mine: _Stage, given: _Stage, trained: bool = False) -> 
     another dropout, and may be of another sensor if its weights fit this one.
     """
     stage, ours, theirs = mine.name, mine.settings, given.settings
-    differing = [name for name in ours if name not in _NOT_LEARNED and ours[name] != theirs.get(name)]
+    differing = [name for name in ours if ours[name] != theirs.get(name)]
     same_sensor = mine.objective.sensor.same_rays(given.objective.sensor)
     given_shapes = given.shapes
     if trained:
-        added = {name for name in mine.objective.additions if ours.get(name) and not theirs.get(name)}
+        additions = [f"{stage}.{name}" for name in mine.objective.additions]
+        added = {name for name in additions if ours.get(name) and not theirs.get(name)}
         differing = [name for name in differing if name not in added and not name.endswith("dropout")]
         given_shapes = _shapes(mine.objective.weights_from(given.objective))
         same_sensor |= mine.shapes.items() >= given_shapes.items()
-    others = [f"{mine.prefix}.{name}={theirs.get(name)}" for name in differing]
-    others += [
-        f"model.{name}={given.of_generator.get(name)}"
-        for name, value in mine.of_generator.items()
-        if value != given.of_generator.get(name)
-    ]
+    others = [f"model.{name}={theirs.get(name)}" for name in differing]
     if same_sensor:  # sizes that settings of other stages decide, such as the number of codes
         others += [
             f"{name} of {'x'.join(map(str, shape))}"
@@ -204,7 +201,7 @@ def _check(setting: str, mine: _Stage, given: _Stage, trained: bool = False) -> 
     if others or not same_sensor:
         raise ConfigError(
             f"{setting}, whose {stage} is another ({[*others, 'data.sensor'][0]})",
-            f"one of this recipe's model{'' if mine.of_generator else mine.prefix.removeprefix('model')} and sensor",
+            f"one of this recipe's {mine.prefix} and sensor",
             "set them as there, or choose another run",
         )
 
