@@ -103,7 +103,9 @@ def test_distances_are_those_of_the_metrics(simulated, recorded, scores):
 
 def test_the_table_names_every_curve(scores):
     lines = as_table(scores).splitlines()
-    assert [line.split()[0] for line in lines[1:]] == [score.simulated.metric for score in scores]
+    assert lines[1].split()[:2] == ["scans", "compared"]
+    assert lines[1].count(" v ") == 2
+    assert [line.split()[0] for line in lines[2:]] == [score.simulated.metric for score in scores]
 
 
 def test_one_scan_and_other_rays_are_refused(simulated, recorded):

@@ -68,7 +68,7 @@ def test_what_is_written_as_json_is_strict_json(tmp_path):
     ("check", "word"),
     [
         *((whole_number, word) for word in ("-1", "1e9", "99999999999999999999", "9" * 100_000, "", "x", "1.0")),
-        *((seed_number, word) for word in (str(2**63), str(2**64), "-1", "x")),
+        *((seed_number, word) for word in (str(2**32), str(2**64), "-1", "x")),
         *((positive_number, word) for word in ("nan", "inf", "1e400", "-1", "x", "1" * 400)),
         *((check_path, word) for word in ("", " ", "a\0b", "\udcff", "x" * 256, "a/" * 3000)),
     ],
@@ -81,7 +81,7 @@ def test_words_that_are_refused_in_one_line(check, word):
 
 
 def test_words_that_are_accepted():
-    assert (whole_number("0"), whole_number("10000000"), seed_number(str(2**63 - 1))) == (0, 10_000_000, 2**63 - 1)
+    assert (whole_number("0"), whole_number("10000000"), seed_number(str(2**32 - 1))) == (0, 10_000_000, 2**32 - 1)
     assert (positive_number("2e14"), positive_number("0")) == (2e14, 0.0)
     assert check_path("/daten/Straße") == Path("/daten/Straße")
     assert user_path("~/x").is_absolute()

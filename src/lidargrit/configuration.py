@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_ty
 
 from lidargrit import _discovery
 from lidargrit.errors import ConfigError, UnknownNameError, nearest_names, one_of
-from lidargrit.untrusted import SEED_AT_MOST
+from lidargrit.untrusted import WHOLE_NUMBER_AT_MOST
 
 T = TypeVar("T")
 
@@ -208,7 +208,7 @@ def _check_numbers(value: Any, where: str) -> None:
     if isinstance(value, (list, tuple)):
         for each in value:
             _check_numbers(each, where)
-    elif isinstance(value, int) and abs(value) > SEED_AT_MOST:
+    elif isinstance(value, int) and abs(value) > WHOLE_NUMBER_AT_MOST:
         raise ConfigError(f"{where} with a number of {value.bit_length()} bits", "at most 63", "lower it")
     elif isinstance(value, float) and not math.isfinite(value):
         raise ConfigError(f"{where}={value}", "a finite number", "correct it")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from lidargrit.untrusted import SEED_AT_MOST
+
 
 def derive_seed(*parts: int) -> int:
     """Mix whole numbers into one seed; neighbouring numbers give unrelated seeds.
@@ -13,6 +15,11 @@ def derive_seed(*parts: int) -> int:
             end do not count: (7, 0) gives the seed of (7,).
     """
     return int(np.random.SeedSequence(parts).generate_state(1, np.uint64)[0] >> np.uint64(1))
+
+
+def scan_seed(*parts: int) -> int:
+    """Mix whole numbers, as :func:`derive_seed` does, into a seed that a generator takes: the last 32 bits of that."""
+    return derive_seed(*parts) & SEED_AT_MOST
 
 
 def evenly_spaced(count: int, total: int) -> list[int]:

@@ -16,8 +16,10 @@ from lidargrit.errors import CheckpointError, DataError, LidarGritError, UsageEr
 JSON_BYTES_AT_MOST = 64 * 2**20  # the scans of the largest data set, 400,000, take 40 MB; parsed, bytes become tenfold
 TEXT_BYTES_AT_MOST = 2**20  # notes for a model card
 JSON_DEPTH_AT_MOST = 32  # our own files nest 8 deep; Python gives up at about 1,000
-SEED_AT_MOST = 2**63 - 1  # PyTorch's generators take no larger one
+SEED_AT_MOST = 2**32 - 1  # PyTorch's generator on a CPU takes the last 32 bits of any other
+WHOLE_NUMBER_AT_MOST = 2**63 - 1  # of settings: what 64 bits hold
 COUNT_AT_MOST = 10_000_000  # scans, columns, steps, processes: ten times the largest data set
+TEMPERATURE_AT_LEAST = 1e-6  # besides 0: by a smaller one, logits and densities overflow
 STEPS_AT_MOST = 100_000  # of a sampler: a hundred times those of any published one
 SEARCH_STEPS_AT_MOST = 10_000  # of a search for latents, which keeps random numbers for each: ten times the published
 NUMBER_AT_MOST = 1e30  # operations of the largest training ever: 1e27

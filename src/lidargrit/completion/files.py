@@ -16,7 +16,7 @@ from lidargrit import formats
 from lidargrit.completion import Completer
 from lidargrit.completion.inputs import Inputs, InputScan
 from lidargrit.conditions import Condition
-from lidargrit.determinism import derive_seed
+from lidargrit.determinism import derive_seed, scan_seed
 from lidargrit.errors import ConfigError, DataError, OutputError, ScanError
 from lidargrit.export import IMAGE, TREE, KittiTree, claimed_scans, writable_format, write_array, write_with_labels
 from lidargrit.files import claim_folder
@@ -205,13 +205,13 @@ def _return_share(completer: Completer, job: _Job, output: OutputConfig) -> Floa
     remaining = iter(range(output.probability))
     while turns := list(islice(remaining, completer.batch)):
         condition = Condition.cat([job.condition] * len(turns))
-        seeds = [derive_seed(output.seed, job.number, turn, 1) for turn in turns]
+        seeds = [scan_seed(output.seed, job.number, turn, 1) for turn in turns]
         total += completer.complete(condition, seeds).return_mask.float().sum(0)
     return total / output.probability
 
 
 def _seed(seed: int, job: _Job) -> int:
-    return derive_seed(seed + job.turn, job.number)
+    return scan_seed(seed + job.turn, job.number)
 
 
 def _folder(turn: int, count: int) -> str:

@@ -22,7 +22,7 @@ from lidargrit.projection import ProjectionVariant
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import load_sensor
 from lidargrit.sources import Source, open_source
-from lidargrit.untrusted import SEED_AT_MOST
+from lidargrit.untrusted import COUNT_AT_MOST, SEED_AT_MOST
 
 _FEW = 100  # scans: below that the interval itself rests on too little, and values hardly differ from real against real
 
@@ -62,9 +62,11 @@ class EvalConfig:
     data: DataConfig = field(default_factory=DataConfig)
 
     def __post_init__(self) -> None:
-        if not (0 <= self.max_scans <= SEED_AT_MOST and 0 <= self.seed <= SEED_AT_MOST):
+        if not (0 <= self.max_scans <= COUNT_AT_MOST and 0 <= self.seed <= SEED_AT_MOST):
             raise ConfigError(
-                f"-n {str(self.max_scans)[:25]}, --seed {str(self.seed)[:25]}", "0 to 2^63 - 1", "correct the number"
+                f"-n {str(self.max_scans)[:25]}, --seed {str(self.seed)[:25]}",
+                f"at most {COUNT_AT_MOST:,} scans, and a seed from 0 to 2^32 - 1",
+                "correct the number",
             )
         if self.pixel_statistics and not self.resampling.halves:
             raise ConfigError(

@@ -16,7 +16,7 @@ from torch import Tensor
 from lidargrit.completion import Completer
 from lidargrit.conditions import Condition
 from lidargrit.conditions.patterns import Pattern
-from lidargrit.determinism import derive_seed
+from lidargrit.determinism import derive_seed, scan_seed
 from lidargrit.errors import ConfigError, DataError, UsageError, counted_scans
 from lidargrit.evaluation.estimates import Estimate
 from lidargrit.loading import RangeImages
@@ -224,7 +224,7 @@ def _complete(completer: Completer, condition: Condition, turn: int, seed: int) 
     parts = []
     for first in range(0, len(condition), completer.batch):
         some = condition[first : first + completer.batch]
-        seeds = [derive_seed(seed + turn, index) for index in range(first, first + len(some))]
+        seeds = [scan_seed(seed + turn, index) for index in range(first, first + len(some))]
         parts.append(completer.complete(some, seeds))
     return RangeImage.cat(parts)
 

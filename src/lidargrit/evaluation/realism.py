@@ -229,7 +229,13 @@ def as_json(scores: Sequence[CurveScore]) -> list[dict[str, Any]]:
 def as_table(scores: Sequence[CurveScore]) -> str:
     """Return scores as lines for a terminal."""
     lines = [f"{'distance of real scans from':<28}{'simulated':>10}{'Bernoulli':>11}{'ratio':>8}{'real v real':>13}"]
+    for score in scores[:1]:
+        lines += [f"{'scans compared':<28}{_counts(score.simulated):>10}{_counts(score.real_against_real):>32}"]
     for score in scores:
         values = f"{score.simulated.value:>10.4f}{score.bernoulli.value:>11.4f}{score.ratio:>8.2f}"
         lines.append(f"{score.simulated.metric:<28}{values}{score.real_against_real.value:>13.4f}")
     return "\n".join(lines)
+
+
+def _counts(result: MetricResult) -> str:
+    return f"{result.num_generated} v {result.num_reference}"

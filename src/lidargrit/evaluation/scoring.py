@@ -60,18 +60,16 @@ class _FedMetric:
         generated: metrics that were fed one group of generated scans each.
         real: metrics that were fed one group of real scans each.
         real_as_generated: metrics that were fed the same real scans as generated ones, for real against real.
-        whole: a metric that was fed all scans of both sets, if merged parts would give another value.
     """
 
     factory: MetricFactory
     generated: list[Part] = field(default_factory=list)
     real: list[Part] = field(default_factory=list)
     real_as_generated: list[Part] = field(default_factory=list)
-    whole: Metric[Any, Any] | None = None
 
     def score(self, group_sizes: Sequence[int], resampling: Resampling, begun_s: float) -> Score:
         """Compute the value with its interval and real against real."""
-        metric = self.whole or merged(self.generated, self.real)
+        metric = merged(self.generated, self.real)
         result = metric.compute()
         interval = reference_row = None
         if resampling.halves:
@@ -136,15 +134,13 @@ def _feed(
 ) -> list[int]:
     """Feed both sets to metrics that share features, and return the number of scans in each group."""
     groups = blocks(len(pair.samples), resampling.groups if resampling.halves else 1)
-    for each in fed:
-        empty = each.factory()
-        each.whole = empty if empty.order_matters and len(groups) > 1 else None
-    wholes = [each.whole for each in fed if each.whole is not None]
     for real, images in ((False, pair.samples), (True, pair.reference)):
         for group in groups:
             parts = [each.factory() for each in fed]
             as_generated = [each.factory() for each in fed] if real and resampling.halves else []
-            metrics = [(metric, real) for metric in (*parts, *wholes)] + [(metric, False) for metric in as_generated]
+            for metric in (*parts, *as_generated):
+                metric.first_image = group.start
+            metrics = [(metric, real) for metric in parts] + [(metric, False) for metric in as_generated]
             _feed_group(metrics, images, group, advance, len(fed))
             for each, metric in zip(fed, parts, strict=True):
                 (each.real if real else each.generated).append(Part(metric))

@@ -17,7 +17,6 @@ PIXEL_STATISTICS, MEMORISED = "marginal", "memorised"
 """The generators whose scans are the second and the third bound."""
 
 _SPREADS = 2.8  # Student's 97.5 % quantile for the five halvings of real against real
-_OR_MORE = ", or the sets of that row are smaller, which makes most scores worse"
 
 
 def noise(score: Score) -> float:
@@ -29,16 +28,18 @@ def noise(score: Score) -> float:
 
 def beats_pixel_statistics(score: Score) -> bool | None:
     """Return whether a score beats that of pixel statistics by more than chance; None where that is not known."""
-    if score.pixel_statistics is None:
+    halves = value_of_halves(score)
+    if score.pixel_statistics is None or halves is None:
         return None
-    return _worse_by(score, score.pixel_statistics, value_of_halves(score)) > noise(score)
+    return _worse_by(score, score.pixel_statistics, halves) > noise(score)
 
 
 def is_like_real(score: Score) -> bool | None:
     """Return whether a score is not worse than real against real by more than chance; None where that is not known."""
-    if score.real_against_real is None:
+    real = score.real_against_real
+    if real is None or (value := _beside(score, real)) is None:
         return None
-    return _worse_by(score, _beside(score, score.real_against_real), score.real_against_real.value) <= noise(score)
+    return _worse_by(score, value, real.value) <= noise(score)
 
 
 def tells_apart(score: Score) -> bool | None:
@@ -85,7 +86,7 @@ def verdict(scores: Sequence[Score]) -> tuple[str, ...]:
     if beyond := [score for score in counted if _is_beyond_real(score)]:
         sentences.append(
             f"Better than real against real: {_names(beyond)}. Either the samples repeat scans of the reference, or "
-            f"they vary less than real ones{'' if all(map(_is_of_halves, beyond)) else _OR_MORE}."
+            "they vary less than real ones."
         )
     return tuple(sentences)
 
@@ -105,20 +106,17 @@ def _count(scores: Sequence[Score]) -> str:
 
 def _is_beyond_real(score: Score) -> bool:
     real = score.real_against_real
-    return real is not None and _worse_by(score, real.value, _beside(score, real)) > noise(score)
+    if real is None or (value := _beside(score, real)) is None:
+        return False
+    return _worse_by(score, real.value, value) > noise(score)
 
 
-def value_of_halves(score: Score) -> float:
-    """Return the mean score of halves of both sets, since most metrics are worse for fewer scans; else the score."""
-    mean = None if score.interval is None else score.interval.mean_of_halves
-    return score.result.value if mean is None else mean
+def value_of_halves(score: Score) -> float | None:
+    """Return the mean score of halves of both sets, since most metrics are worse for fewer scans; None if not known."""
+    return None if score.interval is None else score.interval.mean_of_halves
 
 
-def _is_of_halves(score: Score) -> bool:
-    return score.interval is not None and score.interval.mean_of_halves is not None
-
-
-def _beside(score: Score, real: RealAgainstReal) -> float:
+def _beside(score: Score, real: RealAgainstReal) -> float | None:
     """Return the value that compares with real against real: of whole sets where as many real scans were held out."""
     return value_of_halves(score) if real.halvings else score.result.value
 

@@ -137,7 +137,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         """Generate one scan for each seed; a seed gives the same scan whatever the others are, bit for bit.
 
         Args:
-            seeds: seeds, one for each scan, from 0 to 2^63 - 1.
+            seeds: seeds, one for each scan, from 0 to 2^32 - 1.
             sampling: settings of the generator's own ``Sampling``; its defaults if not given.
 
         Raises:
@@ -199,7 +199,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         Args:
             condition: observed part of each scan, such as ``Condition.of_pixels(images, observed)``, of the kinds in
                 :attr:`conditions`.
-            seeds: seeds, one for each scan, from 0 to 2^63 - 1.
+            seeds: seeds, one for each scan, from 0 to 2^32 - 1.
             sampling: settings of the generator's own ``Sampling``; :meth:`completion_sampling` if not given.
 
         Raises:
@@ -225,7 +225,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
 
         Args:
             images: batch of range images (B, H, W).
-            seeds: seeds, one for each image, from 0 to 2^63 - 1; the search starts at random.
+            seeds: seeds, one for each image, from 0 to 2^32 - 1; the search starts at random.
             sampling: settings of the generator's own ``Sampling``; its defaults if not given.
 
         Raises:

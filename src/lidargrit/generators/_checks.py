@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Sequence, Sized
 from numbers import Integral
 
 from lidargrit.conditions import KINDS, Condition, ConditionKind
@@ -19,13 +19,15 @@ def check_seeds(seeds: Sequence[int], count: int | None = None) -> None:
         seeds: seeds, one for each scan.
         count: number of images; None where the seeds alone say how many scans are wanted.
     """
+    if not isinstance(seeds, Sized):
+        raise ConfigError(f"seeds of type {type(seeds).__name__}", "a sequence, such as [0]", "put them into a list")
     if count is not None and len(seeds) != count:
         raise ConfigError(f"{len(seeds)} seeds for {count} images", "one seed for each image", "correct the seeds")
     if not len(seeds):
         raise ConfigError("no seeds", "at least one, such as seeds=[0]", "name a seed for each scan")
     for seed in seeds:
         if not isinstance(seed, Integral) or isinstance(seed, bool) or not 0 <= seed <= SEED_AT_MOST:
-            raise ConfigError(f"the seed {str(seed)[:30]}", "a whole number from 0 to 2^63 - 1", "choose another seed")
+            raise ConfigError(f"the seed {str(seed)[:30]}", "a whole number from 0 to 2^32 - 1", "choose another seed")
 
 
 def check_images(images: RangeImage | Condition, sensor: SensorModel) -> None:
@@ -53,6 +55,10 @@ def check_condition(condition: Condition, kinds: Collection[ConditionKind], sens
         sensor: sensor of the generator.
         name: name of the generator, for the message.
     """
+    if not isinstance(condition, Condition):
+        raise ConfigError(
+            f"a condition of type {type(condition).__name__}", "a Condition", "make one, such as Condition.of_pixels()"
+        )
     check_images(condition, sensor)
     if not condition.kinds <= set(kinds):
         raise ConfigError(

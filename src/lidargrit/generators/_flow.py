@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidargrit.determinism import derive_seed
+from lidargrit.determinism import scan_seed
 from lidargrit.errors import ConfigError
 from lidargrit.generators._log_range import decode, encode
 from lidargrit.nn import flow
@@ -209,7 +209,7 @@ class FlowPairs(Frozen[Hdit]):
             empty = numbers.new_empty((len(numbers), *self._shape), dtype=torch.float32)
             return empty, empty
         noise = SeededNoise(
-            [derive_seed(_PAIRS_SEED, number) for number in numbers.tolist()], self._shape, numbers.device
+            [scan_seed(_PAIRS_SEED, number) for number in numbers.tolist()], self._shape, numbers.device
         )()
         clean = [self._clean(number, noise[[index]]) for index, number in enumerate(numbers.tolist())]
         return noise, torch.cat(clean).to(noise)

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.func import functional_call
 
 from lidargrit.conditions import Condition
-from lidargrit.determinism import derive_seed
+from lidargrit.determinism import scan_seed
 from lidargrit.errors import CheckpointError, ConfigError
 from lidargrit.files import load_exactly
 from lidargrit.generators import Cost, Generator, SystemFacts
@@ -207,7 +207,7 @@ class Dusty(Generator[DustyConfig, DustySampling]):
         """Return what is added to logits, whose signs then are sampled returns; each seed has its own numbers."""
         if sampling.mask == "threshold":
             return self._latent_like(torch.zeros(()))
-        rngs = rngs_of([derive_seed(seed, sampling.raydrop_seed) for seed in seeds])
+        rngs = rngs_of([scan_seed(seed, sampling.raydrop_seed) for seed in seeds])
         return self._latent_like(torch.stack([logistic_noise(_size(self.sensor), rng) for rng in rngs]))
 
     def _latents(self, seeds: Sequence[int], *count: int) -> Float[Tensor, "B *count D"]:

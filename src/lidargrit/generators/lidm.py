@@ -21,7 +21,7 @@ from lidargrit.nn.flops import flops_of
 from lidargrit.nn.latent_axes import LatentAxes
 from lidargrit.nn.latent_unet import LatentUnet, LatentUnetConfig
 from lidargrit.nn.objective import Objective
-from lidargrit.nn.published import read_checkpoint
+from lidargrit.nn.published import read_checkpoint, weights_below
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import MaskDecoding, RangeImage
 from lidargrit.tokenizers import CodebookTokenizer, Tokenizer, TokenizerConfig, make_tokenizer
@@ -185,7 +185,10 @@ class Lidm(Generator[LidmConfig, LidmSampling]):
         """
         (path,) = files
         found = read_checkpoint(path, ("state_dict",), _PUBLISHED_BYTES_AT_MOST, _NOT_READ)
-        first_stage, last_layer = _below(found, _FIRST_STAGE), found.get(f"{_FIRST_STAGE}decoder.conv_out.weight")
+        first_stage, last_layer = (
+            weights_below(found, _FIRST_STAGE),
+            found.get(f"{_FIRST_STAGE}decoder.conv_out.weight"),
+        )
         if last_layer is None or last_layer.ndim != 4 or not isinstance(config.tokenizer, CurveVqvaeConfig):
             raise CheckpointError(
                 f"{path}, which holds no decoder of a tokenizer {config.tokenizer.name()!r}",
@@ -195,9 +198,9 @@ class Lidm(Generator[LidmConfig, LidmSampling]):
         tokenizer = replace(config.tokenizer, mask_head=len(last_layer) > 1)
         generator = cls(replace(config, tokenizer=tokenizer, scale_latents=False), sensor)
         # The program's average names weights without dots.
-        averaged = _below(found, _AVERAGE)
+        averaged = weights_below(found, _AVERAGE)
         plain = {f"diffusion_model{name.replace('.', '')}": name for name in generator.denoiser.state_dict()}
-        denoiser = {plain.get(name, name): tensor for name, tensor in averaged.items()} or _below(found, _RAW)
+        denoiser = {plain.get(name, name): tensor for name, tensor in averaged.items()} or weights_below(found, _RAW)
         counts = generator.tokenizer.quantize.named_buffers(prefix="quantize")  # of which the program keeps none
         load_exactly(generator.tokenizer, first_stage | dict(counts), path)
         load_exactly(generator.denoiser, denoiser, path)
@@ -252,7 +255,3 @@ class LatentDenoising(Objective):
 
 def _latents(tokenizer: CodebookTokenizer, images: RangeImage) -> Float[Tensor, "B D h w"]:
     return tokenizer.latents(images).float()
-
-
-def _below(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}

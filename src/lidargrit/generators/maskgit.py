@@ -28,7 +28,7 @@ from lidargrit.nn.seeds import rngs_of
 from lidargrit.nn.transformer import MaskedTransformer
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
-from lidargrit.untrusted import STEPS_AT_MOST
+from lidargrit.untrusted import STEPS_AT_MOST, TEMPERATURE_AT_LEAST
 
 _NOT_ASKED = -100  # in the place of tokens that are shown, for torch's cross entropy
 
@@ -70,10 +70,12 @@ class MaskedSampling:
 
     def __post_init__(self) -> None:
         self.pixels()
-        if not (1 <= self.steps <= STEPS_AT_MOST and self.temperature >= 0 and self.order_temperature >= 0):
+        temperature = self.temperature or TEMPERATURE_AT_LEAST
+        valid = temperature >= TEMPERATURE_AT_LEAST and self.order_temperature >= 0
+        if not (valid and 1 <= self.steps <= STEPS_AT_MOST):
             raise ConfigError(
                 f"steps={self.steps}, temperature={self.temperature}, order_temperature={self.order_temperature}",
-                f"1 to {STEPS_AT_MOST:,} steps, and no negative temperature",
+                f"1 to {STEPS_AT_MOST:,} steps, temperature 0 or at least 1e-6, order_temperature at least 0",
                 "correct the one that is out of bounds",
             )
 

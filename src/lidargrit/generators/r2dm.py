@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidargrit.conditions import Condition
-from lidargrit.determinism import evenly_spaced
+from lidargrit.determinism import evenly_spaced, scan_seed
 from lidargrit.errors import ConfigError
 from lidargrit.files import load_exactly
 from lidargrit.generators import Cost, Generator, SystemFacts
@@ -32,7 +32,9 @@ from lidargrit.untrusted import STEPS_AT_MOST
 _BATCH = 8
 _PUBLISHED_SENSOR = "hdl64e_kitti_360"
 _SHARE_SCANS = 1000  # whose returns are counted: more would not change their share
-_CALIBRATION_SEED = 1 << 40  # of the first scan that is sampled for it: no user samples from there on
+_CALIBRATION_SEED = (
+    1 << 40
+)  # mixed with the numbers of the scans sampled for it: their seeds are none of a user's first
 
 
 @dataclass(frozen=True)
@@ -152,7 +154,7 @@ class R2dm(Generator[R2dmConfig, DiffusionSampling]):
 
     def after_training(self) -> None:
         """Fit the threshold of the calibrated raydrop: as many values lie above it as rays returned in training."""
-        seeds = range(_CALIBRATION_SEED, _CALIBRATION_SEED + self.config.calibration_scans)
+        seeds = [scan_seed(_CALIBRATION_SEED, number) for number in range(self.config.calibration_scans)]
         if not seeds or not bool(self.return_share.isfinite()):
             return
         parts = [

@@ -135,7 +135,7 @@ class UltraLidar(Generator[UltraLidarConfig, VoxelSampling]):
         ``config.autoencoder.grid``.
 
         Args:
-            seeds: one for each scan, from 0 to 2^63 - 1.
+            seeds: one for each scan, from 0 to 2^32 - 1.
             sampling: settings of sampling; its defaults if not given.
 
         Raises:

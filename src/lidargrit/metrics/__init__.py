@@ -114,17 +114,17 @@ class Metric(ABC, Generic[Features, Kept]):
             )
         self.kind: ImageKind | None = None
         self.num_images = {False: 0, True: 0}
+        self.first_image = 0
+        """Place in the two sets of the first image that is fed here, for parts that are merged later.
+
+        Sliced Wasserstein distances by the variant ``reference`` sample patch positions by an image's place.
+        """
         self._kept = {real: self.accumulator() for real in (False, True)}
 
     @property
     def name(self) -> str:
         """The public name of the metric: that of its file."""
         return type(self).__module__.rpartition(".")[2]
-
-    @property
-    def order_matters(self) -> bool:
-        """Whether merged parts give another value than one metric that is fed all images in order."""
-        return False
 
     @abstractmethod
     def extractor(self, sensor: SensorModel) -> FeatureExtractor[Features]:

@@ -46,8 +46,8 @@ class SlicedWasserstein(ImageMetric):
         variant: ``reference`` repeats LidarGRIT's program with the same random numbers, generated images first:
             directions divided by their standard deviation instead of their length (values about 7 times larger), the
             upsampled level shifted by one pixel, patch positions shared by the 128 images of a batch. The order of
-            images matters only for the batch into which each falls. Parts that are merged each count batches from their
-            own start: for more than 128 images the value is then that of other, equally good patch positions.
+            images matters only for the batch into which each falls, which parts that are merged know by
+            :attr:`first_image`. Left at 0, all parts share the positions of the first batch, and the value is larger.
             ``textbook`` is Karras et al.: directions of unit length, an aligned pyramid, and positions of its own for
             every image. These are sampled by a seed made of the image itself, its set and ``seed``, so that neither the
             order of images nor the number of processes matters; equal images of one set give equal patches.
@@ -68,11 +68,6 @@ class SlicedWasserstein(ImageMetric):
         super().__init__(variant=variant, seed=seed)
         self._shared: SharedPositions | None = None
 
-    @property
-    def order_matters(self) -> bool:
-        """Whether patch positions depend on the batch into which an image falls, as in ``reference``."""
-        return self.variant == "reference"
-
     def summarise(self, features: RangeImage, *, real: bool) -> Float32[np.ndarray, "B patches 49"]:
         """Cut the patches of a batch of images, those of the finest level first: 75 kB per image."""
         sensor = features.sensor
@@ -80,7 +75,8 @@ class SlicedWasserstein(ImageMetric):
         encoded = encoding.encode(features.range_m.float(), features.return_mask)
         pyramid = laplacian_pyramid(encoded, shifted=self.variant == "reference")
         if self.variant == "reference":
-            images = range(self.num_images[real], self.num_images[real] + len(features))
+            first = self.first_image + self.num_images[real]
+            images = range(first, first + len(features))
             positions = self._shared_positions().of_images(images, real)
         else:
             positions = own_positions(features.range_m, pyramid, self.seed, real)

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 _LEAST_SHARE = 1e-3  # of the largest variance: axes along which codes do not differ are not blown up
+_LEAST_VARIANCE = 1e-12  # where one code is all that is used
 
 
 class LatentAxes(nn.Module):
@@ -39,7 +40,8 @@ class LatentAxes(nn.Module):
         variance, axes = variance.flip(0)[: len(self.axes)], axes.flip(1)[:, : len(self.axes)]
         self.mean.copy_(mean)
         self.axes.copy_(axes.T)
-        self.scale.copy_(torch.maximum(variance, _LEAST_SHARE * variance[0]).sqrt())
+        least = (_LEAST_SHARE * variance[0]).clamp(min=_LEAST_VARIANCE)
+        self.scale.copy_(torch.maximum(variance, least).sqrt())
 
     def forward(self, latents: Float[Tensor, "B D h w"]) -> Float[Tensor, "B axes h w"]:
         """Return latents along the axes."""

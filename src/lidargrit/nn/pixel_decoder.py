@@ -20,6 +20,7 @@ from lidargrit.nn.precision import Precision, autocast_to
 from lidargrit.nn.range_steps import RangeSteps
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import Decoded, RangeImage
+from lidargrit.untrusted import TEMPERATURE_AT_LEAST
 
 _Guided = tuple[
     dict[Lattice, Tensor], dict[Lattice, Tensor]
@@ -54,10 +55,11 @@ class PixelSampling:
     precision: Precision = "fp32"
 
     def __post_init__(self) -> None:
-        if not (0 <= self.range_temperature < math.inf and 0 < self.range_noise < math.inf):
+        temperature = self.range_temperature or TEMPERATURE_AT_LEAST
+        if not (TEMPERATURE_AT_LEAST <= temperature < math.inf and 0 < self.range_noise < math.inf):
             raise ConfigError(
                 f"range_temperature={self.range_temperature}, range_noise={self.range_noise}",
-                "positive numbers, or a temperature of 0 for the model's own",
+                "positive numbers, a temperature of at least 1e-6, or of 0 for the model's own",
                 "take 1 for both, and mask_correlation=0, to sample from the model's own distribution",
             )
         if not 0 <= self.mask_correlation < math.inf:

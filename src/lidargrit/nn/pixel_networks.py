@@ -31,6 +31,7 @@ from lidargrit.nn.range_candidates import RangeCandidates
 from lidargrit.nn.range_mixture import RangeMixture
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import TYPICAL_LOG_RANGE, Decoded
+from lidargrit.untrusted import TEMPERATURE_AT_LEAST
 
 LOGIT_BOUND = 8.0  # of the decoder's return logits, beyond which it is as good as sure
 _HALVINGS_AT_MOST = 8  # of one side alone
@@ -66,9 +67,8 @@ class PixelDecoderConfig:
         gravity_components: whether 8 more components begin on vertical planes through two earlier pixels and on
             horizontal ones through a neighbour, so that walls and the ground are continued from fewer pixels. They
             assume that the sensor is level.
-        range_temperature: temperature at which ranges are sampled where the caller names none; see
-            :class:`~lidargrit.nn.pixel_decoder.PixelSampling`. What suits a model depends on its columns and its
-            training: choose it by samples against validation scans.
+        range_temperature: temperature at which ranges are sampled where the caller names none. What suits a model
+            depends on its columns and its training: choose it by samples against validation scans.
     """
 
     coarsest_cell: int = 8
@@ -87,8 +87,8 @@ class PixelDecoderConfig:
     range_temperature: float = 0.35
 
     def __post_init__(self) -> None:
-        if not 0 < self.range_temperature < math.inf:
-            raise ConfigError(f"range_temperature={self.range_temperature}", "a positive number", "correct it")
+        if not TEMPERATURE_AT_LEAST <= self.range_temperature < math.inf:
+            raise ConfigError(f"range_temperature={self.range_temperature}", "at least 1e-6", "correct it")
         for name, value in vars(self).items():
             least = 0 if isinstance(value, (bool, float)) or name in _MAY_BE_0 else 1
             if value < least:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import warnings
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
@@ -113,3 +113,8 @@ def _refuse_swelling(data: bytes) -> None:
         raise RefusedFileError("whose tensors are compressed, as PyTorch does not write them")
     if sum(entry.file_size for entry in entries) > len(data):
         raise RefusedFileError("whose parts overlap")
+
+
+def weights_below(weights: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """Return the weights whose names begin with a prefix, by what follows it."""
+    return {name.removeprefix(prefix): weight for name, weight in weights.items() if name.startswith(prefix)}

@@ -99,10 +99,6 @@ class VoxelAutoencoder(nn.Module):
         """
         return occupied_at_random(self.decoder(self.codes(tokens)), uniform)
 
-    def flops(self) -> int:
-        """Return the operations of one pass through encoder, codebook and decoder."""
-        return self.encoding_flops() + self.decoding_flops()
-
     def encoding_flops(self) -> int:
         """Return the operations of turning one scan's voxels into tokens."""
         size, length = self.config, self.config.tokens[0] * self.config.tokens[1]

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from lidargrit import __version__
-from lidargrit.serving.requests import PAGE_SEED_AT_MOST, TASKS, upload_endings
+from lidargrit.serving.requests import TASKS, upload_endings
+from lidargrit.untrusted import SEED_AT_MOST
 from lidargrit.viewer import interactive
 from lidargrit.viewer.interactive import button, filled
 
@@ -19,7 +20,7 @@ def page() -> str:
     parts = {
         "viewer": interactive.viewer_html("", f'<span class="soft">Save</span>{buttons}', f"lidargrit {__version__}."),
         "tasks": "".join(f'<option value="{name}">{text}</option>' for name, text in TASKS.items()),
-        "seed_at_most": str(PAGE_SEED_AT_MOST),
+        "seed_at_most": str(SEED_AT_MOST),
         "endings": ",".join(upload_endings()),
         "listed_endings": ", ".join(upload_endings()),
     }

@@ -14,9 +14,8 @@ from lidargrit import formats
 from lidargrit._discovery import names
 from lidargrit.errors import CheckpointError, ConfigError, nearest_names
 from lidargrit.serving.limits import Limits
-from lidargrit.untrusted import parse_json
+from lidargrit.untrusted import SEED_AT_MOST, parse_json
 
-PAGE_SEED_AT_MOST = 2**32 - 1  # what fits a field on a page; more seeds than anyone will try
 UPSAMPLED = {"vlp16": "a VLP-16", "hdl32e": "an HDL-32E", "vlp32c": "a VLP-32C"}  # sensors with few rows
 TASKS = {  # what a model makes of an uploaded scan → its description on the page
     "returns": "fill in the rays without a point",
@@ -132,7 +131,7 @@ def parse_request(values: dict[str, Any], settings: list[list[SamplingSetting]],
             raise ConfigError(f"the setting {name[:40]!r}, which this model does not have", wanted, "use the page")
     return SampleRequest(
         model,
-        _whole("seed", values.get("seed", 0), 0, PAGE_SEED_AT_MOST),
+        _whole("seed", values.get("seed", 0), 0, SEED_AT_MOST),
         _whole("count", values.get("count", 1), 1, limits.scans),
         {name: _number(by_name[name], value) for name, value in changed.items()},
         task,

@@ -10,8 +10,9 @@ from torch import Tensor, nn
 
 from lidargrit.errors import CheckpointError
 from lidargrit.files import load_exactly, read_tensors, write_tensors
+from lidargrit.nn.published import weights_below
 from lidargrit.training.optimiser import WeightAverage
-from lidargrit.untrusted import SEED_AT_MOST
+from lidargrit.untrusted import WHOLE_NUMBER_AT_MOST
 
 
 def save_checkpoint(
@@ -55,13 +56,13 @@ def load_checkpoint(
             "the stage that this run's earlier stages led to",
             "remove the file, and the stage is trained again",
         )
-    load_exactly(objective, _below(tensors, "objective."), path)
-    load_exactly(average.objective, _below(tensors, "average."), path)
+    load_exactly(objective, weights_below(tensors, "objective."), path)
+    load_exactly(average.objective, weights_below(tensors, "average."), path)
     try:
-        state = _optimiser_state(_below(tensors, "optimiser."), optimiser)
+        state = _optimiser_state(weights_below(tensors, "optimiser."), optimiser)
         optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
         scans_seen = about["scans_seen"]
-        if type(scans_seen) is not int or not 0 <= scans_seen <= SEED_AT_MOST:
+        if type(scans_seen) is not int or not 0 <= scans_seen <= WHOLE_NUMBER_AT_MOST:
             raise ValueError(f"{str(scans_seen)[:40]} scans seen")
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise CheckpointError(
@@ -79,7 +80,7 @@ def load_average(path: Path, objective: nn.Module) -> None:
         CheckpointError: the file is damaged, or of another configuration.
     """
     kept = objective.state_dict()  # of what a file of an earlier version lacks
-    load_exactly(objective, {**kept, **_below(read_tensors(path)[0], "average.")}, path)
+    load_exactly(objective, {**kept, **weights_below(read_tensors(path)[0], "average.")}, path)
 
 
 def _optimiser_state(tensors: dict[str, Tensor], optimiser: torch.optim.Optimizer) -> dict[int, dict[str, Tensor]]:
@@ -106,10 +107,6 @@ def _optimiser_state(tensors: dict[str, Tensor], optimiser: torch.optim.Optimize
     if state.keys() - range(number):
         raise ValueError(f"moments of more than {number} weights")
     return state
-
-
-def _below(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
 
 
 def fingerprint(module: nn.Module) -> str:
