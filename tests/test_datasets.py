@@ -309,3 +309,34 @@ def test_every_real_range_image_projects_back_to_its_file(real_root):
         stored_m[(stored_m < sensor.range_min_m) | (stored_m > sensor.range_max_m)] = 0
         assert torch.allclose(project(scan, as_stored).range_m, stored_m, atol=1e-4), scan.source
         assert project(scan, sensor).return_mask.any()
+
+
+def test_scans_without_leading_zeros_are_in_order_of_time(bin_file, tmp_path):
+    for number in range(12):
+        bin_file(ROWS, f"{number}.bin")
+    names = [str(number) for number in range(12)]
+    whole = open_dataset(str(tmp_path))
+    assert [whole.name(index) for index in range(12)] == names
+    late = open_dataset(f"{tmp_path}:all[75%:]")
+    assert [late.name(index) for index in range(len(late))] == names[9:]
+
+
+@pytest.mark.parametrize(
+    ("split", "chosen"),
+    [
+        ("a+b", {"a+b"}),
+        ("a+b+plain", {"a+b", "plain"}),
+        ("plain+a+b[:50%]", {"a+b"}),
+        ("a", {"a"}),
+        ("run[1]", {"run[1]"}),
+        ("run[1][50%:]", {"run[1]"}),
+        ("x[:50%]", {"x[:50%]"}),
+        ("*", {"*"}),
+    ],
+)
+def test_sequences_may_have_any_name(bin_file, tmp_path, split, chosen):
+    for name in ("a", "a+b", "plain", "run[1]", "x[:50%]", "*"):
+        for number in range(2):
+            bin_file(ROWS, f"{name}/{number}.bin")
+    found = open_dataset(f"{tmp_path}:{split}")
+    assert {found.name(index).rpartition("/")[0] for index in range(len(found))} == chosen

@@ -14,7 +14,7 @@ from lidargrit.errors import ConfigError, ScanError
 from lidargrit.fitting import SensorFit, fit_sensor, fit_sensor_to_dataset
 from lidargrit.fitting.azimuths import columns_of_scans
 from lidargrit.fitting.elevations import nearest_row, rows_of_rings
-from lidargrit.fitting.limits import quantum_m, range_limits_m
+from lidargrit.fitting.limits import farthest_m, quantum_m
 from lidargrit.fitting.table import as_table
 from lidargrit.sensors import SensorModel, column_azimuths_rad, load_sensor
 from lidargrit.structures import Scan
@@ -73,7 +73,7 @@ def test_finds_each_of_our_sensors_in_simulated_scans(simulated):
     assert with_field.sensor.projection == "unfolding"
     assert abs(with_field.sensor.width / sensor.width - 1) < 0.01
     assert with_field.sensor.width % 8 == 0, "networks halve the columns"
-    assert sensor.range_min_m - 0.11 <= with_field.sensor.range_min_m
+    assert with_field.sensor.range_min_m == 1.0
     assert with_field.sensor.range_max_m <= math.ceil(sensor.range_max_m)
     again = SensorModel.from_json(with_field.sensor.to_json())
     assert again.same_rays(with_field.sensor)
@@ -166,10 +166,10 @@ def test_finds_the_step_of_ranges_and_no_step_where_there_is_none(step_m):
     assert quantum_m(values) is None
 
 
-def test_limits_hold_all_but_strays():
+def test_the_far_limit_holds_all_but_strays():
     values = np.random.default_rng(0).uniform(2.34, 71.2, 100_000)
-    assert range_limits_m(values) == (2.3, 72.0)
-    assert range_limits_m(np.append(values, [0.01, 900.0])) == (2.3, 72.0)
+    assert farthest_m(values) == 72.0
+    assert farthest_m(np.append(values, [0.01, 900.0])) == 72.0
 
 
 def test_scans_with_another_number_of_rings_are_left_out_and_said():

@@ -215,12 +215,25 @@ def test_what_is_written_is_read_back_to_the_bit(tmp_path, scan, suffix):
 
 @pytest.mark.parametrize(
     ("highest", "kind", "scale"),
-    [(1, "f4", 1), (0.2, "f8", 1), (1.5, "f4", 255), (255, "u1", 255), (100, "u2", 255), (256, "f4", 65_535)],
+    [
+        (1, "f4", 1),
+        (0.2, "f8", 1),
+        (1.5, "f4", 255),
+        (255, "u1", 255),
+        (1, "u1", 255),
+        (100, "u2", 255),
+        (256, "f4", 65_535),
+    ],
 )
 def test_reflectance_is_divided_by_the_smallest_scale_that_holds_it(tmp_path, highest, kind, scale):
     values = np.array([0, highest / 2, highest]).astype(kind)
     np.savez(tmp_path / "a.npz", points=np.ones((3, 3)), Intensity=values)
     assert np.allclose(read_scan(tmp_path / "a.npz").reflectance, values.astype(np.float64) / scale)
+
+
+def test_reflectance_a_little_beyond_1_is_1(tmp_path):
+    np.savez(tmp_path / "a.npz", points=np.ones((3, 3)), intensity=np.array([0.2, 1.0001, 0.5]))
+    assert torch.allclose(read_scan(tmp_path / "a.npz").reflectance, torch.tensor([0.2, 1.0, 0.5]))
 
 
 def test_half_precision_will_do(tmp_path):

@@ -58,7 +58,7 @@ def test_intensity_of_eight_bits_and_none(written):
         (104, "<B", 0x80, r"compressed points \(LAZ\); .*unpack it"),
         (104, "<B", 11, "points of format 11"),
         (100, "<I", 2**32 - 1, "after 4294967295 records"),
-        (96, "<I", 2**31, "points of 26 bytes in"),
+        (96, "<I", 2**31, "points of 30 bytes in"),
         (105, "<H", 2**16 - 1, "points of 65535 bytes in"),
         (247, "<Q", 2**63, "9223372036854775808 points"),
         (247, "<Q", 0, "0 points"),
@@ -90,3 +90,9 @@ def test_the_same_scan_gives_the_same_bytes(written, tmp_path):
     assert (tmp_path / "again.las").read_bytes() == written.read_bytes()
     with laspy.open(BytesIO(written.read_bytes())) as opened:
         assert opened.header.generating_software == "lidargrit"
+
+
+def test_dim_scans_keep_their_reflectance(tmp_path):
+    scan = Scan(torch.rand(5, 3) + 1, torch.tensor([0.0, 0.001, 0.002, 0.003, 0.0038]))
+    LAS.write(tmp_path / "dim.las", scan)
+    assert torch.equal(read_scan(tmp_path / "dim.las").reflectance, scan.reflectance)

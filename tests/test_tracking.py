@@ -7,7 +7,7 @@ import pytest
 
 from lidargrit.cli import main
 from lidargrit.recipes import load_recipe
-from lidargrit.training import tracked
+from lidargrit.training.tracking import tracked
 from tiny_runs import the_one_line, train_words
 
 RECIPE = load_recipe("demo")

@@ -37,7 +37,7 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.generators import load_class
     from lidargrit.recipes import load_recipe
     from lidargrit.reporting import TerminalReporter
-    from lidargrit.training import check_data, measure, plan_training, tracked, train
+    from lidargrit.training import check_data, measure, plan_training, train
 
     recipe = load_recipe(options.recipe, options.set)
     if options.dry_run or options.measure:
@@ -53,7 +53,6 @@ def run(options: argparse.Namespace) -> None:
         )
     from lidargrit.viewer import plot_progress  # matplotlib, which a plan does not need
 
-    with tracked(options.wandb, recipe, options.out):
-        train(recipe, options.out, TerminalReporter(), plot_progress)
+    train(recipe, options.out, TerminalReporter(), plot_progress, options.wandb)
     command = load_class(recipe.generator).facts.first_command.replace("RUN", str(options.out))
     print(f"done: the model lies in {options.out}; try it with: lidargrit {command}")

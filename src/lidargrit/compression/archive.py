@@ -32,6 +32,7 @@ _MAGIC, _END = b"LGZ2", b"2ZGL"
 _START = struct.Struct("<4sII")
 _TAIL = struct.Struct("<QI4s")
 _INDEX_BYTES_AT_MOST = 256 * 2**20  # of the index's lines: those of a million scans take 50 MB
+_LINE_BYTES_AT_MOST = 2**16  # a path and a few numbers
 _CHUNK = 2**20
 _STRICTER = {"bad_points": ["refuse"], "bad_scans": ["refuse"]}  # options by which no other scans were written so far
 
@@ -299,7 +300,8 @@ class Archive:
                 *lines, rest = (rest + text).split(b"\n")
                 for line in lines:
                     yield Entry.parse(line)
-                if total > _INDEX_BYTES_AT_MOST or not (text or opened.eof):
+                too_long = len(rest) > _LINE_BYTES_AT_MOST  # a line without end would be joined again and again
+                if too_long or total > _INDEX_BYTES_AT_MOST or not (text or opened.eof):
                     raise ValueError
         except (zlib.error, ScanError, TypeError, ValueError):
             raise self._damaged() from None

@@ -15,6 +15,7 @@ from typing import ClassVar
 from lidargrit import formats
 from lidargrit.datasets import ScanDataset, recognise
 from lidargrit.datasets._splits import Split
+from lidargrit.determinism import natural_order
 from lidargrit.errors import DataError, OutputError, UsageError, nearest_names
 from lidargrit.formats import BadPoints
 from lidargrit.sensors import load_sensor
@@ -41,7 +42,7 @@ class FileDataset(ScanDataset):
         if not found:
             raise self._wrong_root()
         _check_names(found)
-        wanted = Split.parse(split)
+        wanted = Split.parse(split, {*found.values()})
         chosen = self._choose(wanted, set(found.values()))
         paths = [path for path, sequence in found.items() if sequence in chosen]
         several = not self.format or formats.load(self.format).several
@@ -150,7 +151,7 @@ class FileDataset(ScanDataset):
 
     @classmethod
     def _find(cls, root: Path) -> list[Path]:
-        found = (sorted(filter(_is_scan_file, root.glob(pattern))) for pattern in cls.patterns)
+        found = (sorted(filter(_is_scan_file, root.glob(pattern)), key=natural_order) for pattern in cls.patterns)
         return next((paths for paths in found if paths), [])
 
     def _choose(self, split: Split, sequences: set[str]) -> set[str]:
@@ -165,7 +166,7 @@ class FileDataset(ScanDataset):
         if "all" in split.parts:
             return sequences
         wanted = {sequence for part in split.parts for sequence in named.get(part, (part,))}
-        patterns = [pattern for pattern in wanted if "*" in pattern]  # such as "train/*"
+        patterns = [of for part in split.parts for of in named.get(part, ()) if "*" in of]  # such as "train/*"
         chosen = {one for one in sequences if one in wanted or any(fnmatchcase(one, of) for of in patterns)}
         if not chosen:
             raise self._none_of(split, sequences, sorted(wanted))

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from lidargrit import formats
 from lidargrit.datasets._files import FileDataset, scans_below, unnamed_recording
+from lidargrit.determinism import natural_order
 from lidargrit.formats import BadPoints
 
 
@@ -41,7 +42,7 @@ class Folder(FileDataset):
 
     @classmethod
     def _find(cls, root: Path) -> list[Path]:
-        return sorted(scans_below(root))
+        return sorted(scans_below(root), key=natural_order)
 
     def sequence_of(self, relative: Path) -> str:
         """Name the folder of a file."""

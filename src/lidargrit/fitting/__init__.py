@@ -14,8 +14,8 @@ from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import ConfigError, ScanError
 from lidargrit.fitting.azimuths import columns_of_scans, firing_steps_deg, offsets_deg
 from lidargrit.fitting.elevations import FittedRows, cluster_rows, nearest_row, rows_of_rings
-from lidargrit.fitting.limits import quantum_m, range_limits_m
-from lidargrit.fitting.points import Points
+from lidargrit.fitting.limits import farthest_m, quantum_m
+from lidargrit.fitting.points import NOISE_RANGE_M, Points
 from lidargrit.fitting.rings import Method, Rings, recover_rings
 from lidargrit.sensors import NAME_AT_MOST, ProjectionName, SensorModel, column_azimuths_rad
 from lidargrit.structures import Scan
@@ -195,7 +195,6 @@ def _model(
     rings: Rings,
     num_scans: int,
 ) -> SensorModel:
-    near_m, far_m = range_limits_m(np.concatenate([points.range_m for points in used]))
     offsets = None
     if rings.lasers:
         offsets = offsets_deg(used, row_of_point, len(rows.number), rings.lasers)
@@ -206,8 +205,8 @@ def _model(
         elevation_rad=torch.from_numpy(np.radians(rows.elevation_deg)).float()[:, None],
         # The nearest number that networks can halve three times: four columns more or less, of hundreds.
         azimuth_rad=column_azimuths_rad(_HALVED * max(1, round((columns or _COLUMNS_UNCLEAR) / _HALVED))),
-        range_min_m=near_m,
-        range_max_m=far_m,
+        range_min_m=NOISE_RANGE_M,
+        range_max_m=farthest_m(np.concatenate([points.range_m for points in used])),
         projection=_projection(rows, rings),
         source=f"lidargrit fit-sensor, from {num_scans} scans (rings: {rings.method})",
         azimuth_offset_rad=None if offsets is None else torch.from_numpy(np.radians(offsets)).float(),
@@ -246,7 +245,8 @@ def _warnings(rows: FittedRows, rings: Rings, num_scans: int, columns: int | Non
     blurred = int((rows.residual_deg[1:] > gap / 2).sum())
     if blurred:
         found.append(
-            f"{blurred} rings are blurred by more than half the way to the next: are the scans in their own frame?"
+            f"{blurred} rings are blurred by more than half the way to the next: fit scans in the sensor's own frame, "
+            "without motion compensation (deskewing)"
         )
     if rings.method == "ring field" and not _are_rows(rows):
         found.append("the rings of the files are not numbered from 0 at the top without a gap, so rows go by elevation")

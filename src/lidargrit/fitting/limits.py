@@ -12,10 +12,12 @@ _NEAR_A_STEP = 0.1  # of a step to either side; numbers that know no step are th
 _SHARE_AT_LEAST = 0.8
 
 
-def range_limits_m(range_m: Float64[np.ndarray, "n"]) -> tuple[float, float]:
-    """Return limits that hold all points but a few in ten thousand, rounded outwards to 0.1 m and 1 m."""
-    low, high = np.quantile(range_m, (0.0005, 0.9999))
-    return max(0.1, math.floor(float(low) * 10) / 10), float(math.ceil(float(high)))
+def farthest_m(range_m: Float64[np.ndarray, "n"]) -> float:
+    """Return a limit that holds all points but one in ten thousand, rounded up to whole metres.
+
+    Scans tell no near limit: other scans of the same sensor may have returns nearer than the nearest of these.
+    """
+    return float(math.ceil(float(np.quantile(range_m, 0.9999))))
 
 
 def quantum_m(values_m: Float64[np.ndarray, "n"]) -> float | None:

@@ -10,7 +10,7 @@ from jaxtyping import Float64, Int64
 from lidargrit.errors import ScanError
 from lidargrit.structures import Scan
 
-_NOISE_RANGE_M = 1.0  # nearer points are the car that carries the sensor, or placeholders: their angles mean little
+NOISE_RANGE_M = 1.0  # nearer points are the car that carries the sensor, or placeholders: their angles mean little
 _SECTORS, _SECTORS_AT_LEAST = 36, 27  # of 10 degrees: a camera's crop fills a quarter of them, a revolution nearly all
 _POINTS_AT_LEAST = 200  # fewer show no rings
 
@@ -48,12 +48,12 @@ class Points:
         x, y, z = scan.points_xyz_m.double().numpy().T
         flat = np.hypot(x, y)
         range_m = np.hypot(flat, z)
-        index = np.flatnonzero(range_m > _NOISE_RANGE_M)
+        index = np.flatnonzero(range_m > NOISE_RANGE_M)
         azimuth_deg = np.degrees(np.arctan2(y[index], x[index]))
         sectors = len(np.unique(np.floor(azimuth_deg * (_SECTORS / 360))))
         if len(index) < _POINTS_AT_LEAST:
             raise ScanError(
-                f"{len(index)} points beyond {_NOISE_RANGE_M:g} m in {scan.source}",
+                f"{len(index)} points beyond {NOISE_RANGE_M:g} m in {scan.source}",
                 f"at least {_POINTS_AT_LEAST}",
                 "use scans with more points, in metres",
             )

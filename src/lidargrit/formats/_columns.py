@@ -18,7 +18,7 @@ from lidargrit.formats import BadPoints, damaged, scan_of
 from lidargrit.structures import Scan
 
 BYTES_AT_MOST = 256_000_000  # 4 million points of 64 bytes; sensors' own files have up to 48 a point
-REFLECTANCE_RULE = "0 to 1, 0 to 255 or 0 to 65535: the smallest of these that holds all values of a file"
+REFLECTANCE_RULE = "0 to 1, 0 to 255 or 0 to 65535: the smallest of these that holds all values of a file; 8 bits: 255"
 
 # Lower case; CloudCompare puts "scalar_" before its names. Where a file has several, the first counts: reflectivity is
 # calibrated where intensity is not (Ouster).
@@ -26,6 +26,7 @@ _REFLECTANCE = ("reflectance", "reflectivity", "intensity", "remission", "i")
 _RING = ("ring", "channel")
 _LABEL = ("label",)
 _FULL_SCALES = (1, 255, 65_535)
+_ABOUT_1 = 1.05  # of reflectance from 0 to 1 that a calibration took a little beyond
 _LASERS = (16, 32, 40, 64, 80, 128, 256)  # that sensors have; the top ring may have no return, and not be in the file
 _ONE_RING_AT_MOST_RAD = math.radians(5)  # that the elevations of a sensor with one ring may span
 _RING_AT_MOST = 65_535  # 16 bits, as ROS drivers store it
@@ -35,8 +36,9 @@ _LABEL_AT_MOST = 2**32 - 1  # SemanticKITTI's: class and instance in 16 bits eac
 def scan_of_columns(columns: Mapping[str, Num[np.ndarray, "n"]], path: Path, bad_points: BadPoints) -> Scan:
     """Make a scan of columns that are known by their names; others are left alone.
 
-    Reflectance is divided by 1, 255 or 65535: the smallest that no value exceeds. Rings are counted from the top: where
-    the file's rise with elevation, they are turned round. A ring that all points have is none.
+    Reflectance is divided by 1, 255 or 65535: the smallest that no value exceeds, and 255 for columns of 8 bits. Rings
+    are counted from the top: where the file's rise with elevation, they are turned round. A ring that all points have
+    is none.
 
     Raises:
         ScanError: x, y or z is not there, rings or labels are not whole numbers, or the points are unfit.
@@ -54,7 +56,7 @@ def scan_of_columns(columns: Mapping[str, Num[np.ndarray, "n"]], path: Path, bad
         ring = None
     return scan_of(
         points_xyz_m,
-        None if reflectance is None else _to_unit(_floats(reflectance)),
+        None if reflectance is None else _to_unit(reflectance),
         ring,
         str(path),
         bad_points,
@@ -125,8 +127,13 @@ def _floats(values: np.ndarray) -> Tensor:
         return torch.from_numpy(values.astype(np.float32))
 
 
-def _to_unit(values: Tensor) -> Tensor:
+def _to_unit(reflectance: np.ndarray) -> Tensor:
+    values = _floats(reflectance)
+    if reflectance.dtype == np.uint8:
+        return values / 255
     highest = float(values.nan_to_num(0.0, torch.inf, 0.0).max()) if len(values) else 0.0
+    if 1 < highest <= _ABOUT_1:
+        return values.clamp(max=1)
     return values / next((scale for scale in _FULL_SCALES if highest <= scale), 1)
 
 

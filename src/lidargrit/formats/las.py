@@ -25,6 +25,7 @@ _COMPRESSED = 0xC0  # bits of the point format that LAZ sets
 _POINT_FORMATS = 11  # 0 to 10
 _RECORDS_AT_MOST = 1000  # of remarks between header and points; real files have 1 to 10
 _STEP_M = 1e-4  # in which coordinates are kept: a twentieth of a sensor's own step, and 214 km in 32 bits
+_OURS = "lidargrit"  # the program that writes a file
 _INTENSITY_STEPS = 65_535  # 16 bits, as the standard wants them
 _WRITTEN_ON = date(2000, 1, 1)  # the same scan gives the same bytes on every day
 
@@ -32,9 +33,10 @@ _WRITTEN_ON = date(2000, 1, 1)  # the same scan gives the same bytes on every da
 class Las(ScanFormat):
     """LAS 1.0 to 1.4; compressed files (LAZ) have to be unpacked first.
 
-    Reflectance is LAS's intensity, and none where all of it is 0, which is how LAS says so. Ring and label are extra
-    dimensions of these names; the classes of LAS are others than SemanticKITTI's and left alone. Files are written as
-    version 1.4, point format 0, with coordinates in steps of 0.1 mm.
+    Reflectance is LAS's intensity, and none where all of it is 0, which is how LAS says so. Files that this program
+    writes have it from 0 to 1, too, in an extra dimension of that name, as they have ring and label; the classes of LAS
+    are others than SemanticKITTI's and left alone. Files are written as version 1.4, point format 0, with coordinates
+    in steps of 0.1 mm.
 
     Source:
         LAS Specification 1.4 R15, American Society for Photogrammetry and Remote Sensing, 2019.
@@ -69,7 +71,7 @@ class Las(ScanFormat):
                 warnings.catch_warnings(action="ignore"),  # of remarks that it cannot read, and of huge coordinates
                 laspy.LasReader(BytesIO(data), read_evlrs=False) as reader,
             ):
-                columns = _columns(reader.read_points(-1))
+                columns = _columns(reader.read_points(-1), reader.header.generating_software == _OURS)
         except Exception as error:  # the library meets a damaged file with whatever it stumbles over
             raise damaged(path, _FORMAT, error) from None
         return scan_of_columns(columns, path, bad_points)
@@ -91,20 +93,22 @@ class Las(ScanFormat):
             raise OutputError(f"a coordinate of {farthest_m:g} m", "at most 214 km", "choose .ply")
         header = laspy.LasHeader(version="1.4", point_format=0)
         header.scales, header.offsets = np.full(3, _STEP_M), np.zeros(3)
-        header.generating_software, header.creation_date = "lidargrit", _WRITTEN_ON
+        header.generating_software, header.creation_date = _OURS, _WRITTEN_ON
         extra = {name: columns[name] for name in ("ring", "label") if name in columns}
+        if "intensity" in columns:  # the intensity alone does not say what its full scale is
+            extra["reflectance"] = columns["intensity"].astype(np.float32)
         header.add_extra_dims([laspy.ExtraBytesParams(name, values.dtype) for name, values in extra.items()])
         cloud: Any = laspy.LasData(header)
         cloud.xyz = scan.points_xyz_m.double().numpy()
         if "intensity" in columns:
-            cloud.intensity = (_INTENSITY_STEPS * columns["intensity"].astype(np.float64)).round().astype(np.uint16)
+            cloud.intensity = _steps(columns["intensity"])
         for name, values in extra.items():
             cloud[name] = values
         with atomic_path(path) as temporary, temporary.open("wb") as file:
             cloud.write(file, do_compress=False)
 
 
-def _columns(points: Any) -> dict[str, np.ndarray]:
+def _columns(points: Any, ours: bool) -> dict[str, np.ndarray]:
     """Return the columns that a scan has room for."""
     columns = {axis: np.asarray(points[axis], dtype=np.float64) for axis in "xyz"}
     intensity = np.asarray(points["intensity"])
@@ -114,7 +118,14 @@ def _columns(points: Any) -> dict[str, np.ndarray]:
         values = np.asarray(points[name])
         if known_name(name) and values.ndim == 1:
             columns[name] = values
+    if ours and "reflectance" in columns and not np.array_equal(intensity, _steps(columns["reflectance"])):
+        del columns["reflectance"]  # of before another program changed the intensity
     return columns
+
+
+def _steps(reflectance: np.ndarray) -> np.ndarray:
+    """Return the intensity that is written for reflectance from 0 to 1."""
+    return (_INTENSITY_STEPS * reflectance.astype(np.float64).clip(0, 1)).round().astype(np.uint16)
 
 
 def _check_header(header: bytes, size: int | None, path: Path) -> None:

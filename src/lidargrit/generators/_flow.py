@@ -123,6 +123,10 @@ class FlowMatching(Objective):
         super().__init__(sensor)
         self.network = network
 
+    def check(self, images: RangeImage) -> None:
+        """Refuse images without the reflectance that is to be learned."""
+        encode(images, with_reflectance=self.network.images > 1)
+
     def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the mean squared error as ``loss``."""
         clean = encode(images, with_reflectance=self.network.images > 1)

@@ -252,6 +252,10 @@ class ScoreMatching(Objective):
         sigmas = sigma_table(config.sigma_largest, config.sigma_smallest, config.levels)
         self.register_buffer("sigmas", sigmas, persistent=False)
 
+    def check(self, images: RangeImage) -> None:
+        """Refuse images without the reflectance that is to be learned."""
+        encode(images, self.config)
+
     def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the error, summed over the values of an image, as ``loss``, and that of one value beside it."""
         clean = encode(images, self.config)

@@ -216,6 +216,10 @@ class Denoising(Objective):
         super().__init__(sensor)
         self.network = network
 
+    def check(self, images: RangeImage) -> None:
+        """Refuse images without the reflectance that is to be learned."""
+        encode(images, with_reflectance=self.network.out_conv.out_channels > 1)
+
     def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the weighed error as ``loss``, and the plain one beside it."""
         clean = encode(images, with_reflectance=self.network.out_conv.out_channels > 1)

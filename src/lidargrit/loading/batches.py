@@ -14,6 +14,8 @@ from lidargrit.errors import ConfigError
 from lidargrit.loading.images import RangeImages
 from lidargrit.structures import RangeImage
 
+_THREADS_AT_MOST = 8  # more hold more batches in memory, and read none sooner
+
 
 class Batches:
     """Training batches as a function of the scans seen so far: a resumed run sees the same as one that ran through.
@@ -54,11 +56,12 @@ class Batches:
     def stream(self, scans_seen: int, until: int) -> Iterator[RangeImage]:
         """Yield the batches from ``scans_seen`` scans on, up to the last that begins before ``until`` scans."""
         waiting: deque[Future[RangeImage]] = deque()
-        with ThreadPoolExecutor(self.workers, thread_name_prefix="reading scans") as pool:
+        threads = min(self.workers, _THREADS_AT_MOST)
+        with ThreadPoolExecutor(threads, thread_name_prefix="reading scans") as pool:
             try:
                 for position in range(scans_seen, until, self.batch_size):
                     waiting.append(pool.submit(self._read, *self._chosen(position)))
-                    if len(waiting) > 2 * self.workers:  # enough for none to idle, and few enough to hold in memory
+                    if len(waiting) > 2 * threads:  # enough for none to idle, and few enough to hold in memory
                         yield waiting.popleft().result()
                 while waiting:
                     yield waiting.popleft().result()

@@ -99,7 +99,7 @@ def _made_by_processes(folder: Path, shares: list[list[int]]) -> Iterator[int]:
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}  # one core each: threads of several would fight for them
     command = module_command("lidargrit.loading", str(folder), str(os.getpid()))
     processes: list[subprocess.Popen[str]] = []
-    lines: queue.Queue[str | None] = queue.Queue()
+    lines: queue.Queue[str | int] = queue.Queue()
     try:
         for share in shares:
             process = subprocess.Popen([*command, *map(str, share)], stdout=subprocess.PIPE, text=True, env=environment)
@@ -108,8 +108,10 @@ def _made_by_processes(folder: Path, shares: list[list[int]]) -> Iterator[int]:
         running = len(processes)
         while running:
             line = lines.get()
-            if line is None:
+            if isinstance(line, int):
                 running -= 1
+                if line:  # it died, and the others could go on for hours
+                    break
             elif line.startswith("{"):
                 raise _error_of(line)
             else:
@@ -123,12 +125,12 @@ def _made_by_processes(folder: Path, shares: list[list[int]]) -> Iterator[int]:
         raise DataError("a process that died while projecting scans", "all to end well", "the same command goes on")
 
 
-def _listen(process: subprocess.Popen[str], lines: queue.Queue[str | None]) -> None:
+def _listen(process: subprocess.Popen[str], lines: queue.Queue[str | int]) -> None:
     assert process.stdout is not None
     with process.stdout:
         for line in process.stdout:
             lines.put(line)
-    lines.put(None)
+    lines.put(process.wait())
 
 
 def _error_of(line: str) -> LidarGritError:

@@ -24,6 +24,7 @@ _KINDS = (0.36, 0.74)  # up to these: rows, then sectors, then pixels
 _BOXES = 1 / 3  # of the sectors, hidden in some rows only
 _SECTORS = (24 / 256, 128 / 256)  # of the columns, hidden
 _SHARES = (0.03, 0.5)  # of the pixels, observed
+_SETTING = "model.completion.reflectance"
 _WITHOUT = 0.25  # of the scans show no labels, and as many no reflectance, so that a network completes without them
 _CLASS_WEIGHT, _REFLECTANCE_WEIGHT = 0.5, 2.0
 _MASK_WEIGHT, _ALONE_WEIGHT, _LOG_WEIGHT, _METRE_WEIGHT = 3.0, 0.5, 1.5, 0.3
@@ -47,6 +48,13 @@ class CompletionObjective(Objective):
         super().__init__(sensor)
         self.completion = network
 
+    def check(self, images: RangeImage) -> None:
+        """Refuse images without the labels or the reflectance that are to be learned."""
+        if self.completion.config.labels:
+            labels_to_learn(images.label)
+        if self.completion.config.reflectance:
+            required_reflectance(images.reflectance, _SETTING)
+
     def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the loss, and beside it the error in metres of hidden returns and the bits of a hidden return.
 
@@ -63,7 +71,7 @@ class CompletionObjective(Objective):
         if learned.labels:
             label = hidden_in_some(labels_to_learn(condition.label), 0, _WITHOUT, rng)
         if learned.reflectance:
-            shown = required_reflectance(condition.reflectance, "model.completion.reflectance")
+            shown = required_reflectance(condition.reflectance, _SETTING)
             reflectance = hidden_in_some(shown, TYPICAL_REFLECTANCE, _WITHOUT, rng)
         condition = replace(condition, label=label, reflectance=reflectance)
         point = self.completion(hints_of(condition), observed)

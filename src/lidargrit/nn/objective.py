@@ -39,6 +39,8 @@ class Objective(nn.Module, ABC):
     """Settings of the generator that it learns by, beside those that begin with the name of the stage."""
     over: tuple[str, ...] = ()
     """Names of earlier stages whose networks compute what it learns from; it is of no use with other networks."""
+    needs_marks: bool = False
+    """Whether it learns from surfaces that are marked as returns or not, which no other stage can learn from."""
     period: int = 1
     """Number of training steps after which the same operations come again; more than 1 if some terms come rarely."""
 
@@ -55,6 +57,17 @@ class Objective(nn.Module, ABC):
             rng: random numbers, on the device of the images.
             player: one of ``players``; "" where there are none.
         """
+
+    def check(self, images: RangeImage) -> None:
+        """Refuse images without what the objective learns from, such as labels, before any stage is trained.
+
+        Args:
+            images: one of the training or validation images, as a batch.
+
+        Raises:
+            ConfigError: tells what the images lack.
+        """
+        return
 
     def preparation_flops(self, scans: int) -> int:
         """Return the floating-point operations of what is computed once, before steps learn from it.

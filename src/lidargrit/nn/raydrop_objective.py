@@ -39,6 +39,15 @@ class RaydropObjective(Objective):
     def __init__(self, network: RaydropNetwork, sensor: SensorModel) -> None:
         super().__init__(sensor)
         self.raydrop = network
+        self.needs_marks = network.config.surfaces == "known"
+
+    def check(self, images: RangeImage) -> None:
+        """Refuse images whose surfaces are not marked, or without the labels or the reflectance to be learned."""
+        reflectance = self._marked(images)[1] if self.needs_marks else images.reflectance
+        if self.raydrop.classes is not None:
+            labels_to_learn(images.label)
+        if self.raydrop.config.reflectance:
+            required_reflectance(reflectance, _SETTING)
 
     def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the loss, and beside it the bits of a surface's return, and the mean absolute error of reflectance.
@@ -47,10 +56,10 @@ class RaydropObjective(Objective):
             ConfigError: scans whose surfaces are not marked, unless surfaces are to be estimated; or scans without
                 labels, for a network with classes, or without reflectance, for a network with it.
         """
-        if self.raydrop.config.surfaces == "estimated":
-            surfaces, returned, reflectance = ranges_from_others(images, rng), images.return_mask, images.reflectance
-        else:
+        if self.needs_marks:
             surfaces, (returned, reflectance) = images, self._marked(images)
+        else:
+            surfaces, returned, reflectance = ranges_from_others(images, rng), images.return_mask, images.reflectance
         range_m, surface = surfaces.range_m, surfaces.return_mask
         if self.training:
             noise = torch.randn(range_m.shape, generator=rng, device=rng.device)

@@ -10,7 +10,7 @@ RECIPE = Recipe(
     generator="r2dm",
     model=R2dmConfig(
         unet=UnetConfig(channels=16, channel_multipliers=(1, 2, 4, 8), residual_blocks=(1, 1, 1, 1)),
-        reflectance=False,  # the others of the house learn the range alone; the authors find it sharper, too
+        reflectance=False,  # the other small recipes learn the range alone; the authors find it sharper, too
     ),
     data=DataConfig(train=("simulated:2000:train",), val=("simulated:32:val",)),
     training={

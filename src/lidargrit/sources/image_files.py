@@ -10,7 +10,7 @@ import numpy as np
 from lidargrit import _discovery, formats
 from lidargrit.arrays import ARRAY_BYTES_AT_MOST, parse_array
 from lidargrit.datasets.folder import Folder
-from lidargrit.determinism import evenly_spaced
+from lidargrit.determinism import evenly_spaced, natural_order
 from lidargrit.errors import ConfigError, LidarGritError, ScanError
 from lidargrit.formats import read_bytes
 from lidargrit.loading import DataConfig, Pixels, Provenance, RangeImages
@@ -72,7 +72,7 @@ class ImageFileSource(Source):
 def image_files(path: Path) -> list[Path]:
     """Return the range images that a path names: one ``.npy``, or those of a folder of nothing else; else none."""
     try:
-        found = [path] if path.is_file() else sorted(path.iterdir())
+        found = [path] if path.is_file() else sorted(path.iterdir(), key=natural_order)
     except (OSError, ValueError):
         return []
     found = [one for one in found if one.is_file() and not one.name.startswith(".") and formats.candidates(one)]

@@ -233,6 +233,11 @@ class Vqvae(ConvolutionalTokenizer[VqvaeConfig]):
         latents = (1, self.config.code_dim, *self.grid_size)
         return flops_of(self.post_quant_conv, latents) + flops_of(self.decoder.prepared("fp32"), latents)
 
+    def check(self, images: RangeImage) -> None:
+        """Refuse images without the reflectance that is to be learned."""
+        if self.config.reflectance:
+            required_reflectance(images.reflectance, _SETTING)
+
     def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the loss of eq. 5 of the paper and its terms, the range error in metres, and the mask's accuracy."""
         z = self.quantize(self.latents(images), rng)

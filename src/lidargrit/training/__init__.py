@@ -5,7 +5,6 @@ from lidargrit.training.config import FitConfig, Recipe
 from lidargrit.training.measure import Measured, measure
 from lidargrit.training.plan import TrainingPlan, check_data, plan_training
 from lidargrit.training.run import check_folder, train
-from lidargrit.training.tracking import tracked
 
 __all__ = [
     "FitConfig",
@@ -17,7 +16,6 @@ __all__ = [
     "computing_time",
     "measure",
     "plan_training",
-    "tracked",
     "train",
     "training_flops",
     "with_budget",

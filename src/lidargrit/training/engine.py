@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.distributed import DistError
 
 from lidargrit.determinism import derive_seed
-from lidargrit.errors import LidarGritError, TrainingError
+from lidargrit.errors import ConfigError, LidarGritError, TrainingError
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.precision import Precision, dtype_of
 from lidargrit.processes import rank_and_world_size
@@ -43,7 +43,13 @@ class Engine:
         # One device, unless a launcher such as torchrun began this process as one of several.
         where: dict[str, Any] = {"devices": 1, "plugins": [LightningEnvironment()]}  # whatever a batch queue has set
         _, processes = rank_and_world_size(None, None)
-        if "LOCAL_RANK" in os.environ and processes > 1:
+        if processes > 1:
+            if "LOCAL_RANK" not in os.environ:
+                raise ConfigError(
+                    f"WORLD_SIZE={processes} without LOCAL_RANK",
+                    "a launcher that sets RANK, WORLD_SIZE and LOCAL_RANK, or none of them",
+                    "begin with torchrun, or unset WORLD_SIZE and RANK",
+                )
             here = int(os.environ.get("LOCAL_WORLD_SIZE", processes))
             strategy = DDPStrategy(find_unused_parameters=not reaches_all_weights)
             where = {"devices": here, "num_nodes": processes // here, "strategy": strategy}

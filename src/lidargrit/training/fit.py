@@ -67,6 +67,7 @@ class Fit:
                 "one checkpoint for all processes",
                 "share the run's folder between the machines, and start again",
             )
+        self._lacks_validation = False
         self.engine.by_first(self._begin)
 
     @property
@@ -101,6 +102,8 @@ class Fit:
         begun = time.monotonic()
         progress_bar = self.reporter.progress(what, config.scans, self.scans_seen)
         with Termination() as termination, progress_bar as progress:
+            if self.engine.any(self._lacks_validation) and self._validates():  # the process ended before it
+                self._log_terms("val", self.validate(val), 0.0)
             for images in batches.stream(self.scans_seen, config.scans):
                 terms = self._step(images)
                 stops = self.engine.any(termination.asked)
@@ -111,14 +114,14 @@ class Fit:
                     self._log_terms(
                         "train", {name: float(term) for name, term in terms.items()}, time.monotonic() - begun
                     )
-                if self._passed(config.validate_every) or self.scans_seen >= config.scans:
+                if self._passed(config.checkpoint_every) or self.scans_seen >= config.scans or stops:
+                    self._save()  # before anything that may fail, or take longer than a terminated process has
+                if stops:
+                    raise Terminated
+                if self._validates():
                     self._log_terms("val", self.validate(val), time.monotonic() - begun)
                 if config.pictures_every and self._passed(config.pictures_every):
                     self.engine.by_first(self._plot)
-                if self._passed(config.checkpoint_every) or self.scans_seen >= config.scans or stops:
-                    self._save()
-                if stops:
-                    raise Terminated
         self.engine.by_first(self._close_log)
         if self.engine.any(termination.asked):  # since the last step
             raise Terminated
@@ -160,6 +163,7 @@ class Fit:
     def _begin(self) -> None:
         remove_partials(self.checkpoint.parent)
         self.log = Log(self.folder, self.scans_seen)  # only the first process has one
+        self._lacks_validation = self.scans_seen > 0 and not self.log.validated
 
     def _close_log(self) -> None:
         self.log.close()
@@ -167,6 +171,9 @@ class Fit:
     def _plot(self) -> None:
         if self.plot is not None:
             self.plot(self.average.objective, self.folder / "pictures" / f"{self.scans_seen:09d}.png")
+
+    def _validates(self) -> bool:
+        return self._passed(self.config.validate_every) or self.scans_seen >= self.config.scans
 
     def _passed(self, every: int) -> bool:
         return self.scans_seen // every > (self.scans_seen - self.config.batch_size) // every

@@ -42,6 +42,8 @@ class Log:
 
     def __init__(self, folder: Path, scans_seen: int) -> None:
         self._path, self._resumed_at = folder / LOG_FILE, scans_seen
+        self.validated = False
+        """Whether there is an entry of the validation at the checkpoint from which the stage resumes."""
         self._board: Any = None
         if self._path.is_file():
             self._trim()
@@ -85,4 +87,5 @@ class Log:
 
     def _trim(self) -> None:
         kept = [entry for entry in read_log(self._path) if entry["scans_seen"] <= self._resumed_at]
+        self.validated = any((e["scans_seen"], e.get("split")) == (self._resumed_at, "val") for e in kept)
         write_text(self._path, "".join(f"{json.dumps(entry)}\n" for entry in kept))

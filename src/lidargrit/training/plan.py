@@ -9,6 +9,8 @@ from typing import Any
 import torch
 
 from lidargrit import configuration
+from lidargrit.errors import ConfigError
+from lidargrit.loading import RangeImages
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.precision import Precision
 from lidargrit.sources import PreparedSource, open_to_train
@@ -115,6 +117,25 @@ class CheckedStages:
     objectives: Mapping[str, Objective]
     donors: Mapping[str, str]
 
+    @property
+    def trained(self) -> dict[str, Objective]:
+        """The objectives of the stages that are trained, by name."""
+        return {name: objective for name, objective in self.objectives.items() if name not in self.donors}
+
+    def check_images(self, setting: str, images: RangeImages) -> None:
+        """Refuse images that lack what a stage learns from, as their first one tells.
+
+        Args:
+            setting: setting that names their sources, for the message.
+            images: training or validation images.
+        """
+        for name, objective in self.trained.items():
+            try:
+                objective.check(images.batch([0]))
+            except ConfigError as lacking:
+                why = f"{setting}, for the stage {name}: {lacking.got}"
+                raise ConfigError(why, lacking.wanted, lacking.cure) from None
+
 
 def check_stages(recipe: Recipe, processes: int = 1) -> CheckedStages:
     """Refuse settings of any stage that its training would refuse, and stages to take that do not fit.
@@ -134,10 +155,17 @@ def check_stages(recipe: Recipe, processes: int = 1) -> CheckedStages:
         objectives = {name: generator.objective(name) for name in generator.stages}
     donors = donors_of_stages(recipe, generator.stages)
     taken_stages(recipe, generator)
-    for name, objective in objectives.items():
-        if name not in donors:
-            follow_settings(objective, recipe.settings_of(name), processes)
-    return CheckedStages(objectives, donors)
+    checked = CheckedStages(objectives, donors)
+    for name, objective in checked.trained.items():
+        follow_settings(objective, recipe.settings_of(name), processes)
+    if others := [name for name, objective in checked.trained.items() if not objective.needs_marks]:
+        for name in checked.trained.keys() - set(others):
+            raise ConfigError(
+                f"{name} trained together with {' and '.join(others)}, from scans of every surface",
+                "a run that learns from such scans alone",
+                f"train {' and '.join(others)} first, then take them from that run by stages_from",
+            )
+    return checked
 
 
 def plan_training(recipe: Recipe) -> TrainingPlan:

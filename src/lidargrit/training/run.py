@@ -29,8 +29,9 @@ from lidargrit.training.checkpoint import fingerprint
 from lidargrit.training.config import FitConfig, Recipe
 from lidargrit.training.engine import Engine
 from lidargrit.training.fit import Fit
-from lidargrit.training.plan import check_stages
-from lidargrit.training.taken_stages import check_donor, taken_facts, taken_stages
+from lidargrit.training.plan import CheckedStages, check_data, check_stages
+from lidargrit.training.taken_stages import taken_facts, taken_stages
+from lidargrit.training.tracking import tracked
 
 _IMAGES = "_images"  # of a hash of images, in place of their names
 # Settings of a recipe that change nothing that is computed, the last two of each stage.
@@ -41,7 +42,11 @@ PlotProgress = Callable[[Generator, str, RangeImages, Path], None]
 
 
 def train(
-    recipe: Recipe, folder: Path, reporter: Reporter | None = None, plot: PlotProgress | None = None
+    recipe: Recipe,
+    folder: Path,
+    reporter: Reporter | None = None,
+    plot: PlotProgress | None = None,
+    wandb_project: str = "",
 ) -> Generator:
     """Train every stage of a recipe in a run folder and return the finished generator.
 
@@ -55,6 +60,7 @@ def train(
         folder: run folder.
         reporter: receiver of progress and messages.
         plot: function that plots the progress, called every ``pictures_every`` scans of a stage.
+        wandb_project: project of Weights & Biases that is told of the run, too; "" for none.
 
     Raises:
         OutputError: the folder holds something else, another process trains in it, or it cannot be written.
@@ -66,17 +72,19 @@ def train(
     reporter = reporter if reporter and engine.rank == 0 else Reporter()
     with ExitStack() as held, engine.lost_processes_reported():
         engine.by_first(lambda: check_folder(folder, recipe))
-        engine.by_first(lambda: check_donor(recipe))
-        donors = check_stages(recipe, engine.world_size).donors
+        checked = check_stages(recipe, engine.world_size)
+        check_data(recipe)
         engine.by_first(lambda: held.enter_context(claim_folder(folder)))
+        engine.by_first(lambda: check_folder(folder, recipe))  # another process may have trained in it meanwhile
         begun = claimed_manifest(folder / RUN_FILE, folder / TRAINED_ON_FILE)
         engine.by_first(lambda: held.enter_context(begun))
-        return _train(recipe, donors, folder, reporter, plot, engine)
+        engine.by_first(lambda: held.enter_context(tracked(wandb_project, recipe, folder)))
+        return _train(recipe, checked, folder, reporter, plot, engine)
 
 
 def _train(
     recipe: Recipe,
-    donors: Mapping[str, str],
+    checked: CheckedStages,
     folder: Path,
     reporter: Reporter,
     plot: PlotProgress | None,
@@ -85,26 +93,32 @@ def _train(
     train_images = load_range_images(recipe.data.train, recipe.data, reporter)
     val_images = load_range_images(recipe.data.val, recipe.data, reporter)
     _warn_of_overlap(train_images, val_images, reporter)
+    checked.check_images("data.train", train_images)
+    checked.check_images("data.val", val_images)
     with torch.random.fork_rng(range(torch.cuda.device_count())):  # the caller's own random numbers stay as they are
         torch.manual_seed(derive_seed(recipe.seed, 9))
         generator = recipe.build_generator()
         taken = taken_stages(recipe, generator)
-        engine.by_first(lambda: _claim(folder, recipe, donors, train_images, val_images))
+        engine.by_first(lambda: _claim(folder, recipe, checked.donors, train_images, val_images))
         generator.fit_statistics(train_images)
+
+        def fit_of(number: int, stage: str, built_on: str) -> Fit:
+            seed, objective = derive_seed(recipe.seed, number), generator.objective(stage)
+            if stage in taken:
+                objective.load_state_dict({**objective.state_dict(), **objective.weights_from(taken[stage])})
+            picture = None if plot is None else partial(_plot, plot, generator, stage, val_images)
+            workers, config = recipe.data.workers, recipe.settings_of(stage)
+            return Fit(objective, config, folder / stage, seed, reporter, built_on, workers, picture)
+
         built_on = ""
         for number, stage in enumerate(generator.stages):
-            if stage in donors:
+            if stage in checked.donors:
                 trained = taken[stage]
             else:
-                seed, objective = derive_seed(recipe.seed, number), generator.objective(stage)
-                if stage in taken:
-                    objective.load_state_dict({**objective.state_dict(), **objective.weights_from(taken[stage])})
-                picture = None if plot is None else partial(_plot, plot, generator, stage, val_images)
-                workers, config = recipe.data.workers, recipe.settings_of(stage)
-                fit = Fit(objective, config, folder / stage, seed, reporter, built_on, workers, picture)
-                trained = fit.run(train_images, val_images, f"training {stage}")
+                trained = fit_of(number, stage, built_on).run(train_images, val_images, f"training {stage}")
             generator.load_stage(stage, trained)
             built_on = fingerprint(trained)
+            del trained  # with the tokens that it has kept of the scans
         generator.after_training()
     engine.by_first(lambda: generator.save(folder))
     return generator.cpu().eval()

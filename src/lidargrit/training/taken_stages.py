@@ -14,22 +14,11 @@ from lidargrit.errors import ConfigError
 from lidargrit.files import read_json
 from lidargrit.generators import Generator, load
 from lidargrit.nn.objective import Objective
-from lidargrit.run_folder import CHECKPOINT_FILE, RUN_FILE, UNKNOWN_SCANS, is_run, locate, taken_over
+from lidargrit.run_folder import CHECKPOINT_FILE, RUN_FILE, UNKNOWN_SCANS, locate, taken_over
 from lidargrit.training.checkpoint import load_average
 from lidargrit.training.config import Recipe
 
 _NOT_LEARNED = ("range_temperature", "distilled_steps", "distilled_pairs")  # of sampling, and of another stage
-
-
-def check_donor(recipe: Recipe) -> None:
-    """Refuse a run to take stages from that is none, before any scan is read.
-
-    Raises:
-        CheckpointError: no finished run.
-    """
-    for donor in (recipe.tokenizer_from, recipe.stages_from):
-        if donor is not None and not is_run(locate(donor)):
-            load(donor)  # which says what is wrong
 
 
 def donors_of_stages(recipe: Recipe, stages: Sequence[str]) -> dict[str, str]:

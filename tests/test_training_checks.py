@@ -1,0 +1,149 @@
+"""What a training refuses before its first stage, and what it keeps when something beside it fails."""
+
+import json
+import os
+import signal
+import sys
+from dataclasses import replace
+
+import pytest
+
+from lidargrit.cli import main
+from lidargrit.errors import ConfigError, DataError, Terminated
+from lidargrit.loading.images import RangeImages
+from lidargrit.loading.workers import _made_by_processes
+from lidargrit.recipes import load_recipe
+from lidargrit.reporting import Reporter
+from lidargrit.sources import load_range_images
+from lidargrit.structures import RangeImage
+from lidargrit.training import train
+from lidargrit.training.fit import Fit
+from lidargrit.training.plan import check_stages
+from test_tracking import StandIn
+from test_training import TINY
+from tiny_runs import the_one_line, train_words
+
+ANEW = ["stages_from=", "train_anew=[]"]
+VALIDATING = [
+    f"training.{stage}.{setting}" for stage in ("tokenizer", "transformer") for setting in ("validate_every=4",)
+]
+
+
+class Without(RangeImages):
+    """Images that lack something."""
+
+    def __init__(self, images: RangeImages, **lacking: None) -> None:
+        super().__init__(images.sensor, images._stores)
+        self.lacking = lacking
+
+    def batch(self, indices, first_columns=None) -> RangeImage:
+        return replace(super().batch(indices, first_columns), **self.lacking)
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "lacking", "stage"),
+    [
+        ("compact_completion", ["model.completion.labels=true", *ANEW], "label", "completion"),
+        ("compact_completion", ["model.completion.reflectance=true"], "reflectance", "completion"),
+        (
+            "compact_raydrop",
+            ["model.raydrop.surfaces=estimated", "model.raydrop.reflectance=true"],
+            "reflectance",
+            "raydrop",
+        ),
+        ("r2dm_small", ["model.reflectance=true"], "reflectance", "diffusion"),
+        ("r2flow_small", ["model.reflectance=true"], "reflectance", "flow"),
+        ("lidargen_small", ["model.reflectance=true"], "reflectance", "score"),
+        ("small", ["model.tokenizer.reflectance=true"], "reflectance", "tokenizer"),
+    ],
+)
+def test_images_without_what_a_stage_learns_from_are_refused(name, settings, lacking, stage):
+    recipe = load_recipe(name, settings)
+    checked, images = check_stages(recipe), load_range_images(("simulated:1:val",), recipe.data)
+    checked.check_images("data.val", images)
+    with pytest.raises(ConfigError, match=rf"got data\.val, for the stage {stage}: .*scans without {lacking}"):
+        checked.check_images("data.val", Without(images, **{lacking: None}))
+
+
+def test_unmarked_surfaces_are_refused_before_any_stage():
+    checked = check_stages(load_recipe("compact_raydrop"))
+    images = load_range_images(("simulated:1:val",), load_recipe("compact_raydrop").data)
+    with pytest.raises(ConfigError, match=r"data\.train, for the stage raydrop: training scans that do not mark"):
+        checked.check_images("data.train", images)
+
+
+def test_stages_that_learn_from_scans_do_not_learn_from_surfaces():
+    with pytest.raises(ConfigError, match="raydrop trained together with tokenizer and transformer and pixels"):
+        check_stages(load_recipe("compact_raydrop", ANEW))
+    check_stages(load_recipe("compact_raydrop", [*ANEW, "model.raydrop.surfaces=estimated"]))
+
+
+def test_validation_scans_are_looked_for_before_training_scans_are_projected(tmp_path):
+    class Projecting(Reporter):
+        def progress(self, what, total, done=0):
+            raise AssertionError(what)
+
+    with pytest.raises(DataError, match="nowhere"):
+        train(load_recipe("demo", [*TINY, f"data.val={tmp_path / 'nowhere'}"]), tmp_path / "run", Projecting())
+
+
+def test_a_validation_that_fails_leaves_the_checkpoint(tmp_path, monkeypatch):
+    def fails(*_):
+        raise DataError("a validation scan that is gone", "one that is there", "restore it")
+
+    unbroken, recipe = tmp_path / "unbroken", load_recipe("demo", [*TINY, *VALIDATING])
+    train(recipe, unbroken)
+    with monkeypatch.context() as patched:
+        patched.setattr(Fit, "validate", fails)
+        with pytest.raises(DataError, match="that is gone"):
+            train(recipe, tmp_path / "run")
+    assert (tmp_path / "run" / "tokenizer" / "checkpoint.safetensors").is_file()
+    train(recipe, tmp_path / "run")  # the validation that was missed comes first
+    logs = [(folder / "tokenizer" / "log.jsonl").read_text() for folder in (unbroken, tmp_path / "run")]
+    entries = [[{**json.loads(line), "seconds": 0} for line in log.splitlines()] for log in logs]
+    assert entries[0] == entries[1]
+    assert [entry["scans_seen"] for entry in entries[0] if entry["split"] == "val"] == [4, 8, 12]
+
+
+def test_a_terminated_training_does_not_validate_first(tmp_path, monkeypatch):
+    def validates(*_):
+        raise AssertionError("a validation")
+
+    def step(self, images):
+        os.kill(os.getpid(), signal.SIGTERM)
+        return before(self, images)
+
+    before = Fit._step
+    monkeypatch.setattr(Fit, "validate", validates)
+    monkeypatch.setattr(Fit, "_step", step)
+    settings = [f"training.{stage}.validate_every=2" for stage in ("tokenizer", "transformer")]
+    with pytest.raises(Terminated):
+        train(load_recipe("demo", [*TINY, *settings]), tmp_path / "run")
+    assert (tmp_path / "run" / "tokenizer" / "checkpoint.safetensors").is_file()
+
+
+def test_a_launcher_that_numbers_no_local_process_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setenv("RANK", "0")
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with pytest.raises(ConfigError, match="WORLD_SIZE=2 without LOCAL_RANK"):
+        train(load_recipe("demo", TINY), tmp_path / "run")
+
+
+def test_a_refused_training_does_not_touch_the_tracked_run(tmp_path, monkeypatch, capsys):
+    stand_in = StandIn()
+    monkeypatch.setitem(sys.modules, "wandb", stand_in)
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "notes.txt").write_text("mine")
+    assert main([*train_words(tmp_path / "run"), "--wandb", "lidar"]) == 2
+    assert "which is not empty" in the_one_line(capsys.readouterr().err, "train")
+    assert stand_in.begun == []
+
+
+def test_a_process_that_dies_ends_the_others(tmp_path, monkeypatch):
+    """One dies at once, and the other would go on for a minute."""
+    script = tmp_path / "worker.py"
+    script.write_text("import sys, time\ntime.sleep(60 * (sys.argv[-1] == '1'))\nsys.exit(9)\n")
+    command = [sys.executable, str(script)]
+    monkeypatch.setattr("lidargrit.loading.workers.module_command", lambda *_: command)
+    with pytest.raises(DataError, match="a process that died while projecting"):
+        list(_made_by_processes(tmp_path, [[0], [1]]))
