@@ -267,9 +267,10 @@ def test_a_penalty_that_comes_rarely_is_counted_as_rarely():
     assert half == pytest.approx((none + always) / 2, rel=1e-6)
 
 
-def test_an_a100_takes_days_or_seconds():
+def test_an_a100_takes_days_or_minutes():
     assert "3.9 days on one A100 at 25%" in computing_time(1643 * 10**15, "fp32")
-    assert "13 s on one A100" in computing_time(10**15, "auto")
+    assert "21.4 min on one A100" in computing_time(10**17, "auto")
+    assert "A100" not in computing_time(10**15, "auto")
 
 
 def test_processes_make_a_table_that_can_be_extended(tmp_path, capfd):

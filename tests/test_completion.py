@@ -288,7 +288,7 @@ def test_the_drops_of_a_model_are_scored_beside_independent_ones(folders):
         (["complete", "", "--model", "{}/run"], "an empty source"),
         (["complete", "{}/wide.npy", "--model", "{}/run"], "a range image of 64x33; wanted 64x32"),
         (["complete", "{}/wide_samples", "--model", "{}/run"], "range images of 64x64 of the sensor"),
-        (["complete", "{}/scans", "--model", "nothing"], "nothing, which holds no finished model"),
+        (["complete", "{}/scans", "--model", "nothing"], "nothing, which does not exist"),
         (["complete", "{}/scans", "--model", "linear", "-n", "2"], "-n 2 for linear; wanted 1"),
         (["complete", "{}/scans", "--model", "{}/run", "-n", "0"], "-n 0; wanted at least 1"),
         (["raydrop", "{}/scans", "--model", "{}/run", "--probability", "-1"], "--probability -1; wanted 0 or more"),

@@ -167,7 +167,7 @@ def test_rings_of_another_sensor_are_refused_with_the_cure():
         project(scan, HDL64E)
     assert "--" not in str(refusal.value), "no option that only some commands have"
     assert "fewer lasers" in doubts_about_rays(scan, load_sensor("os1_64"), "spherical")
-    assert "fires less often" in doubts_about_rays(scan, load_sensor("vlp16"), "spherical")
+    assert "have fewer columns" in doubts_about_rays(scan, load_sensor("vlp16"), "spherical")
     assert not doubts_about_rays(scan, load_sensor("vlp16").with_columns(360), "spherical")
 
 

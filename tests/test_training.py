@@ -375,6 +375,6 @@ def test_a_checkpoint_that_does_not_fit_its_optimiser_is_refused(tmp_path):
 
 def test_a_run_to_take_stages_from_is_looked_at_before_any_scan(tmp_path):
     recipe = load_recipe("demo", ("data.train=nowhere", "data.val=nowhere", f"stages_from={tmp_path / 'nothing'}"))
-    with pytest.raises(CheckpointError, match="nothing, which holds no finished model"):
+    with pytest.raises(CheckpointError, match="nothing, which does not exist"):
         train(recipe, tmp_path / "run")
     assert not (tmp_path / "run").exists()

@@ -73,7 +73,7 @@ def test_an_empty_name_is_not_the_folder_one_stands_in(word, capsys):
 
 def test_what_follows_two_dashes_is_no_option(capsys):
     assert main(["sample", "--", "--run", "--out"]) == 2
-    assert "--run, which holds no finished model" in capsys.readouterr().err
+    assert "--run, which does not exist" in capsys.readouterr().err
 
 
 def test_the_metric_that_was_meant_is_named():

@@ -183,7 +183,7 @@ def test_a_sensor_that_does_not_fit_the_scan(refused, tmp_path):
         ),
         (["sample", "RUN", "OUT", "--set", "mask=never"], r"mask=never; wanted auto, .*threshold"),
         (["sample", "RUN", "OUT", "--device", "gpu"], r"device 'gpu'; wanted"),
-        (["sample", "nowhere", "OUT"], r"nowhere, which holds no finished model; .*finish the training"),
+        (["sample", "nowhere", "OUT"], r"nowhere, which does not exist; .*pretrained"),
         (
             ["evaluate", "simulated:1", "simulated:1", "--metrics", "slice"],
             r"'slice', which .*metrics; .*sliced_wasserstein",

@@ -57,4 +57,5 @@ def run(options: argparse.Namespace) -> None:
     config = read_config(scan_settings(options), **{name: vars(options)[name] for name in names.split()})
     sets, report = (options.samples, options.reference), (options.report, write_report, options.overwrite)
     text, values, also = evaluate(*sets, config, TerminalReporter(), *report)
-    print_result(options, text, values, also=also)
+    written = [f"{what} in {path}" for what, path in (("scores", options.json), ("report", options.report)) if path]
+    print_result(options, text, values, f"done: {', '.join(written)}" if written else "", also)

@@ -27,6 +27,8 @@ from lidargrit.sources import open_images, open_source
 from lidargrit.sources.named import ImageScans, PointScans, named_scans
 from lidargrit.structures import RangeImage, Scan
 
+_KEPT_UNTOLD = 0.95  # of a scan's points; the rest are strays, or nearer than the sensor's limit
+
 
 @dataclass(frozen=True, eq=False)
 class InputScan:
@@ -78,11 +80,12 @@ class Inputs:
     Args:
         scans: scans of the source.
         reader: projection of points to range images.
-        reporter: receiver of the first doubt about the sensor of the scans.
+        reporter: receiver of how many points of the first scan have a pixel, and of the first doubt about the sensor.
     """
 
     def __init__(self, scans: PointScans | ImageScans, reader: ScanReader, reporter: Reporter) -> None:
-        self._scans, self._reader, self._reporter, self._doubted = scans, reader, reporter, False
+        self._scans, self._reader, self._reporter = scans, reader, reporter
+        self._counted = self._doubted = False
 
     def __len__(self) -> int:
         return len(self._scans)
@@ -110,7 +113,7 @@ class Inputs:
         return None if path is None or not formats.candidates(path) else formats.recognise(path)
 
     def read(self, index: int) -> InputScan:
-        """Read one scan, and warn once if another sensor than the reader's seems to have made it.
+        """Read one scan; tell once how many of its points have a pixel, and if another sensor seems to have made it.
 
         Raises:
             ScanError: a scan that cannot be used, or of another sensor.
@@ -118,10 +121,20 @@ class Inputs:
         if isinstance(self._scans, ImageScans):
             return InputScan(self._scans.image(index))
         scan = self._reader.read(self._scans.scan(index))
+        if not self._counted and scan.points is not None:
+            self._tell_points(scan.image, len(scan.points))
         if scan.doubt and not self._doubted:
             self._reporter.message(f"WARNING: {scan.doubt}")
             self._doubted = True
         return scan
+
+    def _tell_points(self, image: RangeImage, num_points: int) -> None:
+        kept, self._counted = int(image.return_mask.sum()), True
+        if kept < _KEPT_UNTOLD * num_points:
+            self._reporter.message(
+                f"the image of {image.sensor.height}x{image.sensor.width} holds {kept:,} of the {num_points:,} points "
+                "of the first scan, one a pixel; the others are left out (a sensor or model of more columns keeps more)"
+            )
 
 
 @dataclass(frozen=True)

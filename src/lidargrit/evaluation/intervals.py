@@ -80,7 +80,7 @@ class Interval:
 
 @dataclass(frozen=True)
 class RealAgainstReal:
-    """Score of real scans in place of the samples: no generator can be expected to do better.
+    """Score of real scans in place of the samples: between as many scans, no generator can be expected to do better.
 
     Args:
         value: mean over halvings of the reference, one half against the other; or score of held-out scans.

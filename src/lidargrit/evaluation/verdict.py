@@ -2,7 +2,8 @@
 
 Every score table of this program knows three bounds, by these names alone:
 
-- *real against real*: real scans, scored as if they had been generated. No generator can be expected to do better.
+- *real against real*: real scans, scored as if they had been generated. Between as many scans, no
+  generator can be expected to do better.
 - *pixel statistics*: scans of the generator ``marginal``, which samples every pixel by itself. A model must do better.
 - *memorised training scans*: scans of the generator ``memorised``. They score like real scans, and nothing is new.
 """

@@ -13,7 +13,7 @@ import torch
 
 from lidargrit import _discovery, configuration
 from lidargrit.conditions import Condition, ConditionKind
-from lidargrit.errors import CheckpointError, ConfigError, LidarGritError, one_of
+from lidargrit.errors import CheckpointError, ConfigError, LidarGritError, nearest_names, one_of
 from lidargrit.files import read_json, read_tensors
 from lidargrit.generators._batches import BatchSeeds, in_batches
 from lidargrit.generators._checks import check_condition, check_images, check_seeds
@@ -241,9 +241,11 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     @final
     @torch.no_grad()
     def bits(self, images: RangeImage, step_mm: int = 10, expected: bool = False) -> ScanBits:
-        """Return the negative log-likelihood of each scan in bits, exactly (capability ``likelihood``).
+        """Return the negative log-likelihood of each scan in bits (capability ``likelihood``).
 
-        Ranges are rounded to a step first, since a real number would need infinitely many bits. Systems can be compared
+        It is exact for generators without tokens. With tokens it is an upper bound, since tokens other than the
+        encoder's could stand for the same scan.
+        Ranges are rounded to a step, since a real number would need infinitely many bits. Systems can be compared
         by their bits at one step if these are of the whole scan (:attr:`ScanBits.is_whole`).
 
         Args:
@@ -350,10 +352,14 @@ def load(folder: str | Path) -> Generator:
     """
     folder = locate(folder)
     if not is_run(folder):
+        packaged = [each.name for each in PACKAGED]
+        if not folder.exists():
+            wanted = f"a run's folder, or {nearest_names(folder.name, packaged)}"
+            raise CheckpointError(f"{folder}, which does not exist", wanted, "check the path")
         raise CheckpointError(
             f"{folder}, which holds no finished model",
-            f"a run's folder with {CONFIG_FILE} and {WEIGHTS_FILE}, or {one_of([each.name for each in PACKAGED])}",
-            "finish the training (the same command goes on), or check the path",
+            f"a run's folder with {CONFIG_FILE} and {WEIGHTS_FILE}, or {one_of(packaged)}",
+            "finish the training (lidargrit train with the same words goes on), or check the path",
         )
     about = read_json(folder / CONFIG_FILE)
     try:

@@ -121,7 +121,7 @@ def doubts_about_rays(scan: Scan, sensor: SensorModel, method: ProjectionName) -
     has_points[row, pixels.column[kept].astype(np.int64)] = True
     between = _empty_between(has_points[used])
     if between > _EMPTY_BETWEEN_AT_MOST:
-        return f"{between:.0%} of the pixels between points are empty: the sensor that made the scans fires less often"
+        return f"{between:.0%} of the pixels between points are empty: the scans have fewer columns, or rows elsewhere"
     elevation_deg = elevations_deg(scan.points_xyz_m[kept])
     pixel = row * pixels.width + pixels.column[kept]
     order = np.lexsort((elevation_deg, pixel))

@@ -27,6 +27,7 @@ _SCANS = 2  # in a counted batch: some objectives compare the scans of a batch
 _STEPS_AT_MOST = 64  # that are counted; rarer terms hardly cost
 _A100_FP32_FLOPS_PER_S, _A100_BF16_FLOPS_PER_S = 19.5e12, 312e12
 _CORRECTIONS, _OVERSPENT_AT_MOST = 20, 0.02  # of a budget
+_GPU_FROM_FLOPS = 1e16  # less is a training of small batches, which wait for the launches of kernels
 _SHARE = 0.25  # of a peak: a guess for networks as small as these; small batches reach less
 _MATRIX, _REPETITIONS = 512, 8  # the first repetition chooses a kernel
 
@@ -90,7 +91,7 @@ def stage_costs(recipe: Recipe, taken: Collection[str] | None = None) -> dict[st
 
 
 def computing_time(flops: int, precision: Precision) -> str:
-    """Return a line for a person: the operations, and estimated times for them on this machine's CPU and on a GPU.
+    """Return a line for a person: operations, and estimated times on this machine's CPU and, for many, on a GPU.
 
     Args:
         flops: number of floating-point operations.
@@ -101,11 +102,14 @@ def computing_time(flops: int, precision: Precision) -> str:
     """
     kind, peak = ("fp32", _A100_FP32_FLOPS_PER_S) if precision == "fp32" else ("bf16", _A100_BF16_FLOPS_PER_S)
     here = _cpu_flops_per_s()
-    return (
+    text = (
         f"{flops:.2e} floating-point operations, by estimate {duration(flops / (_SHARE * here))} on this machine's CPU "
-        f"at {_SHARE:.0%} of its {here / 1e9:.0f} GFLOP/s in matrix products, "
-        f"{duration(flops / (_SHARE * peak))} on one A100 at {_SHARE:.0%} of its {peak / 1e12:g} TFLOP/s in {kind}"
+        f"at {_SHARE:.0%} of its {here / 1e9:.0f} GFLOP/s in matrix products"
     )
+    if flops < _GPU_FROM_FLOPS:
+        return text
+    there = duration(flops / (_SHARE * peak))
+    return f"{text}, {there} on one A100 at {_SHARE:.0%} of its {peak / 1e12:g} TFLOP/s in {kind}"
 
 
 @cache

@@ -310,11 +310,11 @@ def _new_scans(demo: DemoPage) -> _Step:
 def _scores(demo: DemoPage) -> _Step:
     text = (
         f"Each metric measures how far {demo.card.samples.scans_used} new scans are from as many training scans; lower "
-        f"is better. Two bounds stand beside every score. <i>Real against real</i> (dashed line) is the score of "
-        f"held-out {demo.kind} scans: no model can be expected to do better. <i>Pixel statistics</i> (square) is the "
-        "score of the generator <code>marginal</code>, which samples each pixel by itself and knows nothing of shapes: "
-        "any model should do better. With so few scans all scores are rough; the bar behind the dot is the 95 % "
-        "interval."
+        f"is better. Two bounds stand beside every score. <i>Real against real</i> (dashed line) is the score of as "
+        f"many held-out {demo.kind} scans: no model can be expected to do better. <i>Pixel statistics</i> (square) is "
+        "the score of the generator <code>marginal</code>, which samples each pixel by itself and knows nothing of "
+        "shapes: any model should do better. With so few scans all scores are rough; the bar behind the dot is the "
+        "95 % interval."
     )
     return _Step("Scores of the new scans", text, score_table(demo.card.scores))
 
