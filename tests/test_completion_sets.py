@@ -150,9 +150,22 @@ def test_a_doubt_about_the_sensor_is_told_once(tmp_path):
     inputs = open_inputs(str(tmp_path), ScanReader(sensor), DataConfig(), reporter)
     assert inputs.read(0).doubt
     assert inputs.read(1).doubt
-    assert len(told) == 1
-    assert told[0].startswith("WARNING: ")
-    assert "take a model of that one" in told[0]
+    warnings = [line for line in told if line.startswith("WARNING: ")]
+    assert len(warnings) == 1
+    assert "take a model of that one" in warnings[0]
+
+
+def test_points_without_a_pixel_are_counted_once(tmp_path):
+    sensor, told = load_sensor("hdl64e_kitti_odometry"), []
+    for name in ("0.npz", "1.npz"):
+        NumpyArray.write(tmp_path / name, unproject(wall(sensor.with_columns(1024), 0)))
+    reporter = Reporter()
+    reporter.message = told.append
+    inputs = open_inputs(str(tmp_path), ScanReader(sensor), DataConfig(), reporter)
+    kept = [int(inputs.read(index).image.return_mask.sum()) for index in range(2)]
+    points = len(inputs.read(0).points)
+    counted = [line for line in told if not line.startswith("WARNING: ")]
+    assert [f"holds {kept[0]:,} of the {points:,} points" in line for line in counted] == [True]
 
 
 def test_a_format_of_another_sensor_is_not_taken():
