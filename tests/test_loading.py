@@ -144,7 +144,7 @@ def test_a_folder_prepared_from_what_has_changed_is_called_stale(tree, tmp_path)
     folder = prepare(str(tree), config, tmp_path / "out")
     assert prepare(str(tree), config, folder) == folder, "again: nothing to do"
     os.utime(KittiOdometry(tree).path(0))
-    with pytest.raises(OutputError, match=r"which is stale: prepared with another digest"):
+    with pytest.raises(OutputError, match=r"which is stale: prepared with other scans"):
         prepare(str(tree), config, folder)
     with pytest.raises(OutputError, match="which is stale: prepared with another sensor"):
         prepare("simulated:1", DataConfig(columns=512), prepare("simulated:1", config, tmp_path / "other"))

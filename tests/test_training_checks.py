@@ -147,3 +147,9 @@ def test_a_process_that_dies_ends_the_others(tmp_path, monkeypatch):
     monkeypatch.setattr("lidargrit.loading.workers.module_command", lambda *_: command)
     with pytest.raises(DataError, match="a process that died while projecting"):
         list(_made_by_processes(tmp_path, [[0], [1]]))
+
+
+def test_compiling_without_a_compiler_is_refused_before_the_first_stage(tmp_path, monkeypatch):
+    monkeypatch.setenv("CXX", str(tmp_path / "none"))
+    with pytest.raises(ConfigError, match=r"compile=true and no C\+\+ compiler"):
+        check_stages(load_recipe("small", ["training.transformer.compile=true"]))

@@ -153,6 +153,9 @@ def pair_for_protocol(
     count = min(len(first.images), len(second.images), config.max_scans or len(first.images))
     pair = EvalPair(first.as_set(count, protocol.range_m), second.as_set(count, protocol.range_m))
     warnings = (*_warnings(pair, overlap(samples, first.images, second.images)), *first.doubts, *second.doubts)
+    if reference.data_set == "samples" != samples.data_set:
+        swapped = f"{reference.text} was generated, and {samples.text} was not: the order is SAMPLES REFERENCE"
+        warnings = (*warnings, swapped)
     return replace(pair, deviations=deviations(pair, protocol), warnings=warnings)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
+from collections.abc import Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ from lidargrit import __version__
 from lidargrit.datasets import ScanDataset, open_dataset
 from lidargrit.determinism import evenly_spaced
 from lidargrit.environment import cache_folder
-from lidargrit.errors import DataError, OutputError
+from lidargrit.errors import DataError, OutputError, counted_scans
 from lidargrit.files import claim_folder, is_taken, remove_partials, write_json, write_text
 from lidargrit.loading.config import DataConfig
 from lidargrit.loading.imaging import choose_imaging
@@ -115,7 +116,7 @@ class Prepared:
         return (
             f"{self.images} range images of {self.rows}x{self.columns} in {self.folder}: "
             f"{self.size / 1e6:.1f} MB, {self.size / 1e3 / max(self.images, 1):.0f} KB each, in {self.seconds:.1f} s"
-            + (f"; {len(self.left_out)} scans left out" if self.left_out else "")
+            + (f"; {counted_scans(len(self.left_out))} left out" if self.left_out else "")
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -246,7 +247,7 @@ def _claim(folder: Path, spec: PreparedSpec, scans: list[tuple[str, str, int, in
         )
         if differing and not lenient:
             raise OutputError(
-                f"{folder}, which is stale: prepared with another {', '.join(differing)}",
+                f"{folder}, which is stale: prepared with {_other(differing)}",
                 "an empty folder, or what was prepared from these very scans in this very way",
                 "prepare into another folder, or remove this one",
             )
@@ -260,6 +261,12 @@ def _claim(folder: Path, spec: PreparedSpec, scans: list[tuple[str, str, int, in
         raise OutputError(f"{folder}, which holds something else", "an empty folder", "choose another one")
     write_text(path, listing)
     write_json(folder / PLAN_FILE, asdict(spec))  # last: it says that the folder is ours
+
+
+def _other(differing: Sequence[str]) -> str:
+    """Name what differs between two plans in words for a person."""
+    settings = [f"another {name}" for name in differing if name not in ("digest", "num_scans")]
+    return ", ".join([*settings, *(["other scans"] if len(settings) < len(differing) else [])])
 
 
 def _is_whole(folder: Path, shard: int) -> bool:

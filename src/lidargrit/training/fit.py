@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -216,8 +219,19 @@ def follow_settings(objective: Objective, config: FitConfig, processes: int) -> 
             is to be recomputed, compiled or trained by Muon.
     """
     _check_parts(objective, config, processes)
+    if config.compile:
+        _check_compiler()
     prepare_for_training(objective, config.recompute, config.compile)
     return make_optimiser(objective, config)
+
+
+def _check_compiler() -> None:
+    """Refuse to compile for a CPU without the compiler that torch would call, which fails at the first step only."""
+    compiler = os.environ.get("CXX") or ("clang++" if sys.platform == "darwin" else "g++")
+    if not torch.cuda.is_available() and shutil.which(compiler) is None:
+        raise ConfigError(
+            f"compile=true and no C++ compiler {compiler!r}", "one that torch can call", "install it, or leave it out"
+        )
 
 
 def _check_parts(objective: Objective, config: FitConfig, processes: int) -> None:
