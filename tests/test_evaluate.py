@@ -268,7 +268,7 @@ def test_sets_that_overlap_and_projections_that_differ_are_told(sets, tmp_path):
     samples = write_scans(tmp_path / "samples", 3, 7, variant="exact")
     twice, _ = compare_sources(samples, samples, plain)
     assert any("overlap (3 scans are in both)" in warning for warning in twice.warnings)
-    assert "the order is SAMPLES REFERENCE" in " ".join(compare_sources(sets[0], samples, plain)[0].warnings)
+    assert "the order is SAMPLES REFERENCE" in " ".join(compare_sources("simulated:3:test", samples, plain)[0].warnings)
     same, _ = compare_sources(sets[0], sets[0], plain)
     assert any("overlap (12 scans are in both)" in warning for warning in same.warnings)
     assert [score.result.value for score in same.scores] == [0.0, 0.0]
