@@ -50,13 +50,13 @@ def rows_and_columns(xyz_m, sensor):
     x, y, z = xyz_m.astype(np.float64).T
     width = sensor.width * sensor.column_stride
     row = np.searchsorted(-edges_of(sensor), -np.arctan2(z, np.hypot(x, y)), side="right") - 1
-    return row, np.floor((np.pi - np.arctan2(y, x)) * (width / (2 * np.pi))).astype(np.int64) % width
+    return row, np.floor((sensor.first_edge_rad - np.arctan2(y, x)) * (width / (2 * np.pi))).astype(np.int64) % width
 
 
 def on_edges(sensor, rng, count):
     """Return points on edges of columns and of rows, and a few units in the last place beside them."""
     width = sensor.width * sensor.column_stride
-    azimuth = np.pi - 2 * np.pi * rng.integers(0, width + 1, count) / width
+    azimuth = sensor.first_edge_rad - 2 * np.pi * rng.integers(0, width + 1, count) / width
     elevation = np.where(rng.random(count) < 0.7, rng.choice(edges_of(sensor), count), rng.uniform(-1.5, 1.5, count))
     azimuth = np.where(rng.random(count) < 0.7, azimuth, rng.uniform(-4, 4, count))
     far = 10 ** rng.uniform(-1, 3, count)

@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+from dataclasses import replace
 
 import pytest
 import torch
@@ -263,3 +264,28 @@ def test_azimuths_go_on_over_the_seam():
     assert float((wrapped - table).abs().max()) > 6
     assert torch.allclose(continuous_azimuths_rad(wrapped), table, atol=1e-12)
     assert torch.allclose(continuous_azimuths_rad(wrapped.roll(-1, 1))[:, -1], table[:, 0] - 2 * torch.pi, atol=1e-12)
+
+
+def test_columns_may_begin_beside_the_half_circle():
+    plain = load_sensor("hdl32e")
+    edge_rad = math.pi + math.pi / 1024
+    turned = replace(
+        plain.with_columns(1024), azimuth_rad=column_azimuths_rad(1024, 1, edge_rad), first_edge_rad=edge_rad
+    )
+    again = SensorModel.from_json(json.loads(json.dumps(turned.to_json())))
+    assert again.first_edge_rad == edge_rad
+    assert "first_edge_rad" not in plain.to_json()
+    few = again.with_columns(512)
+    assert float(few.azimuth_rad[0, 0]) == pytest.approx(edge_rad - math.pi / 512, abs=1e-6)
+    points = unproject(RangeImage.masked(torch.full((32, 1024), 9.0), torch.ones(32, 1024, dtype=torch.bool), turned))
+    near_borders = Scan((points.points_xyz_m / 0.01).round() * 0.01)  # as a driver rounds them
+    assert int(project(near_borders, turned, "spherical").return_mask.sum()) == 32 * 1024
+    with pytest.raises(ConfigError, match="first_edge_rad=3"):
+        replace(plain, first_edge_rad=3.0)
+
+
+def test_an_ouster_fires_into_the_middle_of_columns():
+    for name in ("os1_64", "os1_128"):
+        sensor = load_sensor(name)
+        fired = sensor.azimuth_rad[0].double() / (2 * math.pi / 1024)
+        assert torch.allclose(fired, fired.round(), atol=1e-3)

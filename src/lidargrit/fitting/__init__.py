@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -12,7 +13,7 @@ from jaxtyping import Float64, Int64
 from lidargrit.datasets import ScanDataset
 from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import ConfigError, ScanError
-from lidargrit.fitting.azimuths import columns_of_scans, firing_steps_deg, offsets_deg
+from lidargrit.fitting.azimuths import columns_of_scans, firing_steps_deg, first_edge_rad, offsets_deg
 from lidargrit.fitting.elevations import FittedRows, cluster_rows, nearest_row, rows_of_rings
 from lidargrit.fitting.limits import farthest_m, quantum_m
 from lidargrit.fitting.points import NOISE_RANGE_M, Points
@@ -200,16 +201,19 @@ def _model(
         offsets = offsets_deg(used, row_of_point, len(rows.number), rings.lasers)
         if offsets is not None and float(np.ptp(offsets)) < _SHIFT_ASIDE_DEG:
             offsets = None
+    # The nearest number that networks can halve three times: four columns more or less, of hundreds.
+    halved = _HALVED * max(1, round((columns or _COLUMNS_UNCLEAR) / _HALVED))
+    edge_rad = first_edge_rad(used, row_of_point, halved) if halved == columns else math.pi
     return SensorModel(
         name=name,
         elevation_rad=torch.from_numpy(np.radians(rows.elevation_deg)).float()[:, None],
-        # The nearest number that networks can halve three times: four columns more or less, of hundreds.
-        azimuth_rad=column_azimuths_rad(_HALVED * max(1, round((columns or _COLUMNS_UNCLEAR) / _HALVED))),
+        azimuth_rad=column_azimuths_rad(halved, first_edge_rad=edge_rad),
         range_min_m=NOISE_RANGE_M,
         range_max_m=farthest_m(np.concatenate([points.range_m for points in used])),
         projection=_projection(rows, rings),
         source=f"lidargrit fit-sensor, from {num_scans} scans (rings: {rings.method})",
         azimuth_offset_rad=None if offsets is None else torch.from_numpy(np.radians(offsets)).float(),
+        first_edge_rad=edge_rad,
     )
 
 

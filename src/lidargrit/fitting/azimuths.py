@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -16,6 +17,9 @@ _BINS = 1 << 16  # of the circle: five for each of the finest columns
 _PART_AT_LEAST, _PART_AT_MOST = 0.4, 1.5  # of the commonest step: an encoder rounds (KITTI: 0.18 and 0.09 degrees)
 _AROUND = (0.95, 1.05)  # of the columns that the mean of such steps makes; wider, rounded azimuths mirror the number
 _SCANS_FOR_COLUMNS = 4  # about; one would do, if its street were full
+_SCANS_AGREE = 3  # at least: within one scan, points of any turning sensor line up
+_AGREE = 0.5  # of points that all lie in the middle of columns; about 0 where they lie anywhere
+_ASIDE = 0.1  # of a column: less is the noise of azimuths
 _STANDS_OUT = 8.0  # times what azimuths without a step reach
 
 
@@ -59,6 +63,24 @@ def columns_of_scans(
     low, high = int(_AROUND[0] * usual), min(int(_AROUND[1] * usual) + 1, len(power) - 1)
     columns = low + int(np.argmax(power[low : high + 1]))
     return columns if power[columns] > _STANDS_OUT * total else round(usual)
+
+
+def first_edge_rad(scans: Sequence[Points], rings: Sequence[Int64[np.ndarray, "_"]], columns: int) -> float:
+    """Return the azimuth at which the first of equal columns begins, so that points lie in the middle of columns.
+
+    It is +pi where points do not line up with columns in the same way in all scans, as of a sensor that turns freely.
+    """
+    if len(scans) < _SCANS_AGREE:
+        return math.pi
+    total, count = 0j, 0
+    for points, ring in zip(scans, rings, strict=True):
+        far = (points.range_m > _FAR_M) & (ring >= 0)
+        total += np.exp(1j * columns * np.radians(points.azimuth_deg[far])).sum()
+        count += int(far.sum())
+    aside_rad = float(np.angle(-total * np.exp(-1j * columns * math.pi)))  # 2 pi for a whole column
+    if abs(total) < _AGREE * count or abs(aside_rad) < _ASIDE * 2 * math.pi:
+        return math.pi
+    return math.pi + aside_rad / columns
 
 
 def offsets_deg(

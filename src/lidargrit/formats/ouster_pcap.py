@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import math
 import os
 from pathlib import Path
 from typing import Any
@@ -109,18 +110,20 @@ def sensor_of(path: Path) -> SensorModel:
         if not 1 <= columns <= _COLUMNS_AT_MOST:
             raise ValueError(f"{columns} columns")
         order = (-altitude_deg).argsort(kind="stable")
+        first_edge_rad = math.pi + math.pi / columns  # it fires at whole multiples of a column
         model = load_sensor("os1_128")
         known = line.startswith("OS-1")
         near_m, far_m = (model.range_min_m, model.range_max_m) if known else _WIDEST_LIMITS_M
         return SensorModel(
             name=metadata.stem,
             elevation_rad=torch.from_numpy(np.radians(altitude_deg[order])).float()[:, None],
-            azimuth_rad=column_azimuths_rad(columns),
+            azimuth_rad=column_azimuths_rad(columns, first_edge_rad=first_edge_rad),
             range_min_m=near_m,
             range_max_m=far_m,
             projection="spherical",
             source=f"metadata of a sensor of the line {line}, {metadata.name}",
             azimuth_offset_rad=torch.from_numpy(-np.radians(azimuth_deg[order])).float(),
+            first_edge_rad=first_edge_rad,
         )
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         what = " ".join(str(error).split())[:200]

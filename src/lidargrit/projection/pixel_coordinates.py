@@ -84,7 +84,7 @@ def pixel_coordinates(
         row = scan.ring.numpy()
     else:
         row = unfolding.rings_from_firing_order(xyz_m)
-    return PixelCoordinates(row, unfolding.columns(xyz_m, width), range_m, height, width)
+    return PixelCoordinates(row, unfolding.columns(xyz_m, width, sensor.first_edge_rad), range_m, height, width)
 
 
 def within_limits(range_m: Float32[np.ndarray, "n"], sensor: SensorModel) -> Bool[np.ndarray, "n"]:

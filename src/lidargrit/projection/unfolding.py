@@ -55,8 +55,8 @@ def azimuths_rad(xyz_m: Float32[np.ndarray, "3 n"]) -> Float64[np.ndarray, "n"]:
     return np.arctan2(xyz_m[1], xyz_m[0], dtype=np.float64)
 
 
-def columns(xyz_m: Float32[np.ndarray, "3 n"], width: int) -> Int32[np.ndarray, "n"]:
-    """Return the column whose span [pi - 2 pi w/W, pi - 2 pi (w+1)/W) holds each point's azimuth, around the circle.
+def columns(xyz_m: Float32[np.ndarray, "3 n"], width: int, first_edge_rad: float = np.pi) -> Int32[np.ndarray, "n"]:
+    """Return the column whose span [edge - 2 pi w/W, edge - 2 pi (w+1)/W) holds each point's azimuth, round the circle.
 
     The result is that of double precision, but only points near an edge are computed so. In single precision, azimuths
     of up to pi are wrong by at most 2^-20 (4 units in the last place, more than any arc function in use). The
@@ -65,13 +65,15 @@ def columns(xyz_m: Float32[np.ndarray, "3 n"], width: int) -> Int32[np.ndarray, 
     """
     x, y, _ = torch.from_numpy(xyz_m)  # torch, for its arctan2 is fast on every processor
     at = torch.atan2(y, x).numpy()
-    np.subtract(np.pi, at, out=at)
+    np.subtract(first_edge_rad, at, out=at)
     at *= width / (2 * np.pi)
+    if first_edge_rad != np.pi:  # else nothing lies outside
+        at %= width
     column = at.astype(np.int32)  # floors what is never negative
     at -= column
     margin = width * 2**-20
     remain = np.flatnonzero((at < margin) | (at > 1 - margin))
-    column[remain] = np.floor((np.pi - azimuths_rad(xyz_m[:, remain])) * (width / (2 * np.pi))) % width
+    column[remain] = np.floor((first_edge_rad - azimuths_rad(xyz_m[:, remain])) * (width / (2 * np.pi))) % width
     return column
 
 

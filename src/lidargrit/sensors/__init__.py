@@ -42,6 +42,8 @@ class SensorModel:
         source: origin of the numbers, such as a data sheet.
         azimuth_offset_rad: angle (H,) from a column's azimuth, counter-clockwise, at which each row's laser fires. A
             point is placed by its own azimuth, so images do not depend on it; the simulator aims by it.
+        first_edge_rad: azimuth at which column 0 begins, in radians. Half a column beyond +pi, columns have their
+            centres where a sensor fires at whole multiples of a column (Ouster), and no point lies on a border.
 
     Raises:
         ConfigError: tables whose shapes do not match, angles out of bounds, rows that do not fall, or limits that are
@@ -57,9 +59,11 @@ class SensorModel:
     column_stride: int = 1
     source: str = ""
     azimuth_offset_rad: Float[Tensor, "H"] | None = None
+    first_edge_rad: float = math.pi
 
     def __post_init__(self) -> None:
-        check_tables(self.name, self.elevation_rad, self.azimuth_rad, self.azimuth_offset_rad, self.column_stride)
+        tables = self.elevation_rad, self.azimuth_rad, self.azimuth_offset_rad
+        check_tables(self.name, *tables, self.column_stride, self.first_edge_rad)
         check_projection(self.name, self.projection, get_args(ProjectionName))
         if not 0 < self.range_min_m < self.range_max_m <= _REACH_AT_MOST_M:
             raise ConfigError(
@@ -87,7 +91,7 @@ class SensorModel:
     def with_columns(self, columns: int, stride: int = 1) -> SensorModel:
         """Return this sensor with ``columns // stride`` columns: every ``stride``-th of ``columns`` equal ones.
 
-        The azimuth of a kept column is that of its own centre, pi - 2 pi (stride j + 1/2) / columns.
+        The azimuth of a kept column is that of its own centre, first_edge_rad - 2 pi (stride j + 1/2) / columns.
         """
         if not 1 <= columns <= FINE_COLUMNS_AT_MOST or stride < 1 or columns % stride:
             raise ConfigError(
@@ -101,7 +105,8 @@ class SensorModel:
                 "a sensor with one elevation a row and one azimuth a column",
                 "use the sensor as it is",
             )
-        return replace(self, azimuth_rad=column_azimuths_rad(columns, stride), column_stride=stride)
+        azimuth_rad = column_azimuths_rad(columns, stride, self.first_edge_rad)
+        return replace(self, azimuth_rad=azimuth_rad, column_stride=stride)
 
     def fine(self) -> SensorModel:
         """Return this sensor with every fine column that it fires."""
@@ -121,6 +126,8 @@ class SensorModel:
         }
         if self.azimuth_offset_rad is not None:  # left out if there is none: files from before it existed look the same
             data["azimuth_offset_rad"] = self.azimuth_offset_rad.tolist()
+        if self.first_edge_rad != math.pi:
+            data["first_edge_rad"] = self.first_edge_rad
         return data
 
     @classmethod

@@ -13,9 +13,12 @@ from lidargrit.errors import ConfigError, nearest_names
 from lidargrit.sensors._columns import column_azimuths_rad, mean_azimuths_rad
 
 _WORDS = ("name", "source", "projection")
-_NUMBERS: dict[str, Any] = {"range_min_m": (int, float), "range_max_m": (int, float), "column_stride": int}
+_NUMBERS: dict[str, Any] = {
+    **dict.fromkeys(("range_min_m", "range_max_m", "first_edge_rad"), (int, float)),
+    "column_stride": int,
+}
 _TABLES = {"elevation_rad": 2, "azimuth_rad": 2, "azimuth_offset_rad": 1}  # with their dimensions
-_MAY_BE_LEFT_OUT = {"source", "column_stride", "azimuth_offset_rad"}
+_MAY_BE_LEFT_OUT = {"source", "column_stride", "azimuth_offset_rad", "first_edge_rad"}
 _NUMBER_AT_MOST = 1e9  # anything larger is no number of a sensor, and some are too large to become a float
 _ROWS_AT_MOST = 4096  # sensors have up to 256 lasers; a table beyond this is a mistake that would fill the memory
 FINE_COLUMNS_AT_MOST = 65536  # sensors fire up to 4096 times a revolution
@@ -23,12 +26,20 @@ _PIXELS_AT_MOST = (
     2**24
 )  # 128 rows of 4096 columns have a thirtieth; images of a stranger's sensor would fill the memory
 _APART_AT_MOST = 0.75  # of a column: published programs take the edges of columns, half a column from the centres
+_EDGE_ASIDE_AT_MOST_RAD = math.radians(1)
 _MEASURED_APART_AT_MOST_RAD = math.radians(5)
 NAME_AT_MOST = 200  # letters: a name is part of messages
 _CURE = "compare it with what SensorModel.to_json writes"
 
 
-def check_tables(name: str, elevation: Tensor, azimuth: Tensor, offset: Tensor | None, column_stride: int) -> None:
+def check_tables(
+    name: str,
+    elevation: Tensor,
+    azimuth: Tensor,
+    offset: Tensor | None,
+    column_stride: int,
+    first_edge_rad: float = math.pi,
+) -> None:
     """Check the shapes, the sizes and the angles of a sensor's tables, in radians.
 
     Raises:
@@ -70,10 +81,16 @@ def check_tables(name: str, elevation: Tensor, azimuth: Tensor, offset: Tensor |
             "row 0 the highest ray, every next row lower",
             "sort the rows of the sensor",
         )
-    _check_columns(name, azimuth, column_stride)
+    if not abs(first_edge_rad - math.pi) <= max(2 * math.pi / columns, _EDGE_ASIDE_AT_MOST_RAD):
+        raise ConfigError(
+            f"first_edge_rad={first_edge_rad:g} of the sensor {name!r}",
+            f"+pi, or at most a degree or the width of one of {columns} columns beside it",
+            "correct it, or leave it out",
+        )
+    _check_columns(name, azimuth, column_stride, first_edge_rad)
 
 
-def _check_columns(name: str, azimuth_rad: Tensor, stride: int) -> None:
+def _check_columns(name: str, azimuth_rad: Tensor, stride: int, first_edge_rad: float) -> None:
     """Refuse azimuths of columns other than those into which points are projected: equal ones, from +pi down.
 
     Azimuths of every pixel are measured ones: the mean of each column may lie somewhat further off.
@@ -82,7 +99,7 @@ def _check_columns(name: str, azimuth_rad: Tensor, stride: int) -> None:
     at_most_rad = _APART_AT_MOST * 2 * math.pi / columns
     if len(azimuth_rad) > 1:
         at_most_rad = max(at_most_rad, _MEASURED_APART_AT_MOST_RAD)
-    centres_rad = column_azimuths_rad(columns, stride)[0].double()
+    centres_rad = column_azimuths_rad(columns, stride, first_edge_rad)[0].double()
     apart_rad = (mean_azimuths_rad(azimuth_rad) - centres_rad + math.pi).remainder(2 * math.pi) - math.pi
     if float(apart_rad.abs().max()) > at_most_rad:
         raise ConfigError(
@@ -126,7 +143,7 @@ def checked_entries(data: Any, projections: Sequence[str]) -> dict[str, Any]:
     checked = {key: _checked(key, value) for key, value in entries.items()}
     check_projection(checked["name"], checked["projection"], projections)
     tables = (checked["elevation_rad"], checked["azimuth_rad"], checked.get("azimuth_offset_rad"))
-    check_tables(checked["name"], *tables, checked.get("column_stride", 1))
+    check_tables(checked["name"], *tables, checked.get("column_stride", 1), checked.get("first_edge_rad", math.pi))
     return checked
 
 

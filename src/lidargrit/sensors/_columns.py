@@ -9,10 +9,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 
-def column_azimuths_rad(columns: int, stride: int = 1) -> Float[Tensor, "1 W"]:
-    """Return the azimuths of the centres of every ``stride``-th of ``columns`` equal columns, from +pi down to -pi."""
+def column_azimuths_rad(columns: int, stride: int = 1, first_edge_rad: float = math.pi) -> Float[Tensor, "1 W"]:
+    """Return the azimuths of the centres of every ``stride``-th of ``columns`` equal columns, from +pi down to -pi.
+
+    Args:
+        columns: number of columns around the circle.
+        stride: number of columns of which one is taken.
+        first_edge_rad: azimuth at which the first column begins.
+    """
     index = torch.arange(0, columns, stride, dtype=torch.float64)
-    return (math.pi - 2 * math.pi * (index + 0.5) / columns).float()[None]
+    return (first_edge_rad - 2 * math.pi * (index + 0.5) / columns).float()[None]
 
 
 def mean_azimuths_rad(azimuth_rad: Float[Tensor, "H W"]) -> Float[Tensor, " W"]:

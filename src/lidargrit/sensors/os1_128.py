@@ -28,16 +28,18 @@ _ELEVATION_DEG = (
 )
 # fmt: on
 _ASIDE_DEG = (4.21, 1.41, -1.40, -4.21)  # by turns from the top, medians; clockwise is positive in Ouster's tables
+_FIRST_EDGE_RAD = math.pi + math.pi / 1024  # it fires at whole multiples of a column
 
 OS1_128 = SensorModel(
     name="os1_128",
     elevation_rad=(torch.tensor(_ELEVATION_DEG, dtype=torch.float64) * (math.pi / 180)).float()[:, None],
-    azimuth_rad=column_azimuths_rad(1024),
+    azimuth_rad=column_azimuths_rad(1024, first_edge_rad=_FIRST_EDGE_RAD),
     range_min_m=0.8,
     range_max_m=120.0,
     projection="spherical",
     source="angles: metadata of the OS-1-128 unit 122201000998, firmware 2.3.0, as recorded with a public sample of "
     "Ouster's (its azimuths scatter by 0.03 degrees around these four); other units differ, and lidargrit fit-sensor "
     "finds theirs; columns: mode 1024x10; limits: Ouster's OS1 datasheet, at 80 % reflectivity",
+    first_edge_rad=_FIRST_EDGE_RAD,
     azimuth_offset_rad=-(torch.tensor(_ASIDE_DEG, dtype=torch.float64) * (math.pi / 180)).repeat(32).float(),
 )
