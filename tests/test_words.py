@@ -16,7 +16,7 @@ MISTAKES = {
     "train": "got no recipe and no out; wanted lidargrit train RECIPE OUT; see: lidargrit train --help",
     "simulate here": "got no -n/--num-scans; wanted lidargrit simulate OUT -n NUM_SCANS;",
     "sample --cuont 3": "got the option '--cuont'; wanted one such as --count; see: lidargrit sample --help",
-    "sample run out more": "got a word more, 'more'; wanted fewer;",
+    "sample run out more": "got the unexpected argument 'more'; wanted fewer arguments;",
     "sample run out -x": "got the option '-x'; wanted one such as",
     "simulate here -n two": "got -n 'two'; wanted a whole number;",
     "simulate here -n 1 --wet very": "got --wet 'very'; wanted a number;",

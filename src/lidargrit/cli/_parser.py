@@ -83,7 +83,9 @@ class Parser(argparse.ArgumentParser):
         long = [option for option in self._option_string_actions if option.startswith("--")]
         option = word.startswith("-")
         got, wanted = (
-            ("the option", f"one such as {nearest_names(word, long)}") if option else ("a word more,", "fewer")
+            ("the option", f"one such as {nearest_names(word, long)}")
+            if option
+            else ("the unexpected argument", "fewer arguments")
         )
         raise UsageError(f"{got} {word!r}", wanted, self._help())
 
