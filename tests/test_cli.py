@@ -161,7 +161,7 @@ def test_a_plan_tells_which_stages_are_taken_and_not_trained(tmp_path, capsys, m
     assert stages["pixels"]["taken_from"] == "pretrained"
     assert stages["pixels"]["flops"] == 0 < stages["raydrop"]["flops"]
     monkeypatch.setattr(sys.modules["lidargrit.training.plan"], "training_flops", told_at_once)
-    words = ["--dry-run", "--set", "fine_tune=[pixels]"]
+    words = ["--dry-run", "--set", "fine_tune=[pixels]", "model.raydrop.surfaces=estimated"]
     assert main(["train", "compact_raydrop", str(tmp_path / "none"), *words]) == 0
     text = capsys.readouterr().out
     assert "transformer: 4,539,136 parameters, taken from pretrained and not trained" in text
@@ -237,7 +237,8 @@ def test_evaluate_prints_a_table_and_writes_json(samples, tmp_path, typed):
     output = typed("evaluate", samples, "simulated:3:test", "--json", tmp_path / "deep" / "scores.json")
     words, _, numbers = output.rpartition("\n\n")
     assert words == "" or "below 0" in words, "three scans are too few to set real against real"
-    output = numbers.splitlines()
+    *output, done = numbers.splitlines()
+    assert done == f"done: scores in {tmp_path / 'deep' / 'scores.json'}"
     assert " ".join(output[0].split()) == "metric variant score 95 % interval real against real better scans"
     scores = json.loads((tmp_path / "deep" / "scores.json").read_text())
     assert scores["reference"] == "simulated:3:test"

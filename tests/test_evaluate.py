@@ -383,7 +383,7 @@ def test_the_command_line_writes_scores_page_and_table(tmp_path, capsys, sets):
     assert main([*words, *files]) == 0
     verdict, _, table = capsys.readouterr().out.partition("\n\n")
     assert verdict.startswith("Within noise of real against real in 2 of 2 scores.")
-    head, *rows = table.splitlines()
+    head, *rows, _ = table.splitlines()
     assert " ".join(head.split()) == "metric variant score 95 % interval real against real better scans"
     assert len(rows) == 2
     assert (tmp_path / "s.html").read_text(encoding="utf-8").startswith("<!DOCTYPE html>")

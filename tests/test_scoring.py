@@ -126,7 +126,7 @@ def test_a_metric_that_fails_leaves_the_others_their_scores(passes):
         ({"metrics": ("bev_jds",)}, UnknownNameError, "bev_jsd"),
         ({"protocol": "r2mm"}, UnknownNameError, "r2dm"),
         ({"variant": "exakt"}, ConfigError, "exact"),
-        ({"seed": -1}, ConfigError, "wanted 0 to"),
+        ({"seed": -1}, ConfigError, "a seed from 0 to"),
         (
             {"pixel_statistics": True, "resampling": Resampling(halves=0)},
             ConfigError,

@@ -63,6 +63,12 @@ def print_result(
         print(done, file=sys.stderr if options.json == STANDARD_OUTPUT else sys.stdout)
 
 
+def files_told(**files: Path | None) -> str:
+    """Return the last line of a command that wrote files, by what they hold; "" if there are none."""
+    written = [f"{what} in {path}" for what, path in files.items() if path and path != STANDARD_OUTPUT]
+    return f"done: {', '.join(written)}" if written else ""
+
+
 def _json_file(word: str) -> Path:
     if word == str(STANDARD_OUTPUT):
         return STANDARD_OUTPUT

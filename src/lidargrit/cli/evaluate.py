@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from lidargrit.cli._options import add_scans, scan_settings
-from lidargrit.cli._results import add_json, print_result, refuse_taken
+from lidargrit.cli._results import add_json, files_told, print_result, refuse_taken
 from lidargrit.untrusted import seed_number
 
 EXAMPLES = """\
@@ -57,5 +57,4 @@ def run(options: argparse.Namespace) -> None:
     config = read_config(scan_settings(options), **{name: vars(options)[name] for name in names.split()})
     sets, report = (options.samples, options.reference), (options.report, write_report, options.overwrite)
     text, values, also = evaluate(*sets, config, TerminalReporter(), *report)
-    written = [f"{what} in {path}" for what, path in (("scores", options.json), ("report", options.report)) if path]
-    print_result(options, text, values, f"done: {', '.join(written)}" if written else "", also)
+    print_result(options, text, values, files_told(scores=options.json, report=options.report), also)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidargrit import _discovery, formats
-from lidargrit.determinism import evenly_spaced, natural_order
+from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import DataError, ScanError, UnknownNameError, nearest_names
 from lidargrit.loading import Pixels, Provenance, RangeImages
 from lidargrit.sensors import SensorModel, load_sensor
@@ -219,7 +220,12 @@ def _array(values: Tensor) -> np.ndarray[Any, np.dtype[np.float32]]:
 
 
 def _paths(folder: Path) -> list[Path]:
-    found = sorted(folder.glob("[!.]*.pth"), key=natural_order)
+    found = sorted(folder.glob("[!.]*.pth"), key=_order)
     if not found:
         raise DataError(f"no .pth file in {folder}", "samples as tensors, one file each", "check the folder")
     return found
+
+
+def _order(path: Path) -> tuple[list[int], str]:
+    """Return the numbers in a file's name, 10 after 9, then the name, since file systems have orders of their own."""
+    return [int(number) for number in re.findall(r"\d{1,18}", path.stem)], path.name
