@@ -129,7 +129,7 @@ def test_what_a_kind_cannot_give_is_refused_in_one_line(folders):
 def test_numbers_too_large_are_refused_before_any_work():
     with pytest.raises(ConfigError, match=r"-n 100000000000000000000, --seed 0; wanted at most 10,000,000 scans"):
         EvalConfig(max_scans=10**20)
-    with pytest.raises(ConfigError, match="wanted 0 to"):
+    with pytest.raises(ConfigError, match="a seed from 0 to"):
         EvalConfig(seed=2**64)
     with pytest.raises(ConfigError, match="100000000000000000000 samples"):
         Benchmark("simulated:2:test", 10**20)
