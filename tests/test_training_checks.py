@@ -44,13 +44,6 @@ class Without(RangeImages):
     ("name", "settings", "lacking", "stage"),
     [
         ("compact_completion", ["model.completion.labels=true", *ANEW], "label", "completion"),
-        ("compact_completion", ["model.completion.reflectance=true"], "reflectance", "completion"),
-        (
-            "compact_raydrop",
-            ["model.raydrop.surfaces=estimated", "model.raydrop.reflectance=true"],
-            "reflectance",
-            "raydrop",
-        ),
         ("r2dm_small", ["model.reflectance=true"], "reflectance", "diffusion"),
         ("r2flow_small", ["model.reflectance=true"], "reflectance", "flow"),
         ("lidargen_small", ["model.reflectance=true"], "reflectance", "score"),
