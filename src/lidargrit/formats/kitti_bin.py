@@ -14,6 +14,7 @@ from lidargrit.structures import Scan
 
 _ROW_BYTES = 16  # x, y, z, reflectance
 _ROWS_TO_LOOK_AT = 4096  # enough to tell reflectance from a coordinate
+_NUMBERS_TO_TELL = 1024
 _FORMAT = "float32 rows x, y, z, reflectance, 16 bytes a point"
 
 
@@ -35,8 +36,9 @@ class KittiBin(ScanFormat):
         start = first_bytes(path, _ROW_BYTES * _ROWS_TO_LOOK_AT)
         if not start or path.stat().st_size % _ROW_BYTES:
             return False
-        last = np.frombuffer(start, dtype="<f4")[3::4]
-        return bool(((last >= 0) & (last <= 1)).all())
+        values = np.frombuffer(start, dtype="<f4")
+        last = values[3::4]
+        return bool(((last >= 0) & (last <= 1)).all()) and not _has_rows_of_eight(values)
 
     @staticmethod
     def read(path: Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
@@ -50,7 +52,10 @@ class KittiBin(ScanFormat):
                 ("if its rows have 5 columns, as nuScenes writes them, name it .pcd.bin; else " if nuscenes else "")
                 + "download it again: the file was cut short or is of another format",
             )
-        rows = torch.from_numpy(np.frombuffer(bytearray(data), dtype="<f4").reshape(-1, 4))
+        values = np.frombuffer(bytearray(data), dtype="<f4")
+        if _has_rows_of_eight(values[: 4 * _ROWS_TO_LOOK_AT]):
+            raise ScanError(f"rows of 8 numbers in {path}", _FORMAT, "keep the first four columns")
+        rows = torch.from_numpy(values.reshape(-1, 4))
         return scan_of(rows[:, :3], rows[:, 3].contiguous(), None, str(path), bad_points)
 
     @classmethod
@@ -60,3 +65,13 @@ class KittiBin(ScanFormat):
         rows = torch.cat((scan.points_xyz_m, reflectance[:, None]), dim=1)
         with atomic_path(path) as temporary:
             temporary.write_bytes(rows.numpy().astype("<f4").tobytes())
+
+
+def _has_rows_of_eight(values: np.ndarray) -> bool:
+    """Return whether numbers resemble those eight before them far more than those four before, as rows of eight do."""
+    if len(values) < _NUMBERS_TO_TELL or len(values) % 8:
+        return False
+    known = np.where(np.isfinite(values), values, 0)
+    with np.errstate(over="ignore", invalid="ignore"):  # of a damaged file's numbers
+        apart = [float(np.abs(known[step:] - known[:-step]).mean()) for step in (4, 8)]
+    return apart[1] < apart[0] / 2
