@@ -141,13 +141,18 @@ def test_a_sensor_that_fires_less_often_is_doubted():
     assert ScanReader(source).read(scan).doubt == ""
 
 
-def test_a_doubt_about_the_sensor_is_told_once(tmp_path):
-    sensor, told = load_sensor("hdl64e_kitti_odometry"), []
+def two_walls(folder, sensor, columns, told):
+    """Return two scans of so many columns as inputs for a sensor, whose messages are collected."""
     for name in ("0.npz", "1.npz"):
-        NumpyArray.write(tmp_path / name, unproject(wall(sensor.with_columns(870), 0)))
+        NumpyArray.write(folder / name, unproject(wall(sensor.with_columns(columns), 0)))
     reporter = Reporter()
     reporter.message = told.append
-    inputs = open_inputs(str(tmp_path), ScanReader(sensor), DataConfig(), reporter)
+    return open_inputs(str(folder), ScanReader(sensor), DataConfig(), reporter)
+
+
+def test_a_doubt_about_the_sensor_is_told_once(tmp_path):
+    sensor, told = load_sensor("hdl64e_kitti_odometry"), []
+    inputs = two_walls(tmp_path, sensor, 870, told)
     assert inputs.read(0).doubt
     assert inputs.read(1).doubt
     warnings = [line for line in told if line.startswith("WARNING: ")]
@@ -157,11 +162,7 @@ def test_a_doubt_about_the_sensor_is_told_once(tmp_path):
 
 def test_points_without_a_pixel_are_counted_once(tmp_path):
     sensor, told = load_sensor("hdl64e_kitti_odometry"), []
-    for name in ("0.npz", "1.npz"):
-        NumpyArray.write(tmp_path / name, unproject(wall(sensor.with_columns(1024), 0)))
-    reporter = Reporter()
-    reporter.message = told.append
-    inputs = open_inputs(str(tmp_path), ScanReader(sensor), DataConfig(), reporter)
+    inputs = two_walls(tmp_path, sensor, 1024, told)
     kept = [int(inputs.read(index).image.return_mask.sum()) for index in range(2)]
     points = len(inputs.read(0).points)
     counted = [line for line in told if not line.startswith("WARNING: ")]

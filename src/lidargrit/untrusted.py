@@ -142,6 +142,11 @@ def seed_number(word: str) -> int:
     return whole_number(word, SEED_AT_MOST)
 
 
+def is_temperature(value: float) -> bool:
+    """Return whether a number is 0 or at least :data:`TEMPERATURE_AT_LEAST`."""
+    return value == 0 or value >= TEMPERATURE_AT_LEAST
+
+
 def positive_number(word: str) -> float:
     """Return a number from 0 on that is neither NaN nor infinite.
 

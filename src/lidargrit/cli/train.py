@@ -37,7 +37,7 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.generators import load_class
     from lidargrit.recipes import load_recipe
     from lidargrit.reporting import TerminalReporter
-    from lidargrit.training import check_data, measure, plan_training, train
+    from lidargrit.training import measure, open_data, plan_training, train
 
     recipe = load_recipe(options.recipe, options.set)
     if options.dry_run or options.measure:
@@ -45,7 +45,7 @@ def run(options: argparse.Namespace) -> None:
         planned, measured = plan_training(recipe), measure(recipe) if options.measure else []
         text = "\n".join([planned.as_text(), *(stage.as_text() for stage in measured)])
         print_result(options, text, {**planned.to_json(), "measured": [vars(stage) for stage in measured]})
-        check_data(recipe)  # last: the plan of a recipe is worth reading on a machine without its data too
+        open_data(recipe)  # last: the plan of a recipe is worth reading on a machine without its data too
         return
     if options.json:
         raise ConfigError(

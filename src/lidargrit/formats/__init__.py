@@ -9,6 +9,7 @@ from io import BufferedReader
 from pathlib import Path
 from typing import ClassVar, Literal
 
+import numpy as np
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -228,6 +229,16 @@ def first_bytes(path: Path, at_most: int) -> bytes:
             return file.read(at_most)
     except (ScanError, OSError):
         return b""
+
+
+def mean_difference(values: np.ndarray, step: int) -> float:
+    """Return how far numbers are from those some places before them: least at the numbers of a point, in bare files.
+
+    Numbers that are none count as 0; huge ones, of a damaged file, may give an infinite mean or none.
+    """
+    known = np.where(np.isfinite(values), values, 0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return float(np.abs(known[step:] - known[:-step]).mean())
 
 
 def damaged(path: Path, wanted: str, error: Exception) -> ScanError:

@@ -9,7 +9,7 @@ import torch
 
 from lidargrit.errors import ScanError
 from lidargrit.files import atomic_path
-from lidargrit.formats import POINTS_AT_MOST, BadPoints, ScanFormat, first_bytes, read_bytes, scan_of
+from lidargrit.formats import POINTS_AT_MOST, BadPoints, ScanFormat, first_bytes, mean_difference, read_bytes, scan_of
 from lidargrit.structures import Scan
 
 _ROW_BYTES = 16  # x, y, z, reflectance
@@ -71,7 +71,4 @@ def _has_rows_of_eight(values: np.ndarray) -> bool:
     """Return whether numbers resemble those eight before them far more than those four before, as rows of eight do."""
     if len(values) < _NUMBERS_TO_TELL or len(values) % 8:
         return False
-    known = np.where(np.isfinite(values), values, 0)
-    with np.errstate(over="ignore", invalid="ignore"):  # of a damaged file's numbers
-        apart = [float(np.abs(known[step:] - known[:-step]).mean()) for step in (4, 8)]
-    return apart[1] < apart[0] / 2
+    return mean_difference(values, 8) < mean_difference(values, 4) / 2

@@ -9,7 +9,7 @@ import torch
 
 from lidargrit.errors import OutputError, ScanError
 from lidargrit.files import atomic_path
-from lidargrit.formats import POINTS_AT_MOST, BadPoints, ScanFormat, first_bytes, read_bytes, scan_of
+from lidargrit.formats import POINTS_AT_MOST, BadPoints, ScanFormat, first_bytes, mean_difference, read_bytes, scan_of
 from lidargrit.structures import Scan
 
 _ROW_BYTES = 12  # x, y, z
@@ -73,7 +73,5 @@ class XyzBin(ScanFormat):
 
 def _row_width(values: np.ndarray) -> int:
     """Return after how many values a file resembles itself most; that many belong to a point."""
-    differences = {
-        width: float(np.abs(values[width:] - values[:-width]).mean()) for width in (3, 4, 5) if width < len(values)
-    }
+    differences = {width: mean_difference(values, width) for width in (3, 4, 5) if width < len(values)}
     return min(differences, key=differences.__getitem__, default=3)

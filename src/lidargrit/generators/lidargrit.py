@@ -41,7 +41,7 @@ from lidargrit.nn.transformer import CausalTransformer
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage, TokenGrid
 from lidargrit.tokenizers import Tokenizer
-from lidargrit.untrusted import TEMPERATURE_AT_LEAST
+from lidargrit.untrusted import is_temperature
 
 START_TOKEN = 0  # the reference prepends an ordinary token, shared with the first code, not one of its own
 _PUBLISHED_BYTES_AT_MOST = 2 << 30  # the first release's transformer of 126 M weights, with its optimiser, takes 1.6 GB
@@ -98,8 +98,7 @@ class TokenSampling:
 
     def __post_init__(self) -> None:
         self.pixels()
-        temperature = self.temperature or TEMPERATURE_AT_LEAST
-        if not (temperature >= TEMPERATURE_AT_LEAST and self.top_k >= 0 and 0 < self.top_p <= 1):
+        if not (is_temperature(self.temperature) and self.top_k >= 0 and 0 < self.top_p <= 1):
             raise ConfigError(
                 f"temperature={self.temperature}, top_k={self.top_k}, top_p={self.top_p}",
                 "temperature 0 or at least 1e-6, top_k >= 0, 0 < top_p <= 1",

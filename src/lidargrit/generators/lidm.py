@@ -185,10 +185,8 @@ class Lidm(Generator[LidmConfig, LidmSampling]):
         """
         (path,) = files
         found = read_checkpoint(path, ("state_dict",), _PUBLISHED_BYTES_AT_MOST, _NOT_READ)
-        first_stage, last_layer = (
-            weights_below(found, _FIRST_STAGE),
-            found.get(f"{_FIRST_STAGE}decoder.conv_out.weight"),
-        )
+        first_stage = weights_below(found, _FIRST_STAGE)
+        last_layer = first_stage.get("decoder.conv_out.weight")
         if last_layer is None or last_layer.ndim != 4 or not isinstance(config.tokenizer, CurveVqvaeConfig):
             raise CheckpointError(
                 f"{path}, which holds no decoder of a tokenizer {config.tokenizer.name()!r}",

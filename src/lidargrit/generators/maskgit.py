@@ -28,7 +28,7 @@ from lidargrit.nn.seeds import rngs_of
 from lidargrit.nn.transformer import MaskedTransformer
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
-from lidargrit.untrusted import STEPS_AT_MOST, TEMPERATURE_AT_LEAST
+from lidargrit.untrusted import STEPS_AT_MOST, is_temperature
 
 _NOT_ASKED = -100  # in the place of tokens that are shown, for torch's cross entropy
 
@@ -70,8 +70,7 @@ class MaskedSampling:
 
     def __post_init__(self) -> None:
         self.pixels()
-        temperature = self.temperature or TEMPERATURE_AT_LEAST
-        valid = temperature >= TEMPERATURE_AT_LEAST and self.order_temperature >= 0
+        valid = is_temperature(self.temperature) and self.order_temperature >= 0
         if not (valid and 1 <= self.steps <= STEPS_AT_MOST):
             raise ConfigError(
                 f"steps={self.steps}, temperature={self.temperature}, order_temperature={self.order_temperature}",

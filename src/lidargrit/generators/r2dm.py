@@ -32,9 +32,7 @@ from lidargrit.untrusted import STEPS_AT_MOST
 _BATCH = 8
 _PUBLISHED_SENSOR = "hdl64e_kitti_360"
 _SHARE_SCANS = 1000  # whose returns are counted: more would not change their share
-_CALIBRATION_SEED = (
-    1 << 40
-)  # mixed with the numbers of the scans sampled for it: their seeds are none of a user's first
+_CALIBRATION_SEED = 1 << 40  # mixed with a scan's number, so that its seed is none of a user's first
 
 
 @dataclass(frozen=True)

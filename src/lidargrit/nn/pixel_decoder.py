@@ -20,7 +20,7 @@ from lidargrit.nn.precision import Precision, autocast_to
 from lidargrit.nn.range_steps import RangeSteps
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import Decoded, RangeImage
-from lidargrit.untrusted import TEMPERATURE_AT_LEAST
+from lidargrit.untrusted import is_temperature
 
 _Guided = tuple[
     dict[Lattice, Tensor], dict[Lattice, Tensor]
@@ -55,8 +55,11 @@ class PixelSampling:
     precision: Precision = "fp32"
 
     def __post_init__(self) -> None:
-        temperature = self.range_temperature or TEMPERATURE_AT_LEAST
-        if not (TEMPERATURE_AT_LEAST <= temperature < math.inf and 0 < self.range_noise < math.inf):
+        if not (
+            is_temperature(self.range_temperature)
+            and self.range_temperature < math.inf
+            and 0 < self.range_noise < math.inf
+        ):
             raise ConfigError(
                 f"range_temperature={self.range_temperature}, range_noise={self.range_noise}",
                 "positive numbers, a temperature of at least 1e-6, or of 0 for the model's own",

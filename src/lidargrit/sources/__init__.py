@@ -292,8 +292,17 @@ def load_range_images(
         DataError: no source, a source without a scan, generated scans, or prepared scans of another sensor.
         ScanError: a scan that cannot be used; ``bad_scans=skip`` leaves it out.
     """
+    return joined_images(open_to_train(sources, config), config, reporter, sensor)
+
+
+def joined_images(
+    opened: Sequence[DatasetSource | PreparedSource],
+    config: DataConfig,
+    reporter: Reporter | None = None,
+    sensor: SensorModel | None = None,
+) -> RangeImages:
+    """Return the range images of sources that :func:`open_to_train` has opened as one set."""
     sensor = sensor or config.load_sensor()
-    opened = open_to_train(sources, config)
     return RangeImages.joined(sensor, [source.images(sensor, config, reporter) for source in opened])
 
 

@@ -3,7 +3,7 @@
 from lidargrit.training.compute import computing_time, training_flops, with_budget
 from lidargrit.training.config import FitConfig, Recipe
 from lidargrit.training.measure import Measured, measure
-from lidargrit.training.plan import TrainingPlan, check_data, plan_training
+from lidargrit.training.plan import TrainingPlan, open_data, plan_training
 from lidargrit.training.run import check_folder, train
 
 __all__ = [
@@ -11,10 +11,10 @@ __all__ = [
     "Measured",
     "Recipe",
     "TrainingPlan",
-    "check_data",
     "check_folder",
     "computing_time",
     "measure",
+    "open_data",
     "plan_training",
     "train",
     "training_flops",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -13,7 +13,7 @@ from lidargrit.errors import ConfigError
 from lidargrit.loading import RangeImages
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.precision import Precision
-from lidargrit.sources import PreparedSource, open_to_train
+from lidargrit.sources import DatasetSource, PreparedSource, open_to_train
 from lidargrit.training.compute import computing_time, training_flops
 from lidargrit.training.config import Recipe
 from lidargrit.training.fit import follow_settings
@@ -93,16 +93,30 @@ class TrainingPlan:
         return asdict(self)
 
 
-def check_data(recipe: Recipe) -> None:
-    """Refuse training and validation scans that cannot be used, as far as that is known before one is read.
+@dataclass(frozen=True)
+class OpenedData:
+    """Sources of a recipe's scans, of which none has been read.
+
+    Args:
+        train: sources of the training scans.
+        val: sources of the validation scans.
+    """
+
+    train: Sequence[DatasetSource | PreparedSource]
+    val: Sequence[DatasetSource | PreparedSource]
+
+
+def open_data(recipe: Recipe) -> OpenedData:
+    """Open the sources of training and validation scans, as far as they can be checked before a scan is read.
 
     Raises:
         DataError: a source that is not there, holds no scans, or was prepared for another sensor or projection.
     """
-    for sources in (recipe.data.train, recipe.data.val):
-        for source in open_to_train(sources, recipe.data):
-            if isinstance(source, PreparedSource):
-                source.images(recipe.data.load_sensor(), recipe.data)
+    opened = OpenedData(open_to_train(recipe.data.train, recipe.data), open_to_train(recipe.data.val, recipe.data))
+    for source in (*opened.train, *opened.val):
+        if isinstance(source, PreparedSource):
+            source.images(recipe.data.load_sensor(), recipe.data)
+    return opened
 
 
 @dataclass(frozen=True)

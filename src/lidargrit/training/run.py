@@ -24,12 +24,12 @@ from lidargrit.loading import DataConfig, Provenance, RangeImages
 from lidargrit.nn.objective import Objective
 from lidargrit.reporting import Reporter
 from lidargrit.run_folder import RUN_FILE, TRAINED_ON_FILE, locate, recipe_settings, trained_on, write_trained_on
-from lidargrit.sources import load_range_images
+from lidargrit.sources import joined_images
 from lidargrit.training.checkpoint import fingerprint
 from lidargrit.training.config import FitConfig, Recipe
 from lidargrit.training.engine import Engine
 from lidargrit.training.fit import Fit
-from lidargrit.training.plan import CheckedStages, check_data, check_stages
+from lidargrit.training.plan import CheckedStages, OpenedData, check_stages, open_data
 from lidargrit.training.taken_stages import taken_facts, taken_stages
 from lidargrit.training.tracking import tracked
 
@@ -73,25 +73,26 @@ def train(
     with ExitStack() as held, engine.lost_processes_reported():
         engine.by_first(lambda: check_folder(folder, recipe))
         checked = check_stages(recipe, engine.world_size)
-        check_data(recipe)
+        opened = open_data(recipe)
         engine.by_first(lambda: held.enter_context(claim_folder(folder)))
         engine.by_first(lambda: check_folder(folder, recipe))  # another process may have trained in it meanwhile
         begun = claimed_manifest(folder / RUN_FILE, folder / TRAINED_ON_FILE)
         engine.by_first(lambda: held.enter_context(begun))
         engine.by_first(lambda: held.enter_context(tracked(wandb_project, recipe, folder)))
-        return _train(recipe, checked, folder, reporter, plot, engine)
+        return _train(recipe, checked, opened, folder, reporter, plot, engine)
 
 
 def _train(
     recipe: Recipe,
     checked: CheckedStages,
+    opened: OpenedData,
     folder: Path,
     reporter: Reporter,
     plot: PlotProgress | None,
     engine: Engine,
 ) -> Generator:
-    train_images = load_range_images(recipe.data.train, recipe.data, reporter)
-    val_images = load_range_images(recipe.data.val, recipe.data, reporter)
+    train_images = joined_images(opened.train, recipe.data, reporter)
+    val_images = joined_images(opened.val, recipe.data, reporter)
     _warn_of_overlap(train_images, val_images, reporter)
     checked.check_images("data.train", train_images)
     checked.check_images("data.val", val_images)
