@@ -78,19 +78,17 @@ class Served:
         return b"".join(parts), time.monotonic() - begun
 
 
-def _run(server) -> None:
-    with suppress(OSError):  # of waitress, whose sockets are closed while it waits for them
-        server.run()
-
-
 @contextmanager
 def running(folder: Path):
     """Serve one tiny run of each kind."""
     for name in MODELS:
         made(name)[0].save(folder / f"tiny-{name}")
     with open_server([folder / f"tiny-{name}" for name in MODELS], limits=LIMITS) as server:
-        thread = threading.Thread(target=_run, args=(server,), daemon=True)
+        thread = threading.Thread(target=server.run, daemon=True)
         thread.start()
-        yield Served(server)
-    thread.join(10)
+        try:
+            yield Served(server)
+        finally:
+            server.stop()
+            thread.join(10)
     assert not thread.is_alive()

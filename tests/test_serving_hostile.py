@@ -7,6 +7,7 @@ import os
 import pickle
 import re
 import signal
+import socket
 import tempfile
 import threading
 import time
@@ -254,6 +255,14 @@ def test_fifty_clients_at_once(served):
         time.sleep(0.02)
     served.queue.limits = LIMITS
     assert served.ended(served.take("/generate", {"model": 1}))["state"] == "done", "a new process runs it"
+
+
+def test_a_server_that_ends_hangs_up(tmp_path):
+    with running(tmp_path) as other:
+        client = socket.create_connection(("127.0.0.1", other.port), 10)
+        assert other.ask("/")[0] == 200, "it has accepted the silent client too"
+    with client:
+        assert client.recv(1) == b""
 
 
 def test_what_takes_too_long_is_ended(served):

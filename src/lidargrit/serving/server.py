@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from waitress import wasyncore
 from waitress.server import create_server
 
 from lidargrit.errors import ConfigError, LidarGritError, OutputError
@@ -31,11 +32,13 @@ class RunningServer(NamedTuple):
         port: port at which it listens.
         queue: queue with the jobs of all clients.
         run: function that answers requests until Ctrl-C.
+        stop: function that ends ``run`` from another thread, and with it all connections.
     """
 
     port: int
     queue: JobQueue
     run: Callable[[], None]
+    stop: Callable[[], None]
 
 
 def serve(
@@ -85,8 +88,10 @@ def open_server(
         _temporary_folder() as folder,
         JobQueue(runs, Path(folder), device, limits) as queue,
     ):
+        open_sockets: dict[int, wasyncore.dispatcher] = {}  # the listening one and those of the connections
         server = create_server(
             Application(queue, host),
+            map=open_sockets,
             sockets=[bound],
             threads=_THREADS,
             ident="lidargrit",
@@ -98,11 +103,17 @@ def open_server(
             channel_timeout=limits.idle_seconds,
             cleanup_interval=max(1, limits.idle_seconds // 3),
         )
+
+        def close_all() -> None:
+            wasyncore.close_all(open_sockets, ignore_all=True)
+
         try:
-            yield RunningServer(bound.getsockname()[1], queue, server.run)
+            yield RunningServer(
+                bound.getsockname()[1], queue, server.run, lambda: server.trigger.pull_trigger(close_all)
+            )
         finally:
             server.task_dispatcher.shutdown()
-            server.close()
+            close_all()
 
 
 def finished_runs(folder: Path, say: Callable[[str], object]) -> list[Path]:
