@@ -24,7 +24,8 @@ def random_image(sensor, seed, share=0.7):
     rng = torch.Generator().manual_seed(seed)
     size = (sensor.height, sensor.width)
     span = sensor.range_max_m - sensor.range_min_m
-    range_m = torch.rand(size, generator=rng) * (span - 0.02) + sensor.range_min_m + 0.01
+    range_m = torch.rand(size, generator=rng) * 1.2 * span + sensor.range_min_m - 0.1 * span
+    range_m = range_m.clamp(sensor.range_min_m, sensor.range_max_m)  # many lie at the limits, as networks' do
     return RangeImage.masked(range_m, torch.rand(size, generator=rng) < share, sensor)
 
 

@@ -14,6 +14,8 @@ from lidargrit.structures import Scan
 
 ProjectionVariant = Literal["exact", "reference"]
 
+_ROUNDING = 2.0**-20  # of a range: more than squares, sums and roots of coordinates of 32 bits lose
+
 
 @dataclass(frozen=True, eq=False)
 class PixelCoordinates:
@@ -78,6 +80,8 @@ def pixel_coordinates(
         else:
             row = unfolding.reference_rings(xyz_m, height)
         return PixelCoordinates(row, unfolding.reference_columns(xyz_m, width), range_m, height, width)
+    for limit_m in (sensor.range_min_m, sensor.range_max_m):  # at a limit, coordinates of 32 bits may lie just beyond
+        range_m[np.abs(range_m - np.float32(limit_m)) <= _ROUNDING * limit_m] = limit_m
     if method == "spherical":
         row = spherical.rows(xyz_m, range_m, row_elevation_rad(sensor))
     elif scan.ring is not None:
