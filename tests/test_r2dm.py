@@ -6,6 +6,7 @@ import math
 import pytest
 import torch
 
+from lidargrit import _discovery
 from lidargrit.conditions import Condition
 from lidargrit.errors import CheckpointError, ConfigError
 from lidargrit.generators._log_range import encode
@@ -206,16 +207,18 @@ def test_sizes_that_the_weights_do_not_have_are_refused_before_a_network_is_buil
             load_published(tmp_path / "weights.pth")
 
 
-def test_a_value_beyond_the_far_limit_is_cut_to_it_and_keeps_its_return():
+@pytest.mark.parametrize("name", _discovery.names("sensors"))
+def test_a_value_beyond_the_far_limit_is_cut_to_it_and_keeps_its_return(name):
     """The program cuts values to [-1, 1]; in 32 bits the limit of 80 m decodes to just below 80 m, so it is kept."""
-    generator = R2dm(R2dmConfig(TINY, reflectance=False), load_sensor("hdl64e_kitti_360").with_columns(32))
-    values = torch.full((1, 1, 64, 32), 1.0)
+    sensor = load_sensor(name).with_columns(32)
+    generator = R2dm(R2dmConfig(TINY, reflectance=False), sensor)
+    values = torch.full((1, 1, sensor.height, 32), 1.0)
     values[0, 0, 0], values[0, 0, 1] = 1.01, -1.01
     images = generator._decoded(values, DiffusionSampling())
     assert bool(images.return_mask[0, 0].all())
     assert bool(images.return_mask[0, 2:].all())
     assert not bool(images.return_mask[0, 1].any())
-    assert float(images.range_m[0, 0].min()) == pytest.approx(80, abs=1e-4)
+    assert float(images.range_m[0, 0].min()) == pytest.approx(sensor.range_max_m, rel=1e-6)
 
 
 @pytest.mark.parametrize(

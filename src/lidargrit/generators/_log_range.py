@@ -42,16 +42,15 @@ def decode(
     Args:
         values: channels in [-1, 1], which are clipped to it: the encoded range, and the reflectance where there is one.
         sensor: sensor of the images.
-        returned: mask of the returns; by default the pixels whose range lies inside the sensor's limits, as published.
+        returned: mask of the returns; by default the pixels whose range is longer than the sensor's shortest.
     """
     exponent = (values[:, 0].clamp(-1, 1) + 1) * (math.log2(1 + sensor.range_max_m) / 2)
     range_m = torch.exp2(exponent) - 1
     if returned is None:
-        # The programs cut values to [-1, 1], decode them and keep what lies between the limits. The exponent of the far
-        # limit is rounded to 32 bits: that of 80 m decodes to just below it, which is a return. The power is taken in
-        # 64 bits, because in 32 its last bit differs with the size of a batch.
-        exact_m = torch.exp2(exponent.double()) - 1
-        returned = (exact_m > sensor.range_min_m) & (exact_m < sensor.range_max_m)
+        # The programs cut values to [-1, 1], decode them and keep what lies between the limits, 1.45 and 80 m. A value
+        # of 1 is a return there, as 80 m is rounded to just below itself; farther limits may be rounded upwards, so
+        # they are not compared with. The power is taken in 64 bits: in 32 its last bit differs with a batch's size.
+        returned = torch.exp2(exponent.double()) - 1 > sensor.range_min_m
     image = RangeImage.masked(range_m.clamp(sensor.range_min_m, sensor.range_max_m), returned, sensor)
     if values.shape[1] == 1:
         return image

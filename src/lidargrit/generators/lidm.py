@@ -168,7 +168,8 @@ class Lidm(Generator[LidmConfig, LidmSampling]):
         noise = SeededNoise(seeds, self.latent_shape, self.device)
         latents = latent_diffusion.ddim(self.denoiser, noise, self._shares(), sampling.steps, sampling.eta)
         latents = latents * self.latent_scale if self.axes is None else self.axes.latents(latents)
-        return self.tokenizer.sample(self.tokenizer.quantised(latents), noise.rngs, sampling.mask)
+        decoding = self.tokenizer.for_decoding("fp32")
+        return decoding.sample(self.tokenizer.quantised(latents), noise.rngs, sampling.mask)
 
     def cost(self, sampling: LidmSampling | None = None) -> Cost:
         """Return the denoiser's passes, one a step, and one of the decoder."""

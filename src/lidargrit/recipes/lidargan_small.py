@@ -18,7 +18,7 @@ RECIPE = Recipe(
             gradient_clip=0.0,
             augmentations=("flip",),
             any_columns=True,
-            average_over_scans=1000,
+            average_over_scans=0,  # batch norms know the statistics of the learned weights, not those of averaged ones
             validate_every=4000,
             checkpoint_every=4000,
         )

@@ -1,6 +1,8 @@
 """LiDM's KITTI-360 experiment: spherical projection to 64x1024, range to 56 m, 15.1 M and 257.8 M parameters.
 
-The authors give no number of scans for the diffusion model; 2,560,000 is R2DM's.
+The authors give no number of scans for the diffusion model; 2,560,000 is R2DM's. Their program also mirrors scans from
+front to back, and turns those of the first stage by up to 45 degrees: here they are mirrored from left to right alone,
+so that samples have a front.
 """
 
 from lidargrit.generators.lidm import LidmConfig
@@ -34,7 +36,7 @@ RECIPE = Recipe(
             batch_size=16,
             learning_rate=1e-6 * 16,  # 1e-6 for each scan of a step
             betas=(0.9, 0.999),
-            weight_decay=0.01,
+            weight_decay=0.01,  # of linear layers alone, 5 % of the weights; the authors' reaches all of them
             gradient_clip=0.0,
             average_over_scans=110_000,  # half-life of a decay of 0.9999 every step of 16 scans
             augmentations=("flip",),

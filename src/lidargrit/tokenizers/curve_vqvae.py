@@ -49,7 +49,8 @@ class CurveVqvaeConfig(TokenizerConfig):
         num_codes: number of codes in the codebook.
         range_encoding: map from metres to [-1, 1]; LiDM's models with ``*`` in their names have the linear one.
         range_scale: encoded range that becomes 1: log2(1 + range in metres), or metres for the linear encoding. 5.84
-            and 56 are published, and end at 56 m. Longer ranges are learned as no return.
+            and 56 are published, and end at 56.3 and 56 m. Longer ranges are learned as no return. LiDM's program also
+            drops what is decoded to 56 m and more; here that is a return.
         mask_head: whether a second channel of the decoder learns which beams return. Without it, a range of a few
             millimetres stands for no return.
         codebook_loss: ``paper``, ``reference``, ``vqvae`` or ``ema``; see lidargrit.nn.quantiser. LiDM's program has
