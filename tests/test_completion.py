@@ -101,6 +101,17 @@ def test_an_edge_is_not_smeared():
         assert set(fill(method, Condition.of_pixels(image, observed)).range_m.unique().tolist()) == {5.0, 40.0}
 
 
+def test_samples_that_were_added_are_not_taken_for_those_completed_before(folders, tmp_path, capsys):
+    model, samples = load(folders / "wide_run"), tmp_path / "samples"
+    words = ["complete", str(samples), str(tmp_path / "out"), "--observed", "rows:4", "--format", "image"]
+    words += ["--model", f"{folders}/wide_run"]
+    write_samples(model, folders / "wide_run", samples, [10, 11])
+    assert main(words) == 0
+    write_samples(model, folders / "wide_run", samples, [4])
+    assert main(words) == 2
+    assert "000000.npy is another scan of" in capsys.readouterr().err
+
+
 def test_complete_keeps_names_and_observed_points_and_goes_on(folders, tmp_path, capsys):
     words = ["complete", f"{folders}/scans", str(tmp_path / "out"), "--observed", "rows:4"]
     words += ["--model", "triangulation", "--sensor", f"{folders}/sensor.json"]
@@ -168,7 +179,7 @@ def test_two_images_whose_names_differ_in_letters_alone_are_two_files(tmp_path, 
     (tmp_path / "sensor.json").write_text(json.dumps(SENSOR.to_json()))
     assert main([*words, "--sensor", f"{tmp_path}/sensor.json", "--bad-scans", "skip"]) == 0
     scans = json.loads((tmp_path / "out/completed.json").read_text())["scans"]
-    assert scans == {"scan.NPY.npz": "scan.NPY", "scan.npz": "scan"}
+    assert {file: Path(path).name for file, path in scans.items()} == {"scan.NPY.npz": "scan.NPY", "scan.npz": "scan.npy"}
     assert not recwarn.list
 
 

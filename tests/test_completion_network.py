@@ -143,6 +143,9 @@ def test_a_model_with_the_stage_completes_by_it_and_survives_saving(tmp_path):
     assert torch.equal(load(tmp_path).complete(known[1:], [2]).range_m[0], done.range_m[1])
     dropped = model.complete(Condition.of_surfaces(scans(1)), [0])  # no task for the network
     assert not bool((dropped.return_mask & ~scans(1).return_mask).any())
+    with pytest.raises(ConfigError, match=r"temperature=0\.5, which the network .* does not have"):
+        model.complete(known, [1, 2], TokenSampling(temperature=0.5))
+    model.complete(known, [1, 2], TokenSampling(temperature=0.5, completion="tokens"))
     plain = LidarGrit(LidarGrit.smallest_config(SENSOR), SENSOR)
     with pytest.raises(ConfigError, match="completion=network for a model without a network"):
         plain.complete(known, [1, 2], TokenSampling(completion="network"))

@@ -161,7 +161,7 @@ def test_damaged_files_are_refused(tmp_path):
     path, rng = tmp_path / "scans.lgz", np.random.default_rng(0)
     with writing(path, {"step_mm": 20}) as writer:
         for name in ("one", "two"):
-            writer.add(name, rng.bytes(300), 5)
+            writer.add(name, name, rng.bytes(300), 5)
     whole = path.read_bytes()
     archive = Archive(path)
     archive.check()
@@ -216,10 +216,10 @@ def test_an_interrupted_file_goes_on_and_ends_as_an_uninterrupted_one(tmp_path):
     begun, whole, unfinished = tmp_path / "scans.lgz", tmp_path / "whole.lgz", tmp_path / "scans.lgz.unfinished"
     with writing(whole, {"step_mm": 20}) as writer:
         for name in names:
-            writer.add(name, content[name], 7)
+            writer.add(name, f"{name}, seed 4", content[name], 7)
     with suppress(KeyboardInterrupt), writing(begun, {"step_mm": 20}) as writer:
         for name in names[:3]:
-            writer.add(name, content[name], 7)
+            writer.add(name, f"{name}, seed 4", content[name], 7)
         raise KeyboardInterrupt
     assert not begun.exists()
     with (unfinished / "scans").open("r+b") as file:  # as after a loss of power: the last scan is not there as a whole
@@ -230,11 +230,11 @@ def test_an_interrupted_file_goes_on_and_ends_as_an_uninterrupted_one(tmp_path):
         pytest.raises(OutputError, match="the scan one, which is not the next of these"),
         writing(begun, {"step_mm": 20}) as writer,
     ):
-        writer.go_on(iter(["other"]))
+        writer.go_on(iter(["one, seed 3"]))
     with writing(begun, {"step_mm": 20}) as writer:
-        assert writer.go_on(iter(names)) == 2
+        assert writer.go_on(f"{name}, seed 4" for name in names) == 2
         for name in names[2:]:
-            writer.add(name, content[name], 7)
+            writer.add(name, f"{name}, seed 4", content[name], 7)
     assert begun.read_bytes() == whole.read_bytes()
     assert Archive(begun).names == ["one", "two", "three"]
     assert not unfinished.exists()
@@ -255,7 +255,7 @@ def test_a_strangers_file_writes_only_files_that_can_be_and_below_its_folder(tmp
         path.unlink(missing_ok=True)
         with writing(path, {"step_mm": 20}) as writer:
             for name in names:
-                writer.add(name, b"a", 1)
+                writer.add(name, name, b"a", 1)
         assert main(["decompress", str(path), str(tmp_path / "out")]) == 2
         assert message in the_one_line(capsys.readouterr().err, "decompress")
         assert [one.name for one in tmp_path.iterdir()] == ["scans.lgz"]
@@ -370,7 +370,7 @@ def test_one_that_may_have_left_scans_out_does_not_go_on_as_one_that_refuses_the
     path = tmp_path / "scans.lgz"
     for begun, then in (("skip", "refuse"), ("refuse", "skip")):
         with suppress(KeyboardInterrupt), writing(path, {}, {"bad_scans": begun}) as writer:
-            writer.add("one", b"one", 1)
+            writer.add("one", "one", b"one", 1)
             raise KeyboardInterrupt
         if begun == "skip":
             with pytest.raises(OutputError, match=r"scans of other options \(bad_scans\)"):

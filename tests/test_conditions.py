@@ -69,7 +69,13 @@ def test_patterns_choose_rows_sectors_pixels_and_files(tmp_path):
     assert 0.005 < float((pixels[0] & completion).float().mean()) < 0.015, "a completion has other random numbers"
     assert torch.equal(Pattern("returns").mask(image), image.return_mask)
     np.save(tmp_path / "mask.npy", rows.numpy().astype(np.uint8))
-    assert torch.equal(Pattern(f"{tmp_path}/mask.npy").mask(image), rows)
+    of_file = Pattern(f"{tmp_path}/mask.npy")
+    assert torch.equal(of_file.mask(image), rows)
+    before = of_file.identity()
+    np.save(tmp_path / "mask.npy", sector.expand(rows.shape).numpy().astype(np.uint8))
+    assert of_file.identity().keys() == before.keys() == {"observed", "observed_sha256"}
+    assert of_file.identity() != before, "a folder of completions is not continued with another mask"
+    assert Pattern("rows:4").identity() == {"observed": "rows:4"}
 
 
 @pytest.mark.parametrize(

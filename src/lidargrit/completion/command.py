@@ -50,7 +50,7 @@ def complete_scans(
         return Condition.of_pixels(_batch(scan.image), pattern.mask(scan.image, seed, source)[None])
 
     inputs = open_inputs(source, _reader(completer, pattern.partial), config, reporter)
-    facts = {"verb": "complete", "source": source, "observed": pattern.text}
+    facts = {"verb": "complete", "source": source, **pattern.identity()}
     return write_completions(inputs, out, completer, condition_of, output, facts, config, reporter)
 
 

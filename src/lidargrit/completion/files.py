@@ -102,7 +102,8 @@ def write_completions(
     """
     inputs.check_output(out)
     files = _files(inputs, output, completer.sensor)
-    manifest = facts | _facts(completer, output) | {"scans": {file: inputs.name(at) for (at, _), file in files.items()}}
+    scans = {file: inputs.identity(index) for (index, _), file in files.items()}
+    manifest = facts | _facts(completer, output) | {"scans": scans}
     left_out, labels_lost = set[int](), False
     missing = [job for job, file in files.items() if not (out / file).exists()]
     skipped = left_out if config.bad_scans == "skip" else None

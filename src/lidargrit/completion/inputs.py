@@ -94,6 +94,10 @@ class Inputs:
         """Return the name of its file, without the ending."""
         return self._scans.name(index)
 
+    def identity(self, index: int) -> str:
+        """Return what identifies it, so that another scan is not taken for it."""
+        return self._scans.identity(index)
+
     def number(self, index: int) -> int:
         """Return its number in the source, whatever other scans are taken."""
         return self._scans.number(index)

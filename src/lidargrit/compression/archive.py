@@ -14,7 +14,7 @@ import os
 import struct
 import zlib
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -33,6 +33,7 @@ _START = struct.Struct("<4sII")
 _TAIL = struct.Struct("<QI4s")
 _INDEX_BYTES_AT_MOST = 256 * 2**20  # of the index's lines: those of a million scans take 50 MB
 _LINE_BYTES_AT_MOST = 2**16  # a path and a few numbers
+_SCANS_AT_MOST = 4_000_000  # ten times as many as the largest data set has
 _CHUNK = 2**20
 _STRICTER = {"bad_points": ["refuse"], "bad_scans": ["refuse"]}  # options by which no other scans were written so far
 
@@ -53,9 +54,9 @@ class Entry(NamedTuple):
     num_returns: int
 
     @classmethod
-    def parse(cls, line: bytes) -> Entry:
-        """Parse a line; raises ScanError, TypeError or ValueError if it is none."""
-        name, length, crc32, num_returns = parse_json(line, "a line of the index", list, ScanError)
+    def of(cls, facts: Sequence[Any]) -> Entry:
+        """Check the facts of a line; raises TypeError or ValueError if they are none."""
+        name, length, crc32, num_returns = facts
         if not (isinstance(name, str) and all(isinstance(each, int) for each in (length, crc32, num_returns))):
             raise ValueError
         if length < 0 or not 0 <= crc32 < 2**32:
@@ -145,11 +146,11 @@ class ArchiveWriter:
             raise self._of_others(f"scans of other options ({', '.join(changed)})")
         write_json(path, chosen)
 
-    def go_on(self, names: Iterator[str]) -> int:
+    def go_on(self, identities: Iterator[str]) -> int:
         """Keep the scans of an unfinished file, up to one that was not written whole, and return their number.
 
         Args:
-            names: names of the scans that are to be written.
+            identities: what identifies each of the scans that are to be written.
 
         Raises:
             OutputError: the unfinished file holds other scans.
@@ -159,13 +160,14 @@ class ArchiveWriter:
         end = 0
         for line in self._index:
             try:
-                entry = Entry.parse(line)
+                *facts, identity = parse_json(line, "a line of the index", list, ScanError)
+                entry = Entry.of(facts)
             except (LidarGritError, TypeError, ValueError):
                 break
             compressed = self._scans.read(entry.length)
             if not line.endswith(b"\n") or len(compressed) != entry.length or zlib.crc32(compressed) != entry.crc32:
                 break
-            if entry.name != next(names, None):
+            if identity != next(identities, None):
                 raise self._of_others(f"the scan {entry.name}, which is not the next of these")
             end += len(line)
             self._count(entry)
@@ -174,12 +176,12 @@ class ArchiveWriter:
         self._scans.seek(0, 2)
         return self.num_names
 
-    def add(self, name: str, compressed: bytes, num_returns: int) -> None:
+    def add(self, name: str, identity: str, compressed: bytes, num_returns: int) -> None:
         """Write one scan; without bytes, that it was left out."""
         entry = Entry(name, len(compressed), zlib.crc32(compressed), num_returns)
         self._scans.write(compressed)
         self._scans.flush()
-        self._index.write(json.dumps(entry).encode() + b"\n")
+        self._index.write(json.dumps([*entry, identity]).encode() + b"\n")
         self._index.flush()
         self._count(entry)
 
@@ -187,8 +189,9 @@ class ArchiveWriter:
         """Write the index, after which the file is whole."""
         self._index.seek(0)
         packer, crc32 = zlib.compressobj(9), 0
-        while chunk := self._index.read(_CHUNK):
-            crc32 = self._append(packer.compress(chunk), crc32)
+        for line in self._index:
+            *entry, _ = json.loads(line)
+            crc32 = self._append(packer.compress(json.dumps(entry).encode() + b"\n"), crc32)
         crc32 = self._append(packer.flush(), crc32)
         self._scans.write(_TAIL.pack(self._offset, crc32, _END))
         self._scans.flush()
@@ -292,14 +295,16 @@ class Archive:
         return packed, offset
 
     def _entries(self, packed: bytes) -> Iterator[Entry]:
-        opened, rest, total = zlib.decompressobj(), b"", 0
+        opened, rest, total, count = zlib.decompressobj(), b"", 0, 0
         try:
             while not opened.eof:
                 text = opened.decompress(packed, _CHUNK)
                 packed, total = opened.unconsumed_tail, total + len(text)
                 *lines, rest = (rest + text).split(b"\n")
                 for line in lines:
-                    yield Entry.parse(line)
+                    yield Entry.of(parse_json(line, "a line of the index", list, ScanError))
+                    if (count := count + 1) > _SCANS_AT_MOST:
+                        raise ValueError
                 too_long = len(rest) > _LINE_BYTES_AT_MOST  # a line without end would be joined again and again
                 if too_long or total > _INDEX_BYTES_AT_MOST or not (text or opened.eof):
                     raise ValueError

@@ -69,9 +69,10 @@ def compress_scans(
     chosen = {"source": source, "max_scans": config.max_scans}
     chosen |= {"bad_points": config.bad_points, "bad_scans": config.bad_scans}
     with writing(out, _header(codec, model), chosen) as writer:
-        done = writer.go_on(inputs.name(index) for index in range(len(inputs)))
+        done = writer.go_on(inputs.identity(index) for index in range(len(inputs)))
         with reporter.progress("compressing", len(inputs), done) as progress:
             for index in range(done, len(inputs)):
+                scan = inputs.name(index), inputs.identity(index)
                 try:
                     image = inputs.read(index).image
                     data, returns = codec.compress(image), int(image.return_mask.sum())
@@ -79,9 +80,9 @@ def compress_scans(
                     if config.bad_scans == "refuse":
                         raise
                     reporter.message(f"left out: {error}")
-                    writer.add(inputs.name(index), b"", 0)
+                    writer.add(*scan, b"", 0)
                 else:
-                    writer.add(inputs.name(index), data, returns)
+                    writer.add(*scan, data, returns)
                 progress.advance(1)
         if not writer.num_scans:
             raise DataError(f"no usable scan in {source}", "at least one", "see the messages above")

@@ -52,7 +52,8 @@ class Observed:
         return cls(range_m.cpu().numpy(), returned.cpu().numpy(), observed.cpu().numpy(), *_angles(condition.sensor))
 
     def nearest(self, wanted: Bool[np.ndarray, "H W"]) -> tuple[Int64[np.ndarray, "H W"], Int64[np.ndarray, "H W"]]:
-        """Return for every pixel row and column of the nearest wanted one by angle; of itself if none is wanted."""
+        """Return for every pixel row and column of the nearest wanted one by angle, as if rows were equally spaced; of
+        itself if none is wanted."""
         return _nearest(wanted, self.elevation_rad)
 
     @cached_property
@@ -271,7 +272,8 @@ def _label_of(condition: Condition, index: int, seen: Observed) -> Int[Tensor, "
 
 
 def fill_from_nearest(images: RangeImage, observed: Bool[Tensor, "B H W"]) -> RangeImage:
-    """Return scans in which every unobserved pixel is a copy of the nearest observed one by angle.
+    """Return scans in which every unobserved pixel is a copy of the nearest observed one by angle, as if rows were
+    equally spaced.
 
     Args:
         images: batch of range images; what was observed without a return has a range of 0.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -42,6 +43,14 @@ class Pattern:
     def partial(self) -> bool:
         """Whether scans of a part of the circle are accepted, because pixels without a return count as unobserved."""
         return self.text == "returns"
+
+    def identity(self) -> dict[str, str]:
+        """Return what identifies the pattern, as JSON: another mask may be put in place of one."""
+        if not self.text.lower().endswith(".npy"):
+            return {"observed": self.text}
+        array = _read(Path(self.text), "an .npy of truth values, one for each pixel")
+        content = f"{array.shape} {array.dtype}".encode() + array.tobytes()
+        return {"observed": self.text, "observed_sha256": hashlib.sha256(content).hexdigest()}
 
     def mask(self, image: RangeImage, seed: int = 0, source: str = "a scan") -> Bool[Tensor, "H W"]:
         """Return the mask of the observed pixels of one range image.
@@ -113,15 +122,19 @@ class Pattern:
 
 def _read_mask(path: Path, size: tuple[int, int]) -> Bool[Tensor, "H W"]:
     wanted = f"an .npy of {size[0]}x{size[1]} truth values, one for each pixel"
+    array = _read(path, wanted)
+    if array.shape != size or array.dtype.kind not in "buif":
+        got = f"--observed {path}, a mask of {'x'.join(map(str, array.shape))} {array.dtype}"
+        raise UsageError(got, wanted, "make a mask for this sensor")
+    return torch.from_numpy(np.asarray(array != 0))
+
+
+def _read(path: Path, wanted: str) -> np.ndarray:
     try:
         if not path.is_file():
             raise ValueError("it is no file")
         if path.stat().st_size > _BYTES_AT_MOST:
             raise ValueError("it is too large")
-        array = parse_array(path.read_bytes())
+        return parse_array(path.read_bytes())
     except (OSError, ValueError) as error:
         raise UsageError(f"--observed {path}, which cannot be used ({error})", wanted, "check the file") from None
-    if array.shape != size or array.dtype.kind not in "buif":
-        got = f"--observed {path}, a mask of {'x'.join(map(str, array.shape))} {array.dtype}"
-        raise UsageError(got, wanted, "make a mask for this sensor")
-    return torch.from_numpy(np.asarray(array != 0))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -50,6 +50,7 @@ _PUBLISHED_NETWORKS = {  # by our name: the program's name, and entries of its c
     "transformer": ("Transformer", ("*.attn.mask",)),  # a triangle of ones
 }
 _COUNTERS = ("quantize.usage", "quantize.code_sums")  # of our training, which other programs do not keep
+_OF_NETWORKS = {"completion", "weights", "decoder"}  # settings that change nothing of what a network completes
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ class TokenSampling:
         completion: method by which scans are completed. ``network`` takes the network that was trained for what was
             observed: the one for completion where pixels were, the one for raydrop where all surfaces were. ``tokens``
             samples the tokens without any observed pixel, and then all pixels that were not observed. ``auto`` is
-            ``network`` where a model has one. A network takes none of the other settings.
+            ``network`` where a model has one. A network refuses the settings above, which it does not have.
         weights: number type of the transformer's weights. ``fp32`` is exact; ``bf16`` and ``int8`` (CPUs only) read
             less memory for a token and change probabilities a little, see docs/performance.md.
         decoder: number type of the tokenizer's decoder and of the pixel decoder. ``fp32`` is exact; ``bf16`` is
@@ -238,6 +239,17 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
                 "completion=network for a model without a network for what is known of these scans",
                 "a model with one",
                 "leave completion out, or train a recipe with its stage: compact_completion or compact_raydrop",
+            )
+        changed = [
+            f"{each.name}={getattr(sampling, each.name)}"
+            for each in fields(sampling)
+            if each.name not in _OF_NETWORKS and getattr(sampling, each.name) != each.default
+        ]
+        if network is not None and changed:
+            raise ConfigError(
+                f"{changed[0]}, which the network that completes these scans does not have",
+                "settings that have an effect",
+                "leave it out, or add completion=tokens",
             )
         return network
 

@@ -215,9 +215,16 @@ def _scores(card: Scorecard) -> str:
         for each in card.left_out
         if each.verdict == NOT_APPLICABLE
     ]
-    notes = [f"- not as in the protocol: {_text(_PATH.sub('…', each))}" for each in card.deviations]
-    notes += [f"- warning: {_text(_PATH.sub('…', each))}" for each in card.warnings]
+    notes = [f"- not as in the protocol: {_text(_without_paths(each, card))}" for each in card.deviations]
+    notes += [f"- warning: {_text(_without_paths(each, card))}" for each in card.warnings]
     return "\n".join([*lines, "", *notes]).rstrip()
+
+
+def _without_paths(words: str, card: Scorecard) -> str:
+    """Return a sentence in which no folder of the user is named."""
+    for source, name in ((card.samples.source, "the samples"), (card.reference.source, "the reference")):
+        words = words.replace(source, name)
+    return _PATH.sub("…", words)
 
 
 def _text(words: Any) -> str:
