@@ -103,7 +103,10 @@ def test_recordings_that_are_paths_are_not_published(run, tmp_path):
 
 
 def test_the_card_tells_the_facts(run, tmp_path):
-    assert main(["publish", str(run), str(tmp_path / "public"), "--scores", str(run.parent / "scores.json")]) == 0
+    told = json.loads((run.parent / "scores.json").read_text())
+    told["inputs"]["samples"]["source"], told["warnings"] = "clients/acme corp/smp", ["clients/acme corp/smp overlap"]
+    (tmp_path / "told.json").write_text(json.dumps(told))
+    assert main(["publish", str(run), str(tmp_path / "public"), "--scores", str(tmp_path / "told.json")]) == 0
     head, body = head_of((tmp_path / "public" / "README.md").read_text())
     assert head == {
         "library_name": "lidargrit",
@@ -125,6 +128,7 @@ def test_the_card_tells_the_facts(run, tmp_path):
         f"lidargrit {lidargrit.__version__}, commit ",
         "By the protocol `exact`, against 2 scans of kitti_odometry 00.",
         "Generator.from_pretrained(",
+        "- warning: the samples overlap",
     ):
         assert fact in body, fact
     assert sum(
