@@ -2,6 +2,7 @@
 
 from collections import Counter
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -120,6 +121,28 @@ def test_links_to_folders_are_followed_once_and_not_around(bin_file, tmp_path):
     (tmp_path / "links").mkdir()
     (tmp_path / "links" / "drive").symlink_to(tmp_path / "disk" / "drive")
     assert names_of(open_dataset(str(tmp_path / "links"))) == ["drive/000000", "drive/more/000001"]
+    (tmp_path / "disk" / "best").symlink_to(tmp_path / "disk" / "drive")  # sorts before what it links to
+    assert names_of(open_dataset(str(tmp_path / "disk"))) == ["drive/000000", "drive/more/000001"]
+
+
+@pytest.mark.parametrize("name", ["range_images", "nuscenes"])
+def test_a_folder_of_one_format_with_more_below_is_read_whole(name, tmp_path):
+    dataset = load(name)
+    dataset.write_example(tmp_path / "tree", 2)
+    first, second = sorted(path for path in (tmp_path / "tree").rglob("*") if path.is_file())
+    (tmp_path / "mine" / "day2").mkdir(parents=True)
+    first.rename(tmp_path / "mine" / first.name)
+    assert open_dataset(str(tmp_path / "mine")).public_name() == name
+    second.rename(tmp_path / "mine" / "day2" / second.name)
+    assert len(open_dataset(str(tmp_path / "mine"))) == 2
+
+
+def test_drives_that_may_not_be_read_are_not_passed_over(tmp_path, monkeypatch):
+    load("kitti_odometry").write_example(tmp_path, 2)
+    locked = tmp_path / "sequences" / "08"
+    monkeypatch.setattr("os.access", lambda path, mode: Path(path) != locked)  # whoever runs the tests may read all
+    with pytest.raises(DataError, match="sequences/08, which cannot be read"):
+        open_dataset(f"kitti_odometry:{tmp_path}")
 
 
 def test_the_wish_to_drop_points_reaches_the_reader(bin_file):
@@ -204,8 +227,10 @@ def test_one_bad_file_among_others_is_told_by_its_name_and_left_out(tmp_path, mo
     reporter = Heard()
     images = load_range_images([str(folder)], DataConfig(bad_scans="skip"), reporter)
     assert len(images) == 5
-    assert [message for message in reporter.messages if str(folder / "bad.ply") in message] == reporter.messages
-    assert len(reporter.messages) == 1
+    (left_out,) = [message for message in reporter.messages if message.startswith("left out: ")]
+    assert str(folder / "bad.ply") in left_out
+    lacking = f"WARNING: no reflectance in 1 of 5 scans, such as {folder / 'xyz_bin.bin'}, so that no scan is read with"
+    assert any(message.startswith(lacking) for message in reporter.messages)
 
 
 def test_an_example_overwrites_nothing(bin_file, tmp_path):

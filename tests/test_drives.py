@@ -101,8 +101,11 @@ def test_clean_ranges_and_probabilities_lie_beside_the_scans(drive):
 def test_what_is_there_is_kept_and_more_is_added(drive, tmp_path):
     config = DriveConfig(SENSOR, seed=5, frames=3, clean=True)
     write_drives(tmp_path / "out", 2, config)
-    (tmp_path / "out" / "sequences" / "00" / "labels" / "000001.label").unlink()  # as if killed before its end
+    labels = tmp_path / "out" / "sequences" / "00" / "labels"
+    (labels / "000001.label").unlink()  # as if killed before its end
     write_drives(tmp_path / "out", 6, config, workers=2)
+    (labels / "000000.label").unlink()  # as if a process had gone ahead
+    assert write_drives(tmp_path / "out", 1, config) == 6
     ours, whole = files(tmp_path / "out"), files(drive)
     assert ours.keys() == whole.keys()
     assert all(ours[name] == whole[name] for name in whole if not name.endswith(".npz"))

@@ -63,6 +63,10 @@ def test_damage_is_found_and_made_good(tmp_path, small_shards):
             PreparedImages(str(folder))
         prepare("simulated:6", CONFIG, folder)
         assert all(np.array_equal(one[0], other[0]) for one, other in zip(pixels_of(folder), good, strict=True))
+    shutil.copy(folder / "000000.shard", second)  # whole, but of other scans
+    (folder / "scans.json").write_bytes(b"")
+    prepare("simulated:6", CONFIG, folder)
+    assert all(np.array_equal(one[0], other[0]) for one, other in zip(pixels_of(folder), good, strict=True))
 
 
 @pytest.mark.parametrize(

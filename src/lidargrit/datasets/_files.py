@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 from abc import abstractmethod
@@ -98,11 +99,11 @@ class FileDataset(ScanDataset):
     def matches(cls, root: Path) -> bool:
         """Return whether a folder holds a file where this tree has them, in the same format.
 
-        Where the tree names no folder, scans of other formats must not lie there too: they would go unseen.
+        Where the tree names no folder, no other scans must lie below: they would go unseen.
         """
         pattern = cls._pattern_in(root)
         named = set((pattern or "").split("/")[:-1]) - {"*", "**"}
-        return pattern is not None and (bool(named) or not cls._others_below(root))
+        return pattern is not None and (bool(named) or not cls._others_below(root, pattern))
 
     @classmethod
     def write_example(cls, root: Path, num_scans: int) -> None:
@@ -144,15 +145,17 @@ class FileDataset(ScanDataset):
         return pattern if first and cls._format(first).recognises(first) else None
 
     @classmethod
-    def _others_below(cls, root: Path) -> bool:
-        own = formats.load(cls.format)
-        others = (path for path in scans_below(root) if own not in formats.candidates(path))
-        return any(one.recognises(path) for path in others for one in formats.candidates(path))
+    def _others_below(cls, root: Path, pattern: str) -> bool:
+        own = {*root.glob(pattern)}
+        return any(is_recognised(path) for path in scans_below(root) if path not in own)
 
     @classmethod
     def _find(cls, root: Path) -> list[Path]:
-        found = (sorted(filter(_is_scan_file, root.glob(pattern)), key=natural_order) for pattern in cls.patterns)
-        return next((paths for paths in found if paths), [])
+        for pattern in cls.patterns:
+            _check_readable(root, pattern)
+            if found := sorted(filter(_is_scan_file, root.glob(pattern)), key=natural_order):
+                return found
+        return []
 
     def _choose(self, split: Split, sequences: set[str]) -> set[str]:
         named = self.splits()
@@ -200,6 +203,15 @@ class FileDataset(ScanDataset):
         return next((one for one in (*below, *here.parents[:depth]) if self._pattern_in(one)), None)
 
 
+def _check_readable(root: Path, pattern: str) -> None:
+    """Refuse folders on the way to the scans that cannot be read: ``Path.glob`` would leave them out."""
+    above = pattern.split("/")[:-1]
+    for depth in range(1, len(above) + 1):
+        for folder in root.glob("/".join(above[:depth])):
+            if folder.is_dir() and not os.access(folder, os.R_OK | os.X_OK):
+                raise _unreadable(folder, os.strerror(errno.EACCES))
+
+
 def _check_names(paths: Iterable[Path]) -> None:
     """Refuse file names that are not UTF-8: they cannot be printed, nor written to a file for other programs."""
     try:
@@ -217,8 +229,8 @@ def _is_scan_file(path: Path) -> bool:
 def scans_below(root: Path) -> Iterator[Path]:
     """Find all files that are called like a scan, in no order, leaving out hidden ones.
 
-    Links to folders are followed, once each, unless they lead to a folder that is already being searched or contains
-    one.
+    Links to folders are followed after all folders that are none, so that these keep their names; once each, and not
+    those that lead to a folder that has been searched or contains one.
 
     Raises:
         DataError: a folder below that cannot be read, whose scans would be missing.
@@ -226,23 +238,34 @@ def scans_below(root: Path) -> Iterator[Path]:
     if root.is_file():
         yield from [root] if formats.candidates(root) else []
         return
-    seen = {*root.resolve().parents}
-    for folder, below, names in os.walk(root, onerror=_refuse_folder, followlinks=True):
-        place = Path(folder).resolve()
-        if place in seen:  # a link to what another way leads to
-            below.clear()
-            continue
-        seen.add(place)
-        below[:] = sorted(name for name in below if not name.startswith("."))
-        paths = (Path(folder, name) for name in names if not name.startswith("."))
-        yield from (path for path in paths if formats.candidates(path))
+    seen, starts = {*root.resolve().parents}, [root]
+    for start in starts:
+        for folder, below, names in os.walk(start, onerror=_refuse_folder):
+            place = Path(folder).resolve()
+            if place in seen:  # a link to what another way leads to
+                below.clear()
+                continue
+            seen.add(place)
+            below[:] = sorted(name for name in below if not name.startswith("."))
+            starts += [path for path in (Path(folder, name) for name in below) if path.is_symlink()]
+            paths = (Path(folder, name) for name in names if not name.startswith("."))
+            yield from (path for path in paths if formats.candidates(path))
+
+
+def is_recognised(path: Path) -> bool:
+    """Return whether a file that is called like a scan looks like one."""
+    return any(form.recognises(path) for form in formats.candidates(path))
 
 
 def _refuse_folder(error: OSError) -> None:
     if isinstance(error, (FileNotFoundError, NotADirectoryError)):  # a root that is not there has no scan
         return
-    what = f"{error.filename}, which cannot be read ({error.strerror})"
-    raise DataError(what, "a folder that you may read", "change its permissions, or move it elsewhere") from None
+    raise _unreadable(error.filename, error.strerror) from None
+
+
+def _unreadable(folder: Path | str, why: str | None) -> DataError:
+    what = f"{folder}, which cannot be read ({why})"
+    return DataError(what, "a folder that you may read", "change its permissions, or move it elsewhere")
 
 
 def unnamed_recording(path: Path) -> str:

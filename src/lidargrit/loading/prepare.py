@@ -76,12 +76,12 @@ def prepare(
     facts = json.dumps({**asdict(spec), "source": ""}, sort_keys=True).encode()  # the digest names the scans
     folder = folder or cache_folder() / hashlib.sha256(facts).hexdigest()[:24]
     _claim(folder, spec, scans)
-    missing = [shard for shard in range(spec.num_shards) if not _is_whole(folder, shard)]
+    missing = [shard for shard in range(spec.num_shards) if not _is_whole(folder, spec, shard)]
     if missing:  # a complete folder may be one that this user can only read
         with claim_folder(folder, shared=True):  # with other machines, and with whoever needs the same cache
             mine = [shard for shard in missing if shard % world_size == rank]
             make_shards(folder, spec, mine, dataset, config.workers, reporter)
-            _wait_for(folder, [shard for shard in missing if shard % world_size != rank], reporter)
+            _wait_for(folder, spec, [shard for shard in missing if shard % world_size != rank], reporter)
     remove_partials(folder)
     for left in folder.glob("*.unfinished"):  # by a process that was killed after it had written the shard
         with suppress(OSError):  # of a folder that this user can only read
@@ -154,8 +154,8 @@ def prepare_and_describe(
             (folder / shard_name(shard)).unlink(missing_ok=True)  # another process may have removed it
         prepare(source, config, folder, reporter, sensor, rank, world_size, dataset)
     images, seconds = PreparedImages(str(folder)), time.monotonic() - begun
-    for why in images.left_out.values():
-        reporter.message(f"left out: {why}")
+    for message in (*(f"left out: {why}" for why in images.left_out.values()), *images.told_lacks()):
+        reporter.message(message)
     if not len(images):
         raise DataError(f"no usable scan in {source}", "at least one", "see the messages above")
     size = sum(path.stat().st_size for path in folder.glob("*.shard"))
@@ -237,6 +237,7 @@ def _state(path: Path) -> tuple[str, int, int] | None:
 
 def _claim(folder: Path, spec: PreparedSpec, scans: list[tuple[str, str, int, int]]) -> None:
     """Write the plan into a free folder, or check that the folder's plan is the same."""
+    listing, path = json.dumps(scans), folder / SCANS_FILE
     if (folder / PLAN_FILE).exists():
         planned = PreparedFolder(str(folder)).read_spec()
         # The digest tells whether these are other scans; the same folder may be named in another way.
@@ -251,11 +252,12 @@ def _claim(folder: Path, spec: PreparedSpec, scans: list[tuple[str, str, int, in
                 "an empty folder, or what was prepared from these very scans in this very way",
                 "prepare into another folder, or remove this one",
             )
-        if spec != planned:
-            with nullcontext() if differing else suppress(OutputError):  # a complete folder may not be ours to change
+        with nullcontext() if differing else suppress(OutputError):  # a complete folder may not be ours to change
+            if spec != planned:
                 write_json(folder / PLAN_FILE, asdict(spec))
+            if not path.is_file() or path.read_bytes() != listing.encode():  # damaged: the plan's digest is of the list
+                write_text(path, listing)
         return
-    listing, path = json.dumps(scans), folder / SCANS_FILE
     # In this order: another process may be claiming the folder for the same scans at this moment.
     if is_taken(folder) and not (path.is_file() and path.read_bytes() == listing.encode()):
         raise OutputError(f"{folder}, which holds something else", "an empty folder", "choose another one")
@@ -269,21 +271,21 @@ def _other(differing: Sequence[str]) -> str:
     return ", ".join([*settings, *(["other scans"] if len(settings) < len(differing) else [])])
 
 
-def _is_whole(folder: Path, shard: int) -> bool:
+def _is_whole(folder: Path, spec: PreparedSpec, shard: int) -> bool:
     path = folder / shard_name(shard)
     try:
-        read_index(LocalBytes(path), path.name)
+        entries, left_out = read_index(LocalBytes(path), path.name)
     except (OSError, ValueError):  # ValueError: an empty file, and our own errors
         return False
-    return True
+    return sorted([*(entry.scan for entry in entries), *left_out]) == list(spec.scans_of(shard))
 
 
-def _wait_for(folder: Path, shards: list[int], reporter: Reporter) -> None:
+def _wait_for(folder: Path, spec: PreparedSpec, shards: list[int], reporter: Reporter) -> None:
     """Wait until other machines have made their shards."""
     last = time.monotonic()
     with reporter.progress("waiting for others", len(shards)) as progress:
         while shards:
-            still = [shard for shard in shards if not _is_whole(folder, shard)]
+            still = [shard for shard in shards if not _is_whole(folder, spec, shard)]
             if len(still) < len(shards):
                 last = time.monotonic()
                 progress.advance(len(shards) - len(still))

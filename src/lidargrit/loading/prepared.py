@@ -243,6 +243,16 @@ class PreparedImages:
     def __len__(self) -> int:
         return len(self._entries)
 
+    def told_lacks(self) -> list[str]:
+        """Tell for a person what some scans have, and is read of none since others lack it."""
+        told = []
+        for what, has in (("reflectance", "reflectance_bytes"), ("labels", "label_bytes")):
+            lacking = [at for at, (_, entry) in enumerate(self._entries) if not getattr(entry, has)]
+            if 0 < len(lacking) < len(self):
+                which = f"{len(lacking)} of {len(self)} scans, such as {self.provenance.names[lacking[0]]}"
+                told.append(f"WARNING: no {what} in {which}, so that no scan is read with {what}")
+        return told
+
     def evenly_spaced(self, count: int) -> PreparedImages:
         """Return so many of the images, evenly spaced, without opening the folder again."""
         chosen, whole, indices = copy.copy(self), self.provenance, evenly_spaced(count, len(self))

@@ -102,7 +102,10 @@ def _made_by_processes(folder: Path, shares: list[list[int]]) -> Iterator[int]:
     lines: queue.Queue[str | int] = queue.Queue()
     try:
         for share in shares:
-            process = subprocess.Popen([*command, *map(str, share)], stdout=subprocess.PIPE, text=True, env=environment)
+            # A group of their own: Ctrl-C is for this process, which ends them.
+            process = subprocess.Popen(
+                [*command, *map(str, share)], stdout=subprocess.PIPE, text=True, env=environment, process_group=0
+            )
             processes.append(process)
             threading.Thread(target=_listen, args=(process, lines), daemon=True).start()
         running = len(processes)
@@ -151,4 +154,6 @@ def make_some_shards(folder: Path, parent: int, shards: list[int]) -> int:
     except LidarGritError as error:
         print(json.dumps({"error": [type(error).__name__, error.got, error.wanted, error.cure]}), flush=True)
         return 2
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it is about to end, which nothing should interrupt
     return 0

@@ -58,8 +58,12 @@ class DriveConfig:
 
     def sequence_and_number(self, scan: int) -> tuple[str, int]:
         """Return a scan's sequence and its number in it: a drive each, or many single streets together."""
-        together = self.frames if self.frames > 1 else _SCANS_PER_SEQUENCE
-        return f"{scan // together:02d}", scan % together
+        return f"{scan // self.scans_per_sequence:02d}", scan % self.scans_per_sequence
+
+    @property
+    def scans_per_sequence(self) -> int:
+        """Number of scans in a sequence."""
+        return self.frames if self.frames > 1 else _SCANS_PER_SEQUENCE
 
     def to_json(self) -> dict[str, Any]:
         """Return all that the scans depend on."""
@@ -96,9 +100,10 @@ def write_drives(
         )
     with claim_folder(out), claimed_manifest(out / MANIFEST):
         _claim(out, config)
-        missing = [scan for scan in range(num_scans) if not _label_file(out, config, scan).exists()]
+        there = max(num_scans, _last_scan(out, config) + 1)  # an earlier call may have made more
+        missing = [scan for scan in range(there) if not _label_file(out, config, scan).exists()]
         write = partial(_write_scan, out, config)
-        with (reporter or Reporter()).progress("simulating", num_scans, num_scans - len(missing)) as progress:
+        with (reporter or Reporter()).progress("simulating", there, there - len(missing)) as progress:
             if min(workers, len(missing)) <= 1:
                 for scan in missing:
                     write(scan)
@@ -107,8 +112,6 @@ def write_drives(
                 with process_pool(workers) as pool:
                     for _ in pool.map(write, missing, chunksize=4):
                         progress.advance(1)
-        # An earlier call may have made more.
-        there = max(num_scans, sum(1 for _ in out.glob("sequences/*/labels/[!.]*.label")))
         _write_sequence_files(out, config, there)
     return there
 
@@ -160,6 +163,14 @@ def _write_scan(out: Path, config: DriveConfig, scan: int) -> None:
 def _label_file(out: Path, config: DriveConfig, scan: int) -> Path:
     sequence, number = config.sequence_and_number(scan)
     return out / "sequences" / sequence / "labels" / f"{number:06d}.label"
+
+
+def _last_scan(out: Path, config: DriveConfig) -> int:
+    """Return the last scan that is there, after which an interrupted call may have left gaps; -1 for none."""
+    together = config.scans_per_sequence
+    files = out.glob("sequences/*/labels/[!.]*.label")
+    scans = (int(file.parent.parent.name) * together + int(file.stem) for file in files)
+    return max(scans, default=-1)
 
 
 def _write_sequence_files(out: Path, config: DriveConfig, num_scans: int) -> None:

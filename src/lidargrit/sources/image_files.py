@@ -9,9 +9,10 @@ import numpy as np
 
 from lidargrit import _discovery, formats
 from lidargrit.arrays import ARRAY_BYTES_AT_MOST, parse_array
+from lidargrit.datasets._files import is_recognised, scans_below
 from lidargrit.datasets.folder import Folder
 from lidargrit.determinism import evenly_spaced, natural_order
-from lidargrit.errors import ConfigError, LidarGritError, ScanError
+from lidargrit.errors import ConfigError, DataError, LidarGritError, ScanError
 from lidargrit.formats import read_bytes
 from lidargrit.loading import DataConfig, Pixels, Provenance, RangeImages
 from lidargrit.reporting import Reporter
@@ -87,6 +88,10 @@ def image_files(path: Path) -> list[Path]:
         return []
     for one in found:
         user_path(str(one.absolute()))  # refuses a name that is not UTF-8, which others could not write again
+    below = (one for one in scans_below(path) if one.parent != path and is_recognised(one))
+    if path.is_dir() and (further := next(below, None)):
+        what = f"{path}, with range images and, in {further.parent}, further scans"
+        raise DataError(what, "a folder of range images alone", "move one of them elsewhere")
     return found
 
 
