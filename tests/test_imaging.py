@@ -162,12 +162,14 @@ def test_rings_of_another_sensor_are_refused_with_the_cure():
     rays = load_sensor("vlp16").elevation_rad[:, 0].double()
     scan = replace(scan, ring=(torch.atan2(z, torch.hypot(x, y))[:, None] - rays).abs().argmin(dim=1))
     with pytest.raises(
-        ScanError, match=r"that made the scan \(.*vlp16.*fit-sensor.*or take a model of that sensor"
+        ScanError, match=r"take a model of the sensor that made the scan, .* \(vlp16, or find yours with .*fit-sensor"
     ) as refusal:
         project(scan, HDL64E)
     assert "--" not in str(refusal.value), "no option that only some commands have"
     assert "fewer lasers" in doubts_about_rays(scan, load_sensor("os1_64"), "spherical")
     assert "have fewer columns" in doubts_about_rays(scan, load_sensor("vlp16"), "spherical")
+    upper_half = simulate(seed=0, sensor=load_sensor("vlp32c").with_columns(360))
+    assert "fewer lasers" in doubts_about_rays(upper_half, HDL64E, "unfolding")
     assert not doubts_about_rays(scan, load_sensor("vlp16").with_columns(360), "spherical")
 
 

@@ -42,12 +42,14 @@ _EMPTY_ROWS_AT_MOST = 0.4  # 0 to 0.1 in the rows of the scan's own sensor; scan
 # Pixels without points that have some within three columns on either side: up to 0.09 in the columns of the scan's own
 # sensor; scans of 1,800 columns in 2,048: 0.18 to 0.28; of half as many: 0.5.
 _EMPTY_BETWEEN_AT_MOST, _COLUMNS_AROUND = 0.2, 3
+_RINGS_OFF_AT_MOST_DEG = 2.0  # of a sensor that may be the scan's: in the mean over its rows
 _FEW_POINTS = 0.02  # of what a row has in the median: a stray point does not fill a row
 
 # True in all commands: some choose the projection and the sensor of the scans, in others these are the model's.
 _BY_ELEVATION = (
     "project by elevation where the command lets you: data.projection=spherical (in Python: method='spherical')"
 )
+_NAME_IT = "take a model of the sensor that made the scan, or name that sensor where the command lets you"
 FIT_SENSOR = "or find yours with lidargrit fit-sensor, and name its file in place of a sensor"
 
 
@@ -114,7 +116,9 @@ def doubts_about_rays(scan: Scan, sensor: SensorModel, method: ProjectionName) -
     row = pixels.row[kept].astype(np.int64)
     count = np.bincount(row, minlength=sensor.height)
     used = np.flatnonzero(count > _FEW_POINTS * np.median(count[count > 0]))
-    empty = 1 - len(used) / (used[-1] - used[0] + 1)
+    # The upper rows may all look at the sky; the lowest see the ground, if rows go by ring.
+    last = sensor.height - 1 if method == "unfolding" else used[-1]
+    empty = 1 - len(used) / (last - used[0] + 1)
     if empty > _EMPTY_ROWS_AT_MOST:
         return f"{empty:.0%} of its rows get no points: the sensor that made the scans has fewer lasers"
     has_points = np.zeros((sensor.height, pixels.width), dtype=bool)
@@ -147,14 +151,22 @@ def _empty_between(has_points: Bool[np.ndarray, "H W"]) -> float:
 
 def told_doubt(source: str, sensor: SensorModel, doubt: str) -> str:
     """Return what a person reads of a doubt about the sensor of a source; "" without one."""
-    cure = f"name that sensor, {FIT_SENSOR}; where a model decides the sensor, take a model of that one"
+    cure = f"{_NAME_IT}, {FIT_SENSOR}"
     return f"{source}, imaged as {sensor.name}: {doubt}; {cure}" if doubt else ""
 
 
 def sensors_that_fit(scan: Scan) -> list[str]:
-    """Name the bundled sensors whose rows span the elevations of a scan; the tightest comes first."""
+    """Name the bundled sensors that may have made a scan, the likeliest first.
+
+    Where rings are known these have as many rows, and the rows nearest to the rings come first. Else their rows span
+    the elevations of the scan, and the tightest comes first.
+    """
+    sensors = {name: load_sensor(name) for name in _discovery.names("sensors")}
+    if (off_deg := _distances_of_rows_deg(scan, sensors)) is not None:
+        near = [name for name, off in off_deg.items() if off < _RINGS_OFF_AT_MOST_DEG]
+        return sorted(near, key=lambda name: off_deg[name])
     low_deg, high_deg = elevation_span_deg(scan)
-    spans_deg = {name: _span_of_rows_deg(load_sensor(name)) for name in _discovery.names("sensors")}
+    spans_deg = {name: _span_of_rows_deg(sensor) for name, sensor in sensors.items()}
     fitting = {
         name: top - bottom for name, (bottom, top) in spans_deg.items() if bottom - 1 <= low_deg and high_deg <= top + 1
     }
@@ -162,20 +174,36 @@ def sensors_that_fit(scan: Scan) -> list[str]:
 
 
 def closest_sensor(scan: Scan) -> str:
-    """Guess the bundled sensor: as many rows as the scan has rings, then the most similar span of elevations.
+    """Guess the bundled sensor: that whose rows are nearest to the scan's rings, of those with as many rows.
 
-    If the scan neither names its rings nor is stored ring by ring, or no sensor has as many rows, the elevations alone
-    decide.
+    If the scan neither names its rings nor is stored ring by ring, or no sensor has as many rows, the most similar span
+    of elevations decides.
     """
+    sensors = {name: load_sensor(name) for name in _discovery.names("sensors")}
+    if off_deg := _distances_of_rows_deg(scan, sensors):
+        return min(off_deg, key=lambda name: off_deg[name])
     low_deg, high_deg = elevation_span_deg(scan)
-    rings = ring_count(scan)
 
-    def distance(name: str) -> tuple[bool, float]:
-        sensor = load_sensor(name)
-        bottom_deg, top_deg = _span_of_rows_deg(sensor)
-        return sensor.height != rings, abs(bottom_deg - low_deg) + abs(top_deg - high_deg)
+    def distance_deg(name: str) -> float:
+        bottom_deg, top_deg = _span_of_rows_deg(sensors[name])
+        return abs(bottom_deg - low_deg) + abs(top_deg - high_deg)
 
-    return min(_discovery.names("sensors"), key=distance)
+    return min(sensors, key=distance_deg)
+
+
+def _distances_of_rows_deg(scan: Scan, sensors: dict[str, SensorModel]) -> dict[str, float] | None:
+    """Return how far rings lie from the rows of each sensor with as many, in the mean; None where rings are unknown."""
+    ring = _rings_in_order(scan) if scan.ring is None else scan.ring.numpy()
+    if ring is None or int(ring.min()) < 0:
+        return None
+    points = np.bincount(ring)
+    there = np.flatnonzero(points)
+    mean_deg = np.bincount(ring, elevations_deg(scan.points_xyz_m))[there] / points[there]
+    return {
+        name: float(np.abs(mean_deg - np.degrees(row_elevation_rad(sensor))[there]).mean())
+        for name, sensor in sensors.items()
+        if sensor.height == len(points)
+    }
 
 
 def ring_count(scan: Scan) -> int:
@@ -227,7 +255,7 @@ def _wrong_rows(scan: Scan, sensor: SensorModel, method: ProjectionName, pixels:
     return ScanError(
         f"{rings} rings in {scan.source}",
         f"the {sensor.height} rings of the sensor {sensor.name!r}, in firing order",
-        f"remove the file if the scan was cut; {_BY_ELEVATION}; {FIT_SENSOR}",
+        f"{_name_sensor(scan, sensor)}; remove the file if the scan was cut; {_BY_ELEVATION}",
     )
 
 
@@ -243,7 +271,7 @@ def _misplaced(
     return ScanError(
         f"{what} that lie elsewhere than those of {sensor.name!r}, in {scan.source}",
         "a scan of this sensor",
-        _name_sensor(scan)
+        _name_sensor(scan, sensor)
         if method == "unfolding"
         else "choose data.projection_variant=exact where the command lets you (in Python: variant='exact')",
     )
@@ -292,14 +320,15 @@ def _wrong_elevations(scan: Scan, sensor: SensorModel, outside: float) -> ScanEr
         f"{outside:.0%} of the points of {scan.source} outside the sensor's elevations (the scan spans "
         f"{low_deg:.1f} to {high_deg:.1f} degrees)",
         f"{bottom_deg:.1f} to {top_deg:.1f} degrees for {sensor.name!r}",
-        _name_sensor(scan),
+        _name_sensor(scan, sensor),
     )
 
 
-def _name_sensor(scan: Scan) -> str:
-    if fitting := " or ".join(sensors_that_fit(scan)):
-        return f"name the sensor that made the scan ({fitting}, {FIT_SENSOR}), or take a model of that sensor"
-    return f"no sensor in the package spans its elevations: {FIT_SENSOR.removeprefix('or ')}"
+def _name_sensor(scan: Scan, refused: SensorModel) -> str:
+    """Return the cure for a scan that another sensor has made."""
+    if fitting := " or ".join(name for name in sensors_that_fit(scan) if name != refused.name):
+        return f"{_NAME_IT} ({fitting}, {FIT_SENSOR})"
+    return f"{_NAME_IT}; none in the package is like it: {FIT_SENSOR.removeprefix('or ')}"
 
 
 def _span_of_rows_deg(sensor: SensorModel) -> tuple[float, float]:
