@@ -293,6 +293,7 @@ def test_processes_make_a_table_that_can_be_extended(tmp_path, capfd):
         (["--add", "small", "-n", "5"], "--add with settings of its own (-n)"),
         (["--add", "small", "--against", "simulated:256:test"], "--add with settings of its own (--against)"),
         (["small", "--add", "demo"], "--add with systems before it"),
+        (["--add", str(tmp_path)], f"{tmp_path}, a folder that holds no finished run"),
     ):
         capfd.readouterr()
         assert main(["compare", str(tmp_path), *wrong]) == 2
@@ -306,7 +307,8 @@ def cell_of(system, sha256="ab", metric="bev_jsd", source="real"):
     score["real_against_real"] = {"value": 0.25, "num_scans": 4, "halvings": 2}
     reference = {"scans_used": 4, "sha256": sha256, "source": source, "sensor": "s 8x8"}
     scores = {"scores": [score], "inputs": {"reference": reference}, "protocol": {"name": "exact"}}
-    return {"system": system, "costs": {"parameters": 3}, "scores": scores}
+    told = {"warnings": ["4 scans: too few"], "deviations": [], "verdict": [f"{metric} is near."]}
+    return {"system": system, "costs": {"parameters": 3}, "scores": {**scores, **told}}
 
 
 def test_a_page_has_a_table_for_each_reference():
@@ -315,6 +317,8 @@ def test_a_page_has_a_table_for_each_reference():
     assert [name in first for name in (">a<", ">b<", ">c<")] == [True, False, True]
     assert ">b<" in second
     assert first.count("real against real") == second.count("real against real") == 1
+    assert "<li>a, c: 4 scans: too few</li>" in page
+    assert "<li>b: bev_jsd is near.</li>" in page
 
 
 def test_a_page_of_foreign_names_holds_no_code_of_theirs():

@@ -300,6 +300,7 @@ def test_the_drops_of_a_model_are_scored_beside_independent_ones(folders):
         (["complete", "{}/wide.npy", "--model", "{}/run"], "a range image of 64x33; wanted 64x32"),
         (["complete", "{}/wide_samples", "--model", "{}/run"], "range images of 64x64 of the sensor"),
         (["complete", "{}/scans", "--model", "nothing"], "nothing, which does not exist"),
+        (["complete", "{}/scans", "--model", "trianglation"], "wanted a run's folder, or triangulation; check"),
         (["complete", "{}/scans", "--model", "linear", "-n", "2"], "-n 2 for linear; wanted 1"),
         (["complete", "{}/scans", "--model", "{}/run", "-n", "0"], "-n 0; wanted at least 1"),
         (["raydrop", "{}/scans", "--model", "{}/run", "--probability", "-1"], "--probability -1; wanted 0 or more"),

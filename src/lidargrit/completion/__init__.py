@@ -11,12 +11,12 @@ from lidargrit import configuration
 from lidargrit.conditions import KINDS, Condition, ConditionKind
 from lidargrit.conditions.fills import FILLS, fill
 from lidargrit.configuration import name_and_settings, override
-from lidargrit.errors import ConfigError
+from lidargrit.errors import ConfigError, nearest_names
 from lidargrit.generators import Generator, SamplingT, load
 from lidargrit.loading import Provenance
 from lidargrit.nn.devices import usable_device
 from lidargrit.projection import ProjectionVariant
-from lidargrit.run_folder import locate, projection_variant, trained_on, weights_sha256
+from lidargrit.run_folder import PACKAGED, locate, projection_variant, trained_on, weights_sha256
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
@@ -141,6 +141,11 @@ def open_completer(
             raise ConfigError(got, "its name or .json file", "name it with --to (in Python: sensor=...)")
         return ClassicalCompleter(word, sensor)
     folder = locate(word)
+    if not folder.exists():
+        known = [*(FILLS if kind == "pixels" else ()), *(one.name for one in PACKAGED)]
+        raise ConfigError(
+            f"--model {word}, which does not exist", f"a run's folder, or {nearest_names(word, known)}", "check the name"
+        )
     generator = load(folder).to(usable_device(device))
     if kind not in generator.conditions:
         takes = " or ".join(KINDS[one] for one in sorted(generator.conditions)) or "no condition at all"

@@ -161,7 +161,7 @@ class ScanReader:
             raise ScanError(
                 f"{ring_count(scan)} rings in {scan.source}",
                 f"the {self.sensor.height} of the sensor {self.sensor.name!r}",
-                "add the missing rows with: lidargrit upsample",
+                "add the missing rows with: lidargrit upsample; a classical method completes them on their own sensor",
             )
         method = projection_that_fits(scan, self.sensor)
         try:

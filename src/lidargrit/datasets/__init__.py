@@ -179,7 +179,7 @@ def open_dataset(source: str, bad_points: BadPoints = "refuse") -> ScanDataset:
         if root.is_dir() and not any(root.iterdir()):
             raise DataError(f"{root}, which is an empty folder", "one with scans in it", cure)
         got = "holds no layout we know" if root.is_dir() else "is not a folder" if root.exists() else "does not exist"
-        raise DataError(f"{root}, which {got}", "the root of a data set", cure)
+        raise DataError(f"{root}, which {got}", "scans: a file, a folder or the root of a data set", cure)
     return load(name)(root, split, bad_points)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 from lidargrit import _discovery, configuration
 from lidargrit.errors import ConfigError
@@ -20,9 +21,15 @@ def load_recipe(name: str, settings: Sequence[str] = ()) -> Recipe:
 
     Raises:
         UnknownNameError: no such recipe and no such generator.
-        ConfigError: an unknown setting or a value that does not fit; names the nearest.
+        ConfigError: an unknown setting or a value that does not fit, of which it names the nearest; or a folder.
     """
     is_generator = name not in _discovery.names("recipes") and name in _discovery.names("generators")
+    if not is_generator and name not in _discovery.names("recipes") and Path(name).is_dir():
+        raise ConfigError(
+            f"{name}, a folder that holds no finished run",
+            "a recipe, or where systems are compared a finished run",
+            "see lidargrit list recipes; samples are scored by lidargrit evaluate, whose --tables sets scores side by side",
+        )
     recipe = default_recipe(name) if is_generator else _discovery.load_instance("recipes", name, Recipe)
     return configuration.override(recipe, settings)
 

@@ -8,6 +8,7 @@ from html import escape
 from typing import Any
 
 from lidargrit.evaluation.scorecard import format_value
+from lidargrit.evaluation.verdict import MEMORISED, PIXEL_STATISTICS
 from lidargrit.viewer._page import document
 from lidargrit.viewer.report_style import STYLE
 
@@ -43,6 +44,8 @@ th[aria-sort=ascending] button::after{content:" \\25B2"}
 th[aria-sort=descending] button::after{content:" \\25BC"}
 main{max-width:none}
 tbody th{white-space:nowrap}
+td small{display:block}
+tr>:first-child{position:sticky;left:0;background:var(--paper);border-right:1px solid var(--line)}
 tfoot td,tfoot th{color:var(--soft)}
 """
 
@@ -66,7 +69,7 @@ def table_page(cells: Sequence[dict[str, Any]], flops: float) -> str:
     content = (
         f"<h1>{len(cells)} systems</h1>\n"
         f"<p>{escape(budget)}. Brackets hold 95 % intervals over scans. Click on a head to sort. Lower is better where "
-        f"nothing else is said.{apart}</p>\n{''.join(map(_table, tables.values()))}"
+        f"nothing else is said. A cost that is not known is -.{apart}</p>\n{''.join(map(_table, tables.values()))}"
     )
     return document(f"{len(cells)} systems compared", STYLE + _LOOKS, content, _SCRIPT)
 
@@ -85,9 +88,28 @@ def _table(cells: Sequence[dict[str, Any]]) -> str:
     reference = cells[0]["scores"]["inputs"]["reference"]
     return (
         f"<p>{int(reference['scans_used']):,} samples of each against as many scans of "
-        f"{escape(str(reference['source']))}, {escape(str(reference['sensor']))}</p>\n"
+        f"{escape(str(reference['source']))}, {escape(str(reference['sensor']))}</p>\n{_told(cells)}"
         '<div class="wide" tabindex="0" role="region" aria-label="scores and costs"><table><thead><tr>'
         f"{head}</tr></thead><tbody>{body}</tbody><tfoot>{_real_against_real(cells, columns)}</tfoot></table></div>\n"
+    )
+
+
+def _told(cells: Sequence[dict[str, Any]]) -> str:
+    """Return what a reader must know of the scores before the table: warnings, and the verdict on each system."""
+    kinds = {"warning": "Read this first", "note": "In words"}
+    said: dict[str, dict[str, list[str]]] = {kind: {} for kind in kinds}
+    for cell in cells:
+        scores, system = cell["scores"], str(cell["system"])
+        for line in (*scores.get("warnings", ()), *scores.get("deviations", ())):
+            said["warning"].setdefault(str(line), []).append(system)
+        if (verdict := scores.get("verdict")) and system not in (PIXEL_STATISTICS, MEMORISED):
+            said["note"].setdefault(" ".join(map(str, verdict)), []).append(system)
+    return "".join(
+        f'<section class="{kind}"><h2>{title}</h2><ul>'
+        + "".join(f"<li>{escape(', '.join(systems))}: {escape(line)}</li>" for line, systems in said[kind].items())
+        + "</ul></section>\n"
+        for kind, title in kinds.items()
+        if said[kind]
     )
 
 
