@@ -18,12 +18,12 @@ from lidargrit.untrusted import SEED_AT_MOST, parse_json
 
 UPSAMPLED = {"vlp16": "a VLP-16", "hdl32e": "an HDL-32E", "vlp32c": "a VLP-32C"}  # sensors with few rows
 TASKS = {  # what a model makes of an uploaded scan → its description on the page
-    "returns": "fill in the rays without a point",
-    "ahead": "fill in the quarter straight ahead",
-    "rows": "fill in three of every four rows",
-    "region": "fill in a region that you draw",
-    **{sensor: f"add the rows that {name} lacks" for sensor, name in UPSAMPLED.items()},
-    "raydrop": "drop returns of a clean simulated scan",
+    "returns": "fill in rays without a point",
+    "ahead": "fill in the quarter ahead",
+    "rows": "fill in three rows of four",
+    "region": "fill in a region",
+    **{sensor: f"add the rows {name} lacks" for sensor, name in UPSAMPLED.items()},
+    "raydrop": "drop returns of a clean scan",
 }
 _WHOLE_AT_MOST = 1024  # steps and the like: four times what any published sampler takes
 _FRACTION_AT_MOST = 100.0  # temperatures and the like: far beyond, everything is noise

@@ -85,11 +85,13 @@ def _plot_lost(above: Axes, side: Axes, inspection: Inspection) -> None:
     """Plot every point from above and from the side, the lost ones in the colour of their fate."""
     x, y, z = inspection.scan.points_xyz_m.numpy().T
     away = np.hypot(x, y)
-    for number, name in reversed(list(enumerate(FATES))):  # the kept ones first, so that they hide no lost one
-        those = np.flatnonzero(inspection.fate == number)
+    names = list(FATES)
+    # Those left out with their columns first, then the kept ones, so that they hide no lost one.
+    for name in sorted(names, key=lambda name: (name != "left_out", name != "kept")):
+        those = np.flatnonzero(inspection.fate == names.index(name))
         if len(those):
             shown = those[:: -(-len(those) // _DOTS_AT_MOST)]
-            faint = {"color": _COLOURS[name], "linewidths": 0, "alpha": 0.25 if name in ("kept", "left_out") else 0.8}
+            faint = {"color": _COLOURS[name], "linewidths": 0, "alpha": 0.25 if name == "left_out" else 0.8}
             above.scatter(y[shown], x[shown], s=_DOT, **faint)
             side.scatter(away[shown], z[shown], s=_DOT, **faint)
             side.scatter([], [], color=_COLOURS[name], s=20, label=f"{FATES[name]}: {len(those)}")

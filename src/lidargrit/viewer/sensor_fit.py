@@ -49,14 +49,15 @@ def plot_sensor_fit(fit: SensorFit, path: Path) -> None:
 def _plot_elevations(axes: Axes, fit: SensorFit, rows_deg: np.ndarray) -> None:
     margin = max(1.0, 0.05 * float(np.ptp(rows_deg)))
     low, high = float(rows_deg.min()) - margin, float(rows_deg.max()) + margin
-    bins = min(2000, _BINS_PER_ROW * len(rows_deg))
+    width = float(np.ptp(rows_deg)) / min(2000, max(1, len(rows_deg) - 1) * _BINS_PER_ROW) or margin
+    bins = np.arange(float(rows_deg.max()) + width / 2, low - width, -width)[::-1]  # equal rows in the middle of theirs
+    bins = np.append(bins, np.arange(bins[-1] + width, high + width, width))
     seen = axes.get_yaxis_transform()
     axes.hlines(rows_deg, 0, 1, transform=seen, color=_ROW, linewidth=0.6, alpha=0.25, zorder=0)
     axes.hlines(rows_deg, 0.95, 1, transform=seen, color=_ROW, linewidth=0.8, label="fitted rows")
     axes.hist(
         fit.elevations_deg,
-        bins=bins,
-        range=(low, high),
+        bins=bins.tolist(),
         orientation="horizontal",
         histtype="stepfilled",  # bars thinner than a dot of the picture would vanish
         color=_POINT,

@@ -188,6 +188,7 @@ class Desk {
       el("status").textContent = "";
       el("error").textContent = error.message;
       el("error").hidden = false;
+      el("error").scrollIntoView({ block: "nearest" });
     }
   }
 
