@@ -179,7 +179,10 @@ def test_two_images_whose_names_differ_in_letters_alone_are_two_files(tmp_path, 
     (tmp_path / "sensor.json").write_text(json.dumps(SENSOR.to_json()))
     assert main([*words, "--sensor", f"{tmp_path}/sensor.json", "--bad-scans", "skip"]) == 0
     scans = json.loads((tmp_path / "out/completed.json").read_text())["scans"]
-    assert {file: Path(path).name for file, path in scans.items()} == {"scan.NPY.npz": "scan.NPY", "scan.npz": "scan.npy"}
+    assert {file: Path(path).name for file, path in scans.items()} == {
+        "scan.NPY.npz": "scan.NPY",
+        "scan.npz": "scan.npy",
+    }
     assert not recwarn.list
 
 

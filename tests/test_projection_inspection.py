@@ -133,7 +133,8 @@ def test_a_scan_that_does_not_fit_is_reported_not_refused():
 @pytest.mark.parametrize("name", [*_discovery.names("sensors")])
 def test_the_closest_sensor_is_the_one_that_made_the_scan(name):
     sensor = load_sensor(name).with_columns(360)
-    scan = unproject(RangeImage.masked(torch.full((sensor.height, 360), 10.0), torch.ones(sensor.height, 360) > 0, sensor))
+    every = torch.ones(sensor.height, 360)
+    scan = unproject(RangeImage.masked(10 * every, every > 0, sensor))
     assert closest_sensor(scan) == sensors_that_fit(scan)[0] == name
     if name in ("hdl64e_kitti_360", "vlp16"):  # rings that are found in the order of the points
         assert closest_sensor(replace(scan, ring=None)) == name

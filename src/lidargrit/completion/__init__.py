@@ -144,7 +144,9 @@ def open_completer(
     if not folder.exists():
         known = [*(FILLS if kind == "pixels" else ()), *(one.name for one in PACKAGED)]
         raise ConfigError(
-            f"--model {word}, which does not exist", f"a run's folder, or {nearest_names(word, known)}", "check the name"
+            f"--model {word}, which does not exist",
+            f"a run's folder, or {nearest_names(word, known)}",
+            "check the name",
         )
     generator = load(folder).to(usable_device(device))
     if kind not in generator.conditions:

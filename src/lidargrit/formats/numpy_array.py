@@ -90,7 +90,9 @@ def _archive_columns(archive: zipfile.ZipFile, path: Path) -> dict[str, np.ndarr
     points_name = next((name for name in _POINTS if name in members), None)
     if points_name is None and "range_m" in members:
         raise ScanError(
-            f"{path}, a range image from a folder of samples", _FORMAT, f"name the whole folder: {path.absolute().parent}"
+            f"{path}, a range image from a folder of samples",
+            _FORMAT,
+            f"name the whole folder: {path.absolute().parent}",
         )
     if points_name is None:
         raise _refused(f"the arrays {', '.join(map(ascii, list(members)[:8]))[:120]}", path)

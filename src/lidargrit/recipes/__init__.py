@@ -28,7 +28,7 @@ def load_recipe(name: str, settings: Sequence[str] = ()) -> Recipe:
         raise ConfigError(
             f"{name}, a folder that holds no finished run",
             "a recipe, or where systems are compared a finished run",
-            "see lidargrit list recipes; samples are scored by lidargrit evaluate, whose --tables sets scores side by side",
+            "see lidargrit list recipes; score samples with lidargrit evaluate (--tables: side by side)",
         )
     recipe = default_recipe(name) if is_generator else _discovery.load_instance("recipes", name, Recipe)
     return configuration.override(recipe, settings)

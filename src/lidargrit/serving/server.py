@@ -8,7 +8,7 @@ import socket
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from waitress import wasyncore
 from waitress.server import create_server
@@ -88,7 +88,8 @@ def open_server(
         _temporary_folder() as folder,
         JobQueue(runs, Path(folder), device, limits) as queue,
     ):
-        open_sockets: dict[int, wasyncore.dispatcher] = {}  # the listening one and those of the connections
+        # The listening one and those of the connections, as waitress wraps them; the types of its stubs are others.
+        open_sockets: dict[int, Any] = {}
         server = create_server(
             Application(queue, host),
             map=open_sockets,
@@ -107,10 +108,11 @@ def open_server(
         def close_all() -> None:
             wasyncore.close_all(open_sockets, ignore_all=True)
 
+        def stop() -> None:  # by the thread that runs it
+            server.trigger.pull_trigger(close_all)  # pyright: ignore[reportAttributeAccessIssue]  a number in the stubs
+
         try:
-            yield RunningServer(
-                bound.getsockname()[1], queue, server.run, lambda: server.trigger.pull_trigger(close_all)
-            )
+            yield RunningServer(bound.getsockname()[1], queue, server.run, stop)
         finally:
             server.task_dispatcher.shutdown()
             close_all()
