@@ -101,9 +101,8 @@ def write_completions(
         ScanError, DataError: a scan that cannot be used, or no usable one.
     """
     inputs.check_output(out)
-    files = _files(inputs, output, completer.sensor)
-    scans = {file: inputs.identity(index) for (index, _), file in files.items()}
-    manifest = facts | _facts(completer, output) | {"scans": scans}
+    files, facts = _files(inputs, output, completer.sensor), facts | _facts(completer, output)
+    identities = {file: inputs.identity(index) for (index, _), file in files.items()}
     left_out, labels_lost = set[int](), False
     missing = [job for job, file in files.items() if not (out / file).exists()]
     skipped = left_out if config.bad_scans == "skip" else None
@@ -111,7 +110,7 @@ def write_completions(
     first = list(islice(jobs, 1))  # a mistake in it is told before anything is written
     with (
         claim_folder(out),
-        claimed_scans(out / "completed.json", manifest) as files_left_out,
+        claimed_scans(out / "completed.json", {**facts, "scans": identities}) as files_left_out,
         reporter.progress("completing", len(files), len(files) - len(missing)) as progress,
     ):
         for batch in _batches(chain(first, jobs), completer.batch):

@@ -150,7 +150,7 @@ class ArchiveWriter:
         """Keep the scans of an unfinished file, up to one that was not written whole, and return their number.
 
         Args:
-            identities: what identifies each of the scans that are to be written.
+            identities: identity of each of the scans that are to be written.
 
         Raises:
             OutputError: the unfinished file holds other scans.
