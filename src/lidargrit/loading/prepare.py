@@ -154,8 +154,8 @@ def prepare_and_describe(
             (folder / shard_name(shard)).unlink(missing_ok=True)  # another process may have removed it
         prepare(source, config, folder, reporter, sensor, rank, world_size, dataset)
     images, seconds = PreparedImages(str(folder)), time.monotonic() - begun
-    for message in (*(f"left out: {why}" for why in images.left_out.values()), *images.told_lacks()):
-        reporter.message(message)
+    for remark in images.remarks():
+        reporter.message(remark)
     if not len(images):
         raise DataError(f"no usable scan in {source}", "at least one", "see the messages above")
     size = sum(path.stat().st_size for path in folder.glob("*.shard"))
@@ -277,7 +277,7 @@ def _is_whole(folder: Path, spec: PreparedSpec, shard: int) -> bool:
         entries, left_out = read_index(LocalBytes(path), path.name)
     except (OSError, ValueError):  # ValueError: an empty file, and our own errors
         return False
-    return sorted([*(entry.scan for entry in entries), *left_out]) == list(spec.scans_of(shard))
+    return spec.is_shard(shard, entries, left_out)
 
 
 def _wait_for(folder: Path, spec: PreparedSpec, shards: list[int], reporter: Reporter) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
@@ -65,6 +65,10 @@ class PreparedSpec:
     def scans_of(self, shard: int) -> range:
         """Return the indices of one shard's scans among all scans."""
         return range(shard * self.shard_scans, min((shard + 1) * self.shard_scans, self.num_scans))
+
+    def is_shard(self, shard: int, entries: Iterable[ShardEntry], left_out: Iterable[int]) -> bool:
+        """Return whether an index, of images and of scans that were left out, is that of a shard."""
+        return sorted([*(entry.scan for entry in entries), *left_out]) == list(self.scans_of(shard))
 
     def differences(self, other: PreparedSpec) -> list[str]:
         """Return the names of the fields that differ from another's."""
@@ -222,7 +226,7 @@ class PreparedImages:
         with ThreadPoolExecutor(_OPENED_AT_ONCE) as pool:
             indices = list(pool.map(self._read_index, range(self.spec.num_shards)))
         for shard, (entries, left_out) in enumerate(indices):
-            if sorted([*(entry.scan for entry in entries), *left_out]) != list(self.spec.scans_of(shard)):
+            if not self.spec.is_shard(shard, entries, left_out):
                 raise DataError(f"{shard_name(shard)} with other scans", "those of the plan", "prepare again")
             self._entries += [(shard, entry) for entry in entries]
             self.left_out |= left_out
@@ -243,9 +247,9 @@ class PreparedImages:
     def __len__(self) -> int:
         return len(self._entries)
 
-    def told_lacks(self) -> list[str]:
-        """Tell for a person what some scans have, and is read of none since others lack it."""
-        told = []
+    def remarks(self) -> list[str]:
+        """Tell for a person which scans were left out, and what is read of none since some lack it."""
+        told = [f"left out: {why}" for why in self.left_out.values()]
         for what, has in (("reflectance", "reflectance_bytes"), ("labels", "label_bytes")):
             lacking = [at for at, (_, entry) in enumerate(self._entries) if not getattr(entry, has)]
             if 0 < len(lacking) < len(self):

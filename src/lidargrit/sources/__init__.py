@@ -362,7 +362,7 @@ def _data_set_or_nothing(text: str) -> tuple[str, str]:
 
 def _require_some(text: str, prepared: PreparedImages, reporter: Reporter) -> None:
     """Tell which scans were left out and what some lack, and raise DataError if none is left."""
-    for message in (*(f"left out: {why}" for why in prepared.left_out.values()), *prepared.told_lacks()):
-        reporter.message(message)
+    for remark in prepared.remarks():
+        reporter.message(remark)
     if not len(prepared):
         raise DataError(f"no usable scan in {text}", "at least one", "see the messages above")
