@@ -1,6 +1,7 @@
 """What tests share: where the reference numbers and the real scans lie, if they lie beside the project."""
 
 import os
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,17 @@ def _cache(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("LIDARGRIT_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
+
+
+@pytest.fixture(autouse=True)
+def _signal_handlers():
+    """Fail a test that leaves signals handled otherwise; programs that later tests start inherit what is ignored."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)}
+    yield
+    left = {number: handler for number in before if (handler := signal.getsignal(number)) is not before[number]}
+    for number in left:
+        signal.signal(number, before[number])
+    assert not left
 
 
 @pytest.fixture(scope="session")

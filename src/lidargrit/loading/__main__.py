@@ -1,11 +1,15 @@
 """Entry point of one of the processes that make shards; see workers.py."""
 
+import signal
 import sys
 from pathlib import Path
 
 from lidargrit.loading.workers import make_some_shards
 
+signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that a half-written file is removed
 try:
-    sys.exit(make_some_shards(Path(sys.argv[1]), int(sys.argv[2]), [int(shard) for shard in sys.argv[3:]]))
+    code = make_some_shards(Path(sys.argv[1]), int(sys.argv[2]), [int(shard) for shard in sys.argv[3:]])
 except (KeyboardInterrupt, BrokenPipeError):
-    sys.exit(130)
+    code = 130
+signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it is about to end, which nothing should interrupt
+sys.exit(code)

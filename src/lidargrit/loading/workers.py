@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import os
 import queue
-import signal
 import subprocess
 import threading
 import time
@@ -143,7 +142,6 @@ def _error_of(line: str) -> LidarGritError:
 
 def make_some_shards(folder: Path, parent: int, shards: list[int]) -> int:
     """Make shards until the parent process ends; print a line for every scan, or the error."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that a half-written file is removed
     try:
         spec = PreparedFolder(str(folder)).read_spec()
         dataset = open_dataset(spec.source, "drop" if spec.bad_points == "drop" else "refuse")
@@ -154,6 +152,4 @@ def make_some_shards(folder: Path, parent: int, shards: list[int]) -> int:
     except LidarGritError as error:
         print(json.dumps({"error": [type(error).__name__, error.got, error.wanted, error.cure]}), flush=True)
         return 2
-    finally:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it is about to end, which nothing should interrupt
     return 0
