@@ -13,15 +13,14 @@ from lidargrit import _discovery
 from lidargrit.cli import main
 from lidargrit.errors import DataError, LidarGritError, UnknownNameError
 from lidargrit.evaluation.command import read_config
-from lidargrit.evaluation.comparison import EvalConfig, compare_pair, compare_sources
+from lidargrit.evaluation.comparison import EvalConfig, compare_sources
 from lidargrit.evaluation.intervals import Resampling
-from lidargrit.evaluation.pairs import EvalPair, EvalSet, pair_for_protocol
+from lidargrit.evaluation.pairs import pair_for_protocol
 from lidargrit.evaluation.protocols import MetricChoice, Protocol, load_protocol
-from lidargrit.evaluation.reference_rows import with_pixel_statistics
 from lidargrit.evaluation.scorecard import Scorecard, format_value
 from lidargrit.evaluation.tables import published, read_tables, side_by_side
 from lidargrit.files import write_json
-from lidargrit.loading import DataConfig, Pixels, Provenance, RangeImages
+from lidargrit.loading import DataConfig, Pixels, Provenance
 from lidargrit.loading.config import ScanSettings
 from lidargrit.metrics import load_metric
 from lidargrit.sensors import load_sensor
@@ -238,29 +237,6 @@ def test_files_of_one_name_are_told_apart_and_rows_complete_each_other(card, tmp
     table, _ = read_tables([*paths, *bounds])
     assert table.count("marginal (pixel statistics)") == 2
     assert not re.search(r"marginal: (Better|Within)", table)
-
-
-def test_pixel_statistics_without_reflectance_leave_its_scores_alone():
-    images = RangeImages(SENSOR, [WithReflectance()])
-    pair = EvalPair(EvalSet("a", images, range(4)), EvalSet("b", images, range(4, 8)))
-    settings = EvalConfig(metrics=("reflectance_histogram",), resampling=Resampling(halves=0))
-    scored = compare_pair(pair, settings)
-    (score,) = with_pixel_statistics(scored, pair, settings).scores
-    assert score.result.value == scored.scores[0].result.value
-    assert score.pixel_statistics is None
-
-
-def test_pixel_statistics_compute_what_the_scorecard_has_and_no_other_variant(sets, monkeypatch):
-    plain = EvalConfig(metrics=("bev_mmd",), variant="exact", resampling=Resampling(halves=0))
-    scored, pair = compare_sources(*sets, plain)
-    computed = []
-    monkeypatch.setattr(
-        "lidargrit.evaluation.reference_rows.compare_pair",
-        lambda pair, settings, choices: computed.append(choices) or compare_pair(pair, settings, choices=choices),
-    )
-    (score,) = with_pixel_statistics(scored, pair, EvalConfig(resampling=Resampling(halves=0))).scores
-    assert computed == [[MetricChoice("bev_mmd", "exact")]] * 2
-    assert score.pixel_statistics is not None
 
 
 def test_sets_that_overlap_and_projections_that_differ_are_told(sets, tmp_path):

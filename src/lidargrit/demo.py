@@ -17,7 +17,6 @@ from lidargrit.errors import CheckpointError, DataError, counted_scans
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
 from lidargrit.evaluation.reconstruction import ReconstructionErrors, score_reconstruction
-from lidargrit.evaluation.reference_rows import with_held_out, with_pixel_statistics
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.files import read_json, write_json
 from lidargrit.generators import Generator, load
@@ -93,7 +92,7 @@ def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter
     packaged = _packaged_samples(folder / "samples_of_packaged_model", clock, reporter) if data is None else None
     with clock.stage("score reconstruction and new scans"):
         reconstruction = score_reconstruction(generator.get_tokenizer(), val)
-        card = _score(samples, val, real, reporter)
+        card = _score(samples, real, reporter)
     write_json(
         folder / "evaluation.json",
         {"reconstruction_on_val": asdict(reconstruction), "generated_against_train": card.to_json()},
@@ -170,7 +169,7 @@ def write_results_page(
         val: held-out scans; the page follows the first of them.
         samples: scans that the generator sampled.
         errors: errors of reconstruction.
-        card: scores of the samples against training scans, with those of held-out scans and of pixel statistics.
+        card: scores of the samples against training scans, with real against real and pixel statistics.
         seconds: time that each stage took, in seconds, by its name.
         facts: short sentences about the model and its training.
         folder: folder of the run.
@@ -298,18 +297,15 @@ def _expected_s(recipe: Recipe, simulates: bool) -> dict[str, float]:
     }
 
 
-def _score(samples: RangeImages, val: RangeImages, real: RangeImages, reporter: Reporter) -> Scorecard:
-    """Score new scans against training scans, with held-out scans and pixel statistics beside them."""
-    count, settings = min(len(samples), len(real)), EvalConfig()
+def _score(samples: RangeImages, real: RangeImages, reporter: Reporter) -> Scorecard:
+    """Score new scans against training scans, with both reference rows."""
+    count = min(len(samples), len(real))
 
-    def some(name: str, images: RangeImages, at_most: int) -> EvalSet:
-        return EvalSet(name, images, evenly_spaced(min(at_most, len(images)), len(images)))
+    def some(name: str, images: RangeImages) -> EvalSet:
+        return EvalSet(name, images, evenly_spaced(count, len(images)))
 
-    pair = EvalPair(some("samples", samples, count), some("train", real, count))
-    held_out = some("val", val, count)
-    card = compare_pair(pair, settings, reporter)
-    card = with_held_out(card, held_out, some("train", real, len(held_out)), settings)
-    return with_pixel_statistics(card, pair, settings)
+    pair = EvalPair(some("samples", samples), some("train", real))
+    return compare_pair(pair, EvalConfig(pixel_statistics=True), reporter)
 
 
 _INTERRUPTED = " (interrupted)"  # end of the name of a stage that is not done yet, with the time that it took so far

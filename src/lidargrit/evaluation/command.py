@@ -15,7 +15,6 @@ from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.pairs import EvalPair
 from lidargrit.evaluation.protocols import DEFAULT, public_name
 from lidargrit.evaluation.reconstruction import score_run
-from lidargrit.evaluation.reference_rows import with_pixel_statistics
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.files import refuse_to_overwrite
 from lidargrit.loading.config import DataConfig, ScanSettings
@@ -67,8 +66,6 @@ def evaluate(
     _refuse_unused(first, config)
     pair = open_pair(first, second, config, reporter)
     card = compare_pair(pair, config, reporter)
-    if config.pixel_statistics:
-        card = with_pixel_statistics(card, pair, config)
     for warning in card.warnings[len(pair.warnings) :]:
         reporter.message(f"WARNING: {warning}")
     also = partial(write_report, card, pair, report) if report and write_report else None

@@ -164,7 +164,6 @@ def compare_pair(
     pair: EvalPair,
     settings: EvalConfig,
     reporter: Reporter | None = None,
-    choices: Sequence[MetricChoice] | None = None,
 ) -> Scorecard:
     """Score two opened sets.
 
@@ -172,15 +171,14 @@ def compare_pair(
         pair: the two sets.
         settings: protocol and its changes.
         reporter: receives the progress.
-        choices: metrics and variants; those of the settings if not given.
 
     Raises:
         LidarGritError: not one metric could be computed; the reason of the first.
     """
     reporter, protocol = reporter or Reporter(), load_protocol(settings.protocol)
-    wanted, not_applicable = _applicable(choices or settings.chosen_metrics(), pair)
+    wanted, not_applicable = _applicable(settings.chosen_metrics(), pair)
     factories = [metric_factory(choice, settings, reporter) for choice in wanted]
-    found = score_metrics(factories, pair, settings.resampling, reporter)
+    found = score_metrics(factories, pair, settings.resampling, reporter, settings.pixel_statistics)
     scores = [score for score in found if isinstance(score, Score)]
     errors = [error for error in found if isinstance(error, LidarGritError)]
     left_out = [
@@ -190,7 +188,7 @@ def compare_pair(
     ]
     if errors and not scores:
         raise errors[0]
-    warnings = [*pair.warnings, *_doubts(pair, scores, settings.resampling)]
+    warnings = [*pair.warnings, *_doubts(pair, scores, settings)]
     return Scorecard(
         public_name(settings.protocol),
         {
@@ -243,15 +241,18 @@ def metric_factory(choice: MetricChoice, settings: EvalConfig, reporter: Reporte
     return MetricFactory(choice, settings.seed, weights, settings.device, reporter)
 
 
-def _doubts(pair: EvalPair, scores: Sequence[Score], resampling: Resampling) -> list[str]:
+def _doubts(pair: EvalPair, scores: Sequence[Score], settings: EvalConfig) -> list[str]:
     """Return warnings about the scores themselves."""
     found = []
     count = len(pair.samples)
     if count < _FEW:
         found.append(f"{counted_scans(count)} in each set: too few for reliable scores and intervals")
-    if resampling.halves and any(score.interval is None for score in scores):
+    if settings.resampling.halves and any(score.interval is None for score in scores):
         without = [score.result.metric for score in scores if score.interval is None]
         found.append(f"too few scans for the intervals of {', '.join(dict.fromkeys(without))}")
+    if settings.pixel_statistics and any(score.pixel_statistics is None for score in scores):
+        without = [score.result.metric for score in scores if score.pixel_statistics is None]
+        found.append(f"too few scans for pixel statistics of {', '.join(dict.fromkeys(without))}")
     for score in scores:
         name = f"{score.result.metric} ({score.result.variant})"
         found += [f"{name}: {text}" for text in score.result.details.get("warnings", [])]

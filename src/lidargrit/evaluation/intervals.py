@@ -83,12 +83,11 @@ class RealAgainstReal:
     """Score of real scans in place of the samples: between as many scans, no generator can be expected to do better.
 
     Args:
-        value: mean over halvings of the reference, one half against the other; or score of held-out scans.
-        num_scans: number of scans in each set, on average. Most metrics fall as sets grow, some by a third where they
-            double: so compare it with ``Interval.mean_of_halves``, unless the scans were held out.
-        halvings: number of halvings; 0 for held-out scans.
-        spread: standard deviation of the scores of single halvings; None for held-out scans and in files of earlier
-            versions.
+        value: mean over halvings of the reference, one half against the other.
+        num_scans: number of scans in each half, on average. Most metrics fall as sets grow, some by a third where they
+            double: so compare it with ``Interval.mean_of_halves``.
+        halvings: number of halvings.
+        spread: standard deviation of the scores of single halvings; None in files of earlier versions.
     """
 
     value: float
@@ -106,8 +105,8 @@ class Score:
         interval: 95 % interval; None if it was not wanted or cannot be computed.
         real_against_real: score of real scans in place of the samples; None if it was not computed.
         seconds: time that the metric, its interval and real against real took.
-        pixel_statistics: score of the generator ``marginal`` in place of the samples, on sets of the size of the
-            halves; None if it was not computed.
+        pixel_statistics: score of scans in place of the samples, each of whose pixels comes from another scan of one
+            half of the reference, against the other half; None if it was not computed.
     """
 
     result: MetricResult

@@ -1,4 +1,4 @@
-"""Two sets and a list of metrics → scores with intervals and real against real; shared features are computed once."""
+"""Two sets and a list of metrics → scores with intervals and reference rows; shared features are computed once."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from lidargrit.errors import LidarGritError, ScanError
+from lidargrit.determinism import scan_seed
+from lidargrit.errors import DataError, LidarGritError, ScanError
 from lidargrit.evaluation.intervals import Part, Resampling, Score, blocks, interval_of, merged, real_against_real
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
+from lidargrit.evaluation.pixel_statistics import pixel_statistics
 from lidargrit.evaluation.protocols import MetricChoice
 from lidargrit.metrics import Metric, WholeImages, load_metric, update_together
 from lidargrit.reporting import Reporter
@@ -60,15 +62,18 @@ class _FedMetric:
         generated: metrics that were fed one group of generated scans each.
         real: metrics that were fed one group of real scans each.
         real_as_generated: metrics that were fed the same real scans as generated ones, for real against real.
+        pixel_statistics: metrics that were fed pixel statistics as generated scans: of every second group of real scans
+            from the first, and of the others. Empty if these are not wanted.
     """
 
     factory: MetricFactory
     generated: list[Part] = field(default_factory=list)
     real: list[Part] = field(default_factory=list)
     real_as_generated: list[Part] = field(default_factory=list)
+    pixel_statistics: list[Part] = field(default_factory=list)
 
     def score(self, group_sizes: Sequence[int], resampling: Resampling, begun_s: float) -> Score:
-        """Compute the value with its interval and real against real."""
+        """Compute the value with its interval, real against real and, where they were fed, pixel statistics."""
         metric = merged(self.generated, self.real)
         result = metric.compute()
         interval = reference_row = None
@@ -76,11 +81,25 @@ class _FedMetric:
             interval = interval_of(result.value, metric, self.generated, self.real, resampling)
             reference_row = real_against_real(metric, self.real, self.real_as_generated, group_sizes, resampling)
         seconds = time.perf_counter() - begun_s
-        return Score(result, interval, reference_row, seconds)
+        return Score(result, interval, reference_row, seconds, self._score_of_pixel_statistics(metric))
+
+    def _score_of_pixel_statistics(self, whole: Metric) -> float | None:
+        """Return the mean score of pixel statistics of either half of the real scans against the other half."""
+        values = []
+        for half, shuffled in enumerate(self.pixel_statistics):
+            try:
+                values.append(merged([shuffled], self.real[1 - half :: 2], whole).compute().value)
+            except DataError:  # half of the scans are too few for this metric
+                return None
+        return sum(values) / len(values) if values else None
 
 
 def score_metrics(
-    factories: Sequence[MetricFactory], pair: EvalPair, resampling: Resampling, reporter: Reporter | None = None
+    factories: Sequence[MetricFactory],
+    pair: EvalPair,
+    resampling: Resampling,
+    reporter: Reporter | None = None,
+    with_pixel_statistics: bool = False,
 ) -> list[Score | LidarGritError]:
     """Score two sets by several metrics.
 
@@ -92,6 +111,7 @@ def score_metrics(
         pair: the two sets.
         resampling: settings of the intervals and of real against real.
         reporter: receives the progress.
+        with_pixel_statistics: whether each score gets that of pixel statistics, if there are four scans or more.
 
     Returns:
         the score of each metric, or why it could not be computed: no weights, no reflectance, too few scans.
@@ -108,13 +128,17 @@ def score_metrics(
             found[index] = error
         else:
             together.setdefault(index if isinstance(extractor, WholeImages) else extractor, []).append(index)
-    with (reporter or Reporter()).progress("scoring", 2 * len(pair.samples) * len(factories)) as progress:
+    sets = 3 if with_pixel_statistics else 2
+    with (reporter or Reporter()).progress("scoring", sets * len(pair.samples) * len(factories)) as progress:
         for indices in together.values():
             fed = {index: _FedMetric(factories[index]) for index in indices}
             note = ", ".join(factories[index].choice.metric for index in indices)
             begun_s = time.perf_counter()
             try:
-                sizes = _feed(list(fed.values()), pair, resampling, lambda n: progress.advance(n, note=note))  # noqa: B023
+                advance = lambda n: progress.advance(n, note=note)  # noqa: B023, E731
+                sizes = _feed(list(fed.values()), pair, resampling, advance)
+                if with_pixel_statistics:
+                    _feed_pixel_statistics(list(fed.values()), pair.reference, resampling, advance)
             except ScanError:
                 raise
             except LidarGritError as error:
@@ -141,7 +165,10 @@ def _feed(
             for metric in (*parts, *as_generated):
                 metric.first_image = group.start
             metrics = [(metric, real) for metric in parts] + [(metric, False) for metric in as_generated]
-            _feed_group(metrics, images, group, advance, len(fed))
+            for first in range(0, len(group), _BATCH):
+                batch = images.batch(group[first : first + _BATCH])
+                update_together(metrics, batch)
+                advance(len(fed) * len(batch))
             for each, metric in zip(fed, parts, strict=True):
                 (each.real if real else each.generated).append(Part(metric))
             for each, metric in zip(fed, as_generated, strict=False):
@@ -149,14 +176,20 @@ def _feed(
     return [len(group) for group in groups]
 
 
-def _feed_group(
-    metrics: Sequence[tuple[Metric[Any, Any], bool]],
-    images: EvalSet,
-    group: Sequence[int],
-    advance: Callable[[int], None],
-    times: int,
+def _feed_pixel_statistics(
+    fed: Sequence[_FedMetric], reference: EvalSet, resampling: Resampling, advance: Callable[[int], None]
 ) -> None:
-    for first in range(0, len(group), _BATCH):
-        batch = images.batch(group[first : first + _BATCH])
-        update_together(metrics, batch)
-        advance(times * len(batch))
+    """Feed pixel statistics of every second group, then of the others, to metrics that share features."""
+    groups = blocks(len(reference), resampling.groups)
+    for half in range(2):
+        indices = [index for group in groups[half::2] for index in group]
+        if len(groups) < 2 or len(indices) < 2:  # one scan has nothing to be shuffled with
+            return
+        metrics = [each.factory() for each in fed]
+        for images in pixel_statistics(reference, indices, scan_seed(resampling.seed, 3, half)):
+            for first in range(0, len(images), _BATCH):
+                batch = images[first : first + _BATCH]
+                update_together([(metric, False) for metric in metrics], batch)
+                advance(len(fed) * len(batch))
+        for each, metric in zip(fed, metrics, strict=True):
+            each.pixel_statistics.append(Part(metric))

@@ -129,7 +129,7 @@ def _with_pixel_statistics(cards: Sequence[tuple[str, Scorecard]]) -> list[tuple
     rows = [card for name, card in cards if _system(name) == PIXEL_STATISTICS]
     if not rows:
         return list(cards)
-    values = {_column(score): value_of_halves(score) for score in rows[0].scores}
+    values = {_column(score): value for score in rows[0].scores if (value := value_of_halves(score)) is not None}
     return [
         (
             name,

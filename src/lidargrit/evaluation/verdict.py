@@ -2,9 +2,10 @@
 
 Every score table of this program knows three bounds, by these names alone:
 
-- *real against real*: real scans, scored as if they had been generated. Between as many scans, no
-  generator can be expected to do better.
-- *pixel statistics*: scans of the generator ``marginal``, which samples every pixel by itself. A model must do better.
+- *real against real*: one half of the real scans, scored as if it had been generated, against the other half. Between
+  as many scans, no generator can be expected to do better.
+- *pixel statistics*: scans each of whose pixels comes from another real scan, or scans of the generator ``marginal``,
+  which samples every pixel by itself. A model must do better.
 - *memorised training scans*: scans of the generator ``memorised``. They score like real scans, and nothing is new.
 """
 
@@ -12,10 +13,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from lidargrit.evaluation.intervals import RealAgainstReal, Score
+from lidargrit.evaluation.intervals import Score
 
 PIXEL_STATISTICS, MEMORISED = "marginal", "memorised"
-"""The generators whose scans are the second and the third bound."""
+"""The generators whose scans may stand for the second bound, and are the third."""
 
 _SPREADS = 2.8  # Student's 97.5 % quantile for the five halvings of real against real
 
@@ -38,7 +39,7 @@ def beats_pixel_statistics(score: Score) -> bool | None:
 def is_like_real(score: Score) -> bool | None:
     """Return whether a score is not worse than real against real by more than chance; None where that is not known."""
     real = score.real_against_real
-    if real is None or (value := _beside(score, real)) is None:
+    if real is None or (value := value_of_halves(score)) is None:
         return None
     return _worse_by(score, value, real.value) <= noise(score)
 
@@ -107,7 +108,7 @@ def _count(scores: Sequence[Score]) -> str:
 
 def _is_beyond_real(score: Score) -> bool:
     real = score.real_against_real
-    if real is None or (value := _beside(score, real)) is None:
+    if real is None or (value := value_of_halves(score)) is None:
         return False
     return _worse_by(score, real.value, value) > noise(score)
 
@@ -115,11 +116,6 @@ def _is_beyond_real(score: Score) -> bool:
 def value_of_halves(score: Score) -> float | None:
     """Return the mean score of halves of both sets, since most metrics are worse for fewer scans; None if not known."""
     return None if score.interval is None else score.interval.mean_of_halves
-
-
-def _beside(score: Score, real: RealAgainstReal) -> float | None:
-    """Return the value that compares with real against real: of whole sets where as many real scans were held out."""
-    return value_of_halves(score) if real.halvings else score.result.value
 
 
 def _worse_by(score: Score, value: float, other: float) -> float:

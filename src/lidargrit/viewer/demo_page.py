@@ -70,7 +70,7 @@ class DemoPage:
         lattices: lattices of the pixel decoder, each with the number of phases after which it is complete.
         sets: sets of scans to turn side by side.
         errors: errors of reconstruction over all held-out scans.
-        card: scores of new scans against training scans, with those of held-out scans and of pixel statistics.
+        card: scores of new scans against training scans, with real against real and pixel statistics.
         seconds: time that each stage took, in seconds, by its name.
         facts: short sentences about the model and its training.
         run: folder of the run.
@@ -310,11 +310,12 @@ def _new_scans(demo: DemoPage) -> _Step:
 def _scores(demo: DemoPage) -> _Step:
     text = (
         f"Each metric measures how far {demo.card.samples.scans_used} new scans are from as many training scans; lower "
-        f"is better. Two bounds stand beside every score. <i>Real against real</i> (dashed line) is the score of as "
-        f"many held-out {demo.kind} scans: no model can be expected to do better. <i>Pixel statistics</i> (square) is "
-        "the score of the generator <code>marginal</code>, which samples each pixel by itself and knows nothing of "
-        "shapes: any model should do better. With so few scans all scores are rough; the bar behind the dot is the "
-        "95 % interval."
+        f"is better. Two bounds stand beside every score. <i>Real against real</i> (dashed line) is the score of one "
+        "half of the training scans against the other half: no model can be expected to do better. <i>Pixel "
+        "statistics</i> (square) is the score of scans each of whose pixels comes from another training scan, so that "
+        "no shape is left: any model should do better. Both are of half as many scans, and most metrics fall as sets "
+        "grow, so a good score may lie below real against real. With so few scans all scores are rough; the bar "
+        "behind the dot is the 95 % interval."
     )
     return _Step("Scores of the new scans", text, score_table(demo.card.scores))
 

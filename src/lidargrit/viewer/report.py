@@ -107,8 +107,8 @@ def _scores(card: Scorecard) -> str:
         "95 % interval. The upright dashed line is <i>real against real</i>: the score of one half of the reference "
         "against its other half. No generator can be expected to do better. The halves are smaller than the sets, and "
         "most metrics fall as sets grow, so a good score may still lie below this line. The square, where there is "
-        "one, is <i>pixel statistics</i>: scans whose pixels are sampled one by one, which any model has to beat. "
-        "Every chart begins at 0 and has its own scale.</p>"
+        "one, is <i>pixel statistics</i>: scans each of whose pixels comes from another real scan. Any model has to "
+        "beat it. Every chart begins at 0 and has its own scale.</p>"
         + (f"<h3>Left out</h3><ul>{left_out}</ul>" if left_out else "")
         + "</section>"
     )
