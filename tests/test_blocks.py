@@ -64,6 +64,8 @@ def test_recomputed_gradients_are_the_same_and_take_less_memory(words):
     plain, recomputed = objective_of(*words), objective_of(*words)
     prepare_for_training(recomputed, recompute=True, compiled=False)
     assert plain.state_dict().keys() == recomputed.state_dict().keys()
+    prepare_for_training(plain, recompute=True, compiled=False)  # as a stage before may have
+    prepare_for_training(plain, recompute=False, compiled=False)
     (wanted, kept), (got, kept_less) = gradients(plain), gradients(recomputed)
     assert len(wanted) == len(got) > 10
     assert all(torch.equal(one, other) for one, other in zip(wanted, got, strict=True))

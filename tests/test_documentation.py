@@ -7,7 +7,8 @@ import inspect
 import re
 import shlex
 import tomllib
-from dataclasses import replace
+import typing
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,7 @@ from PIL import Image
 from lidargrit import _discovery
 from lidargrit.cli import build_parser
 from lidargrit.errors import UsageError
+from lidargrit.generators import load_class
 from lidargrit.generators.lidargrit import LidarGrit
 from lidargrit.nn.pixel_networks import PixelDecoderConfig
 from lidargrit.sensors import load_sensor
@@ -177,3 +179,19 @@ def test_examples_run_and_draw_what_is_shown(path, tiny_run, tmp_path, capsys):
     for name in drawn:
         with Image.open(tmp_path / name) as new, Image.open(ROOT / "docs" / "pictures" / name) as shown:
             assert new.size == shown.size
+
+
+def _settings_below(config: type) -> list[type]:
+    """Return a class of settings and those of its fields."""
+    hints = typing.get_type_hints(config)
+    kinds = [kind for field in fields(config) for kind in (hints[field.name], *typing.get_args(hints[field.name]))]
+    return [config, *(one for kind in kinds if is_dataclass(kind) for one in _settings_below(kind))]
+
+
+def test_the_reference_has_every_setting_of_every_generator():
+    page = (ROOT / "docs" / "reference" / "settings.md").read_text()
+    for name in _discovery.names("generators"):
+        cls = load_class(name)
+        for config in dict.fromkeys([*_settings_below(cls.Config), cls.Sampling]):
+            if fields(config):
+                assert f".{config.__name__}\n" in page, f"{name}: {config.__module__}.{config.__name__}"

@@ -49,7 +49,7 @@ import contextlib, io, os, sys
 from pathlib import Path
 import torch
 from lidargrit.cli import main
-from test_processes import agreements, learn_noise, learn_pixels, play, steps_with_a_bad_process
+from test_processes import agreements, learn_noise, learn_pixels, loss_of_pixels, play, steps_with_a_bad_process
 
 folder, words = Path(sys.argv[1]), sys.argv[2:]
 assert main(words) == 0
@@ -59,6 +59,7 @@ assert steps_with_a_bad_process() == [False, False]
 assert learn_pixels()
 assert agreements(rank) == [True, False]
 torch.save(learn_noise(rank), folder / f"noise{rank}.pt")
+torch.save(loss_of_pixels(rank, 2), folder / f"pixels{rank}.pt")
 assert main([*words, "training.tokenizer.learning_rate=1"]) == 2  # all are told what the first found
 if rank == 1:
     os._exit(0)  # dies in the middle of the work, as far as the other can see
@@ -161,6 +162,17 @@ def learn_noise(rank: int) -> torch.Tensor:
     return noise.sums
 
 
+def loss_of_pixels(rank: int, processes: int) -> torch.Tensor:
+    """Return the loss of a pixel decoder on a share of four scans, of which the last two have few returns."""
+    torch.manual_seed(0)
+    objective = Multiscale(Multiscale.smallest_config(SENSOR), SENSOR).objective("pixels").train()
+    images, share = some_images(4), 4 // processes
+    mask = images.return_mask & (torch.arange(SENSOR.width) % 16 == 0)
+    mask[:2] = True
+    images = RangeImage.masked(images.range_m, mask, SENSOR)[rank * share : (rank + 1) * share]
+    return objective(images, torch.Generator().manual_seed(0), "")["loss"].detach()
+
+
 def losses(folder: Path, stage: str, name: str) -> list[float]:
     lines = [json.loads(line) for line in (folder / stage / "log.jsonl").read_text().splitlines()]
     return [line[name] for line in lines if line["split"] == "val"]
@@ -204,6 +216,9 @@ def test_two_processes_learn_what_one_does(tmp_path):
             assert two == pytest.approx(one, rel=2e-3), (stage, name)
     one, two = (read_tensors(tmp_path / name / "tokenizer" / "checkpoint.safetensors")[0] for name in ("one", "two"))
     assert torch.allclose(one["objective.quantize.usage"], two["objective.quantize.usage"], rtol=0.02, atol=0.5)
+    shares = [torch.load(tmp_path / f"pixels{rank}.pt", weights_only=True) for rank in range(2)]
+    assert float(sum(shares) / 2) == pytest.approx(float(loss_of_pixels(0, 1)), rel=1e-5)
+    assert float(shares[0]) != pytest.approx(float(shares[1]), rel=0.1)
     alone, _ = play()
     for rank in range(2):
         noise = torch.load(tmp_path / f"noise{rank}.pt", weights_only=True)
@@ -234,7 +249,7 @@ def test_a_batch_in_parts_takes_the_same_step(tmp_path, parts):
 
 def test_parts_that_cannot_be_are_refused(tmp_path):
     learn = FitConfig(scans=4, batch_size=4, learning_rate=1e-3, accumulate=3)
-    with pytest.raises(ConfigError, match="batch_size=4 on 1 processes in 3 parts each"):
+    with pytest.raises(ConfigError, match="batch_size=4 on 1 processes in 3 parts each; wanted a multiple of 3"):
         Fit(Plain(), learn, tmp_path, 0, Reporter())
     with pytest.raises(ConfigError, match="accumulate=2 for players who take turns"):
         Fit(Game(), replace(learn, accumulate=2), tmp_path, 0, Reporter())

@@ -48,7 +48,10 @@ def test_fine_tuning_starts_from_the_weights_of_the_other_run(tmp_path):
         assert (max(moved) > 0) == (stage == "pixels")
     for settings, message in (
         ({"fine_tune": ("mask",)}, "fine_tune=mask; wanted one of tokenizer, transformer, pixels"),
-        ({"fine_tune": ("pixels",), "train_anew": ("pixels",)}, "fine_tune=pixels; wanted one of tokenizer, trans"),
+        (
+            {"fine_tune": ("pixels",), "train_anew": ("pixels",)},
+            "pixels in fine_tune and in train_anew; wanted a stage",
+        ),
     ):
         wrong = replace(recipe, **settings)
         with pytest.raises(ConfigError, match=message):
@@ -88,6 +91,13 @@ def test_settings_of_a_stage_that_is_not_trained_are_not_looked_at(tmp_path):
     ):
         with pytest.raises(ConfigError, match=message):
             check_stages(replace(recipe, **settings), processes=3)
+
+
+def test_a_stage_that_was_trained_with_another_dropout_is_taken(tmp_path):
+    """The page about training gives this command."""
+    load_recipe("compact").build_generator().save(tmp_path / "compact")
+    checked = check_stages(load_recipe("compact_pixels", [f"stages_from={tmp_path / 'compact'}"]))
+    assert checked.donors == dict.fromkeys(("tokenizer", "transformer"), str(tmp_path / "compact"))
 
 
 def test_a_stage_that_does_not_fit_is_told_before_any_scan(tmp_path):

@@ -4,19 +4,24 @@ import json
 import os
 import signal
 import sys
+import threading
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from lidargrit.cli import main
 from lidargrit.errors import ConfigError, DataError, Terminated
+from lidargrit.loading import Batches, Pixels, Provenance
 from lidargrit.loading.images import RangeImages
 from lidargrit.loading.workers import _made_by_processes
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
+from lidargrit.sensors import load_sensor
 from lidargrit.sources import load_range_images
 from lidargrit.structures import RangeImage
 from lidargrit.training import train
+from lidargrit.training.engine import Engine
 from lidargrit.training.fit import Fit
 from lidargrit.training.plan import check_stages
 from test_tracking import StandIn
@@ -113,6 +118,45 @@ def test_a_terminated_training_does_not_validate_first(tmp_path, monkeypatch):
     with pytest.raises(Terminated):
         train(load_recipe("demo", [*TINY, *settings]), tmp_path / "run")
     assert (tmp_path / "run" / "tokenizer" / "checkpoint.safetensors").is_file()
+
+
+def test_a_training_that_is_terminated_while_it_validates_loses_no_step(tmp_path, monkeypatch):
+    def evaluate(self, objective, images, seed):
+        os.kill(os.getpid(), signal.SIGTERM)
+        calls.append(seed)
+        return before(self, objective, images, seed)
+
+    calls, before = [], Engine.evaluate
+    monkeypatch.setattr(Engine, "evaluate", evaluate)
+    settings = ("validate_every=4", "checkpoint_every=1000", "batch_size=1", "validation_scans=2")
+    recipe = load_recipe("demo", [*TINY, *(f"training.tokenizer.{setting}" for setting in settings)])
+    with pytest.raises(Terminated):
+        train(recipe, tmp_path / "run")
+    assert len(calls) == 1, "the second scan is left out"
+    assert (tmp_path / "run" / "tokenizer" / "checkpoint.safetensors").is_file()
+
+
+def test_as_many_batches_are_read_at_once_as_there_are_workers():
+    sensor = load_sensor("hdl64e_kitti_odometry")
+
+    class Meeting:
+        """A store that answers once twelve requests are open."""
+
+        provenance = Provenance()
+
+        def __init__(self) -> None:
+            self.barrier = threading.Barrier(12, timeout=20)
+
+        def __len__(self) -> int:
+            return 24
+
+        def read(self, index: int) -> Pixels:
+            self.barrier.wait()
+            return Pixels(range_m)
+
+    range_m = np.full((sensor.height, sensor.width), 10, np.float32)
+    batches = Batches(RangeImages(sensor, [Meeting()]), 1, (), False, 0, workers=12)
+    assert len(list(batches.stream(0, 24))) == 24
 
 
 def test_a_launcher_that_numbers_no_local_process_is_refused(tmp_path, monkeypatch):

@@ -179,8 +179,9 @@ class PairMatching(Objective):
     def preparation_flops(self, scans: int) -> int:
         """Return the operations of making the pairs; the adaptive solver counts as 256 equal steps."""
         kept = min(self._count, self._pairs.kept_at_most)
-        # Each pair that is kept is made once, and the others at every sight.
-        return round(min(kept, scans) + scans * (1 - kept / self._count)) * self._pairs.flops()
+        # Pairs are drawn with repetition. One that is kept is made at its first sight, another at every sight.
+        made = kept * (1 - (1 - 1 / self._count) ** scans) + scans * (1 - kept / self._count)
+        return round(made) * self._pairs.flops()
 
 
 class FlowPairs(Frozen[Hdit]):

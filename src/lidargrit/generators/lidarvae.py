@@ -30,6 +30,7 @@ from lidargrit.nn.lidargan import (
     without_counters,
 )
 from lidargrit.nn.objective import Objective
+from lidargrit.nn.processes import num_processes
 from lidargrit.nn.published import read_checkpoint
 from lidargrit.nn.seeds import normal_latents
 from lidargrit.nn.size import numbers_of_file
@@ -50,7 +51,7 @@ class LidarVaeConfig:
             many.
         rows: number of rows that are encoded and generated: 24, 40, 56 or more in steps of 16.
         first_row: index of the highest of these rows. The program leaves out the highest 17 and the lowest 7 of 64.
-        warmup_scans: number of training scans, in each process, over which the weight of the divergence rises linearly
+        warmup_scans: number of training scans over which the weight of the divergence rises linearly
             from 0 to 1; 0 for a weight of 1 from the start.
         free_nats: KL divergence of a scan's latent, in nats, below which it adds nothing to the loss (free bits).
         initial_std: standard deviation of the new weights of both networks.
@@ -243,7 +244,7 @@ class LidarVaeObjective(Objective):
         mean, log_variance = self.encode(real).chunk(2, dim=1)
         latents = mean
         if self.training:
-            self.scans_seen += len(real)
+            self.scans_seen += len(real) * num_processes()
             noise = torch.randn(mean.shape, generator=rng, device=rng.device)
             latents = mean + (log_variance / 2).exp() * noise
         weight = (self.scans_seen / max(self.config.warmup_scans, 1)).clamp(max=1.0)

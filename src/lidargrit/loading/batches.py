@@ -14,7 +14,8 @@ from lidargrit.errors import ConfigError
 from lidargrit.loading.images import RangeImages
 from lidargrit.structures import RangeImage
 
-_THREADS_AT_MOST = 8  # more hold more batches in memory, and read none sooner
+_THREADS_AT_MOST = 128
+_AHEAD = 8  # batches that wait beyond those that are being read: enough for no thread to idle
 
 
 class Batches:
@@ -61,7 +62,7 @@ class Batches:
             try:
                 for position in range(scans_seen, until, self.batch_size):
                     waiting.append(pool.submit(self._read, *self._chosen(position)))
-                    if len(waiting) > 2 * threads:  # enough for none to idle, and few enough to hold in memory
+                    if len(waiting) > threads + min(threads, _AHEAD):  # few enough to hold in memory
                         yield waiting.popleft().result()
                 while waiting:
                     yield waiting.popleft().result()

@@ -41,8 +41,9 @@ def prepare_for_training(objective: nn.Module, recompute: bool, compiled: bool) 
     Raises:
         ConfigError: the objective has no block to recompute, or no network to compile.
     """
-    for block in _parts(objective, Block, "recompute") if recompute else ():
-        block.recomputed = True
+    for block in objective.modules() if not recompute else _parts(objective, Block, "recompute"):
+        if isinstance(block, Block):
+            block.recomputed = recompute  # a stage before may have trained the same network otherwise
     for network in _parts(objective, Network, "compile") if compiled else ():
         network.compile()
 

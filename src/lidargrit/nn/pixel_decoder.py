@@ -17,6 +17,7 @@ from lidargrit.errors import ConfigError
 from lidargrit.nn.pixel_networks import Guide, MaskNetwork, PixelDecoderConfig, RangeNetwork
 from lidargrit.nn.pixel_phases import Lattice, Phase, at_phases, join_phases, one_of_phases
 from lidargrit.nn.precision import Precision, autocast_to
+from lidargrit.nn.processes import mean_over_processes
 from lidargrit.nn.range_steps import RangeSteps
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import Decoded, RangeImage
@@ -188,6 +189,8 @@ class PixelDecoder(nn.Module):
             mask_nats = mask_nats + share * of_mask.sum()
             range_nats = range_nats + share * of_range.sum()
             returns = returns + share * at_phases(images.return_mask, chosen).sum()
+        if self.training:  # as many returns as one process with the whole batch would divide by, for each process
+            returns = mean_over_processes(returns)
         return mask_nats / guide.v.numel(), range_nats / returns.clamp(min=1)
 
     @property

@@ -1,4 +1,4 @@
-"""Sums and samples over the processes of a training, equal to those of one process with the whole batch."""
+"""Sums, means and samples over the processes of a training, equal to those of one process with the whole batch."""
 
 from __future__ import annotations
 
@@ -12,6 +12,16 @@ def sum_over_processes(counted: Shaped[Tensor, "*shape"]) -> Shaped[Tensor, "*sh
     if _several():
         distributed.all_reduce(counted)
     return counted
+
+
+def mean_over_processes(counted: Shaped[Tensor, "*shape"]) -> Shaped[Tensor, "*shape"]:
+    """Return the mean of a tensor over all processes, in place; a ratio to it has the mean of one to the sum."""
+    return sum_over_processes(counted) / num_processes()
+
+
+def num_processes() -> int:
+    """Return the number of processes that train together."""
+    return distributed.get_world_size() if _several() else 1
 
 
 def sample_from_all(rows: Float[Tensor, "n D"], count: int, rng: torch.Generator | None) -> Float[Tensor, "count D"]:

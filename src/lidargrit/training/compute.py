@@ -53,7 +53,9 @@ def training_flops(recipe: Recipe, taken: Collection[str] | None = None) -> dict
     """Count the floating-point operations of a recipe's training, forward and backward, for each stage.
 
     Matrix products and convolutions are counted while a few steps run, on scans whose every pixel returns at 10 m. A
-    multiplication with its addition counts as two operations. Validation and the optimiser are not counted.
+    multiplication with its addition counts as two operations. Validation and the optimiser are not counted. An image
+    that a trained network encodes for a later stage is counted at every sight, since how many images there are is not
+    known from a recipe, although its encoding is kept and computed once.
 
     The steps run on tensors that have a shape and no values, so that nothing is computed, and networks of any width are
     counted alike. Only where the operations of an objective depend on values, as those of a network that completes

@@ -106,7 +106,7 @@ class Fit:
         progress_bar = self.reporter.progress(what, config.scans, self.scans_seen)
         with Termination() as termination, progress_bar as progress:
             if self.engine.any(self._lacks_validation) and self._validates():  # the process ended before it
-                self._log_terms("val", self.validate(val), 0.0)
+                self._log_terms("val", self.validate(val, termination), 0.0)
             for images in batches.stream(self.scans_seen, config.scans):
                 terms = self._step(images)
                 stops = self.engine.any(termination.asked)
@@ -117,12 +117,12 @@ class Fit:
                     self._log_terms(
                         "train", {name: float(term) for name, term in terms.items()}, time.monotonic() - begun
                     )
-                if self._passed(config.checkpoint_every) or self.scans_seen >= config.scans or stops:
+                if self._passed(config.checkpoint_every) or self._validates() or stops:
                     self._save()  # before anything that may fail, or take longer than a terminated process has
                 if stops:
                     raise Terminated
                 if self._validates():
-                    self._log_terms("val", self.validate(val), time.monotonic() - begun)
+                    self._log_terms("val", self.validate(val, termination), time.monotonic() - begun)
                 if config.pictures_every and self._passed(config.pictures_every):
                     self.engine.by_first(self._plot)
         self.engine.by_first(self._close_log)
@@ -130,13 +130,19 @@ class Fit:
             raise Terminated
         return self.average.objective.eval()
 
-    def validate(self, images: RangeImages) -> dict[str, float]:
-        """Return the averaged objective's mean loss terms over evenly spaced validation scans."""
+    def validate(self, images: RangeImages, termination: Termination | None = None) -> dict[str, float]:
+        """Return the averaged objective's mean loss terms over evenly spaced validation scans.
+
+        Raises:
+            Terminated: SIGTERM was received meanwhile; the resumed training validates again.
+        """
         chosen = evenly_spaced(self.config.validation_scans, len(images))
         totals: dict[str, float] = {}
         # As many at once as a process has in a step, since more may not fit in memory.
         at_once = max(1, self.config.batch_size // (self.engine.world_size * self.config.accumulate))
         for first in range(0, len(chosen), at_once):
+            if termination is not None and self.engine.any(termination.asked):
+                raise Terminated
             indices = chosen[first : first + at_once]
             terms = self.engine.evaluate(
                 self.average.objective, images.batch(indices), derive_seed(self.seed, 3, first)
@@ -245,6 +251,6 @@ def _check_parts(objective: Objective, config: FitConfig, processes: int) -> Non
     if config.batch_size % (processes * config.accumulate):
         raise ConfigError(
             f"batch_size={config.batch_size} on {processes} processes in {config.accumulate} parts each",
-            "a multiple of both",
+            f"a multiple of {processes * config.accumulate}, processes times parts",
             "change one of them",
         )

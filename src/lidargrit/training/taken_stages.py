@@ -66,8 +66,7 @@ def taken_stages(recipe: Recipe, generator: Generator) -> dict[str, Objective]:
     """Return the trained stages that a recipe takes from another run, once they are known to fit the generator.
 
     Those that the recipe names in ``fine_tune`` are among them: their training starts from these weights. They may
-    lack what :attr:`Objective.additions` add, which begins untrained, may have had another dropout, and may be of
-    another sensor if its weights fit.
+    lack what :attr:`Objective.additions` add, which begins untrained, and may be of another sensor if its weights fit.
     The run may be of another generator if what they share learns by the same objective.
 
     Raises:
@@ -95,7 +94,10 @@ def taken_stages(recipe: Recipe, generator: Generator) -> dict[str, Objective]:
         )
     if unknown := sorted({*recipe.train_anew} - {*generator.stages}):
         raise ConfigError(f"train_anew={unknown[0]}", f"one of {', '.join(generator.stages)}", "name a stage")
-    if unknown := sorted({*recipe.fine_tune} - {*shared} | {*recipe.fine_tune} & {*recipe.train_anew}):
+    if both := sorted({*recipe.fine_tune} & {*recipe.train_anew}):
+        got, cure = f"{both[0]} in fine_tune and in train_anew", "take it out of one of them, as by train_anew=[]"
+        raise ConfigError(got, "a stage that is trained further or from new weights", cure)
+    if unknown := sorted({*recipe.fine_tune} - {*shared}):
         names = ", ".join(stage for stage in shared if stage not in recipe.train_anew)
         raise ConfigError(f"fine_tune={unknown[0]}", f"one of {names}", "name a stage that the run of stages_from has")
     stages = [stage for stage in shared if stage not in recipe.train_anew]
@@ -167,17 +169,17 @@ def _check_base(recipe: Recipe, stage: _Stage) -> None:
 def _check(setting: str, mine: _Stage, given: _Stage, trained: bool = False) -> None:
     """Refuse a stage whose sizes or sensor are not the generator's.
 
-    Settings that sampling alone reads may differ. One that is trained further may lack its additions, may have had
-    another dropout, and may be of another sensor if its weights fit this one.
+    Dropout, which belongs to the training before, and settings that sampling alone reads may differ. A stage that is
+    trained further may lack its additions, and may be of another sensor if its weights fit this one.
     """
     stage, ours, theirs = mine.name, mine.settings, given.settings
-    differing = [name for name in ours if ours[name] != theirs.get(name)]
+    differing = [name for name in ours if ours[name] != theirs.get(name) and not name.endswith("dropout")]
     same_sensor = mine.objective.sensor.same_rays(given.objective.sensor)
     given_shapes = given.shapes
     if trained:
         additions = [f"{stage}.{name}" for name in mine.objective.additions]
         added = {name for name in additions if ours.get(name) and not theirs.get(name)}
-        differing = [name for name in differing if name not in added and not name.endswith("dropout")]
+        differing = [name for name in differing if name not in added]
         given_shapes = _shapes(mine.objective.weights_from(given.objective))
         same_sensor |= mine.shapes.items() >= given_shapes.items()
     others = [f"model.{name}={theirs.get(name)}" for name in differing]
