@@ -12,7 +12,7 @@ from lidargrit import configuration
 from lidargrit.cli import main
 from lidargrit.conditions.marks import read_marks
 from lidargrit.datasets import load
-from lidargrit.errors import CheckpointError, ConfigError, LidarGritError, OutputError
+from lidargrit.errors import ConfigError, LidarGritError, OutputError
 from lidargrit.evaluation import benchmark
 from lidargrit.evaluation.benchmark import Benchmark, as_table
 from lidargrit.evaluation.benchmark import run as run_benchmark
@@ -62,20 +62,6 @@ def test_a_run_named_by_dots_has_the_name_of_its_folder(tmp_path, monkeypatch):
         monkeypatch.chdir(here)
         assert run_benchmark([name], tmp_path / "table", wanted) == [tmp_path / "table" / "marginal" / "marginal.json"]
     assert [path.name for path in (tmp_path / "table").iterdir() if path.is_dir()] == ["marginal"]
-
-
-def test_bits_are_of_the_reference_of_today_and_a_time_once_measured_stays(tmp_path, monkeypatch):
-    measured = iter((1.5, 2.5))
-    monkeypatch.setattr(benchmark, "bits_per_return", lambda generator, scans: next(measured))
-    run_benchmark(["marginal"], tmp_path, BENCHMARK)
-    first = json.loads((tmp_path / "marginal" / "costs.json").read_text())
-    run_benchmark(["marginal"], tmp_path, BENCHMARK)  # nothing new
-    assert json.loads((tmp_path / "marginal" / "costs.json").read_text()) == first
-    scores = run_benchmark(["marginal"], tmp_path, replace(BENCHMARK, reference="simulated:8:val"))
-    second = json.loads((tmp_path / "marginal" / "costs.json").read_text())
-    assert (first["bits_per_return"], second["bits_per_return"]) == (1.5, 2.5)
-    assert first["seconds_per_scan"] == second["seconds_per_scan"]
-    assert r"& 2.5 \\" in as_table(scores, "latex")
 
 
 def test_a_recipe_is_trained_once_in_how_many_ways_ever_it_is_drawn_from(tmp_path, capsys):
@@ -330,26 +316,6 @@ def test_a_page_of_foreign_names_holds_no_code_of_theirs():
     assert "0.25" in page
 
 
-def test_the_time_of_many_scans_outlives_that_of_one(tmp_path):
-    run_benchmark(["marginal"], tmp_path, BENCHMARK)
-    costs = tmp_path / "marginal" / benchmark.COSTS
-    before = json.loads(costs.read_text())
-    assert before["scans"] == 8
-    (tmp_path / "marginal" / "samples" / "00000003.npz").unlink()
-    run_benchmark(["marginal"], tmp_path, BENCHMARK)
-    assert json.loads(costs.read_text())["seconds_per_scan"] == before["seconds_per_scan"]
-
-
-def test_a_time_that_is_lacking_is_added(tmp_path):
-    """Earlier versions wrote the number of samples beside a time that they had not taken."""
-    run_benchmark(["marginal"], tmp_path, BENCHMARK)
-    costs = tmp_path / "marginal" / benchmark.COSTS
-    costs.write_text(json.dumps(json.loads(costs.read_text()) | {"seconds_per_scan": None, "scans": 256}))
-    (tmp_path / "marginal" / "samples" / "00000003.npz").unlink()
-    run_benchmark(["marginal"], tmp_path, BENCHMARK)
-    assert json.loads(costs.read_text())["seconds_per_scan"] > 0
-
-
 def test_a_finished_run_of_before_keeps_its_warm_up(tmp_path, monkeypatch):
     """Budgets once left settings of a model that count scans as they were."""
     recipe = load_recipe("lidarvae_small", FEW)
@@ -376,14 +342,6 @@ def test_metrics_of_which_none_can_be_made_are_refused_before_training(tmp_path,
 def test_json_is_not_written_over_the_table(tmp_path, capsys):
     assert main(["compare", str(tmp_path), "marginal", "--json", str(tmp_path / "table.json")]) == 2
     assert "table.json for two files" in the_one_line(capsys.readouterr().err, "compare")
-
-
-@pytest.mark.parametrize("change", [{"parameters": "many"}, {"training_flops": [1]}, {"flops_per_scan": None}, None])
-def test_damaged_costs_are_refused_in_one_line(change, tmp_path):
-    costs = {"parameters": 3, "training_flops": None, "network_evaluations": 1, "flops_per_scan": 5.0}
-    (tmp_path / "costs.json").write_text(json.dumps({**costs, "seconds_per_scan": 1, **change} if change else costs))
-    with pytest.raises(CheckpointError, match="is no number; wanted what lidargrit compare wrote; remove"):
-        as_table([tmp_path / "scores.json"])
 
 
 def test_a_second_comparison_in_the_same_folder_is_refused(tmp_path):

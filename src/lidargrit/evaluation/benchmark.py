@@ -18,41 +18,30 @@ import torch
 
 from lidargrit import __version__
 from lidargrit.configuration import name_and_settings, override
-from lidargrit.errors import CheckpointError, ConfigError, LidarGritError, OutputError
+from lidargrit.errors import ConfigError, LidarGritError, OutputError
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair, metric_factory, open_pair
-from lidargrit.evaluation.likelihood import bits_per_return
-from lidargrit.evaluation.pairs import EvalPair, EvalSet, require_same_rays
-from lidargrit.evaluation.protocols import public_name
-from lidargrit.evaluation.scorecard import Scorecard
-from lidargrit.evaluation.tables import Format, TableBlock, render, side_by_side
+from lidargrit.evaluation.costs import COSTS, Costs, costs_block, read_costs
+from lidargrit.evaluation.pairs import EvalPair, require_same_rays
+from lidargrit.evaluation.protocols import MetricChoice, load_protocol, public_name
+from lidargrit.evaluation.scorecard import NOT_APPLICABLE, Scorecard
+from lidargrit.evaluation.tables import Format, render, side_by_side
 from lidargrit.evaluation.verdict import MEMORISED, PIXEL_STATISTICS
 from lidargrit.files import claim_folder, read_json, write_json
 from lidargrit.generators import Generator, load, load_class
+from lidargrit.metrics import load_metric
+from lidargrit.metrics._networks.features import FeatureMetric
 from lidargrit.nn.devices import usable_device
 from lidargrit.processes import check_processes, process_pool
 from lidargrit.recipes import load_recipe
 from lidargrit.reporting import Reporter
-from lidargrit.run_folder import is_run, locate
+from lidargrit.run_folder import is_run, locate, weights_sha256
 from lidargrit.sensors import SensorModel
 from lidargrit.sources import Source, data_set_of, open_source
-from lidargrit.sources.samples import write_samples
-from lidargrit.training import Recipe, check_folder, train, training_flops, with_budget
+from lidargrit.sources.samples import read_samples, write_samples
+from lidargrit.training import Recipe, check_folder, train, with_budget
 from lidargrit.training.compute import duration
 from lidargrit.training.plan import check_stages
 
-COSTS = "costs.json"
-_COSTS = {  # entry of the file → name and unit in the table, and whether a system may lack it
-    "parameters": (("parameters", "all networks"), False),
-    "training_flops": (("training", "FLOPs"), True),
-    "flops_per_scan": (("sampling", "FLOPs/scan"), False),
-    "network_evaluations": (("network evaluations", "per scan"), False),
-    "seconds_per_scan": (("time", "s/scan"), True),
-    "bits_per_return": (("likelihood", "bits/return"), True),
-}
-_NOTES = (
-    "time: on this machine, in batches; likelihood: of at most 64 scans of the reference, ranges in steps of 10 mm, "
-    "- where a system has none; MaskGIT's tokens count as equally likely",
-)
 _SAMPLES_AT_MOST = 10**8  # names of files have eight digits
 
 
@@ -218,13 +207,26 @@ def _finish(
         samples = folder / name / "samples"
         timed = _sample(generator, plan.run, samples, plan.sampling, benchmark, reporter)
         sampled += timed is not None
-        _write_costs(folder / name / COSTS, plan, generator, timed)
-        pair = open_pair(open_source(str(samples)), reference, settings, reporter)
-        _add_bits(folder / name / COSTS, generator, pair.reference, reporter)
+        costs = Costs(folder / name / COSTS, weights_sha256(plan.run))
+        costs.write(generator, plan.sampling, plan.recipe, timed)
+        pair = _of_first_seeds(open_pair(open_source(str(samples)), reference, settings, reporter), samples)
+        costs.add_bits(generator, pair.reference, reporter)
         _score(pair, settings, folder / name / f"{name}.json", reporter)
-        if len(pair.samples) < benchmark.num_samples:
-            reporter.message(f"WARNING: {benchmark.reference} has {len(pair.samples)} scans, so as many are compared")
+        if (compared := len(pair.samples)) < benchmark.num_samples:
+            protocol_takes = load_protocol(settings.protocol).scans_at_most(benchmark.num_samples)
+            limit = f"{benchmark.reference} has" if compared < protocol_takes else f"protocol {settings.protocol} takes"
+            reporter.message(f"WARNING: {limit} {compared:,} scans, so as many are compared")
     return sampled
+
+
+def _of_first_seeds(pair: EvalPair, folder: Path) -> EvalPair:
+    """Return a pair in which as many samples are those of the first seeds, from 0 on.
+
+    The folder may hold more, of an earlier comparison of more samples: spaced evenly over these, the samples of this
+    system would have other seeds than those of a system that is sampled now.
+    """
+    samples = replace(pair.samples, images=read_samples(folder), indices=range(len(pair.samples)))
+    return replace(pair, samples=samples)
 
 
 def _folder_name(system: str) -> str:
@@ -262,39 +264,15 @@ class _Remaining:
 
 def as_table(scores: Sequence[Path], form: Format = "text", remarks: Sequence[str] = ()) -> str:
     """Return the scores side by side, below them what each system costs, and remarks."""
-    rows = []
-    for path in scores:
-        of = _read_costs(path.parent / COSTS)
-        numbers = [of[name] for name in _COSTS]
-        rows.append((path.stem, tuple("" if number is None else _as_text(number) for number in numbers)))
-    columns = tuple(column for column, _ in _COSTS.values())
-    costs = TableBlock("Costs", columns, tuple(rows), (*_NOTES, *remarks))
+    costs = costs_block([(path.stem, path.parent / COSTS) for path in scores], remarks)
     return f"{side_by_side(scores, form)}\n\n{render([costs], form)}"
-
-
-def _as_text(number: int | float) -> str:
-    return f"{number:,}" if isinstance(number, int) and number < 1e9 else f"{number:.4g}"
 
 
 def as_json(scores: Sequence[Path]) -> list[dict[str, Any]]:
     """Return the name, the costs and the scores of each system, as the files hold them."""
     return [
-        {"system": path.stem, "costs": _read_costs(path.parent / COSTS), "scores": read_json(path)} for path in scores
+        {"system": path.stem, "costs": read_costs(path.parent / COSTS), "scores": read_json(path)} for path in scores
     ]
-
-
-def _read_costs(path: Path) -> dict[str, Any]:
-    """Read what :func:`_write_costs` wrote.
-
-    Raises:
-        CheckpointError: the file cannot be read, or an entry lacks or is no number.
-    """
-    of = {"bits_per_return": None, "scans": 0} | read_json(path)  # files of before lack the first
-    for name, may_lack in (*((name, may) for name, (_, may) in _COSTS.items()), ("scans", False)):
-        if name not in of or not (type(of[name]) in (int, float) or (may_lack and of[name] is None)):
-            cure = "remove the folder of this system, and compare again"
-            raise CheckpointError(f"{path}, whose {name} is no number", "what lidargrit compare wrote", cure)
-    return of
 
 
 @dataclass(frozen=True)
@@ -351,47 +329,37 @@ def _sample(
 
 
 def _score(pair: EvalPair, settings: EvalConfig, path: Path, reporter: Reporter) -> None:
-    """Score two sets and write the file, unless it holds the scores of the same images by the same settings."""
+    """Score two sets and write the file, unless it holds the scores of the same images by the same settings.
+
+    Scores that rest on weights of a network are computed again if these were not there, or were others.
+    """
     facts = (settings.facts(), pair.samples.record(), pair.reference.record(), __version__)
     wanted = (public_name(settings.protocol), *facts)
     if path.is_file():
         there = Scorecard.read(path)
-        if (there.protocol, there.settings, there.samples, there.reference, there.versions.get("lidargrit")) == wanted:
+        known = (there.protocol, there.settings, there.samples, there.reference, there.versions.get("lidargrit"))
+        if known == wanted and not _has_other_weights(there, pair, settings, reporter):
             reporter.message(f"scores are there already; remove {path} to score again")
             return
     write_json(path, compare_pair(pair, settings, reporter).to_json())
 
 
-def _write_costs(path: Path, plan: _Plan, generator: Generator, timed: tuple[int, float] | None) -> None:
-    """Write what a system costs, unless it is there, with the time of at least as many scans."""
-    scans, seconds = timed or (0, None)
-    if path.is_file():
-        there = _read_costs(path)
-        if timed is None or (there["seconds_per_scan"] is not None and scans <= there["scans"]):
-            return
-    cost = generator.cost(plan.sampling)
-    write_json(
-        path,
-        {
-            "parameters": sum(weight.numel() for weight in generator.parameters()),
-            "training_flops": None if plan.recipe is None else sum(training_flops(plan.recipe).values()),
-            "network_evaluations": cost.network_evaluations,
-            "flops_per_scan": cost.flops,
-            "seconds_per_scan": seconds,
-            "scans": scans,  # over which the time was taken
-        },
-    )
-
-
-def _add_bits(path: Path, generator: Generator, scans: EvalSet, reporter: Reporter) -> None:
-    """Add the bits a return of the reference to what a system costs, unless those of the same scans are there."""
-    costs = _read_costs(path)
-    reference = {"sha256": scans.record().sha256, "range_m": list(scans.range_m or ())}
-    if costs.get("reference") == reference:
-        return
-    try:
-        bits = bits_per_return(generator, scans)
-    except ConfigError as error:  # scans that the model cannot encode can still be compared with
-        reporter.message(f"no likelihood of the reference: {error}")
-        bits = None
-    write_json(path, {**costs, "bits_per_return": bits, "reference": reference})
+def _has_other_weights(there: Scorecard, pair: EvalPair, settings: EvalConfig, reporter: Reporter) -> bool:
+    """Return whether the networks of metrics have weights now that they had not when these scores were computed."""
+    stored: dict[MetricChoice, Any] = {
+        MetricChoice(each.metric, each.variant): None for each in there.left_out if each.verdict != NOT_APPLICABLE
+    }
+    for score in there.scores:
+        weights = score.result.details.get("weights")
+        sha256 = weights.get("sha256") if isinstance(weights, dict) else None
+        stored[MetricChoice(score.result.metric, score.result.variant)] = sha256
+    for choice, sha256 in stored.items():
+        if not load_metric(choice.metric).needs_weights:  # what the same program left out of the same images stays so
+            continue
+        with suppress(LidarGritError):  # still no weights, or images that this network cannot see
+            metric = metric_factory(choice, settings, reporter)()
+            if isinstance(metric, FeatureMetric) and metric.network.sha256 != sha256:
+                for images, real in ((pair.samples, False), (pair.reference, True)):
+                    metric.update(images.batch([0]), real=real)
+                return True
+    return False

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from lidargrit import __version__
-from lidargrit.errors import ConfigError, LidarGritError, counted_scans, nearest_names
+from lidargrit.errors import ConfigError, LidarGritError, counted_scans, nearest_names, one_of
 from lidargrit.evaluation.intervals import Resampling, Score
 from lidargrit.evaluation.pairs import EvalPair, pair_for_protocol
-from lidargrit.evaluation.protocols import DEFAULT, MetricChoice, load_protocol, public_name
+from lidargrit.evaluation.protocols import DEFAULT, MetricChoice, Protocol, load_protocol, public_name
 from lidargrit.evaluation.scorecard import NOT_APPLICABLE, LeftOut, Scorecard
 from lidargrit.evaluation.scoring import MetricFactory, score_metrics
 from lidargrit.loading import DataConfig
@@ -116,6 +116,7 @@ class EvalConfig:
             "projection_variant": self.data_config().projection_variant,
             **({"sensor": self.sensor} if self.sensor else {}),
             **({"projection": self.data.projection} if self.data.projection != "sensor" else {}),
+            **({"columns": self.data.columns, "column_stride": self.data.column_stride} if self.data.columns else {}),
             "max_scans": self.max_scans,
             "seed": self.seed,
             "resampling": asdict(self.resampling),
@@ -152,6 +153,8 @@ def open_pair(samples: Source, reference: Source, settings: EvalConfig, reporter
     """Read the two sets of an evaluation, and warn where they are not comparable."""
     protocol, config = load_protocol(settings.protocol), settings.data_config()
     sensor = load_sensor(settings.sensor) if settings.sensor else protocol.load_sensor()
+    if sensor is None and (settings.data.columns or settings.data.projection != "sensor"):
+        sensor = samples.sensor  # named for prepared scans and .npy, which else keep their own columns and projection
     sensor = sensor and config.imaged(sensor)
     pair = pair_for_protocol(samples, reference, protocol, config, reporter, sensor)
     for warning in pair.warnings:
@@ -203,7 +206,7 @@ def compare_pair(
         pair.reference.record(),
         tuple(scores),
         (*left_out, *not_applicable),
-        pair.deviations,
+        (*pair.deviations, *_other_definitions(scores, protocol)),
         tuple(warnings),
         settings.facts(),
         {
@@ -226,6 +229,24 @@ def _applicable(wanted: Sequence[MetricChoice], pair: EvalPair) -> tuple[list[Me
         else:
             kept.append(choice)
     return kept, others
+
+
+def _other_definitions(scores: Sequence[Score], protocol: Protocol) -> list[str]:
+    """Return the metrics of a protocol that were computed by other definitions than its own alone, one sentence each.
+
+    Metrics that the protocol does not have are no difference: they change none of the others.
+    """
+    own: dict[str, list[str]] = {}
+    for choice in protocol.metrics:
+        own.setdefault(choice.metric, []).append(choice.variant or load_metric(choice.metric).variants[0])
+    computed: dict[str, list[str]] = {}
+    for score in scores:
+        computed.setdefault(score.result.metric, []).append(score.result.variant)
+    return [
+        f"{metric} is computed by the definition {one_of(variants)}, not by {one_of(own[metric])}"
+        for metric, variants in computed.items()
+        if metric in own and not set(variants) & set(own[metric])
+    ]
 
 
 def _require_known(variant: str, wanted: Sequence[MetricChoice]) -> None:

@@ -204,9 +204,25 @@ def deviations(pair: EvalPair, protocol: Protocol) -> tuple[str, ...]:
         found.append(f"the reference is {reference.data_set or 'of an unknown data set'}, not {protocol.data_set}")
     elif protocol.splits and reference.split not in protocol.splits:
         found.append(f"the reference is {reference.split!r} of {reference.data_set}, not {protocol.splits[0]!r}")
-    if protocol.sensor and reference.projection_variant not in {protocol.variant, ""}:
-        found.append(f"the reference is projected by {reference.projection_variant!r}, not by {protocol.variant!r}")
+    for name, each in (("samples are", pair.samples), ("reference is", reference)):
+        if wanted is not None:
+            found += [f"the {name} {difference}" for difference in _other_images(each, wanted, protocol.variant)]
     return tuple(found)
+
+
+def _other_images(images: EvalSet, wanted: SensorModel, variant: str) -> list[str]:
+    """Return how a set became images in another way than a protocol wants, apart from their rays: ends of sentences."""
+    found = []
+    sensor = images.images.sensor
+    if images.projection_variant not in {variant, ""}:
+        found.append(f"projected by {images.projection_variant!r}, not by {variant!r}")
+    if sensor.projection != wanted.projection:
+        rows = {"spherical": "elevation (spherical)", "unfolding": "ring (unfolding)"}
+        found.append(f"in rows by {rows[sensor.projection]}, not by {rows[wanted.projection]}")
+    limits = [f"{each.range_min_m:g} to {each.range_max_m:g} m" for each in (sensor, wanted)]
+    if limits[0] != limits[1]:
+        found.append(f"of a sensor that sees {limits[0]}, not {limits[1]}")
+    return found
 
 
 def _warnings(pair: EvalPair, shared: str) -> tuple[str, ...]:

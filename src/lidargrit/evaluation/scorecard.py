@@ -124,6 +124,10 @@ class Scorecard:
         wanted, cure = "the scores that lidargrit evaluate --json wrote", "check the path, or evaluate again"
         try:
             data = read_json(path, error=DataError, wanted=wanted, cure=cure)
+            if isinstance(data, dict) and "reconstruction" in data:  # what evaluate wrote for a run
+                wanted = "scores of samples, which tables set side by side"
+                cure = "generate samples first with: lidargrit sample RUN FOLDER, and evaluate these"
+                raise DataError(f"{path}, which holds errors of reconstruction", wanted, cure)
             protocol = dict(data["protocol"])
             return cls(
                 str(protocol.pop("name")),

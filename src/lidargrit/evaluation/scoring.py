@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -135,7 +136,7 @@ def score_metrics(
             note = ", ".join(factories[index].choice.metric for index in indices)
             begun_s = time.perf_counter()
             try:
-                advance = lambda n: progress.advance(n, note=note)  # noqa: B023, E731
+                advance = partial(progress.advance, note=note)
                 sizes = _feed(list(fed.values()), pair, resampling, advance)
                 if with_pixel_statistics:
                     _feed_pixel_statistics(list(fed.values()), pair.reference, resampling, advance)

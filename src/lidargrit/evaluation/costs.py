@@ -1,0 +1,133 @@
+"""What a system of a benchmark costs: parameters, operations, time and bits → costs.json → a block of the table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lidargrit.errors import CheckpointError, ConfigError
+from lidargrit.evaluation.likelihood import bits_per_return
+from lidargrit.evaluation.pairs import EvalSet
+from lidargrit.evaluation.tables import TableBlock
+from lidargrit.files import read_json, write_json
+from lidargrit.generators import Generator
+from lidargrit.reporting import Reporter
+from lidargrit.training import Recipe, training_flops
+
+COSTS = "costs.json"
+_ENTRIES = {  # entry of the file → name and unit in the table, and whether a system may lack it
+    "parameters": (("parameters", "all networks"), False),
+    "training_flops": (("training", "FLOPs"), True),
+    "flops_per_scan": (("sampling", "FLOPs/scan"), False),
+    "network_evaluations": (("network evaluations", "per scan"), False),
+    "seconds_per_scan": (("time", "s/scan"), True),
+    "bits_per_return": (("likelihood", "bits/return"), True),
+}
+_NOTES = (
+    "time: on this machine, in batches; likelihood: of at most 64 scans of the reference, ranges in steps of 10 mm, "
+    "- where a system has none; MaskGIT's tokens count as equally likely",
+)
+
+
+@dataclass(frozen=True)
+class Costs:
+    """The file with what one system costs.
+
+    Args:
+        path: the file, ``costs.json``.
+        weights_sha256: hash of the weights of the system's run.
+    """
+
+    path: Path
+    weights_sha256: str
+
+    def write(
+        self, generator: Generator, sampling: object, recipe: Recipe | None, timed: tuple[int, float] | None
+    ) -> None:
+        """Write what a system costs, unless that of these weights is there, with the time of at least as many scans.
+
+        Args:
+            generator: the trained generator.
+            sampling: settings of the generator's own ``Sampling``.
+            recipe: recipe that was trained; None for a run that was given, whose training is not counted.
+            timed: number of scans that were sampled just now, and seconds for each; None if none was.
+        """
+        scans, seconds = timed or (0, None)
+        if self.path.is_file():
+            there = read_costs(self.path)
+            # Files of earlier versions lack the hash: they are taken to be of these weights.
+            of_these_weights = there.get("weights_sha256", self.weights_sha256) == self.weights_sha256
+            has_time = there["seconds_per_scan"] is not None and scans <= there["scans"]
+            if of_these_weights and (timed is None or has_time):
+                return
+        cost = generator.cost(sampling)
+        write_json(
+            self.path,
+            {
+                "weights_sha256": self.weights_sha256,
+                "parameters": sum(weight.numel() for weight in generator.parameters()),
+                "training_flops": None if recipe is None else sum(training_flops(recipe).values()),
+                "network_evaluations": cost.network_evaluations,
+                "flops_per_scan": cost.flops,
+                "seconds_per_scan": seconds,
+                "scans": scans,  # over which the time was taken
+            },
+        )
+
+    def add_bits(self, generator: Generator, scans: EvalSet, reporter: Reporter) -> None:
+        """Add the bits a return of the reference to the file, unless those of the same scans are there.
+
+        Args:
+            generator: the trained generator.
+            scans: the reference.
+            reporter: receiver of the reason where the system has no likelihood of these scans.
+        """
+        costs = read_costs(self.path)
+        reference = {"sha256": scans.record().sha256, "range_m": list(scans.range_m or ())}
+        if costs.get("reference") == reference:
+            return
+        try:
+            bits = bits_per_return(generator, scans)
+        except ConfigError as error:  # scans that the model cannot encode can still be compared with
+            reporter.message(f"no likelihood of the reference: {error}")
+            bits = None
+        write_json(self.path, {**costs, "bits_per_return": bits, "reference": reference})
+
+
+def read_costs(path: Path) -> dict[str, Any]:
+    """Read what :class:`Costs` wrote.
+
+    Raises:
+        CheckpointError: the file cannot be read, or an entry lacks or is no number.
+    """
+    of = {"bits_per_return": None, "scans": 0} | read_json(path)  # files of before lack the first
+    for name, may_lack in (*((name, may) for name, (_, may) in _ENTRIES.items()), ("scans", False)):
+        if name not in of or not (type(of[name]) in (int, float) or (may_lack and of[name] is None)):
+            cure = "remove the folder of this system, and compare again"
+            raise CheckpointError(f"{path}, whose {name} is no number", "what lidargrit compare wrote", cure)
+    return of
+
+
+def costs_block(files: Sequence[tuple[str, Path]], remarks: Sequence[str] = ()) -> TableBlock:
+    """Return the costs of several systems as a block of a table.
+
+    Args:
+        files: name of each system, and its ``costs.json``.
+        remarks: lines to print below the costs.
+
+    Raises:
+        CheckpointError: a file that cannot be read, or in which an entry lacks or is no number.
+    """
+    rows = []
+    for name, path in files:
+        of = read_costs(path)
+        numbers = [of[entry] for entry in _ENTRIES]
+        rows.append((name, tuple("" if number is None else _as_text(number) for number in numbers)))
+    columns = tuple(column for column, _ in _ENTRIES.values())
+    return TableBlock("Costs", columns, tuple(rows), (*_NOTES, *remarks))
+
+
+def _as_text(number: int | float) -> str:
+    return f"{number:,}" if isinstance(number, int) and number < 1e9 else f"{number:.4g}"

@@ -1,0 +1,98 @@
+"""A comparison that is begun again: scores of weights that came since, the same seeds, and which limit held."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from lidargrit.evaluation import benchmark
+from lidargrit.evaluation.benchmark import run as run_benchmark
+from lidargrit.evaluation.comparison import EvalConfig
+from lidargrit.evaluation.intervals import Resampling
+from lidargrit.evaluation.pairs import EvalPair, EvalSet
+from lidargrit.evaluation.protocols import load_protocol
+from lidargrit.loading import Pixels, Provenance, RangeImages
+from lidargrit.reporting import Reporter
+from lidargrit.sensors import load_sensor
+from seeded_networks import weights
+from test_benchmark import BENCHMARK
+
+SENSOR = load_sensor("vlp16").with_columns(32)
+
+
+class Listener(Reporter):
+    def __init__(self):
+        self.lines = []
+
+    def message(self, text):
+        self.lines.append(text)
+
+
+class Seeded:
+    """Range images without reflectance."""
+
+    provenance = Provenance()
+
+    def __len__(self):
+        return 4
+
+    def read(self, index):
+        range_m = np.random.default_rng(index).uniform(2, 60, (SENSOR.height, SENSOR.width))
+        return Pixels(range_m.astype(np.float32))
+
+
+def test_scores_are_computed_again_with_weights_that_came_since(tmp_path):
+    file, path = tmp_path / "weights.pth", tmp_path / "scores.json"
+    metrics = "return_rate_per_ring", "frechet_pointcloud_distance"
+    plain = Resampling(halves=0)
+    settings = EvalConfig("lidargrit-kitti-odometry", metrics, weights={"pointnet": file}, resampling=plain)
+    pair = EvalPair(*(EvalSet(name, RangeImages(SENSOR, [Seeded()]), range(2)) for name in "ab"))
+    pair = replace(pair, samples=replace(pair.samples, indices=range(2, 4)))
+
+    def scored():
+        listener = Listener()
+        benchmark._score(pair, settings, path, listener)
+        there = json.loads(path.read_text())
+        return there["scores"], there["left_out"], any("are there already" in line for line in listener.lines)
+
+    scores, left_out, _ = scored()
+    assert [each["metric"] for each in left_out] == ["frechet_pointcloud_distance"]
+    assert scored() == (scores, left_out, True), "no weights yet"
+    torch.save(weights("pointnet"), file)
+    first, left_out, kept = scored()
+    assert ([score["metric"] for score in first], left_out, kept) == ([*metrics], [], False)
+    assert scored() == (first, [], True)
+    torch.save(weights("pointnet", seed=5), file)
+    second, _, kept = scored()
+    assert not kept
+    assert second[1]["value"] != first[1]["value"]
+    file.unlink()
+    assert scored() == (second, [], True), "nothing to score with again"
+
+
+def test_a_few_samples_are_those_of_the_first_seeds(tmp_path):
+    """They were spaced evenly over what an earlier comparison of more had left, unlike those of a system added now."""
+    plain = replace(BENCHMARK, settings=EvalConfig(metrics=("bev_jsd",), resampling=Resampling(halves=0)))
+    run_benchmark(["marginal"], tmp_path / "six", replace(plain, num_samples=6))
+    found = [
+        json.loads(run_benchmark(["marginal"], tmp_path / name, replace(plain, num_samples=3))[0].read_text())
+        for name in ("six", "three")
+    ]
+    six, three = (each["inputs"]["samples"] for each in found)
+    assert six["sha256"] == three["sha256"]
+    assert (six["scans"], six["scans_used"]) == (6, 3)
+
+
+def test_it_is_told_which_limit_held(tmp_path, monkeypatch):
+    def told(folder, **changes):
+        listener = Listener()
+        run_benchmark(["marginal"], tmp_path / folder, replace(BENCHMARK, **changes), listener)
+        (line,) = (line for line in listener.lines if "as many are compared" in line)
+        return line
+
+    assert "simulated:6:test has 6 scans" in told("reference", reference="simulated:6:test")
+    few = replace(load_protocol("exact"), num_scans=4)
+    for module in ("benchmark.load_protocol", "comparison.load_protocol"):
+        monkeypatch.setattr(f"lidargrit.evaluation.{module}", lambda name: few)
+    assert "protocol exact takes 4 scans" in told("protocol")
