@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 
+from lidargrit.evaluation import profiles
 from lidargrit.evaluation.comparison import EvalConfig, compare_sources
 from lidargrit.evaluation.intervals import Interval, RealAgainstReal, Score
-from lidargrit.evaluation.profiles import matches, profile
+from lidargrit.evaluation.profiles import matches, profile, searched_scans
 from lidargrit.evaluation.scorecard import LeftOut
 from lidargrit.projection import points_of_pixels
 from lidargrit.structures import MetricResult
@@ -101,6 +102,22 @@ def test_the_page_names_no_folder_of_the_machine(evaluated):
     assert "kitti_360:…/kitti_360:train" in text
 
 
+@pytest.mark.parametrize(
+    "folder", ["/home/jane doe/secret project", "/home/jane/secret (old)", '/home/jane/"secret" x']
+)
+def test_folders_of_the_sources_may_have_any_letters(evaluated, folder):
+    card, pair = evaluated
+    source = f"kitti_360:{folder}/scans:lidargen-code/train"
+    told = {"warnings": (f"{folder}/scans/1.bin: few points",), "settings": {"weights": {"lidm": f"{folder}/a.pt"}}}
+    changed = replace(card, reference=replace(card.reference, source=source), **told)
+    text = page(changed, replace(pair, reference=replace(pair.reference, source=source)))
+    assert "secret" not in text
+    assert "jane" not in text
+    assert "<td>kitti_360:…/scans:lidargen-code/train</td>" in text
+    assert "…/1.bin: few points" in text
+    assert "…/a.pt" in text
+
+
 def test_whatever_comes_from_outside_is_escaped(evaluated):
     card, pair = evaluated
     bad = replace(card.samples, source=EVIL, split=EVIL, sensor=EVIL)
@@ -161,6 +178,19 @@ def test_a_scan_is_its_own_nearest(evaluated):
             ((pair.samples, other[0].generated), (pair.reference, other[0].real))]  # fmt: skip
     apart = [torch.log2(1 + one[rows][:, columns]) for one in pair]
     assert other[0].distance == pytest.approx(float((apart[0] - apart[1]).abs().mean()), rel=1e-4)
+
+
+def test_all_reference_scans_are_searched_for_the_nearest(evaluated, monkeypatch):
+    card, pair = evaluated
+    few = replace(pair, samples=replace(pair.samples, indices=[0]), reference=replace(pair.reference, indices=[1]))
+    monkeypatch.setattr(profiles, "_BLOCK", 3)  # the last of several blocks is smaller
+    copied = replace(few, samples=replace(few.samples, images=pair.reference.images, indices=[3]))
+    assert [(one.real, one.distance) for one in matches(copied.samples, searched_scans(copied.reference))] == [(3, 0.0)]
+    wanted = "For 1 of the 1 samples the nearest was searched among 4 of the 4 reference scans that were read"
+    assert wanted in page(card, few)
+    assert "over 32 x 128 evenly spaced pixels" in page(card, few)
+    monkeypatch.setattr(profiles, "SEARCHED_AT_MOST", 2)
+    assert "among 2 of the 4 reference scans" in page(card, few)
 
 
 def test_pages_run_no_script_but_their_own_and_fetch_nothing():

@@ -1,6 +1,7 @@
 """The page that is served: what can be chosen, and what happens when somebody clicks and types, in a browser."""
 
 import re
+import socket
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -387,14 +388,13 @@ def test_the_command_says_where_and_to_whom(tmp_path, capsys, monkeypatch):
     assert main(["serve", "--port", "0", "--host", "0.0.0.0"]) == 0
     said = capsys.readouterr().out
     assert re.match(
-        r"left out: runs/tiny: got \S*model.safetensors.*; wanted .*\nWARNING: everybody who reaches 0", said
+        r"left out: runs/tiny: got \S*model.safetensors.*; wanted .*\nWARNING: everybody who reaches ", said
     )
-    assert re.search(r"open http://0\.0\.0\.0:\d+ in a browser", said)
+    assert re.search(rf"open http://{re.escape(socket.gethostname())}:\d+ in a browser \(where .* numeric", said)
     for wrong in (
         ["--seconds", "-1"],
         ["--seconds", "inf"],
         ["--port", "99999"],
-        ["--host", "no.such.host.invalid", "--port", "0"],
     ):
         assert main(["serve", *wrong]) == 2
         assert capsys.readouterr().err.startswith("lidargrit serve: got ")

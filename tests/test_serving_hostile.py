@@ -19,8 +19,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import lidargrit
+from lidargrit.errors import OutputError
+from lidargrit.formats import load, read_scan
 from lidargrit.serving import application
 from lidargrit.serving.application import is_own
+from lidargrit.serving.server import _listening
 from served import LIMITS, running
 
 QUICK = {"steps": 3, "resamples": 2}
@@ -67,6 +71,29 @@ def test_which_names_are_our_own():
     assert is_own("192.168.0.7:8000", "0.0.0.0")
     assert is_own("box.lan", "box.lan")
     assert not is_own("evil.example", "0.0.0.0")
+    for served_at in ("0.0.0.0", "::"):
+        assert is_own(f"{socket.gethostname().upper()}:8000", served_at)
+        assert is_own(socket.getfqdn(), served_at)
+    assert not is_own(f"{socket.gethostname()}.evil.example", "0.0.0.0")
+    assert not is_own(socket.gethostname(), "127.0.0.1")
+
+
+def test_a_refused_name_is_told_how_to_get_in(served):
+    status, why = served.refused("/", Host="box.lan")
+    assert status == 403
+    assert why.endswith("open it as localhost, or serve it with --host NAME.")
+    everywhere = application.Application(served.queue, "0.0.0.0")
+    answer = b"".join(everywhere({"HTTP_HOST": "box.lan"}, lambda *_: None)).decode()
+    assert "open it by the numeric address of this machine, or serve it with --host NAME." in answer
+
+
+@pytest.mark.parametrize("host", ["no.such.host.invalid", "192.0.2.1"])  # the second is an address of nobody
+def test_a_wrong_host_is_no_matter_of_the_port(host):
+    with pytest.raises(OutputError, match=r"wanted an address or a name of this machine; .* --host") as refused:
+        _listening(host, 0)
+    assert "--port" not in str(refused.value)
+    with socket.create_server(("127.0.0.1", 0)) as other, pytest.raises(OutputError, match="by --port"):
+        _listening("127.0.0.1", other.getsockname()[1])
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", "", "https://127.0.0.1", "http://127.0.0.1:1"])
@@ -106,6 +133,20 @@ def test_results_are_had_by_their_names_only(served):
     for method in ("PUT", "DELETE", "OPTIONS", "HEAD", "TRACE"):
         assert served.ask("/models", method=method)[0] == 405
     assert served.refused("/models", {})[0] == 405
+
+
+def test_labels_that_the_page_shows_are_saved(served, tmp_path):
+    scan = lidargrit.simulate(seed=5)
+    load("ply").write(tmp_path / "a.ply", scan)
+    job = upload(served, tmp_path / "a.ply", {"model": 2, "task": "region"})
+    assert served.ended(job)["state"] == "done"
+    for ending in ("ply", "npz"):
+        saved = tmp_path / f"saved.{ending}"
+        saved.write_bytes(served.ask(f"{job}/0-0.{ending}")[2])
+        label = read_scan(saved).label
+        assert label is not None
+        assert set(label.unique().tolist()) <= set((scan.label & 0xFFFF).tolist()), "without the numbers of instances"
+        assert len(label.unique()) > 3
 
 
 def bombs() -> dict[str, bytes]:
@@ -246,6 +287,7 @@ def test_fifty_clients_at_once(served):
     for thread in threads:
         thread.join()
     assert sorted(answers) == [202] * LIMITS.waiting + [503] * (50 - LIMITS.waiting)
+    waiting = served.queue._waiting[0]
     served.queue.limits = replace(LIMITS, unpolled_seconds=0.0)  # nobody asks for theirs
     os.kill(served.queue._worker.pid, signal.SIGKILL)  # as when memory runs out
     assert "during which the program ended" in served.ended(holding)["error"]
@@ -254,6 +296,8 @@ def test_fifty_clients_at_once(served):
         assert time.monotonic() < end
         time.sleep(0.02)
     served.queue.limits = LIMITS
+    assert LIMITS.unpolled_seconds > 120, "hidden tabs ask once a minute"
+    assert waiting.error.endswith("wanted a page that stays open; press the button again")
     assert served.ended(served.take("/generate", {"model": 1}))["state"] == "done", "a new process runs it"
 
 

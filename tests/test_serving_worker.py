@@ -84,6 +84,23 @@ def test_a_part_of_the_circle_is_taken_only_where_lost_returns_are_completed(tas
         compute_result(made("lidargrit")[0], SampleRequest(0, task=task, file=str(part_file), name="mine.ply"))
 
 
+@pytest.mark.parametrize(
+    ("sensor", "task", "cure"),
+    [
+        ("vlp16", "returns", "choose the task 'add the rows a VLP-16 lacks', or a model of the scan's sensor"),
+        ("hdl32e", "returns", "lacks' or 'add the rows a VLP-32C lacks', or a model of the scan's sensor"),
+        ("os1_128", "returns", "choose a model of the sensor that made the scan, or choose another scan"),
+        ("hdl32e", "vlp16", "choose the task that names the sensor of the scan, or choose another scan"),
+    ],
+)
+def test_the_cure_for_a_scan_of_another_sensor_is_one_of_the_page(sensor, task, cure, tmp_path):
+    load("ply").write(tmp_path / "a.ply", lidargrit.simulate(seed=5, sensor=lidargrit.load_sensor(sensor)))
+    request = SampleRequest(0, task=task, file=str(tmp_path / "a.ply"), name="mine.ply")
+    with pytest.raises(ScanError, match=r"mine\.ply") as refused:
+        compute_result(made("lidargrit")[0], request)
+    assert refused.value.cure.endswith(cure)
+
+
 def test_models_that_do_not_complete_have_no_task(scan_file):
     model = made("maskgit")[0]
     assert describe_model("tiny", model)["tasks"] == []

@@ -15,6 +15,7 @@ from PIL import Image
 from lidargrit.cli import main
 from lidargrit.errors import ConfigError, OutputError
 from lidargrit.generators import load_class
+from lidargrit.loading.config import ScanSettings
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import load_sensor
 from lidargrit.sources import open_source
@@ -54,6 +55,19 @@ def test_an_image_of_one_row_has_a_height(images, tmp_path, recwarn):
     sensor = replace(images.sensor, elevation_rad=images.sensor.elevation_rad[:1])
     plot_comparison({"one": RangeImage(images.range_m[:1, :1], images.return_mask[:1, :1], sensor)}, tmp_path / "a.png")
     assert not recwarn.list
+
+
+@pytest.mark.parametrize("name", ["hdl64e_kitti_odometry", "vlp32c", "os1_64", "vlp16"])
+def test_round_elevations_stand_beside_their_rows(name):
+    elevation_deg = load_sensor(name).elevation_rad.double().mean(dim=1).rad2deg().numpy()
+    rows, labels = pictures._elevation_ticks(elevation_deg)
+    degrees = [int(label.replace("−", "-").removesuffix("°")) for label in labels]
+    assert 3 <= len(rows) <= 6
+    assert set(degrees) >= {0, -10}
+    for row, there in zip(rows, degrees, strict=True):
+        assert elevation_deg[int(np.floor(row))] + 1e-9 >= there >= elevation_deg[int(np.ceil(row))] - 1e-9
+    assert np.diff(sorted(rows)).min() >= len(elevation_deg) / 6, "their labels do not overlap"
+    assert pictures._elevation_ticks(elevation_deg[:1]) == ([0.0], [f"{elevation_deg[0]:.1f}°"])
 
 
 def test_other_sensors_labels_and_empty_images(images, tmp_path):
@@ -141,6 +155,32 @@ def test_runs_compute_on_the_device_that_is_named(tmp_path):
         view(["simulated:1"], tmp_path / "a.png", surprise_by="pretrained", device="cuda:99")
     assert main(["view", "pretrained", "-o", str(tmp_path / "a.png"), "--device", "cuda:99"]) == 2
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("options", "width"),
+    [
+        ({}, 2048),
+        ({"sensor": "hdl64e_kitti_360"}, 1024),
+        ({"sensor": "hdl64e_kitti_odometry"}, 2048),
+        ({"columns": 512}, 512),
+        ({"sensor": "hdl64e_kitti_odometry", "columns": 512}, 512),
+    ],
+)
+def test_a_page_has_all_columns_of_a_named_sensor_too(options, width):
+    how = {"settings": ScanSettings.read(**options), "all_columns": True}
+    (one,) = load_scan_sets(["simulated:1:val"], 1, **how)
+    assert one.images.range_m.shape == (1, 64, width)
+    model = load_sensor("hdl64e_kitti_odometry")
+    (beside,) = load_scan_sets(["simulated:1:val"], 1, sensor=model, all_columns=True)
+    assert beside.images.sensor.same_rays(model), "a model computes on its own columns only"
+
+
+def test_a_picture_of_too_many_scans_names_the_page(tmp_path):
+    with pytest.raises(ConfigError, match=r"wanted 1 to 8; correct the number, or write an \.html, which takes 100$"):
+        view(["simulated:9"], tmp_path / "a.png", count=9)
+    with pytest.raises(ConfigError, match=r"wanted 1 to 100; correct the number$"):
+        view(["simulated:9"], tmp_path / "a.html", count=101)
 
 
 def test_sets_of_one_name_are_told_apart_and_runs_of_other_rays_reconstruct_nothing(tmp_path):

@@ -19,7 +19,9 @@ import re
 from collections.abc import Iterable, Sequence
 
 _LETTERS_AT_MOST = 600  # of each part of a message: a long path in full, or a few
-_ABSOLUTE_PATH = re.compile(r"(?<![\w.…])(?:~|[A-Za-z]:)?[/\\][^\s,;:)'\"<>]*")
+_ROOT, _LETTERS_OF_A_PATH = r"(?:~|[A-Za-z]:)?[/\\]", r"[^\s,;:)'\"<>]*"
+_ABSOLUTE_PATH = re.compile(rf"(?<![\w.…]){_ROOT}{_LETTERS_OF_A_PATH}")
+_PATH_OF_A_SOURCE = re.compile(rf"(?:^|(?<=:)){_ROOT}[^:]*")  # of NAME:PATH:SPLIT, or alone
 _SURELY_MEANT = 0.85  # of difflib's likeness: one letter wrong, missing or doubled in a name of seven
 
 
@@ -102,14 +104,28 @@ def first_words(error: Exception) -> str:
     return "".join(filter(str.isprintable, " ".join(str(error).split())))[:120] or type(error).__name__
 
 
-def without_folders(text: str) -> str:
+def without_folders(text: str, sources: Iterable[str] = ()) -> str:
     """Return a text in which absolute paths have lost their folders, for pages and files that others will read.
 
+    Args:
+        text: text that may hold paths.
+        sources: sources and paths that the text may name, as the user typed them. Their folders may have any letters;
+            other paths are known only up to the next space, bracket or quotation mark.
+
     Example:
+        >>> without_folders("no scan in /data/jane doe/scans", ["kitti_360:/data/jane doe/scans:train"])
+        'no scan in …/scans'
         >>> without_folders("kitti_360:/data/mine/kitti_360:train against ~/runs/mine/samples")
         'kitti_360:…/kitti_360:train against …/samples'
     """
-    return _ABSOLUTE_PATH.sub(lambda found: "…/" + re.split(r"[/\\]", found[0].rstrip("/\\"))[-1], text)
+
+    def last_name(found: re.Match[str]) -> str:
+        return "…/" + re.split(r"[/\\]", found[0].rstrip("/\\"))[-1]
+
+    paths = [found[0] for source in sources if (found := _PATH_OF_A_SOURCE.search(source.rstrip("/\\")))]
+    for path in sorted(paths, key=len, reverse=True):
+        text = re.sub(rf"(?<![\w.…]){re.escape(path)}{_LETTERS_OF_A_PATH}", last_name, text)
+    return _ABSOLUTE_PATH.sub(last_name, text)
 
 
 def nearest_names(name: str, known: Iterable[str], at_most: int = 3) -> str:

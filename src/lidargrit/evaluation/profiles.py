@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -15,11 +16,9 @@ from lidargrit.projection import points_of_pixels
 HALF_VIEW_M = 50.0  # beyond it a 64-row sensor sees little but walls
 _CELLS = 100  # of 1 m, along each axis
 _BATCH = 16
-_ROWS, _COLUMNS = (
-    32,
-    128,
-)  # pixels that are compared: enough to tell streets apart, and few enough for thousands of pairs
-_GENERATED_AT_MOST, _REAL_AT_MOST = 500, 2000  # scans that are compared one by one: a few seconds
+MATCHED_ROWS, MATCHED_COLUMNS = 32, 128  # pixels compared: enough to tell streets apart, few enough for many pairs
+MATCHED_AT_MOST, SEARCHED_AT_MOST = 500, 10_000  # samples, and reference scans: at most a minute of one core
+_BLOCK = 1000  # reference scans in memory at once, as 16 MB of pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +41,8 @@ class Match:
     """A generated scan and the reference scan that is most like it.
 
     Args:
-        generated: index of the generated scan in its set.
-        real: index of the reference scan in its set.
+        generated: index of the generated scan among those that are compared.
+        real: index of the reference scan among those that are searched.
         distance: mean absolute difference of log2(1 + range in metres) over pixels, where no return counts as 0.
     """
 
@@ -71,26 +70,38 @@ def profile(scans: EvalSet) -> Profile:
     return Profile(mean.numpy(), (returns / len(scans)).numpy(), (cells / len(scans)).view(_CELLS, _CELLS).numpy())
 
 
+def searched_scans(reference: EvalSet) -> EvalSet:
+    """Return the reference with all of its scans in place of those that are compared, to search for nearest ones.
+
+    Of more than 10,000 these are 10,000, evenly spaced.
+    """
+    return replace(reference, indices=evenly_spaced(SEARCHED_AT_MOST, len(reference.images)))
+
+
 def matches(samples: EvalSet, reference: EvalSet) -> list[Match]:
     """Return the nearest reference scan of every generated one, the most alike first.
 
-    Of many scans 500 generated and 2,000 real ones are compared, evenly spaced.
+    Args:
+        samples: set of generated scans; of more than 500 these are 500, evenly spaced.
+        reference: set that is searched, as :func:`searched_scans` returns it.
     """
-    chosen, known = evenly_spaced(_GENERATED_AT_MOST, len(samples)), evenly_spaced(_REAL_AT_MOST, len(reference))
-    distance = torch.cdist(_outlines(samples, chosen), _outlines(reference, known), p=1) / (_ROWS * _COLUMNS)
-    nearest = distance.min(dim=1)
-    found = [
-        Match(generated, known[int(real)], float(apart))
-        for generated, real, apart in zip(chosen, nearest.indices, nearest.values, strict=True)
-    ]
+    chosen = evenly_spaced(MATCHED_AT_MOST, len(samples))
+    ours = _outlines(samples, chosen)
+    distance, nearest = torch.full((len(chosen),), torch.inf), torch.zeros(len(chosen), dtype=torch.int64)
+    for first in range(0, len(reference), _BLOCK):
+        theirs = _outlines(reference, range(first, min(first + _BLOCK, len(reference))))
+        apart, at = (torch.cdist(ours, theirs, p=1) / ours.shape[1]).min(dim=1)
+        nearest = torch.where(apart < distance, first + at, nearest)
+        distance = torch.minimum(apart, distance)
+    found = map(Match, chosen, nearest.tolist(), distance.tolist())
     return sorted(found, key=lambda match: match.distance)
 
 
-def _outlines(scans: EvalSet, indices: list[int]) -> Float[torch.Tensor, "n pixels"]:
+def _outlines(scans: EvalSet, indices: Sequence[int]) -> Float[torch.Tensor, "n pixels"]:
     """Return some pixels of each scan, as logarithms: a metre matters more nearby."""
     sensor = scans.images.sensor
-    rows = torch.linspace(0, sensor.height - 1, _ROWS).round().long()
-    columns = torch.linspace(0, sensor.width - 1, _COLUMNS).round().long()
+    rows = torch.linspace(0, sensor.height - 1, MATCHED_ROWS).round().long()
+    columns = torch.linspace(0, sensor.width - 1, MATCHED_COLUMNS).round().long()
     parts = []
     for first in range(0, len(indices), _BATCH):
         range_m = scans.batch(indices[first : first + _BATCH]).range_m

@@ -7,10 +7,12 @@ a name of this machine is refused, so that no web page elsewhere can reach this 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import ipaddress
 import json
 import re
 import shutil
+import socket
 import tempfile
 import urllib.parse
 from collections.abc import Callable, Iterable
@@ -31,6 +33,7 @@ from lidargrit.serving.worker import NO_ROOM, PAGE_FILE, PIXELS_FILE
 from lidargrit.structures import RangeImage
 
 LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
+ALL_ADDRESSES = frozenset({"0.0.0.0", "::", ""})  # as a host to listen at: every address of this machine
 _WRITERS = {"npz": "numpy_array", "ply": "ply", "bin": "kitti_bin"}  # endings of files to save → formats
 _JOB = re.compile(r"/jobs/([\w-]{1,40})(?:/(scans|(\d{1,3})-(\d{1,3})\.(\w{1,4})))?")
 _HOST = re.compile(r"(?:\[([0-9a-fA-F:.]+)\]|([\w.-]+))(?::\d{1,5})?")
@@ -111,7 +114,9 @@ class Application:
     def _respond(self, environment: Environment) -> Response:
         host = environment.get("HTTP_HOST", "")
         if not is_own(host, self._host):
-            raise RefusedRequestError("403 Forbidden", "This page is not served at this address.")
+            known = "as localhost" if self._host in LOOPBACK_NAMES else "by the numeric address of this machine"
+            why = f"This page is not served under this name: open it {known}, or serve it with --host NAME."
+            raise RefusedRequestError("403 Forbidden", why)
         method, path = environment["REQUEST_METHOD"], environment["PATH_INFO"]
         if method == "GET":
             return self._get(path)
@@ -145,9 +150,9 @@ class Application:
         sensor = SensorModel.from_json(self._queue.models[job.request.model]["rays"])
         with np.load(job.folder / PIXELS_FILE, allow_pickle=False) as pixels:
             range_m = torch.from_numpy(pixels[f"range_m_{scan_set}"][index])
-            reflectance = pixels.get(f"reflectance_{scan_set}")
-        kept = None if reflectance is None else torch.from_numpy(reflectance[index])
-        scan = unproject(RangeImage(range_m, range_m > 0, sensor, kept))
+            kept = [pixels.get(f"{name}_{scan_set}") for name in ("reflectance", "label")]
+        reflectance, label = (None if one is None else torch.from_numpy(one[index]) for one in kept)
+        scan = unproject(RangeImage(range_m, range_m > 0, sensor, reflectance, label))
         try:
             with tempfile.TemporaryDirectory(dir=job.folder) as folder:
                 path = Path(folder) / f"scan.{ending}"
@@ -209,7 +214,8 @@ def is_own(host: str, served_at: str) -> bool:
     """Return whether a request's Host names this machine, and not a foreign name that was made to lead here.
 
     A page served at a loopback address accepts the loopback's names only. A page served elsewhere accepts numeric
-    addresses as well: an attack through somebody's browser needs a name.
+    addresses as well: an attack through somebody's browser needs a name. One served at all addresses also accepts the
+    machine's own name, which nobody else's is.
     """
     parts = _HOST.fullmatch(host)
     if parts is None:
@@ -217,7 +223,14 @@ def is_own(host: str, served_at: str) -> bool:
     name = (parts[1] or parts[2]).lower()
     if served_at in LOOPBACK_NAMES or name in LOOPBACK_NAMES:
         return name in LOOPBACK_NAMES
-    return name == served_at.lower() or _is_number(name)
+    if name == served_at.lower() or _is_number(name):
+        return True
+    return served_at in ALL_ADDRESSES and name in _names_of_this_machine()
+
+
+@functools.cache  # the second may ask a name server, which may take seconds
+def _names_of_this_machine() -> frozenset[str]:
+    return frozenset({socket.gethostname().lower(), socket.getfqdn().lower()})
 
 
 def _is_number(name: str) -> bool:

@@ -129,7 +129,12 @@ class JobQueue:
                 job = self._waiting.popleft()
                 job.state = "running"
             if time.monotonic() - job.polled > self.limits.unpolled_seconds:
-                self._finish(job, "the page no longer asked for it")
+                limit = f"{self.limits.unpolled_seconds:g} seconds"
+                self._finish(
+                    job,
+                    f"got a request that its page did not ask about for {limit}; wanted a page that stays open; "
+                    "press the button again",
+                )
             else:
                 self._finish(job, self._run(job))
 

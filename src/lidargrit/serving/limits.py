@@ -20,7 +20,8 @@ class Limits:
         seconds: longest time that one job may compute; the worker process is ended when it is over.
         start_seconds: longest time that the worker process may take to read the runs.
         waiting: largest number of jobs in the queue; a further client is asked to try again.
-        unpolled_seconds: time after which a waiting job is dropped if its client no longer asks for it.
+        unpolled_seconds: time after which a waiting job is dropped if its client no longer asks for it. Browsers let a
+            hidden tab ask once a minute.
         kept: number of finished results that are kept; the oldest is removed first.
         connections: largest number of open connections, each of which holds at most one upload in memory.
         idle_seconds: time after which a connection is closed if no byte arrives on it.
@@ -32,7 +33,7 @@ class Limits:
     seconds: float = 120.0
     start_seconds: float = 300.0
     waiting: int = 8
-    unpolled_seconds: float = 20.0
+    unpolled_seconds: float = 150.0
     kept: int = 24
     connections: int = 64
     idle_seconds: int = 15

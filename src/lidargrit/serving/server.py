@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import logging
 import socket
 import tempfile
@@ -16,7 +17,7 @@ from waitress.server import create_server
 from lidargrit.errors import ConfigError, LidarGritError, OutputError
 from lidargrit.generators import load
 from lidargrit.run_folder import PACKAGED, is_run
-from lidargrit.serving.application import LOOPBACK_NAMES, Application
+from lidargrit.serving.application import ALL_ADDRESSES, LOOPBACK_NAMES, Application
 from lidargrit.serving.jobs import JobQueue
 from lidargrit.serving.limits import Limits
 
@@ -64,12 +65,14 @@ def serve(
         LidarGritError: a run that cannot be read.
     """
     with open_server(runs, host, port, device, limits) as server:
+        name = socket.gethostname() if host in ALL_ADDRESSES else host
         if host not in LOOPBACK_NAMES:
             say(
-                f"WARNING: everybody who reaches {host} can use this machine's processor and memory, without a password"
+                f"WARNING: everybody who reaches {name} can use this machine's processor and memory, without a password"
             )
-        name = f"[{host}]" if ":" in host else host
-        say(f"open http://{name}:{server.port} in a browser; Ctrl-C ends it")
+        more = " (where this name is not known, at this machine's numeric address)" if host in ALL_ADDRESSES else ""
+        url = f"http://[{name}]:{server.port}" if ":" in name else f"http://{name}:{server.port}"
+        say(f"open {url} in a browser{more}; Ctrl-C ends it")
         server.run()
 
 
@@ -153,8 +156,8 @@ def _listening(host: str, port: int) -> socket.socket:
         return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
     except OSError as error:
         reason = str(error.strerror).partition(" (")[0]
-        raise OutputError(
-            f"{host} port {port}, where nothing can be served ({reason})",
-            "an address of this machine, and a port that is free",
-            "choose another one by --port",
-        ) from None
+        got = f"{host} port {port}, where nothing can be served ({reason})"
+        if error.errno in (errno.EADDRINUSE, errno.EACCES):  # taken, or one of those kept for the administrator
+            raise OutputError(got, "a port that is free", "choose another one by --port") from None
+        cure = "choose another one by --host, such as 127.0.0.1 for this machine only"
+        raise OutputError(got, "an address or a name of this machine", cure) from None

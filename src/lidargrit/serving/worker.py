@@ -27,19 +27,21 @@ from lidargrit.completion.inputs import InputScan, ScanReader
 from lidargrit.completion.sparse import SparseReader, observed_rows
 from lidargrit.conditions import Condition
 from lidargrit.conditions.patterns import Pattern
-from lidargrit.errors import ConfigError, LidarGritError, OutputError, ScanError, UsageError
+from lidargrit.errors import ConfigError, LidarGritError, OutputError, ScanError, UsageError, one_of
 from lidargrit.files import atomic_path, write_text
 from lidargrit.generators import Generator, load
 from lidargrit.nn.devices import usable_device
 from lidargrit.projection import ProjectionVariant
+from lidargrit.projection.fit import has_few_rings, ring_count
 from lidargrit.run_folder import locate, projection_variant
 from lidargrit.sensors import load_sensor
 from lidargrit.serving.requests import TASKS, UPSAMPLED, SampleRequest, sampling_settings
-from lidargrit.structures import RangeImage
+from lidargrit.structures import RangeImage, Scan
 from lidargrit.viewer.interactive import page_data
 from lidargrit.viewer.scan_sets import ScanSet
 
 PAGE_FILE, PIXELS_FILE = "page.json", "pixels.npz"  # of a result: for the page, and for files to save
+_NOT_ON_THE_PAGE = ("lidargrit ", "--", "data.", "sensor")  # words of cures that the page does not offer
 NO_ROOM = OutputError(
     "no room on the server's disk for this scan", "some free space in its temporary folder", "try again later"
 )
@@ -134,7 +136,7 @@ def compute_result(generator: Generator, request: SampleRequest, variant: Projec
     if not request.file:
         names = tuple(f"seed {seed}" for seed in seeds)
         return [ScanSet("generated", generator.sample(seeds, sampling).to("cpu"), names)]
-    seen = _read_upload(request, _reader(request, generator, variant))
+    seen = _read_upload(request, generator, _reader(request, generator, variant))
     image = RangeImage.stack([seen.image])
     sets = [ScanSet("as uploaded", image, (request.name,))]
     if "complete" not in generator.capabilities:
@@ -161,14 +163,32 @@ def _reader(request: SampleRequest, generator: Generator, variant: ProjectionVar
     return ScanReader(generator.sensor, variant, partial=completes and request.task == "returns")
 
 
-def _read_upload(request: SampleRequest, reader: ScanReader) -> InputScan:
+def _read_upload(request: SampleRequest, generator: Generator, reader: ScanReader) -> InputScan:
     """Read and project an uploaded file; messages give its name on the client's side, not its path on the server."""
     path = Path(request.file)
     try:
-        return reader.read(dataclasses.replace(formats.read_scan(path, bad_points="drop"), source=request.name))
+        scan = dataclasses.replace(formats.read_scan(path, bad_points="drop"), source=request.name)
     except LidarGritError as error:
         parts = [part.replace(str(path), request.name) for part in (error.got, error.wanted, error.cure)]
         raise type(error)(*parts) from None
+    try:
+        return reader.read(scan)
+    except LidarGritError as error:
+        if not any(words in error.cure for words in _NOT_ON_THE_PAGE):
+            raise
+        raise type(error)(error.got, error.wanted, _cure_on_the_page(request, generator, scan)) from None
+
+
+def _cure_on_the_page(request: SampleRequest, generator: Generator, scan: Scan) -> str:
+    """Return what somebody can do on the page about a scan that another sensor made, or that has other rows."""
+    if request.task in UPSAMPLED:
+        return "choose the task that names the sensor of the scan, or choose another scan"
+    if has_few_rings(scan, generator.sensor):
+        rings = ring_count(scan)
+        tasks = [task for task in UPSAMPLED if load_sensor(task).height == rings and _can(generator, task)]
+        if tasks:
+            return f"choose the task {one_of([repr(TASKS[task]) for task in tasks])}, or a model of the scan's sensor"
+    return "choose a model of the sensor that made the scan, or choose another scan"
 
 
 def _observed(request: SampleRequest, seen: InputScan) -> Bool[Tensor, "H W"]:
@@ -203,6 +223,8 @@ def _answer_request(
             pixels[f"range_m_{index}"] = scans.images.range_m.numpy()
             if scans.images.reflectance is not None:
                 pixels[f"reflectance_{index}"] = scans.images.reflectance.numpy()
+            if scans.images.label is not None:
+                pixels[f"label_{index}"] = scans.images.label.numpy()
         try:
             write_text(folder / PAGE_FILE, json.dumps(page_data(sets)))
             with atomic_path(folder / PIXELS_FILE) as temporary, temporary.open("wb") as file:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from lidargrit.viewer.scan_sets import SURPRISED_BITS
 SCANS_AT_MOST = 8  # scans of a group; more make a picture that no viewer shows well
 _DOTS_PER_INCH = 100  # 1400 pixels across: a laptop shows the picture without shrinking it
 _WIDTH, _ROW, _HEAD, _FOOT = 14.0, 2.95, 0.75, 0.95  # inches: the picture, one scan of one group, title, colour bars
+_TICKS_AT_LEAST, _TICKS_AT_MOST = 3, 6  # of elevation: enough to read a row's by, and words that do not overlap
 _SURPRISE_NOTE = f"\nsurprise: black = as expected or less,\nyellow = {SURPRISED_BITS:g} bits more or beyond"
 
 
@@ -86,7 +88,7 @@ class _Panel:
     range_m: Float[np.ndarray, "H W"]
     return_mask: Bool[np.ndarray, "H W"]
     points_xyz_m: Float[np.ndarray, "n 3"]
-    elevation_deg: tuple[float, float]  # of the top and the bottom row
+    elevation_deg: Float[np.ndarray, " H"]
     surprise: Float[np.ndarray, "H W"] | None = None
 
 
@@ -139,13 +141,12 @@ def _check(groups: dict[str, RangeImage], max_range_m: float | None) -> None:
 
 def _panel(images: RangeImage, index: int, title: str) -> _Panel:
     image = (images[index] if images.range_m.ndim == 3 else images).to("cpu")
-    elevation_deg = image.sensor.elevation_rad.mean(dim=1).rad2deg()
     return _Panel(
         title,
         image.range_m.detach().numpy(),
         image.return_mask.numpy(),
         points_of_pixels(image).detach()[image.return_mask].numpy(),
-        (float(elevation_deg[0]), float(elevation_deg[-1])),
+        image.sensor.elevation_rad.double().mean(dim=1).rad2deg().numpy(),
     )
 
 
@@ -156,8 +157,8 @@ def _plot_row(figure: Figure, height: float, bottom: float, panel: _Panel, scale
         return figure.add_axes((left / _WIDTH, (bottom + up) / height, wide / _WIDTH, tall / height))
 
     # A revolution is 13 times as wide as the rows are high; rows are plotted about twice as tall, to be seen.
-    highest, lowest = panel.elevation_deg
-    extent = (180.0, -180.0, min(lowest, highest - 1), highest)  # a single row has a height, too
+    # All rows are equally high, though few sensors have equal steps of elevation: so up the picture go row numbers.
+    extent = (180.0, -180.0, len(panel.elevation_deg) - 0.5, -0.5)
     ranges = axes(0.75, 1.55, 9.9, 1.05)
     shown = np.ma.masked_where(~panel.return_mask, panel.range_m)
     colours, norm = scales.range_colours, scales.range_norm
@@ -175,7 +176,7 @@ def _plot_row(figure: Figure, height: float, bottom: float, panel: _Panel, scale
     mask.set_xlabel("azimuth, counter-clockwise from forward", fontsize=10, labelpad=0)
     mask.set_xticks(np.arange(180, -181, -45), [f"{d}°" for d in range(180, -181, -45)], fontsize=9)
     for axis, name in ((ranges, "range"), (mask, "return mask" if panel.surprise is None else "surprise")):
-        axis.set_yticks([0, -10, -20], ["0°", "−10°", "−20°"], fontsize=9)
+        axis.set_yticks(*_elevation_ticks(panel.elevation_deg), fontsize=9)
         axis.set_ylabel(name, fontsize=10)
     view = axes(11.3, 0.45, 2.25, 2.25)
     x, y, z = panel.points_xyz_m.T
@@ -190,6 +191,24 @@ def _plot_row(figure: Figure, height: float, bottom: float, panel: _Panel, scale
     view.tick_params(labelsize=9)
     view.set_ylabel("forward [m]", fontsize=10, labelpad=0)
     view.set_xlabel("left [m]", fontsize=10, labelpad=0)
+
+
+def _elevation_ticks(elevation_deg: Float[np.ndarray, " H"]) -> tuple[list[float], list[str]]:
+    """Return at which rows round elevations lie, between two rows where need be, and their labels."""
+    from_below = elevation_deg[::-1], np.arange(len(elevation_deg))[::-1]
+    low, high = float(elevation_deg.min()), float(elevation_deg.max())
+    ticks: dict[float, int] = {}  # row → degrees
+    for step in (10, 5, 2, 1):  # finer steps only where the sensor spans too few of the coarse ones
+        if len(ticks) >= _TICKS_AT_LEAST:
+            break
+        inside = range(math.ceil(low / step) * step, math.floor(high / step) * step + 1, step)
+        for degrees in sorted(inside, key=abs):
+            row = float(np.interp(degrees, *from_below))
+            if all(abs(row - other) * _TICKS_AT_MOST >= len(elevation_deg) for other in ticks):
+                ticks[row] = degrees
+    if not ticks:  # a single row, or a few within a degree
+        return [0.0], [f"{elevation_deg[0]:.1f}°".replace("-", "−")]
+    return list(ticks), [f"{degrees}°".replace("-", "−") for degrees in ticks.values()]
 
 
 def _plot_scales(figure: Figure, height: float, scales: _Scales, more: str = "") -> None:

@@ -4,16 +4,27 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import fields, replace
 from html import escape
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import without_folders
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
-from lidargrit.evaluation.profiles import HALF_VIEW_M, Match, Profile, matches, profile
-from lidargrit.evaluation.scorecard import NOT_APPLICABLE, EvalSetRecord, Scorecard
+from lidargrit.evaluation.profiles import (
+    HALF_VIEW_M,
+    MATCHED_COLUMNS,
+    MATCHED_ROWS,
+    Match,
+    Profile,
+    matches,
+    profile,
+    searched_scans,
+)
+from lidargrit.evaluation.scorecard import NOT_APPLICABLE, EvalSetRecord, LeftOut, Scorecard
 from lidargrit.files import write_text
 from lidargrit.viewer._page import document, figure
 from lidargrit.viewer.report_charts import line_chart
@@ -25,7 +36,7 @@ from lidargrit.viewer.report_pictures import (
     rate_picture,
 )
 from lidargrit.viewer.report_style import STYLE
-from lidargrit.viewer.score_table import score_table
+from lidargrit.viewer.score_table import REAL_AGAINST_REAL, score_table
 
 _MATCHES = 3  # best, and as many worst
 _SHEET = 12  # samples on the sheet
@@ -48,28 +59,52 @@ def write_report(card: Scorecard, pair: EvalPair, path: Path) -> None:
 
 def page(card: Scorecard, pair: EvalPair) -> str:
     """Return the page as text; foreign text is escaped, and absolute paths lose their folders."""
+    card, without_raydrop = _for_others(card, pair.without_raydrop())
     limits_m = _limits_m(pair)
     both = profile(pair.samples), profile(pair.reference)
-    found = matches(pair.samples, pair.reference)
     parts = [
         _head(card),
         _notes("Read this first", [*card.warnings], "warning"),
         _notes(f"Not as in the protocol {card.protocol}", [*card.deviations], "warning"),
         _scores(card),
-        _matches(found, pair, limits_m),
+        _matches(pair.samples, searched_scans(pair.reference), limits_m),
         _means(both, limits_m),
-        _rings(both, pair.without_raydrop()),
+        _rings(both, without_raydrop),
         _densities(both),
         _sheet(pair.samples, limits_m),
         _settings(card),
     ]
-    title = without_folders(f"{card.samples.source} against {card.reference.source}")
-    return document(title, STYLE, "\n".join(part for part in parts if part), images="data:")
+    return document(
+        f"{card.samples.source} against {card.reference.source}",
+        STYLE,
+        "\n".join(part for part in parts if part),
+        images="data:",
+    )
+
+
+def _for_others(card: Scorecard, without_raydrop: str) -> tuple[Scorecard, str]:
+    """Return scores and a sentence without the folders of the user's machine, for a page that others may see."""
+    files = map(str, (card.settings.get("sensor", ""), *card.settings.get("weights", {}).values()))
+    sources = [card.samples.source, card.reference.source, *files]
+
+    def changed(value: Any) -> Any:
+        if isinstance(value, str):
+            return without_folders(value, sources)
+        if isinstance(value, (list, tuple)):
+            return type(value)(map(changed, value))
+        if isinstance(value, dict):
+            return {changed(name): changed(of) for name, of in value.items()}
+        if isinstance(value, (EvalSetRecord, LeftOut)):
+            return replace(value, **{one.name: changed(getattr(value, one.name)) for one in fields(value)})
+        return value
+
+    names = ("samples", "reference", "left_out", "deviations", "warnings", "settings")
+    return replace(card, **{name: changed(getattr(card, name)) for name in names}), changed(without_raydrop)
 
 
 def _head(card: Scorecard) -> str:
     rows = "".join(
-        f'<tr><th scope="row">{name}</th><td>{_escaped(scans.source)}</td><td>{escape(_kind(scans))}</td>'
+        f'<tr><th scope="row">{name}</th><td>{escape(scans.source)}</td><td>{escape(_kind(scans))}</td>'
         f"<td>{scans.scans_used:,} of {scans.scans:,}</td><td>{escape(scans.sensor)}</td>"
         f"<td>{escape(scans.projection)}</td></tr>"
         for name, scans in (("samples", card.samples), ("reference", card.reference))
@@ -85,30 +120,23 @@ def _head(card: Scorecard) -> str:
     )
 
 
-def _escaped(text: str) -> str:
-    """Return text of the user's machine for a page that others may see."""
-    return escape(without_folders(text))
-
-
 def _kind(scans: EvalSetRecord) -> str:
     return " ".join(word for word in (scans.data_set or "not known", scans.split) if word)
 
 
 def _notes(title: str, lines: Sequence[str], kind: str) -> str:
-    items = "".join(f"<li>{_escaped(line)}</li>" for line in lines)
+    items = "".join(f"<li>{escape(line)}</li>" for line in lines)
     return f'<section class="{kind}"><h2>{escape(title)}</h2><ul>{items}</ul></section>' if lines else ""
 
 
 def _scores(card: Scorecard) -> str:
     not_applicable = [each for each in card.left_out if each.verdict == NOT_APPLICABLE]
-    left_out = "".join(f"<li><b>{escape(each.metric)}</b>: {_escaped(each.why)}</li>" for each in card.left_out)
+    left_out = "".join(f"<li><b>{escape(each.metric)}</b>: {escape(each.why)}</li>" for each in card.left_out)
     return (
         f"<section><h2>Scores</h2>{score_table(card.scores, not_applicable)}<p>The dot is the score and the bar its "
-        "95 % interval. The upright dashed line is <i>real against real</i>: the score of one half of the reference "
-        "against its other half. No generator can be expected to do better. The halves are smaller than the sets, and "
-        "most metrics fall as sets grow, so a good score may still lie below this line. The square, where there is "
-        "one, is <i>pixel statistics</i>: scans each of whose pixels comes from another real scan. Any model has to "
-        "beat it. Every chart begins at 0 and has its own scale.</p>"
+        f"95 % interval. The upright dashed line is <i>real against real</i>: {REAL_AGAINST_REAL}. The square, where "
+        "there is one, is <i>pixel statistics</i>: scans each of whose pixels comes from another real scan. Any model "
+        "has to beat it. Every chart begins at 0 and has its own scale.</p>"
         + (f"<h3>Left out</h3><ul>{left_out}</ul>" if left_out else "")
         + "</section>"
     )
@@ -134,36 +162,39 @@ def _name(scans: EvalSet, index: int) -> str:
     """Return the end of a scan's path as its name: the folders before it are the user's, and alike for all scans."""
     names = scans.images.provenance.names
     index = scans.indices[index]
-    name = names[index] if index < len(names) else f"scan {index}"
-    if without_folders(name) != name:
-        name = "/".join(name.split("/")[-3:])
+    name = without_folders(names[index], [scans.source]) if index < len(names) else f"scan {index}"
     while len(name) > _NAME and "/" in name:
         name = name.partition("/")[2]
     return name[-_NAME:]
 
 
-def _matches(found: Sequence[Match], pair: EvalPair, limits_m: tuple[float, float]) -> str:
+def _matches(samples: EvalSet, searched: EvalSet, limits_m: tuple[float, float]) -> str:
     """Return the samples that are most and least like any reference scan, each beside that scan."""
+    found = matches(samples, searched)
 
     def pairs(some: Sequence[Match]) -> str:
         return "".join(
             '<div class="pair">'
-            + _scan(pair.samples, match.generated, limits_m, _name(pair.samples, match.generated))
+            + _scan(samples, match.generated, limits_m, _name(samples, match.generated))
             + _scan(
-                pair.reference,
+                searched,
                 match.real,
                 limits_m,
-                f"nearest, at {match.distance:.3f}: {_name(pair.reference, match.real)}",
+                f"nearest, at {match.distance:.3f}: {_name(searched, match.real)}",
             )
             + "</div>"
             for match in some
         )
 
     why = (
-        "Each sample stands on the left, and the reference scan that is most like it on the right. The distance of two "
-        "scans is the mean absolute difference of log2(1 + range in metres) over all pixels. Yellow is near "
+        "Each sample stands on the left, and the reference scan that is most like it on the right. For "
+        f"{len(found):,} of the {len(samples):,} samples the nearest was searched among {len(searched):,} of the "
+        f"{len(searched.images):,} reference scans that were read, whether the metrics compare them or not. The "
+        "distance of two scans is the mean absolute difference of log2(1 + range in metres) over "
+        f"{MATCHED_ROWS} x {MATCHED_COLUMNS} evenly spaced pixels, where no return counts as 0 m. Yellow is near "
         f"({limits_m[0]:.1f} m), violet is far ({limits_m[1]:.0f} m), and light grey marks rays without a return. A "
-        "distance near 0 means that the model memorised a scan, or that one scan is in both sets."
+        "distance near 0 means that the model memorised a scan, or that one scan is in both sets. Scans that were not "
+        "searched, such as training scans outside of the reference, may be nearer."
     )
     best, worst = found[:_MATCHES], found[_MATCHES:][-_MATCHES:][::-1]
     text = f"<section><h2>Nearest neighbours</h2><p>{why}</p><h3>The best matches</h3>{pairs(best)}"
@@ -186,7 +217,7 @@ def _means(both: tuple[Profile, Profile], limits_m: tuple[float, float]) -> str:
 def _rings(both: tuple[Profile, Profile], without_raydrop: str) -> str:
     if without_raydrop:
         sentence = f"{NOT_APPLICABLE}: {without_raydrop}"
-        return f"<section><h2>Return rate by ring</h2><p>{_escaped(sentence[0].upper() + sentence[1:])}.</p></section>"
+        return f"<section><h2>Return rate by ring</h2><p>{escape(sentence[0].upper() + sentence[1:])}.</p></section>"
     rates = {name: scans.return_rate.mean(axis=1) for name, scans in zip(("samples", "reference"), both, strict=True)}
     count = len(rates["samples"])
     chart = line_chart(rates, "ring, 0 = the highest", "return rate", range(0, count, max(1, count // 8)))
@@ -234,7 +265,7 @@ def _settings(card: Scorecard) -> str:
     departures = _notes(
         "Where this program departs from the protocol's source", [*card.about.get("departures", [])], "note"
     )
-    text = escape("\n".join(map(without_folders, json.dumps(data, indent=2, ensure_ascii=False).split("\n"))))
+    text = escape(json.dumps(data, indent=2, ensure_ascii=False))
     return (
         f"{departures}<section><h2>Settings</h2><details><summary>Every setting, hash and version</summary>"
         f'<pre tabindex="0">{text}</pre></details><p><span class="swatch" style="background:{NO_RETURN}"></span> '

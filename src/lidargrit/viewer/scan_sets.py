@@ -68,7 +68,8 @@ def load_scan_sets(
         reporter: receiver of messages about scans that are left out.
         sensor: sensor to project scans with if the settings name none; those of runs and samples keep theirs.
         all_columns: whether scans are shown with all columns that their sensor fires, up to 200,000 pixels; otherwise
-            with those that its image keeps. It has no effect if a sensor is named, nor beside samples and runs.
+            with those that its image keeps. It has no effect if the settings give a number of columns, beside samples
+            and runs, nor with a ``sensor``.
         device: device that runs compute on; a GPU if there is one and none is named.
 
     Raises:
@@ -82,14 +83,17 @@ def load_scan_sets(
     runs, chosen = [source for source in opened if isinstance(source, RunSource)], usable_device(device)
     generators = {source.text: source.generator.to(chosen) for source in runs}
     of_runs = (generator.sensor for generator in generators.values())
-    sensor = settings.load_sensor() or sensor or next(of_runs, None)
+    named = settings.load_sensor()
+    scans_alone = sensor is None and all(isinstance(source, DatasetSource) for source in opened)
+    fine = all_columns and scans_alone and not config.columns
+    sensor = named or sensor or next(of_runs, None)
     if sensor is None:
         imaged = (source for source in opened if not isinstance(source, (DatasetSource, RunSource)))
         sensor = next((source.sensor for source in imaged), None)
     sets: list[ScanSet] = []
     for source in opened:
         if not isinstance(source, RunSource):
-            rays = _fine(source.sensor) if sensor is None and all_columns else sensor
+            rays = _fine(named or config.imaged(source.sensor)) if fine else sensor
             how = (count, rays, config, reporter)
             read = _of_scans(source, *how) if isinstance(source, DatasetSource) else _of_images(source, *how)
             sets.append(replace(read, name=_short(source.text)))

@@ -11,6 +11,10 @@ from lidargrit.evaluation.verdict import counted_first, verdict
 from lidargrit.metrics import load_metric
 from lidargrit.viewer.report_charts import score_chart
 
+REAL_AGAINST_REAL = (
+    "the score of one half of the reference against its other half. No generator can be expected to do better. The "
+    "halves are smaller than the sets, and most metrics fall as sets grow, so a good score may still lie below it"
+)
 _HEADS = ("metric", "score", "95 % interval", "real against real", "pixel statistics", "chart", "better")
 
 

@@ -52,7 +52,8 @@ def view(
     is_page = out.suffix.lower() == ".html"
     at_most = PAGE_SCANS_AT_MOST if is_page else SCANS_AT_MOST
     if not 1 <= count <= at_most:
-        raise ConfigError(f"{count} scans of each set", f"1 to {at_most}", "correct the number")
+        other = "" if is_page else f", or write an .html, which takes {PAGE_SCANS_AT_MOST}"
+        raise ConfigError(f"{count} scans of each set", f"1 to {at_most}", f"correct the number{other}")
     model = load(surprise_by).to(usable_device(device)) if surprise_by else None
     rays = None if model is None else model.sensor
     sets = load_scan_sets(sources, count, seed, settings, reporter, rays, is_page, device)

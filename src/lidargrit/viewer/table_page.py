@@ -7,10 +7,12 @@ from collections.abc import Sequence
 from html import escape
 from typing import Any
 
+from lidargrit.errors import without_folders
 from lidargrit.evaluation.scorecard import format_value
 from lidargrit.evaluation.verdict import MEMORISED, PIXEL_STATISTICS
 from lidargrit.viewer._page import document
 from lidargrit.viewer.report_style import STYLE
+from lidargrit.viewer.score_table import REAL_AGAINST_REAL
 
 _COSTS = {
     "parameters": "parameters",
@@ -67,11 +69,17 @@ def table_page(cells: Sequence[dict[str, Any]], flops: float) -> str:
         tables.setdefault(_comparable(cell), []).append(cell)
     apart = "" if len(tables) < 2 else " Systems compared with other scans, or by another sensor, have their own table."
     content = (
-        f"<h1>{len(cells)} systems</h1>\n"
+        f"<h1>{_systems(len(cells))}</h1>\n"
         f"<p>{escape(budget)}. Brackets hold 95 % intervals over scans. Click on a head to sort. Lower is better where "
-        f"nothing else is said. A cost that is not known is -.{apart}</p>\n{''.join(map(_table, tables.values()))}"
+        f"nothing else is said. A cost that is not known is -.{apart}</p>\n"
+        f"<p><em>Real against real</em>, below each table, is {REAL_AGAINST_REAL}. Behind it, n is the number of scans "
+        f"in a half.</p>\n{''.join(map(_table, tables.values()))}"
     )
-    return document(f"{len(cells)} systems compared", STYLE + _LOOKS, content, _SCRIPT)
+    return document(f"{_systems(len(cells))} compared", STYLE + _LOOKS, content, _SCRIPT)
+
+
+def _systems(count: int) -> str:
+    return f"{count} {'system' if count == 1 else 'systems'}"
 
 
 def _comparable(cell: dict[str, Any]) -> tuple[str, str, int]:
@@ -88,7 +96,8 @@ def _table(cells: Sequence[dict[str, Any]]) -> str:
     reference = cells[0]["scores"]["inputs"]["reference"]
     return (
         f"<p>{int(reference['scans_used']):,} samples of each against as many scans of "
-        f"{escape(str(reference['source']))}, {escape(str(reference['sensor']))}</p>\n{_told(cells)}"
+        f"{escape(_without_folders(str(reference['source']), cells))}, {escape(str(reference['sensor']))}</p>\n"
+        f"{_told(cells)}"
         '<div class="wide" tabindex="0" role="region" aria-label="scores and costs"><table><thead><tr>'
         f"{head}</tr></thead><tbody>{body}</tbody><tfoot>{_real_against_real(cells, columns)}</tfoot></table></div>\n"
     )
@@ -101,7 +110,7 @@ def _told(cells: Sequence[dict[str, Any]]) -> str:
     for cell in cells:
         scores, system = cell["scores"], str(cell["system"])
         for line in (*scores.get("warnings", ()), *scores.get("deviations", ())):
-            said["warning"].setdefault(str(line), []).append(system)
+            said["warning"].setdefault(_without_folders(str(line), cells), []).append(system)
         if (verdict := scores.get("verdict")) and system not in (PIXEL_STATISTICS, MEMORISED):
             said["note"].setdefault(" ".join(map(str, verdict)), []).append(system)
     return "".join(
@@ -111,6 +120,12 @@ def _told(cells: Sequence[dict[str, Any]]) -> str:
         for kind, title in kinds.items()
         if said[kind]
     )
+
+
+def _without_folders(text: str, cells: Sequence[dict[str, Any]]) -> str:
+    """Return a text without the folders of the user's machine, for a page that others may see."""
+    inputs = (scans for cell in cells for scans in cell["scores"]["inputs"].values())
+    return without_folders(text, {str(scans["source"]) for scans in inputs})
 
 
 def _column(score: dict[str, Any]) -> tuple[str, str]:
@@ -142,9 +157,11 @@ def _number(value: int | float | None) -> str:
 
 
 def _real_against_real(cells: Sequence[dict[str, Any]], columns: Sequence[tuple[str, str]]) -> str:
-    values = {}
+    values, sizes = {}, set()
     for score in (score for cell in cells for score in cell["scores"]["scores"]):
         if score["real_against_real"] is not None:
             values[_column(score)] = score["real_against_real"]["value"]
+            sizes.add(int(score["real_against_real"]["num_scans"]))
     row = [f'<td class="number">{format_value(values[column]) if column in values else ""}</td>' for column in columns]
-    return f'<tr><th scope="row">real against real</th>{"".join(row)}<td colspan="{len(_COSTS)}"></td></tr>'
+    size = f" <small>(n = {' or '.join(f'{one:,}' for one in sorted(sizes))})</small>" if sizes else ""
+    return f'<tr><th scope="row">real against real{size}</th>{"".join(row)}<td colspan="{len(_COSTS)}"></td></tr>'

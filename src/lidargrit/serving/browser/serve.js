@@ -149,7 +149,7 @@ class Desk {
     return asked("/generate", { method: "POST", body: JSON.stringify(request) });
   }
 
-  complete() {
+  async complete() {
     const [file] = el("file").files;
     if (file.size > this.limits.uploadBytes) {
       throw new Error(`The file has ${file.size.toLocaleString("en")} bytes; at most ${this.limits.uploadBytes.toLocaleString("en")} are taken.`);
@@ -158,7 +158,13 @@ class Desk {
     if (this.draws && this.region) {
       request.region = this.region.map((share) => Number(share.toFixed(4)));
     }
-    return asked(`/complete?request=${encodeURIComponent(JSON.stringify(request))}`, { method: "POST", body: file });
+    let body;
+    try {
+      body = await file.arrayBuffer(); // else fetch fails as it does for a server that has ended
+    } catch {
+      throw new Error(`${file.name} has changed since you chose it, or can no longer be read. Choose it again.`);
+    }
+    return asked(`/complete?request=${encodeURIComponent(JSON.stringify(request))}`, { method: "POST", body });
   }
 
   async submit(event, begin) {

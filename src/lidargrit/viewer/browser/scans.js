@@ -100,7 +100,7 @@ const POSITIONS = {
   height: (source, scan, points, [low, high]) => (pixel) => (points[4 * pixel + 2] - low) / (high - low),
   reflectance: (source, scan) => scan.reflectance && ((pixel) => scan.reflectance[pixel] / 255),
   surprise: (source, scan) => scan.surprise && ((pixel) => scan.surprise[pixel] / 255),
-  ring: (source) => (pixel) => Math.floor(pixel / source.width) / (source.height - 1),
+  ring: (source) => (pixel) => Math.floor(pixel / source.width) / Math.max(1, source.height - 1),
 };
 
 // Red, green, blue and opacity of every pixel, for points and for the range image alike.

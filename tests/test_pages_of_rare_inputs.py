@@ -1,0 +1,54 @@
+"""Pages in a browser, with inputs that are rare: a sensor of one row, and a file that changes after it was chosen."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+import lidargrit
+from browser import CHROMIUM, Browser
+from lidargrit.formats import load
+from lidargrit.sensors import load_sensor
+from lidargrit.structures import RangeImage
+from lidargrit.viewer.interactive import write_page
+from lidargrit.viewer.scan_sets import ScanSet
+from served import running
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    if CHROMIUM is None:
+        pytest.skip("needs Chromium")
+    opened = Browser(tmp_path_factory.mktemp("profile"))
+    yield opened
+    opened.close()
+
+
+def test_a_sensor_of_one_row_is_coloured_by_its_row(browser, tmp_path):
+    sensor = load_sensor("hdl64e_kitti_odometry").with_columns(256)
+    sensor = replace(sensor, elevation_rad=sensor.elevation_rad[:1])
+    images = RangeImage(torch.full((1, 1, 256), 9.0), torch.ones(1, 1, 256, dtype=torch.bool), sensor)
+    write_page([ScanSet("one row", images, ("a",))], tmp_path / "page.html")
+    browser.open(tmp_path / "page.html")
+    browser.run(
+        "((one) => { one.value = 'ring'; one.dispatchEvent(new Event('change')); })(document.querySelector('#mode'))"
+    )
+    browser.settle()
+    assert browser.run("document.querySelector('#legend').textContent").startswith("top row")
+    assert browser.troubles() == []
+
+
+def test_a_file_that_changed_after_it_was_chosen_is_told_apart_from_a_dead_server(browser, tmp_path):
+    path = tmp_path / "mine.ply"
+    load("ply").write(path, lidargrit.simulate(seed=5))
+    with running(tmp_path / "runs") as served:
+        browser.send("Page.navigate", url=served.url)
+        browser.wait("document.readyState === 'complete' && typeof desk !== 'undefined' && desk !== null")
+        root = browser.send("DOM.getDocument")["root"]["nodeId"]
+        node = browser.send("DOM.querySelector", nodeId=root, selector="#file")["nodeId"]
+        browser.send("DOM.setFileInputFiles", files=[str(path)], nodeId=node)
+        path.write_bytes(path.read_bytes() + b" ")
+        browser.click("#complete")
+        browser.wait("!document.querySelector('#error').hidden")
+        told = browser.run("document.querySelector('#error').textContent")
+    assert told == "mine.ply has changed since you chose it, or can no longer be read. Choose it again."
