@@ -18,7 +18,6 @@ from lidargrit.errors import ConfigError
 from lidargrit.nn.blocks import Block, Network, zeroed
 from lidargrit.nn.convolution import Convolution, wrapped
 
-_GROUPS = 32  # of every norm, as in the reference; so channels are multiples of it
 _LONGEST_PERIOD = 10_000  # of the waves that tell the time step, as in the reference
 _BLOCKS_AT_MOST = 100  # residual blocks of a level; the published network has 2
 
@@ -28,14 +27,16 @@ class LatentUnetConfig:
     """Sizes of the network; the defaults are the published ones.
 
     Args:
-        channels: number of channels of the finest level, a multiple of 32; the embedding of the time step has four
-            times as many.
+        channels: number of channels of the finest level, a multiple of ``norm_groups``; the embedding of the time step
+            has four times as many.
         channel_multipliers: channels of each level over those of the finest, from fine to coarse; each further level
             halves rows and columns.
         residual_blocks: number of residual blocks of each level on the way down; on the way up there is one more.
         attention_levels: numbers of the levels with attention after each block, the finest level being 0. The middle of
             the network has attention besides.
         head_channels: number of channels of an attention head.
+        norm_groups: number of groups of every group norm. A group of one channel loses its mean over the image, and a
+            network of such groups cannot see whether latents are too high or too low as a whole.
     """
 
     channels: int = 256
@@ -43,11 +44,14 @@ class LatentUnetConfig:
     residual_blocks: int = 2
     attention_levels: tuple[int, ...] = (0, 1, 2)
     head_channels: int = 32
+    norm_groups: int = 32
 
     def __post_init__(self) -> None:
-        if self.channels < _GROUPS or self.channels % _GROUPS:
+        if self.norm_groups < 1 or self.channels < 2 or self.channels % 2 or self.channels % self.norm_groups:
             raise ConfigError(
-                f"channels={self.channels}", f"a positive multiple of {_GROUPS}", "the norms share 32 groups: round up"
+                f"channels={self.channels} in norm_groups={self.norm_groups}",
+                "a positive even number of channels, a multiple of the groups",
+                "change one of them",
             )
         multipliers = self.channel_multipliers
         if not 1 <= len(multipliers) <= 16 or min(multipliers) < 1 or not 1 <= self.residual_blocks <= _BLOCKS_AT_MOST:
@@ -107,7 +111,7 @@ class LatentUnet(Network):
                 self.input_blocks.append(_Steps([_Halve(width)]))
                 passed.append(width)
         self.middle_block = _Steps(
-            [_Residual(width, width, embedding), _Attention(width, config), _Residual(width, width, embedding)]
+            [_Residual(width, width, config), _Attention(width, config), _Residual(width, width, config)]
         )
         self.output_blocks = nn.ModuleList()
         for level, multiplier in reversed([*enumerate(config.channel_multipliers)]):
@@ -118,7 +122,7 @@ class LatentUnet(Network):
                     steps.append(_Double(width))
                 self.output_blocks.append(steps)
         self.out = nn.Sequential(
-            nn.GroupNorm(_GROUPS, width), nn.SiLU(), zeroed(Convolution(width, latent_channels, "wrap"))
+            nn.GroupNorm(config.norm_groups, width), nn.SiLU(), zeroed(Convolution(width, latent_channels, "wrap"))
         )
 
     def forward(self, noisy: Float[Tensor, "B D h w"], step: Float[Tensor, "B"]) -> Float[Tensor, "B D h w"]:
@@ -149,19 +153,20 @@ class _Steps(nn.ModuleList):
 def _steps(config: LatentUnetConfig, inputs: int, outputs: int, level: int) -> _Steps:
     """Return a residual block of a level, with attention after it if the level has it."""
     attention = [_Attention(outputs, config)] if level in config.attention_levels else []
-    return _Steps([_Residual(inputs, outputs, 4 * config.channels), *attention])
+    return _Steps([_Residual(inputs, outputs, config), *attention])
 
 
 class _Residual(Block):
     """Norm, swish, convolution, twice, with the embedding added between; then the input is added."""
 
-    def __init__(self, inputs: int, outputs: int, embedding: int) -> None:
+    def __init__(self, inputs: int, outputs: int, config: LatentUnetConfig) -> None:
         super().__init__()
-        self.in_layers = nn.Sequential(nn.GroupNorm(_GROUPS, inputs), nn.SiLU(), Convolution(inputs, outputs, "wrap"))
+        groups, embedding = config.norm_groups, 4 * config.channels
+        self.in_layers = nn.Sequential(nn.GroupNorm(groups, inputs), nn.SiLU(), Convolution(inputs, outputs, "wrap"))
         self.emb_layers = nn.Sequential(nn.SiLU(), nn.Linear(embedding, outputs))
         # The program has dropout of 0 before the last convolution, which counts in the names of weights.
         last = zeroed(Convolution(outputs, outputs, "wrap"))
-        self.out_layers = nn.Sequential(nn.GroupNorm(_GROUPS, outputs), nn.SiLU(), nn.Identity(), last)
+        self.out_layers = nn.Sequential(nn.GroupNorm(groups, outputs), nn.SiLU(), nn.Identity(), last)
         self.skip_connection = nn.Conv2d(inputs, outputs, 1) if inputs != outputs else nn.Identity()
 
     def forward(self, x: Tensor, embedding: Tensor) -> Tensor:
@@ -175,7 +180,7 @@ class _Attention(Block):
     def __init__(self, channels: int, config: LatentUnetConfig) -> None:
         super().__init__()
         self.heads = channels // config.head_channels
-        self.norm = nn.GroupNorm(_GROUPS, channels)
+        self.norm = nn.GroupNorm(config.norm_groups, channels)
         self.qkv = nn.Conv1d(channels, 3 * channels, 1)
         self.proj_out = zeroed(nn.Conv1d(channels, channels, 1))
 

@@ -22,7 +22,7 @@ RECIPE = Recipe(
             mask_head=True,
             restart_dead_codes=True,
         ),
-        denoiser=LatentUnetConfig(32, (1, 2, 3), residual_blocks=1, attention_levels=(1, 2), head_channels=16),
+        denoiser=LatentUnetConfig(32, (1, 2, 3), 1, attention_levels=(1, 2), head_channels=16, norm_groups=8),
         scale_latents=True,
     ),
     data=DataConfig(train=("simulated:2000:train",), val=("simulated:32:val",)),
