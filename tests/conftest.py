@@ -30,7 +30,7 @@ def _cache(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def _signal_handlers():
     """Fail a test that leaves signals handled otherwise; programs that later tests start inherit what is ignored."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)}
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     yield
     left = {number: handler for number in before if (handler := signal.getsignal(number)) is not before[number]}
     for number in left:

@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +35,7 @@ TINY = [
     "training.tokenizer.scans=8",
     "training.transformer.scans=8",
 ]
-ONE_METRIC = ("lidargrit.demo.EvalConfig", lambda: EvalConfig(metrics=("bev_jsd",)))
+ONE_METRIC = ("lidargrit.demo.EvalConfig", partial(EvalConfig, metrics=("bev_jsd",)))
 COUNTED = ("lidargen_kitti_360", "r2flow_kitti_360")  # counting takes seconds for each recipe
 PIXELS = ["training.pixels.scans=2", "model.pixels.mask_width=4", "model.pixels.range_width=4", "model.pixels.blocks=1"]
 

@@ -16,7 +16,7 @@ def test_demo_trains_the_packaged_model_further_on_a_users_own_drives(tmp_path, 
     load("kitti_odometry").write_example(tmp_path / "own scans", 4)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("lidargrit.demo._NUM_SAMPLES", 11)  # as many as its pictures show
-    monkeypatch.setattr("lidargrit.demo.EvalConfig", lambda: EvalConfig(metrics=("bev_jsd",)))
+    monkeypatch.setattr("lidargrit.demo.EvalConfig", partial(EvalConfig, metrics=("bev_jsd",)))
     few = ["training.tokenizer.scans=2", "training.transformer.scans=8", "training.pixels.scans=2"]
     assert main(["demo", "--data", str(tmp_path / "own scans"), "--set", *few]) == 0
     run = tmp_path / "runs" / "demo-own scans"
