@@ -1,6 +1,7 @@
 """The demo: which networks it trains, on whose scans, and what it says of that."""
 
 import json
+from functools import partial
 
 from lidargrit import demo
 from lidargrit.cli import main
