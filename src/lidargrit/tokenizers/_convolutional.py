@@ -17,14 +17,17 @@ from lidargrit.structures import RangeImage
 from lidargrit.tokenizers import CodebookTokenizer, Config
 
 
-def check_sizes(channels: int, residual_blocks: int, code_dim: int, num_codes: int) -> None:
+def check_sizes(channels: int, residual_blocks: int, code_dim: int, num_codes: int, norm_groups: int) -> None:
     """Refuse sizes of which no network can be built.
 
     Raises:
         ConfigError: channels that the norms' groups do not divide, or a number out of bounds.
     """
-    if channels < 32 or channels % 32:
-        raise ConfigError(f"channels={channels}", "a positive multiple of 32", "the norms share 32 groups: round it up")
+    if norm_groups < 1:
+        raise ConfigError(f"norm_groups={norm_groups}", "at least 1", "32 are published")
+    if channels < 1 or channels % norm_groups:
+        wanted, cure = f"a positive multiple of {norm_groups}", f"the norms share {norm_groups} groups: round it up"
+        raise ConfigError(f"channels={channels}", wanted, cure)
     sizes = {"residual_blocks": residual_blocks, "code_dim": code_dim, "num_codes": num_codes}
     most = {"residual_blocks": 100, "code_dim": 16_384, "num_codes": 65_536}
     for name, size in sizes.items():

@@ -1,12 +1,14 @@
-"""LiDM's denoiser at the sizes of the recipes."""
+"""Groups of the norms of small networks, which must not take away what an image has in the mean."""
 
 from dataclasses import replace
 
 import pytest
 import torch
 
+from lidargrit.errors import ConfigError
 from lidargrit.nn.latent_unet import LatentUnet
 from lidargrit.recipes import load_recipe
+from lidargrit.tokenizers import make_tokenizer
 
 
 @pytest.mark.parametrize("recipe", ["lidm_small", "lidm_shared_small"])
@@ -26,3 +28,20 @@ def test_a_small_denoiser_sees_latents_that_are_too_high_as_a_whole(recipe):
 
     groups = load_recipe(recipe).model.denoiser.norm_groups
     assert moved(groups) > 5 * moved(32)
+
+
+@pytest.mark.parametrize("recipe", ["small", "lidm_small"])
+def test_all_norms_of_a_tokenizer_have_as_many_groups_as_its_setting_says(recipe):
+    loaded = load_recipe(recipe)
+    plain, coarser = (
+        make_tokenizer(replace(loaded.model.tokenizer, norm_groups=groups), loaded.data.load_sensor())
+        for groups in (32, 8)
+    )
+    norms = [module for module in coarser.modules() if isinstance(module, torch.nn.GroupNorm)]
+    assert {norm.num_groups for norm in norms} == {8}
+    assert len(norms) > 10
+    shapes = [{name: weight.shape for name, weight in each.state_dict().items()} for each in (plain, coarser)]
+    assert shapes[0] == shapes[1]
+    for groups in (0, 24):
+        with pytest.raises(ConfigError, match=f"{groups}"):
+            replace(loaded.model.tokenizer, norm_groups=groups)
