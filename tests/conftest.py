@@ -9,6 +9,8 @@ import pytest
 import torch
 from hypothesis import settings
 
+from browser import CHROMIUM, Browser
+
 SHARED = Path(os.environ.get("LIDARGRIT_SHARED", Path(__file__).resolve().parents[2] / "shared"))
 
 # How long an example takes says nothing: other tests run beside it.
@@ -36,6 +38,16 @@ def _signal_handlers():
     for number in left:
         signal.signal(number, before[number])
     assert not left
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    """Return a browser without a screen, one for all tests of a file."""
+    if CHROMIUM is None:
+        pytest.skip("needs Chromium")
+    opened = Browser(tmp_path_factory.mktemp("profile"))
+    yield opened
+    opened.close()
 
 
 @pytest.fixture(scope="session")

@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 
-import numpy as np
 import torch
 
 from lidargrit.evaluation import benchmark
@@ -12,9 +11,10 @@ from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
 from lidargrit.evaluation.protocols import load_protocol
-from lidargrit.loading import Pixels, Provenance, RangeImages
+from lidargrit.loading import RangeImages
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import load_sensor
+from seeded_images import SeededImages
 from seeded_networks import weights
 from test_benchmark import BENCHMARK
 
@@ -29,25 +29,12 @@ class Listener(Reporter):
         self.lines.append(text)
 
 
-class Seeded:
-    """Range images without reflectance."""
-
-    provenance = Provenance()
-
-    def __len__(self):
-        return 4
-
-    def read(self, index):
-        range_m = np.random.default_rng(index).uniform(2, 60, (SENSOR.height, SENSOR.width))
-        return Pixels(range_m.astype(np.float32))
-
-
 def test_scores_are_computed_again_with_weights_that_came_since(tmp_path):
     file, path = tmp_path / "weights.pth", tmp_path / "scores.json"
     metrics = "return_rate_per_ring", "frechet_pointcloud_distance"
     plain = Resampling(halves=0)
     settings = EvalConfig("lidargrit-kitti-odometry", metrics, weights={"pointnet": file}, resampling=plain)
-    pair = EvalPair(*(EvalSet(name, RangeImages(SENSOR, [Seeded()]), range(2)) for name in "ab"))
+    pair = EvalPair(*(EvalSet(name, RangeImages(SENSOR, [SeededImages(SENSOR, 4)]), range(2)) for name in "ab"))
     pair = replace(pair, samples=replace(pair.samples, indices=range(2, 4)))
 
     def scored():

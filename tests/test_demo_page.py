@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from browser import CHROMIUM, Browser
 from lidargrit import demo
 from lidargrit.evaluation.intervals import RealAgainstReal
 from lidargrit.evaluation.reconstruction import score_reconstruction
@@ -113,27 +112,21 @@ def test_a_pixel_decoder_is_shown_phase_by_phase(written, with_pixel_decoder):
     assert "in 10 phases" in text
 
 
-def test_a_browser_shows_it(written, tmp_path):
-    if CHROMIUM is None:
-        pytest.skip("needs Chromium")
-    browser = Browser(tmp_path)
-    try:
-        browser.open(written)
-        names = browser.run("[...document.querySelectorAll('[data-part=name]')].map((one) => one.textContent)")
-        assert names == ["simulated, held out", "reconstructed", "new"]
-        for which in range(3):
-            for canvas in (".cloud", ".image"):
-                picture = browser.screenshot(canvas, which)
-                assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 20
-        assert browser.run("[...document.images].every((one) => one.complete && one.naturalWidth > 0)")
-        assert browser.run("document.documentElement.scrollWidth <= innerWidth")
-        browser.run("document.querySelector('#next').scrollIntoView()")
-        browser.click("#next")
-        assert browser.run("document.querySelector('#counter').textContent") == "Scan 2 of 6"
-        assert browser.troubles() == []
-        assert browser.requests() == []
-    finally:
-        browser.close()
+def test_a_browser_shows_it(written, browser):
+    browser.open(written)
+    names = browser.run("[...document.querySelectorAll('[data-part=name]')].map((one) => one.textContent)")
+    assert names == ["simulated, held out", "reconstructed", "new"]
+    for which in range(3):
+        for canvas in (".cloud", ".image"):
+            picture = browser.screenshot(canvas, which)
+            assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 20
+    assert browser.run("[...document.images].every((one) => one.complete && one.naturalWidth > 0)")
+    assert browser.run("document.documentElement.scrollWidth <= innerWidth")
+    browser.run("document.querySelector('#next').scrollIntoView()")
+    browser.click("#next")
+    assert browser.run("document.querySelector('#counter').textContent") == "Scan 2 of 6"
+    assert browser.troubles() == []
+    assert browser.requests() == []
 
 
 def test_times_are_those_of_the_first_time(tmp_path):

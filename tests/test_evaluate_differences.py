@@ -13,30 +13,18 @@ from lidargrit.evaluation.pairs import EvalPair, EvalSet, deviations
 from lidargrit.evaluation.protocols import load_protocol
 from lidargrit.evaluation.tables import side_by_side
 from lidargrit.files import write_json
-from lidargrit.loading import DataConfig, Pixels, Provenance, RangeImages, prepare
+from lidargrit.loading import DataConfig, RangeImages, prepare
 from lidargrit.sensors import load_sensor
+from seeded_images import SeededImages
 
 ODOMETRY = load_sensor("hdl64e_kitti_odometry")
 PLAIN = Resampling(halves=0)
 BOTH = "samples are", "reference is"
 
 
-class Seeded:
-    """Two range images."""
-
-    provenance = Provenance()
-
-    def __len__(self):
-        return 2
-
-    def read(self, index):
-        range_m = np.random.default_rng(index).uniform(2, 50, (ODOMETRY.height, ODOMETRY.width))
-        return Pixels(range_m.astype(np.float32))
-
-
 def as_wanted(sensor=ODOMETRY, samples_variant="reference"):
     """Return a pair that is as the protocol of KITTI odometry wants it, apart from its number of scans."""
-    images = RangeImages(sensor, [Seeded()])
+    images = RangeImages(sensor, [SeededImages(ODOMETRY, 2)])
     samples = EvalSet("a", images, range(2), data_set="samples", projection_variant=samples_variant)
     reference = EvalSet("b", images, range(2), data_set="kitti_odometry", split="test", projection_variant="reference")
     return EvalPair(samples, reference)
@@ -101,7 +89,7 @@ def test_columns_without_a_sensor_are_those_of_range_images(tmp_path):
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
         for index in range(2):
-            np.save(tmp_path / name / f"{index}.npy", Seeded().read(index).range_m)
+            np.save(tmp_path / name / f"{index}.npy", SeededImages(ODOMETRY, 2).read(index).range_m)
     settings = EvalConfig(metrics=("return_rate_per_ring",), resampling=PLAIN, data=DataConfig(columns=128))
     with pytest.raises(ScanError, match="a range image of 64x256; wanted 64x128"):
         compare_sources(str(tmp_path / "a"), str(tmp_path / "b"), settings)

@@ -2,26 +2,15 @@
 
 from dataclasses import replace
 
-import pytest
 import torch
 
 import lidargrit
-from browser import CHROMIUM, Browser
 from lidargrit.formats import load
 from lidargrit.sensors import load_sensor
 from lidargrit.structures import RangeImage
 from lidargrit.viewer.interactive import write_page
 from lidargrit.viewer.scan_sets import ScanSet
 from served import running
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    if CHROMIUM is None:
-        pytest.skip("needs Chromium")
-    opened = Browser(tmp_path_factory.mktemp("profile"))
-    yield opened
-    opened.close()
 
 
 def test_a_sensor_of_one_row_is_coloured_by_its_row(browser, tmp_path):

@@ -12,7 +12,7 @@ import torch
 from waitress.server import TcpWSGIServer
 
 import lidargrit
-from browser import CHROMIUM, Browser
+from browser import Browser
 from lidargrit.cli import main
 from lidargrit.errors import ConfigError, ScanError
 from lidargrit.formats import load, read_scan
@@ -42,15 +42,6 @@ def scan_file(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("scans") / "my <b>street.ply"
     load("ply").write(path, lidargrit.simulate(seed=5))
     return path
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    if CHROMIUM is None:
-        pytest.skip("needs Chromium")
-    opened = Browser(tmp_path_factory.mktemp("profile"))
-    yield opened
-    opened.close()
 
 
 # What can be chosen.

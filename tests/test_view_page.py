@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from browser import CHROMIUM, Browser
+from browser import Browser
 from lidargrit.cli import main
 from lidargrit.errors import ConfigError, ScanError
 from lidargrit.formats import read_scan
@@ -157,19 +157,15 @@ def test_the_command_writes_a_page(tmp_path, capsys):
 
 
 @pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    if CHROMIUM is None:
-        pytest.skip("needs Chromium")
-    opened = Browser(tmp_path_factory.mktemp("profile"))
+def browser(browser):
     # Here WebGL is computed on the processor, of which the page would rather not make use.
     script = (
         "const was = WebGLRenderingContext.prototype.getParameter;"
         "WebGLRenderingContext.prototype.getParameter = function (what) {"
         "return what === 0x9246 && !globalThis.honest ? 'A graphics card' : was.call(this, what); };"
     )
-    opened.send("Page.addScriptToEvaluateOnNewDocument", source=script)
-    yield opened
-    opened.close()
+    browser.send("Page.addScriptToEvaluateOnNewDocument", source=script)
+    return browser
 
 
 @pytest.fixture(scope="module")

@@ -51,8 +51,8 @@ class LidarVaeConfig:
             many.
         rows: number of rows that are encoded and generated: 24, 40, 56 or more in steps of 16.
         first_row: index of the highest of these rows. The program leaves out the highest 17 and the lowest 7 of 64.
-        warmup_scans: number of training scans over which the weight of the divergence rises linearly
-            from 0 to 1; 0 for a weight of 1 from the start.
+        warmup_scans: number of training scans over which the weight of the divergence rises linearly from 0 to 1; 0
+            for a weight of 1 from the start.
         free_nats: KL divergence of a scan's latent, in nats, below which it adds nothing to the loss (free bits).
         initial_std: standard deviation of the new weights of both networks.
     """

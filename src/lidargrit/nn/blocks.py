@@ -41,11 +41,11 @@ def prepare_for_training(objective: nn.Module, recompute: bool, compiled: bool) 
     Raises:
         ConfigError: the objective has no block to recompute, or no network to compile.
     """
-    for block in objective.modules() if not recompute else _parts(objective, Block, "recompute"):
-        if isinstance(block, Block):
-            block.recomputed = recompute  # a stage before may have trained the same network otherwise
-    for network in _parts(objective, Network, "compile") if compiled else ():
-        network.compile()
+    for block in _parts(objective, Block, "recompute", recompute):
+        block.recomputed = recompute  # a stage before may have trained the same network otherwise
+    for network in _parts(objective, Network, "compile", compiled):
+        if compiled:
+            network.compile()
 
 
 def zeroed(layer: ModuleT) -> ModuleT:
@@ -55,9 +55,9 @@ def zeroed(layer: ModuleT) -> ModuleT:
     return layer
 
 
-def _parts(objective: nn.Module, kind: type[ModuleT], setting: str) -> list[ModuleT]:
+def _parts(objective: nn.Module, kind: type[ModuleT], setting: str, wanted: bool) -> list[ModuleT]:
     found = [module for module in objective.modules() if isinstance(module, kind)]
-    if not found:
+    if wanted and not found:
         raise ConfigError(
             f"{setting}=true for {type(objective).__name__}, which has no {kind.__name__}",
             "false",

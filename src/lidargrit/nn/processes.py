@@ -15,7 +15,10 @@ def sum_over_processes(counted: Shaped[Tensor, "*shape"]) -> Shaped[Tensor, "*sh
 
 
 def mean_over_processes(counted: Shaped[Tensor, "*shape"]) -> Shaped[Tensor, "*shape"]:
-    """Return the mean of a tensor over all processes, in place; a ratio to it has the mean of one to the sum."""
+    """Return the mean of a tensor over all processes; the tensor itself becomes their sum.
+
+    The mean over processes of ``part / mean`` is the sum of all parts over the sum of what is counted.
+    """
     return sum_over_processes(counted) / num_processes()
 
 
