@@ -8,7 +8,7 @@ from pathlib import Path
 from lidargrit.cli._options import add_settings
 
 EXAMPLES = """\
-  lidargrit demo                                simulated streets, three to five minutes on two cores
+  lidargrit demo                                simulated streets, three to five minutes on two cores with bfloat16
   lidargrit demo --data /data/kitti_odometry    your own scans: a KITTI tree, or any folder of .bin
   lidargrit demo --anew --out runs/demo_anew    all networks trained anew, about ten minutes
 """
