@@ -105,6 +105,15 @@ def test_a_scan_with_nothing_observed_is_left_out(run, tmp_path, capsys):
     assert sorted(json.loads((tmp_path / "out" / "completed.json").read_text())["scans"]) == ["0.npz", "1.npz"]
 
 
+def test_a_scan_without_a_drop_is_left_out(run, tmp_path, capsys):
+    source, size = scan_files(tmp_path / "scans", 2), (SENSOR.height, SENSOR.width)
+    whole = RangeImage.masked(torch.full(size, 9.0), torch.ones(size, dtype=torch.bool), SENSOR, torch.rand(size))
+    NumpyArray.write(tmp_path / "scans" / "00.npz", unproject(whole))
+    assert complete(run, source, tmp_path / "out", "--observed", "returns", "--bad-scans", "skip") == 0
+    assert "00.npz, in which every pixel has a return" in capsys.readouterr().err
+    assert sorted(path.name for path in (tmp_path / "out").glob("*.npz")) == ["0.npz", "1.npz"]
+
+
 def test_a_scan_is_never_called_as_its_return_probabilities_are(run, tmp_path, capsys):
     source = scan_files(tmp_path / "scans", 1)
     (tmp_path / "scans" / "0.npz").rename(tmp_path / "scans" / "0.probability.npz")

@@ -62,9 +62,11 @@ class Pattern:
 
         Raises:
             UsageError: a mask of another size, or one by which all pixels are observed.
-            ScanError: no return of this scan is observed.
+            ScanError: no return of this scan is observed, or ``returns`` of a scan in which every pixel has one.
         """
         mask = self._mask(image, seed)
+        if self.text == "returns" and bool(mask.all()):
+            raise ScanError(f"{source}, in which every pixel has a return", "some without", "leave the scan out")
         if bool(mask.all()):
             got = f"--observed {self.text}, by which all pixels are observed"
             raise UsageError(got, "some pixels that are not", "choose other pixels")
