@@ -8,7 +8,6 @@ import torch
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
-from lidargrit import configuration
 from lidargrit.cli import main
 from lidargrit.conditions.marks import read_marks
 from lidargrit.datasets import load
@@ -18,7 +17,7 @@ from lidargrit.evaluation.benchmark import Benchmark, as_table
 from lidargrit.evaluation.benchmark import run as run_benchmark
 from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.evaluation.intervals import Resampling
-from lidargrit.files import claim_folder, write_json
+from lidargrit.files import claim_folder
 from lidargrit.generators import load_class
 from lidargrit.loading import DataConfig, prepare
 from lidargrit.nn.flops import flops_of
@@ -314,18 +313,6 @@ def test_a_page_of_foreign_names_holds_no_code_of_theirs():
     assert "&lt;script&gt;alert" in page
     assert page.count("<script>") == 1
     assert "0.25" in page
-
-
-def test_a_finished_run_of_before_keeps_its_warm_up(tmp_path, monkeypatch):
-    """Budgets once left settings of a model that count scans as they were."""
-    recipe = load_recipe("lidarvae_small", FEW)
-    flops = sum(training_flops(recipe).values()) / 4
-    trained = tmp_path / "runs" / "lidarvae_small"
-    before = replace(with_budget(recipe, flops), model=recipe.model)
-    write_json(trained / "run.json", {"recipe": configuration.to_json(before)})
-    monkeypatch.setattr(benchmark, "is_run", lambda folder: folder == trained)
-    plan = benchmark._Plan.of("lidarvae_small", tmp_path, Benchmark("simulated:8:test", 8, QUICK, FEW, flops))
-    assert plan.recipe.model.warmup_scans == recipe.model.warmup_scans
 
 
 def test_metrics_of_which_none_can_be_made_are_refused_before_training(tmp_path, monkeypatch):

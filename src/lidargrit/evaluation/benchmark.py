@@ -18,7 +18,7 @@ import torch
 
 from lidargrit import __version__
 from lidargrit.configuration import name_and_settings, override
-from lidargrit.errors import ConfigError, LidarGritError, OutputError
+from lidargrit.errors import ConfigError, LidarGritError
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair, metric_factory, open_pair
 from lidargrit.evaluation.costs import COSTS, Costs, costs_block, read_costs
 from lidargrit.evaluation.pairs import EvalPair, require_same_rays
@@ -29,7 +29,6 @@ from lidargrit.evaluation.verdict import MEMORISED, PIXEL_STATISTICS
 from lidargrit.files import claim_folder, read_json, write_json
 from lidargrit.generators import Generator, load, load_class
 from lidargrit.metrics import load_metric
-from lidargrit.metrics._networks.features import FeatureMetric
 from lidargrit.nn.devices import usable_device
 from lidargrit.processes import check_processes, process_pool
 from lidargrit.recipes import load_recipe
@@ -303,17 +302,7 @@ class _Plan:
             return cls(system, run, None, override(generator.Sampling(), settings, owner, cure), generator.sensor)
         recipe = benchmark.recipe(name, check=not is_run(trained))
         sampling = override(load_class(recipe.generator).Sampling(), settings, owner, cure)
-        try:
-            check_folder(trained, recipe)
-        except OutputError as error:
-            # In tables of before, a budget did not shorten what settings of a model count in scans.
-            before = replace(recipe, model=load_recipe(name, benchmark.recipe_settings).model)
-            if not is_run(trained) or before == recipe:
-                raise
-            with suppress(OutputError):
-                check_folder(trained, before)
-                return cls(system, trained, before, sampling, recipe.data.load_sensor())
-            raise error from None
+        check_folder(trained, recipe)
         return cls(system, trained, recipe, sampling, recipe.data.load_sensor())
 
 
@@ -358,7 +347,7 @@ def _has_other_weights(there: Scorecard, pair: EvalPair, settings: EvalConfig, r
             continue
         with suppress(LidarGritError):  # still no weights, or images that this network cannot see
             metric = metric_factory(choice, settings, reporter)()
-            if isinstance(metric, FeatureMetric) and metric.network.sha256 != sha256:
+            if metric.weights_sha256 != sha256:
                 for images, real in ((pair.samples, False), (pair.reference, True)):
                     metric.update(images.batch([0]), real=real)
                 return True

@@ -126,6 +126,11 @@ class Metric(ABC, Generic[Features, Kept]):
         """The public name of the metric: that of its file."""
         return type(self).__module__.rpartition(".")[2]
 
+    @property
+    def weights_sha256(self) -> str:
+        """Hash of the file of weights of the network that ``needs_weights`` names; empty without one."""
+        return ""
+
     @abstractmethod
     def extractor(self, sensor: SensorModel) -> FeatureExtractor[Features]:
         """Return what turns images of a sensor into the features that :meth:`summarise` takes."""

@@ -155,6 +155,11 @@ class FeatureMetric(Metric[Float32[np.ndarray, "B d"], Kept]):
         super().__init__(variant=variant, seed=seed)
         self.network = load_network(self.needs_weights, weights, device, reporter)
 
+    @property
+    def weights_sha256(self) -> str:
+        """Hash of the file of the network's weights."""
+        return self.network.sha256
+
     @final
     def extractor(self, sensor: SensorModel) -> NetworkFeatures:
         """Return the network with the inputs of the variant."""
@@ -172,7 +177,7 @@ class FeatureMetric(Metric[Float32[np.ndarray, "B d"], Kept]):
         """Refuse to merge with a metric of another kind, variant, seed or weights."""
         super().require_same_options(other)
         assert isinstance(other, FeatureMetric)
-        if other.network.sha256 != self.network.sha256:
+        if other.weights_sha256 != self.weights_sha256:
             raise ConfigError(
                 f"features through other weights ({other.network.path}) to merge",
                 f"those through {self.network.path}",
@@ -181,7 +186,7 @@ class FeatureMetric(Metric[Float32[np.ndarray, "B d"], Kept]):
 
     def weights_details(self) -> dict[str, Any]:
         """Return what identifies the weights, for the details of a result."""
-        return {"weights": {"file": self.network.path.name, "sha256": self.network.sha256}}
+        return {"weights": {"file": self.network.path.name, "sha256": self.weights_sha256}}
 
 
 def within(images: RangeImage, window_m: tuple[float, float] | None) -> RangeImage:
