@@ -4,6 +4,7 @@ import os
 import signal
 from pathlib import Path
 
+import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -38,6 +39,12 @@ def _signal_handlers():
     for number in left:
         signal.signal(number, before[number])
     assert not left
+
+
+@pytest.fixture
+def untyped(monkeypatch):
+    """Let values of any type reach our own checks, as they do outside of the tests."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 
 @pytest.fixture(scope="module")

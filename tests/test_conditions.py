@@ -1,5 +1,7 @@
 """What is known of a scan: its checks, the patterns of observed pixels, and what stands in a completed scan."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -51,6 +53,35 @@ def test_conditions_that_cannot_be_are_refused():
         Condition(images.range_m, every, images.return_mask, every, SENSOR)
     with pytest.raises(ScanError, match="an observed return of unknown range"):
         Condition(images.range_m, ~every, images.return_mask, every, SENSOR)
+
+
+@pytest.mark.usefixtures("untyped")
+def test_reflectance_labels_and_unknown_pixels_that_cannot_be_are_refused():
+    images = scans()
+    every, bright = torch.ones(2, 64, 32, dtype=torch.bool), images.reflectance
+    assert bright is not None
+    for wrong in (bright * 255, bright - 1, bright * torch.nan):
+        with pytest.raises(ScanError, match=r"reflectance is NaN, below 0 or above 1; wanted values in \[0, 1\]"):
+            Condition.of_pixels(replace(images, reflectance=wrong), every)
+    beyond = torch.where(images.return_mask, bright, 2.0)
+    mask = images.return_mask
+    assert len(Condition(images.range_m, mask, mask, mask, SENSOR, beyond)) == 2, "values elsewhere have no influence"
+    with pytest.raises(ConfigError, match=r"^got labels of type torch.float32; wanted whole numbers"):
+        Condition.of_pixels(replace(images, label=bright), every)
+    with pytest.raises(ConfigError, match=r"^got unknown pixels of .* and type torch.float32; wanted .*torch.bool"):
+        Condition.of_surfaces(images, every.float())
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16])
+def test_images_and_conditions_are_kept_in_32_bits(dtype):
+    images = scans()
+    assert images.reflectance is not None
+    given = replace(images, range_m=images.range_m.to(dtype), reflectance=images.reflectance.to(dtype))
+    assert given.range_m.dtype == given.reflectance.dtype == torch.float32
+    mask = images.return_mask
+    known = Condition(images.range_m.to(dtype), mask, mask, mask, SENSOR, images.reflectance.to(dtype))
+    assert known.range_m.dtype == known.reflectance.dtype == torch.float32
+    assert torch.equal(known.range_m, given.range_m)
 
 
 def test_patterns_choose_rows_sectors_pixels_and_files(tmp_path):

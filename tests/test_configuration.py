@@ -11,6 +11,7 @@ from lidargrit import _discovery
 from lidargrit.configuration import from_json, leaves, name_and_settings, override, to_json
 from lidargrit.errors import ConfigError
 from lidargrit.generators import load_class
+from lidargrit.generators.lidargrit import LidarGritConfig
 from lidargrit.loading import DataConfig
 from lidargrit.nn.transformer import TransformerConfig
 from lidargrit.recipes import load_recipe
@@ -175,6 +176,23 @@ def test_json_that_does_not_fit_is_told_in_one_line(cls, change, text):
 def test_json_that_is_no_configuration_at_all(data):
     with pytest.raises(ConfigError, match=r"a configuration in run\.json that does not fit"):
         from_json(FitConfig, data, "run.json")
+
+
+@pytest.mark.parametrize("name", ["lidargrit", "maskgit", "lidm"])
+def test_a_kind_that_is_not_named_is_the_default_of_its_configuration(name):
+    config = load_class(name).Config
+    assert from_json(config, {}, "config.json") == config()
+    written = {key: value for key, value in to_json(config()).items() if key != "tokenizer"}
+    assert from_json(config, written, "config.json") == config()
+
+
+@pytest.mark.parametrize("key", ["transformer", "tokenizer"])
+def test_what_is_no_settings_is_told_with_its_name(key):
+    for wrong in (None, 5, [1]):
+        with pytest.raises(ConfigError) as refusal:
+            from_json(LidarGritConfig, {key: wrong}, "config.json")
+        assert f"('{wrong}' in place of settings by name for {key!r})" in str(refusal.value)
+    from_json(LidarGritConfig, {"pixels": None}, "config.json")
 
 
 def test_settings_of_a_recipe_are_checked_with_the_words_of_their_class():

@@ -365,13 +365,3 @@ def test_sequences_may_have_any_name(bin_file, tmp_path, split, chosen):
             bin_file(ROWS, f"{name}/{number}.bin")
     found = open_dataset(f"{tmp_path}:{split}")
     assert {found.name(index).rpartition("/")[0] for index in range(len(found))} == chosen
-
-
-def test_rows_of_eight_numbers_are_not_taken_for_twice_as_many_points(tmp_path):
-    scan = simulate(0, load_sensor("hdl64e_kitti_odometry"))
-    rows = torch.cat((scan.points_xyz_m, torch.rand(len(scan), 5)), dim=1)
-    (tmp_path / "a.bin").write_bytes(rows.numpy().astype("<f4").tobytes())
-    with pytest.raises(ScanError, match="rows of 8 numbers"):
-        formats.read_scan(tmp_path / "a.bin")
-    (tmp_path / "b.bin").write_bytes(rows[:, :4].contiguous().numpy().astype("<f4").tobytes())
-    assert len(formats.read_scan(tmp_path / "b.bin")) == len(scan)

@@ -119,6 +119,30 @@ def test_ply_of_other_headers(refused, scan, old, new, text):
     assert text in refused(data.replace(old, new, 1), "a.ply")
 
 
+def test_text_of_lines_that_would_take_twenty_times_their_size(refused):
+    endless = b"1 " * 500_000 + b"1\n"
+    header = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 2\nHEIGHT 1\nPOINTS 2\nDATA ascii\n"
+    for name, data in (
+        ("a.pcd", header.encode() + endless + b"1 2 3\n"),
+        ("a.csv", b"x y z\n1 2 3\n" + endless),
+        ("b.csv", b"x,y,z\n" + b"1" * 1_000_000 + b",2,3\n"),
+    ):
+        assert "a line of more than 65,536 bytes" in refused(data, name)
+
+
+def test_rows_before_the_vertices_are_counted_together_and_not_split(refused, tmp_path):
+    def ply(*counts: int, rows: int) -> bytes:
+        before = "".join(f"element e{at} {count}\nproperty float a\n" for at, count in enumerate(counts))
+        axes = "".join(f"property float {axis}\n" for axis in "xyz")
+        head = f"ply\nformat ascii 1.0\n{before}element vertex 1\n{axes}end_header\n"
+        return head.encode() + b"11\n" * rows + b"1 2 3\n"
+
+    assert "8000000 rows before its vertices" in refused(ply(4_000_000, 4_000_000, rows=0), "a.ply")
+    assert "299999 of the 300000 rows before its vertices" in refused(ply(300_000, rows=299_998), "a.ply")
+    (tmp_path / "b.ply").write_bytes(ply(3, 4, rows=7))
+    assert read_scan(tmp_path / "b.ply").points_xyz_m.tolist() == [[1, 2, 3]]
+
+
 def npy(header: str, body: bytes = bytes(96), version: tuple[int, int] = (1, 0)) -> bytes:
     length = struct.pack("<H" if version == (1, 0) else "<I", len(header))
     return b"\x93NUMPY" + bytes(version) + length + header.encode() + body

@@ -4,11 +4,13 @@ import functools
 import itertools
 import re
 from concurrent.futures import ThreadPoolExecutor
+from typing import Literal, get_args, get_origin, get_type_hints
 
+import numpy as np
 import pytest
 import torch
 
-from lidargrit import _discovery
+from lidargrit import _discovery, configuration
 from lidargrit.cli import build_parser
 from lidargrit.conditions import Condition
 from lidargrit.errors import ConfigError
@@ -85,6 +87,17 @@ def calls(images, condition, seeds, sampling):
     }
 
 
+class Counted:
+    """A function of images that keeps how many it got each time."""
+
+    def __init__(self, function):
+        self.function, self.sizes = function, []
+
+    def __call__(self, images, *more):
+        self.sizes.append(len(images))
+        return self.function(images, *more)
+
+
 def call(generator, name_and_arguments):
     name, *arguments = name_and_arguments
     return getattr(generator, name)(*arguments)
@@ -133,6 +146,33 @@ def test_seeds_and_settings_that_cannot_be_are_refused(name):
     assert generator.sample([(1 << 32) - 1], sampling).range_m.shape == (1, 64, 32)
     with pytest.raises(ConfigError, match=r"^got settings of type SensorModel; wanted \w+; "):
         generator.sample([0], SENSOR)
+
+
+@pytest.mark.usefixtures("untyped")
+def test_seeds_without_an_order_are_refused(name):
+    generator, sampling = made(name)
+    for seeds, kind in (({3, 4}, "set"), ({3: 4}.keys(), "dict_keys"), (3, "int"), (iter([3]), "list_iterator")):
+        with pytest.raises(ConfigError, match=rf"^got seeds of type {kind}; wanted a sequence, such as \[0\]; "):
+            generator.sample(seeds, sampling)
+    assert same(generator.sample(np.array([3]), sampling), sampled_together(name)[:1])
+
+
+@pytest.mark.usefixtures("untyped")
+def test_a_setting_of_another_type_and_a_word_that_is_no_choice_are_refused(name):
+    """From Python, where no parser looks at them: a misspelt word once was another method without a word about it."""
+    sampling = load_class(name).Sampling
+    for setting, hint in get_type_hints(sampling).items():
+        wrong, wanted = [], ""
+        if get_origin(hint) is Literal:
+            wrong, wanted = [f"{get_args(hint)[0]}s", get_args(hint)[0].upper(), None], get_args(hint)[0]
+        elif hint in (int, int | None):
+            wrong, wanted = [1.5, "a", True], "whole number"
+        elif hint in (float, float | None):
+            wrong, wanted = ["1", [1.0]], "number"
+        assert wrong, f"no wrong value of {setting} is known here"
+        for value in wrong:
+            with pytest.raises(ConfigError, match=rf"^got {setting}={re.escape(repr(value))}; wanted .*{wanted}"):
+                sampling(**{setting: value})
 
 
 def test_images_and_masks_of_others_are_refused(name):
@@ -200,6 +240,17 @@ def test_has_exactly_the_capabilities_that_it_declares(name):
         ), capability
 
 
+def test_settings_that_only_completion_reads_are_no_settings_of_sampling(name):
+    cls = load_class(name)
+    settings = configuration.leaves(cls.Sampling())
+    assert cls.not_of_sampling <= settings.keys()
+    for setting in cls.not_of_sampling:
+        with pytest.raises(ConfigError, match=f"'{setting}', which sampling does not have"):
+            configuration.override(cls.Sampling(), [f"{setting}=1"], "sampling", fixed=cls.not_of_sampling)
+        assert any(line.startswith("complete --set besides: ") and setting in line for line in cls.about())
+        assert not any(line.startswith("sample --set: ") and f"{setting}=" in line for line in cls.about())
+
+
 def test_what_it_cannot_do_is_told_with_who_can(name):
     generator, sampling = made(name)
     images = IMAGES.batch([0, 1])
@@ -230,9 +281,12 @@ def test_what_it_can_do_besides_keeps_to_the_seeds_and_the_sensor(name):
     observed = torch.zeros(2, 64, 32, dtype=torch.bool)
     observed[:, ::4] = True
     if "encode" in generator.capabilities:
-        assert generator.reconstruct(images).range_m.shape == (2, 64, 32)
+        together = generator.reconstruct(images)
+        assert together.range_m.shape == (2, 64, 32)
+        assert same(generator.reconstruct(images[1:]), together[1:2])
     if "likelihood" in generator.capabilities:
-        bits = generator.bits(images)
+        bits, alone = generator.bits(images), generator.bits(images[1:])
+        assert torch.equal(alone.total(), bits.total()[1:])
         assert bits.per_scan().keys() == ({"tokens", "mask", "range"} if bits.is_whole else {"tokens"})
         assert bool((bits.total() > 0).all())
         assert float(bits.per_pixel().double().sum()) == pytest.approx(float(bits.total().sum()), rel=1e-5)
@@ -243,6 +297,17 @@ def test_what_it_can_do_besides_keeps_to_the_seeds_and_the_sensor(name):
             method = getattr(generator, capability)
             found = method(given, [3, 4], sampling)
             assert same(found[1:2], method(given[1:], [4], sampling))
+
+
+def test_images_without_seeds_are_computed_one_by_one(name):
+    """So that memory is bounded, and that no scan's result depends on the batch that it came in."""
+    generator, _ = made(name)
+    for capability in generator.capabilities & {"encode", "likelihood"}:
+        counted = Counted(getattr(generator, HOOKS[capability]))
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(generator, HOOKS[capability], counted)
+            call(generator, calls(IMAGES.batch([0, 1, 2]), None, [], None)[capability])
+        assert counted.sizes == [1, 1, 1]
 
 
 def test_an_objective_has_a_finite_loss_and_gradients(name):

@@ -8,13 +8,11 @@ import pytest
 import torch
 
 from lidargrit import cli, formats
-from lidargrit.datasets import open_dataset
 from lidargrit.errors import ConfigError, ScanError
 from lidargrit.evaluation.pairs import EvalSet, pair_for_protocol
 from lidargrit.evaluation.protocols import load_protocol
 from lidargrit.loading import DataConfig
 from lidargrit.loading.config import ScanSettings
-from lidargrit.loading.imaging import choose_imaging
 from lidargrit.projection import doubts_about_rays, inspect, project, projection_that_fits
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import load_sensor
@@ -190,17 +188,3 @@ def test_settings_of_reading_scans_mean_the_same_by_word_and_by_option():
     for words in (["projection=spherical"], ["data.train=x"], ["data.nothing=1"]):
         with pytest.raises(Exception, match="setting"):
             ScanSettings.read(words)
-
-
-def test_reflectance_of_two_scales_is_told(tmp_path):
-    for name, highest in (("a", 250), ("b", 260)):
-        scan = replace(simulate(seed=0), label=None)
-        reflectance = torch.full((len(scan),), 100.0)
-        reflectance[0] = highest
-        points = torch.cat([scan.points_xyz_m, reflectance[:, None], scan.ring[:, None]], 1).numpy()
-        np.savez(tmp_path / f"{name}.npz", points=points[:, :3], intensity=points[:, 3], ring=points[:, 4].astype("u2"))
-    dataset = open_dataset(str(tmp_path))
-    (doubt,) = choose_imaging("scans", dataset, HDL64E, DataConfig()).doubts
-    assert "up to 0.98 in one scan and 0.004 in another" in doubt
-    (tmp_path / "b.npz").unlink()
-    assert not choose_imaging("scans", open_dataset(str(tmp_path)), HDL64E, DataConfig()).doubts

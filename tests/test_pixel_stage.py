@@ -128,6 +128,26 @@ def test_a_model_without_a_pixel_decoder_refuses_to_sample_by_one():
         TokenSampling(range_noise=0.0)
 
 
+@pytest.mark.parametrize("kind", [LidarGrit, MaskGit])
+def test_settings_of_a_pixel_decoder_that_samples_nothing_are_refused(kind):
+    without = kind(kind.Config(TOKENIZER, TRANSFORMER), SENSOR).eval()
+    for changed in ({"range_noise": 0.5}, {"range_temperature": 0.5}, {"mask_correlation": 0.0}):
+        name, value = next(iter(changed.items()))
+        with pytest.raises(
+            ConfigError, match=rf"^got {name}={value}, .* for a model without one; wanted settings that"
+        ):
+            without.sample([0], kind.Sampling(**changed))
+    without.check_choice("auto", kind.Sampling(decoder="bf16").pixels())
+    for mask in ("bernoulli", "threshold"):
+        with pytest.raises(ConfigError, match=rf"for mask={mask}; wanted .*; leave it out, or take mask=pixels"):
+            made().sample([0], TokenSampling(mask=mask, range_noise=0.5))
+
+
+def test_a_noise_beyond_all_numbers_is_refused():
+    with pytest.raises(ConfigError, match=r"range_noise=1e\+39; wanted .* a noise up to 1e6; "):
+        TokenSampling(range_noise=1e39)
+
+
 def test_maskgit_takes_a_pixel_decoder_too():
     torch.manual_seed(0)
     generator = MaskGit(MaskGitConfig(TOKENIZER, TRANSFORMER, PIXELS), SENSOR).eval()

@@ -12,6 +12,7 @@ import pytest
 
 from lidargrit.datasets.kitti_odometry import KittiOdometry
 from lidargrit.errors import DataError, OutputError, ScanError
+from lidargrit.files import claim_folder
 from lidargrit.loading import DataConfig, PreparedImages, damaged_shards, prepare
 from lidargrit.loading.shards import LocalBytes
 
@@ -117,6 +118,14 @@ def test_a_plan_or_a_list_of_scans_that_is_none_is_refused(folder, name, content
         PreparedImages(str(folder))
 
 
+@pytest.mark.parametrize("step_m", [0.0, 0.1, -0.002, 1e308])
+def test_another_step_of_range_than_the_sensors_is_refused(folder, step_m):
+    plan = json.loads((folder / "plan.json").read_text())
+    (folder / "plan.json").write_text(json.dumps({**plan, "range_step_m": step_m}))
+    with pytest.raises(DataError, match=r"range_step_m is another than its sensor's; wanted 0.002 m; prepare again"):
+        PreparedImages(str(folder))
+
+
 @pytest.mark.parametrize("name", ["plan.json", "scans.json", "000000.shard"])
 def test_a_pipe_in_a_prepared_folder_does_not_hang(folder, name):
     (folder / name).unlink()
@@ -138,6 +147,33 @@ def test_a_folder_goes_on_with_what_its_refusal_advised(tmp_path, small_shards):
     assert {path: path.stat().st_mtime_ns for path in made} == made
     with pytest.raises(OutputError, match="prepared with another bad_scans"):
         prepare(str(tree), config, tmp_path / "out")
+
+
+def test_a_preparation_that_made_nothing_leaves_its_folder_free(tmp_path, monkeypatch):
+    tree, out = tmp_path / "tree", tmp_path / "out"
+    KittiOdometry.write_example(tree, 2)
+    good = KittiOdometry(tree).path(0).read_bytes()
+    KittiOdometry(tree).path(0).write_bytes(good[:-3])
+    with pytest.raises(ScanError, match="download it again"):
+        prepare(str(tree), CONFIG, out)
+    assert not list(out.iterdir())
+    with claim_folder(out, shared=True), pytest.raises(ScanError):  # as another machine does that works by the plan
+        prepare(str(tree), CONFIG, out)
+    assert {path.name for path in out.iterdir()} == {"plan.json", "scans.json"}
+
+    failed = []
+
+    def once_another_failed(folder, shared=False):  # between this machine's plan and its lock
+        if not failed:
+            failed.append(folder)
+            prepare_module._take_back(folder)
+            assert not (folder / "plan.json").exists()
+        return claim_folder(folder, shared)
+
+    KittiOdometry(tree).path(0).write_bytes(good)
+    shutil.rmtree(out)
+    monkeypatch.setattr(prepare_module, "claim_folder", once_another_failed)
+    assert len(PreparedImages(str(prepare(str(tree), CONFIG, out)))) == 2
 
 
 def test_scans_that_were_left_out_do_not_come_back_unseen(tmp_path, small_shards):

@@ -22,7 +22,7 @@ from lidargrit.cli import main
 from lidargrit.datasets import _files, data_set_and_split, load, open_dataset
 from lidargrit.datasets import folder as folder_of_scans
 from lidargrit.datasets.kitti_odometry import KittiOdometry
-from lidargrit.errors import CheckpointError
+from lidargrit.errors import CheckpointError, ConfigError
 from lidargrit.files import write_json
 from lidargrit.generators import Generator
 from lidargrit.generators.lidargrit import LidarGrit
@@ -388,6 +388,8 @@ def test_a_name_that_is_no_folder_is_asked_of_the_hub(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "huggingface_hub", SimpleNamespace(snapshot_download=snapshot_download))
     assert isinstance(Generator.from_pretrained("some-one/model.1", revision="v1"), Marginal)
     assert asked == [("some-one/model.1", "v1", ("*.json", "model.safetensors"))]
+    with pytest.raises(ConfigError, match=r"^got revision='v1' of .*fetched, which is a folder here; wanted "):
+        Generator.from_pretrained(tmp_path / "fetched", revision="v1")
     with pytest.raises(CheckpointError, match=r"which cannot be fetched \(RuntimeError: 404\);"):
         Generator.from_pretrained("nobody/nothing")
     with pytest.raises(CheckpointError, match="runs/mine/gone, which is no folder"):

@@ -210,6 +210,15 @@ def test_operations_of_the_pairs_are_counted_once():
     assert counted["reflow"] == pytest.approx(400 * flow_scan + made * a_pair, rel=1e-6)
 
 
+def test_a_setting_of_the_other_solver_is_refused():
+    with pytest.raises(
+        ConfigError, match=r"^got tolerance=0.001 for solver=euler, .*; leave it out, or add solver=dopri5"
+    ):
+        FlowSampling(tolerance=1e-3)
+    with pytest.raises(ConfigError, match=r"^got steps=4 for solver=dopri5, .*; leave it out, or add solver=euler"):
+        FlowSampling(solver="dopri5", steps=4)
+
+
 def test_cost_counts_the_passes_of_either_solver():
     generator = stirred(made())
     two, four = (generator.cost(FlowSampling(steps=steps)) for steps in (2, 4))

@@ -232,3 +232,21 @@ def test_a_bag_whose_chunk_unpacks_to_too_much_is_refused(tmp_path, monkeypatch)
     monkeypatch.setattr(ros_bag, "BYTES_AT_MOST", 1000)
     with pytest.raises(ScanError, match="that unpacks to more than any recorder's"):
         read_scan(path)
+
+
+def test_the_index_of_a_bag_is_read_once(tmp_path, monkeypatch):
+    store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
+    path = tmp_path / "a.bag"
+    bag = rosbag1.Writer(path)
+    bag.chunk_threshold = 1  # one message a chunk
+    with bag:
+        top, rear = (bag.add_connection(topic, TYPE, typestore=store) for topic in ("/top", "/rear"))
+        for number in range(6):
+            bag.write(top, 20 - number // 2, store.serialize_ros1(cloud(store, number), TYPE))
+        bag.write(rear, 10, store.serialize_ros1(cloud(store, 9), TYPE))
+    opened, opening = [], rosbag1.Reader.open
+    monkeypatch.setattr(rosbag1.Reader, "open", lambda reader: (opened.append(reader), opening(reader))[1])
+    found = [read_scan(path, index).points_xyz_m[:, 0].numpy() for index in range(6)]
+    assert len(opened) == 1
+    for scan, number in zip(found, (4, 5, 2, 3, 0, 1), strict=True):  # in the order of time, then of the file
+        assert np.array_equal(scan, rows(number)["x"])

@@ -2,6 +2,7 @@
 
 import contextlib
 import pickle
+import warnings
 import zipfile
 from pathlib import Path
 
@@ -147,7 +148,14 @@ def test_no_code_of_a_stranger_runs(tmp_path, capsys):
     assert "must not run" not in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("what", ["text", "cut", "no tensor", "swollen", "bomb", "whole numbers", "empty", "sparse"])
+def nested() -> torch.Tensor:
+    with warnings.catch_warnings(action="ignore"):  # of a prototype
+        return torch.nested.nested_tensor([torch.zeros(2, 3), torch.zeros(4, 3)])
+
+
+@pytest.mark.parametrize(
+    "what", ["text", "cut", "no tensor", "swollen", "bomb", "whole numbers", "empty", "sparse", "meta", "nested"]
+)
 def test_what_is_no_tensor_is_refused(what, tmp_path, monkeypatch):
     monkeypatch.setattr("lidargrit.sources.sample_formats._BYTES_AT_MOST", 16 << 20)
     path = tmp_path / "0.pth"
@@ -156,6 +164,8 @@ def test_what_is_no_tensor_is_refused(what, tmp_path, monkeypatch):
         "swollen": torch.zeros(1).expand(1 << 20),
         "whole numbers": torch.zeros(5, 64, 1024, dtype=torch.int64),
         "sparse": torch.zeros(5, 64).to_sparse(),
+        "meta": torch.zeros(5, 64, 1024, device="meta"),
+        "nested": nested(),
     }
     torch.save(contents.get(what, torch.zeros(5, 64, 1024)), path)
     if what == "text":

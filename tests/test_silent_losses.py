@@ -17,14 +17,16 @@ from lidargrit.fitting import fit_sensor
 from lidargrit.formats import read_scan
 from lidargrit.formats.kitti_bin import KittiBin
 from lidargrit.formats.ouster_pcap import sensor_of
-from lidargrit.loading import DataConfig, prepare
+from lidargrit.loading import DataConfig, PreparedImages, prepare, prepare_and_describe
 from lidargrit.loading.workers import make_some_shards
+from lidargrit.reporting import Reporter
 from lidargrit.sensors import load_sensor
 from lidargrit.simulator import simulate
 from lidargrit.simulator.drives import DriveConfig, write_drives
+from lidargrit.sources import open_source
 from lidargrit.structures import Scan
 
-K360 = load_sensor("hdl64e_kitti_360")
+K360, VLP16 = load_sensor("hdl64e_kitti_360"), load_sensor("vlp16")
 
 
 @pytest.fixture
@@ -198,3 +200,93 @@ def test_a_condition_of_another_size_than_its_sensor_is_refused():
     known, range_m = torch.zeros(1, 64, 32, dtype=torch.bool), torch.zeros(1, 64, 32)
     with pytest.raises(ConfigError, match="range_m of"):
         Condition(range_m, known, known, known, K360.with_columns(64))
+
+
+class Heard(Reporter):
+    def __init__(self) -> None:
+        self.messages: list[str] = []
+
+    def message(self, text: str) -> None:
+        self.messages.append(text)
+
+
+@pytest.mark.parametrize(("usual", "bright", "told"), [(0.6, 3.5, "by 1 in 5 scans"), (250, 300, "by 255 in 5 scans")])
+def test_a_bright_point_that_makes_its_scan_darker_is_told(tmp_path, usual, bright, told):
+    scan = simulate(0, VLP16)
+    for number in range(6):
+        intensity = torch.linspace(0, usual, len(scan)).numpy()
+        intensity[0] = bright if number == 5 else usual
+        np.savez(tmp_path / f"{number}.npz", points=scan.points_xyz_m.numpy(), intensity=intensity)
+    config, heard = DataConfig(sensor="vlp16", columns=180, workers=1), Heard()
+    folder = prepare_and_describe(str(tmp_path), open_dataset(str(tmp_path)), config, tmp_path / "out", heard).folder
+    for said in (heard.messages, PreparedImages(str(folder)).remarks()):
+        (warning,) = (line for line in said if "reflectance" in line)
+        assert f"divided {told} and by" in warning
+        assert "in 1 scan, such as" in warning
+        assert f"{tmp_path.name}/5.npz" in warning
+    source = open_source(str(folder))
+    source.images(reporter=heard)
+    (doubt,) = source.doubts
+    assert doubt in warning
+    assert not PreparedImages(str(folder)).evenly_spaced(3).doubts(), "the first, the third and the fifth"
+
+
+def test_dark_scans_of_whole_numbers_and_bytes_are_of_one_scale(tmp_path):
+    points = simulate(0, VLP16).points_xyz_m.numpy()
+    for name, values in (("zero", np.zeros(len(points), "u2")), ("byte", np.ones(len(points), "u1"))):
+        np.savez(tmp_path / f"{name}.npz", points=points, intensity=values)
+        assert read_scan(tmp_path / f"{name}.npz").full_scale == 0, name
+    np.savez(tmp_path / "a.npz", points=points, intensity=np.full(len(points), 256, "u2"))
+    assert read_scan(tmp_path / "a.npz").full_scale == 65_535
+
+
+def by_turns(scan: Scan) -> torch.Tensor:
+    """Return the points of 16 lasers as they are fired: the lowest, the ninth, the second, the tenth, ..."""
+    order = torch.stack((torch.arange(15, 7, -1), torch.arange(7, -1, -1)), 1).flatten().argsort()
+    azimuth_rad = torch.atan2(scan.points_xyz_m[:, 1], scan.points_xyz_m[:, 0])
+    column = ((torch.pi - azimuth_rad) / (2 * torch.pi) * 1800).long()
+    return scan.points_xyz_m[(column * 16 + order[scan.ring]).argsort()]
+
+
+@pytest.mark.parametrize("fired", ["ring by ring", "by turns", "shuffled"])
+def test_wide_rows_are_refused_and_bare_ones_are_not(tmp_path, fired):
+    scan, rng = simulate(0, VLP16), np.random.default_rng(0)
+    points = (by_turns(scan) if fired == "by turns" else scan.points_xyz_m).numpy()
+    count = len(points) // 12 * 12  # whole rows of all widths
+    ring, time = np.arange(count) % 16, np.linspace(0, 0.1, count)
+    columns = [*points[:count].T, rng.random(count), ring, time, np.zeros(count), np.ones(count)]
+    table = np.column_stack(columns).astype("<f4")
+    table = rng.permutation(table) if fired == "shuffled" else table
+    for width in range(3, 9):
+        path = tmp_path / f"{width}.bin"
+        path.write_bytes(np.ascontiguousarray(table[:, :width]).tobytes())
+        if width <= 4:
+            assert len(read_scan(path)) == count
+            continue
+        with pytest.raises(ScanError, match=f"rows of {width} numbers") as refusal:
+            read_scan(path)
+        assert ("name it .pcd.bin" in refusal.value.cure) == (width == 5)
+
+
+@pytest.mark.parametrize("row", [b"4,5,6,2,99", b"4,5,6,2,,9"])
+def test_lines_with_more_fields_than_names_are_refused(tmp_path, row):
+    (tmp_path / "a.csv").write_bytes(b"x,y,z,ring\n1,2,3,1\n" + row + b"\n")
+    with pytest.raises(ScanError, match=r"a line of [56] fields below 4 names") as refusal:
+        read_scan(tmp_path / "a.csv")
+    assert "name every column" in refusal.value.cure
+    (tmp_path / "a.csv").write_bytes(b"x,y,z,ring\n1,2,3,1,\r\n4,5,6,2\r\n")
+    assert len(read_scan(tmp_path / "a.csv")) == 2, "an empty field at the end names nothing"
+    (tmp_path / "a.csv").write_bytes(b"x  y z\n1 2   3 \n4 5 6\n")
+    assert len(read_scan(tmp_path / "a.csv")) == 2
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_rings_counted_from_1_are_refused(tmp_path, turned):
+    scan = simulate(0, VLP16)
+    ring = scan.ring.numpy()
+    ring = 15 - ring if turned else ring
+    for count_from, rings in ((0, ring), (1, ring + 1)):
+        np.savez(tmp_path / f"{count_from}.npz", points=scan.points_xyz_m.numpy(), ring=rings)
+    assert torch.equal(read_scan(tmp_path / "0.npz").ring, scan.ring)
+    with pytest.raises(ScanError, match=r"rings from \d+ to 16 in .*counted from 1; .*subtract 1"):
+        read_scan(tmp_path / "1.npz")

@@ -89,6 +89,17 @@ def test_range_images_in_npy_files_are_a_set_of_a_named_sensor(tmp_path, capsys)
     np.save(folder / "4.npy", np.ones((16, 90), bool))
     with pytest.raises(ScanError, match=r"4.npy, an array of truth values; wanted a range image"):
         open_source(str(folder)).images(sensor).batch([4])
+    (folder / "log.csv").write_text("step,loss\n1,2\n")
+    with pytest.raises(DataError, match=r"with range images and log\.csv; .*alone; move that file elsewhere"):
+        open_source(str(folder))
+    (folder / "log.csv").unlink()
+    np.save(folder / "0.npy", np.ones((16, 90), bool))
+    with pytest.raises(ScanError, match=r"0\.npy, an array of truth values; .*move masks to another folder"):
+        open_source(str(folder))
+    (tmp_path / "scans").mkdir()
+    np.save(tmp_path / "scans" / "poses.npy", np.ones((5, 12)))
+    (tmp_path / "scans" / "a.csv").write_text("x,y,z\n1,2,3\n")
+    assert type(open_source(str(tmp_path / "scans"))) is DatasetSource, "with a table beside its scans"
     np.save(tmp_path / "points.npy", np.ones((100, 4), np.float32))
     assert type(open_source(str(tmp_path / "points.npy"))) is DatasetSource
 

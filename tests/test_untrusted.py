@@ -19,7 +19,15 @@ from lidargrit.errors import CheckpointError, ConfigError, DataError, LidarGritE
 from lidargrit.files import read_json, read_text, write_json
 from lidargrit.generators import load_class
 from lidargrit.nn.devices import usable_device
-from lidargrit.untrusted import check_path, parse_json, positive_number, seed_number, user_path, whole_number
+from lidargrit.untrusted import (
+    check_path,
+    parse_json,
+    positive_number,
+    seed_number,
+    seeds_in_a_row,
+    user_path,
+    whole_number,
+)
 
 
 @pytest.mark.parametrize(
@@ -201,6 +209,17 @@ def test_scans_are_counted_from_0(tmp_path):
     for index in (-1, 1):
         with pytest.raises(ScanError, match=f"scan number {index} of .*one of its 1, counted from 0"):
             load_scan(tmp_path / "scan.npy", index)
+
+
+def test_seeds_beyond_the_last_are_refused_before_anything_is_loaded(tmp_path, capsys):
+    assert seeds_in_a_row(2**32 - 4, 4) == range(2**32 - 4, 2**32)
+    words = ["sample", str(tmp_path / "no_run"), str(tmp_path / "out"), "-n", "4", "--seed", "4294967294"]
+    assert main(words) == 2
+    assert capsys.readouterr().err == (
+        "lidargrit sample: got --seed 4294967294 with -n 4, of which the last scan has the seed 4294967297; "
+        "wanted seeds up to 4294967295; lower one of the two\n"
+    )
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_device_without_numbers_is_refused():

@@ -7,6 +7,7 @@ import json
 import math
 import re
 from collections.abc import Collection, Iterable
+from numbers import Integral, Real
 from typing import Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from lidargrit import _discovery
@@ -45,6 +46,23 @@ class NamedConfig:
         return cls.__module__.rpartition(".")[2]
 
 
+@dataclasses.dataclass(frozen=True)
+class TypedSettings:
+    """Base of settings that users also make in Python, where no parser looks at their types.
+
+    A class with further checks calls this one's ``__post_init__`` first.
+
+    Raises:
+        ConfigError: a word that is not among a setting's choices, or a value of another type.
+    """
+
+    def __post_init__(self) -> None:
+        hints = get_type_hints(type(self))
+        for name, value in _children(self).items():
+            if not _fits(value, hints[name]):
+                raise ConfigError(f"{name}={value!r}", _in_words(hints[name]), "correct the value")
+
+
 def to_json(config: Any) -> Any:
     """Return a configuration as plain JSON values (tuples become lists)."""
     return json.loads(json.dumps(_plain(config)))
@@ -58,8 +76,7 @@ def from_json(cls: type[T], data: Any, source: str) -> T:
         UnknownNameError: a kind that there is not.
     """
     try:
-        if not isinstance(data, dict):  # the parser would take the defaults
-            raise TypeError(f"{str(data)[:40]!r} in place of settings by name")
+        _check_nested(cls, data)
         for name, value in leaves(data).items():
             if isinstance(value, list) and len(value) > _VALUES_AT_MOST:
                 raise TypeError(f"more than {_VALUES_AT_MOST:,} values for {name[:40]!r}")
@@ -168,8 +185,22 @@ def _in_words(hint: Any) -> str:
     """Return what a value of a type is, for a person."""
     if get_origin(hint) is Literal:
         return one_of([str(choice) for choice in get_args(hint)])
+    if type(None) in get_args(hint):
+        others = [_in_words(part) for part in get_args(hint) if part is not type(None)]
+        return one_of([*others, "none"])
     usual = {int: "a whole number", float: "a number", bool: "true or false"}
     return usual.get(hint) or f"a value of the type {str(hint).replace('typing.', '')}"
+
+
+def _fits(value: object, hint: Any) -> bool:
+    """Return whether a value is of a type: one of its choices, a number, text, or one of several such types."""
+    if get_origin(hint) is Literal:
+        return value in get_args(hint)
+    if hint in (int, float):
+        return isinstance(value, Integral if hint is int else Real) and not isinstance(value, bool)
+    if isinstance(hint, type):
+        return isinstance(value, hint)
+    return any(_fits(value, part) for part in get_args(hint))
 
 
 def _parsed(hint: Any, path: str, text: str) -> Any:
@@ -241,14 +272,34 @@ def _concrete(cls: type, data: dict[str, Any]) -> tuple[type, dict[str, Any]]:
     """
     kinds: dict[str, type] = {}
     for key, hint in get_type_hints(cls).items():
-        if isinstance(hint, type) and issubclass(hint, NamedConfig) and isinstance(data.get(key), dict):
-            settings = {**data[key]}
+        if isinstance(hint, type) and issubclass(hint, NamedConfig):
+            settings = {**data[key]} if key in data else _default_of(cls, key)
             kinds[key] = _discovery.load_class(hint.package, str(settings.pop("name", hint.default_name)), hint)
             data = {**data, key: settings}
     if not kinds:
         return cls, data
     fields = [(key, kind, dataclasses.field(default_factory=kind)) for key, kind in kinds.items()]
     return dataclasses.make_dataclass(cls.__name__, fields, bases=(cls,), frozen=True), data
+
+
+def _default_of(cls: type, key: str) -> dict[str, Any]:
+    """Return the default of a field as JSON; {}, which is the default kind, of a field without one."""
+    field = cls.__dataclass_fields__[key]
+    if field.default_factory is not dataclasses.MISSING:
+        return _plain(field.default_factory())
+    return {} if field.default is dataclasses.MISSING else _plain(field.default)
+
+
+def _check_nested(cls: type, data: Any, place: str = "") -> None:
+    """Refuse anything but settings by name where a configuration is to stand, down to the last, with TypeError.
+
+    The parser would take the defaults, or fail with words about its own insides.
+    """
+    if not isinstance(data, dict):
+        raise TypeError(f"{str(data)[:40]!r} in place of settings by name{place}")
+    for key, hint in get_type_hints(cls).items():
+        if key in data and isinstance(hint, type) and dataclasses.is_dataclass(hint):
+            _check_nested(hint, data[key], f" for {key!r}")
 
 
 def _children(node: Any) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from lidargrit.errors import CheckpointError, ConfigError, LidarGritError, Outpu
 from lidargrit.untrusted import JSON_BYTES_AT_MOST, TEXT_BYTES_AT_MOST, parse_json
 
 if TYPE_CHECKING:  # quick start of commands that only read and write JSON
-    from torch import Tensor, nn
+    from torch import Tensor
 
 _PARTIALS = f".lidargrit-partial-{os.getuid()}"  # one a user: a shared folder such as /tmp has files of many
 _ATTEMPTS = 1000  # to make a file that others may sweep away; some file systems can make none, and say so each time
@@ -366,35 +366,3 @@ def _opened_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     with safe_open(path, framework="pt") as opened:
         about = parse_json((opened.metadata() or {}).get("about", "{}"), str(path))
         return {name: opened.get_tensor(name) for name in opened.keys()}, about  # noqa: SIM118  not a dict
-
-
-def load_exactly(
-    module: nn.Module, weights: dict[str, Tensor], source: Path, may_lack: frozenset[str] = frozenset()
-) -> None:
-    """Load weights into a module of the very same layout.
-
-    Args:
-        module: module that gets the weights.
-        weights: weights by their names.
-        source: file that they were read from.
-        may_lack: names that files of earlier versions lack; the module's own values stay.
-
-    Raises:
-        CheckpointError: a name or a size differs; names the first.
-    """
-    wanted = module.state_dict()
-    weights = {**{name: wanted[name] for name in may_lack}, **weights}
-    cure = "load them with the configuration that they were trained with"
-    for name in sorted(wanted.keys() | weights.keys()):
-        if name not in weights or name not in wanted:
-            side = "lacks" if name in wanted else "has besides"
-            raise CheckpointError(
-                f"weights in {source} of another configuration (the file {side} {name!r})", "those of this model", cure
-            )
-        if weights[name].shape != wanted[name].shape:
-            raise CheckpointError(
-                f"weights in {source} of another configuration ({name!r} is {tuple(weights[name].shape)})",
-                f"{tuple(wanted[name].shape)}",
-                cure,
-            )
-    module.load_state_dict(weights)

@@ -35,6 +35,8 @@ class Scan:
         ring: index of the laser of every point, 0 = the highest.
         label: class of every point by SemanticKITTI's numbers, with its instance in the upper 16 of 32 bits.
         source: file or other origin of the scan, for messages.
+        full_scale: number that reflectance was divided by, 1, 255 or 65,535, where the file does not tell and the
+            largest value decided; 0 elsewhere.
 
     Raises:
         ScanError: no point, a coordinate that is not finite, a point at the origin, or a reflectance outside [0, 1].
@@ -45,6 +47,7 @@ class Scan:
     ring: Int[Tensor, "n"] | None = None
     label: Int[Tensor, "n"] | None = None
     source: str = "a scan"
+    full_scale: int = 0
 
     def __post_init__(self) -> None:
         if len(self) == 0:
@@ -98,10 +101,10 @@ class RangeImage:
     """One range image or a batch: row 0 is the highest elevation, column 0 the azimuth +pi, falling to the right.
 
     Args:
-        range_m: Euclidean distance to the return, in metres; 0 where there is none.
+        range_m: Euclidean distance to the return, in metres, kept in 32 bits; 0 where there is none.
         return_mask: whether the beam came back.
         sensor: sensor whose rays the pixels are.
-        reflectance: reflectance of the return, in [0, 1]; 0 where there is none.
+        reflectance: reflectance of the return, in [0, 1], kept in 32 bits; 0 where there is none.
         label: class of what returned by SemanticKITTI's numbers, without its instance; 0 where there is no return or
             the class is not known.
 
@@ -117,6 +120,9 @@ class RangeImage:
     label: Int[Tensor, "*batch H W"] | None = None
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "range_m", self.range_m.float())  # those of NumPy often have 64 bits
+        if self.reflectance is not None:
+            object.__setattr__(self, "reflectance", self.reflectance.float())
         size = tuple(self.range_m.shape[-2:])
         if size != (self.sensor.height, self.sensor.width):
             raise ConfigError(
@@ -288,6 +294,17 @@ class ScanBits:
     mask: Float[Tensor, "B H W"] | None = None
     range: Float[Tensor, "B H W"] | None = None
     expected: Float[Tensor, "B H W"] | None = None
+
+    @classmethod
+    def cat(cls, batches: Sequence[ScanBits]) -> ScanBits:
+        """Make one batch of several batches of one model, by one step."""
+        first = batches[0]
+        parts = {
+            name: torch.cat([getattr(batch, name) for batch in batches])
+            for name in ("return_mask", "tokens", "mask", "range", "expected")
+            if getattr(first, name) is not None
+        }
+        return replace(first, **parts)
 
     @property
     def is_whole(self) -> bool:

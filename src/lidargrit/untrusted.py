@@ -142,6 +142,20 @@ def seed_number(word: str) -> int:
     return whole_number(word, SEED_AT_MOST)
 
 
+def seeds_in_a_row(first: int, count: int) -> range:
+    """Return the seeds of a number of scans from a first one on, the next scan with the next seed.
+
+    Raises:
+        UsageError: no scan, or the last seed is above :data:`SEED_AT_MOST`.
+    """
+    if count < 1:
+        raise UsageError(f"-n {count}", "at least one scan", "raise it")
+    if first + count - 1 > SEED_AT_MOST:
+        got = f"--seed {first} with -n {count}, of which the last scan has the seed {first + count - 1}"
+        raise UsageError(got, f"seeds up to {SEED_AT_MOST}", "lower one of the two")
+    return range(first, first + count)
+
+
 def is_temperature(value: float) -> bool:
     """Return whether a number is 0 or at least :data:`TEMPERATURE_AT_LEAST`."""
     return value == 0 or value >= TEMPERATURE_AT_LEAST

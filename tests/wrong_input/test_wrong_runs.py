@@ -87,7 +87,7 @@ def test_json_that_is_not_ours(refused, run_folder, tmp_path, damaged, name):
     (run_folder / name).write_bytes(damaged)
     words = ["sample", run_folder, tmp_path / "new"] if name == "config.json" else train_words(run_folder)
     message = refused(*words)
-    assert name in message or "not among the generators" in message
+    assert name in message
 
 
 def test_a_run_whose_data_have_no_names(refused, run_folder):
@@ -103,6 +103,10 @@ def test_a_run_whose_data_have_no_names(refused, run_folder):
         {"sensor": {"elevation_rad": [[1], [2, 3]]}},
         {"config": 3},
         {"config": {"colour": 1}},
+        {"config": {"transformer": None}},
+        {"config": {"transformer": {"layers": 0}}},
+        {"config": {"tokenizer": {"name": "none"}}},
+        {"generator": 5},
     ],
 )
 def test_a_configuration_of_the_wrong_shape(refused, run_folder, tmp_path, change):
@@ -110,7 +114,9 @@ def test_a_configuration_of_the_wrong_shape(refused, run_folder, tmp_path, chang
     for key, value in change.items():
         config[key] = config[key] | value if isinstance(value, dict) and value else value
     (run_folder / "config.json").write_text(json.dumps(config))
-    assert "config.json" in refused("sample", run_folder, tmp_path / "new")
+    message = refused("sample", run_folder, tmp_path / "new")
+    assert "config.json" in message
+    assert "functools" not in message
     del config[next(iter(change))]
     (run_folder / "config.json").write_text(json.dumps(config))
     assert "config.json" in refused("sample", run_folder, tmp_path / "new")

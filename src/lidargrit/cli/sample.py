@@ -8,7 +8,7 @@ from pathlib import Path
 
 from lidargrit.cli._options import add_device, add_rank, add_settings
 from lidargrit.errors import counted_scans
-from lidargrit.untrusted import seed_number
+from lidargrit.untrusted import seed_number, seeds_in_a_row
 
 EXAMPLES = """\
   lidargrit sample pretrained samples                     by a model that comes with the package, 64x256
@@ -37,7 +37,6 @@ def run(options: argparse.Namespace) -> None:
     import torch
 
     from lidargrit.configuration import override
-    from lidargrit.errors import ConfigError
     from lidargrit.generators import load
     from lidargrit.nn.devices import usable_device
     from lidargrit.processes import rank_and_world_size
@@ -45,15 +44,15 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.run_folder import locate
     from lidargrit.sources.samples import write_samples
 
-    if options.count < 1:
-        raise ConfigError(f"-n {options.count}", "at least one scan", "raise it")
+    seeds = seeds_in_a_row(options.seed, options.count)
     rank, world_size = rank_and_world_size(options.rank, options.world_size)
     own = f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu"
     device = usable_device(options.device or own)
     run_folder = locate(options.run_folder)
     generator = load(run_folder).to(device)
     owner = f"sampling from {generator.public_name()!r}"
-    sampling = override(generator.Sampling(), options.set, owner, "see all with: lidargrit list generators")
-    seeds = range(options.seed, options.seed + options.count)[rank::world_size]
+    cure, unread = "see all with: lidargrit list generators", generator.not_of_sampling
+    sampling = override(generator.Sampling(), options.set, owner, cure, unread)
+    seeds = seeds[rank::world_size]
     write_samples(generator, run_folder, options.out, seeds, sampling, TerminalReporter())
     print(f"done: {counted_scans(len(seeds))} in {options.out}; look at them with: lidargrit view {options.out}")

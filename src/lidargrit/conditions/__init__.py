@@ -30,18 +30,19 @@ class Condition:
     Every quantity has a mask of its own that says where it was observed. Values elsewhere have no influence.
 
     Args:
-        range_m: range of the surface that the beam meets, in metres.
+        range_m: range of the surface that the beam meets, in metres, kept in 32 bits.
         range_observed: True where the range is known.
         return_mask: True where the beam came back.
         return_observed: True where it is known whether the beam came back.
         sensor: sensor whose rays the pixels are.
-        reflectance: reflectance in [0, 1] of the observed returns; None if it is not known.
+        reflectance: reflectance in [0, 1] of the observed returns, kept in 32 bits; None if it is not known.
         label: class of the surface by SemanticKITTI's numbers, 0 where it is not known; None if it is not known
             anywhere.
 
     Raises:
-        ConfigError: masks of another size or type than the ranges, or no batch.
-        ScanError: an observed range that is not positive and finite, or an observed return without a range.
+        ConfigError: masks of another size or type than the ranges, labels that are no whole numbers, or no batch.
+        ScanError: an observed range that is not positive and finite, an observed return without a range, or its
+            reflectance outside [0, 1].
     """
 
     range_m: Float[Tensor, "B H W"]
@@ -56,16 +57,26 @@ class Condition:
         check_observed(self.range_observed, self.range_m)
         check_observed(self.return_observed, self.range_m)
         check_observed(self.return_mask, self.range_m, "a mask of returns")
+        object.__setattr__(self, "range_m", self.range_m.float())  # those of NumPy often have 64 bits
+        if self.reflectance is not None:
+            object.__setattr__(self, "reflectance", self.reflectance.float())
         size = (len(self.range_m), self.sensor.height, self.sensor.width)
         for name in ("range_m", "reflectance", "label"):
             pixels: Tensor | None = getattr(self, name)
             if pixels is not None and pixels.shape != size:
                 raise ConfigError(f"{name} of {tuple(pixels.shape)}", f"{size}, of the sensor", "give all one shape")
+        if self.label is not None and (self.label.is_floating_point() or self.label.dtype == torch.bool):
+            raise ConfigError(f"labels of type {self.label.dtype}", "whole numbers", "make them of type torch.int32")
         range_m = self.range_m[self.range_observed]
         if not bool(((range_m > 0) & range_m.isfinite()).all()):
             raise ScanError("an observed range of 0 metres, NaN or infinity", "positive metres", "mark it as unknown")
         if bool((self.return_observed & self.return_mask & ~self.range_observed).any()):
             raise ScanError("an observed return of unknown range", "both, or neither", "mark it as unknown")
+        if self.reflectance is not None:
+            reflectance = self.reflectance[self.return_observed & self.return_mask]
+            if not bool(((reflectance >= 0) & (reflectance <= 1)).all()):  # NaN is neither
+                got = "an observed return whose reflectance is NaN, below 0 or above 1"
+                raise ScanError(got, "values in [0, 1]", "scale it, e.g. divide an intensity of 0..255 by 255")
 
     @classmethod
     def of_pixels(cls, images: RangeImage, observed: Bool[Tensor, "B H W"]) -> Condition:
@@ -91,6 +102,7 @@ class Condition:
             unknown: True for pixels of which nothing is known; none if not given.
         """
         unknown = torch.zeros_like(clean.return_mask) if unknown is None else unknown
+        check_observed(unknown, clean.range_m, "unknown pixels")
         hit = clean.return_mask & ~unknown
         label = None if clean.label is None else torch.where(hit, clean.label, 0)
         return cls(clean.range_m, hit, torch.zeros_like(hit), ~clean.return_mask & ~unknown, clean.sensor, label=label)

@@ -130,8 +130,9 @@ class FileDataset(ScanDataset):
 
     @classmethod
     def scans_in(cls, path: Path) -> int:
-        """Count the scans in a file that belong to the data set."""
-        return formats.count_scans(path)
+        """Count the scans in a file that belong to the data set, which is of one sensor."""
+        of_several = any(form.sensors > 1 for form in formats.candidates(path))
+        return 1 if of_several else formats.count_scans(path)
 
     @classmethod
     def _format(cls, path: Path) -> type[formats.ScanFormat]:

@@ -50,8 +50,3 @@ class Argoverse2(FileDataset):
         folder = path.resolve().parent
         in_a_log = folder.parts[-2:] == ("sensors", "lidar")
         return f"argoverse2/{folder.parts[-3]}" if in_a_log else unnamed_recording(path)
-
-    @classmethod
-    def scans_in(cls, path: Path) -> int:
-        """Count one: the upright sensor's."""
-        return 1

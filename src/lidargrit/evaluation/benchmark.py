@@ -299,9 +299,11 @@ class _Plan:
         owner, cure = f"sampling from {name!r}", "see all with: lidargrit list generators"
         if is_run(run):
             generator = load(run)
-            return cls(system, run, None, override(generator.Sampling(), settings, owner, cure), generator.sensor)
+            sampling = override(generator.Sampling(), settings, owner, cure, generator.not_of_sampling)
+            return cls(system, run, None, sampling, generator.sensor)
         recipe = benchmark.recipe(name, check=not is_run(trained))
-        sampling = override(load_class(recipe.generator).Sampling(), settings, owner, cure)
+        kind = load_class(recipe.generator)
+        sampling = override(kind.Sampling(), settings, owner, cure, kind.not_of_sampling)
         check_folder(trained, recipe)
         return cls(system, trained, recipe, sampling, recipe.data.load_sensor())
 

@@ -9,7 +9,6 @@ from io import BufferedReader
 from pathlib import Path
 from typing import ClassVar, Literal
 
-import numpy as np
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -36,6 +35,8 @@ class ScanFormat(ABC):
     """The sensor that makes such files, if it is always the same."""
     several: ClassVar[bool] = False
     """Whether one file may hold more than one scan."""
+    sensors: ClassVar[int] = 1
+    """How many sensors a file has a scan of each; a set of scans is of the first, for the others have other rays."""
     keeps: ClassVar[tuple[str, ...]] = ()
     """What :meth:`write` keeps of a scan besides its points, in files of the first suffix: reflectance, ring, label."""
     companion: ClassVar[str] = ""
@@ -173,13 +174,14 @@ def scan_of(
     source: str,
     bad_points: BadPoints,
     label: Int[Tensor, "n"] | None = None,
+    full_scale: int = 0,
 ) -> Scan:
     """Make a scan of what a file holds, without points that are no returns if ``bad_points`` is ``drop``."""
     if bad_points == "drop":
         kept = usable_points(points_xyz_m, reflectance)
         points_xyz_m = points_xyz_m[kept]
         reflectance, ring, label = (None if one is None else one[kept] for one in (reflectance, ring, label))
-    return Scan(points_xyz_m.contiguous(), reflectance, ring, label, source)
+    return Scan(points_xyz_m.contiguous(), reflectance, ring, label, source, full_scale)
 
 
 def usable_points(points_xyz_m: Float[Tensor, "n 3"], reflectance: Float[Tensor, "n"] | None) -> Bool[Tensor, "n"]:
@@ -229,16 +231,6 @@ def first_bytes(path: Path, at_most: int) -> bytes:
             return file.read(at_most)
     except (ScanError, OSError):
         return b""
-
-
-def mean_difference(values: np.ndarray, step: int) -> float:
-    """Return how far numbers are from those some places before them: least at the numbers of a point, in bare files.
-
-    Numbers that are none count as 0; huge ones, of a damaged file, may give an infinite mean or none.
-    """
-    known = np.where(np.isfinite(values), values, 0)
-    with np.errstate(over="ignore", invalid="ignore"):
-        return float(np.abs(known[step:] - known[:-step]).mean())
 
 
 def damaged(path: Path, wanted: str, error: Exception) -> ScanError:

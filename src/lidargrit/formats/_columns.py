@@ -29,6 +29,7 @@ _FULL_SCALES = (1, 255, 65_535)
 _ABOUT_1 = 1.05  # of reflectance from 0 to 1 that a calibration took a little beyond
 _LASERS = (16, 32, 40, 64, 80, 128, 256)  # that sensors have; the top ring may have no return, and not be in the file
 _ONE_RING_AT_MOST_RAD = math.radians(5)  # that the elevations of a sensor with one ring may span
+_LINE_BYTES_AT_MOST = 65_536  # of text; real ones take up to some hundreds
 _RING_AT_MOST = 65_535  # 16 bits, as ROS drivers store it
 _LABEL_AT_MOST = 2**32 - 1  # SemanticKITTI's: class and instance in 16 bits each
 
@@ -41,7 +42,8 @@ def scan_of_columns(columns: Mapping[str, Num[np.ndarray, "n"]], path: Path, bad
     is none.
 
     Raises:
-        ScanError: x, y or z is not there, rings or labels are not whole numbers, or the points are unfit.
+        ScanError: x, y or z is not there, rings or labels are not whole numbers, rings are counted from 1, or the
+            points are unfit.
     """
     named = {_plain(name): values for name, values in reversed(list(columns.items()))}
     if not {"x", "y", "z"} <= named.keys():
@@ -51,17 +53,14 @@ def scan_of_columns(columns: Mapping[str, Num[np.ndarray, "n"]], path: Path, bad
     reflectance, ring, label = (_first(named, names) for names in (_REFLECTANCE, _RING, _LABEL))
     good = points_xyz_m.isfinite().all(dim=1) & (points_xyz_m != 0).any(dim=1)
     if ring is not None and _tells_rows(ring, points_xyz_m, good):
-        ring = _from_the_top(_whole(ring, good, _RING_AT_MOST, "ring", path), points_xyz_m, good)
+        ring = _whole(ring, good, _RING_AT_MOST, "ring", path)
+        _refuse_counts_from_1(ring[good], path)
+        ring = _from_the_top(ring, points_xyz_m, good)
     else:
         ring = None
-    return scan_of(
-        points_xyz_m,
-        None if reflectance is None else _to_unit(reflectance),
-        ring,
-        str(path),
-        bad_points,
-        None if label is None else _whole(label, good, _LABEL_AT_MOST, "label", path),
-    )
+    in_unit, full_scale = (None, 0) if reflectance is None else _to_unit(reflectance)
+    label = None if label is None else _whole(label, good, _LABEL_AT_MOST, "label", path)
+    return scan_of(points_xyz_m, in_unit, ring, str(path), bad_points, label, full_scale)
 
 
 def known_name(name: str) -> str:
@@ -85,6 +84,20 @@ def columns_of(scan: Scan) -> dict[str, np.ndarray]:
     return columns
 
 
+def check_lines(data: bytes, path: Path, wanted: str) -> None:
+    """Refuse text with a line longer than any of numbers: NumPy takes twenty times the memory of a line.
+
+    Raises:
+        ScanError: such a line.
+    """
+    start = 0
+    while len(data) - start > _LINE_BYTES_AT_MOST:
+        start = data.rfind(b"\n", start, start + _LINE_BYTES_AT_MOST) + 1
+        if not start:
+            what = f"a line of more than {_LINE_BYTES_AT_MOST:,} bytes in {path}"
+            raise ScanError(what, wanted, "give every point a line of its own")
+
+
 def text_rows(data: bytes, rows: int, names: list[str], path: Path, wanted: str) -> dict[str, np.ndarray]:
     """Read rows of numbers between blanks.
 
@@ -94,6 +107,7 @@ def text_rows(data: bytes, rows: int, names: list[str], path: Path, wanted: str)
     promised = f"the {rows} rows of {len(names)} numbers that its header says"
     if 2 * rows * len(names) > len(data) + 1:  # a number takes a digit and a blank; room is made for all rows at once
         raise ScanError(f"{len(data)} bytes of text in {path}", promised, "download it again: the file was cut short")
+    check_lines(data, path, promised)
     try:
         with warnings.catch_warnings(action="ignore"):  # of empty lines: what is missing is seen below
             table = np.loadtxt(BytesIO(data), np.float64, comments=None, max_rows=rows, ndmin=2, encoding="latin1")
@@ -127,14 +141,18 @@ def _floats(values: np.ndarray) -> Tensor:
         return torch.from_numpy(values.astype(np.float32))
 
 
-def _to_unit(reflectance: np.ndarray) -> Tensor:
+def _to_unit(reflectance: np.ndarray) -> tuple[Tensor, int]:
+    """Return reflectance from 0 to 1, and its full scale if the largest value told that; 0 otherwise."""
     values = _floats(reflectance)
     if reflectance.dtype == np.uint8:
-        return values / 255
+        return values / 255, 0
     highest = float(values.nan_to_num(0.0, torch.inf, 0.0).max()) if len(values) else 0.0
-    if 1 < highest <= _ABOUT_1:
-        return values.clamp(max=1)
-    return values / next((scale for scale in _FULL_SCALES if highest <= scale), 1)
+    if highest <= 0:  # of any scale
+        return values, 0
+    if highest <= _ABOUT_1:
+        return (values.clamp(max=1) if highest > 1 else values), 1
+    full_scale = next((scale for scale in _FULL_SCALES if highest <= scale), 1)
+    return values / full_scale, full_scale
 
 
 def _whole(values: np.ndarray, good: Tensor, at_most: int, what: str, path: Path) -> Tensor:
@@ -156,6 +174,16 @@ def _tells_rows(ring: np.ndarray, points_xyz_m: Tensor, good: Tensor) -> bool:
         return True
     low, high = _elevation_rad(points_xyz_m[good]).aminmax()
     return float(high - low) < _ONE_RING_AT_MOST_RAD
+
+
+def _refuse_counts_from_1(ring: Tensor, path: Path) -> None:
+    """Refuse rings from 1 to the number of lasers that a sensor has; in rows counted from 0 each would be off by 1."""
+    if len(ring) and 1 <= int(ring.min()) < int(ring.max()) and int(ring.max()) in _LASERS:
+        raise ScanError(
+            f"rings from {int(ring.min())} to {int(ring.max())} in {path}, as if they were counted from 1",
+            "rings counted from 0",
+            "subtract 1 from each, or leave the column out",
+        )
 
 
 def _from_the_top(ring: Tensor, points_xyz_m: Tensor, good: Tensor) -> Tensor:

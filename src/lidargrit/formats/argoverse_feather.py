@@ -57,6 +57,7 @@ class ArgoverseFeather(ScanFormat):
     sensor = "vlp32c"
     keeps = ("reflectance", "ring")
     several = True
+    sensors = 2
     extra = "argoverse"
 
     @staticmethod

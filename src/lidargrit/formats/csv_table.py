@@ -11,7 +11,14 @@ import numpy as np
 from lidargrit.errors import ScanError, first_words
 from lidargrit.files import atomic_path
 from lidargrit.formats import POINTS_AT_MOST, BadPoints, ScanFormat, first_bytes, read_bytes
-from lidargrit.formats._columns import BYTES_AT_MOST, REFLECTANCE_RULE, columns_of, known_name, scan_of_columns
+from lidargrit.formats._columns import (
+    BYTES_AT_MOST,
+    REFLECTANCE_RULE,
+    check_lines,
+    columns_of,
+    known_name,
+    scan_of_columns,
+)
 from lidargrit.structures import Scan
 
 _FORMAT = "lines of numbers below a line that names the columns, x, y and z among them"
@@ -51,6 +58,8 @@ class CsvTable(ScanFormat):
                 f"{path}, whose first line names {there}", _FORMAT, "put a line such as x,y,z,intensity before the rest"
             )
         body = data[data.find(b"\n") + 1 :] if b"\n" in data else b""
+        check_lines(body, path, _FORMAT)
+        _check_fields(body, len(names), separator, path)
         try:
             with warnings.catch_warnings(action="ignore"):  # of a table without lines: said below
                 table = np.loadtxt(
@@ -78,6 +87,21 @@ class CsvTable(ScanFormat):
         table = np.column_stack([of.astype(np.float64) for of in columns.values()])
         with atomic_path(path) as temporary:
             np.savetxt(temporary, table, form, ",", header=",".join(columns), comments="", encoding="ascii")
+
+
+def _check_fields(body: bytes, at_most: int, separator: str, path: Path) -> None:
+    """Refuse a line of more fields than there are names: which of them is x could not be told."""
+    mark = separator.encode()
+    for line in BytesIO(body):
+        if separator == " ":
+            fields = len(line.split())
+        elif line.count(mark) < at_most:
+            continue
+        else:  # empty ones at the end name nothing, and some programs write one
+            fields = line.rstrip(b"\r\n\t " + mark).count(mark) + 1
+        if fields > at_most:
+            what = f"a line of {fields} fields below {at_most} names in {path}"
+            raise ScanError(what, _FORMAT, "name every column in the first line, and give no line more")
 
 
 def _names(start: bytes) -> tuple[list[str], str]:

@@ -9,12 +9,12 @@ import torch
 
 from lidargrit.errors import ScanError
 from lidargrit.files import atomic_path
-from lidargrit.formats import POINTS_AT_MOST, BadPoints, ScanFormat, first_bytes, mean_difference, read_bytes, scan_of
+from lidargrit.formats import POINTS_AT_MOST, BadPoints, ScanFormat, first_bytes, read_bytes, scan_of
+from lidargrit.formats._bare_rows import wide_row
 from lidargrit.structures import Scan
 
 _ROW_BYTES = 16  # x, y, z, reflectance
 _ROWS_TO_LOOK_AT = 4096  # enough to tell reflectance from a coordinate
-_NUMBERS_TO_TELL = 1024
 _FORMAT = "float32 rows x, y, z, reflectance, 16 bytes a point"
 
 
@@ -32,18 +32,22 @@ class KittiBin(ScanFormat):
 
     @staticmethod
     def recognises(path: Path) -> bool:
-        """Return whether rows of four hold a reflectance in [0, 1] at their end."""
+        """Return whether rows of four, and no wider ones, hold a reflectance in [0, 1] at their end."""
         start = first_bytes(path, _ROW_BYTES * _ROWS_TO_LOOK_AT)
         if not start or path.stat().st_size % _ROW_BYTES:
             return False
         values = np.frombuffer(start, dtype="<f4")
         last = values[3::4]
-        return bool(((last >= 0) & (last <= 1)).all()) and not _has_rows_of_eight(values)
+        return bool(((last >= 0) & (last <= 1)).all()) and not wide_row(values)
 
     @staticmethod
     def read(path: Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
         """Read the scan in a file."""
         data = read_bytes(path, POINTS_AT_MOST * _ROW_BYTES, _FORMAT)
+        if width := wide_row(np.frombuffer(data, "<f4", min(len(data) // 4, 4 * _ROWS_TO_LOOK_AT))):
+            nuscenes = "if nuScenes wrote it, name it .pcd.bin; else " if width == 5 else ""
+            cure = f"{nuscenes}keep x, y, z and reflectance from 0 to 1, or save named columns as .npz"
+            raise ScanError(f"rows of {width} numbers in {path}", _FORMAT, cure)
         if len(data) % _ROW_BYTES:
             nuscenes = len(data) % 20 == 0
             raise ScanError(
@@ -52,10 +56,7 @@ class KittiBin(ScanFormat):
                 ("if its rows have 5 columns, as nuScenes writes them, name it .pcd.bin; else " if nuscenes else "")
                 + "download it again: the file was cut short or is of another format",
             )
-        values = np.frombuffer(bytearray(data), dtype="<f4")
-        if _has_rows_of_eight(values[: 4 * _ROWS_TO_LOOK_AT]):
-            raise ScanError(f"rows of 8 numbers in {path}", _FORMAT, "keep the first four columns")
-        rows = torch.from_numpy(values.reshape(-1, 4))
+        rows = torch.from_numpy(np.frombuffer(bytearray(data), dtype="<f4").reshape(-1, 4))
         return scan_of(rows[:, :3], rows[:, 3].contiguous(), None, str(path), bad_points)
 
     @classmethod
@@ -65,10 +66,3 @@ class KittiBin(ScanFormat):
         rows = torch.cat((scan.points_xyz_m, reflectance[:, None]), dim=1)
         with atomic_path(path) as temporary:
             temporary.write_bytes(rows.numpy().astype("<f4").tobytes())
-
-
-def _has_rows_of_eight(values: np.ndarray) -> bool:
-    """Return whether numbers resemble those eight before them far more than those four before, as rows of eight do."""
-    if len(values) < _NUMBERS_TO_TELL or len(values) % 8:
-        return False
-    return mean_difference(values, 8) < mean_difference(values, 4) / 2

@@ -38,7 +38,7 @@ class OusterPcap(ScanFormat):
 
     title = "Ouster .pcap with its .json"
     suffixes = (".pcap",)
-    reflectance = "calibrated reflectivity of 8 bits, divided by 255; of 16 bits in old recordings, by 65535"
+    reflectance = "calibrated reflectivity of 8 bits, divided by 255"
     frame = "x forward (away from the plug), y left, z up, origin at the sensor's base"
     several = True
     companion = "the sensor's metadata, a .json of the same name"
@@ -68,8 +68,8 @@ class OusterPcap(ScanFormat):
             raise _unusable(path, error) from None
         reflectance = None
         if reflectivity is not None:
-            full_scale = float(np.iinfo(reflectivity.dtype).max)
-            reflectance = torch.from_numpy((reflectivity[returned] / full_scale).astype(np.float32))
+            # 8 bits in every profile, that of the oldest recordings included
+            reflectance = torch.from_numpy((reflectivity[returned] / 255).astype(np.float32))
         ring = torch.from_numpy(row_to_ring[np.nonzero(returned)[0]])
         with np.errstate(over="ignore"):  # infinite, and so refused or dropped
             points_xyz_m = torch.from_numpy(xyz_m.astype(np.float32))

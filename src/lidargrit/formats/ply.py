@@ -84,8 +84,7 @@ class Ply(ScanFormat):
             vertices = np.frombuffer(data, row, header.points, first)
             columns = {name: vertices[name] for name in header.properties}
         else:
-            body = data[header.end :].split(b"\n", header.rows_before)[-1]
-            columns = text_rows(body, header.points, list(header.properties), path, _FORMAT)
+            columns = text_rows(_below(data, header, path), header.points, list(header.properties), path, _FORMAT)
         return scan_of_columns(columns, path, bad_points)
 
     @classmethod
@@ -134,6 +133,9 @@ class _Header:
         before, vertices = elements[:index], elements[index]
         if not 0 < vertices.rows <= POINTS_AT_MOST:
             raise _refused(f"{vertices.rows} vertices", path)
+        rows_before = sum(element.rows for element in before)
+        if rows_before > POINTS_AT_MOST:
+            raise _refused(f"{rows_before} rows before its vertices", path)
         for element in before:
             if not 0 <= element.rows <= POINTS_AT_MOST or "list" in element.properties.values():
                 raise _refused(f"{element.rows} rows of {element.name[:20]!r} before its vertices", path)
@@ -142,10 +144,20 @@ class _Header:
             byte_order,
             vertices.rows,
             vertices.properties,
-            sum(element.rows for element in before),
+            rows_before,
             sum(element.rows * size for element, size in zip(before, row_bytes, strict=True)),
             end,
         )
+
+
+def _below(data: bytes, header: _Header, path: Path) -> bytes:
+    """Return the text below the rows of the elements before the vertices, without making lines of those."""
+    end = header.end
+    for row in range(header.rows_before):
+        end = data.find(b"\n", end) + 1
+        if not end:
+            raise _refused(f"{row} of the {header.rows_before} rows before its vertices", path)
+    return data[end:]
 
 
 class _Element(NamedTuple):

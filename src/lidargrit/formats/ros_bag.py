@@ -8,7 +8,7 @@ import sqlite3
 import warnings
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from io import BytesIO
 from itertools import islice
 from pathlib import Path
@@ -123,47 +123,50 @@ def _busiest(topics: Counter[str], path: Path) -> str:
 
 class _Ros1:
     def __init__(self, path: Path) -> None:
-        self._path = path
-        with _bag(path) as reader:
-            clouds = [each for each in reader.connections if each.msgtype in _TYPES]
-            topic = _busiest(
-                Counter({each.topic: sum(c.msgcount for c in clouds if c.topic == each.topic) for each in clouds}), path
-            )
-            self._ids = {each.id for each in clouds if each.topic == topic}
-            if sum(each.msgcount for each in clouds if each.id in self._ids) > _MESSAGES_AT_MOST:
-                raise ValueError("more messages than a recording can have")
-            self.times = sorted(entry.time for each in self._ids for entry in reader.indexes[each])
+        from rosbags.rosbag1 import Reader  # noqa: PLC0415  an optional part
+
+        self._path, reader = path, Reader(path)
+        try:
+            reader.open()
+        finally:  # the library leaves the file open where it meets a damaged one
+            if reader.bio is not None:
+                reader.bio.close()
+        for chunk in reader.chunks.values():
+            if chunk.datasize > _CHUNK_BYTES_AT_MOST or chunk.decompressor.__module__ == "bz2":
+                what = f"{path}, whose chunks are packed by bzip2 or larger than 64 MB"
+                raise ScanError(what, "chunks of lz4, or unpacked ones", "unpack it with: rosbag decompress")
+        clouds = [each for each in reader.connections if each.msgtype in _TYPES]
+        counts: Counter[str] = Counter()
+        for each in clouds:
+            counts[each.topic] += each.msgcount
+        topic = _busiest(counts, path)
+        if counts[topic] > _MESSAGES_AT_MOST:
+            raise ValueError("more messages than a recording can have")
+        entries = (entry for each in clouds if each.topic == topic for entry in reader.indexes[each.id])
+        # The whole index is read once, here: a long recording has a hundred thousand entries.
+        self._entries = sorted(entries, key=lambda entry: entry.time)
+        self._chunks = reader.chunks
+        self.times = [entry.time for entry in self._entries]
 
     def message(self, index: int) -> Any:
-        from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415  an optional part
+        from rosbags.rosbag1.reader import Header, RecordType  # noqa: PLC0415  an optional part
 
-        unpack = functools.partial(_unpacked_lz4, at_most=BYTES_AT_MOST)
-        with _bag(self._path) as reader:
-            for position, chunk in reader.chunks.items():
-                if chunk.datasize > _CHUNK_BYTES_AT_MOST or chunk.decompressor.__module__ == "bz2":
-                    what = f"{self._path}, whose chunks are packed by bzip2 or larger than 64 MB"
-                    raise ScanError(what, "chunks of lz4, or unpacked ones", "unpack it with: rosbag decompress")
-                if chunk.decompressor.__module__.startswith("lz4"):  # which would unpack whatever is there
-                    reader.chunks[position] = chunk._replace(decompressor=unpack)
-            clouds = [each for each in reader.connections if each.id in self._ids]
-            same = self.times[:index].count(self.times[index])
-            found = reader.messages(clouds, self.times[index], self.times[index] + 1)
-            _, _, raw = next(islice(found, same, None))
-        return get_typestore(Stores.ROS1_NOETIC).deserialize_ros1(raw, _TYPES[0])
-
-
-@contextmanager
-def _bag(path: Path) -> Iterator[Any]:
-    """Open a recording of ROS 1; the library leaves the file open where it meets a damaged one."""
-    from rosbags.rosbag1 import Reader  # noqa: PLC0415  an optional part
-
-    reader = Reader(path)
-    try:
-        reader.open()
-        yield reader
-    finally:
-        if reader.bio is not None:
-            reader.bio.close()
+        entry = self._entries[index]
+        chunk = self._chunks[entry.chunk_pos]
+        with self._path.open("rb") as file:
+            file.seek(chunk.datapos)
+            packed = file.read(chunk.datasize)
+        # The library's own function would unpack whatever is there.
+        is_packed = chunk.decompressor.__module__.startswith("lz4")
+        records = BytesIO(_unpacked_lz4(packed, BYTES_AT_MOST) if is_packed else packed)
+        records.seek(entry.offset)
+        kind, data = RecordType.CONNECTION, b""
+        while kind == RecordType.CONNECTION:  # which may stand before the first message of each
+            kind = Header.read(records).get_uint8("op")
+            data = records.read(int.from_bytes(records.read(4), "little"))
+        if kind != RecordType.MSGDATA:
+            raise ValueError("an index that leads to no message")
+        return _decoded(data, "ros1")
 
 
 def _unpacked_lz4(packed: bytes, at_most: int) -> bytes:
@@ -308,13 +311,18 @@ class _Sqlite:
 
 
 def _decoded(raw: bytes, encoding: str) -> Any:
-    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415  an optional part
-
     if encoding == "ros1":
-        return get_typestore(Stores.ROS1_NOETIC).deserialize_ros1(raw, _TYPES[0])
+        return _types("ROS1_NOETIC").deserialize_ros1(raw, _TYPES[0])
     if encoding != "cdr":
         raise ValueError(f"messages in {encoding[:20]}, not in cdr")
-    return get_typestore(Stores.ROS2_FOXY).deserialize_cdr(raw, _TYPES[0])
+    return _types("ROS2_FOXY").deserialize_cdr(raw, _TYPES[0])
+
+
+@functools.cache  # which takes longer to make than a scan to read
+def _types(release: str) -> Any:
+    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415  an optional part
+
+    return get_typestore(Stores[release])
 
 
 def _columns(cloud: Any) -> dict[str, np.ndarray]:

@@ -9,7 +9,8 @@ import torch
 
 from lidargrit.errors import OutputError, ScanError
 from lidargrit.files import atomic_path
-from lidargrit.formats import POINTS_AT_MOST, BadPoints, ScanFormat, first_bytes, mean_difference, read_bytes, scan_of
+from lidargrit.formats import POINTS_AT_MOST, BadPoints, ScanFormat, first_bytes, read_bytes, scan_of
+from lidargrit.formats._bare_rows import row_width
 from lidargrit.structures import Scan
 
 _ROW_BYTES = 12  # x, y, z
@@ -38,7 +39,7 @@ class XyzBin(ScanFormat):
             return False
         values = np.frombuffer(start, dtype="<f4")
         values = np.where(np.isnan(values), 0, values)  # placeholders for no return
-        return bool((np.abs(values) <= _FARTHEST_M).all()) and _row_width(values) == 3
+        return bool((np.abs(values) <= _FARTHEST_M).all()) and row_width(values) == 3
 
     @staticmethod
     def read(path: Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
@@ -69,9 +70,3 @@ class XyzBin(ScanFormat):
             raise OutputError(what, f"at most {_FARTHEST_M:g} m", "choose another format, such as ply")
         with atomic_path(path) as temporary:
             temporary.write_bytes(scan.points_xyz_m.numpy().astype("<f4").tobytes())
-
-
-def _row_width(values: np.ndarray) -> int:
-    """Return after how many values a file resembles itself most; that many belong to a point."""
-    differences = {width: mean_difference(values, width) for width in (3, 4, 5) if width < len(values)}
-    return min(differences, key=differences.__getitem__, default=3)

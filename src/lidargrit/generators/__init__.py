@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar, final
@@ -15,11 +14,11 @@ from lidargrit import _discovery, configuration
 from lidargrit.conditions import Condition, ConditionKind
 from lidargrit.errors import CheckpointError, ConfigError, LidarGritError, nearest_names, one_of
 from lidargrit.files import read_json, read_tensors
-from lidargrit.generators._batches import BatchSeeds, in_batches
+from lidargrit.generators._batches import BatchSeeds, in_batches, one_by_one
 from lidargrit.generators._checks import check_condition, check_images, check_seeds
-from lidargrit.generators._facts import CAPABILITIES, SystemFacts
+from lidargrit.generators._facts import CAPABILITIES, Cost, NoSampling, SystemFacts
 from lidargrit.generators._hub import download
-from lidargrit.generators._saved import ConfigT, SavedModel
+from lidargrit.generators._saved import ConfigT, SavedModel, told_of
 from lidargrit.loading import RangeImages
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.precision import Precision
@@ -30,25 +29,6 @@ from lidargrit.run_folder import CONFIG_FILE, PACKAGED, WEIGHTS_FILE, is_run, lo
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage, ScanBits
 from lidargrit.tokenizers import Tokenizer
-
-
-@dataclass(frozen=True)
-class NoSampling:
-    """Settings of a generator that leaves nothing to choose."""
-
-
-@dataclass(frozen=True)
-class Cost:
-    """Cost of sampling one scan, counted and not timed, so the same on every machine.
-
-    Args:
-        network_evaluations: number of passes through a network, one after the other.
-        flops: number of floating-point operations in products and convolutions, two for a multiply-add.
-    """
-
-    network_evaluations: int
-    flops: int
-
 
 SamplingT = TypeVar("SamplingT")
 
@@ -66,6 +46,9 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     """
 
     Sampling: ClassVar[type] = NoSampling
+    not_of_sampling: ClassVar[frozenset[str]] = frozenset()
+    """Names of those settings in ``Sampling`` that only completing or inverting a scan reads."""
+
     capabilities: ClassVar[frozenset[str]] = frozenset()
     facts: ClassVar[SystemFacts] = SystemFacts(generates="range images")
     training_precision: ClassVar[Precision] = "auto"
@@ -171,7 +154,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     @final
     @torch.no_grad()
     def reconstruct(self, images: RangeImage) -> RangeImage:
-        """Encode each scan and decode it again (capability ``encode``).
+        """Encode each scan and decode it again, by itself (capability ``encode``).
 
         Args:
             images: batch of range images (B, H, W).
@@ -181,7 +164,8 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         """
         self._require("encode")
         check_images(images, self.sensor)
-        return self.eval()._reconstruct(images.to(self.device))
+        self.eval()
+        return RangeImage.cat([self._reconstruct(image) for image in one_by_one(images.to(self.device))])
 
     @final
     @torch.no_grad()
@@ -241,7 +225,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     @final
     @torch.no_grad()
     def bits(self, images: RangeImage, step_mm: int = 10, expected: bool = False) -> ScanBits:
-        """Return the negative log-likelihood of each scan in bits (capability ``likelihood``).
+        """Return the negative log-likelihood of each scan in bits, each computed by itself (capability ``likelihood``).
 
         It is exact for generators without tokens. With tokens it is an upper bound, since tokens other than the
         encoder's could stand for the same scan.
@@ -259,7 +243,9 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         self._require("likelihood")
         check_images(images, self.sensor)
         steps = RangeSteps(self.sensor, step_mm)
-        return self.eval()._bits(steps.round(images.to(self.device)), steps, expected)
+        self.eval()
+        rounded = steps.round(images.to(self.device))
+        return ScanBits.cat([self._bits(image, steps, expected) for image in one_by_one(rounded)])
 
     @abstractmethod
     def _sample(self, seeds: BatchSeeds, sampling: SamplingT) -> RangeImage:
@@ -273,9 +259,11 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         raise NotImplementedError
 
     def _reconstruct(self, images: RangeImage) -> RangeImage:
+        """Encode and decode a batch of one scan."""
         raise NotImplementedError
 
     def _bits(self, images: RangeImage, steps: RangeSteps, expected: bool) -> ScanBits:
+        """Return the bits of a batch of one scan."""
         raise NotImplementedError
 
     def _settings(self, given: SamplingT | None, default: Callable[[], SamplingT]) -> SamplingT:
@@ -300,8 +288,12 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     def about(cls) -> list[str]:
         """Return lines for a person: the system's facts, and the sampling settings with their defaults."""
         facts = cls.facts.lines(cls.capabilities)
-        settings = [f"{name}={value}" for name, value in configuration.leaves(cls.Sampling()).items()]
-        return [*facts, f"sample --set: {', '.join(settings)}"] if settings else facts
+        defaults = configuration.leaves(cls.Sampling())
+        for verb, names in (("sample", defaults.keys() - cls.not_of_sampling), ("complete", cls.not_of_sampling)):
+            settings = [f"{name}={value}" for name, value in defaults.items() if name in names]
+            also = " besides" if verb == "complete" else ""
+            facts += [f"{verb} --set{also}: {', '.join(settings)}"] if settings else []
+        return facts
 
     @classmethod
     def from_published(cls, files: Sequence[Path], config: ConfigT, sensor: SensorModel) -> Generator[Any, Any]:
@@ -332,8 +324,14 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
 
         Raises:
             CheckpointError: no such folder or repository, a damaged one, or another kind of generator in it.
+            ConfigError: a revision of a folder, which has none.
         """
         here = locate(name)
+        if here.is_dir() and revision is not None:
+            got = f"revision={revision!r} of {name}, which is a folder here"
+            raise ConfigError(
+                got, "a repository on the hub, or no revision", "leave it out, or start in another folder"
+            )
         generator = load(here if here.is_dir() else download(str(name), revision, ["*.json", WEIGHTS_FILE]))
         if not isinstance(generator, cls):
             raise CheckpointError(
@@ -362,25 +360,21 @@ def load(folder: str | Path) -> Generator:
             "finish the training (lidargrit train with the same words goes on), or check the path",
         )
     about = read_json(folder / CONFIG_FILE)
-    try:
-        config, sensor = about["config"], SensorModel.from_json(about["sensor"])
-        cls = load_class(str(about["generator"]))
-    except ConfigError as error:
-        raise CheckpointError(
-            f"{folder / CONFIG_FILE}, in which {error.got}", error.wanted, "restore the file"
-        ) from None
-    except LidarGritError:
-        raise
-    except (KeyError, TypeError, ValueError) as error:  # the last from tables that are not rectangular
-        raise CheckpointError(
-            f"{folder / CONFIG_FILE}, which cannot be used ({error})", "what lidargrit wrote", "restore the file"
-        ) from None
-    config = configuration.from_json(cls.Config, config, str(folder / CONFIG_FILE))
-    weights = without_quantized(read_tensors(folder / WEIGHTS_FILE)[0])
-    expected = sum(tensor.numel() for tensor in weights.values())
-    # Twice as many as the file holds, for what is built besides: a wrong file is refused before it fills the memory.
-    with numbers_at_most(2 * expected + 2**20, f"{folder / CONFIG_FILE} with a network", "restore both files"):
-        return cls.from_weights(config, sensor, weights, folder / WEIGHTS_FILE)
+    with told_of(folder / CONFIG_FILE):
+        try:
+            config, sensor, name = about["config"], SensorModel.from_json(about["sensor"]), str(about["generator"])
+        except LidarGritError:
+            raise
+        except (KeyError, TypeError, ValueError) as error:  # the last from tables that are not rectangular
+            got = f"{folder / CONFIG_FILE}, which cannot be used ({error})"
+            raise CheckpointError(got, "what lidargrit wrote", "restore the file") from None
+        cls = load_class(name)
+        config = configuration.from_json(cls.Config, config, str(folder / CONFIG_FILE))
+        weights = without_quantized(read_tensors(folder / WEIGHTS_FILE)[0])
+        expected = sum(tensor.numel() for tensor in weights.values())
+        # Twice as many as the file holds, for what is built besides: a wrong file is refused before it fills memory.
+        with numbers_at_most(2 * expected + 2**20, f"{folder / CONFIG_FILE} with a network", "restore both files"):
+            return cls.from_weights(config, sensor, weights, folder / WEIGHTS_FILE)
 
 
 def load_class(name: str) -> type[Generator]:

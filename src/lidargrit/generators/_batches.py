@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import overload
 
 from lidargrit.structures import RangeImage
@@ -46,3 +46,12 @@ def in_batches(seeds: Sequence[int], size: int, compute: Callable[[list[int], Ba
         indices = [*wanted, *[wanted[-1]] * (size - len(wanted))]
         parts.append(compute(indices, BatchSeeds([int(seeds[index]) for index in wanted], size))[: len(wanted)])
     return RangeImage.cat(parts)
+
+
+def one_by_one(images: RangeImage) -> Iterator[RangeImage]:
+    """Yield batches of one image each, for work without seeds: what it gives for a scan depends on that scan alone.
+
+    A network takes as long for each scan of a batch, and the memory of one is enough for any number of them.
+    """
+    for index in range(len(images)):
+        yield images[index : index + 1]

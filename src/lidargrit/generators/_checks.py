@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence, Sized
+from collections.abc import Collection, Sequence
 from numbers import Integral
+
+import numpy as np
 
 from lidargrit.conditions import KINDS, Condition, ConditionKind
 from lidargrit.errors import ConfigError
@@ -19,7 +21,7 @@ def check_seeds(seeds: Sequence[int], count: int | None = None) -> None:
         seeds: seeds, one for each scan.
         count: number of images; None where the seeds alone say how many scans are wanted.
     """
-    if not isinstance(seeds, Sized):
+    if not isinstance(seeds, Sequence | np.ndarray):  # a set has no order by which the scans could be told apart
         raise ConfigError(f"seeds of type {type(seeds).__name__}", "a sequence, such as [0]", "put them into a list")
     if count is not None and len(seeds) != count:
         raise ConfigError(f"{len(seeds)} seeds for {count} images", "one seed for each image", "correct the seeds")

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from lidargrit.configuration import TypedSettings
+
 CAPABILITIES = {  # name → what a generator with it can do besides sampling, for messages
     "tokens": "turn scans into tokens and back",
     "encode": "encode scans and reconstruct them",
@@ -12,6 +14,24 @@ CAPABILITIES = {  # name → what a generator with it can do besides sampling, f
     "invert": "invert a scan: search the latent whose scan is nearest to it",
     "likelihood": "compute the likelihood of a scan",
 }
+
+
+@dataclass(frozen=True)
+class NoSampling(TypedSettings):
+    """Settings of a generator that leaves nothing to choose."""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Cost of sampling one scan, counted and not timed, so the same on every machine.
+
+    Args:
+        network_evaluations: number of passes through a network, one after the other.
+        flops: number of floating-point operations in products and convolutions, two for a multiply-add.
+    """
+
+    network_evaluations: int
+    flops: int
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lidargrit.configuration import TypedSettings
 from lidargrit.determinism import scan_seed
 from lidargrit.errors import ConfigError
 from lidargrit.generators._log_range import decode, encode
@@ -33,7 +34,7 @@ _HUBER_SCALE = 0.00054  # times the root of the number of an image's values, as 
 
 
 @dataclass(frozen=True)
-class FlowSampling:
+class FlowSampling(TypedSettings):
     """Settings of following the flow from noise to a scan.
 
     Args:
@@ -49,10 +50,17 @@ class FlowSampling:
     tolerance: float = 1e-5
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not 0 <= self.steps <= STEPS_AT_MOST:
             raise ConfigError(f"steps={self.steps}", f"0 to {STEPS_AT_MOST:,}", "256 are published")
         if not 1e-7 <= self.tolerance <= 1:  # below, 32 bits of the network are the larger error
             raise ConfigError(f"tolerance={self.tolerance:g}", "a number from 1e-7 to 1", "change it")
+        if self.solver == "euler" and self.tolerance != FlowSampling.tolerance:
+            got = f"tolerance={self.tolerance:g} for solver=euler, which takes equal steps"
+            raise ConfigError(got, "settings that have an effect", "leave it out, or add solver=dopri5")
+        if self.solver == "dopri5" and self.steps:
+            got = f"steps={self.steps} for solver=dopri5, which chooses its own"
+            raise ConfigError(got, "settings that have an effect", "leave it out, or add solver=euler")
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from typing import Literal, TypeVar
 
 import torch
@@ -114,14 +114,23 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
         """Return what the tokens keep of a batch of scans, the mask by threshold."""
         return self.tokenizer.reconstruct(images)
 
-    def check_choice(self, mask: PixelChoice) -> None:
-        """Refuse a choice of the pixel decoder where there is none, before any token is sampled, with ConfigError."""
+    def check_choice(self, mask: PixelChoice, pixels: PixelSampling) -> None:
+        """Refuse, before any token is sampled, a choice of the pixel decoder where there is none, and changed settings
+        of it where it samples nothing, with ConfigError."""
         if mask == "pixels" and self.pixels is None:
             raise ConfigError(
                 "mask=pixels for a model without a pixel decoder",
                 "a model with one",
                 "leave mask out, or train a recipe with the stage pixels, such as compact_pixels",
             )
+        if self.pixels is None or mask not in ("auto", "pixels"):
+            of_networks = replace(PixelSampling(), precision=pixels.precision)  # that of the tokenizer's decoder, too
+            for each in fields(pixels):
+                if getattr(pixels, each.name) != getattr(of_networks, each.name):
+                    without = "a model without one" if self.pixels is None else f"mask={mask}"
+                    got = f"{each.name}={getattr(pixels, each.name)}, which the pixel decoder reads, for {without}"
+                    cure = "leave it out" if self.pixels is None else "leave it out, or take mask=pixels"
+                    raise ConfigError(got, "settings that have an effect", cure)
 
     def decode(
         self,

@@ -14,9 +14,9 @@ from torch import Tensor
 from torch.func import functional_call
 
 from lidargrit.conditions import Condition
+from lidargrit.configuration import TypedSettings
 from lidargrit.determinism import scan_seed
 from lidargrit.errors import CheckpointError, ConfigError
-from lidargrit.files import load_exactly
 from lidargrit.generators import Cost, Generator, SystemFacts
 from lidargrit.nn.dcgan import LEVELS, Discriminator, Synthesis, Widths, from_published
 from lidargrit.nn.differentiable_augmentation import (
@@ -24,6 +24,7 @@ from lidargrit.nn.differentiable_augmentation import (
     DifferentiableAugmentation,
     augment_differentiably,
 )
+from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.latent_search import search_latents
 from lidargrit.nn.objective import Objective
@@ -87,7 +88,7 @@ class DustyConfig:
 
 
 @dataclass(frozen=True)
-class DustySampling:
+class DustySampling(TypedSettings):
     """Settings of sampling, and of the search for the latent of a scan.
 
     Args:
@@ -109,6 +110,7 @@ class DustySampling:
     search_rate: float = 0.1
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.search_steps > SEARCH_STEPS_AT_MOST:
             got = f"search_steps={self.search_steps}"
             raise ConfigError(got, f"at most {SEARCH_STEPS_AT_MOST:,}", "lower it")
@@ -134,6 +136,7 @@ class Dusty(Generator[DustyConfig, DustySampling]):
         weights_licence="MIT, as the program",
     )
     Sampling = DustySampling
+    not_of_sampling = frozenset({"search_steps", "search_rate"})
     capabilities = frozenset({"complete", "invert"})
     published_files = ("generator",)
 

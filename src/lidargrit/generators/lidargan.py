@@ -12,9 +12,9 @@ from torch import Tensor
 from torch.func import functional_call
 
 from lidargrit.errors import CheckpointError, ConfigError
-from lidargrit.files import load_exactly
 from lidargrit.generators import Cost, Generator, NoSampling, SystemFacts
 from lidargrit.loading import RangeImages
+from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.filled_rows import FilledRows
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.lidargan import (

@@ -13,10 +13,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidargrit.conditions import Condition
+from lidargrit.configuration import TypedSettings
 from lidargrit.errors import CheckpointError, ConfigError
-from lidargrit.files import load_exactly
 from lidargrit.generators import Cost, Generator, SystemFacts
 from lidargrit.nn.diffusion import SeededNoise
+from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.lidargen_checkpoint import read_lidargen_checkpoint
 from lidargrit.nn.ncsn import SIDE_AT_LEAST, Ncsn
@@ -77,7 +78,7 @@ class LidarGenConfig:
 
 
 @dataclass(frozen=True)
-class LangevinSampling:
+class LangevinSampling(TypedSettings):
     """Settings of Langevin sampling, and of the window of ranges that count as returns.
 
     The published 232 levels, 5 steps and step size are those that the theory of Song and Ermon (2020) gives for 32x32
@@ -104,6 +105,7 @@ class LangevinSampling:
     pull: float = 1.0
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         _check_counts(2 if self.levels is None else self.levels, 1 if self.steps_each is None else self.steps_each)
         if self.step_lr is not None and not 0 < self.step_lr < 1:
             raise ConfigError(f"step_lr={self.step_lr}", "a number between 0 and 1", "6.2e-6 is published")
@@ -128,6 +130,7 @@ class LidarGen(Generator[LidarGenConfig, LangevinSampling]):
         weights_licence="MIT, as the program",
     )
     Sampling = LangevinSampling
+    not_of_sampling = frozenset({"pull"})
     capabilities = frozenset({"complete"})
     published_files = ("checkpoint",)
 

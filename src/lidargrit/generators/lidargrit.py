@@ -16,8 +16,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lidargrit.conditions import Condition, ConditionKind
+from lidargrit.configuration import TypedSettings
 from lidargrit.errors import ConfigError
-from lidargrit.files import load_exactly
 from lidargrit.generators import Cost, SystemFacts
 from lidargrit.generators._batches import BatchSeeds
 from lidargrit.generators._tokens import (
@@ -29,6 +29,7 @@ from lidargrit.generators._tokens import (
 from lidargrit.nn.completion_network import CompletionNetwork, CompletionNetworkConfig
 from lidargrit.nn.completion_objective import CompletionObjective
 from lidargrit.nn.decoding import CachedDecoder, WeightPrecision
+from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.pixel_decoder import PixelSampling
 from lidargrit.nn.precision import Precision
@@ -54,7 +55,7 @@ _OF_NETWORKS = {"completion", "weights", "decoder"}  # settings that change noth
 
 
 @dataclass(frozen=True)
-class TokenSampling:
+class TokenSampling(TypedSettings):
     """Settings of sampling tokens, returns and ranges.
 
     Args:
@@ -98,6 +99,7 @@ class TokenSampling:
     decoder: Precision = "fp32"
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         self.pixels()
         if not (is_temperature(self.temperature) and self.top_k >= 0 and 0 < self.top_p <= 1):
             raise ConfigError(
@@ -140,6 +142,7 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         weights_licence="no licence stated",
     )
     Sampling = TokenSampling
+    not_of_sampling = frozenset({"completion"})
     published_files = tuple(_PUBLISHED_NETWORKS)
     capabilities = TokenGenerator.capabilities | {"complete"}
 
@@ -216,7 +219,7 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
             count: number of scans to return.
             sampling: settings of sampling.
         """
-        self.check_choice(sampling.mask)
+        self.check_choice(sampling.mask, sampling.pixels())
         uniform = torch.stack([torch.rand(self.transformer.context_length, generator=rng) for rng in rngs])
         tokens = None if condition is None else self.observed_tokens(condition)
         with self._one_at_a_time:  # threads would write into one cache

@@ -12,11 +12,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidargrit.conditions import Condition
-from lidargrit.configuration import COUNTS_SCANS
+from lidargrit.configuration import COUNTS_SCANS, TypedSettings
 from lidargrit.errors import CheckpointError, ConfigError
-from lidargrit.files import load_exactly
 from lidargrit.generators import Cost, Generator, SystemFacts
 from lidargrit.loading import RangeImages
+from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.filled_rows import FilledRows
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.latent_search import search_latents
@@ -73,7 +73,7 @@ class LidarVaeConfig:
 
 
 @dataclass(frozen=True)
-class VaeSampling:
+class VaeSampling(TypedSettings):
     """Settings of completing and inverting scans; sampling itself has none.
 
     Args:
@@ -88,6 +88,7 @@ class VaeSampling:
     search_rate: float = 0.05
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.search_steps > SEARCH_STEPS_AT_MOST:
             got = f"search_steps={self.search_steps}"
             raise ConfigError(got, f"at most {SEARCH_STEPS_AT_MOST:,}", "lower it")
@@ -109,6 +110,7 @@ class LidarVae(Generator[LidarVaeConfig, VaeSampling]):
 
     Config = LidarVaeConfig
     Sampling = VaeSampling
+    not_of_sampling = frozenset({"spread", "search_steps", "search_rate"})
     facts = SystemFacts(
         generates="range; every ray of 40 rows returns, and no ray of the others",
         paper="Caccia et al., Deep Generative Modeling of LiDAR Data, IROS 2019",

@@ -11,12 +11,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lidargrit.configuration import TypedSettings
 from lidargrit.errors import CheckpointError, ConfigError
-from lidargrit.files import load_exactly
 from lidargrit.generators import Cost, Generator, SystemFacts
 from lidargrit.nn import latent_diffusion
 from lidargrit.nn.diffusion import SeededNoise
 from lidargrit.nn.encoding_cache import EncodingCache
+from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.latent_axes import LatentAxes
 from lidargrit.nn.latent_unet import LatentUnet, LatentUnetConfig
@@ -59,7 +60,7 @@ class LidmConfig:
 
 
 @dataclass(frozen=True)
-class LidmSampling:
+class LidmSampling(TypedSettings):
     """Settings of sampling latents and returns.
 
     Args:
@@ -74,6 +75,7 @@ class LidmSampling:
     mask: MaskDecoding = "bernoulli"
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not 1 <= self.steps <= latent_diffusion.STEPS_AT_MOST:
             raise ConfigError(f"steps={self.steps}", f"1 to {latent_diffusion.STEPS_AT_MOST}", "50 are published")
         if not 0 <= self.eta <= 1:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -79,6 +80,23 @@ class Marginal(Generator[MarginalConfig, NoSampling]):
             for one, mask in zip(bins, batch.return_mask, strict=True):
                 self.counts.scatter_add_(0, one[None], mask[None].int())
             self.scans += len(batch)
+
+    @classmethod
+    def from_weights(
+        cls, config: MarginalConfig, sensor: SensorModel, weights: dict[str, Tensor], source: Path
+    ) -> Marginal:
+        """Make a generator of given counts.
+
+        Raises:
+            CheckpointError: weights of another configuration, or pixels with fewer returns than none, or more than
+                scans.
+        """
+        generator = super().from_weights(config, sensor, weights, source)
+        counts, scans = generator.counts, generator.scans
+        if bool((counts < 0).any()) or bool((counts.sum(dim=0) > scans).any()):
+            got = f"{source}, with pixels of less than 0 returns, or of more than its {int(scans)} scans"
+            raise CheckpointError(got, "0 to as many as there are scans", "restore the file, or train again")
+        return generator
 
     @property
     def compute_batch(self) -> int:

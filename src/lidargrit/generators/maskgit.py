@@ -11,6 +11,7 @@ import torch.nn.functional as F
 from jaxtyping import Int
 from torch import Tensor
 
+from lidargrit.configuration import TypedSettings
 from lidargrit.errors import ConfigError
 from lidargrit.generators import Cost, SystemFacts
 from lidargrit.generators._batches import BatchSeeds
@@ -34,7 +35,7 @@ _NOT_ASKED = -100  # in the place of tokens that are shown, for torch's cross en
 
 
 @dataclass(frozen=True)
-class MaskedSampling:
+class MaskedSampling(TypedSettings):
     """Settings of sampling tokens, returns and ranges.
 
     Args:
@@ -69,6 +70,7 @@ class MaskedSampling:
     decoder: Precision = "fp32"
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         self.pixels()
         valid = is_temperature(self.temperature) and self.order_temperature >= 0
         if not (valid and 1 <= self.steps <= STEPS_AT_MOST):
@@ -122,7 +124,7 @@ class MaskGit(TokenGenerator[MaskGitConfig, MaskedSampling]):
         return MaskedSampling(steps=4)
 
     def _sample(self, seeds: BatchSeeds, sampling: MaskedSampling) -> RangeImage:
-        self.check_choice(sampling.mask)
+        self.check_choice(sampling.mask, sampling.pixels())
         rngs = rngs_of(seeds)
         tokens = generate_tokens(self.transformer, rngs, sampling)
         tokenizer = self.tokenizer.for_decoding(sampling.decoder)

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import CheckpointError, ConfigError
-from lidargrit.files import load_exactly
 from lidargrit.generators import Cost, Generator, NoSampling, SystemFacts
 from lidargrit.loading import RangeImages
+from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
@@ -67,11 +67,18 @@ class Memorised(Generator[MemorisedConfig, NoSampling]):
     def from_weights(
         cls, config: MemorisedConfig, sensor: SensorModel, weights: dict[str, Tensor], source: Path
     ) -> Memorised:
-        """Make a generator that keeps as many scans as the weights hold."""
+        """Make a generator that keeps as many scans as the weights hold.
+
+        Raises:
+            CheckpointError: weights of another configuration, or a count that is not that of the scans.
+        """
         generator, kept = cls(config, sensor), weights.get("range_m", torch.zeros(0))
         if kept.ndim == 3:
             generator.range_m = torch.zeros(len(kept), sensor.height, sensor.width)
         load_exactly(generator, weights, source)
+        if int(generator.scans) != len(generator.range_m):
+            got = f"{source}, which counts {int(generator.scans)} scans and holds {len(generator.range_m)}"
+            raise CheckpointError(got, "as many as it counts", "restore the file, or train again")
         return generator.eval()
 
     def _sample(self, seeds: Sequence[int], sampling: NoSampling) -> RangeImage:

@@ -13,14 +13,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidargrit.conditions import Condition
+from lidargrit.configuration import TypedSettings
 from lidargrit.determinism import evenly_spaced, scan_seed
 from lidargrit.errors import ConfigError
-from lidargrit.files import load_exactly
 from lidargrit.generators import Cost, Generator, SystemFacts
 from lidargrit.generators._log_range import decode, encode
 from lidargrit.loading import RangeImages
 from lidargrit.nn import diffusion
 from lidargrit.nn.diffusion import Sampler, SeededNoise
+from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.r2dm_checkpoint import read_r2dm_checkpoint
@@ -57,7 +58,7 @@ class R2dmConfig:
 
 
 @dataclass(frozen=True)
-class DiffusionSampling:
+class DiffusionSampling(TypedSettings):
     """Settings of sampling, and the rule by which a pixel is a return.
 
     Args:
@@ -75,6 +76,7 @@ class DiffusionSampling:
     resamples: int = 16
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not 1 <= min(self.steps, self.resamples) <= max(self.steps, self.resamples) <= STEPS_AT_MOST:
             got = f"steps={self.steps}, resamples={self.resamples}"
             raise ConfigError(got, f"1 to {STEPS_AT_MOST:,} of both", "256 and 16 are the default")
@@ -99,6 +101,7 @@ class R2dm(Generator[R2dmConfig, DiffusionSampling]):
         weights_licence="MIT, as the program",
     )
     Sampling = DiffusionSampling
+    not_of_sampling = frozenset({"resamples"})
     capabilities = frozenset({"complete"})
     published_files = ("settings and network",)
     return_share: Tensor

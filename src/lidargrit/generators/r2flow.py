@@ -8,12 +8,12 @@ from pathlib import Path
 
 import torch
 
-from lidargrit.files import load_exactly
 from lidargrit.generators import Cost, Generator, SystemFacts
 from lidargrit.generators._flow import FlowMatching, FlowSampling, PairMatching, ReflowConfig, solve, steps_of
 from lidargrit.generators._log_range import decode
 from lidargrit.nn import flow
 from lidargrit.nn.diffusion import SeededNoise
+from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.hdit import Hdit, HditConfig
 from lidargrit.nn.objective import Objective

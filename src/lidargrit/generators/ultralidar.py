@@ -11,11 +11,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidargrit.errors import ConfigError
-from lidargrit.files import load_exactly
 from lidargrit.generators import Cost, Generator, SystemFacts
 from lidargrit.generators._checks import check_seeds
 from lidargrit.nn.codebook_care import CodebookCare
 from lidargrit.nn.encoding_cache import Frozen
+from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.precision import without_autocast

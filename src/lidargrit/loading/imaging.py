@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from lidargrit.datasets import ScanDataset
@@ -15,7 +14,6 @@ from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import Scan
 
-_SCALES_APART = 50  # between the highest reflectances of two scans; 255 and 65,535 are 257 apart
 _PROBES = 3  # scans that are looked at: the first would do, were a folder not sometimes a mixture
 
 
@@ -27,8 +25,7 @@ class Imaging:
         sensor: sensor of the images, with the projection that fits the scans.
         config: settings of the projection, with the variant that fits the scans.
         notes: sentences on what was chosen in place of what the sensor and the settings say.
-        doubts: sentences that tell why another sensor than this one may have made the scans, or that their reflectance
-            is not of one scale.
+        doubts: sentences that tell why another sensor than this one may have made the scans.
     """
 
     sensor: SensorModel
@@ -64,23 +61,8 @@ def choose_imaging(source: str, dataset: ScanDataset, sensor: SensorModel, confi
         notes.append(f"{source}: points that are not in firing order, so rows go by elevation (projection=spherical)")
     doubts_of_scans = (doubts_about_rays(scan, sensor, sensor.projection) for scan in probes)
     doubt = next((each for each in doubts_of_scans if each), "")
-    doubts = (told_doubt(source, sensor, doubt), _doubt_about_scales(source, probes))
-    return Imaging(sensor, config, tuple(notes), tuple(each for each in doubts if each))
-
-
-def _doubt_about_scales(source: str, scans: Sequence[Scan]) -> str:
-    """Return a sentence if the reflectance of some scans seems to be divided by another number; "" otherwise.
-
-    Formats that do not say how it is scaled are read file by file.
-    """
-    highest = [float(scan.reflectance.max()) for scan in scans if scan.reflectance is not None and len(scan)]
-    highest = [one for one in highest if one > 0]
-    if not highest or min(highest) * _SCALES_APART > max(highest):
-        return ""
-    return (
-        f"{source}: reflectance goes up to {max(highest):.2g} in one scan and {min(highest):.2g} in another, as if "
-        "their files had different scales; write it as a number from 0 to 1"
-    )
+    told = told_doubt(source, sensor, doubt)
+    return Imaging(sensor, config, tuple(notes), (told,) if told else ())
 
 
 def _probes(dataset: ScanDataset, sensor: SensorModel) -> list[Scan]:

@@ -78,10 +78,16 @@ def prepare(
     _claim(folder, spec, scans)
     missing = [shard for shard in range(spec.num_shards) if not _is_whole(folder, spec, shard)]
     if missing:  # a complete folder may be one that this user can only read
-        with claim_folder(folder, shared=True):  # with other machines, and with whoever needs the same cache
-            mine = [shard for shard in missing if shard % world_size == rank]
-            make_shards(folder, spec, mine, dataset, config.workers, reporter)
-            _wait_for(folder, spec, [shard for shard in missing if shard % world_size != rank], reporter)
+        try:
+            with claim_folder(folder, shared=True):  # with other machines, and with whoever needs the same cache
+                if not (folder / PLAN_FILE).exists():  # another machine has failed meanwhile, and taken its plan back
+                    _claim(folder, spec, scans)
+                mine = [shard for shard in missing if shard % world_size == rank]
+                make_shards(folder, spec, mine, dataset, config.workers, reporter)
+                _wait_for(folder, spec, [shard for shard in missing if shard % world_size != rank], reporter)
+        except BaseException:
+            _take_back(folder)
+            raise
     remove_partials(folder)
     for left in folder.glob("*.unfinished"):  # by a process that was killed after it had written the shard
         with suppress(OSError):  # of a folder that this user can only read
@@ -263,6 +269,17 @@ def _claim(folder: Path, spec: PreparedSpec, scans: list[tuple[str, str, int, in
         raise OutputError(f"{folder}, which holds something else", "an empty folder", "choose another one")
     write_text(path, listing)
     write_json(folder / PLAN_FILE, asdict(spec))  # last: it says that the folder is ours
+
+
+def _take_back(folder: Path) -> None:
+    """Remove a plan of which nothing has been made, so that a corrected command is not refused as another.
+
+    A machine that still works by the plan holds the folder, and keeps it.
+    """
+    with suppress(OutputError, OSError), claim_folder(folder):
+        if not any(path.suffix in (".shard", ".unfinished") for path in folder.iterdir()):
+            for name in (PLAN_FILE, SCANS_FILE):
+                (folder / name).unlink(missing_ok=True)
 
 
 def _other(differing: Sequence[str]) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import threading
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -11,10 +12,10 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from lidargrit.determinism import evenly_spaced
-from lidargrit.errors import DataError
+from lidargrit.errors import DataError, counted_scans
 from lidargrit.loading.columns import FewerColumns, has_fewer_columns
 from lidargrit.loading.images import ImageStore, Pixels, Provenance
-from lidargrit.loading.shards import Bytes, LocalBytes, ShardEntry, read_image, read_index
+from lidargrit.loading.shards import Bytes, LocalBytes, ShardEntry, range_step_m, read_image, read_index
 from lidargrit.sensors import SensorModel
 from lidargrit.untrusted import JSON_BYTES_AT_MOST, parse_json, user_path
 
@@ -215,6 +216,12 @@ class PreparedImages:
         self._folder = PreparedFolder(location)
         self.spec = self._folder.read_spec()
         self.sensor = SensorModel.from_json(self.spec.sensor)
+        if self.spec.range_step_m != range_step_m(self.sensor):  # pixels are numbers of steps
+            raise DataError(
+                f"{location}/{PLAN_FILE}, whose range_step_m is another than its sensor's",
+                f"{range_step_m(self.sensor):g} m",
+                "prepare again",
+            )
         self._shape = (self.sensor.height, self.sensor.width)
         self._entries: list[tuple[int, ShardEntry]] = []
         self.left_out: dict[int, str] = {}
@@ -255,7 +262,20 @@ class PreparedImages:
             if 0 < len(lacking) < len(self):
                 which = f"{len(lacking)} of {len(self)} scans, such as {self.provenance.names[lacking[0]]}"
                 told.append(f"WARNING: no {what} in {which}, so that no scan is read with {what}")
-        return told
+        return told + [f"WARNING: {doubt}" for doubt in self.doubts()]
+
+    def doubts(self) -> tuple[str, ...]:
+        """Return a sentence if the reflectance of some scans was divided by another number than that of others."""
+        scales = Counter(entry.full_scale for _, entry in self._entries if entry.full_scale)
+        if len(scales) < 2:
+            return ()
+        rare = min(scales, key=scales.__getitem__)
+        at = next(at for at, (_, entry) in enumerate(self._entries) if entry.full_scale == rare)
+        divided = " and ".join(f"by {scale:,} in {counted_scans(count)}" for scale, count in scales.most_common())
+        return (
+            f"reflectance divided {divided}, such as {self.provenance.names[at]}, as the largest value of each scan "
+            "allowed: bright in one is dark in another; write it as numbers from 0 to 1",
+        )
 
     def evenly_spaced(self, count: int) -> PreparedImages:
         """Return so many of the images, evenly spaced, without opening the folder again."""

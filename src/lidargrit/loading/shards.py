@@ -48,6 +48,8 @@ class ShardEntry:
             shards.
         label_bytes: length of the compressed classes, in bytes, which come last; 0 if there are none.
         label_fingerprint: hash of the classes; "" if there are none. A scan is the same with labels or without.
+        full_scale: number that the reflectance of the scan's file was divided by because its largest value fits; 0 if
+            that had not to tell, and in older shards.
     """
 
     scan: int
@@ -58,6 +60,7 @@ class ShardEntry:
     range_fingerprint: str = ""
     label_bytes: int = 0
     label_fingerprint: str = ""
+    full_scale: int = 0
 
     @property
     def end(self) -> int:
@@ -131,8 +134,8 @@ class ShardWriter:
         """Indices of the scans that have been added or left out."""
         return {entry.scan for entry in self._entries} | self._left_out.keys()
 
-    def add(self, scan: int, image: RangeImage) -> None:
-        """Add the image of a scan."""
+    def add(self, scan: int, image: RangeImage, full_scale: int = 0) -> None:
+        """Add the image of a scan; for ``full_scale`` see :class:`ShardEntry`."""
         steps = np.rint(image.range_m.numpy() / np.float32(self._step_m)).astype(np.uint16)
         steps[image.return_mask.numpy() & (steps == 0)] = 1  # a return stays one
         levels = None if image.reflectance is None else np.rint(image.reflectance.numpy() * 255).astype(np.uint8)
@@ -143,7 +146,9 @@ class ShardWriter:
         of_classes = "" if classes is None else _fingerprint(classes)
         of_range, of_reflectance, of_label = map(len, blobs)
         self._append(
-            ShardEntry(scan, self._end, of_range, of_reflectance, of_pixels, of_ranges, of_label, of_classes),
+            ShardEntry(
+                scan, self._end, of_range, of_reflectance, of_pixels, of_ranges, of_label, of_classes, full_scale
+            ),
             b"".join(blobs),
         )
 
@@ -192,7 +197,8 @@ def read_index(file: Bytes, name: str) -> tuple[list[ShardEntry], dict[int, str]
         index = parse_json(data, "its index")
         entries = [ShardEntry(**entry) for entry in index["entries"]]
         for entry in entries:
-            numbers = entry.scan, entry.offset, entry.range_bytes, entry.reflectance_bytes, entry.label_bytes
+            lengths = entry.range_bytes, entry.reflectance_bytes, entry.label_bytes
+            numbers = entry.scan, entry.offset, *lengths, entry.full_scale
             if not all(type(number) is int and number >= 0 for number in numbers):
                 raise ValueError("lengths that are no whole numbers")
             hashes = entry.fingerprint, entry.range_fingerprint, entry.label_fingerprint

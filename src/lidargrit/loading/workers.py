@@ -84,7 +84,7 @@ def make_shard(
                 raise ScanError(error.got, error.wanted, f"{error.cure}, or {leave_out}") from None
             writer.leave_out(index, str(error))
         else:
-            writer.add(index, image)
+            writer.add(index, image, scan.full_scale)
         advance(1)
         if time.monotonic() - kept_at > _KEEP_EVERY_S:
             writer.write(unfinished)

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from lidargrit.conditions import Condition
+from lidargrit.configuration import TypedSettings
 from lidargrit.errors import ConfigError
 from lidargrit.nn.pixel_networks import Guide, MaskNetwork, PixelDecoderConfig, RangeNetwork
 from lidargrit.nn.pixel_phases import Lattice, Phase, at_phases, join_phases, one_of_phases
@@ -29,11 +30,13 @@ _Guided = tuple[
 
 _ALL_PHASES_AREA = 16  # training counts all phases of lattices with one in so many pixels, or fewer
 
+_NOISE_AT_MOST = 1e6  # beyond, the components' scales have no finite numbers; with 100 all ranges are noise already
+
 BITS_STEP_M = 0.01  # bits of a return are those of naming its range to a centimetre
 
 
 @dataclass(frozen=True)
-class PixelSampling:
+class PixelSampling(TypedSettings):
     """Settings of sampling masks, and ranges from their mixtures.
 
     By default samples are sharper than the mixtures themselves, which are ragged where a surface is uncertain. Only
@@ -56,14 +59,15 @@ class PixelSampling:
     precision: Precision = "fp32"
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not (
             is_temperature(self.range_temperature)
             and self.range_temperature < math.inf
-            and 0 < self.range_noise < math.inf
+            and 0 < self.range_noise <= _NOISE_AT_MOST
         ):
             raise ConfigError(
                 f"range_temperature={self.range_temperature}, range_noise={self.range_noise}",
-                "positive numbers, a temperature of at least 1e-6, or of 0 for the model's own",
+                "positive numbers, a temperature of at least 1e-6, or of 0 for the model's own, a noise up to 1e6",
                 "take 1 for both, and mask_correlation=0, to sample from the model's own distribution",
             )
         if not 0 <= self.mask_correlation < math.inf:

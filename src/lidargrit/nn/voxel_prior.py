@@ -16,6 +16,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from lidargrit.configuration import TypedSettings
 from lidargrit.errors import ConfigError
 from lidargrit.nn.blocks import Network
 from lidargrit.nn.swin import SwinConfig, initialise_linear, sine_cosine_positions, swin_blocks
@@ -30,7 +31,7 @@ Fill = Callable[[Float[Tensor, "B T K"]], Int[Tensor, "B T"]]
 
 
 @dataclass(frozen=True)
-class FillSampling:
+class FillSampling(TypedSettings):
     """Settings of filling hidden tokens in.
 
     Args:
@@ -49,6 +50,7 @@ class FillSampling:
     blank_steps: int = 10
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not 1 <= self.steps <= _STEPS_AT_MOST:
             raise ConfigError(f"steps={self.steps}", f"1 to {_STEPS_AT_MOST}", "30 are published")
         if not 0 <= self.order_temperature < math.inf:

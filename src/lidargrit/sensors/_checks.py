@@ -149,9 +149,11 @@ def checked_entries(data: Any, projections: Sequence[str]) -> dict[str, Any]:
 
 def _checked(key: str, value: Any) -> Any:
     if key in _WORDS:
-        if not isinstance(value, str) or (key == "name" and not 0 < len(value) <= NAME_AT_MOST):
-            what = f"a {type(value).__name__}" if not isinstance(value, str) else f"{len(value)} letters"
-            raise ConfigError(f"{what} for a sensor's {key}", f"words, a name of 1 to {NAME_AT_MOST} letters", _CURE)
+        if not isinstance(value, str):
+            raise ConfigError(f"a {type(value).__name__} for a sensor's {key}", "words", _CURE)
+        if key == "name" and not (0 < len(value) <= NAME_AT_MOST and value.isprintable()):  # pictures show it
+            what = f"{len(value)} letters{'' if value.isprintable() else ', not all of which can be printed,'}"
+            raise ConfigError(f"{what} for a sensor's name", f"1 to {NAME_AT_MOST} letters in one line", _CURE)
         return value
     if key in _NUMBERS:
         # A whole number of any length is JSON, and printing a long one is refused by Python itself: so no value here.

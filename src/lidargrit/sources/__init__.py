@@ -74,8 +74,8 @@ class DatasetSource(Source):
         imaging.report(reporter)
         sensor, config = imaging.sensor, imaging.config
         folder = prepare(self.text, config, reporter=reporter, sensor=sensor, dataset=self._dataset)
-        self.doubts, self._imaged_by = imaging.doubts, config.projection_variant
         prepared = PreparedImages(str(folder))
+        self.doubts, self._imaged_by = (*imaging.doubts, *prepared.doubts()), config.projection_variant
         _require_some(self.text, prepared, reporter)
         return RangeImages(sensor, [prepared])
 
@@ -119,6 +119,7 @@ class PreparedSource(Source):
             columns = f"{self.sensor.width} columns gathered into {sensor.width * sensor.column_stride}"
             reporter.message(f"{self.text}: {columns}, of each pixel the nearest return")
         _require_some(self.text, chosen, reporter)
+        self.doubts = chosen.doubts()
         return RangeImages(sensor, [store])
 
 

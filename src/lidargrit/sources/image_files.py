@@ -71,21 +71,32 @@ class ImageFileSource(Source):
 
 
 def image_files(path: Path) -> list[Path]:
-    """Return the range images that a path names: one ``.npy``, or those of a folder of nothing else; else none."""
+    """Return the range images that a path names: one ``.npy``, or those of a folder of nothing else; else none.
+
+    Raises:
+        DataError: range images beside other files or above further scans, or a name that is not UTF-8.
+        ScanError: the first of them is a mask.
+    """
     try:
         found = [path] if path.is_file() else sorted(path.iterdir(), key=natural_order)
     except (OSError, ValueError):
         return []
     found = [one for one in found if one.is_file() and not one.name.startswith(".") and formats.candidates(one)]
     found = [one for one in found if not one.name.endswith(PROBABILITY)]
-    if not found or any(one.suffix.lower() != ".npy" for one in found):
+    others = [one for one in found if one.suffix.lower() != ".npy"]
+    if len(others) == len(found) or any(map(is_recognised, others)):
         return []
+    first = next(one for one in found if one not in others)
     try:
-        array = _array(found[0])
+        array = _parsed(first)
     except LidarGritError:  # told where the file is read as the points of a scan
         return []
     if array.ndim != 2 or array.shape[1] <= _POINT_COLUMNS_AT_MOST:
         return []
+    if others:
+        what = f"{path}, with range images and {others[0].name}"
+        raise DataError(what, "a folder of range images alone", "move that file elsewhere")
+    _refuse_mask(array, first)
     for one in found:
         user_path(str(one.absolute()))  # refuses a name that is not UTF-8, which others could not write again
     below = (one for one in scans_below(path) if one.parent != path and is_recognised(one))
@@ -123,12 +134,20 @@ class _ImageFiles:
 
 
 def _array(path: Path) -> np.ndarray:
+    array = _parsed(path)
+    _refuse_mask(array, path)
+    return array
+
+
+def _parsed(path: Path) -> np.ndarray:
     try:
-        array = parse_array(read_bytes(path, ARRAY_BYTES_AT_MOST, _IMAGE))
+        return parse_array(read_bytes(path, ARRAY_BYTES_AT_MOST, _IMAGE))
     except LidarGritError:
         raise
     except ValueError as error:
         raise ScanError(f"{path}, which cannot be read ({error})", _IMAGE, "save it anew") from None
+
+
+def _refuse_mask(array: np.ndarray, path: Path) -> None:
     if array.dtype == bool:  # such as a mask for complete --observed
         raise ScanError(f"{path}, an array of truth values", _IMAGE, "move masks to another folder")
-    return array

@@ -27,7 +27,7 @@ class Source(ABC):
     split: str = ""
     """Part of the data set, or the sample format of tensors; "" where there is none."""
     doubts: tuple[str, ...] = ()
-    """Reasons to doubt that the sensor of the images that were opened last made the scans, one sentence each."""
+    """Reasons to doubt the images that were opened last: made by another sensor, or of mixed scales of reflectance."""
 
     def __init__(self, text: str) -> None:
         self.text = text

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from lidargrit.errors import CheckpointError
-from lidargrit.files import load_exactly, read_tensors, write_tensors
+from lidargrit.files import read_tensors, write_tensors
+from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.published import weights_below
 from lidargrit.training.optimiser import WeightAverage
 from lidargrit.untrusted import WHOLE_NUMBER_AT_MOST

@@ -135,8 +135,8 @@ def read_tensor(path: Path) -> Tensor:
         if size > _BYTES_AT_MOST:
             raise ValueError(f"{size} bytes")
         tensor: Any = torch.load(path, map_location="cpu", weights_only=True)
-        if not isinstance(tensor, Tensor) or tensor.layout != torch.strided:
-            raise TypeError(f"a {type(tensor).__name__}")
+        if not isinstance(tensor, Tensor) or tensor.layout != torch.strided or tensor.is_nested or tensor.is_meta:
+            raise TypeError(f"a {type(tensor).__name__} that holds no plain array of numbers")
         if tensor.numel() * tensor.element_size() > tensor.untyped_storage().nbytes():
             raise ValueError("a tensor larger than what the file holds")  # a stride of 0 can name terabytes
         if not tensor.is_floating_point():
