@@ -53,8 +53,11 @@ def test_the_file_of_the_page_is_compared_without_a_recipe(code, tmp_path, capsy
 
 
 @pytest.mark.parametrize("test", CONTRACT)
-def test_the_file_of_the_page_keeps_the_contract(test, code, tmp_path):
+def test_the_file_of_the_page_keeps_the_contract(test, code, tmp_path, request):
     asked = getattr(contract, test)
+    for mark in getattr(asked, "pytestmark", ()):
+        if mark.name == "usefixtures":
+            request.getfixturevalue(*mark.args)
     given = {"name": "mean_street", "tmp_path": tmp_path}
     asked(**{name: given[name] for name in inspect.signature(asked).parameters})
 

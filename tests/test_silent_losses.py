@@ -3,6 +3,8 @@
 import json
 import os
 import sqlite3
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -179,6 +181,26 @@ def test_a_process_whose_source_has_gone_says_so_in_one_line(kitti, tmp_path, ca
     kitti.rename(tmp_path / "elsewhere")
     assert make_some_shards(prepared, os.getppid(), [0]) == 2
     assert json.loads(capsys.readouterr().out)["error"][0] == "DataError"
+
+
+def test_a_process_that_is_ended_while_nobody_listens_says_nothing():
+    """What it was about to print would otherwise be told as an error when Python ends."""
+    code = """
+import runpy, sys
+from lidargrit.loading import workers
+def interrupted(*_):
+    print(1)
+    raise KeyboardInterrupt
+workers.make_some_shards = interrupted
+sys.argv = ["", "folder", "1"]
+runpy.run_module("lidargrit.loading", run_name="__main__")
+"""
+    buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    command, pipe = [sys.executable, "-c", code], subprocess.PIPE
+    process = subprocess.Popen(command, stdout=pipe, stderr=pipe, env=buffered)
+    process.stdout.close()
+    assert (process.stderr.read(), process.wait()) == (b"", 130)
+    process.stderr.close()
 
 
 def test_a_simulation_without_a_return_leaves_its_folder_free(tmp_path):
