@@ -150,7 +150,7 @@ def _to_unit(reflectance: np.ndarray) -> tuple[Tensor, int]:
     if highest <= 0:  # of any scale
         return values, 0
     if highest <= _ABOUT_1:
-        return (values.clamp(max=1) if highest > 1 else values), 1
+        return values.clamp(max=1), 1
     full_scale = next((scale for scale in _FULL_SCALES if highest <= scale), 1)
     return values / full_scale, full_scale
 
