@@ -179,7 +179,7 @@ def test_a_sensor_that_does_not_fit_the_scan(refused, tmp_path):
         (["sample", "RUN", "OUT", "--set", "temperature=.nan"], r"temperature=nan; wanted a finite number"),
         (
             ["sample", "RUN", "OUT", "--set", "temprature=1"],
-            r"'temprature', which sampling from 'lidargrit' does not have; wanted one such as temperature; .*list gen",
+            r"'temprature', which sampling with 'lidargrit' does not have; wanted one such as temperature; .*list gen",
         ),
         (["sample", "RUN", "OUT", "--set", "mask=never"], r"mask=never; wanted auto, .*threshold"),
         (["sample", "RUN", "OUT", "--device", "gpu"], r"device 'gpu'; wanted"),

@@ -36,7 +36,6 @@ def run(options: argparse.Namespace) -> None:
     """Sample to disk."""
     import torch
 
-    from lidargrit.configuration import override
     from lidargrit.generators import load
     from lidargrit.nn.devices import usable_device
     from lidargrit.processes import rank_and_world_size
@@ -50,9 +49,7 @@ def run(options: argparse.Namespace) -> None:
     device = usable_device(options.device or own)
     run_folder = locate(options.run_folder)
     generator = load(run_folder).to(device)
-    owner = f"sampling from {generator.public_name()!r}"
-    cure, unread = "see all with: lidargrit list generators", generator.not_of_sampling
-    sampling = override(generator.Sampling(), options.set, owner, cure, unread)
+    sampling = generator.parse_sampling(options.set)
     seeds = seeds[rank::world_size]
     write_samples(generator, run_folder, options.out, seeds, sampling, TerminalReporter())
     print(f"done: {counted_scans(len(seeds))} in {options.out}; look at them with: lidargrit view {options.out}")

@@ -10,7 +10,7 @@ from typing import Any, Generic
 from lidargrit import configuration
 from lidargrit.conditions import KINDS, Condition, ConditionKind
 from lidargrit.conditions.fills import FILLS, fill
-from lidargrit.configuration import name_and_settings, override
+from lidargrit.configuration import name_and_settings
 from lidargrit.errors import ConfigError, nearest_names
 from lidargrit.generators import Generator, SamplingT, load
 from lidargrit.loading import Provenance
@@ -163,9 +163,7 @@ def open_completer(
             f"its own, {own}",
             "leave the sensor out, or name another model",
         )
-    owner = f"completion by {generator.public_name()!r}"
-    sampling = override(generator.completion_sampling(), settings, owner, "see all with: lidargrit list generators")
-    return LearnedCompleter(word, folder, generator, sampling)
+    return LearnedCompleter(word, folder, generator, generator.parse_sampling(settings, completing=True))
 
 
 def open_completers(words: Sequence[str], sensor: SensorModel | None = None, device: str = "") -> list[Completer]:

@@ -17,7 +17,7 @@ from typing import Any
 import torch
 
 from lidargrit import __version__
-from lidargrit.configuration import name_and_settings, override
+from lidargrit.configuration import name_and_settings
 from lidargrit.errors import ConfigError, LidarGritError
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair, metric_factory, open_pair
 from lidargrit.evaluation.costs import COSTS, Costs, costs_block, read_costs
@@ -296,14 +296,11 @@ class _Plan:
     def of(cls, system: str, folder: Path, benchmark: Benchmark) -> _Plan:
         name, settings = name_and_settings(system)
         run, trained = locate(name), folder / "runs" / name
-        owner, cure = f"sampling from {name!r}", "see all with: lidargrit list generators"
         if is_run(run):
             generator = load(run)
-            sampling = override(generator.Sampling(), settings, owner, cure, generator.not_of_sampling)
-            return cls(system, run, None, sampling, generator.sensor)
+            return cls(system, run, None, generator.parse_sampling(settings), generator.sensor)
         recipe = benchmark.recipe(name, check=not is_run(trained))
-        kind = load_class(recipe.generator)
-        sampling = override(kind.Sampling(), settings, owner, cure, kind.not_of_sampling)
+        sampling = load_class(recipe.generator).parse_sampling(settings)
         check_folder(trained, recipe)
         return cls(system, trained, recipe, sampling, recipe.data.load_sensor())
 

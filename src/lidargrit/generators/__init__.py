@@ -72,6 +72,19 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         """Return the settings by which scans are completed if the caller names none."""
         return cls.Sampling()
 
+    @classmethod
+    @final
+    def parse_sampling(cls, words: Iterable[str], completing: bool = False) -> SamplingT:
+        """Return the settings by which it samples or completes, with those changed that words NAME=VALUE name.
+
+        Raises:
+            ConfigError: an unknown name, one that sampling does not read, or a value of another type.
+        """
+        verb, cure = ("completion" if completing else "sampling"), "see all with: lidargrit list generators"
+        settings = cls.completion_sampling() if completing else cls.Sampling()
+        unread = frozenset() if completing else cls.not_of_sampling
+        return configuration.override(settings, words, f"{verb} with {cls.public_name()!r}", cure, unread)
+
     @property
     def conditions(self) -> frozenset[ConditionKind]:
         """Kinds of conditions that :meth:`complete` accepts; they may depend on ``config``."""
