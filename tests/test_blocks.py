@@ -1,6 +1,5 @@
 """Activations computed twice, compiled networks, and columns that wrap: the same gradients as by the plain way."""
 
-import json
 import os
 import subprocess
 import sys
@@ -134,15 +133,8 @@ def test_compiled_networks_have_the_same_gradients_and_resume(tmp_path):
     assert ended.returncode == 0, ended.stderr[-3000:]
 
 
-def test_a_run_from_before_there_was_the_choice_goes_on(tmp_path):
+def test_a_run_of_the_other_choice_is_refused(tmp_path):
     recipe = load_recipe("demo", (*MODEL, *SIMULATED, *SHORT))
-    train(recipe, tmp_path)
-    about = json.loads((tmp_path / "run.json").read_text())
-    for stage in about["recipe"]["training"].values():
-        del stage["recompute"], stage["compile"], stage["accumulate"]
-    del about["recipe"]["model"]["tokenizer"]["restart_dead_codes"]
-    about["recipe"]["data"]["variant"] = about["recipe"]["data"].pop("projection_variant")  # its former name
-    (tmp_path / "run.json").write_text(json.dumps(about))
     train(recipe, tmp_path)
     on = replace(recipe.training["tokenizer"], recompute=True)
     with pytest.raises(OutputError, match=r"recompute=False, here True"):

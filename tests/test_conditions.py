@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from lidargrit.conditions import Condition
-from lidargrit.conditions.fills import fill_from_nearest
+from lidargrit.conditions.fills import fill_from_nearest, fill_lacking
 from lidargrit.conditions.patterns import Pattern
 from lidargrit.determinism import derive_seed
 from lidargrit.errors import ConfigError, ScanError, UsageError
@@ -146,3 +146,12 @@ def test_the_nearest_observed_pixel_is_that_of_the_smallest_angle_around_the_cir
     assert float(filled.range_m[0, 32, 3]) == 5.0  # 12 rows are 4 degrees, and one column is 11
     assert float(filled.range_m[0, 26, 31]) == 5.0
     assert not fill_from_nearest(images, torch.zeros_like(observed)).return_mask.any()
+
+
+def test_what_was_not_observed_has_no_influence_where_nothing_returned():
+    none, every = torch.zeros(1, 64, 32, dtype=torch.bool), torch.ones(1, 64, 32, dtype=torch.bool)
+    stray = torch.full((1, 64, 32), 0.7)
+    known = Condition(9 * stray, none, none, every, SENSOR, stray, torch.full((1, 64, 32), 50))
+    filled = fill_lacking(RangeImage(9 * stray, every, SENSOR), known)
+    assert torch.equal(filled.reflectance, torch.zeros(1, 64, 32))
+    assert not filled.label.any()

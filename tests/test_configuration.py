@@ -204,12 +204,6 @@ def test_settings_of_a_recipe_are_checked_with_the_words_of_their_class():
         load_recipe("small", ["training.tokenizer.learning_rate=.nan"])
 
 
-def test_a_setting_is_known_by_its_former_name():
-    recipe = load_recipe("small", ["data.variant=reference"])
-    assert recipe.data.projection_variant == "reference"
-    assert leaves({"data": {"variant": "reference"}}) == {"data.projection_variant": "reference"}
-
-
 @pytest.mark.parametrize(
     ("word", "name", "settings"),
     [

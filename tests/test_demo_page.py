@@ -2,7 +2,9 @@
 
 import json
 import re
+import shlex
 from dataclasses import replace
+from html import unescape
 from pathlib import Path
 
 import numpy as np
@@ -48,7 +50,8 @@ def scored():
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory, scored) -> Path:
-    folder = tmp_path_factory.mktemp("run")
+    folder = tmp_path_factory.mktemp("a") / "new run"
+    folder.mkdir()
     generator, val = made("lidargrit")[0], RangeImages(SENSOR, [Named()])
     errors = score_reconstruction(generator.get_tokenizer(), val)
     demo.write_results_page(generator, "simulated", val, scored[0], errors, scored[1], SECONDS, ("a <fact>",), folder)
@@ -93,6 +96,9 @@ def test_the_page_tells_all_of_it_and_fetches_nothing(written, scored):
     assert text.index('class="verdict"') < text.index("pixel statistics</th>"), "words come before numbers"
     assert "a &lt;fact&gt;" in text
     assert "154.1 s" in text
+    assert shlex.split(unescape(re.findall(r"<code>(lidargrit serve .*?)</code>", text)[0]))[2:] == [
+        str(written.parent)
+    ]
     generator = made("lidargrit")[0]
     tokens = generator.get_tokenizer().encode(RangeImages(SENSOR, [Store()]).batch([0])).tokens[0]
     shown = [int(number) for number in re.findall(r'text-anchor="middle" style="fill:#\w+">(\d+)</text>', text)]

@@ -179,9 +179,9 @@ def test_returns_outside_the_window_are_none(sets):
 
 
 def test_words_of_reading_scans_are_obeyed_or_refused(tmp_path, capsys):
-    former = read_config(ScanSettings.read(["data.variant=reference", "data.max_scans=7"]))
-    assert former.projection_variant == "reference"
-    assert former.max_scans == 7
+    named = read_config(ScanSettings.read(["data.projection_variant=reference", "data.max_scans=7"]))
+    assert named.projection_variant == "reference"
+    assert named.max_scans == 7
     assert read_config(ScanSettings.read(["data.max_scans=7"]), max_scans=3).max_scans == 3
     report = ["--report", str(tmp_path / "r.html")]
     others = ["--variant", "exact"], ["--sensor", "vlp16"], ["--protocol", "r2dm"], ["--metrics", "bev_jsd"]

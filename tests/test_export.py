@@ -17,6 +17,7 @@ from lidargrit.export import MANIFEST, KittiTree, export_scans
 from lidargrit.formats import read_scan
 from lidargrit.loading import DataConfig, prepare
 from lidargrit.projection import unproject
+from lidargrit.reporting import Reporter
 from lidargrit.sensors import load_sensor
 from lidargrit.sources import open_images
 from tiny_runs import contents
@@ -318,3 +319,11 @@ def test_the_command(samples, tmp_path, capsys):
     assert re.match(r"done: 2 scans in .*out", captured.out)
     assert main([*words[:-1], "ply"]) == 2
     assert "wanted an empty folder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("kind", "told"), [("bin", [".bin keeps no labels"]), ("npz", []), ("kitti_odometry", [])])
+def test_labels_that_a_format_does_not_keep_are_told_once(streets, tmp_path, monkeypatch, kind, told):
+    reporter, said = Reporter(), []
+    monkeypatch.setattr(reporter, "message", said.append)
+    export_scans(streets, tmp_path, kind, DataConfig(max_scans=2), reporter)
+    assert [text.partition(";")[0] for text in said] == told

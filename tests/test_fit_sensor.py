@@ -353,6 +353,10 @@ def test_names_and_files_that_no_command_would_read(tmp_path, capsys):
     dataset = open_dataset("simulated:1")
     with pytest.raises(ConfigError, match="a name of 201 letters; wanted at most 200"):
         fit_sensor_to_dataset(dataset, "a" * 201)
+    for name in ("", " ", "two\nlines", "\x1b[2J"):
+        for fit in (lambda name: fit_sensor_to_dataset(dataset, name), lambda name: fit_sensor([], name)):
+            with pytest.raises(ConfigError, match=r"--name '.*; wanted a name in one line that is not blank"):
+                fit(name)
     path = tmp_path / "mine.JSON"
     assert main(["fit-sensor", "simulated:1", "-o", str(path), "--json", str(path)]) == 2
     assert "for two files" in capsys.readouterr().err

@@ -11,6 +11,7 @@ import torch
 
 import lidargrit
 from lidargrit.cli import main
+from lidargrit.files import claim_folder
 from lidargrit.generators.lidargrit import LidarGrit
 from lidargrit.recipes import load_recipe
 from reference_weights import seeded_weights
@@ -21,7 +22,7 @@ from tiny_runs import contents, the_one_line
 SMALL = [  # the sizes of the reference numbers' two networks, whose tokens fit one another at 64x64
     "data.columns=512",
     "data.column_stride=8",
-    "data.variant=reference",
+    "data.projection_variant=reference",
     "model.tokenizer.channels=32",
     "model.tokenizer.channel_multipliers=[1,1,2,2]",
     "model.tokenizer.code_dim=16",
@@ -109,6 +110,9 @@ def test_the_same_import_again_changes_nothing_and_no_training_goes_on_there(fil
     assert "whose weights were imported; wanted " in capsys.readouterr().err
     assert imported(tmp_path / "run", files, "seed=7") == 2
     assert "which is not empty" in the_one_line(capsys.readouterr().err, "import-weights")
+    with claim_folder(tmp_path / "run"):  # as another import of the same weights does
+        assert imported(tmp_path / "run", files) == 2
+    assert ", which process " in the_one_line(capsys.readouterr().err, "import-weights")
     assert contents(tmp_path / "run") == before
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lidargrit.errors import ConfigError
 from lidargrit.sensors import load_sensor
 from lidargrit.simulator import labels, materials
 from lidargrit.simulator.beams import Beams
@@ -33,6 +34,22 @@ def seen():
 def brightness(material, albedo, cos_incidence, model=MODEL, wet=0.0):
     surfaces = Surfaces.of(wall(10.0, albedo, material), model, wet)
     return float(surfaces.brightness(np.int32([0]), np.float32([cos_incidence]))[0])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"least_power": 0.0}, "got least_power=0; wanted a power above 0"),
+        ({"patch_deg": 0.0}, "got patch_deg=0; wanted 0.01 or more"),
+        ({"patch_deg": float("nan")}, "got patch_deg=nan"),
+        ({"gap_share": 1.0}, "got gap_share=1; wanted a share from 0 to less than 1"),
+        ({"gap_share": -0.1}, "got gap_share=-0.1"),
+        ({"laser_readings": (1.0,) * 32}, "got 64 laser_gains and 32 laser_readings"),
+    ],
+)
+def test_a_model_with_which_no_scan_can_be_simulated_is_refused(change, message):
+    with pytest.raises(ConfigError, match=message):
+        replace(MODEL, **change)
 
 
 def test_power_falls_as_the_square_of_range_far_away():

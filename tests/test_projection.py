@@ -1,8 +1,6 @@
 """The exact projection as mathematics: round trips, turns of the car, who wins a pixel, which scans are refused."""
 
 import math
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -12,7 +10,7 @@ from hypothesis import strategies as st
 
 from lidargrit import _discovery
 from lidargrit.errors import ConfigError, ScanError
-from lidargrit.projection import RangeEncoding, project, unproject
+from lidargrit.projection import RangeEncoding, index_map, inspect, project, unproject
 from lidargrit.sensors import SensorModel, column_azimuths_rad, load_sensor
 from lidargrit.simulator import simulate
 from lidargrit.structures import RangeImage, Scan
@@ -112,6 +110,15 @@ def test_rows_and_columns_are_where_the_conventions_say():
     assert (int(high), int(low)) == (0, 62)
 
 
+@pytest.mark.parametrize("kind", [torch.int8, torch.int16, torch.int32, torch.int64])
+def test_labels_may_have_any_number_of_bits(kind):
+    sensor, instance = load_sensor("hdl64e_kitti_360"), 0 if kind.itemsize < 4 else 7 << 16
+    scan = Scan(torch.tensor([[10.0, 0, 0], [0, 10.0, 0]]), label=torch.tensor([40 + instance, 50], dtype=kind))
+    label = project(scan, sensor).label
+    assert label[label > 0].tolist() == [50, 40]  # the left comes first
+    assert label.dtype == torch.int64
+
+
 @pytest.mark.parametrize("name", SENSORS)
 def test_rays_are_unit_vectors_and_rows_descend(name):
     sensor = load_sensor(name)
@@ -163,11 +170,14 @@ def test_images_that_contradict_themselves_are_refused():
         unproject(RangeImage.stack([RangeImage(good, good > 0, sensor)]))
 
 
-def test_a_word_that_names_no_projection_is_refused():
-    """In a process of its own, for in the tests the types of the arguments are checked."""
-    code = "import lidargrit\nlidargrit.project(lidargrit.simulate(0), lidargrit.load_sensor('vlp16'), variant='exat')"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert "ConfigError: got variant='exat'; wanted exact or reference; correct it" in done.stderr
+@pytest.mark.usefixtures("untyped")
+@pytest.mark.parametrize("use", [project, index_map, inspect])
+def test_a_word_that_names_no_projection_is_refused(use):
+    scan, sensor = scan_at([[10.0, 0, 0], [0, 10.0, 0]]), load_sensor("vlp16")
+    with pytest.raises(ConfigError, match="got variant='exat'; wanted exact or reference; correct it"):
+        use(scan, sensor, variant="exat")
+    with pytest.raises(ConfigError, match="got method='sphericl'; wanted spherical or unfolding; correct it"):
+        use(scan, sensor, "sphericl")
 
 
 def test_points_of_64_bits_are_those_of_32():

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
 
 import numpy as np
 import pytest
 import torch
 
-from lidargrit.nn.pixel_networks import PixelDecoderConfig
 from lidargrit.nn.pixel_phases import Phase, phases_of
 from lidargrit.nn.range_candidates import RangeCandidates
 from lidargrit.sensors import SensorModel
@@ -115,14 +113,6 @@ def test_each_kind_of_surface_may_be_left_out(surfaces: bool, gravity: bool, kep
         assert some.shape[1] == kept
         np.testing.assert_array_equal(some[:, :6], every[:, :6])
         np.testing.assert_array_equal(some[:, 6:], every[:, 6:14] if surfaces else every[:, 14 : 14 + 8 * gravity])
-
-
-def test_a_config_of_before_has_no_vertical_and_horizontal_planes() -> None:
-    known = asdict(PixelDecoderConfig(surface_components=True))
-    del known["gravity_components"]
-    config, phase = PixelDecoderConfig(**known), phases_of(4)[1]
-    candidates = RangeCandidates(tiny_sensor(8, 16), [phase], config.surface_components, config.gravity_components)
-    assert (candidates.count, candidates.distances) == (14, 11)
 
 
 def plane_image(sensor: SensorModel, normal: tuple[float, float, float], distance_m: float) -> RangeImage:

@@ -5,6 +5,7 @@ import math
 import sys
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -291,3 +292,30 @@ def test_an_ouster_fires_into_the_middle_of_columns():
         sensor = load_sensor(name)
         fired = sensor.azimuth_rad[0].double() / (2 * math.pi / 1024)
         assert torch.allclose(fired, fired.round(), atol=1e-3)
+
+
+@pytest.mark.parametrize(("firings", "columns"), [(1024, 1024), (2048, 2048), (1024, 2048), (512, 512)])
+def test_no_firing_of_an_ouster_lies_on_a_border_whatever_its_mode(firings, columns):
+    sensor = load_sensor("os1_64").with_columns(columns)
+    azimuth = 2 * np.pi * np.arange(firings) / firings
+    beside = (sensor.first_edge_rad - azimuth) / (2 * np.pi / columns) % 1  # 0 and 1 are the borders
+    assert 0.2 < beside.min() <= beside.max() < 0.8
+    elevation = sensor.elevation_rad.double().numpy()
+    ways = np.broadcast_arrays(
+        np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)
+    )
+    fired = Scan(torch.from_numpy((20 * np.stack(ways, axis=-1).reshape(-1, 3) / 0.005).round() * 0.005))
+    assert int(project(fired, sensor).return_mask.sum()) == 64 * firings
+
+
+def test_more_columns_keep_measured_firings_in_their_middle():
+    rng = np.random.default_rng(0)
+    for own in (90, 360, 1000):
+        for columns in (own + 1, 2 * own, 3 * own):
+            edge_rad = np.pi + rng.uniform(-1, 1) * np.pi / own
+            plain = load_sensor("vlp16").with_columns(own)
+            turned = replace(plain, azimuth_rad=column_azimuths_rad(own, 1, edge_rad), first_edge_rad=edge_rad)
+            finer = turned.with_columns(columns)
+            fired_rad = edge_rad - np.pi / own  # in the middle of the first column
+            assert (finer.first_edge_rad - fired_rad) / (2 * np.pi / columns) % 1 == pytest.approx(0.5, abs=1e-6)
+            assert finer.fine().same_rays(finer)

@@ -69,6 +69,7 @@ GOOD = {"model": 0, "seed": 3, "count": 2, "sampling": {"temperature": 1, "top_k
     [
         ({"seed": -1}, "whole number from 0"),
         ({"seed": 2**32}, "whole number from 0"),
+        ({"seed": 2**32 - 1}, "seeds up to 4294967295; lower one of the two"),
         ({"seed": 10**400}, "whole number from 0"),
         ({"seed": True}, "whole number"),
         ({"seed": 1.0}, "whole number"),
@@ -386,6 +387,7 @@ def test_the_command_says_where_and_to_whom(tmp_path, capsys, monkeypatch):
         ["--seconds", "-1"],
         ["--seconds", "inf"],
         ["--port", "99999"],
+        ["--host", "ü" * 70],
     ):
         assert main(["serve", *wrong]) == 2
         assert capsys.readouterr().err.startswith("lidargrit serve: got ")

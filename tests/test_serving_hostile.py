@@ -24,6 +24,7 @@ from lidargrit.errors import OutputError
 from lidargrit.formats import load, read_scan
 from lidargrit.serving import application
 from lidargrit.serving.application import is_own
+from lidargrit.serving.requests import TASKS
 from lidargrit.serving.server import _listening
 from served import LIMITS, running
 
@@ -233,6 +234,20 @@ def test_a_file_that_needs_another_beside_it_is_not_offered(served):
     assert "cannot be read here by itself" in why
     assert ".ply" in why
     assert why.count(".pcap") == 1
+
+
+def test_a_task_that_a_model_cannot_do_is_refused_at_once_in_words_of_the_page(served):
+    models = json.loads(served.ask("/models")[2])["models"]
+    lacking = [
+        (at, task) for at, one in enumerate(models) for task in TASKS if one["tasks"] and task not in one["tasks"]
+    ]
+    assert lacking
+    for model, task in lacking:
+        words = urllib.parse.quote(json.dumps({"name": "a.ply", "model": model, "task": task}))
+        status, why = served.refused(f"/complete?request={words}", b"x" * 100)
+        assert status == 400
+        assert f"got the task {TASKS[task]!r}, which " in why
+        assert "--" not in why
 
 
 def test_too_much_is_cut_off_without_being_read(served):

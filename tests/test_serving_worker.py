@@ -46,6 +46,8 @@ def test_settings_that_were_left_alone_are_those_of_what_is_done(name, other, ch
         assert begun.value.args == (replace(own, **changed),)
     value = getattr(model.completion_sampling(), other)
     settings = describe_model("tiny", model)["settings"]
+    unread = {one["name"] for one in settings if one["about"].endswith("Only completing a scan reads it.")}
+    assert unread == {one["name"] for one in settings} & model.not_of_sampling != set()
     assert [one["name"] for one in settings if f"a scan is completed with {value}." in one["about"]] == [other]
 
 

@@ -99,8 +99,15 @@ def test_two_scans_of_one_name_are_not_exported_over_each_other(tmp_path, capsys
         rows[:, :3] = xyz(64)
         rows[:, 4] = np.arange(64) % 32
         (each / "n008-2018-08-01-15-16-36-0400__LIDAR_TOP__1533151603547590.pcd.bin").write_bytes(rows.tobytes())
-    assert main(["export", str(tmp_path), str(tmp_path / "out"), "--format", "ply"]) != 0
-    assert "got several scans of " in capsys.readouterr().err
+    source, out = str(tmp_path), str(tmp_path.with_name("out"))
+    for words in (
+        ["export", source, out, "--format", "ply"],
+        ["complete", source, out, "--observed", "rows:4", "--model", "nearest", "--sensor", "hdl32e"],
+        ["compress", source, f"{out}.lgz"],
+    ):
+        assert main(words) == 2
+        assert "got several scans of " in capsys.readouterr().err
+    assert list(tmp_path.parent.glob("out*")) == []
 
 
 @pytest.mark.parametrize(("before", "separator"), [("# ", " "), ("#", ","), ("//", " ")])

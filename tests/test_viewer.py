@@ -12,8 +12,10 @@ import pytest
 import torch
 from PIL import Image
 
+from lidargrit import simulate
 from lidargrit.cli import main
 from lidargrit.errors import ConfigError, OutputError
+from lidargrit.formats import load as load_format
 from lidargrit.generators import load_class
 from lidargrit.loading.config import ScanSettings
 from lidargrit.reporting import Reporter
@@ -21,7 +23,7 @@ from lidargrit.sensors import load_sensor
 from lidargrit.sources import open_source
 from lidargrit.sources.samples import write_samples
 from lidargrit.structures import RangeImage
-from lidargrit.viewer import pictures, plot_comparison, view
+from lidargrit.viewer import pictures, plot_comparison, scan_sets, view
 from lidargrit.viewer.scan_sets import load_scan_sets
 
 
@@ -211,3 +213,21 @@ def test_words_that_the_command_would_not_follow_are_refused(words, message, tmp
     assert main(["view", "simulated:1", *words]) == 2
     assert message in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", [r"a$\nosuch{$.bin", "街.bin"])
+def test_names_are_drawn_as_they_are_written(name, tmp_path, recwarn):
+    """Between dollar signs would be a formula; and what a font lacks is no matter for the terminal."""
+    load_format("kitti_bin").write(tmp_path / name, simulate(seed=0))
+    assert main(["view", str(tmp_path / name), "-o", str(tmp_path / "view.png")]) == 0
+    assert main(["inspect", str(tmp_path / name), "-o", str(tmp_path / "inspect.png")]) == 0
+    assert size_of_png(tmp_path / "view.png")[0] == size_of_png(tmp_path / "inspect.png")[0] == 1400
+    assert not [str(one.message) for one in recwarn.list if "Glyph" in str(one.message)]
+
+
+def test_a_later_seed_that_is_too_large_is_told_before_scans_are_read(tmp_path, monkeypatch, capsys):
+    assert len(load_scan_sets(["simulated:2"], 2, seed=2**32 - 1)) == 1, "scans have no seed"
+    monkeypatch.setattr(scan_sets, "_of_scans", lambda *given: pytest.fail("read a scan"))
+    words = ["view", "simulated:2", "pretrained", "-n", "2", "--seed", str(2**32 - 1), "-o", str(tmp_path / "a.png")]
+    assert main(words) == 2
+    assert "got --seed 4294967295 with -n 2, of which the last scan has" in capsys.readouterr().err

@@ -71,14 +71,6 @@ def test_the_scorecard_says_so_in_words(compared, tmp_path):
     assert Scorecard.read(tmp_path / "card.json").left_out == card.left_out
 
 
-def test_cards_of_before_there_were_verdicts_are_read(compared, tmp_path):
-    data = compared[0].to_json()
-    for each in data["left_out"]:
-        del each["verdict"]
-    write_json(tmp_path / "card.json", data)
-    assert {each.verdict for each in Scorecard.read(tmp_path / "card.json").left_out} == {"left out"}
-
-
 def test_it_does_not_matter_which_set_has_no_raydrop(sets):
     card, _ = compare_sources(str(sets / "dusty"), str(sets / "lidargan"), SETTINGS)
     assert {each.metric for each in card.left_out} == set(RAYDROP)

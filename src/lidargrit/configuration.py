@@ -22,7 +22,6 @@ COUNTS_SCANS = "counts_scans"
 _VALUES_AT_MOST = 1000  # of one setting; the parser takes a second for ten thousand
 _LETTERS_AT_MOST = 100_000  # of one value on the command line: a list of as many long paths
 _OTHER_BASES = re.compile(r":|(^|[\[,\s])[-+]?0\d")  # YAML 1.1 reads 1:30 as 90, and 010 in a list as 8
-_RENAMED = {"data.variant": "data.projection_variant"}  # run folders have the former name, and users may type it
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,12 +96,6 @@ def from_json(cls: type[T], data: Any, source: str) -> T:
         ) from None
 
 
-def defaults(config: T) -> T:
-    """Return a configuration of the same kinds, down to the last, in which every setting has its default."""
-    nested = {name: defaults(value) for name, value in _children(config).items() if dataclasses.is_dataclass(value)}
-    return type(config)(**nested)
-
-
 def override(
     config: T,
     settings: Iterable[str],
@@ -130,7 +123,7 @@ def override(
         path, equals, text = setting.partition("=")
         if not equals:
             raise ConfigError(f"the setting {setting!r}", "NAME=VALUE", f"e.g. --set {next(iter(known), 'name')}=...")
-        values[setting_name(path)] = text
+        values[path.strip()] = text
     unknown = [path for path in values if path not in known]
     if unknown:
         raise ConfigError(
@@ -154,18 +147,13 @@ def name_and_settings(word: str) -> tuple[str, list[str]]:
     return (name, settings.split(",")) if colon and "=" in settings else (word, [])
 
 
-def setting_name(path: str) -> str:
-    """Return a setting's dotted name of today for one that a user typed or a file holds."""
-    return _RENAMED.get(path.strip(), path.strip())
-
-
 def leaves(config: Any, prefix: str = "") -> dict[str, Any]:
     """Return every setting of a configuration, or of its JSON, by its dotted name."""
     found: dict[str, Any] = {}
     for name, value in _children(config).items():
         nested = dataclasses.is_dataclass(value) or isinstance(value, dict)
         path = f"{prefix}{name}"
-        found |= leaves(value, f"{path}.") if nested else {setting_name(path): value}
+        found |= leaves(value, f"{path}.") if nested else {path: value}
     return found
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -71,26 +71,50 @@ def export_scans(
     scans, of_images = _open(source, config, sensor)
     scans.check_output(out)
     files = layout.files([scans.name(index) for index in range(len(scans))])
-    if twice := sorted(file for file, count in Counter(files).items() if count > 1):
-        what = f"several scans of {source} that would be {twice[0]}"
-        raise DataError(what, "a name for each scan, as each becomes a file", "rename some, or export them apart")
-    identities = [scans.identity(index) for index in range(len(scans))]
-    facts = {"source": source, "format": kind, **of_images, "scans": dict(zip(files, identities, strict=True))}
+    check_names(source, files)
+    identities = {file: scans.identity(index) for index, file in enumerate(files)}
+    facts = {"source": source, "format": kind, **of_images, "scans": identities}
     with claim_folder(out), claimed_scans(out / MANIFEST, facts) as left_out:
-        missing = [index for index, file in enumerate(files) if not layout.is_there(file)]
+        told_labels, missing = layout.keeps_labels, [at for at, file in enumerate(files) if not (out / file).exists()]
         with reporter.progress("exporting", len(files), len(files) - len(missing)) as progress:
             for index in missing:
                 try:
-                    layout.write(files[index], scans.scan(index))
+                    scan = scans.scan(index)
+                    layout.write(files[index], scan)
                 except ScanError as error:
                     if config.bad_scans == "refuse":
                         raise
                     reporter.message(f"left out: {error}")
                     left_out.add(files[index])
+                else:
+                    told_labels = told_labels or _told_labels(scan, files[index], reporter)
                 progress.advance(1)
         if len(left_out) == len(files):
             raise DataError(f"no usable scan in {source}", "at least one", "see the messages above")
         return len(files) - len(left_out)
+
+
+def check_names(source: str, names: Sequence[str]) -> None:
+    """Raise DataError if several scans of a source have one name, or would be one file: the last would replace others.
+
+    Args:
+        source: source, for the message.
+        names: name or file of each scan.
+    """
+    if twice := sorted(name for name, count in Counter(names).items() if count > 1):
+        got = f"several scans of {source} that would be {twice[0]}"
+        raise DataError(got, "a name for each scan, as each becomes a file", "rename some, or take their folders apart")
+
+
+def labels_lost(file: str) -> str:
+    """Return the message that a file, by its ending, keeps no labels."""
+    return f"{Path(file).suffix} keeps no labels; --format {TREE} or npz keeps them"
+
+
+def _told_labels(scan: Scan, file: str, reporter: Reporter) -> bool:
+    if scan.label is not None:
+        reporter.message(labels_lost(file))
+    return scan.label is not None
 
 
 def write_array(path: Path, pixels: Float[Tensor, "H W"]) -> None:
@@ -116,13 +140,11 @@ class _Flat:
 
     def __init__(self, out: Path, form: type[ScanFormat], suffix: str) -> None:
         self._out, self._form, self._suffix = out, form, suffix
+        self.keeps_labels = "label" in form.keeps
 
     def files(self, names: list[str]) -> list[str]:
         """Return the file of every scan, below the folder."""
         return [name + self._suffix for name in names]
-
-    def is_there(self, file: str) -> bool:
-        return (self._out / file).exists()
 
     def write(self, file: str, scan: Scan) -> None:
         self._form.write(self._out / file, scan)
@@ -134,6 +156,8 @@ class KittiTree:
     Args:
         out: folder of the tree.
     """
+
+    keeps_labels = True
 
     def __init__(self, out: Path) -> None:
         self._out = out
@@ -150,10 +174,6 @@ class KittiTree:
                 seen[folder] += 1
             names = numbered
         return [f"sequences/{name[:-7]}/velodyne/{name[-6:]}.bin" for name in names]
-
-    def is_there(self, file: str) -> bool:
-        """Return whether the file of a scan is written."""
-        return (self._out / file).exists()
 
     def write(self, file: str, scan: Scan) -> None:
         """Write a scan; see :func:`write_with_labels`."""

@@ -18,7 +18,6 @@ CONFIG_FILE, WEIGHTS_FILE, CARD_FILE = "config.json", "model.safetensors", "READ
 RUN_FILE = "run.json"  # ``origin`` in it says that the weights beside it were not trained in this folder
 CHECKPOINT_FILE = "checkpoint.safetensors"  # of a stage, in its own folder
 TRAINED_ON_FILE = "trained_on.json"  # in a run's folder and beside its samples: which drives, which pixels
-UNKNOWN_SCANS = "a run that does not say on which scans it was trained"  # in the place of a source
 _NAMES_AT_MOST = 10_000_000  # that a file stands for by their first and last
 PRETRAINED = Path(__file__).parent / "pretrained"
 PACKAGED = (PRETRAINED, PRETRAINED.with_name("pretrained_wide"))  # their names go wherever a run is wanted
@@ -54,12 +53,9 @@ def taken_over(about: Any) -> dict[str, Any]:
     """Return what a ``run.json`` says of weights that came from other runs: ``train``, ``files`` and ``training``.
 
     Those are the sources of their training scans, the files of imported weights, and the settings of stages that were
-    not trained in the run. Runs of earlier versions do not say on which scans the weights were trained.
+    not trained in the run.
     """
-    recipe = about.get("recipe") or {}
-    took = recipe.get("tokenizer_from") or recipe.get("stages_from")
-    unsaid = {"train": [UNKNOWN_SCANS] if took else [], "files": [], "training": {}}
-    return {**unsaid, **about.get("taken", {})}
+    return {"train": [], "files": [], "training": {}, **about.get("taken", {})}
 
 
 def recorded_projection(folder: Path) -> str:
@@ -84,8 +80,7 @@ def trained_on(folder: Path) -> Provenance:
         return Provenance()
     try:
         facts = {name: tuple(of) for name, of in read_json(folder / TRAINED_ON_FILE).items()}
-        if "recordings" in facts:
-            facts["recordings"] = tuple(_each_name(facts["recordings"]))
+        facts["recordings"] = tuple(_each_name(facts["recordings"]))
         if not all(isinstance(each, str) for of in facts.values() for each in of):
             raise TypeError("something is no text")
         return Provenance(**facts)
@@ -104,7 +99,7 @@ def write_trained_on(folder: Path, provenance: Provenance) -> None:
     listed = {
         "recordings": _first_and_last({*provenance.recordings} - {""}),
         "fingerprints": sorted({*provenance.fingerprints}),
-        "range_fingerprints": sorted({*provenance.range_fingerprints} - {""}),
+        "range_fingerprints": sorted({*provenance.range_fingerprints}),
     }
     write_text(folder / TRAINED_ON_FILE, json.dumps(listed, separators=(",", ":")) + "\n")
 

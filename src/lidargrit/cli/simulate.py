@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--seed", type=seed_number, default=0, help="seed of the first street; each next street has the next seed"
     )
     parser.add_argument(
-        "--frames", type=int, default=1, help="number of scans of each street, a tenth of a second apart"
+        "--frames", type=int, default=1, help="scans of each street, 0.1 s apart; a street ends at 100 m"
     )
     parser.add_argument(
         "--theme", choices=["mixed", "city", "suburb", "country"], default="mixed", help="kind of streets"

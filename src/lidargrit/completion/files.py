@@ -18,7 +18,17 @@ from lidargrit.completion.inputs import Inputs, InputScan
 from lidargrit.conditions import Condition
 from lidargrit.determinism import derive_seed, scan_seed
 from lidargrit.errors import ConfigError, DataError, OutputError, ScanError
-from lidargrit.export import IMAGE, TREE, KittiTree, claimed_scans, writable_format, write_array, write_with_labels
+from lidargrit.export import (
+    IMAGE,
+    TREE,
+    KittiTree,
+    check_names,
+    claimed_scans,
+    labels_lost,
+    writable_format,
+    write_array,
+    write_with_labels,
+)
 from lidargrit.files import claim_folder
 from lidargrit.formats import ScanFormat
 from lidargrit.loading import DataConfig
@@ -88,7 +98,7 @@ def write_completions(
         completer: model or classical method.
         condition_of: function that returns the condition for a scan and a seed.
         output: number and kind of files.
-        facts: further entries of ``completed.json``; a folder with other entries is refused.
+        facts: further entries of ``completed.json``, among them the ``source``; a folder with other entries is refused.
         config: treatment of scans that cannot be used; nothing else of it is used.
         reporter: receiver of progress and messages.
 
@@ -98,12 +108,12 @@ def write_completions(
     Raises:
         ConfigError: several completions by what completes a scan in one way.
         OutputError: the folder holds something else, lies in the source, or cannot be written.
-        ScanError, DataError: a scan that cannot be used, or no usable one.
+        ScanError, DataError: a scan that cannot be used, no usable one, or two that would be one file.
     """
     inputs.check_output(out)
-    files, facts = _files(inputs, output, completer.sensor), facts | _facts(completer, output)
+    files, facts = _files(inputs, str(facts["source"]), output, completer.sensor), facts | _facts(completer, output)
     identities = {file: inputs.identity(index) for (index, _), file in files.items()}
-    left_out, labels_lost = set[int](), False
+    left_out, told_labels = set[int](), False
     missing = [job for job, file in files.items() if not (out / file).exists()]
     skipped = left_out if config.bad_scans == "skip" else None
     jobs = _jobs(inputs, missing, condition_of, output.seed, skipped, reporter)
@@ -119,9 +129,9 @@ def write_completions(
                 if output.probability and job.turn == 0:
                     share = _return_share(completer, job, output)
                     write_array(out / f"{file.removesuffix(Path(file).suffix)}{PROBABILITY}", share)
-                if not _write(out / file, output.format, image, job) and not labels_lost:
-                    labels_lost = True
-                    reporter.message(f"{Path(file).suffix} keeps no labels; --format {TREE} or npz keeps them")
+                if not _write(out / file, output.format, image, job) and not told_labels:
+                    told_labels = True
+                    reporter.message(labels_lost(file))
                 progress.advance(1)
         files_left_out.update(file for (index, _), file in files.items() if index in left_out)
     if len(left_out) == len(inputs):
@@ -140,7 +150,7 @@ def _facts(completer: Completer, output: OutputConfig) -> dict[str, Any]:
     return made
 
 
-def _files(inputs: Inputs, output: OutputConfig, sensor: SensorModel) -> dict[tuple[int, int], str]:
+def _files(inputs: Inputs, source: str, output: OutputConfig, sensor: SensorModel) -> dict[tuple[int, int], str]:
     """Return the name of each file below the folder, by the index of its scan and the number of the completion."""
     if len(inputs) * output.count > _FILES_AT_MOST:
         got = f"{output.count:,} completions of each of {len(inputs):,} scans"
@@ -150,6 +160,7 @@ def _files(inputs: Inputs, output: OutputConfig, sensor: SensorModel) -> dict[tu
         names = KittiTree(Path()).files(names)
     else:
         names = [name + _suffix(inputs.suffix(index), output.format, sensor) for index, name in enumerate(names)]
+    check_names(source, names)
     if taken := [name for name in names if name.endswith(PROBABILITY)]:
         got = f"a scan that would be {taken[0]}, as files of return probabilities are called"
         raise OutputError(got, "another name", "rename the scan, or choose another --format")

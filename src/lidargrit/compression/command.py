@@ -15,7 +15,7 @@ from lidargrit.compression.archive import Archive, writing
 from lidargrit.compression.coder import not_reproduced
 from lidargrit.compression.scan_codec import ScanCodec
 from lidargrit.errors import CheckpointError, DataError, ScanError, UsageError
-from lidargrit.export import IMAGE, claimed_scans, writable_format, write_array
+from lidargrit.export import IMAGE, check_names, claimed_scans, writable_format, write_array
 from lidargrit.files import claim_folder
 from lidargrit.generators import load
 from lidargrit.loading import DataConfig
@@ -59,13 +59,14 @@ def compress_scans(
 
     Raises:
         ConfigError: a model without a pixel decoder, a step that is not one, or no range coder.
-        DataError: no usable scan.
+        DataError: no usable scan, or two of one name.
         OutputError: an unfinished file of another command, or one that cannot be written.
         ScanError: a scan that cannot be used.
     """
     codec = ScanCodec(load(model), step_mm)
     reader = ScanReader(codec.sensor, projection_variant(locate(model)))
     inputs = open_inputs(source, reader, config, reporter)
+    check_names(source, [inputs.name(index) for index in range(len(inputs))])  # of which a file has each once
     chosen = {"source": source, "max_scans": config.max_scans}
     chosen |= {"bad_points": config.bad_points, "bad_scans": config.bad_scans}
     with writing(out, _header(codec, model), chosen) as writer:
@@ -108,6 +109,7 @@ def decompress_scans(path: Path, out: Path, model: str, kind: str, chosen: Seque
         UnknownNameError: a format that is none, or that cannot be written.
         UsageError: an index that the file does not have.
     """
+    form, suffix = (None, ".npy") if kind == IMAGE else writable_format(kind, IMAGE)
     archive = Archive(path)
     wrong = [index for index in chosen if not 0 <= index < len(archive)]
     if wrong:
@@ -115,7 +117,6 @@ def decompress_scans(path: Path, out: Path, model: str, kind: str, chosen: Seque
         raise UsageError(f"--only {wrong[0]}", wanted, "correct it" if len(archive) else "name another file")
     archive.check()
     codec = _codec_of(archive, model)
-    form, suffix = (None, ".npy") if kind == IMAGE else writable_format(kind, IMAGE)
     files = {index: archive.names[index] + suffix for index in chosen or range(len(archive))}
     scans = {file: archive.names[index] for index, file in files.items()}
     missing = [index for index, file in files.items() if not (out / file).exists()]

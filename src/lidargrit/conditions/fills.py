@@ -258,17 +258,18 @@ def _reflectance_of(
     seen: Observed,
     method: Callable[[Observed, Float32[np.ndarray, "H W"]], Float32[np.ndarray, "H W"]],
 ) -> Float[Tensor, "H W"]:
-    """Return the reflectance of every pixel of a scan by a method; unchanged where no return was observed."""
+    """Return the reflectance of every pixel of a scan by a method; 0 where no return was observed."""
     assert condition.reflectance is not None
     pixels = condition.reflectance[index].cpu().numpy()
-    return torch.from_numpy(method(seen, pixels) if seen.returned.any() else pixels).clamp(0, 1)
+    return torch.from_numpy(method(seen, pixels) if seen.returned.any() else np.zeros_like(pixels)).clamp(0, 1)
 
 
 def _label_of(condition: Condition, index: int, seen: Observed) -> Int[Tensor, "H W"]:
-    """Return for every pixel of a scan the label of the nearest observed return."""
+    """Return for every pixel of a scan the label of the nearest observed return; 0 where there is none."""
     assert condition.label is not None
+    label = condition.label[index].cpu()
     rows, columns = (torch.from_numpy(part) for part in seen.nearest_return)
-    return condition.label[index].cpu()[rows, columns]
+    return label[rows, columns] if seen.returned.any() else torch.zeros_like(label)
 
 
 def fill_from_nearest(images: RangeImage, observed: Bool[Tensor, "B H W"]) -> RangeImage:

@@ -57,10 +57,7 @@ class Costs:
         scans, seconds = timed or (0, None)
         if self.path.is_file():
             there = read_costs(self.path)
-            # Files of earlier versions lack the hash: they are taken to be of these weights.
-            of_these_weights = there.get("weights_sha256", self.weights_sha256) == self.weights_sha256
-            has_time = there["seconds_per_scan"] is not None and scans <= there["scans"]
-            if of_these_weights and (timed is None or has_time):
+            if there.get("weights_sha256") == self.weights_sha256 and scans <= there["scans"]:
                 return
         cost = generator.cost(sampling)
         write_json(
@@ -73,6 +70,7 @@ class Costs:
                 "flops_per_scan": cost.flops,
                 "seconds_per_scan": seconds,
                 "scans": scans,  # over which the time was taken
+                "bits_per_return": None,  # until they are added
             },
         )
 
@@ -102,7 +100,7 @@ def read_costs(path: Path) -> dict[str, Any]:
     Raises:
         CheckpointError: the file cannot be read, or an entry lacks or is no number.
     """
-    of = {"bits_per_return": None, "scans": 0} | read_json(path)  # files of before lack the first
+    of = read_json(path)
     for name, may_lack in (*((name, may) for name, (_, may) in _ENTRIES.items()), ("scans", False)):
         if name not in of or not (type(of[name]) in (int, float) or (may_lack and of[name] is None)):
             cure = "remove the folder of this system, and compare again"

@@ -24,6 +24,7 @@ from lidargrit.structures import ScanBits
 
 _BATCH = 4
 _COMPARED_AT_MOST = 64  # scans: enough to tell systems apart, and seconds where all would take minutes
+_COMPARED_STEP_MM = 10  # in which ranges are rounded
 _ALL = "all"
 _UNITS = {"scan": "a scan", "return": "a return", "pixel": "a pixel"}
 
@@ -132,18 +133,17 @@ def score_likelihood(
     return Likelihood(step_mm, whole, images.provenance.names, parts, returns, sensor.height * sensor.width)
 
 
-def bits_per_return(generator: Generator, scans: EvalSet, step_mm: int = 10) -> float | None:
+def bits_per_return(generator: Generator, scans: EvalSet) -> float | None:
     """Return the bits that the model needs for a return of whole scans; None if it has no such likelihood.
 
     Args:
         generator: any model; without the capability ``likelihood``, or with tokens alone, it gets None.
         scans: scans of its sensor, of which at most 64 are taken, evenly spaced.
-        step_mm: step in millimetres that ranges are rounded to.
     """
     if "likelihood" not in generator.capabilities:
         return None
     bits, returns = 0.0, 0
-    for found in _bits(generator, scans, evenly_spaced(_COMPARED_AT_MOST, len(scans)), step_mm):
+    for found in _bits(generator, scans, evenly_spaced(_COMPARED_AT_MOST, len(scans)), _COMPARED_STEP_MM):
         if not found.is_whole:
             return None
         bits += float(found.total().sum())

@@ -53,9 +53,7 @@ class RaydropScore:
     real_against_real: MetricResult
 
 
-def score_raydrop(
-    generator: Generator, scans: str, clean: RangeImage, true: RangeImage, seed: int = 0
-) -> list[RaydropScore]:
+def score_raydrop(generator: Generator, scans: str, clean: RangeImage, true: RangeImage) -> list[RaydropScore]:
     """Drop returns of clean scans by a model, and independently of one another, and compare both with the true scans.
 
     Args:
@@ -63,7 +61,6 @@ def score_raydrop(
         scans: kind of the scans; see :class:`RaydropScore`.
         clean: batch of range images in which every surface returns.
         true: measured range images of the same scans, with true drops.
-        seed: seed of the first scan's drops, and of the independent ones.
 
     Raises:
         ConfigError: a model that does not take clean surfaces.
@@ -72,10 +69,10 @@ def score_raydrop(
     dropped = []
     for first in range(0, len(clean), generator.compute_batch):
         some = clean[first : first + generator.compute_batch]
-        seeds = range(seed + first, seed + first + len(some))
+        seeds = range(first, first + len(some))
         dropped.append(generator.complete(Condition.of_surfaces(some), seeds).to("cpu"))
     by_model = RangeImage.cat(dropped)
-    independent = drop_independently(clean, float(true.return_mask.float().mean()), seed)
+    independent = drop_independently(clean, float(true.return_mask.float().mean()))
     half = len(true) // 2
     return [
         RaydropScore(
@@ -104,16 +101,13 @@ def raydrop_model(word: str, device: str = "") -> Generator:
     return generator
 
 
-def scores_of_model(
-    generator: Generator, simulated: SimulatedScans, real: RangeImages, seed: int = 0
-) -> list[RaydropScore]:
+def scores_of_model(generator: Generator, simulated: SimulatedScans, real: RangeImages) -> list[RaydropScore]:
     """Score a model's drops: on simulated scans, whose clean ranges are known, and on real ones, estimated twice.
 
     Args:
         generator: model of :func:`raydrop_model`.
         simulated: simulated scans of the run's sensor, before and after drops.
         real: real scans of its sensor.
-        seed: seed of the first scan's drops.
 
     Raises:
         ConfigError: a model of another sensor.
@@ -122,9 +116,9 @@ def scores_of_model(
     pairs = {
         "simulated": (simulated.clean, simulated.measured),
         "real": (decoded, true),
-        "real_triangulated": (triangulated_surfaces(true, seed), true),
+        "real_triangulated": (triangulated_surfaces(true), true),
     }
-    return [score for scans, (clean, of) in pairs.items() for score in score_raydrop(generator, scans, clean, of, seed)]
+    return [score for scans, (clean, of) in pairs.items() for score in score_raydrop(generator, scans, clean, of)]
 
 
 @torch.no_grad()
@@ -155,16 +149,15 @@ def decoded_surfaces(generator: Generator, real: RangeImages) -> tuple[RangeImag
     return _surfaces(range_m, true), true
 
 
-def triangulated_surfaces(true: RangeImage, seed: int = 0) -> RangeImage:
+def triangulated_surfaces(true: RangeImage) -> RangeImage:
     """Return scans with a range for every ray, interpolated from the returns of other rays.
 
     A ray that never returns in any of the scans, such as one that ends on the car, has no surface.
 
     Args:
         true: batch of real scans.
-        seed: seed of the choice of the other rays; see :func:`lidargrit.conditions.fills.ranges_from_others`.
     """
-    return _surfaces(ranges_from_others(true, torch.Generator().manual_seed(seed)).range_m, true)
+    return _surfaces(ranges_from_others(true, torch.Generator().manual_seed(0)).range_m, true)
 
 
 def _surfaces(range_m: Tensor, true: RangeImage) -> RangeImage:

@@ -111,15 +111,14 @@ def _require_two(real: RangeImages) -> None:
         )
 
 
-def drop_independently(clean: RangeImage, return_share: float, seed: int = 0) -> RangeImage:
+def drop_independently(clean: RangeImage, return_share: float) -> RangeImage:
     """Drop returns independently of one another (Bernoulli) at one rate, so that a given share of all pixels returns.
 
     Args:
         clean: a batch where all surfaces return.
         return_share: share of all pixels that return, in [0, 1]; if fewer pixels see a surface, all of these return.
-        seed: seed of the random numbers.
     """
-    rng = torch.Generator().manual_seed(seed)
+    rng = torch.Generator().manual_seed(0)
     keep = return_share / max(float(clean.return_mask.float().mean()), 1e-9)
     mask = clean.return_mask & (torch.rand(clean.range_m.shape, generator=rng) < keep)
     return RangeImage.masked(clean.range_m, mask, clean.sensor, clean.reflectance, clean.label)

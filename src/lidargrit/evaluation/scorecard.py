@@ -46,8 +46,7 @@ class EvalSetRecord:
         sensor: name and size of its images.
         projection: description of the projection of its scans.
         sha256: hash of the pixels that were compared.
-        weights_sha256: hash of the weights that generated the scans; "" for scans of other origins, and where an old
-            file lacks it.
+        weights_sha256: hash of the weights that generated the scans; "" for scans of other origins.
     """
 
     source: str
@@ -58,7 +57,7 @@ class EvalSetRecord:
     sensor: str
     projection: str
     sha256: str
-    weights_sha256: str = field(default="", compare=False)  # equal pixels are equal, and old files lack it
+    weights_sha256: str = field(default="", compare=False)  # equal pixels are equal
 
 
 @dataclass(frozen=True)
@@ -194,13 +193,9 @@ def _row(score: Score, with_pixels: bool) -> tuple[str, ...]:
 
 
 def _set_record(data: dict[str, Any]) -> EvalSetRecord:
-    words = {name: str(data[name]) for name in ("source", "data_set", "split", "sensor", "projection", "sha256")}
-    return EvalSetRecord(
-        **words,
-        scans=int(data["scans"]),
-        scans_used=int(data["scans_used"]),
-        weights_sha256=str(data.get("weights_sha256", "")),
-    )
+    names = ("source", "data_set", "split", "sensor", "projection", "sha256", "weights_sha256")
+    words = {name: str(data[name]) for name in names}
+    return EvalSetRecord(**words, scans=int(data["scans"]), scans_used=int(data["scans_used"]))
 
 
 def _score(data: dict[str, Any]) -> Score:

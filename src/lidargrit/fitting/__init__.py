@@ -82,7 +82,7 @@ def fit_sensor(scans: Sequence[Scan], name: str = "fitted") -> SensorFit:
         name: name of the new sensor.
 
     Raises:
-        ConfigError: no scan.
+        ConfigError: no scan, or a name that is blank, too long or cannot be printed in one line.
         ScanError: scans that do not show their sensor: one ring, a camera's crop, a map, points of another frame.
 
     Example:
@@ -90,6 +90,7 @@ def fit_sensor(scans: Sequence[Scan], name: str = "fitted") -> SensorFit:
         >>> fit_sensor([simulate(seed) for seed in range(2)]).sensor.height
         64
     """
+    _check_name(name)
     if not scans:
         raise ConfigError("no scan to fit a sensor to", "at least one", "name a source that holds some")
     everything = [Points.of_scan(scan) for scan in scans]
@@ -138,17 +139,22 @@ def fit_sensor_to_dataset(dataset: ScanDataset, name: str = "fitted", num_scans:
         num_scans: largest number of scans to use; 0 for all.
 
     Raises:
-        ConfigError: a negative number of scans, or no name.
+        ConfigError: a negative number of scans, or a name that is blank, too long or cannot be printed in one line.
         ScanError: a scan that cannot be used, or does not show its sensor.
     """
     if num_scans < 0:
         raise ConfigError(f"-n {num_scans}", "at least 1 scan, or 0 for all", "raise it")
-    if not name.strip():
-        raise ConfigError(f"--name {name!r}", "a name that is not blank", "choose another")
-    if len(name) > NAME_AT_MOST:
-        raise ConfigError(f"a name of {len(name)} letters", f"at most {NAME_AT_MOST}", "choose a shorter --name")
+    _check_name(name)
     indices = evenly_spaced(num_scans or len(dataset), len(dataset))
     return fit_sensor([dataset.scan(index) for index in indices], name)
+
+
+def _check_name(name: str) -> None:
+    """Refuse a name with which no command would read the sensor's file."""
+    if not (name.strip() and name.isprintable()):
+        raise ConfigError(f"--name {name!r}", "a name in one line that is not blank", "choose another")
+    if len(name) > NAME_AT_MOST:
+        raise ConfigError(f"a name of {len(name)} letters", f"at most {NAME_AT_MOST}", "choose a shorter --name")
 
 
 def _rows_by_order(scans: Sequence[Points], rings: Rings) -> tuple[FittedRows | None, Rings | None]:

@@ -13,7 +13,6 @@ from lidargrit import configuration
 from lidargrit.errors import CheckpointError, ConfigError, UnknownNameError
 from lidargrit.files import write_json, write_tensors, write_text
 from lidargrit.nn.exact_weights import load_exactly
-from lidargrit.nn.phase_noise import PhaseNoise
 from lidargrit.nn.quantization import WeightBits, with_quantized
 from lidargrit.run_folder import CARD_FILE, CONFIG_FILE, WEIGHTS_FILE
 from lidargrit.sensors import SensorModel
@@ -91,7 +90,7 @@ class SavedModel(nn.Module, Generic[ConfigT]):
             CheckpointError: weights of another configuration.
         """
         generator = cls(config, sensor)
-        load_exactly(generator, weights, source, PhaseNoise.names_in(generator))
+        load_exactly(generator, weights, source)
         return generator.eval()
 
     def save_pretrained(self, folder: str | Path, card: str = "", bits: WeightBits = 32) -> None:

@@ -2,19 +2,14 @@
 
 from lidargrit.loading.batches import Batches
 from lidargrit.loading.config import DataConfig
-from lidargrit.loading.images import ImageStore, Pixels, Provenance, RangeImages
+from lidargrit.loading.images import Pixels, Provenance, RangeImages
 from lidargrit.loading.imaging import Imaging, choose_imaging
-from lidargrit.loading.prepare import (
-    damaged_shards,
-    prepare,
-    prepare_and_describe,
-)
+from lidargrit.loading.prepare import damaged_shards, prepare, prepare_and_describe
 from lidargrit.loading.prepared import PreparedFolder, PreparedImages, is_prepared
 
 __all__ = [
     "Batches",
     "DataConfig",
-    "ImageStore",
     "Imaging",
     "Pixels",
     "Provenance",

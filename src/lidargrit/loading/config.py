@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from lidargrit.configuration import override, setting_name
+from lidargrit.configuration import override
 from lidargrit.errors import ConfigError
 from lidargrit.formats import BadPoints
 from lidargrit.projection import ProjectionVariant
@@ -92,7 +92,7 @@ class ScanSettings:
         words = [*settings, *(f"data.{name}={value}" for name, value in options.items() if value not in (None, ""))]
         owner, cure = "reading scans", "name one with data. before it, as data.projection=spherical"
         data = override(cls(), words, owner, cure, ("data.train", "data.val", "sensor", "projection_variant")).data
-        named = {setting_name(word.partition("=")[0]) for word in words}
+        named = {word.partition("=")[0].strip() for word in words}
         variant = data.projection_variant if "data.projection_variant" in named else None
         return cls(data, data.sensor if "data.sensor" in named else "", variant)
 

@@ -39,8 +39,7 @@ class Provenance:
         names: one name for each image: the file of its scan, or another identifier.
         recordings: names of the drives that the images were cut from; empty for generated scans.
         fingerprints: one hash of the pixels for each image; empty where it is not known.
-        range_fingerprints: one hash of the ranges for each image, without reflectance; empty or "" where it is not
-            known.
+        range_fingerprints: one hash of the ranges for each image, without reflectance; empty where it is not known.
     """
 
     names: tuple[str, ...] = ()

@@ -21,7 +21,6 @@ from lidargrit.untrusted import JSON_BYTES_AT_MOST, parse_json, user_path
 
 PLAN_FILE, SCANS_FILE = "plan.json", "scans.json"
 FORMAT = 4  # to be raised whenever projection or simulation give other pixels for the same scan
-_OLDEST = 2  # format that is still read: without labels; up to 3 simulated surfaces have no reflectance
 _OPENED_AT_ONCE = 16  # shards: a store takes some hundredths of a second for each
 _LIST_BYTES_AT_MOST = 2**28  # the list of a million scans takes half of it
 
@@ -155,7 +154,7 @@ class PreparedFolder:
                 kind = {"int": int, "float": (int, float), "str": str}.get(str(field.type), dict)
                 if not isinstance(getattr(spec, field.name), kind) or isinstance(getattr(spec, field.name), bool):
                     raise TypeError(f"{field.name} is {getattr(spec, field.name)!r:.40}")
-            if not _OLDEST <= spec.format <= FORMAT or min(spec.shard_scans, spec.num_scans) < 1:
+            if spec.format != FORMAT or min(spec.shard_scans, spec.num_scans) < 1:
                 raise TypeError(f"format {spec.format}, {spec.num_scans} scans by {spec.shard_scans}")
             return spec
         except TypeError as error:
@@ -244,11 +243,7 @@ class PreparedImages:
             tuple(scans[entry.scan][0] for _, entry in self._entries),
             tuple(scans[entry.scan][1] for _, entry in self._entries),
             tuple(entry.fingerprint for _, entry in self._entries),
-            # Without reflectance the ranges are all pixels, in older shards, too.
-            tuple(
-                entry.range_fingerprint or ("" if entry.reflectance_bytes else entry.fingerprint)
-                for _, entry in self._entries
-            ),
+            tuple(entry.range_fingerprint for _, entry in self._entries),
         )
 
     def __len__(self) -> int:

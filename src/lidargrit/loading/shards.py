@@ -44,12 +44,11 @@ class ShardEntry:
         range_bytes: length of the compressed range, in bytes.
         reflectance_bytes: length of the compressed reflectance, in bytes, which follows the range; 0 if there is none.
         fingerprint: hash of the pixels before compression.
-        range_fingerprint: hash of the ranges alone, by which a scan without its reflectance is recognised; "" in older
-            shards.
+        range_fingerprint: hash of the ranges alone, by which a scan without its reflectance is recognised.
         label_bytes: length of the compressed classes, in bytes, which come last; 0 if there are none.
         label_fingerprint: hash of the classes; "" if there are none. A scan is the same with labels or without.
         full_scale: number that the reflectance of the scan's file was divided by because its largest value fits; 0 if
-            that had not to tell, and in older shards.
+            that had not to tell.
     """
 
     scan: int
@@ -57,10 +56,10 @@ class ShardEntry:
     range_bytes: int
     reflectance_bytes: int
     fingerprint: str
-    range_fingerprint: str = ""
-    label_bytes: int = 0
-    label_fingerprint: str = ""
-    full_scale: int = 0
+    range_fingerprint: str
+    label_bytes: int
+    label_fingerprint: str
+    full_scale: int = 0  # format 4 did not have it from the first
 
     @property
     def end(self) -> int:

@@ -11,23 +11,19 @@ from torch import Tensor, nn
 from lidargrit.errors import CheckpointError
 
 
-def load_exactly(
-    module: nn.Module, weights: dict[str, Tensor], source: Path, may_lack: frozenset[str] = frozenset()
-) -> None:
+def load_exactly(module: nn.Module, weights: dict[str, Tensor], source: Path) -> None:
     """Load weights into a module of the very same layout.
 
     Args:
         module: module that gets the weights; it stays as it is if they are refused.
         weights: weights by their names.
         source: file that they were read from.
-        may_lack: names that files of earlier versions lack; the module's own values stay.
 
     Raises:
         CheckpointError: a name, a size or a kind of number differs, or a parameter is not finite; names the first.
             Buffers may be NaN: some stand for what was never fitted.
     """
     wanted = module.state_dict()
-    weights = {**{name: wanted[name] for name in may_lack}, **weights}
     parameters = {name for name, _ in module.named_parameters(remove_duplicate=False)}
     cure = "load them with the configuration that they were trained with"
     for name in sorted(wanted.keys() | weights.keys()):

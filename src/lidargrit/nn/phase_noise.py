@@ -39,11 +39,6 @@ class PhaseNoise(nn.Module):
 
     sums: Tensor
 
-    @classmethod
-    def names_in(cls, module: nn.Module) -> frozenset[str]:
-        """Return the names of all sums in a module; weights that lack them were trained with independent pixels."""
-        return frozenset(f"{name}.sums" for name, each in module.named_modules() if isinstance(each, cls))
-
     def __init__(self, phases: Sequence[Phase]) -> None:
         super().__init__()
         self.phases = tuple(phases)

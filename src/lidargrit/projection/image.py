@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import get_args
-
 import numpy as np
 import torch
 from jaxtyping import Float32, Int32
 
-from lidargrit.errors import ConfigError, ScanError, one_of
+from lidargrit.errors import ScanError
 from lidargrit.projection.fit import fit_problems
 from lidargrit.projection.pixel_coordinates import ProjectionVariant, pixel_coordinates, within_limits
 from lidargrit.sensors import ProjectionName, SensorModel
@@ -24,8 +22,9 @@ def project(
 ) -> RangeImage:
     """Assign each point of a scan to the pixel whose ray it lies on; the nearest point wins a pixel.
 
-    Column w spans azimuths [pi - 2 pi w/W, pi - 2 pi (w+1)/W): pixel centres sit at w + 1/2, so that the first and
-    last columns are as wide as the others. With a column stride, the columns between the kept ones are left out.
+    Column w spans azimuths [edge - 2 pi w/W, edge - 2 pi (w+1)/W), where the sensor's ``first_edge_rad`` is the edge,
+    +pi for most: pixel centres sit at w + 1/2, so that the first and last columns are as wide as the others. With a
+    column stride, the columns between the kept ones are left out.
 
     Args:
         scan: points in the sensor's frame; for ``unfolding`` in firing order, or with their ring.
@@ -69,7 +68,7 @@ def project(
         reflectance = torch.from_numpy(of_point.take(point_of_pixel))
     label = None
     if scan.label is not None:
-        of_point = np.append(scan.label.numpy() & CLASS_BITS, 0)
+        of_point = np.append(scan.label.long().numpy() & CLASS_BITS, 0)  # 8 bits do not hold that mask
         label = torch.from_numpy(of_point.take(point_of_pixel))
     return RangeImage(torch.from_numpy(range_m), torch.from_numpy(filled), sensor, reflectance, label)
 
@@ -97,9 +96,6 @@ def _nearest(
     refuse: bool,
 ) -> tuple[Int32[np.ndarray, "H fine_W"], Float32[np.ndarray, "H fine_W"]]:
     method = method or sensor.projection
-    for name, value, hint in (("method", method, ProjectionName), ("variant", variant, ProjectionVariant)):
-        if value not in get_args(hint):
-            raise ConfigError(f"{name}={value!r}", one_of(get_args(hint)), "correct it")
     pixels = pixel_coordinates(scan, sensor, method, variant)
     for problem in fit_problems(scan, sensor, method, pixels, partial, variant) if refuse else ():
         raise problem

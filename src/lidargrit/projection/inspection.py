@@ -85,6 +85,9 @@ def inspect(
 
     Args:
         scan, sensor, method, variant: the arguments of :func:`project`.
+
+    Raises:
+        ConfigError: no method or variant of that name.
     """
     method = method or sensor.projection
     pixels = pixel_coordinates(scan, sensor, method, variant)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int, Int32
 
+from lidargrit.errors import ConfigError, one_of
 from lidargrit.projection import spherical, unfolding
 from lidargrit.sensors import ProjectionName, SensorModel
 from lidargrit.structures import Scan
@@ -66,7 +67,14 @@ class PixelCoordinates:
 def pixel_coordinates(
     scan: Scan, sensor: SensorModel, method: ProjectionName, variant: ProjectionVariant
 ) -> PixelCoordinates:
-    """Find the row, the fine column and the range of every point."""
+    """Find the row, the fine column and the range of every point.
+
+    Raises:
+        ConfigError: no method or variant of that name.
+    """
+    for name, value, hint in (("method", method, ProjectionName), ("variant", variant, ProjectionVariant)):
+        if value not in get_args(hint):
+            raise ConfigError(f"{name}={value!r}", one_of(get_args(hint)), "correct it")
     xyz_m = np.ascontiguousarray(scan.points_xyz_m.numpy().T)  # NumPy is far faster along whole coordinates
     with np.errstate(over="ignore", under="ignore"):
         range_m = xyz_m[0] * xyz_m[0]

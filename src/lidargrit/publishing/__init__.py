@@ -20,7 +20,6 @@ from lidargrit.publishing.card import model_card
 from lidargrit.recipes import load_recipe
 from lidargrit.run_folder import CARD_FILE, RUN_FILE, locate, taken_over, trained_on, weights_sha256, write_trained_on
 from lidargrit.sources import data_set_of
-from lidargrit.sources.samples import is_sample_folder, weights_of
 
 
 def import_weights(recipe: str, folder: Path, files: Sequence[Path], settings: Sequence[str] = ()) -> Generator:
@@ -38,6 +37,8 @@ def import_weights(recipe: str, folder: Path, files: Sequence[Path], settings: S
         CheckpointError: a file that holds something else, or weights of other sizes; names the first.
         OutputError: the folder holds something else.
     """
+    if not (folder / RUN_FILE).is_file():
+        _refuse_taken(folder, None)  # before much is read
     made_of = load_recipe(recipe, settings)
     cls = load_class(made_of.generator)
     if cls.published_files and len(files) != len(cls.published_files):
@@ -53,10 +54,10 @@ def import_weights(recipe: str, folder: Path, files: Sequence[Path], settings: S
         "recipe": configuration.to_json(made_of),
         "lidargrit": __version__,
     }
-    if is_taken(folder) and not ((folder / RUN_FILE).is_file() and read_json(folder / RUN_FILE) == about):
-        raise OutputError(f"{folder}, which is not empty", "an empty folder", "choose another one")
-    write_json(folder / RUN_FILE, about)
-    generator.save(folder)
+    with claim_folder(folder):
+        _refuse_taken(folder, about)
+        write_json(folder / RUN_FILE, about)
+        generator.save(folder)
     return generator
 
 
@@ -144,16 +145,7 @@ def _public_facts(about: dict[str, Any], generator: Generator) -> dict[str, Any]
 
 
 def _check_scores(scores: Scorecard, run: Path) -> None:
-    """Raise ConfigError if the scores are of other weights.
-
-    Old scores do not name their weights: they are accepted, unless the samples still exist and name other weights.
-    """
-    theirs, samples = scores.samples.weights_sha256, scores.samples.source
-    if not theirs:
-        if not is_sample_folder(Path(samples)):
-            return
-        theirs = weights_of(Path(samples))
-    if theirs != weights_sha256(run):
-        raise ConfigError(
-            f"scores of {samples}, which were not sampled from {run}", "scores of this run's samples", "evaluate those"
-        )
+    """Raise ConfigError if the scores are not of samples of these weights."""
+    if scores.samples.weights_sha256 != weights_sha256(run):
+        got = f"scores of {scores.samples.source}, which were not sampled from {run}"
+        raise ConfigError(got, "scores of this run's samples", "evaluate those")

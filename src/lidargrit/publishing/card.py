@@ -222,8 +222,10 @@ def _scores(card: Scorecard) -> str:
 
 def _without_paths(words: str, card: Scorecard) -> str:
     """Return a sentence in which no folder of the user is named."""
-    for source, name in ((card.samples.source, "the samples"), (card.reference.source, "the reference")):
-        words = words.replace(source, name)
+    names = {card.samples.source: "the samples", card.reference.source: "the reference"}
+    for source in sorted(filter(None, names), key=len, reverse=True):  # one may lie in the other
+        # Not within a word; and a folder called "samples" stands for no more than the word does.
+        words = re.sub(rf"(?<![\w./])(?:the )?{re.escape(source)}(?!\w)", names[source], words)
     return _PATH.sub("…", words)
 
 

@@ -91,7 +91,8 @@ class SensorModel:
     def with_columns(self, columns: int, stride: int = 1) -> SensorModel:
         """Return this sensor with ``columns // stride`` columns: every ``stride``-th of ``columns`` equal ones.
 
-        The azimuth of a kept column is that of its own centre, first_edge_rad - 2 pi (stride j + 1/2) / columns.
+        The azimuth of a kept column is that of its own centre, first_edge_rad - 2 pi (stride j + 1/2) / columns. Where
+        columns begin beside +pi, so that the sensor's firings lie in their middle, more columns keep the firings there.
         """
         if not 1 <= columns <= FINE_COLUMNS_AT_MOST or stride < 1 or columns % stride:
             raise ConfigError(
@@ -105,8 +106,12 @@ class SensorModel:
                 "a sensor with one elevation a row and one azimuth a column",
                 "use the sensor as it is",
             )
-        azimuth_rad = column_azimuths_rad(columns, stride, self.first_edge_rad)
-        return replace(self, azimuth_rad=azimuth_rad, column_stride=stride)
+        edge_rad, own = self.first_edge_rad, self.width * self.column_stride
+        if edge_rad != math.pi and columns > own:  # the old edge would be where a finer mode of the sensor fires
+            fired_rad = math.remainder(edge_rad - math.pi / own - math.pi, 2 * math.pi / columns)
+            edge_rad = math.pi + fired_rad + math.pi / columns
+        azimuth_rad = column_azimuths_rad(columns, stride, edge_rad)
+        return replace(self, azimuth_rad=azimuth_rad, column_stride=stride, first_edge_rad=edge_rad)
 
     def fine(self) -> SensorModel:
         """Return this sensor with every fine column that it fires."""

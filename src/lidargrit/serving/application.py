@@ -23,12 +23,19 @@ import numpy as np
 import torch
 
 from lidargrit import formats
-from lidargrit.errors import ConfigError, LidarGritError, OutputError
+from lidargrit.errors import ConfigError, LidarGritError, OutputError, one_of
 from lidargrit.projection import unproject
 from lidargrit.sensors import SensorModel
 from lidargrit.serving.jobs import Job, JobQueue
 from lidargrit.serving.page import page, script, style
-from lidargrit.serving.requests import parse_json_object, parse_request, upload_ending, upload_endings
+from lidargrit.serving.requests import (
+    TASKS,
+    SampleRequest,
+    parse_json_object,
+    parse_request,
+    upload_ending,
+    upload_endings,
+)
 from lidargrit.serving.worker import NO_ROOM, PAGE_FILE, PIXELS_FILE
 from lidargrit.structures import RangeImage
 
@@ -172,7 +179,7 @@ class Application:
             text = urllib.parse.unquote_to_bytes(query.removeprefix("request="))
         request = parse_request(parse_json_object(text), self._settings, self._queue.limits)
         if path == "/complete":
-            self._check_upload(request.model, request.name, size)
+            self._check_upload(request, size)
         folder, name = None, None
         try:
             folder = self._queue.new_folder()
@@ -191,13 +198,19 @@ class Application:
             raise RefusedRequestError("503 Service Unavailable", busy)
         return Response("202 Accepted", json.dumps({"job": name}).encode())
 
-    def _check_upload(self, index: int, name: str, size: int) -> None:
-        model = self._queue.models[index]
+    def _check_upload(self, request: SampleRequest, size: int) -> None:
+        model, name = self._queue.models[request.model], request.name
         if not model["upload"]:
             raise ConfigError(
                 f"a scan for {model['name']}, which can neither complete nor reconstruct one",
                 "a model that can",
                 "choose another model",
+            )
+        if model["tasks"] and request.task not in model["tasks"]:
+            raise ConfigError(
+                f"the task {TASKS[request.task]!r}, which {model['name']} cannot do",
+                one_of([repr(TASKS[task]) for task in model["tasks"]]),
+                "choose another task",
             )
         if not upload_ending(name):
             raise ConfigError(

@@ -129,10 +129,15 @@ def parse_request(values: dict[str, Any], settings: list[list[SamplingSetting]],
         if name not in by_name:
             wanted = f"one such as {nearest_names(name[:40], by_name)}" if by_name else "none: it has no such settings"
             raise ConfigError(f"the setting {name[:40]!r}, which this model does not have", wanted, "use the page")
+    seed = _whole("seed", values.get("seed", 0), 0, SEED_AT_MOST)
+    count = _whole("count", values.get("count", 1), 1, limits.scans)
+    if seed + count - 1 > SEED_AT_MOST:  # told here, not once the job has waited for its turn
+        got = f"seed={seed} for {count} scans, each with the next seed"
+        raise ConfigError(got, f"seeds up to {SEED_AT_MOST}", "lower one of the two")
     return SampleRequest(
         model,
-        _whole("seed", values.get("seed", 0), 0, SEED_AT_MOST),
-        _whole("count", values.get("count", 1), 1, limits.scans),
+        seed,
+        count,
         {name: _number(by_name[name], value) for name, value in changed.items()},
         task,
         _region(values.get("region", [])),

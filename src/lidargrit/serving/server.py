@@ -152,6 +152,11 @@ def _temporary_folder() -> tempfile.TemporaryDirectory[str]:
 def _listening(host: str, port: int) -> socket.socket:
     if not 0 <= port <= _PORT_AT_MOST:
         raise ConfigError(f"--port {port}", f"0 to {_PORT_AT_MOST}", "choose another one")
+    wanted, cure = "an address or a name of this machine", "such as 127.0.0.1 for this machine only"
+    try:
+        host.encode("idna")
+    except UnicodeError:  # letters that no name of a machine has, or too many of them
+        raise OutputError(f"the address {host}, which is none", wanted, f"correct --host, {cure}") from None
     try:
         return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
     except OSError as error:
@@ -159,5 +164,4 @@ def _listening(host: str, port: int) -> socket.socket:
         got = f"{host} port {port}, where nothing can be served ({reason})"
         if error.errno in (errno.EADDRINUSE, errno.EACCES):  # taken, or one of those kept for the administrator
             raise OutputError(got, "a port that is free", "choose another one by --port") from None
-        cure = "choose another one by --host, such as 127.0.0.1 for this machine only"
-        raise OutputError(got, "an address or a name of this machine", cure) from None
+        raise OutputError(got, wanted, f"choose another one by --host, {cure}") from None

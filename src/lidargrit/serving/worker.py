@@ -109,11 +109,15 @@ def _can(generator: Generator, task: str) -> bool:
 
 
 def _settings_of(generator: Generator) -> list[dict[str, Any]]:
-    """Return the sampling settings, which say where a completion that is told nothing else takes another value."""
+    """Return the sampling settings, which say where a completion that is told nothing else takes another value.
+
+    Those that generating does not read say so: the page has one field for both.
+    """
     settings = []
     for one in sampling_settings(generator.Sampling()):
         value = getattr(generator.completion_sampling(), one.name)
         note = "" if value == one.default else f" If you leave it alone, a scan is completed with {value}."
+        note += " Only completing a scan reads it." if one.name in generator.not_of_sampling else ""
         settings.append(dataclasses.asdict(one) | {"about": one.about + note})
     return settings
 

@@ -12,12 +12,14 @@ from lidargrit.simulator.beams import REVOLUTION_S
 from lidargrit.simulator.observation import Observation, ObservationConfig, observe_scene
 from lidargrit.simulator.power import RaydropModel
 from lidargrit.simulator.scene import Scene, Theme, sample_scene
+from lidargrit.simulator.scene.street_plan import sample_street_plan
 from lidargrit.structures import Scan
 
-__all__ = ["Observation", "RaydropModel", "Scene", "Theme", "observe", "scene_of", "simulate"]
+__all__ = ["Observation", "RaydropModel", "Scene", "Theme", "frames_of", "observe", "scene_of", "simulate"]
 
 FRAME_S = REVOLUTION_S  # from one frame to the next
 FRAMES_AT_MOST = 100_000  # each has a random stream of its own, and they are set up one after the other
+ROAD_M = 100.0  # that our car drives at most: 0.97 of the returns are still there, after 120 m 0.72, after 140 m 0.17
 _HDL64E_OF_KITTI = RaydropModel()
 
 
@@ -42,7 +44,8 @@ def simulate(
         seed: seed of the street and of the noise, 0 or more; the same seed gives the same scan, bit for bit.
         sensor: sensor to simulate, with every column that it fires; the HDL-64E of KITTI odometry if not given.
         theme: kind of street.
-        frame: index of the revolution, 0.1 s apart; the frames of one seed are a drive through one street.
+        frame: index of the revolution, 0.1 s apart; the frames of one seed are a drive through one street, which ends
+            after 100 m; see :func:`frames_of`.
         motion: whether points stay as a moving car measures them, distorted by its motion; otherwise all are as seen
             from where the revolution began, which is how KITTI odometry stores them.
         wet: wetness of asphalt and concrete, from 0 (dry) to 1 (soaked).
@@ -55,7 +58,9 @@ def simulate(
         ahead; with ring, reflectance, and label as SemanticKITTI's files hold it (the instance in the upper 16 bits).
 
     Raises:
-        ConfigError: a negative seed or frame, an unknown theme, or a wetness outside [0, 1].
+        ConfigError: a negative seed or frame, a frame after the end of the street, an unknown theme, or a wetness
+            outside [0, 1].
+        ScanError: not one beam came back.
 
     Example:
         >>> scan = simulate(seed=0)
@@ -88,7 +93,7 @@ def observe(
 ) -> Observation:
     """Simulate one revolution as :func:`simulate` does, and return surface, signal and label of every pixel.
 
-    Args, Raises: as for :func:`simulate`.
+    Args, Raises: as for :func:`simulate`; without a return there is an observation all the same.
 
     Returns:
         arrays of one value for each pixel of ``sensor.fine()``, or of ``sensor`` if ``kept_columns_only``.
@@ -114,11 +119,23 @@ def scene_of(seed: int, theme: Theme = "mixed") -> Scene:
     return sample_scene(np.random.default_rng(seed).spawn(2)[0], theme)
 
 
-def check_settings(seed: int, theme: str, frame: int = 0, wet: float = 0.0) -> None:
+def frames_of(seed: int, theme: Theme = "mixed") -> int:
+    """Return how many frames the drive of a seed has: with more, our car would drive out of its street.
+
+    Raises:
+        ConfigError: a negative seed, or an unknown theme.
+    """
+    check_settings(seed, theme)
+    speed_m_s = sample_street_plan(np.random.default_rng(seed).spawn(2)[0], theme).speed_m_s
+    return min(FRAMES_AT_MOST, 1 + int(ROAD_M / (speed_m_s * FRAME_S))) if speed_m_s else FRAMES_AT_MOST
+
+
+def check_settings(seed: int, theme: Theme, frame: int = 0, wet: float = 0.0) -> None:
     """Refuse what cannot be simulated.
 
     Raises:
-        ConfigError: a negative seed, an unknown theme, or a frame or a wetness out of its bounds.
+        ConfigError: a negative seed, an unknown theme, or a frame or a wetness out of its bounds. Those of a frame are
+            the street's: see :func:`frames_of`.
     """
     if not 0 <= frame < FRAMES_AT_MOST:
         raise ConfigError(f"the frame {frame}", f"a frame from 0 to {FRAMES_AT_MOST - 1}", "choose another frame")
@@ -128,3 +145,9 @@ def check_settings(seed: int, theme: str, frame: int = 0, wet: float = 0.0) -> N
         raise ConfigError(f"the seed {seed}", "a seed of 0 or more", "choose another seed")
     if theme not in get_args(Theme):
         raise ConfigError(f"the theme {theme!r}", f"one of {', '.join(get_args(Theme))}", "choose one of them")
+    if frame and frame >= (frames := frames_of(seed, theme)):
+        raise ConfigError(
+            f"the frame {frame} of the street {seed}",
+            f"a frame from 0 to {frames - 1}, in which our car drives the first {ROAD_M:g} m of its street",
+            "choose fewer frames, or another seed",
+        )

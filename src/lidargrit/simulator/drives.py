@@ -31,7 +31,7 @@ class DriveConfig:
     Args:
         sensor: sensor to simulate.
         seed: seed of the first street; each further street has the next seed.
-        frames: scans of each street, 0.1 s apart; with 1, every scan shows another street.
+        frames: scans of each street, 0.1 s apart; with 1, every scan shows another street. A street ends after 100 m.
         theme: kind of street.
         motion: whether scans keep the distortion by the car's own motion; KITTI odometry has it removed.
         wet: wetness of the ground, from 0 (dry) to 1 (soaked).
@@ -50,7 +50,7 @@ class DriveConfig:
     def __post_init__(self) -> None:
         if not 1 <= self.frames <= FRAMES_AT_MOST:
             raise ConfigError(f"frames={self.frames}", f"1 to {FRAMES_AT_MOST:,} scans of a street", "correct it")
-        check_settings(self.seed, self.theme, self.frames - 1, self.wet)
+        check_settings(self.seed, self.theme, wet=self.wet)
 
     def street_of(self, scan: int) -> tuple[int, int]:
         """Return the seed of a scan's street and its frame there."""
@@ -89,6 +89,7 @@ def write_drives(
         Number of scans that are there now.
 
     Raises:
+        ConfigError: no scan, no process, or more frames than a street has.
         OutputError: the folder holds something else.
         DataError: a street of which no ray returns.
     """
@@ -98,6 +99,9 @@ def write_drives(
             "at least one of each",
             "correct it",
         )
+    for last in range(config.frames - 1, num_scans + config.frames - 1, config.frames):  # of each street
+        street, frame = config.street_of(min(last, num_scans - 1))
+        check_settings(street, config.theme, frame)
     with claim_folder(out), claimed_manifest(out / MANIFEST):
         _claim(out, config)
         there = max(num_scans, _last_scan(out, config) + 1)  # an earlier call may have made more
@@ -167,10 +171,14 @@ def _label_file(out: Path, config: DriveConfig, scan: int) -> Path:
 
 def _last_scan(out: Path, config: DriveConfig) -> int:
     """Return the last scan that is there, after which an interrupted call may have left gaps; -1 for none."""
-    together = config.scans_per_sequence
-    files = out.glob("sequences/*/labels/[!.]*.label")
-    scans = (int(file.parent.parent.name) * together + int(file.stem) for file in files)
-    return max(scans, default=-1)
+    last = -1
+    for file in out.glob("sequences/*/labels/[!.]*.label"):
+        sequence, number = file.parent.parent.name, file.stem
+        if sequence.isdecimal() and number.isdecimal():
+            scan = int(sequence) * config.scans_per_sequence + int(number)
+            if file == _label_file(out, config, scan):  # else it is a file of the user's
+                last = max(last, scan)
+    return last
 
 
 def _write_sequence_files(out: Path, config: DriveConfig, num_scans: int) -> None:

@@ -17,7 +17,6 @@ class Material:
         retroreflection: strength of the lobe that goes straight back whatever the incidence (foils, number plates).
         passes: share of the light that goes through (glass).
         mottle: relative variation of its reflectance from spot to spot: leaves face all directions, plaster is rough.
-        source: origin of the numbers.
     """
 
     name: str
@@ -27,7 +26,6 @@ class Material:
     retroreflection: float = 0.0
     passes: float = 0.0
     mottle: float = 0.0
-    source: str = ""
 
 
 ASPHALT, CONCRETE, PLASTER, BRICK, METAL, PAINT, GLASS, FOIL, LEAVES, BARK, CLOTH, SKIN, RUBBER, GRASS, WATER = range(

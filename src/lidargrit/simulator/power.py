@@ -8,11 +8,13 @@ import numpy as np
 from jaxtyping import Float32, Int32, UInt8
 from scipy.special import ndtr
 
+from lidargrit.errors import ConfigError
 from lidargrit.sensors import SensorModel
 from lidargrit.simulator.kitti_car import LASER_GAINS, LASER_READINGS, is_on_car
 from lidargrit.simulator.materials import ASPHALT, CONCRETE, MATERIALS, Material
 from lidargrit.simulator.mesh import Mesh
 
+_PATCH_AT_LEAST_DEG = 0.01  # finer than any sensor's columns; every patch of a ring takes memory
 _EVEN_RAD = 1e-4  # by which equal steps may differ, because of rounding; those of lasers differ by far more
 
 
@@ -56,6 +58,9 @@ class RaydropModel:
             films of water darken rough ground.
         wet_gloss: strength of the mirror-like lobe of soaked ground. Assumed: 0.02, as Fresnel's law has it for water.
         materials: reflection properties of all materials.
+
+    Raises:
+        ConfigError: a number with which no scan can be simulated, or tables of lasers that differ in length.
     """
 
     least_power: float = 2.5e-6
@@ -82,6 +87,21 @@ class RaydropModel:
     wet_darkening: float = 0.5
     wet_gloss: float = 0.02
     materials: tuple[Material, ...] = MATERIALS
+
+    def __post_init__(self) -> None:
+        gains, readings = len(self.laser_gains), len(self.laser_readings)
+        for fits, got, wanted in (
+            (self.least_power > 0, f"least_power={self.least_power:g}", "a power above 0"),
+            (
+                self.patch_deg >= _PATCH_AT_LEAST_DEG,
+                f"patch_deg={self.patch_deg:g}",
+                f"{_PATCH_AT_LEAST_DEG:g} or more",
+            ),
+            (0 <= self.gap_share < 1, f"gap_share={self.gap_share:g}", "a share from 0 to less than 1"),
+            (gains == readings, f"{gains} laser_gains and {readings} laser_readings", "one of each for every laser"),
+        ):
+            if not fits:  # also for NaN
+                raise ConfigError(got, wanted, "correct the raydrop model")
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,7 +38,6 @@ from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 
 MANIFEST = "samples.json"
-_LATER_ENTRIES = ("projection_variant", "generator")  # not in folders of before they existed
 
 
 def write_samples(
@@ -76,9 +75,8 @@ def write_samples(
         manifest["projection_variant"] = variant
     if generator.full_rows is not None:
         manifest["full_rows"] = [generator.full_rows.start, generator.full_rows.stop]
-    defaults = configuration.to_json(generator.Sampling())
     trained_on = _trained_on(run_folder)
-    begun = _is_begun(folder, manifest, defaults)
+    begun = _is_begun(folder, manifest)
     missing = _missing(folder, seeds)
     images = generator.stream(missing, sampling)
     with (
@@ -87,7 +85,7 @@ def write_samples(
     ):
         first = list(islice(images, 1))  # what the model refuses is told before anything is written
         if missing and not begun:
-            _begin(folder, manifest, defaults)
+            _begin(folder, manifest)
         if trained_on is not None and not (folder / TRAINED_ON_FILE).exists() and is_sample_folder(folder):
             write_text(folder / TRAINED_ON_FILE, trained_on)
         for seed, image in zip(missing, chain(first, images), strict=True):
@@ -100,10 +98,10 @@ def write_samples(
     remove_partials(folder)
 
 
-def _is_begun(folder: Path, manifest: dict[str, Any], defaults: dict[str, Any]) -> bool:
+def _is_begun(folder: Path, manifest: dict[str, Any]) -> bool:
     """Return whether a folder holds samples of the same kind; False for a free one, others are refused."""
     if (folder / MANIFEST).exists():
-        if not _same(read_json(folder / MANIFEST), manifest, defaults):
+        if not _same(read_json(folder / MANIFEST), manifest):
             raise OutputError(
                 f"{folder}, which holds samples of another model or sampled in another way",
                 "an empty folder, or one that this very command began",
@@ -115,9 +113,9 @@ def _is_begun(folder: Path, manifest: dict[str, Any], defaults: dict[str, Any]) 
     return False
 
 
-def _begin(folder: Path, manifest: dict[str, Any], defaults: dict[str, Any]) -> None:
+def _begin(folder: Path, manifest: dict[str, Any]) -> None:
     """Write the manifest into a free folder, unless another process has written it meanwhile."""
-    if not _is_begun(folder, manifest, defaults):
+    if not _is_begun(folder, manifest):
         write_json(folder / MANIFEST, manifest)
 
 
@@ -197,16 +195,9 @@ def _missing(folder: Path, seeds: Sequence[int]) -> list[int]:
     return [seed for seed in seeds if _file(folder, seed).name not in there]
 
 
-def _same(there: Any, manifest: dict[str, Any], defaults: dict[str, Any]) -> bool:
-    """Return whether samples there were sampled as these will be; their cost follows from the rest.
-
-    A choice that folders of before it existed do not name was what is now its default.
-    """
-    if not isinstance(there, dict) or not isinstance(there.get("sampling"), dict):
-        return False
-    there = {**there, "sampling": {**defaults, **there["sampling"]}}
-    wanted = {key: of for key, of in manifest.items() if key in there or key not in _LATER_ENTRIES}
-    return {**there, "cost_per_scan": None} == {**wanted, "cost_per_scan": None}
+def _same(there: dict[str, Any], manifest: dict[str, Any]) -> bool:
+    """Return whether samples there were sampled as these will be; their cost follows from the rest."""
+    return {**there, "cost_per_scan": None} == {**manifest, "cost_per_scan": None}
 
 
 class _Files:

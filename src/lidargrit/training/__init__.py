@@ -2,15 +2,13 @@
 
 from lidargrit.training.compute import computing_time, training_flops, with_budget
 from lidargrit.training.config import FitConfig, Recipe
-from lidargrit.training.measure import Measured, measure
-from lidargrit.training.plan import TrainingPlan, open_data, plan_training
+from lidargrit.training.measure import measure
+from lidargrit.training.plan import open_data, plan_training
 from lidargrit.training.run import check_folder, train
 
 __all__ = [
     "FitConfig",
-    "Measured",
     "Recipe",
-    "TrainingPlan",
     "check_folder",
     "computing_time",
     "measure",

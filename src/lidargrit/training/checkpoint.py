@@ -51,7 +51,7 @@ def load_checkpoint(
         CheckpointError: the file is damaged, of another configuration, or of a stage that was built on other weights.
     """
     tensors, about = read_tensors(path)
-    if about.get("built_on", "") != built_on:
+    if about.get("built_on") != built_on:
         raise CheckpointError(
             f"{path}, which was trained on top of another earlier stage",
             "the stage that this run's earlier stages led to",
@@ -80,8 +80,7 @@ def load_average(path: Path, objective: nn.Module) -> None:
     Raises:
         CheckpointError: the file is damaged, or of another configuration.
     """
-    kept = objective.state_dict()  # of what a file of an earlier version lacks
-    load_exactly(objective, {**kept, **weights_below(read_tensors(path)[0], "average.")}, path)
+    load_exactly(objective, weights_below(read_tensors(path)[0], "average."), path)
 
 
 def _optimiser_state(tensors: dict[str, Tensor], optimiser: torch.optim.Optimizer) -> dict[int, dict[str, Tensor]]:

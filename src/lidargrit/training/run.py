@@ -20,13 +20,13 @@ from lidargrit.determinism import derive_seed
 from lidargrit.errors import CheckpointError, OutputError
 from lidargrit.files import claim_folder, claimed_manifest, is_taken, read_json, write_json
 from lidargrit.generators import Generator
-from lidargrit.loading import DataConfig, Provenance, RangeImages
+from lidargrit.loading import Provenance, RangeImages
 from lidargrit.nn.objective import Objective
 from lidargrit.reporting import Reporter
 from lidargrit.run_folder import RUN_FILE, TRAINED_ON_FILE, locate, recipe_settings, trained_on, write_trained_on
 from lidargrit.sources import joined_images
 from lidargrit.training.checkpoint import fingerprint
-from lidargrit.training.config import FitConfig, Recipe
+from lidargrit.training.config import Recipe
 from lidargrit.training.engine import Engine
 from lidargrit.training.fit import Fit
 from lidargrit.training.plan import CheckedStages, OpenedData, check_stages, open_data
@@ -142,14 +142,13 @@ def check_folder(folder: Path, recipe: Recipe) -> None:
         CheckpointError: its ``run.json`` cannot be used.
     """
     if (folder / RUN_FILE).exists():
-        about, ours = read_json(folder / RUN_FILE), configuration.to_json(recipe)
-        if not (theirs := recipe_settings(about)):
+        about, mine = read_json(folder / RUN_FILE), configuration.leaves(configuration.to_json(recipe))
+        if not (other := recipe_settings(about)):
             raise CheckpointError(f"{folder / RUN_FILE} without a recipe", "what lidargrit wrote", "restore the file")
         if "origin" in about:
             raise OutputError(
                 f"{folder}, whose weights were {about['origin']}", "a run of train's", "choose another folder"
             )
-        mine, other = configuration.leaves(ours), {**_defaults(recipe), **theirs}
         settings = {name for name in mine.keys() | other.keys() if not name.endswith(_NO_CHANGE_OF_STAGES)} - _NO_CHANGE
         differing = [name for name in settings if (mine.get(name) or None) != (other.get(name) or None)]
         if differing:
@@ -167,13 +166,6 @@ def check_folder(folder: Path, recipe: Recipe) -> None:
         )
 
 
-def _defaults(recipe: Recipe) -> dict[str, Any]:
-    """Return the default settings of a recipe: a run that began before a setting existed had its default."""
-    fits = {name: FitConfig(fit.scans, fit.batch_size, fit.learning_rate) for name, fit in recipe.training.items()}
-    plain = Recipe(recipe.title, recipe.generator, configuration.defaults(recipe.model), DataConfig(), fits)
-    return configuration.leaves(configuration.to_json(plain))
-
-
 def _claim(
     folder: Path, recipe: Recipe, donors: Mapping[str, str], train_images: RangeImages, val_images: RangeImages
 ) -> None:
@@ -187,13 +179,13 @@ def _claim(
         },
     }
     if (folder / RUN_FILE).exists():
-        before = read_json(folder / RUN_FILE).get("data", data)
+        before = read_json(folder / RUN_FILE).get("data")
         if not isinstance(before, dict):
             raise CheckpointError(
                 f"{folder / RUN_FILE}, whose 'data' hold no names", "what lidargrit wrote", "restore it"
             )
         for name, value in data.items():
-            if before.get(name, value if name.endswith(_IMAGES) else None) != value:  # runs of before lack images
+            if before.get(name) != value:
                 part = name.removesuffix(_IMAGES)
                 raise OutputError(
                     f"{folder}, whose run began with {'another sensor' if name == 'sensor' else f'other {part} scans'}",

@@ -14,10 +14,11 @@ from lidargrit.errors import ConfigError
 from lidargrit.files import read_json
 from lidargrit.generators import Generator, load
 from lidargrit.nn.objective import Objective
-from lidargrit.run_folder import CHECKPOINT_FILE, RUN_FILE, UNKNOWN_SCANS, locate, taken_over
+from lidargrit.run_folder import CHECKPOINT_FILE, RUN_FILE, locate, taken_over
 from lidargrit.training.checkpoint import load_average
 from lidargrit.training.config import Recipe
 
+_UNKNOWN_SCANS = "a run that does not say on which scans it was trained"  # in the place of a source
 _NOT_LEARNED = ("range_temperature", "distilled_steps", "distilled_pairs")  # of sampling, and of another stage
 
 
@@ -56,7 +57,7 @@ def taken_facts(recipe: Recipe, donors: Mapping[str, str]) -> dict[str, Any]:
     theirs, before = about.get("recipe") or {}, taken_over(about)
     trained = {} if about.get("files") else {**theirs.get("training", {}), **before["training"]}
     return {
-        "train": sorted({*theirs.get("data", {}).get("train", [UNKNOWN_SCANS]), *before["train"]}),
+        "train": sorted({*theirs.get("data", {}).get("train", [_UNKNOWN_SCANS]), *before["train"]}),
         "files": [*about.get("files", ()), *before["files"]],
         "training": {stage: trained.get(stage) for stage in donors},
     }

@@ -16,10 +16,9 @@ from matplotlib.ticker import NullFormatter, ScalarFormatter
 
 from lidargrit.errors import ConfigError
 from lidargrit.evaluation.realism import CurveScore
-from lidargrit.files import atomic_path
+from lidargrit.viewer._matplotlib import DOTS_PER_INCH, write_png
 
 _WIDTH, _ROW, _HEAD = 14.0, 3.4, 0.6  # inches: the picture, a row of panels, the title
-_DOTS_PER_INCH = 100  # 1400 pixels across: a laptop shows the picture without shrinking it
 _SIDES = {
     "real": "#26323c",
     "simulated": "#d1495b",
@@ -50,19 +49,18 @@ def plot_curves(scores: Sequence[CurveScore], path: Path, title: str = "") -> No
     deep = [score for score in scores if _curve(score, "real").ndim == 2]
     rows = -(-len(flat) // 2) + len(deep)
     height = _HEAD + _ROW * rows
-    figure = Figure(figsize=(_WIDTH, height), dpi=_DOTS_PER_INCH)
+    figure = Figure(figsize=(_WIDTH, height), dpi=DOTS_PER_INCH)
     FigureCanvasAgg(figure)
     grid = GridSpec(
         rows, 2, figure, left=0.06, right=0.98, top=1 - (_HEAD + 0.35) / height, bottom=0.55 / height,
         hspace=0.6, wspace=0.16,
     )  # fmt: skip
-    figure.text(0.5, 1 - 0.3 / height, title, ha="center", va="center", fontsize=15)
+    figure.text(0.5, 1 - 0.3 / height, title, ha="center", va="center", fontsize=15, parse_math=False)
     for index, score in enumerate(flat):
         _plot_lines(figure.add_subplot(grid[index // 2, index % 2]), score)
     for index, score in enumerate(deep):
         _plot_images(figure, grid[rows - len(deep) + index, :], score)
-    with atomic_path(path) as unfinished:
-        figure.savefig(unfinished, format="png", dpi=_DOTS_PER_INCH)
+    write_png(figure, path)
 
 
 def _curve(score: CurveScore, which: str) -> Float64[np.ndarray, "*rows n"]:

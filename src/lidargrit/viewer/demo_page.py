@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -326,7 +327,7 @@ def _timings(demo: DemoPage) -> _Step:
 
 
 def _next(demo: DemoPage) -> str:
-    run = escape(str(demo.run))
+    run = escape(shlex.quote(str(demo.run)))
     commands = (
         (
             f"lidargrit serve {run}",

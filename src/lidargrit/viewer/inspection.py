@@ -11,13 +11,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import BoundaryNorm, ListedColormap, LogNorm
 from matplotlib.figure import Figure
 
-from lidargrit.files import atomic_path
 from lidargrit.projection.fit import elevations_deg
 from lidargrit.projection.inspection import FATES, Inspection
 from lidargrit.projection.pixel_coordinates import row_elevation_rad
+from lidargrit.viewer._matplotlib import DOTS_PER_INCH, write_png
 from lidargrit.viewer.report_pictures import NO_RETURN
 
-_DOTS_PER_INCH = 100
 _COLOURS = {
     "above": "#7b3294",
     "below": "#e66101",
@@ -41,7 +40,7 @@ def plot_inspection(inspection: Inspection, path: Path) -> None:
     Raises:
         OutputError: the picture cannot be written.
     """
-    figure = Figure(figsize=(14, 11), dpi=_DOTS_PER_INCH, layout="constrained")
+    figure = Figure(figsize=(14, 11), dpi=DOTS_PER_INCH, layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplot_mosaic(
         [["range"] * 3, ["collisions"] * 3, ["above", "side", "rows"]], height_ratios=[1, 1, 2.4]
@@ -49,14 +48,14 @@ def plot_inspection(inspection: Inspection, path: Path) -> None:
     sensor = inspection.sensor
     figure.suptitle(
         f"{Path(inspection.scan.source).name}: {inspection.method}, {inspection.variant}, to "
-        f"{sensor.height}x{sensor.width} of {sensor.name}"
+        f"{sensor.height}x{sensor.width} of {sensor.name}",
+        parse_math=False,
     )
     _plot_range(figure, panels["range"], inspection)
     _plot_collisions(figure, panels["collisions"], inspection)
     _plot_lost(panels["above"], panels["side"], inspection)
     _plot_rows(panels["rows"], inspection)
-    with atomic_path(path) as unfinished:
-        figure.savefig(unfinished, format="png", dpi=_DOTS_PER_INCH)
+    write_png(figure, path)
 
 
 def _plot_range(figure: Figure, axes: Axes, inspection: Inspection) -> None:

@@ -17,14 +17,13 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from lidargrit.errors import ConfigError
-from lidargrit.files import atomic_path
 from lidargrit.projection import points_of_pixels
 from lidargrit.structures import RangeImage
+from lidargrit.viewer._matplotlib import DOTS_PER_INCH, write_png
 from lidargrit.viewer.report_pictures import NO_RETURN
 from lidargrit.viewer.scan_sets import SURPRISED_BITS
 
 SCANS_AT_MOST = 8  # scans of a group; more make a picture that no viewer shows well
-_DOTS_PER_INCH = 100  # 1400 pixels across: a laptop shows the picture without shrinking it
 _WIDTH, _ROW, _HEAD, _FOOT = 14.0, 2.95, 0.75, 0.95  # inches: the picture, one scan of one group, title, colour bars
 _TICKS_AT_LEAST, _TICKS_AT_MOST = 3, 6  # of elevation: enough to read a row's by, and words that do not overlap
 _SURPRISE_NOTE = f"\nsurprise: black = as expected or less,\nyellow = {SURPRISED_BITS:g} bits more or beyond"
@@ -69,15 +68,14 @@ def plot_comparison(
         panels = [replace(panel, surprise=each) for panel, each in zip(panels, bits, strict=True)]
     scales = _Scales.of(panels, max_range_m)
     height = _HEAD * bool(title) + _ROW * len(panels) + _FOOT
-    figure = Figure(figsize=(_WIDTH, height), dpi=_DOTS_PER_INCH)
+    figure = Figure(figsize=(_WIDTH, height), dpi=DOTS_PER_INCH)
     FigureCanvasAgg(figure)
     if title:
-        figure.text(0.5, 1 - 0.42 / height, title, ha="center", va="center", fontsize=17)
+        figure.text(0.5, 1 - 0.42 / height, title, ha="center", va="center", fontsize=17, parse_math=False)
     for row, panel in enumerate(panels):
         _plot_row(figure, height, _FOOT + _ROW * (len(panels) - 1 - row), panel, scales)
     _plot_scales(figure, height, scales, "" if surprise is None else _SURPRISE_NOTE)
-    with atomic_path(path) as unfinished:
-        figure.savefig(unfinished, format="png", dpi=_DOTS_PER_INCH)
+    write_png(figure, path)
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +163,8 @@ def _plot_row(figure: Figure, height: float, bottom: float, panel: _Panel, scale
     ranges.imshow(shown, cmap=colours, norm=norm, aspect="auto", interpolation="nearest", extent=extent)
     share = panel.return_mask.mean()
     size = "x".join(map(str, panel.range_m.shape))
-    ranges.set_title(f"{panel.title}  ({size}, {share:.0%} of rays returned)", loc="left", fontsize=12)
+    title = f"{panel.title}  ({size}, {share:.0%} of rays returned)"
+    ranges.set_title(title, loc="left", fontsize=12, parse_math=False)
     ranges.set_xticks([])
     mask = axes(0.75, 0.45, 9.9, 1.05)
     shape = {"aspect": "auto", "interpolation": "nearest", "extent": extent}

@@ -19,6 +19,7 @@ from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel
 from lidargrit.sources import DatasetSource, RunSource, Source, open_source
 from lidargrit.structures import RangeImage
+from lidargrit.untrusted import seeds_in_a_row
 
 _PIXELS_AT_MOST = 200_000  # of a scan on a page: what browsers still turn smoothly
 _BATCH = 8  # scans computed at once: what a laptop has memory for
@@ -74,6 +75,7 @@ def load_scan_sets(
 
     Raises:
         ConfigError: no source.
+        UsageError: runs, and a later seed of theirs is above the largest one.
         DataError: no usable scan in a source.
         ScanError: a scan that cannot be used, unless such scans are skipped.
     """
@@ -81,12 +83,12 @@ def load_scan_sets(
     config = settings.data
     opened = [open_source(source, config.bad_points) for source in sources]
     runs, chosen = [source for source in opened if isinstance(source, RunSource)], usable_device(device)
+    seeds = seeds_in_a_row(seed, count) if runs else range(0)
     generators = {source.text: source.generator.to(chosen) for source in runs}
-    of_runs = (generator.sensor for generator in generators.values())
     named = settings.load_sensor()
     scans_alone = sensor is None and all(isinstance(source, DatasetSource) for source in opened)
     fine = all_columns and scans_alone and not config.columns
-    sensor = named or sensor or next(of_runs, None)
+    sensor = named or sensor or next((generator.sensor for generator in generators.values()), None)
     if sensor is None:
         imaged = (source for source in opened if not isinstance(source, (DatasetSource, RunSource)))
         sensor = next((source.sensor for source in imaged), None)
@@ -99,7 +101,7 @@ def load_scan_sets(
             sets.append(replace(read, name=_short(source.text)))
     scans = sets[0] if sets else None
     for name, generator in generators.items():
-        sets += _of_generator(name, generator, range(seed, seed + count), scans, reporter)
+        sets += _of_generator(name, generator, seeds, scans, reporter)
     if not sets:
         raise ConfigError("no source", "a scan, a folder or a run", "name at least one")
     return _told_apart(sets)

@@ -9,10 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from lidargrit.files import atomic_path
 from lidargrit.fitting import SensorFit
+from lidargrit.viewer._matplotlib import DOTS_PER_INCH, write_png
 
-_DOTS_PER_INCH = 100
 _POINT, _ROW, _BAD = "#3b6ea5", "#d95f02", "#b2182b"
 _BINS_PER_ROW = 12  # of the histogram of elevations: enough to see a gap between rows, few enough to see peaks
 
@@ -27,12 +26,13 @@ def plot_sensor_fit(fit: SensorFit, path: Path) -> None:
     Raises:
         OutputError: the picture cannot be written.
     """
-    figure = Figure(figsize=(14.0, 9.0), dpi=_DOTS_PER_INCH, layout="constrained")
+    figure = Figure(figsize=(14.0, 9.0), dpi=DOTS_PER_INCH, layout="constrained")
     FigureCanvasAgg(figure)
     sensor = fit.sensor
     figure.suptitle(
         f"{sensor.name}: {sensor.height} rows ({fit.method}), {sensor.width} columns, scans: {fit.num_scans}, "
-        f"{fit.agree_share:.1%} of the points agree"
+        f"{fit.agree_share:.1%} of the points agree",
+        parse_math=False,
     )
     tall, upper, lower, steps = figure.subplot_mosaic(
         [["tall", "upper"], ["tall", "lower"], ["tall", "steps"]]
@@ -42,8 +42,7 @@ def plot_sensor_fit(fit: SensorFit, path: Path) -> None:
     _plot_spread(upper, fit, rows_deg)
     _plot_counts(lower, fit)
     _plot_steps(steps, fit)
-    with atomic_path(path) as unfinished:
-        figure.savefig(unfinished, format="png", dpi=_DOTS_PER_INCH)
+    write_png(figure, path)
 
 
 def _plot_elevations(axes: Axes, fit: SensorFit, rows_deg: np.ndarray) -> None:
