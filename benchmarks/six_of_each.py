@@ -2,7 +2,7 @@
 
     python benchmarks/six_of_each.py six.png real=/data/held_out LidarGRIT=table/small/samples table/r2dm_small/samples
 
-A name before an equals sign stands in the picture in place of the folder's. Colours tell ranges from 2 to 80 m; a
+A name before the first equals sign stands in place of the folder's. Colours tell ranges from 2 to 80 m; a
 pixel without a return is white. Nothing is chosen: the scans are evenly spaced over each source.
 """
 
@@ -49,10 +49,16 @@ def main() -> None:
     parser.add_argument("sources", nargs="+", metavar="[NAME=]SOURCE")
     parser.add_argument("-n", type=int, default=6, help="number of scans of each")
     options = parser.parse_args()
-    named = [words.rpartition("=") for words in options.sources]
-    sources = [source for _, _, source in named]
-    names = [name or Path(source.removesuffix("/samples")).name for name, _, source in named]
-    plot(load_scan_sets(sources, options.n), names, options.out)
+    named = [_name_and_source(words) for words in options.sources]
+    plot(load_scan_sets([source for _, source in named], options.n), [name for name, _ in named], options.out)
+
+
+def _name_and_source(words: str) -> tuple[str, str]:
+    """Split NAME=SOURCE; a source, whose path may hold an equals sign too, is called as its folder."""
+    name, equals, source = words.partition("=")
+    if not equals or Path(words).exists():
+        return Path(words.removesuffix("/samples")).name, words
+    return name, source
 
 
 if __name__ == "__main__":
