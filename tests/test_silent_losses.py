@@ -19,6 +19,7 @@ from lidargrit.fitting import fit_sensor
 from lidargrit.formats import read_scan
 from lidargrit.formats.kitti_bin import KittiBin
 from lidargrit.formats.ouster_pcap import sensor_of
+from lidargrit.generators.multiscale import Multiscale
 from lidargrit.loading import DataConfig, PreparedImages, prepare, prepare_and_describe
 from lidargrit.loading.workers import make_some_shards
 from lidargrit.reporting import Reporter
@@ -319,3 +320,12 @@ def test_rings_counted_from_1_are_refused(tmp_path, turned):
     assert torch.equal(read_scan(tmp_path / "0.npz").ring, scan.ring)
     with pytest.raises(ScanError, match=r"rings from \d+ to 16 in .*counted from 1; .*subtract 1"):
         read_scan(tmp_path / "1.npz")
+
+
+def test_compress_says_once_what_it_does_not_keep(kitti, tmp_path, capsys):
+    pytest.importorskip("constriction")
+    torch.manual_seed(0)
+    Multiscale(Multiscale.smallest_config(K360), K360.with_columns(32)).save(tmp_path / "run")
+    words = ["compress", str(kitti), str(tmp_path / "scans.lgz"), "--model", str(tmp_path / "run")]
+    assert main(words) == 0
+    assert capsys.readouterr().err.count(".lgz keeps no reflectance\n") == 1

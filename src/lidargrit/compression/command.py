@@ -22,6 +22,7 @@ from lidargrit.loading import DataConfig
 from lidargrit.projection import unproject
 from lidargrit.reporting import Reporter
 from lidargrit.run_folder import locate, projection_variant
+from lidargrit.structures import RangeImage
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,7 @@ def compress_scans(
     check_names(source, [inputs.name(index) for index in range(len(inputs))])  # of which a file has each once
     chosen = {"source": source, "max_scans": config.max_scans}
     chosen |= {"bad_points": config.bad_points, "bad_scans": config.bad_scans}
+    told = False
     with writing(out, _header(codec, model), chosen) as writer:
         done = writer.go_on(inputs.identity(index) for index in range(len(inputs)))
         with reporter.progress("compressing", len(inputs), done) as progress:
@@ -84,6 +86,9 @@ def compress_scans(
                     writer.add(*scan, b"", 0)
                 else:
                     writer.add(*scan, data, returns)
+                    if not told and (lost := _not_kept(image)):
+                        told = True
+                        reporter.message(f"{out.suffix} keeps no {lost}")
                 progress.advance(1)
         if not writer.num_scans:
             raise DataError(f"no usable scan in {source}", "at least one", "see the messages above")
@@ -135,6 +140,12 @@ def decompress_scans(path: Path, out: Path, model: str, kind: str, chosen: Seque
                 form.write(out / files[index], unproject(image))
             progress.advance(1)
     return len(files)
+
+
+def _not_kept(image: RangeImage) -> str:
+    """Return what an image holds besides the ranges, which alone are compressed."""
+    held = (("reflectance", image.reflectance), ("labels", image.label))
+    return " and no ".join(name for name, pixels in held if pixels is not None)
 
 
 def _header(codec: ScanCodec, model: str) -> dict[str, Any]:
