@@ -1,5 +1,6 @@
 """The transformer against the reference program; how it generates token by token."""
 
+import copy
 from functools import partial
 
 import numpy as np
@@ -97,6 +98,38 @@ def test_steps_give_the_logits_of_the_whole_prefix(transformer, precision, toler
         stepwise = torch.stack([decoder.next_logits(tokens[:, i], i) for i in range(24)], dim=1)
     assert whole.std() > 1
     assert float((whole - stepwise).abs().max()) < tolerance
+
+
+def without_attention(transformer, block):
+    weaker = copy.deepcopy(transformer)
+    torch.nn.init.zeros_(weaker.blocks[block].attn.proj.weight)
+    torch.nn.init.zeros_(weaker.blocks[block].attn.proj.bias)
+    return weaker
+
+
+@pytest.mark.parametrize(("layers", "unattending"), [(1, 0), (2, 0), (4, 2)])
+@pytest.mark.parametrize("static", [False, True])
+def test_guidance_moves_logits_away_from_those_without_the_attention_of_the_last_block_but_one(
+    layers, unattending, static
+):
+    torch.manual_seed(layers)
+    config = TransformerConfig(layers=layers, heads=2, width=16)
+    transformer = CausalTransformer(config, num_tokens=20, context_length=24).eval()
+    for parameter in transformer.parameters():  # at first biases are zero
+        torch.nn.init.normal_(parameter, std=0.5)
+    uniform = torch.rand((4, 24), generator=torch.Generator().manual_seed(1))
+    sampled = generate(transformer, uniform, TokenSampling(), guidance=1.5, static=static)
+    decoder = CachedDecoder(transformer, 4, partial(sample_token, sampling=GREEDY), guidance=1.5)
+    with torch.no_grad():
+        read = after_start(sampled[:, :-1])
+        own, weaker = transformer(read), without_attention(transformer, unattending)(read)
+        stepwise = torch.stack([decoder.next_logits(read[:, i], i) for i in range(24)], dim=1)
+    guided = weaker + 1.5 * (own - weaker)
+    assert float((own - weaker).abs().max()) > 1
+    assert torch.allclose(stepwise, guided, atol=1e-3)
+    chosen = [sample_token(guided[:, i], uniform[:, i], TokenSampling()) for i in range(24)]
+    assert torch.equal(torch.stack(chosen, 1), sampled)
+    assert not torch.equal(generate(transformer, uniform, TokenSampling(), static=static), sampled)
 
 
 def test_a_token_never_sees_what_follows(transformer):

@@ -28,7 +28,7 @@ from lidargrit.generators._tokens import (
 )
 from lidargrit.nn.completion_network import CompletionNetwork, CompletionNetworkConfig
 from lidargrit.nn.completion_objective import CompletionObjective
-from lidargrit.nn.decoding import CachedDecoder, WeightPrecision
+from lidargrit.nn.decoding import CachedDecoder, WeightPrecision, flops_of_step
 from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.objective import Objective
 from lidargrit.nn.pixel_decoder import PixelSampling
@@ -51,6 +51,7 @@ _PUBLISHED_NETWORKS = {  # by our name: the program's name, and entries of its c
     "transformer": ("Transformer", ("*.attn.mask",)),  # a triangle of ones
 }
 _COUNTERS = ("quantize.usage", "quantize.code_sums")  # of our training, which other programs do not keep
+_GUIDANCE_AT_MOST = 100  # at 2 samples are already far from any scan
 _OF_NETWORKS = {"completion", "weights", "decoder"}  # settings that change nothing of what a network completes
 
 
@@ -65,6 +66,9 @@ class TokenSampling(TypedSettings):
             since the paper names no other number. The released program takes 100, which makes the scans of a barely
             trained model bland.
         top_p: total probability of the likeliest tokens that are sampled from; 1 for all.
+        guidance: factor by which logits of tokens are farther than the model's own from those of the same transformer
+            without the attention of its last block but one. Above 1, scans differ more from each other as a whole. 1
+            is the model's own distribution, and 0 takes the guidance of its configuration (``model.guidance``).
         mask: method by which returns and ranges are decided. ``pixels`` samples both by the pixel decoder, phase by
             phase. ``bernoulli`` samples each return with its probability, independently of the others, and keeps the
             decoded ranges (the released program, so what the paper's scores were computed with). ``threshold`` keeps a
@@ -72,7 +76,8 @@ class TokenSampling(TypedSettings):
             decoder, and ``bernoulli`` elsewhere.
         range_temperature: temperature of the pixel decoder's density of ranges on one surface; below 1 ranges keep to
             the surface more precisely; 0 takes the model's own (``model.pixels.range_temperature``). Only scans sampled
-            with 1, a noise of 1 and a correlation of 0 follow the distribution whose likelihood the model gives.
+            with 1, a noise of 1, a correlation of 0 and a guidance of 1 follow the distribution whose likelihood the
+            model gives.
         range_noise: multiplier of the pixel decoder's spread of ranges about a surface.
         mask_correlation: multiplier of how much of their noise close pixels of the pixel decoder's mask share that are
             sampled at once; 0 samples them independently. The networks for completion and raydrop always take 1.
@@ -90,6 +95,7 @@ class TokenSampling(TypedSettings):
     temperature: float = 1.0
     top_k: int = 0
     top_p: float = 1.0
+    guidance: float = 0.0
     mask: PixelChoice = "auto"
     range_temperature: float = PixelSampling.range_temperature
     range_noise: float = PixelSampling.range_noise
@@ -107,6 +113,9 @@ class TokenSampling(TypedSettings):
                 "temperature 0 or at least 1e-6, top_k >= 0, 0 < top_p <= 1",
                 "correct the one that is out of bounds",
             )
+        if self.guidance and not 1 <= self.guidance <= _GUIDANCE_AT_MOST:
+            wanted = f"1 to {_GUIDANCE_AT_MOST}, or 0 for the model's own"
+            raise ConfigError(f"guidance={self.guidance}", wanted, "correct it")
 
     def pixels(self) -> PixelSampling:
         """Return the settings of the pixel decoder."""
@@ -120,10 +129,17 @@ class LidarGritConfig(TokenGeneratorConfig):
     Args:
         completion: sizes of a network that completes scans; none in the paper.
         raydrop: sizes of a network that tells which surfaces of clean scans return; none in the paper.
+        guidance: guidance by which tokens are sampled where the caller names none; see :class:`TokenSampling`. 1, the
+            paper's, leaves the transformer's own distribution. What suits a model is found on validation scans.
     """
 
     completion: CompletionNetworkConfig | None = None
     raydrop: RaydropConfig | None = None
+    guidance: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.guidance <= _GUIDANCE_AT_MOST:
+            raise ConfigError(f"guidance={self.guidance}", f"1 to {_GUIDANCE_AT_MOST}", "correct it")
 
 
 class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
@@ -265,25 +281,27 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
 
     def cost(self, sampling: TokenSampling | None = None) -> Cost:
         """Return the cost of one step of the transformer for each token, with a cache, and of one decoding."""
-        sizes, tokens = self.config.transformer, self.transformer.context_length
-        # Per token and layer: four projections and a perceptron of four times the width, then queries by keys and
-        # weights by values over all tokens so far.
-        products = sizes.layers * (24 * sizes.width**2 * tokens + 2 * sizes.width * tokens * (tokens + 1))
-        head = 2 * sizes.width * self.transformer.num_tokens * tokens
-        decoding = self.decoding_cost((sampling or TokenSampling()).mask)
-        return Cost(tokens + decoding.network_evaluations, products + head + decoding.flops)
+        tokens = self.transformer.context_length
+        sampling = sampling or TokenSampling()
+        guidance = sampling.guidance or self.config.guidance
+        flops = sum(flops_of_step(self.transformer, position, guidance) for position in range(tokens))
+        decoding = self.decoding_cost(sampling.mask)
+        return Cost(tokens + decoding.network_evaluations, flops + decoding.flops)
 
     @torch.inference_mode(False)  # what is kept may be used outside of it, too
     @torch.no_grad()
     def _prepare(self, batch_size: int, sampling: TokenSampling) -> tuple[CachedDecoder, Tokenizer]:
         """Return what generates tokens and what decodes them, kept from the last call if nothing has changed since."""
         weights = tuple((each.data_ptr(), -1 if each.is_inference() else each._version) for each in self.parameters())
-        choices = (sampling.temperature, sampling.top_k, sampling.top_p, sampling.weights, sampling.decoder)
+        guidance = sampling.guidance or self.config.guidance
+        choices = (sampling.temperature, sampling.top_k, sampling.top_p, guidance, sampling.weights, sampling.decoder)
         key = (batch_size, choices, weights)
         if self._prepared is None or self._prepared.key != key:
             self._prepared = None  # its cache is given back before the next is taken
             by_choices = partial(sample_token, sampling=sampling)
-            decoder = CachedDecoder(self.transformer, batch_size, by_choices, START_TOKEN, sampling.weights)
+            decoder = CachedDecoder(
+                self.transformer, batch_size, by_choices, START_TOKEN, sampling.weights, guidance=guidance
+            )
             self._prepared = _Prepared(key, decoder, self.tokenizer.for_decoding(sampling.decoder))
         return self._prepared.decoder, self._prepared.tokenizer
 

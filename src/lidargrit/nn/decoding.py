@@ -40,6 +40,9 @@ class CachedDecoder:
             8 bits, with one scale a row, and the rest in 16; only on CPUs.
         static: whether shapes stay the same from token to token, so that a GPU can replay recorded CUDA graphs; by
             default only on a GPU.
+        guidance: factor by which logits are farther from those of a weaker transformer than its own are; 1 gives its
+            own. The weaker one is the same without the attention of the last block but one, so that what this block
+            learns of earlier tokens weighs more. It shares all blocks before.
 
     Raises:
         ConfigError: 8 bits on a device that is not a CPU.
@@ -53,6 +56,7 @@ class CachedDecoder:
         start: int = 0,
         precision: WeightPrecision = "fp32",
         static: bool | None = None,
+        guidance: float = 1.0,
     ) -> None:
         self._device = transformer.head.weight.device
         if precision == "int8" and self._device.type != "cpu":
@@ -64,10 +68,13 @@ class CachedDecoder:
         self._embedding = transformer.tok_emb.weight.detach().to(dtype)
         self._positions = transformer.pos_emb[0].detach().to(dtype)
         self._blocks = [_Block(block, heads, precision) for block in transformer.blocks]
+        self._guidance, self._weaker = guidance, self._blocks[-2:] if guidance != 1 else []
         self._last_norm = _norm(transformer.ln_f, dtype)
         self._head = transformer.head.weight.detach().to(dtype)
-        # Layer, key or value, sequence and head, position, number: a step writes one position of all layers.
-        size = (len(self._blocks), 2, batch_size * heads, self._length, width // heads)
+        # Layer, key or value, sequence and head, position, number: a step writes one position of all layers, the weaker
+        # transformer's own last one behind those of all blocks.
+        layers = len(self._blocks) + len(self._weaker[1:])
+        size = (layers, 2, batch_size * heads, self._length, width // heads)
         self._cache = torch.zeros(size, dtype=dtype, device=self._device)
         self._slots = self._cache.unflatten(2, (batch_size, heads))
         fused = torch.zeros(batch_size, 3 * width, dtype=dtype, device=self._device)
@@ -79,8 +86,7 @@ class CachedDecoder:
         self._observed = torch.full_like(self._generated, -1)
         self._position = torch.zeros(1, dtype=torch.long, device=self._device)
         self._graphs: dict[int, Callable[[], None]] = {}
-        # The products of a step: four projections and a perceptron of four times the width in each block, and the head.
-        self._step_flops = 2 * batch_size * (12 * len(self._blocks) * width**2 + self._head.numel())
+        self._step_flops = batch_size * flops_of_step(transformer, 0, guidance)
 
     @torch.inference_mode(False)  # its tensors are written to in later calls, which may be outside of it
     @torch.no_grad()
@@ -123,11 +129,27 @@ class CachedDecoder:
         self, x: Tensor, past: Tensor, write_cache: Callable[[int], None], future: Tensor | None = None
     ) -> Tensor:
         keys, values = (each.unbind() for each in past.unflatten(2, self._query.shape[:2]).unbind(1))
-        for layer, block in enumerate(self._blocks):
+
+        def add_attention(layer: int, block: _Block, x: Tensor) -> None:
             block.query_key_value(block.norm1(x), self._fused)
             write_cache(layer)
             x.add_(block.proj(_attend(self._query, keys[layer], values[layer], future).view_as(x), None))
-            x.add_(block.contract(F.gelu(block.expand(block.norm2(x), None)), None))
+
+        weaker = x
+        for layer, block in enumerate(self._blocks):
+            if layer == len(self._blocks) - len(self._weaker):
+                weaker = x.clone()
+            add_attention(layer, block, x)
+            block.add_perceptron(x)
+        if not self._weaker:
+            return self._head_logits(x)
+        self._weaker[0].add_perceptron(weaker)
+        for layer, block in enumerate(self._weaker[1:], start=len(self._blocks)):
+            add_attention(layer, block, weaker)
+            block.add_perceptron(weaker)
+        return torch.lerp(self._head_logits(weaker), self._head_logits(x), self._guidance)
+
+    def _head_logits(self, x: Tensor) -> Tensor:
         return F.linear(self._last_norm(x), self._head).float()
 
     def _static_step(self, num_positions: int) -> None:
@@ -169,6 +191,16 @@ class CachedDecoder:
             self._graphs[index] = graph.replay
 
 
+def flops_of_step(transformer: CausalTransformer, position: int, guidance: float = 1.0) -> int:
+    """Return the operations that the token at a position of one sequence takes, with a cache."""
+    layers, width = transformer.config.layers, transformer.config.width
+    perceptron, head = 16 * width**2, 2 * width * transformer.num_tokens
+    # Four projections, queries by keys, and weights by values.
+    block = 8 * width**2 + 4 * width * (position + 1) + perceptron
+    flops = layers * block + head
+    return flops if guidance == 1 else flops + perceptron + min(layers - 1, 1) * block + head
+
+
 class _Block:
     """The weights of one block, laid out for single tokens; those of the query hold the scale of attention."""
 
@@ -182,6 +214,9 @@ class _Block:
         self.expand, self.contract = (_product(*_weights(perceptron, name), precision) for name in ("0", "2"))
         dtype = torch.float32 if precision == "fp32" else torch.bfloat16
         self.norm1, self.norm2 = (_norm(block.get_submodule(name), dtype) for name in ("ln1", "ln2"))
+
+    def add_perceptron(self, x: Tensor) -> None:
+        x.add_(self.contract(F.gelu(self.expand(self.norm2(x), None)), None))
 
 
 def _weights(parent: nn.Module, name: str) -> tuple[Tensor, Tensor]:
