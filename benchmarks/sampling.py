@@ -14,11 +14,12 @@ both measured in the same run.
 import argparse
 import time
 from functools import partial
+from statistics import mean
 
 import torch
 
 from lidargrit.generators.lidargrit import LidarGrit, TokenSampling, sample_token
-from lidargrit.nn.decoding import CachedDecoder
+from lidargrit.nn.decoding import CachedDecoder, flops_of_step
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.transformer import CausalTransformer
 from lidargrit.recipes import load_recipe
@@ -82,9 +83,7 @@ def step_bytes(transformer: CausalTransformer, batch: int, precision: str) -> fl
 
 def step_flops(transformer: CausalTransformer, batch: int) -> float:
     """Return the operations of a step, in the mean over all."""
-    sizes = transformer.config
-    products = 24 * sizes.layers * sizes.width**2 + 2 * sizes.width * transformer.num_tokens
-    return batch * (products + 2 * sizes.layers * sizes.width * (transformer.context_length + 1))
+    return batch * mean(flops_of_step(transformer, position) for position in range(transformer.context_length))
 
 
 def compare_tokens(transformer: CausalTransformer, batch: int, rates: dict[str, float], beside: bool = True) -> float:
@@ -156,7 +155,7 @@ def main() -> None:
         recomputed = compare_tokens(transformer, batch, rates)
         plain = recomputed + batch * plain_decoding
         for weights, decoder in (("fp32", "fp32"), ("int8" if batch == 1 else "bf16", "bf16")):
-            sampling = TokenSampling(weights=weights, decoder=decoder)
+            sampling = TokenSampling(guidance=1.0, weights=weights, decoder=decoder)
             whole = seconds(partial(generator.sample, range(batch), sampling))
             print(
                 f"whole scans, batch {batch:<4}weights {weights}, decoder {decoder}{whole:9.2f} s  plain{plain:9.1f} s"

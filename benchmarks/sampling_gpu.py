@@ -67,11 +67,11 @@ def ours(
     generator: LidarGrit, batch: int, sampling: TokenSampling, compiled: bool, device: torch.device
 ) -> list[float]:
     """Return the seconds of the tokens of a batch, and of whole scans."""
-    writer, tokenizer = generator._prepare(batch, sampling)
+    decoder, tokenizer = generator._prepare(batch, sampling)
     if compiled:
         tokenizer.decoder.compile()
     uniform = torch.rand(batch, generator.transformer.context_length, device=device)
-    tokens = seconds(partial(writer.write, uniform), device)
+    tokens = seconds(partial(decoder.generate, uniform), device)
     return [tokens, seconds(partial(generator.sample, range(batch), sampling), device)]
 
 
@@ -90,7 +90,7 @@ def main() -> None:
     recipe, other = load_recipe(options.recipe), load_recipe(options.r2dm)
     generator = LidarGrit(recipe.model, recipe.data.load_sensor()).eval().to(device)
     rival = load_class("r2dm")(other.model, other.data.load_sensor()).eval().to(device)
-    sampling = TokenSampling(weights=options.weights, decoder="bf16")
+    sampling = TokenSampling(guidance=1.0, weights=options.weights, decoder="bf16")
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else "a CPU, for a smoke run"
     print(f"{name}, torch {torch.__version__}, weights {options.weights}; scans a second")
     print("batch      ours  tokens only  recomputed      R2DM  ours/recomputed  ours/R2DM")

@@ -210,6 +210,7 @@ def test_sampling_options_reach_the_model(run_folder, tmp_path, typed):
         "temperature": 0.0,
         "top_k": 0,
         "top_p": 1.0,
+        "guidance": 0.0,
         "mask": "threshold",
         "range_temperature": 0.0,
         "range_noise": 0.7,
@@ -285,7 +286,7 @@ def test_list_names_everything_there_is(typed):
         for name in _discovery.names(kind):
             assert f"  {name} " in output
             assert f"  {name} " in in_full
-    assert "sample --set: temperature=1.0, top_k=0, top_p=1.0, mask=auto" in typed("list", "generators")
+    assert "sample --set: temperature=1.0, top_k=0, top_p=1.0, guidance=0.0, mask=auto" in typed("list", "generators")
     assert "licence: " in typed("list", "datasets")
     assert "  lidargrit-kitti-360 " in typed("list", "protocols")
     assert "  lidargen " in typed("list", "sample-formats")

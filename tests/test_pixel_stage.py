@@ -6,7 +6,6 @@ import json
 import math
 import pickle
 import re
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -269,27 +268,6 @@ def test_its_cost_counts_every_phase():
     cost, before = generator.cost(), generator.cost(TokenSampling(mask="threshold"))
     assert cost.network_evaluations == before.network_evaluations + 20
     assert cost.flops > before.flops == made(None).cost().flops
-
-
-def test_guidance_is_the_models_own_unless_named():
-    plain = made(None)
-    guided = LidarGrit(replace(plain.config, guidance=3.0), SENSOR).eval()
-    guided.load_state_dict(plain.state_dict())
-    wanted = plain.sample([0], TokenSampling(guidance=3.0)).range_m
-    assert torch.equal(guided.sample([0]).range_m, wanted)
-    assert not torch.equal(plain.sample([0]).range_m, wanted)
-    assert torch.equal(guided.sample([0], TokenSampling(guidance=1.0)).range_m, plain.sample([0]).range_m)
-    assert guided.cost() == plain.cost(TokenSampling(guidance=3.0)) != plain.cost()
-    grid = plain.tokenizer.encode(plain.sample([0]))
-    assert torch.equal(guided.token_bits(grid), plain.token_bits(grid))  # likelihoods are the model's own
-
-
-@pytest.mark.parametrize("guidance", [0.5, -1.0, 1e9, float("nan")])
-def test_a_guidance_out_of_bounds_is_refused(guidance):
-    with pytest.raises(ConfigError, match="guidance="):
-        TokenSampling(guidance=guidance)
-    with pytest.raises(ConfigError, match="guidance="):
-        LidarGritConfig(TOKENIZER, TRANSFORMER, guidance=guidance)
 
 
 def test_all_of_it_is_trained_saved_and_read_again(tmp_path):

@@ -147,10 +147,10 @@ def test_fine_tuning_takes_a_run_of_fewer_columns_and_another_dropout(tmp_path):
 def test_settings_of_sampling_alone_are_the_recipe_s_own(fine_tune, tmp_path):
     made().save(tmp_path / "donor")
     recipe = recipe_of(replace(PIXELS, range_temperature=0.1), stages_from=str(tmp_path / "donor"))
-    recipe = replace(recipe, fine_tune=fine_tune)
+    recipe = replace(recipe, fine_tune=fine_tune, model=replace(recipe.model, guidance=1.5))
     generator = recipe.build_generator()
-    assert "pixels" in taken_stages(recipe, generator)
-    assert generator.pixels.config.range_temperature == 0.1
+    assert {"transformer", "pixels"} <= set(taken_stages(recipe, generator))
+    assert (generator.pixels.config.range_temperature, generator.config.guidance) == (0.1, 1.5)
 
 
 def test_a_run_of_other_sizes_or_another_kind_gives_no_stages(tmp_path):

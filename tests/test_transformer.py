@@ -89,22 +89,24 @@ def generate(transformer, uniform, sampling, **options):
     )
 
 
-@pytest.mark.parametrize(("precision", "tolerance"), [("fp32", 1e-5), ("bf16", 0.2), ("int8", 0.2)])
-def test_steps_give_the_logits_of_the_whole_prefix(transformer, precision, tolerance):
-    tokens = torch.randint(20, (3, 24), generator=torch.Generator().manual_seed(0))
-    decoder = CachedDecoder(transformer, 3, partial(sample_token, sampling=GREEDY), precision=precision)
-    with torch.no_grad():
-        whole = transformer(tokens)
-        stepwise = torch.stack([decoder.next_logits(tokens[:, i], i) for i in range(24)], dim=1)
-    assert whole.std() > 1
-    assert float((whole - stepwise).abs().max()) < tolerance
-
-
 def without_attention(transformer, block):
     weaker = copy.deepcopy(transformer)
     torch.nn.init.zeros_(weaker.blocks[block].attn.proj.weight)
     torch.nn.init.zeros_(weaker.blocks[block].attn.proj.bias)
     return weaker
+
+
+@pytest.mark.parametrize("guidance", [1.0, 1.5])
+@pytest.mark.parametrize(("precision", "tolerance"), [("fp32", 1e-5), ("bf16", 0.2), ("int8", 0.2)])
+def test_steps_give_the_logits_of_the_whole_prefix(transformer, precision, tolerance, guidance):
+    tokens = torch.randint(20, (3, 24), generator=torch.Generator().manual_seed(0))
+    by_choices = partial(sample_token, sampling=GREEDY)
+    decoder = CachedDecoder(transformer, 3, by_choices, precision=precision, guidance=guidance)
+    with torch.no_grad():
+        whole = torch.lerp(without_attention(transformer, 0)(tokens), transformer(tokens), guidance)
+        stepwise = torch.stack([decoder.next_logits(tokens[:, i], i) for i in range(24)], dim=1)
+    assert whole.std() > 1
+    assert float((whole - stepwise).abs().max()) < tolerance
 
 
 @pytest.mark.parametrize(("layers", "unattending"), [(1, 0), (2, 0), (4, 2)])
@@ -129,6 +131,14 @@ def test_guidance_moves_logits_away_from_those_without_the_attention_of_the_last
     assert torch.allclose(stepwise, guided, atol=1e-3)
     chosen = [sample_token(guided[:, i], uniform[:, i], TokenSampling()) for i in range(24)]
     assert torch.equal(torch.stack(chosen, 1), sampled)
+    with torch.no_grad():  # after another sequence, and of observed tokens
+        again = CachedDecoder(
+            transformer, 4, partial(sample_token, sampling=TokenSampling()), guidance=1.5, static=static
+        )
+        again.generate(1 - uniform)
+        assert torch.equal(again.generate(uniform), sampled)
+        held = torch.where(torch.arange(24) < 12, sampled, -1)
+        assert torch.equal(again.generate(uniform, held), sampled)
     assert not torch.equal(generate(transformer, uniform, TokenSampling(), static=static), sampled)
 
 
@@ -196,13 +206,15 @@ def test_the_start_token_is_an_ordinary_one():
     assert after_start(torch.tensor([[5, 6]])).tolist() == [[START_TOKEN, 5, 6]]
 
 
-def test_the_cost_is_what_torch_counts():
+@pytest.mark.parametrize(("guidance", "layers"), [(1.0, 4), (1.5, 4), (1.5, 1)])
+def test_the_cost_is_what_torch_counts(guidance, layers):
     from torch.utils.flop_counter import FlopCounterMode
 
     from lidargrit.generators.lidargrit import LidarGrit
     from lidargrit.recipes import load_recipe
 
-    recipe = load_recipe("small", ["model.transformer.width=32", "data.columns=512", "data.column_stride=8"])
+    changes = [f"model.guidance={guidance}", f"model.transformer.layers={layers}", "model.transformer.width=32"]
+    recipe = load_recipe("small", [*changes, "data.columns=512", "data.column_stride=8"])
     generator = LidarGrit(recipe.model, recipe.data.load_sensor())
     with FlopCounterMode(display=False) as counter:
         generator.sample(range(generator.compute_batch))

@@ -105,8 +105,12 @@ class LearnedCompleter(Completer, Generic[SamplingT]):
         return trained_on(self._folder)
 
     def identity(self) -> dict[str, Any]:
-        """Return the hash of its weights, and its settings."""
-        return {"weights_sha256": weights_sha256(self._folder), "sampling": configuration.to_json(self._sampling)}
+        """Return the hash of its weights, its configuration, and the settings of sampling."""
+        return {
+            "weights_sha256": weights_sha256(self._folder),
+            "config": configuration.to_json(self._generator.config),
+            "sampling": configuration.to_json(self._sampling),
+        }
 
 
 def open_completer(

@@ -51,7 +51,7 @@ _PUBLISHED_NETWORKS = {  # by our name: the program's name, and entries of its c
     "transformer": ("Transformer", ("*.attn.mask",)),  # a triangle of ones
 }
 _COUNTERS = ("quantize.usage", "quantize.code_sums")  # of our training, which other programs do not keep
-_GUIDANCE_AT_MOST = 100  # at 2 samples are already far from any scan
+_GUIDANCE_AT_MOST = 100  # far beyond what is of use, and safe in 32 bits
 _OF_NETWORKS = {"completion", "weights", "decoder"}  # settings that change nothing of what a network completes
 
 
@@ -62,13 +62,14 @@ class TokenSampling(TypedSettings):
     Args:
         temperature: divisor of the logits: above 1 scans vary more than the model's own, below 1 less; 0 takes the
             likeliest token.
-        top_k: number of the likeliest tokens that are sampled from. 0 takes all, which is the model's own distribution,
-            since the paper names no other number. The released program takes 100, which makes the scans of a barely
+        top_k: number of the likeliest tokens that are sampled from. 0 takes all, since the paper names no
+            number. The released program takes 100, which makes the scans of a barely
             trained model bland.
         top_p: total probability of the likeliest tokens that are sampled from; 1 for all.
-        guidance: factor by which logits of tokens are farther than the model's own from those of the same transformer
-            without the attention of its last block but one. Above 1, scans differ more from each other as a whole. 1
-            is the model's own distribution, and 0 takes the guidance of its configuration (``model.guidance``).
+        guidance: weight w of logits weaker + w (own - weaker), by which tokens are sampled. The weaker logits are those
+            of the same transformer without the attention of its last block but one, or of its only one. Above 1, scans
+            and regions differ more from one another; 1 leaves the transformer's own distribution; 0 takes the model's
+            setting (``model.guidance``).
         mask: method by which returns and ranges are decided. ``pixels`` samples both by the pixel decoder, phase by
             phase. ``bernoulli`` samples each return with its probability, independently of the others, and keeps the
             decoded ranges (the released program, so what the paper's scores were computed with). ``threshold`` keeps a
@@ -129,8 +130,8 @@ class LidarGritConfig(TokenGeneratorConfig):
     Args:
         completion: sizes of a network that completes scans; none in the paper.
         raydrop: sizes of a network that tells which surfaces of clean scans return; none in the paper.
-        guidance: guidance by which tokens are sampled where the caller names none; see :class:`TokenSampling`. 1, the
-            paper's, leaves the transformer's own distribution. What suits a model is found on validation scans.
+        guidance: value of :attr:`TokenSampling.guidance` where the caller names none; 1 in the paper. What suits a
+            model is found on validation scans.
     """
 
     completion: CompletionNetworkConfig | None = None

@@ -40,9 +40,8 @@ class CachedDecoder:
             8 bits, with one scale a row, and the rest in 16; only on CPUs.
         static: whether shapes stay the same from token to token, so that a GPU can replay recorded CUDA graphs; by
             default only on a GPU.
-        guidance: factor by which logits are farther from those of a weaker transformer than its own are; 1 gives its
-            own. The weaker one is the same without the attention of the last block but one, so that what this block
-            learns of earlier tokens weighs more. It shares all blocks before.
+        guidance: weight w of logits weaker + w (own - weaker), where the weaker ones are those of the same transformer
+            without the attention of its last block but one, or of its only one; 1 gives the transformer's own logits.
 
     Raises:
         ConfigError: 8 bits on a device that is not a CPU.

@@ -40,7 +40,8 @@ class PixelSampling(TypedSettings):
     """Settings of sampling masks, and ranges from their mixtures.
 
     By default samples are sharper than the mixtures themselves, which are ragged where a surface is uncertain. Only
-    scans that are sampled with 1, 1 and a correlation of 0 follow the distribution whose likelihood the model computes.
+    pixels that are sampled with 1, 1 and a correlation of 0 follow the distribution, given the tokens, whose likelihood
+    the model computes.
 
     Args:
         range_temperature: temperature of the mixture's density on one surface; 1 leaves it unchanged, below 1 prefers

@@ -11,7 +11,9 @@ RECIPE = replace(
     title="LidarGRIT with a pixel decoder: 64x1024 in 1,024 tokens, for one CPU core and five hours",
     # Columns are four times as near as those of 64x256: at its temperature there are too many edges.
     model=replace(
-        compact_pixels.RECIPE.model, pixels=replace(compact_pixels.RECIPE.model.pixels, range_temperature=0.2)
+        compact_pixels.RECIPE.model,
+        pixels=replace(compact_pixels.RECIPE.model.pixels, range_temperature=0.2),
+        guidance=1.0,  # regions of its samples differ as those of validation streets do
     ),
     data=replace(multiscale_wide.RECIPE.data, train=compact_pixels.RECIPE.data.train),
     training={

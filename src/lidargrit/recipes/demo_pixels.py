@@ -25,6 +25,6 @@ _TRAINING = [
 ]
 
 RECIPE = replace(
-    override(compact_pixels.RECIPE, [*_DATA, *_SMALLER, *_TRAINING]),
+    override(compact_pixels.RECIPE, [*_DATA, *_SMALLER, *_TRAINING, "model.guidance=1"]),
     title="LidarGRIT with a pixel decoder, demo: 64x256 in 256 tokens, for two CPU cores and ten minutes",
 )

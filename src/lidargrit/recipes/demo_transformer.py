@@ -7,7 +7,7 @@ from lidargrit.recipes import compact_pixels
 
 _DATA = ("data.train=simulated:256:train", "data.val=simulated:16:val")
 # Half as wide, a transformer learns nearly as much from a scan, and sees twice as many in the same time.
-_SMALLER = ("model.transformer.layers=3", "model.transformer.width=192")
+_SMALLER = ("model.guidance=1", "model.transformer.layers=3", "model.transformer.width=192")
 _TRANSFORMER = (
     "scans=2400",
     "warmup_scans=160",

@@ -67,6 +67,7 @@ def write_samples(
     manifest: dict[str, Any] = {
         "weights_sha256": weights_sha256(run_folder),
         "generator": generator.public_name(),
+        "config": configuration.to_json(generator.config),
         "sampling": configuration.to_json(sampling),
         "cost_per_scan": asdict(generator.cost(sampling)),
         "sensor": generator.sensor.to_json(),
@@ -240,7 +241,7 @@ class _Files:
 
 def _model_and_sampling(manifest: dict[str, Any]) -> str:
     """Return what two sets of samples share if equal seeds in them are the same scans: model and settings."""
-    facts = [manifest.get("weights_sha256"), manifest.get("sampling")]
+    facts = [manifest.get(name) for name in ("weights_sha256", "config", "sampling")]
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:8]
 
 

@@ -19,12 +19,7 @@ from lidargrit.training.checkpoint import load_average
 from lidargrit.training.config import Recipe
 
 _UNKNOWN_SCANS = "a run that does not say on which scans it was trained"  # in the place of a source
-_NOT_LEARNED = (  # settings of sampling, and of another stage
-    "guidance",
-    "range_temperature",
-    "distilled_steps",
-    "distilled_pairs",
-)
+_NOT_LEARNED = ("range_temperature", "distilled_steps", "distilled_pairs")  # of sampling, and of another stage
 
 
 def donors_of_stages(recipe: Recipe, stages: Sequence[str]) -> dict[str, str]:
