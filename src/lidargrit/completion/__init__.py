@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Generic
 
-from lidargrit import configuration
 from lidargrit.conditions import KINDS, Condition, ConditionKind
 from lidargrit.conditions.fills import FILLS, fill
 from lidargrit.configuration import name_and_settings
@@ -16,8 +15,9 @@ from lidargrit.generators import Generator, SamplingT, load
 from lidargrit.loading import Provenance
 from lidargrit.nn.devices import usable_device
 from lidargrit.projection import ProjectionVariant
-from lidargrit.run_folder import PACKAGED, locate, projection_variant, trained_on, weights_sha256
+from lidargrit.run_folder import PACKAGED, locate, projection_variant, trained_on
 from lidargrit.sensors import SensorModel
+from lidargrit.sources.samples import sampling_identity
 from lidargrit.structures import RangeImage
 
 
@@ -106,11 +106,7 @@ class LearnedCompleter(Completer, Generic[SamplingT]):
 
     def identity(self) -> dict[str, Any]:
         """Return the hash of its weights, its configuration, and the settings of sampling."""
-        return {
-            "weights_sha256": weights_sha256(self._folder),
-            "config": configuration.to_json(self._generator.config),
-            "sampling": configuration.to_json(self._sampling),
-        }
+        return sampling_identity(self._generator, self._folder, self._sampling)
 
 
 def open_completer(

@@ -62,9 +62,8 @@ class TokenSampling(TypedSettings):
     Args:
         temperature: divisor of the logits: above 1 scans vary more than the model's own, below 1 less; 0 takes the
             likeliest token.
-        top_k: number of the likeliest tokens that are sampled from. 0 takes all, since the paper names no
-            number. The released program takes 100, which makes the scans of a barely
-            trained model bland.
+        top_k: number of the likeliest tokens that are sampled from. 0 takes all, since the paper names no number. The
+            released program takes 100, which makes the scans of a barely trained model bland.
         top_p: total probability of the likeliest tokens that are sampled from; 1 for all.
         guidance: weight w of logits weaker + w (own - weaker), by which tokens are sampled. The weaker logits are those
             of the same transformer without the attention of its last block but one, or of its only one. Above 1, scans
@@ -284,17 +283,20 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         """Return the cost of one step of the transformer for each token, with a cache, and of one decoding."""
         tokens = self.transformer.context_length
         sampling = sampling or TokenSampling()
-        guidance = sampling.guidance or self.config.guidance
+        guidance = self._guidance(sampling)
         flops = sum(flops_of_step(self.transformer, position, guidance) for position in range(tokens))
         decoding = self.decoding_cost(sampling.mask)
         return Cost(tokens + decoding.network_evaluations, flops + decoding.flops)
+
+    def _guidance(self, sampling: TokenSampling) -> float:
+        return sampling.guidance or self.config.guidance
 
     @torch.inference_mode(False)  # what is kept may be used outside of it, too
     @torch.no_grad()
     def _prepare(self, batch_size: int, sampling: TokenSampling) -> tuple[CachedDecoder, Tokenizer]:
         """Return what generates tokens and what decodes them, kept from the last call if nothing has changed since."""
         weights = tuple((each.data_ptr(), -1 if each.is_inference() else each._version) for each in self.parameters())
-        guidance = sampling.guidance or self.config.guidance
+        guidance = self._guidance(sampling)
         choices = (sampling.temperature, sampling.top_k, sampling.top_p, guidance, sampling.weights, sampling.decoder)
         key = (batch_size, choices, weights)
         if self._prepared is None or self._prepared.key != key:

@@ -13,7 +13,7 @@ RECIPE = replace(
     model=replace(
         compact_pixels.RECIPE.model,
         pixels=replace(compact_pixels.RECIPE.model.pixels, range_temperature=0.2),
-        guidance=1.0,  # regions of its samples differ as those of validation streets do
+        guidance=1.0,  # without any, regions of its samples differ in drops as those of validation streets do
     ),
     data=replace(multiscale_wide.RECIPE.data, train=compact_pixels.RECIPE.data.train),
     training={

@@ -65,10 +65,8 @@ def write_samples(
     """
     sampling = generator.Sampling() if sampling is None else sampling
     manifest: dict[str, Any] = {
-        "weights_sha256": weights_sha256(run_folder),
+        **sampling_identity(generator, run_folder, sampling),
         "generator": generator.public_name(),
-        "config": configuration.to_json(generator.config),
-        "sampling": configuration.to_json(sampling),
         "cost_per_scan": asdict(generator.cost(sampling)),
         "sensor": generator.sensor.to_json(),
     }
@@ -97,6 +95,15 @@ def write_samples(
     if seeds and (not is_sample_folder(folder) or _missing(folder, seeds)):
         raise removed_meanwhile(folder)
     remove_partials(folder)
+
+
+def sampling_identity(generator: Generator[Any, Any], run_folder: Path, sampling: object) -> dict[str, Any]:
+    """Return what decides, beside the seed, which scan is sampled: the weights, the configuration and the settings."""
+    return {
+        "weights_sha256": weights_sha256(run_folder),
+        "config": configuration.to_json(generator.config),
+        "sampling": configuration.to_json(sampling),
+    }
 
 
 def _is_begun(folder: Path, manifest: dict[str, Any]) -> bool:
