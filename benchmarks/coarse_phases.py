@@ -14,15 +14,15 @@ from collections.abc import Sequence
 
 import torch
 
-from lidargrit.conditions import Condition
-from lidargrit.generators import load
-from lidargrit.generators.lidargrit import LidarGrit
-from lidargrit.metrics import load_metric, update_together
-from lidargrit.nn.pixel_decoder import PixelDecoder, PixelSampling
-from lidargrit.nn.pixel_phases import Lattice, completed_lattices
-from lidargrit.sources import open_images
-from lidargrit.structures import RangeImage
-from lidargrit.tokenizers import Tokenizer
+from lidargrit.data.sources import open_images
+from lidargrit.evaluation.metrics import load_metric, update_together
+from lidargrit.generation.generator import load
+from lidargrit.generation.pixel_decoder.pixel_decoder import PixelDecoder, PixelSampling
+from lidargrit.generation.pixel_decoder.pixel_phases import Lattice, completed_lattices
+from lidargrit.generation.tokenizers import Tokenizer
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.types import RangeImage
+from lidargrit.systems.lidargrit.system import LidarGrit
 
 METRICS = ("wall_straightness", "flying_points", "drop_run_lengths", "drop_correlation", "point_cloud_jsd")
 _AT_ONCE, _LATTICES = 8, 4

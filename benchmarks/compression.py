@@ -22,16 +22,17 @@ from jaxtyping import UInt16
 from numcodecs import Zstd
 from PIL import Image
 
-from lidargrit.compression.scan_codec import ScanCodec
+from lidargrit.core.files import write_json
+from lidargrit.data.images import RangeImages
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.sources import open_images
 from lidargrit.evaluation.estimates import Estimate
-from lidargrit.files import write_json
-from lidargrit.generators import Generator, load
-from lidargrit.loading import DataConfig, RangeImages
-from lidargrit.nn.range_steps import RangeSteps
-from lidargrit.projection import unproject
-from lidargrit.recipes import load_recipe
-from lidargrit.sources import open_images
-from lidargrit.structures import RangeImage
+from lidargrit.generation.generator import Generator, load
+from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.range_steps import RangeSteps
+from lidargrit.inference.compress.scan_codec import ScanCodec
+from lidargrit.scans.projection import unproject
+from lidargrit.scans.types import RangeImage
 
 Picture = UInt16[np.ndarray, "H W"]
 Bytes = Callable[[Picture], bytes]

@@ -20,13 +20,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
-from lidargrit.configuration import override
+from lidargrit.core.configuration import override
+from lidargrit.core.reporting import TerminalReporter
 from lidargrit.evaluation.benchmark import Benchmark
 from lidargrit.evaluation.benchmark import run as run_benchmark
 from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.evaluation.scorecard import Scorecard
-from lidargrit.generators import Generator, load
-from lidargrit.reporting import TerminalReporter
+from lidargrit.generation.generator import Generator, load
 
 COLOURS = ("#d1495b", "#3a7d44", "#8a5fbf", "#c07f1a")
 METRICS = {"sliced_wasserstein": "textbook", "point_cloud_jsd": "exact", "return_rate_per_ring": "exact"}  # → variant

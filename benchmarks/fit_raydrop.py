@@ -19,17 +19,17 @@ from unittest.mock import patch
 
 import numpy as np
 
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.sources import load_range_images
+from lidargrit.evaluation.metrics import load_metric
+from lidargrit.evaluation.metrics.shared.curves import divergence
 from lidargrit.evaluation.realism import CURVES, SimulatedScans, as_table, compare, pair_of, simulate_pair
-from lidargrit.loading import DataConfig
-from lidargrit.metrics import load_metric
-from lidargrit.metrics._curves import divergence
-from lidargrit.sensors import SensorModel, load_sensor
+from lidargrit.scans.sensors import SensorModel, load_sensor
+from lidargrit.scans.types import RangeImage
 from lidargrit.simulator import observation
 from lidargrit.simulator.power import RaydropModel
 from lidargrit.simulator.scene import sample_scene
 from lidargrit.simulator.tracing import Hits, Tracer, in_reach
-from lidargrit.sources import load_range_images
-from lidargrit.structures import RangeImage
 
 FITTED = [name for name in CURVES if name not in ("range_histogram_per_ring", "bev_occupancy")]  # those are geometry
 # First step: the factor by which a parameter, or one of a material, is multiplied or divided, or what is added to it.

@@ -23,7 +23,7 @@ from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 
-from lidargrit.files import read_tensors
+from lidargrit.core.files import read_tensors
 
 STAGES = ("tokenizer", "transformer")
 SETTINGS = [  # 24 and 48 steps, a checkpoint after each
@@ -50,7 +50,7 @@ SETTINGS = [  # 24 and 48 steps, a checkpoint after each
 SERVER = """
 import os, sys
 import lightning_fabric, safetensors.torch
-import lidargrit.cli, lidargrit.generators.lidargrit, lidargrit.recipes, lidargrit.training
+import lidargrit.cli, lidargrit.systems.lidargrit.system, lidargrit.generation.presets, lidargrit.training
 print("ready", flush=True)
 for _ in sys.stdin:
     child = os.fork()

@@ -10,14 +10,14 @@ here and its figures taken from there. OUT keeps runs, samples and scores, and t
 import argparse
 from pathlib import Path
 
-from lidargrit.configuration import override
-from lidargrit.errors import TrainingError
+from lidargrit.core.configuration import override
+from lidargrit.core.errors import TrainingError
+from lidargrit.core.reporting import TerminalReporter
+from lidargrit.data.run_folder import is_run
 from lidargrit.evaluation.benchmark import Benchmark, as_table
 from lidargrit.evaluation.benchmark import run as run_benchmark
 from lidargrit.evaluation.comparison import EvalConfig
-from lidargrit.recipes import load_recipe
-from lidargrit.reporting import TerminalReporter
-from lidargrit.run_folder import is_run
+from lidargrit.generation.presets import load_recipe
 from lidargrit.training import check_folder, train, training_flops, with_budget
 
 METRICS = ("sliced_wasserstein", "point_cloud_jsd", "range_histogram_per_ring", "return_rate_per_ring")

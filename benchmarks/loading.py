@@ -15,12 +15,15 @@ import time
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from lidargrit.files import write_json, write_text
-from lidargrit.loading import Batches, DataConfig, PreparedImages, RangeImages, prepare
-from lidargrit.loading.prepared import PLAN_FILE, SCANS_FILE, shard_name
-from lidargrit.loading.shards import ShardWriter
-from lidargrit.sensors import load_sensor
-from lidargrit.structures import RangeImage
+from lidargrit.core.files import write_json, write_text
+from lidargrit.data.batches import Batches
+from lidargrit.data.images import RangeImages
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.prepared.prepare import prepare
+from lidargrit.data.prepared.prepared import PLAN_FILE, SCANS_FILE, PreparedImages, shard_name
+from lidargrit.data.prepared.shards import ShardWriter
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage
 
 
 def main() -> None:

@@ -18,14 +18,16 @@ import torch
 import torch.nn.functional as F
 
 import lidargrit
-from lidargrit.metrics import _clouds, _matching, load_metric
-from lidargrit.metrics._birds_eye import histograms
-from lidargrit.metrics._farthest_points import farthest_points
-from lidargrit.metrics.bev_mmd import discrepancy, frobenius
-from lidargrit.metrics.lidm_bev_matching import pair_distances
-from lidargrit.metrics.point_cloud_jsd import divergence_with_epsilon, grid_counts
-from lidargrit.projection import RangeEncoding, points_of_pixels
-from lidargrit.structures import RangeImage
+from lidargrit.evaluation.metrics import load_metric
+from lidargrit.evaluation.metrics.bev_mmd import discrepancy, frobenius
+from lidargrit.evaluation.metrics.lidm_bev_matching import pair_distances
+from lidargrit.evaluation.metrics.point_cloud_jsd import divergence_with_epsilon, grid_counts
+from lidargrit.evaluation.metrics.shared import clouds as _clouds
+from lidargrit.evaluation.metrics.shared import matching
+from lidargrit.evaluation.metrics.shared.birds_eye import histograms
+from lidargrit.evaluation.metrics.shared.farthest_points import farthest_points
+from lidargrit.scans.projection import RangeEncoding, points_of_pixels
+from lidargrit.scans.types import RangeImage
 
 
 def timed(work: Callable[[], Any], repeats: int = 1) -> tuple[float, Any]:
@@ -175,7 +177,7 @@ def of_clouds(n: int, repeats: int) -> None:
     generated, real = clouds_of(n, 0), clouds_of(n, 1)
     few = max(n // 10, 1)
     plain_s, plain = timed(lambda: plain_chamfer(real[:few], generated))
-    ours_s, ours = timed(lambda: _matching.chamfer_matrix(real, generated), repeats)
+    ours_s, ours = timed(lambda: matching.chamfer_matrix(real, generated), repeats)
     assert np.allclose(ours[:few], plain, atol=1e-6)
     line(f"Chamfer matrix, {n} x {n} clouds of 512", plain_s, n // few, ours_s)
     small = [side[:few] for side in (real, generated)]
@@ -229,7 +231,7 @@ def growth() -> None:
     counts = {n: [rng.poisson(0.5, (n, 10_000)).astype(np.uint16) for _ in range(2)] for n in (50, 100, 200)}
     bits = {n: [rng.integers(0, 256, (n, 5000), dtype=np.uint8) for _ in range(2)] for n in (50, 100, 200)}
     rows: dict[str, Callable[[int], Any]] = {
-        "Chamfer matrix": lambda n: _matching.chamfer_matrix(clouds_of(n, 0), clouds_of(n, 1)),
+        "Chamfer matrix": lambda n: matching.chamfer_matrix(clouds_of(n, 0), clouds_of(n, 1)),
         "bev_mmd": lambda n: discrepancy(*counts[n], frobenius, unbiased=True),
         "lidm_bev_matching": lambda n: pair_distances(*bits[n]),
     }

@@ -14,13 +14,13 @@ from pathlib import Path
 
 import torch
 
-from lidargrit.files import read_tensors
-from lidargrit.generators import load
-from lidargrit.generators.lidargrit import LidarGrit
-from lidargrit.nn.phase_noise import PhaseNoise
-from lidargrit.nn.pixel_networks import MaskNetwork
-from lidargrit.run_folder import RUN_FILE, TRAINED_ON_FILE, WEIGHTS_FILE, locate
-from lidargrit.sources import open_images
+from lidargrit.core.files import read_tensors
+from lidargrit.data.run_folder import RUN_FILE, TRAINED_ON_FILE, WEIGHTS_FILE, locate
+from lidargrit.data.sources import open_images
+from lidargrit.generation.generator import load
+from lidargrit.generation.pixel_decoder.phase_noise import PhaseNoise
+from lidargrit.generation.pixel_decoder.pixel_networks import MaskNetwork
+from lidargrit.systems.lidargrit.system import LidarGrit
 
 _AT_ONCE = 4
 

@@ -20,13 +20,13 @@ from pathlib import Path
 import torch
 import torch.nn.functional as F
 
-from lidargrit.generators import load
-from lidargrit.generators.lidargrit import LidarGrit, TokenSampling, after_start, sample_token
-from lidargrit.loading import DataConfig
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.sources import load_range_images
+from lidargrit.generation.generator import load
+from lidargrit.generation.pixel_decoder.pixel_decoder import PixelSampling, nats_to_range_bits
 from lidargrit.nn.decoding import CachedDecoder
-from lidargrit.nn.pixel_decoder import PixelSampling, nats_to_range_bits
-from lidargrit.sources import load_range_images
-from lidargrit.structures import TokenGrid
+from lidargrit.scans.types import TokenGrid
+from lidargrit.systems.lidargrit.system import LidarGrit, TokenSampling, after_start, sample_token
 
 
 def stepwise_logits(generator: LidarGrit, tokens: torch.Tensor, precision: str) -> torch.Tensor:

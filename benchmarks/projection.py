@@ -14,10 +14,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from lidargrit.datasets import open_dataset
-from lidargrit.projection import index_map, project
-from lidargrit.sensors import SensorModel, load_sensor
-from lidargrit.structures import RangeImage, Scan
+from lidargrit.data.datasets import open_dataset
+from lidargrit.scans.projection import index_map, project
+from lidargrit.scans.sensors import SensorModel, load_sensor
+from lidargrit.scans.types import RangeImage, Scan
 
 
 def row_edges(sensor: SensorModel) -> np.ndarray:

@@ -10,11 +10,11 @@ import argparse
 
 import torch
 
-from lidargrit.datasets import open_dataset
-from lidargrit.metrics import load_metric
-from lidargrit.projection import project
-from lidargrit.sensors import load_sensor
-from lidargrit.structures import RangeImage
+from lidargrit.data.datasets import open_dataset
+from lidargrit.evaluation.metrics import load_metric
+from lidargrit.scans.projection import project
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage
 
 METRICS = {
     "sliced_wasserstein": "reference",

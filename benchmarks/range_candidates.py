@@ -15,10 +15,10 @@ from collections.abc import Sequence
 
 import torch
 
-from lidargrit.nn.pixel_phases import phases_of
-from lidargrit.nn.range_candidates import RangeCandidates
-from lidargrit.recipes import load_recipe
-from lidargrit.sources import open_images
+from lidargrit.data.sources import open_images
+from lidargrit.generation.pixel_decoder.pixel_phases import phases_of
+from lidargrit.generation.pixel_decoder.range_candidates import RangeCandidates
+from lidargrit.generation.presets import load_recipe
 
 NEAR_M = (0.03, 0.06, 0.2)
 _CELL = 16  # of the first phase: lattices of 8 pixels and finer

@@ -19,16 +19,16 @@ import copy
 
 import torch
 
-from lidargrit.conditions import Condition
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.run_folder import locate
+from lidargrit.data.sources import open_images
 from lidargrit.evaluation.raydrop import RAYDROP_CURVES
 from lidargrit.evaluation.realism import distance, drop_independently, pair_of
-from lidargrit.generators import load
-from lidargrit.generators.lidargrit import LidarGrit
-from lidargrit.loading import DataConfig
-from lidargrit.run_folder import locate
+from lidargrit.generation.generator import load
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.types import RangeImage
 from lidargrit.simulator import observe
-from lidargrit.sources import open_images
-from lidargrit.structures import RangeImage
+from lidargrit.systems.lidargrit.system import LidarGrit
 
 _FIRST_TEST_SEED = 2_000_000
 

@@ -18,11 +18,11 @@ from statistics import mean
 
 import torch
 
-from lidargrit.generators.lidargrit import LidarGrit, TokenSampling, sample_token
+from lidargrit.generation.presets import load_recipe
 from lidargrit.nn.decoding import CachedDecoder, flops_of_step
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.transformer import CausalTransformer
-from lidargrit.recipes import load_recipe
+from lidargrit.systems.lidargrit.system import LidarGrit, TokenSampling, sample_token
 
 PRECISIONS = ("fp32", "bf16", "int8")
 SPANS = 4

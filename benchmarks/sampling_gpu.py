@@ -15,11 +15,11 @@ from functools import partial
 
 import torch
 
-from lidargrit.generators import load_class
-from lidargrit.generators.lidargrit import LidarGrit, TokenSampling
-from lidargrit.generators.r2dm import DiffusionSampling, R2dm
+from lidargrit.generation.generator import load_class
+from lidargrit.generation.presets import load_recipe
 from lidargrit.nn.transformer import CausalTransformer
-from lidargrit.recipes import load_recipe
+from lidargrit.systems.lidargrit.system import LidarGrit, TokenSampling
+from lidargrit.systems.r2dm.system import DiffusionSampling, R2dm
 
 SPANS = 4
 

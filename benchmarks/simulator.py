@@ -11,7 +11,7 @@ import multiprocessing
 import time
 from pathlib import Path
 
-from lidargrit.sensors import load_sensor
+from lidargrit.scans.sensors import load_sensor
 from lidargrit.simulator import simulate
 
 

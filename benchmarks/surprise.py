@@ -25,20 +25,20 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from lidargrit.core.files import write_json
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.sources import open_images
 from lidargrit.evaluation.estimates import Estimate
-from lidargrit.files import write_json
-from lidargrit.generators import Generator, load
-from lidargrit.generators._log_range import encode
-from lidargrit.generators.r2dm import R2dm
-from lidargrit.loading import DataConfig
-from lidargrit.nn.diffusion import SeededNoise, alpha_sigma, log_snr_at, noised
-from lidargrit.sensors import SensorModel
+from lidargrit.generation.generator import Generator, load
+from lidargrit.generation.range_values import encode
+from lidargrit.scans.sensors import SensorModel
+from lidargrit.scans.types import RangeImage
 from lidargrit.simulator.mesh import Mesh
 from lidargrit.simulator.observation import ObservationConfig, observe_scene
 from lidargrit.simulator.scene import sample_scene
 from lidargrit.simulator.scene.shapes import boxes
-from lidargrit.sources import open_images
-from lidargrit.structures import RangeImage
+from lidargrit.systems.r2dm.diffusion import SeededNoise, alpha_sigma, log_snr_at, noised
+from lidargrit.systems.r2dm.system import R2dm
 
 CELL = 8
 _BLOCK = "a block askew in the street"

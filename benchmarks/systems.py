@@ -14,9 +14,10 @@ from pathlib import Path
 
 import torch
 
-from lidargrit.files import write_json
-from lidargrit.recipes import load_recipe
-from lidargrit.training import Recipe, measure, training_flops
+from lidargrit.core.files import write_json
+from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.settings import Recipe
+from lidargrit.training import measure, training_flops
 
 PAIRS = {  # system → its small recipe, and that of the published size
     "lidargrit": ("small", "lidargrit_kitti_360"),

@@ -23,12 +23,13 @@ import torch
 from torch import nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
-from lidargrit.generators import Generator
-from lidargrit.loading import RangeImages
-from lidargrit.recipes import load_recipe
-from lidargrit.reporting import Progress, Reporter
-from lidargrit.sources import load_range_images
-from lidargrit.training import Recipe, training_flops
+from lidargrit.core.reporting import Progress, Reporter
+from lidargrit.data.images import RangeImages
+from lidargrit.data.sources import load_range_images
+from lidargrit.generation.generator import Generator
+from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.settings import Recipe
+from lidargrit.training import training_flops
 from lidargrit.training.fit import Fit
 
 SCANS = 16

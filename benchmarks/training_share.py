@@ -23,10 +23,10 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from training import SCANS, on_simulated_scans, ours
 
-from lidargrit.generators import Generator
-from lidargrit.loading import RangeImages
-from lidargrit.recipes import load_recipe
-from lidargrit.training import Recipe
+from lidargrit.data.images import RangeImages
+from lidargrit.generation.generator import Generator
+from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.settings import Recipe
 
 ATEN = torch.ops.aten
 COUNTED = {ATEN.mm, ATEN.addmm, ATEN.bmm, ATEN.baddbmm, ATEN.convolution, ATEN.convolution_backward}

@@ -24,14 +24,14 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from lidargrit.generators import load
-from lidargrit.generators.lidargrit import LidarGrit, after_start
-from lidargrit.loading import Batches
+from lidargrit.data.batches import Batches
+from lidargrit.data.sources import open_images
+from lidargrit.generation.generator import load
+from lidargrit.generation.settings import FitConfig
 from lidargrit.nn.precision import dtype_of
 from lidargrit.nn.transformer import CausalTransformer, TransformerBlock, TransformerConfig
-from lidargrit.sources import open_images
-from lidargrit.structures import RangeImage
-from lidargrit.training import FitConfig
+from lidargrit.scans.types import RangeImage
+from lidargrit.systems.lidargrit.system import LidarGrit, after_start
 from lidargrit.training.optimiser import learning_rate_at, make_optimiser
 
 BATCH = 8

@@ -9,13 +9,13 @@ from matplotlib.colors import LogNorm
 from torch import Tensor
 
 import lidargrit
-from lidargrit.conditions import Condition
-from lidargrit.conditions.fills import fill
-from lidargrit.conditions.patterns import Pattern
-from lidargrit.errors import ConfigError, LidarGritError
+from lidargrit.core.errors import ConfigError, LidarGritError
 from lidargrit.evaluation.realism import simulate_pair
-from lidargrit.generators.lidargrit import LidarGrit, TokenSampling
-from lidargrit.structures import RangeImage
+from lidargrit.inference.complete.patterns import Pattern
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.fills import fill
+from lidargrit.scans.types import RangeImage
+from lidargrit.systems.lidargrit.system import LidarGrit, TokenSampling
 
 STREET = 10_000_012  # a seed that no packaged model has learned from
 SAMPLES = 8  # as many as are computed at once

@@ -5,9 +5,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import lidargrit
-from lidargrit.files import write_json
-from lidargrit.fitting import fit_sensor
-from lidargrit.fitting.table import as_table
+from lidargrit.core.files import write_json
+from lidargrit.scans.fit_sensor import fit_sensor
+from lidargrit.scans.fit_sensor.table import as_table
 from lidargrit.viewer.sensor_fit import plot_sensor_fit
 
 

@@ -7,10 +7,10 @@ import matplotlib.pyplot as plt
 from matplotlib.colors import LogNorm
 
 import lidargrit
-from lidargrit.errors import ConfigError, LidarGritError
-from lidargrit.generators.lidargrit import LidarGrit, TokenSampling
-from lidargrit.nn.pixel_decoder import PixelDecoder
-from lidargrit.nn.pixel_phases import completed_lattices
+from lidargrit.core.errors import ConfigError, LidarGritError
+from lidargrit.generation.pixel_decoder.pixel_decoder import PixelDecoder
+from lidargrit.generation.pixel_decoder.pixel_phases import completed_lattices
+from lidargrit.systems.lidargrit.system import LidarGrit, TokenSampling
 
 SEED = 3
 SHOWN = 4  # finest lattices of sampled pixels

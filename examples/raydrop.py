@@ -7,7 +7,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import LogNorm
 
-from lidargrit.sensors import load_sensor
+from lidargrit.scans.sensors import load_sensor
 from lidargrit.simulator import observe
 
 

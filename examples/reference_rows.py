@@ -7,8 +7,8 @@ import matplotlib.pyplot as plt
 import torch
 
 import lidargrit
-from lidargrit.metrics import load_metric
-from lidargrit.structures import RangeImage
+from lidargrit.evaluation.metrics import load_metric
+from lidargrit.scans.types import RangeImage
 
 METRICS = ("bev_jsd", "range_histogram_per_ring", "drop_run_lengths")
 COUNT = 16  # scans of each set: few, so that this takes seconds; score thousands

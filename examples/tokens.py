@@ -8,8 +8,8 @@ import torch
 from matplotlib.colors import LogNorm
 
 import lidargrit
-from lidargrit.structures import RangeImage
-from lidargrit.tokenizers.vqvae import Vqvae, VqvaeConfig
+from lidargrit.generation.tokenizers.vqvae import Vqvae, VqvaeConfig
+from lidargrit.scans.types import RangeImage
 
 STEPS = 60  # a taste, of one street; the recipe `small` takes thousands, of thousands
 

@@ -10,14 +10,14 @@ import pytest
 import torch
 from pypcd4.pypcd4 import Encoding, PointCloud
 
-from lidargrit import _discovery
-from lidargrit.errors import ScanError
-from lidargrit.formats import ScanFormat, load, read_scan
-from lidargrit.projection import unproject
-from lidargrit.sensors import load_sensor
-from lidargrit.structures import RangeImage, Scan
+from lidargrit.core import discovery
+from lidargrit.core.errors import ScanError
+from lidargrit.data.formats import ScanFormat, load, read_scan
+from lidargrit.scans.projection import unproject
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage, Scan
 
-NAMES = _discovery.names("formats")
+NAMES = discovery.names("formats")
 
 
 def can_write(cls: type[ScanFormat]) -> bool:

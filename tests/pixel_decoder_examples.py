@@ -6,10 +6,10 @@ import math
 
 import torch
 
-from lidargrit.nn.pixel_decoder import PixelDecoder
-from lidargrit.nn.pixel_networks import PixelDecoderConfig
-from lidargrit.sensors import SensorModel
-from lidargrit.structures import Decoded, RangeImage
+from lidargrit.generation.pixel_decoder.pixel_decoder import PixelDecoder
+from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
+from lidargrit.scans.sensors import SensorModel
+from lidargrit.scans.types import Decoded, RangeImage
 
 FEATURES = 5
 

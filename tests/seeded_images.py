@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from lidargrit.loading import Pixels, Provenance
-from lidargrit.sensors import SensorModel
+from lidargrit.data.images import Pixels, Provenance
+from lidargrit.scans.sensors import SensorModel
 
 
 class SeededImages:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import torch
 
-from lidargrit.metrics._networks.network import NETWORKS
+from lidargrit.evaluation.metrics.shared.networks.network import NETWORKS
 from reference_weights import seeded_weights
 
 

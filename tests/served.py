@@ -8,8 +8,8 @@ import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from lidargrit.serving import Limits
-from lidargrit.serving.server import open_server
+from lidargrit.viewer.serve import Limits
+from lidargrit.viewer.serve.server import open_server
 from test_generator_contract import made
 
 MODELS = ("lidargrit", "marginal", "r2dm")

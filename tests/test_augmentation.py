@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from lidargrit.augmentation import augment
-from lidargrit.sensors import load_sensor
-from lidargrit.structures import RangeImage
+from lidargrit.scans.augmentation import augment
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage
 
 SENSOR = load_sensor("hdl64e_kitti_odometry")
 

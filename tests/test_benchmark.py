@@ -9,19 +9,20 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
 from lidargrit.cli import main
-from lidargrit.conditions.marks import read_marks
-from lidargrit.datasets import load
-from lidargrit.errors import ConfigError, LidarGritError, OutputError
+from lidargrit.core.errors import ConfigError, LidarGritError, OutputError
+from lidargrit.core.files import claim_folder
+from lidargrit.data.datasets import load
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.prepared.prepare import prepare
 from lidargrit.evaluation import benchmark
 from lidargrit.evaluation.benchmark import Benchmark, as_table
 from lidargrit.evaluation.benchmark import run as run_benchmark
 from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.evaluation.intervals import Resampling
-from lidargrit.files import claim_folder
-from lidargrit.generators import load_class
-from lidargrit.loading import DataConfig, prepare
+from lidargrit.generation.generator import load_class
+from lidargrit.generation.presets import load_recipe
 from lidargrit.nn.flops import flops_of
-from lidargrit.recipes import load_recipe
+from lidargrit.scans.marks import read_marks
 from lidargrit.training import compute, computing_time, training_flops, with_budget
 from lidargrit.training.compute import uniform_images
 from lidargrit.viewer.table_page import table_page
@@ -134,7 +135,7 @@ def test_training_flops_are_three_forward_passes_of_a_plain_stack():
     recipe = load_recipe("r2dm_small", FEW)
     network = load_recipe("r2dm_small", FEW).model
     counted = training_flops(recipe)["diffusion"] / recipe.training["diffusion"].scans
-    from lidargrit.generators.r2dm import R2dm
+    from lidargrit.systems.r2dm.system import R2dm
 
     generator = R2dm(network, recipe.data.load_sensor())
     one_pass = generator.cost(replace(generator.Sampling(), steps=1)).flops

@@ -9,13 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.distance import jensenshannon
 
-from lidargrit.errors import ConfigError
-from lidargrit.metrics import _birds_eye as above
-from lidargrit.metrics import bev_mmd, load_metric
-from lidargrit.metrics import lidm_bev_matching as matching
-from lidargrit.projection import points_of_pixels
-from lidargrit.sensors import SensorModel, column_azimuths_rad
-from lidargrit.structures import RangeImage
+from lidargrit.core.errors import ConfigError
+from lidargrit.evaluation.metrics import bev_mmd, load_metric
+from lidargrit.evaluation.metrics import lidm_bev_matching as matching
+from lidargrit.evaluation.metrics.shared import birds_eye as above
+from lidargrit.scans.projection import points_of_pixels
+from lidargrit.scans.sensors import SensorModel, column_azimuths_rad
+from lidargrit.scans.types import RangeImage
 
 SENSOR = SensorModel("small", torch.linspace(0.05, -0.4, 16)[:, None], column_azimuths_rad(64), 1.0, 100.0, "spherical")
 GOLDEN_OF = {"exact": "lidargen", "lidargrit": "lidargrit", "r2dm": "r2dm", "lidargen": "lidargen"}

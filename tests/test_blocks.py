@@ -10,12 +10,13 @@ import pytest
 import torch
 from torch import nn
 
-from lidargrit.errors import ConfigError, OutputError
-from lidargrit.generators import load_class
+from lidargrit.core.errors import ConfigError, OutputError
+from lidargrit.generation.generator import load_class
+from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.settings import FitConfig
 from lidargrit.nn.blocks import Block, Network, prepare_for_training
 from lidargrit.nn.convolution import wrapped
-from lidargrit.recipes import load_recipe
-from lidargrit.training import FitConfig, train
+from lidargrit.training import train
 from lidargrit.training.compute import uniform_images
 from tiny_runs import LONG, MODEL, SHORT, SIMULATED
 

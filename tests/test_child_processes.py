@@ -9,12 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from lidargrit.errors import ConfigError, DataError
-from lidargrit.loading import DataConfig, prepare
-from lidargrit.processes import process_pool
-from lidargrit.sensors import load_sensor
-from lidargrit.serving.jobs import JobQueue
-from lidargrit.simulator.drives import DriveConfig, write_drives
+from lidargrit.core.errors import ConfigError, DataError
+from lidargrit.core.processes import process_pool
+from lidargrit.data.drives import DriveConfig, write_drives
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.prepared.prepare import prepare
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.viewer.serve.jobs import JobQueue
 from test_generator_contract import made
 
 

@@ -15,17 +15,17 @@ import torch
 from PIL import Image
 
 import lidargrit
-from lidargrit import _discovery
 from lidargrit.cli import build_parser, main
-from lidargrit.datasets import load
-from lidargrit.demo import divided
+from lidargrit.core import discovery
+from lidargrit.core.reporting import TerminalReporter
+from lidargrit.data.datasets import load
+from lidargrit.data.formats import read_scan as read_bin
+from lidargrit.data.sources import load_range_images
+from lidargrit.data.sources.samples import read_samples
 from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.evaluation.scorecard import format_value
-from lidargrit.formats import read_scan as read_bin
-from lidargrit.recipes import load_recipe
-from lidargrit.reporting import TerminalReporter
-from lidargrit.sources import load_range_images
-from lidargrit.sources.samples import read_samples
+from lidargrit.generation.presets import load_recipe
+from lidargrit.viewer.demo import divided
 from tiny_runs import MODEL, the_one_line
 
 TINY = [
@@ -35,7 +35,7 @@ TINY = [
     "training.tokenizer.scans=8",
     "training.transformer.scans=8",
 ]
-ONE_METRIC = ("lidargrit.demo.EvalConfig", partial(EvalConfig, metrics=("bev_jsd",)))
+ONE_METRIC = ("lidargrit.viewer.demo.EvalConfig", partial(EvalConfig, metrics=("bev_jsd",)))
 COUNTED = ("lidargen_kitti_360", "r2flow_kitti_360")  # counting takes seconds for each recipe
 PIXELS = ["training.pixels.scans=2", "model.pixels.mask_width=4", "model.pixels.range_width=4", "model.pixels.blocks=1"]
 
@@ -142,7 +142,7 @@ def told_at_once(recipe, without=()):
     return dict.fromkeys(recipe.training, 10**18)
 
 
-@pytest.mark.parametrize("recipe", _discovery.names("recipes"))
+@pytest.mark.parametrize("recipe", discovery.names("recipes"))
 def test_every_recipe_has_a_plan(recipe, tmp_path, capsys, monkeypatch):
     if recipe not in COUNTED:
         monkeypatch.setattr(sys.modules["lidargrit.training.plan"], "training_flops", told_at_once)
@@ -182,7 +182,7 @@ def test_sample_writes_one_file_a_seed_and_draws_no_seed_twice(run_folder, sampl
     def draws_nothing(*_):
         raise AssertionError("drew what was there")
 
-    monkeypatch.setattr("lidargrit.generators.lidargrit.LidarGrit.sample", draws_nothing)
+    monkeypatch.setattr("lidargrit.systems.lidargrit.system.LidarGrit.sample", draws_nothing)
     assert "done: 3 scans in" in typed("sample", run_folder, samples, "-n", 3)
     assert contents(samples) == before
 
@@ -283,7 +283,7 @@ def test_list_names_everything_there_is(typed):
     for kind in ("datasets", "formats", "sensors", "tokenizers", "generators", "metrics", "recipes"):
         in_full = typed("list", kind)
         assert in_full.splitlines()[0] == kind
-        for name in _discovery.names(kind):
+        for name in discovery.names(kind):
             assert f"  {name} " in output
             assert f"  {name} " in in_full
     assert "sample --set: temperature=1.0, top_k=0, top_p=1.0, guidance=0.0, mask=auto" in typed("list", "generators")
@@ -301,8 +301,8 @@ def test_doctor_tells_versions_and_room(typed):
 
 def test_demo_writes_its_page_and_writes_it_again(tmp_path, typed, monkeypatch):
     monkeypatch.setattr(*ONE_METRIC)
-    monkeypatch.setattr("lidargrit.demo._PACKAGED_SCANS", 1)
-    monkeypatch.setattr("lidargrit.demo._NUM_SAMPLES", 11)  # as many as its pictures show
+    monkeypatch.setattr("lidargrit.viewer.demo._PACKAGED_SCANS", 1)
+    monkeypatch.setattr("lidargrit.viewer.demo._NUM_SAMPLES", 11)  # as many as its pictures show
     words = ("demo", "--out", tmp_path / "demo", "--set", *TINY, *PIXELS)
     assert f"done: look at {tmp_path / 'demo'}" in typed(*words)
     before = contents(tmp_path / "demo")
@@ -362,7 +362,7 @@ main([])
 main(["list"])
 sys.exit(" ".join(name for name in ("torch", "numpy", "matplotlib", "rich", "jsonargparse") if name in sys.modules))
 """
-    verbs = [name.replace("_", "-") for name in _discovery.names("cli")]
+    verbs = [name.replace("_", "-") for name in discovery.names("cli")]
     done = python(program, *verbs)
     assert (done.returncode, done.stderr) == (1, "\n"), done.stderr
     assert done.stdout.count("examples:\n  lidargrit ") == len(verbs) + 2

@@ -6,14 +6,15 @@ import os
 import numpy as np
 import pytest
 
-from lidargrit import formats
-from lidargrit._discovery import names
-from lidargrit.datasets import open_dataset
-from lidargrit.datasets.argoverse2 import Argoverse2
-from lidargrit.datasets.kitti_odometry import KittiOdometry
-from lidargrit.errors import OutputError
-from lidargrit.formats import ouster_pcap, read_scan
-from lidargrit.loading import DataConfig, prepare
+from lidargrit.core.discovery import names
+from lidargrit.core.errors import OutputError
+from lidargrit.data import formats
+from lidargrit.data.datasets import open_dataset
+from lidargrit.data.datasets.argoverse2 import Argoverse2
+from lidargrit.data.datasets.kitti_odometry import KittiOdometry
+from lidargrit.data.formats import ouster_pcap, read_scan
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.prepared.prepare import prepare
 
 CONFIG = DataConfig(workers=1)
 

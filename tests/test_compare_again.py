@@ -5,15 +5,15 @@ from dataclasses import replace
 
 import torch
 
+from lidargrit.core.reporting import Reporter
+from lidargrit.data.images import RangeImages
 from lidargrit.evaluation import benchmark
 from lidargrit.evaluation.benchmark import run as run_benchmark
 from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
 from lidargrit.evaluation.protocols import load_protocol
-from lidargrit.loading import RangeImages
-from lidargrit.reporting import Reporter
-from lidargrit.sensors import load_sensor
+from lidargrit.scans.sensors import load_sensor
 from seeded_images import SeededImages
 from seeded_networks import weights
 from test_benchmark import BENCHMARK

@@ -9,29 +9,29 @@ import numpy as np
 import pytest
 import torch
 
-from lidargrit import formats
 from lidargrit.cli import main
-from lidargrit.completion import open_completer, open_completers
-from lidargrit.completion.inputs import ScanReader, open_inputs
-from lidargrit.conditions import Condition
-from lidargrit.conditions.fills import FILLS, fill
-from lidargrit.errors import ConfigError, DataError, ScanError
+from lidargrit.core.errors import ConfigError, DataError, ScanError
+from lidargrit.core.reporting import Reporter
+from lidargrit.data import formats
+from lidargrit.data.formats import read_scan
+from lidargrit.data.formats.kitti_bin import KittiBin
+from lidargrit.data.formats.numpy_array import NumpyArray
+from lidargrit.data.formats.ply import Ply
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.sources import open_images
+from lidargrit.data.sources.samples import write_samples
 from lidargrit.evaluation.raydrop import RAYDROP_CURVES, decoded_surfaces, raydrop_table, score_raydrop
-from lidargrit.formats import read_scan
-from lidargrit.formats.kitti_bin import KittiBin
-from lidargrit.formats.numpy_array import NumpyArray
-from lidargrit.formats.ply import Ply
-from lidargrit.generators import load, load_class
-from lidargrit.generators.lidargrit import LidarGrit
-from lidargrit.loading import DataConfig
-from lidargrit.nn.pixel_networks import PixelDecoderConfig
-from lidargrit.projection import unproject
-from lidargrit.reporting import Reporter
-from lidargrit.sensors import SensorModel, load_sensor
+from lidargrit.generation.generator import load, load_class
+from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
+from lidargrit.inference.complete import open_completer, open_completers
+from lidargrit.inference.complete.inputs import ScanReader, open_inputs
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.fills import FILLS, fill
+from lidargrit.scans.projection import unproject
+from lidargrit.scans.sensors import SensorModel, load_sensor
+from lidargrit.scans.types import RangeImage, Scan
 from lidargrit.simulator import simulate
-from lidargrit.sources import open_images
-from lidargrit.sources.samples import write_samples
-from lidargrit.structures import RangeImage, Scan
+from lidargrit.systems.lidargrit.system import LidarGrit
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
 SIXTEEN = load_sensor("vlp16")

@@ -5,20 +5,20 @@ from dataclasses import replace
 import pytest
 import torch
 
-from lidargrit.conditions import Condition
-from lidargrit.conditions.fills import fill
-from lidargrit.conditions.hints import hints_of
-from lidargrit.errors import ConfigError
-from lidargrit.generators import load
-from lidargrit.generators.completion_only import CompletionOnlyConfig
-from lidargrit.generators.lidargrit import LidarGrit, TokenSampling
-from lidargrit.generators.multiscale import MultiscaleConfig
-from lidargrit.loading import DataConfig
-from lidargrit.nn.completion_network import CompletionNetwork, CompletionNetworkConfig
-from lidargrit.nn.completion_objective import CompletionObjective, random_patterns
-from lidargrit.sensors import load_sensor
-from lidargrit.structures import RangeImage
-from lidargrit.training import Recipe
+from lidargrit.core.errors import ConfigError
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.generation.generator import load
+from lidargrit.generation.settings import Recipe
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.fills import fill
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage
+from lidargrit.systems.completion_only.completion_network import CompletionNetwork, CompletionNetworkConfig
+from lidargrit.systems.completion_only.completion_objective import CompletionObjective, random_patterns
+from lidargrit.systems.completion_only.hints import hints_of
+from lidargrit.systems.completion_only.system import CompletionOnlyConfig
+from lidargrit.systems.lidargrit.system import LidarGrit, TokenSampling
+from lidargrit.systems.multiscale.system import MultiscaleConfig
 from lidargrit.training.taken_stages import taken_stages
 from tiny_runs import learn
 

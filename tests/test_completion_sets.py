@@ -8,20 +8,20 @@ import pytest
 import torch
 
 from lidargrit.cli import main
-from lidargrit.completion.files import _suffix
-from lidargrit.completion.inputs import ScanReader, open_inputs
-from lidargrit.completion.sparse import SparseReader
-from lidargrit.demo import divided
-from lidargrit.errors import OutputError
-from lidargrit.files import write_text
-from lidargrit.formats.numpy_array import NumpyArray
-from lidargrit.generators.lidargrit import LidarGrit
-from lidargrit.loading import DataConfig
-from lidargrit.nn.pixel_networks import PixelDecoderConfig
-from lidargrit.projection import unproject
-from lidargrit.reporting import Reporter
-from lidargrit.sensors import load_sensor
-from lidargrit.structures import RangeImage, Scan
+from lidargrit.core.errors import OutputError
+from lidargrit.core.files import write_text
+from lidargrit.core.reporting import Reporter
+from lidargrit.data.formats.numpy_array import NumpyArray
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
+from lidargrit.inference.complete.files import _suffix
+from lidargrit.inference.complete.inputs import ScanReader, open_inputs
+from lidargrit.inference.complete.sparse import SparseReader
+from lidargrit.scans.projection import unproject
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage, Scan
+from lidargrit.systems.lidargrit.system import LidarGrit
+from lidargrit.viewer.demo import divided
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
 
@@ -188,7 +188,7 @@ def test_a_file_system_that_makes_no_folder_is_told_of(tmp_path, monkeypatch):
     def vanishing(folder):
         raise FileNotFoundError(2, "No such file or directory")
 
-    monkeypatch.setattr("lidargrit.files._hidden", vanishing)
+    monkeypatch.setattr("lidargrit.core.files._hidden", vanishing)
     with pytest.raises(OutputError, match="No such file"):
         write_text(tmp_path / "a.txt", "a")
 

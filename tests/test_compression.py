@@ -16,20 +16,20 @@ import pytest
 import torch
 
 from lidargrit.cli import main
-from lidargrit.compression import rounding
-from lidargrit.compression.archive import Archive, writing
-from lidargrit.compression.arithmetic import exp, ln, sigmoid
-from lidargrit.compression.scan_codec import ScanCodec
-from lidargrit.errors import ConfigError, OutputError, ScanError
-from lidargrit.generators.lidargrit import LidarGrit, LidarGritConfig, TokenSampling
-from lidargrit.generators.multiscale import Multiscale, MultiscaleConfig
-from lidargrit.nn.pixel_decoder import PixelSampling
-from lidargrit.nn.pixel_networks import PixelDecoderConfig
-from lidargrit.nn.range_steps import RangeSteps
+from lidargrit.core.errors import ConfigError, OutputError, ScanError
+from lidargrit.generation.pixel_decoder.pixel_decoder import PixelSampling
+from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
+from lidargrit.generation.range_steps import RangeSteps
+from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
+from lidargrit.inference.compress import rounding
+from lidargrit.inference.compress.archive import Archive, writing
+from lidargrit.inference.compress.arithmetic import exp, ln, sigmoid
+from lidargrit.inference.compress.scan_codec import ScanCodec
 from lidargrit.nn.transformer import TransformerConfig
-from lidargrit.sensors import load_sensor
-from lidargrit.structures import RangeImage
-from lidargrit.tokenizers.vqvae import VqvaeConfig
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage
+from lidargrit.systems.lidargrit.system import LidarGrit, LidarGritConfig, TokenSampling
+from lidargrit.systems.multiscale.system import Multiscale, MultiscaleConfig
 from tiny_runs import the_one_line
 
 pytest.importorskip("constriction")
@@ -241,7 +241,7 @@ def test_an_interrupted_file_goes_on_and_ends_as_an_uninterrupted_one(tmp_path):
 
 
 def test_a_strangers_file_writes_only_files_that_can_be_and_below_its_folder(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("lidargrit.compression.command._codec_of", lambda *_: ScanCodec(made(), 20))
+    monkeypatch.setattr("lidargrit.inference.compress.command._codec_of", lambda *_: ScanCodec(made(), 20))
     path = tmp_path / "scans.lgz"
     for names, message in (
         (["../out"], "a scan that would lie outside"),

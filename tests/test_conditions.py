@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from lidargrit.conditions import Condition
-from lidargrit.conditions.fills import fill_from_nearest, fill_lacking
-from lidargrit.conditions.patterns import Pattern
-from lidargrit.determinism import derive_seed
-from lidargrit.errors import ConfigError, ScanError, UsageError
-from lidargrit.sensors import load_sensor
-from lidargrit.structures import RangeImage
+from lidargrit.core.determinism import derive_seed
+from lidargrit.core.errors import ConfigError, ScanError, UsageError
+from lidargrit.inference.complete.patterns import Pattern
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.fills import fill_from_nearest, fill_lacking
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
 

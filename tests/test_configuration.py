@@ -7,18 +7,18 @@ from typing import Literal
 
 import pytest
 
-from lidargrit import _discovery
-from lidargrit.configuration import from_json, leaves, name_and_settings, override, to_json
-from lidargrit.errors import ConfigError
-from lidargrit.generators import load_class
-from lidargrit.generators.lidargrit import LidarGritConfig
-from lidargrit.loading import DataConfig
+from lidargrit.core import discovery
+from lidargrit.core.configuration import from_json, leaves, name_and_settings, override, to_json
+from lidargrit.core.errors import ConfigError
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.generation.generator import load_class
+from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.settings import FitConfig, Recipe
+from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
 from lidargrit.nn.transformer import TransformerConfig
-from lidargrit.recipes import load_recipe
-from lidargrit.tokenizers.vqvae import VqvaeConfig
-from lidargrit.training import FitConfig, Recipe
+from lidargrit.systems.lidargrit.system import LidarGritConfig
 
-RECIPES = _discovery.names("recipes")
+RECIPES = discovery.names("recipes")
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from lidargrit.errors import CheckpointError
+from lidargrit.core.errors import CheckpointError
 from lidargrit.evaluation import costs
 from lidargrit.evaluation.benchmark import as_table
 from lidargrit.evaluation.benchmark import run as run_benchmark

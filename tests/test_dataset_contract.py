@@ -5,13 +5,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from lidargrit import _discovery
-from lidargrit.datasets import ScanDataset, load, open_dataset, recognise
-from lidargrit.errors import DataError, OutputError, UnknownNameError
-from lidargrit.projection import project
-from lidargrit.sensors import load_sensor
+from lidargrit.core import discovery
+from lidargrit.core.errors import DataError, OutputError, UnknownNameError
+from lidargrit.data.datasets import ScanDataset, load, open_dataset, recognise
+from lidargrit.scans.projection import project
+from lidargrit.scans.sensors import load_sensor
 
-NAMES = _discovery.names("datasets")
+NAMES = discovery.names("datasets")
 READ_ONLY = {"ouster"}
 ROOT = Path("4")  # a folder for those that read files, a count for the simulated one
 
@@ -47,7 +47,7 @@ def test_says_what_it_is(cls):
         assert scheme.source
         assert scheme.leak.endswith("."), "a sentence on what the parts share"
         assert all(scheme.parts.values())
-    assert _discovery.summary("datasets", cls.public_name()), "a line for `lidargrit list`"
+    assert discovery.summary("datasets", cls.public_name()), "a line for `lidargrit list`"
     assert load_sensor(cls.sensor).name == cls.sensor
 
 

@@ -10,18 +10,18 @@ import torch
 from PIL import Image
 
 from format_examples import NAMES, can_write, written
-from lidargrit import formats
-from lidargrit.datasets import ScanDataset, load, open_dataset
-from lidargrit.datasets.folder import Folder
-from lidargrit.errors import DataError, OutputError, ScanError, UnknownNameError
-from lidargrit.files import write_json
-from lidargrit.loading import DataConfig
-from lidargrit.projection import project
-from lidargrit.projection.unfolding import rings_from_firing_order
-from lidargrit.reporting import Reporter
-from lidargrit.sensors import load_sensor
+from lidargrit.core.errors import DataError, OutputError, ScanError, UnknownNameError
+from lidargrit.core.files import write_json
+from lidargrit.core.reporting import Reporter
+from lidargrit.data import formats
+from lidargrit.data.datasets import ScanDataset, load, open_dataset
+from lidargrit.data.datasets.folder import Folder
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.sources import load_range_images, open_source
+from lidargrit.scans.projection import project
+from lidargrit.scans.projection.unfolding import rings_from_firing_order
+from lidargrit.scans.sensors import load_sensor
 from lidargrit.simulator import simulate
-from lidargrit.sources import load_range_images, open_source
 
 ROWS = np.array([[1, 2, 3, 0.5], [4, 5, 6, 0.25], [7, 8, 9, 1]], dtype="<f4")
 

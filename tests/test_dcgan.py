@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from lidargrit.errors import CheckpointError
-from lidargrit.generators.dusty import AdversarialObjective, Dusty, DustyConfig, load_published
-from lidargrit.nn.dcgan import Discriminator, Synthesis, Widths
+from lidargrit.core.errors import CheckpointError
 from lidargrit.nn.flops import flops_of
-from lidargrit.sensors import load_sensor
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.systems.dusty.dcgan import Discriminator, Synthesis, Widths
+from lidargrit.systems.dusty.system import AdversarialObjective, Dusty, DustyConfig, load_published
 from reference_weights import seeded_weights
 
 SENSOR = load_sensor("hdl64e_kitti_odometry")

@@ -3,21 +3,21 @@
 import json
 from functools import partial
 
-from lidargrit import demo
 from lidargrit.cli import main
-from lidargrit.datasets import load
+from lidargrit.core.reporting import TerminalReporter
+from lidargrit.data.datasets import load
 from lidargrit.evaluation.comparison import EvalConfig
-from lidargrit.generators.lidargrit import TokenSampling
-from lidargrit.reporting import TerminalReporter
-from lidargrit.training import Recipe
+from lidargrit.generation.settings import Recipe
+from lidargrit.systems.lidargrit.system import TokenSampling
+from lidargrit.viewer import demo
 
 
 def test_demo_trains_the_packaged_model_further_on_a_users_own_drives(tmp_path, monkeypatch):
     monkeypatch.setenv("LIDARGRIT_CACHE", str(tmp_path / "cache"))
     load("kitti_odometry").write_example(tmp_path / "own scans", 4)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("lidargrit.demo._NUM_SAMPLES", 11)  # as many as its pictures show
-    monkeypatch.setattr("lidargrit.demo.EvalConfig", partial(EvalConfig, metrics=("bev_jsd",)))
+    monkeypatch.setattr("lidargrit.viewer.demo._NUM_SAMPLES", 11)  # as many as its pictures show
+    monkeypatch.setattr("lidargrit.viewer.demo.EvalConfig", partial(EvalConfig, metrics=("bev_jsd",)))
     few = ["training.tokenizer.scans=2", "training.transformer.scans=8", "training.pixels.scans=2"]
     assert main(["demo", "--data", str(tmp_path / "own scans"), "--set", *few]) == 0
     run = tmp_path / "runs" / "demo-own scans"

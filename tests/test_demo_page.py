@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lidargrit import demo
+from lidargrit.core.reporting import Reporter
+from lidargrit.data.images import Pixels, Provenance, RangeImages
+from lidargrit.data.run_folder import RUN_FILE
 from lidargrit.evaluation.intervals import RealAgainstReal
 from lidargrit.evaluation.reconstruction import score_reconstruction
-from lidargrit.generators.lidargrit import LidarGrit
-from lidargrit.loading import Pixels, Provenance, RangeImages
-from lidargrit.nn.pixel_networks import PixelDecoderConfig
-from lidargrit.reporting import Reporter
-from lidargrit.run_folder import RUN_FILE
+from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
+from lidargrit.systems.lidargrit.system import LidarGrit
+from lidargrit.viewer import demo
 from lidargrit.viewer.report_charts import score_chart
 from test_generator_contract import SENSOR, Store, made
 

@@ -2,7 +2,7 @@
 
 import torch
 
-from lidargrit.nn.differentiable_augmentation import augment_differentiably
+from lidargrit.systems.dusty.differentiable_augmentation import augment_differentiably
 
 IMAGES = torch.rand(500, 1, 32, 64, generator=torch.Generator().manual_seed(0)) * 2 - 1
 

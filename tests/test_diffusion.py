@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidargrit.nn.diffusion import (
+from lidargrit.systems.r2dm.diffusion import (
     SeededNoise,
     alpha_sigma,
     log_snr_at,

@@ -9,12 +9,12 @@ import pytest
 import torch
 
 from lidargrit.cli import main
-from lidargrit.datasets import data_set_and_split, open_dataset
-from lidargrit.errors import ConfigError, OutputError
-from lidargrit.export import export_scans
-from lidargrit.sensors import load_sensor
+from lidargrit.core.errors import ConfigError, OutputError
+from lidargrit.data.datasets import data_set_and_split, open_dataset
+from lidargrit.data.drives import DriveConfig, write_drives
+from lidargrit.data.export import export_scans
+from lidargrit.scans.sensors import load_sensor
 from lidargrit.simulator import frames_of, scene_of, simulate
-from lidargrit.simulator.drives import DriveConfig, write_drives
 
 SENSOR = replace(load_sensor("vlp16").with_columns(360), name="a small sensor")
 

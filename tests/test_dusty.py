@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from lidargrit.conditions import Condition
-from lidargrit.errors import ConfigError
-from lidargrit.generators.dusty import Dusty, DustyConfig, DustySampling, InverseRange
+from lidargrit.core.errors import ConfigError
 from lidargrit.nn.latent_search import rate_share, search_latents
-from lidargrit.nn.raydrop import logistic_noise, straight_through
-from lidargrit.sensors import load_sensor
-from lidargrit.structures import RangeImage
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage
+from lidargrit.systems.dusty.raydrop import logistic_noise, straight_through
+from lidargrit.systems.dusty.system import Dusty, DustyConfig, DustySampling, InverseRange
 from lidargrit.training.engine import Engine
 
 SENSOR = load_sensor("hdl64e_kitti_odometry")

@@ -7,10 +7,10 @@ import copy
 import torch
 from torch import nn
 
-from lidargrit.nn.encoding_cache import EncodingCache
-from lidargrit.recipes import load_recipe
-from lidargrit.sensors import load_sensor
-from lidargrit.structures import RangeImage
+from lidargrit.generation.encoding_cache import EncodingCache
+from lidargrit.generation.presets import load_recipe
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage
 from lidargrit.training.measure import measure
 from tiny_runs import MODEL, SHORT, SIMULATED
 

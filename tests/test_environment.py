@@ -5,9 +5,9 @@ import os
 import pytest
 
 from lidargrit.cli import main
-from lidargrit.environment import cache_folder, folder_in
-from lidargrit.errors import ConfigError
-from lidargrit.processes import rank_and_world_size
+from lidargrit.core.environment import cache_folder, folder_in
+from lidargrit.core.errors import ConfigError
+from lidargrit.core.processes import rank_and_world_size
 
 
 @pytest.fixture(autouse=True)

@@ -9,27 +9,27 @@ import numpy as np
 import pytest
 import torch
 
-from lidargrit import _discovery
 from lidargrit.cli import main
-from lidargrit.errors import DataError, LidarGritError, UnknownNameError
+from lidargrit.core import discovery
+from lidargrit.core.errors import DataError, LidarGritError, UnknownNameError
+from lidargrit.core.files import write_json
+from lidargrit.data.images import Pixels, Provenance
+from lidargrit.data.prepared.config import DataConfig, ScanSettings
+from lidargrit.data.sources import open_source
 from lidargrit.evaluation.command import read_config
 from lidargrit.evaluation.comparison import EvalConfig, compare_sources
 from lidargrit.evaluation.intervals import Resampling
+from lidargrit.evaluation.metrics import load_metric
 from lidargrit.evaluation.pairs import pair_for_protocol
 from lidargrit.evaluation.protocols import MetricChoice, Protocol, load_protocol
 from lidargrit.evaluation.scorecard import Scorecard, format_value
 from lidargrit.evaluation.tables import published, read_tables, side_by_side
-from lidargrit.files import write_json
-from lidargrit.loading import DataConfig, Pixels, Provenance
-from lidargrit.loading.config import ScanSettings
-from lidargrit.metrics import load_metric
-from lidargrit.sensors import load_sensor
-from lidargrit.sources import open_source
+from lidargrit.scans.sensors import load_sensor
 from tiny_runs import the_one_line
 
 CHEAP = ("return_rate_per_ring", "bev_occupancy")
 SENSOR = load_sensor("hdl64e_kitti_odometry")
-PROTOCOLS = _discovery.names("evaluation.protocols")
+PROTOCOLS = discovery.names("protocols")
 
 
 class WithReflectance:
@@ -85,8 +85,8 @@ def test_a_protocol_asks_for_what_there_is(name):
     assert (sensor is None) == (name == "exact")
     if sensor is not None:
         assert (sensor.height, sensor.width) == (64, 256 if name.endswith("odometry") else 1024)
-        assert protocol.data_set in _discovery.names("datasets")
-    assert 20 < len(_discovery.summary("evaluation.protocols", name)) < 180
+        assert protocol.data_set in discovery.names("datasets")
+    assert 20 < len(discovery.summary("protocols", name)) < 180
 
 
 def test_the_papers_protocol_is_the_papers():

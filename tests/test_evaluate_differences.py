@@ -6,15 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lidargrit.errors import DataError, ScanError
+from lidargrit.core.errors import DataError, ScanError
+from lidargrit.core.files import write_json
+from lidargrit.data.images import RangeImages
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.prepared.prepare import prepare
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair, compare_sources
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.pairs import EvalPair, EvalSet, deviations
 from lidargrit.evaluation.protocols import load_protocol
 from lidargrit.evaluation.tables import side_by_side
-from lidargrit.files import write_json
-from lidargrit.loading import DataConfig, RangeImages, prepare
-from lidargrit.sensors import load_sensor
+from lidargrit.scans.sensors import load_sensor
 from seeded_images import SeededImages
 
 ODOMETRY = load_sensor("hdl64e_kitti_odometry")

@@ -3,12 +3,13 @@
 import pytest
 import torch
 
-from lidargrit.errors import CheckpointError
-from lidargrit.generators import NoSampling, load
-from lidargrit.generators.marginal import Marginal, MarginalConfig
-from lidargrit.generators.memorised import Memorised, MemorisedConfig
-from lidargrit.loading import Pixels, Provenance, RangeImages
-from lidargrit.sensors import load_sensor
+from lidargrit.core.errors import CheckpointError
+from lidargrit.data.images import Pixels, Provenance, RangeImages
+from lidargrit.generation.facts import NoSampling
+from lidargrit.generation.generator import load
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.systems.marginal.system import Marginal, MarginalConfig
+from lidargrit.systems.memorised.system import Memorised, MemorisedConfig
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
 

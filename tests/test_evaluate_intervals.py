@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 import torch
 
-from lidargrit import _discovery
-from lidargrit.errors import ConfigError
+from lidargrit.core import discovery
+from lidargrit.core.errors import ConfigError
 from lidargrit.evaluation.intervals import Part, Resampling, around, blocks, interval_of, merged, real_against_real
-from lidargrit.metrics import ImageMetric, load_metric
-from lidargrit.metrics._accumulators import RowAccumulator
-from lidargrit.sensors import load_sensor
-from lidargrit.structures import MetricResult, RangeImage
+from lidargrit.evaluation.metrics import ImageMetric, load_metric
+from lidargrit.evaluation.metrics.shared.accumulators import RowAccumulator
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import MetricResult, RangeImage
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(64)
-PLAIN = [name for name in _discovery.names("metrics") if not load_metric(name).needs_weights]
+PLAIN = [name for name in discovery.names("metrics") if not load_metric(name).needs_weights]
 
 
 class Ratio(ImageMetric):
@@ -180,7 +180,7 @@ def test_every_metric_can_be_merged_from_parts_of_one_side_only(name, packed, mo
 @pytest.mark.parametrize("name", ["flying_points", "edge_rate_per_range", "thin_object_rate_per_range"])
 def test_halves_compare_the_bins_of_the_whole_sets(name, monkeypatch):
     """Half as many pixels leave fewer bins with 500, and none where all are rare, so that all of them count."""
-    monkeypatch.setattr("lidargrit.metrics._curves._LEAST", 300)
+    monkeypatch.setattr("lidargrit.evaluation.metrics.shared.curves._LEAST", 300)
     whole, half = load_metric(name)(), load_metric(name)()
     for real in (False, True):
         whole.update(images(int(real), 8), real=real)
@@ -197,7 +197,8 @@ def test_halves_compare_the_bins_of_the_whole_sets(name, monkeypatch):
 def test_intervals_and_real_against_real_are_of_the_score_s_bins(monkeypatch):
     seen = []
     monkeypatch.setattr(
-        "lidargrit.metrics._curves.enough_trials", lambda generated, real: seen.append(1) or (generated[0] >= 0)
+        "lidargrit.evaluation.metrics.shared.curves.enough_trials",
+        lambda generated, real: seen.append(1) or (generated[0] >= 0),
     )
     sides = {real: [] for real in (False, True)}
     for real, start in ((real, start) for real in sides for start in range(0, 8, 2)):

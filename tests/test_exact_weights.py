@@ -7,12 +7,12 @@ import pytest
 import torch
 from torch import nn
 
-from lidargrit.errors import CheckpointError
-from lidargrit.files import read_tensors, write_tensors
-from lidargrit.generators import load, load_class
-from lidargrit.loading import RangeImages
+from lidargrit.core.errors import CheckpointError
+from lidargrit.core.files import read_tensors, write_tensors
+from lidargrit.data.images import RangeImages
+from lidargrit.generation.generator import load, load_class
 from lidargrit.nn.exact_weights import load_exactly
-from lidargrit.sensors import load_sensor
+from lidargrit.scans.sensors import load_sensor
 from seeded_images import SeededImages
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)

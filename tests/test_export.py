@@ -11,15 +11,16 @@ import pytest
 import torch
 
 from lidargrit.cli import main
-from lidargrit.datasets import open_dataset
-from lidargrit.errors import ConfigError, DataError, OutputError, ScanError, UnknownNameError
-from lidargrit.export import MANIFEST, KittiTree, export_scans
-from lidargrit.formats import read_scan
-from lidargrit.loading import DataConfig, prepare
-from lidargrit.projection import unproject
-from lidargrit.reporting import Reporter
-from lidargrit.sensors import load_sensor
-from lidargrit.sources import open_images
+from lidargrit.core.errors import ConfigError, DataError, OutputError, ScanError, UnknownNameError
+from lidargrit.core.reporting import Reporter
+from lidargrit.data.datasets import open_dataset
+from lidargrit.data.export import MANIFEST, KittiTree, export_scans
+from lidargrit.data.formats import read_scan
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.prepared.prepare import prepare
+from lidargrit.data.sources import open_images
+from lidargrit.scans.projection import unproject
+from lidargrit.scans.sensors import load_sensor
 from tiny_runs import contents
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(512, 8)

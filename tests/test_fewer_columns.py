@@ -2,12 +2,13 @@
 
 import numpy as np
 
+from lidargrit.data.images import Pixels, Provenance
+from lidargrit.data.prepared.columns import FewerColumns
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.prepared.prepare import prepare
+from lidargrit.data.sources import open_source
 from lidargrit.evaluation.pairs import EvalSet
-from lidargrit.loading import DataConfig, prepare
-from lidargrit.loading.columns import FewerColumns
-from lidargrit.loading.images import Pixels, Provenance
-from lidargrit.sensors import load_sensor
-from lidargrit.sources import open_source
+from lidargrit.scans.sensors import load_sensor
 
 
 class OneImage:

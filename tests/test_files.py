@@ -14,8 +14,8 @@ import pytest
 import safetensors
 import torch
 
-from lidargrit.errors import CheckpointError, OutputError, ScanError
-from lidargrit.files import (
+from lidargrit.core.errors import CheckpointError, OutputError, ScanError
+from lidargrit.core.files import (
     atomic_path,
     claim_folder,
     is_taken,
@@ -25,7 +25,7 @@ from lidargrit.files import (
     write_tensors,
     write_text,
 )
-from lidargrit.sources.sample_formats import read_tensor
+from lidargrit.data.sources.sample_formats import read_tensor
 
 WRITE_AND_WAIT = """
 import sys, time

@@ -9,15 +9,15 @@ import torch
 
 from lidargrit import simulate
 from lidargrit.cli import main
-from lidargrit.datasets import open_dataset
-from lidargrit.errors import ConfigError, ScanError
-from lidargrit.fitting import SensorFit, fit_sensor, fit_sensor_to_dataset
-from lidargrit.fitting.azimuths import columns_of_scans
-from lidargrit.fitting.elevations import nearest_row, rows_of_rings
-from lidargrit.fitting.limits import farthest_m, quantum_m
-from lidargrit.fitting.table import as_table
-from lidargrit.sensors import SensorModel, column_azimuths_rad, load_sensor
-from lidargrit.structures import Scan
+from lidargrit.core.errors import ConfigError, ScanError
+from lidargrit.data.datasets import open_dataset
+from lidargrit.scans.fit_sensor import SensorFit, fit_sensor, fit_sensor_to_dataset
+from lidargrit.scans.fit_sensor.azimuths import columns_of_scans
+from lidargrit.scans.fit_sensor.elevations import nearest_row, rows_of_rings
+from lidargrit.scans.fit_sensor.limits import farthest_m, quantum_m
+from lidargrit.scans.fit_sensor.table import as_table
+from lidargrit.scans.sensors import SensorModel, column_azimuths_rad, load_sensor
+from lidargrit.scans.types import Scan
 
 SMALL = {  # fewer columns than the real ones, for time; the rows are what is hard
     "hdl64e_kitti_odometry": 512,

@@ -8,10 +8,11 @@ import pytest
 import torch
 
 from format_examples import NAMES, can_write, example, small_files, written
-from lidargrit import _discovery, formats
-from lidargrit.errors import OutputError, ScanError
-from lidargrit.formats import ScanFormat, candidates, load, read_scan, stem
-from lidargrit.structures import Scan
+from lidargrit.core import discovery
+from lidargrit.core.errors import OutputError, ScanError
+from lidargrit.data import formats
+from lidargrit.data.formats import ScanFormat, candidates, load, read_scan, stem
+from lidargrit.scans.types import Scan
 
 SECONDS_AT_MOST = 2  # a reader that waits for ever is stopped
 
@@ -64,7 +65,7 @@ def test_says_what_it_is(cls):
     assert all(suffix.startswith(".") and suffix == suffix.lower() for suffix in cls.suffixes)
     assert set(cls.keeps) <= {"reflectance", "ring", "label"}
     assert cls.public_name() in NAMES
-    assert 20 < len(_discovery.summary("formats", cls.public_name())) < 180
+    assert 20 < len(discovery.summary("formats", cls.public_name())) < 180
 
 
 def test_its_names_lead_to_it_and_lose_their_ending(cls, tmp_path):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from format_examples import example, pcd_files, ply_files, refused_within
-from lidargrit.formats import candidates, load, read_scan
+from lidargrit.data.formats import candidates, load, read_scan
 
 MEGABYTES_AT_MOST = 20  # each file here is small
 

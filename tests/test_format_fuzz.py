@@ -8,9 +8,9 @@ import torch
 
 from fuzz import fuzz_formats
 from fuzz.fuzz_formats import WELL, fuzz, outcomes
-from lidargrit.errors import ScanError
-from lidargrit.formats import ScanFormat
-from lidargrit.structures import Scan
+from lidargrit.core.errors import ScanError
+from lidargrit.data.formats import ScanFormat
+from lidargrit.scans.types import Scan
 
 
 def test_damaged_files_are_a_scan_or_one_line():

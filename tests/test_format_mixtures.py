@@ -3,11 +3,11 @@
 import pytest
 import torch
 
-from lidargrit.datasets import load, open_dataset
-from lidargrit.formats import load as load_format
-from lidargrit.sensors import load_sensor
+from lidargrit.data.datasets import load, open_dataset
+from lidargrit.data.formats import load as load_format
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import Scan
 from lidargrit.simulator import simulate
-from lidargrit.structures import Scan
 
 
 def put(path, content):

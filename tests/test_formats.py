@@ -11,13 +11,13 @@ from PIL import Image
 from pypcd4.pypcd4 import PointCloud
 
 from format_examples import example, numpy_files, pcd_files, ply_files
-from lidargrit.errors import OutputError, ScanError
-from lidargrit.formats import candidates, load, read_scan, recognise, stem
-from lidargrit.formats.kitti_bin import KittiBin
-from lidargrit.formats.xyz_bin import XyzBin
-from lidargrit.projection import project
-from lidargrit.sensors import load_sensor
-from lidargrit.structures import Scan
+from lidargrit.core.errors import OutputError, ScanError
+from lidargrit.data.formats import candidates, load, read_scan, recognise, stem
+from lidargrit.data.formats.kitti_bin import KittiBin
+from lidargrit.data.formats.xyz_bin import XyzBin
+from lidargrit.scans.projection import project
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import Scan
 
 ROWS = np.array([[1, 2, 3, 0.5], [4, 5, 6, 0.25], [7, 8, 9, 1]], dtype="<f4")
 

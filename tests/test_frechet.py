@@ -8,8 +8,8 @@ import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidargrit.metrics._networks.frechet import Moments, frechet_distance
-from lidargrit.metrics._networks.kernel import kernel_distance, subset_kernel_distance
+from lidargrit.evaluation.metrics.shared.networks.frechet import Moments, frechet_distance
+from lidargrit.evaluation.metrics.shared.networks.kernel import kernel_distance, subset_kernel_distance
 
 
 def moments(*batches):

@@ -10,14 +10,15 @@ import numpy as np
 import pytest
 import torch
 
-from lidargrit import _discovery, configuration
 from lidargrit.cli import build_parser
-from lidargrit.conditions import Condition
-from lidargrit.errors import ConfigError
-from lidargrit.generators import CAPABILITIES, Generator, load, load_class
-from lidargrit.loading import Pixels, Provenance, RangeImages
-from lidargrit.sensors import load_sensor
-from lidargrit.structures import RangeImage
+from lidargrit.core import configuration, discovery
+from lidargrit.core.errors import ConfigError
+from lidargrit.data.images import Pixels, Provenance, RangeImages
+from lidargrit.generation.facts import CAPABILITIES
+from lidargrit.generation.generator import Generator, load, load_class
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
 HOOKS = {  # what a generator with a capability overrides
@@ -103,7 +104,7 @@ def call(generator, name_and_arguments):
     return getattr(generator, name)(*arguments)
 
 
-NAMES = _discovery.names("generators")
+NAMES = discovery.names("generators")
 pytestmark = pytest.mark.parametrize("name", NAMES)
 
 

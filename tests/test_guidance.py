@@ -5,12 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from lidargrit.errors import ConfigError, OutputError
-from lidargrit.generators import load
-from lidargrit.generators.lidargrit import LidarGrit, LidarGritConfig, TokenSampling
+from lidargrit.core.errors import ConfigError, OutputError
+from lidargrit.data.sources.samples import read_samples, write_samples
+from lidargrit.generation.generator import load
 from lidargrit.nn.transformer import TransformerConfig
-from lidargrit.sensors import load_sensor
-from lidargrit.sources.samples import read_samples, write_samples
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.systems.lidargrit.system import LidarGrit, LidarGritConfig, TokenSampling
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(512, stride=8)  # 64x64 pixels
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from lidargrit.datasets import load
+from lidargrit.data.datasets import load
 from tiny_runs import the_one_line
 
 ASCII = {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 import lidargrit
-from lidargrit import _discovery, api
+from lidargrit import api
+from lidargrit.core import discovery
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = sorted((ROOT / "src").rglob("*.py"))
@@ -46,9 +47,9 @@ def test_what_is_exported_is_there():
 
 @pytest.mark.parametrize("kind", ["datasets", "sensors", "tokenizers", "generators", "metrics", "recipes", "cli"])
 def test_every_public_file_says_what_it_is(kind):
-    assert _discovery.names(kind)
-    for name in _discovery.names(kind):
-        assert 20 < len(_discovery.summary(kind, name)) < 180
+    assert discovery.names(kind)
+    for name in discovery.names(kind):
+        assert 20 < len(discovery.summary(kind, name)) < 180
 
 
 def test_nothing_of_this_machine_is_in_the_project():

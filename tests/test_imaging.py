@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 import torch
 
-from lidargrit import cli, formats
-from lidargrit.errors import ConfigError, ScanError
+from lidargrit import cli
+from lidargrit.core.errors import ConfigError, ScanError
+from lidargrit.core.reporting import Reporter
+from lidargrit.data import formats
+from lidargrit.data.prepared.config import DataConfig, ScanSettings
+from lidargrit.data.sources import open_source
 from lidargrit.evaluation.pairs import EvalSet, pair_for_protocol
 from lidargrit.evaluation.protocols import load_protocol
-from lidargrit.loading import DataConfig
-from lidargrit.loading.config import ScanSettings
-from lidargrit.projection import doubts_about_rays, inspect, project, projection_that_fits
-from lidargrit.reporting import Reporter
-from lidargrit.sensors import load_sensor
+from lidargrit.scans.projection import doubts_about_rays, inspect, project, projection_that_fits
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import Scan
 from lidargrit.simulator import simulate
-from lidargrit.sources import open_source
-from lidargrit.structures import Scan
 from lidargrit.viewer.scan_sets import load_scan_sets
 
 HDL64E = load_sensor("hdl64e_kitti_odometry")

@@ -11,9 +11,9 @@ import torch
 
 import lidargrit
 from lidargrit.cli import main
-from lidargrit.files import claim_folder
-from lidargrit.generators.lidargrit import LidarGrit
-from lidargrit.recipes import load_recipe
+from lidargrit.core.files import claim_folder
+from lidargrit.generation.presets import load_recipe
+from lidargrit.systems.lidargrit.system import LidarGrit
 from reference_weights import seeded_weights
 from test_dcgan import published as dusty_weights
 from test_r2dm import seeded_checkpoint as r2dm_checkpoint

@@ -7,25 +7,27 @@ import pytest
 import torch
 
 from lidargrit.cli import main
-from lidargrit.conditions import Condition
-from lidargrit.conditions.fills import fill, fill_lacking
-from lidargrit.conditions.hints import hints_of
-from lidargrit.datasets.kitti_odometry import KittiOdometry
-from lidargrit.errors import ConfigError
-from lidargrit.export import KittiTree
-from lidargrit.formats.numpy_array import NumpyArray
-from lidargrit.generators import load
-from lidargrit.generators.lidargrit import LidarGrit
-from lidargrit.loading import DataConfig, PreparedImages, damaged_shards, prepare
-from lidargrit.nn.completion_network import CompletionNetwork, CompletionNetworkConfig
-from lidargrit.nn.completion_objective import CompletionObjective
-from lidargrit.nn.raydrop_network import RaydropConfig, RaydropNetwork
-from lidargrit.nn.raydrop_objective import RaydropObjective
-from lidargrit.nn.semantic_classes import CLASSES, class_indices, labels_of
-from lidargrit.projection import project, unproject
-from lidargrit.sensors import load_sensor
-from lidargrit.simulator.labels import LABELS, OTHER_OBJECT, OTHER_STRUCTURE
-from lidargrit.structures import RangeImage
+from lidargrit.core.errors import ConfigError
+from lidargrit.data.datasets.kitti_odometry import KittiOdometry
+from lidargrit.data.export import KittiTree
+from lidargrit.data.formats.numpy_array import NumpyArray
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.prepared.prepare import damaged_shards, prepare
+from lidargrit.data.prepared.prepared import PreparedImages
+from lidargrit.generation.generator import load
+from lidargrit.generation.semantic_classes import CLASSES, class_indices, labels_of
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.fills import fill, fill_lacking
+from lidargrit.scans.labels import LABELS, OTHER_OBJECT, OTHER_STRUCTURE
+from lidargrit.scans.projection import project, unproject
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage
+from lidargrit.systems.completion_only.completion_network import CompletionNetwork, CompletionNetworkConfig
+from lidargrit.systems.completion_only.completion_objective import CompletionObjective
+from lidargrit.systems.completion_only.hints import hints_of
+from lidargrit.systems.lidargrit.system import LidarGrit
+from lidargrit.systems.raydrop.raydrop_network import RaydropConfig, RaydropNetwork
+from lidargrit.systems.raydrop.raydrop_objective import RaydropObjective
 from tiny_runs import every_fourth_row, learn
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)

@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from format_examples import example
-from lidargrit.errors import OutputError, ScanError
-from lidargrit.formats import load, read_scan
-from lidargrit.structures import Scan
+from lidargrit.core.errors import OutputError, ScanError
+from lidargrit.data.formats import load, read_scan
+from lidargrit.scans.types import Scan
 
 LAS = load("las")
 

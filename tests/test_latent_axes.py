@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from lidargrit.errors import ConfigError
-from lidargrit.generators.lidm import Lidm, LidmConfig
-from lidargrit.nn.latent_axes import LatentAxes
-from lidargrit.tokenizers.vqvae import VqvaeConfig
+from lidargrit.core.errors import ConfigError
+from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
+from lidargrit.systems.lidm.latent_axes import LatentAxes
+from lidargrit.systems.lidm.system import Lidm, LidmConfig
 from test_lidm import SENSOR, SMALL, made, walls
 
 CONFIG = LidmConfig(VqvaeConfig(32, (1, 1, 1), code_dim=8, num_codes=32), SMALL.denoiser, latent_axes=2)

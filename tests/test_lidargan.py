@@ -7,18 +7,18 @@ from dataclasses import replace
 import pytest
 import torch
 
-from lidargrit.conditions import Condition
-from lidargrit.errors import ConfigError, DataError
-from lidargrit.generators.lidargan import LidarGan, LidarGanConfig
-from lidargrit.generators.lidarvae import LidarVae, LidarVaeConfig, VaeSampling
-from lidargrit.loading import Pixels, Provenance, RangeImages
-from lidargrit.nn.filled_rows import FilledRows, distance_and_height, fill_holes, in_box
+from lidargrit.core.errors import ConfigError, DataError
+from lidargrit.data.images import Pixels, Provenance, RangeImages
+from lidargrit.generation.presets import load_recipe
 from lidargrit.nn.flops import flops_of
-from lidargrit.nn.lidargan import Decoder, Encoder, discriminator_loss, generator_loss, kl_nats, vae_loss
-from lidargrit.projection import project
-from lidargrit.recipes import load_recipe
-from lidargrit.sensors import load_sensor
-from lidargrit.structures import RangeImage, Scan
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.projection import project
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage, Scan
+from lidargrit.systems.lidargan.filled_rows import FilledRows, distance_and_height, fill_holes, in_box
+from lidargrit.systems.lidargan.networks import Decoder, Encoder, discriminator_loss, generator_loss, kl_nats, vae_loss
+from lidargrit.systems.lidargan.system import LidarGan, LidarGanConfig
+from lidargrit.systems.lidarvae.system import LidarVae, LidarVaeConfig, VaeSampling
 from lidargrit.training import compute
 from reference_weights import seeded_weights
 

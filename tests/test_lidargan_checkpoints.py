@@ -5,10 +5,10 @@ import torch
 
 import lidargrit
 from lidargrit.cli import main
-from lidargrit.errors import CheckpointError
-from lidargrit.generators.lidargan import LidarGan
-from lidargrit.generators.lidarvae import LidarVae
-from lidargrit.sensors import load_sensor
+from lidargrit.core.errors import CheckpointError
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.systems.lidargan.system import LidarGan
+from lidargrit.systems.lidarvae.system import LidarVae
 
 
 def checkpoint(cls):

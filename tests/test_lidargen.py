@@ -9,15 +9,21 @@ import torch
 
 import lidargrit
 from lidargrit.cli import main
-from lidargrit.conditions import Condition
-from lidargrit.errors import CheckpointError, ConfigError
-from lidargrit.generators.lidargen import LangevinSampling, LidarGen, LidarGenConfig, encode
-from lidargrit.nn.ncsn import InstanceNormPlus, Ncsn
-from lidargrit.nn.score_matching import langevin, noise_left, pull_towards, score_matching_errors, sigma_table
-from lidargrit.projection import project
-from lidargrit.recipes import load_recipe
-from lidargrit.sensors import load_sensor
-from lidargrit.structures import RangeImage, Scan
+from lidargrit.core.errors import CheckpointError, ConfigError
+from lidargrit.generation.presets import load_recipe
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.projection import project
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage, Scan
+from lidargrit.systems.lidargen.ncsn import InstanceNormPlus, Ncsn
+from lidargrit.systems.lidargen.score_matching import (
+    langevin,
+    noise_left,
+    pull_towards,
+    score_matching_errors,
+    sigma_table,
+)
+from lidargrit.systems.lidargen.system import LangevinSampling, LidarGen, LidarGenConfig, encode
 from reference_weights import seeded_weights
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)

@@ -9,19 +9,25 @@ import torch
 
 import lidargrit
 from lidargrit.cli import main
-from lidargrit.errors import CheckpointError, ConfigError
-from lidargrit.generators.lidargrit import LidarGrit
-from lidargrit.generators.lidm import Lidm, LidmConfig, LidmSampling, _latents
-from lidargrit.loading import DataConfig
-from lidargrit.nn import latent_diffusion
-from lidargrit.nn.encoding_cache import EncodingCache
-from lidargrit.nn.latent_unet import LatentUnet, LatentUnetConfig
-from lidargrit.recipes import load_recipe
-from lidargrit.sensors import load_sensor
-from lidargrit.structures import RangeImage, TokenGrid
-from lidargrit.tokenizers.curve_vqvae import CurveVqvae, CurveVqvaeConfig, decode_range, encode_range, return_threshold
-from lidargrit.tokenizers.vqvae import VqvaeConfig
-from lidargrit.training import Recipe
+from lidargrit.core.errors import CheckpointError, ConfigError
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.generation.encoding_cache import EncodingCache
+from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.settings import Recipe
+from lidargrit.generation.tokenizers.curve_vqvae import (
+    CurveVqvae,
+    CurveVqvaeConfig,
+    decode_range,
+    encode_range,
+    return_threshold,
+)
+from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage, TokenGrid
+from lidargrit.systems.lidargrit.system import LidarGrit
+from lidargrit.systems.lidm import latent_diffusion
+from lidargrit.systems.lidm.latent_unet import LatentUnet, LatentUnetConfig
+from lidargrit.systems.lidm.system import Lidm, LidmConfig, LidmSampling, _latents
 from lidargrit.training.taken_stages import taken_stages
 from reference_weights import seeded_weights
 from tiny_runs import the_one_line

@@ -13,25 +13,20 @@ import pytest
 import torch
 from fsspec.implementations.local import LocalFileSystem
 
-from lidargrit.datasets import open_dataset
-from lidargrit.datasets.kitti_odometry import KittiOdometry
-from lidargrit.errors import ConfigError, DataError, OutputError, ScanError
-from lidargrit.loading import (
-    Batches,
-    DataConfig,
-    PreparedImages,
-    Provenance,
-    RangeImages,
-    damaged_shards,
-    prepare,
-    shards,
-    workers,
-)
-from lidargrit.loading import prepare as prepare_function
-from lidargrit.projection import project
-from lidargrit.reporting import Reporter
-from lidargrit.sensors import load_sensor
-from lidargrit.sources import load_range_images
+from lidargrit.core.errors import ConfigError, DataError, OutputError, ScanError
+from lidargrit.core.reporting import Reporter
+from lidargrit.data.batches import Batches
+from lidargrit.data.datasets import open_dataset
+from lidargrit.data.datasets.kitti_odometry import KittiOdometry
+from lidargrit.data.images import Provenance, RangeImages
+from lidargrit.data.prepared import shards, workers
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.prepared.prepare import damaged_shards, prepare
+from lidargrit.data.prepared.prepare import prepare as prepare_function
+from lidargrit.data.prepared.prepared import PreparedImages
+from lidargrit.data.sources import load_range_images
+from lidargrit.scans.projection import project
+from lidargrit.scans.sensors import load_sensor
 
 prepare_module = sys.modules[prepare_function.__module__]
 SIMULATED = DataConfig(workers=1)
@@ -218,7 +213,7 @@ def test_a_bad_scan_met_by_another_process_is_told_here(tree, small_shards):
 KILLED_AND_FINISHED = """
 import os, signal, sys, time
 from pathlib import Path
-import lidargrit.loading as loading
+import lidargrit.data.prepared as loading
 folder = Path(sys.argv[1])
 sys.modules[loading.prepare.__module__]._SHARD_SCANS = 2
 

@@ -9,9 +9,12 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidargrit.configuration import override
-from lidargrit.errors import ConfigError
-from lidargrit.generators.maskgit import (
+from lidargrit.core.configuration import override
+from lidargrit.core.errors import ConfigError
+from lidargrit.generation.presets import load_recipe
+from lidargrit.nn.transformer import CausalTransformer, MaskedTransformer, TransformerConfig
+from lidargrit.scans.types import RangeImage
+from lidargrit.systems.maskgit.system import (
     HiddenTokens,
     MaskedSampling,
     MaskGit,
@@ -19,9 +22,6 @@ from lidargrit.generators.maskgit import (
     numbers_hidden,
     share_hidden,
 )
-from lidargrit.nn.transformer import CausalTransformer, MaskedTransformer, TransformerConfig
-from lidargrit.recipes import load_recipe
-from lidargrit.structures import RangeImage
 from lidargrit.training import train
 from tiny_runs import MODEL, SHORT, SIMULATED
 

@@ -1,4 +1,4 @@
-"""What every metric promises, asked of every file in ``metrics/`` and each of its variants."""
+"""What every metric promises, asked of every file in ``evaluation/metrics/`` and each of its variants."""
 
 import contextlib
 import functools
@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 import torch
 
-from lidargrit import _discovery
-from lidargrit.errors import ConfigError, DataError, UnknownNameError
-from lidargrit.metrics import Metric, load_metric
-from lidargrit.metrics._accumulators import SumAccumulator
-from lidargrit.metrics._networks.network import PretrainedNetwork
-from lidargrit.sensors import load_sensor
-from lidargrit.structures import MetricResult, RangeImage
+from lidargrit.core import discovery
+from lidargrit.core.errors import ConfigError, DataError, UnknownNameError
+from lidargrit.evaluation.metrics import Metric, load_metric
+from lidargrit.evaluation.metrics.shared.accumulators import SumAccumulator
+from lidargrit.evaluation.metrics.shared.networks.network import PretrainedNetwork
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import MetricResult, RangeImage
 from seeded_networks import weights_folder
 
-CASES = [(name, variant) for name in _discovery.names("metrics") for variant in load_metric(name).variants]
+CASES = [(name, variant) for name in discovery.names("metrics") for variant in load_metric(name).variants]
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(128)
 SMALL = replace(SENSOR, elevation_rad=SENSOR.elevation_rad[::8]).with_columns(32)
 

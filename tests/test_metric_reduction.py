@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from lidargrit import metrics
-from lidargrit.metrics import load_metric
-from lidargrit.sensors import load_sensor
-from lidargrit.structures import RangeImage
+from lidargrit.evaluation import metrics
+from lidargrit.evaluation.metrics import load_metric
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage
 
 PROCESS = """
 import pickle, sys
@@ -56,9 +56,9 @@ def test_two_processes_have_the_number_of_one(tmp_path):
 
 
 def test_a_metric_is_imported_by_the_name_of_its_class():
-    from lidargrit.metrics import SlicedWasserstein
+    from lidargrit.evaluation.metrics import SlicedWasserstein
 
     assert SlicedWasserstein is load_metric("sliced_wasserstein")
     with pytest.raises(ImportError, match="SlicedWassertein"):
-        from lidargrit.metrics import SlicedWassertein  # noqa: F401
+        from lidargrit.evaluation.metrics import SlicedWassertein  # noqa: F401
     assert not hasattr(metrics, "sliced_wasserstien")

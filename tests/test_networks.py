@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 import torch
 
-from lidargrit.errors import ConfigError, DataError, WeightsError
-from lidargrit.metrics import load_metric
-from lidargrit.metrics._networks.features import NormalisedImages, UnitClouds
-from lidargrit.metrics._networks.network import NETWORKS, filled, load_network
-from lidargrit.metrics._networks.pointnet import PointNet
-from lidargrit.metrics._networks.rangenet import chosen_values
-from lidargrit.projection import points_of_pixels
-from lidargrit.sensors import load_sensor
-from lidargrit.structures import RangeImage
+from lidargrit.core.errors import ConfigError, DataError, WeightsError
+from lidargrit.evaluation.metrics import load_metric
+from lidargrit.evaluation.metrics.shared.networks.features import NormalisedImages, UnitClouds
+from lidargrit.evaluation.metrics.shared.networks.network import NETWORKS, filled, load_network
+from lidargrit.evaluation.metrics.shared.networks.pointnet import PointNet
+from lidargrit.evaluation.metrics.shared.networks.rangenet import chosen_values
+from lidargrit.scans.projection import points_of_pixels
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage
 from reference_weights import seeded_weights
 from seeded_networks import weights, weights_folder
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from lidargrit.errors import ConfigError
-from lidargrit.nn.latent_unet import LatentUnet
-from lidargrit.recipes import load_recipe
-from lidargrit.tokenizers import make_tokenizer
+from lidargrit.core.errors import ConfigError
+from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.tokenizers import make_tokenizer
+from lidargrit.systems.lidm.latent_unet import LatentUnet
 
 
 @pytest.mark.parametrize("recipe", ["lidm_small", "lidm_shared_small"])

@@ -6,15 +6,15 @@ import pytest
 import torch
 from torch import nn
 
-from lidargrit.errors import ConfigError
-from lidargrit.loading import DataConfig
-from lidargrit.nn.objective import Objective
+from lidargrit.core.errors import ConfigError
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.sources import load_range_images
+from lidargrit.generation.objective import Objective
+from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.settings import FitConfig
+from lidargrit.generation.tokenizers.vqvae import Vqvae
 from lidargrit.nn.transformer import CausalTransformer, TransformerConfig
-from lidargrit.recipes import load_recipe
-from lidargrit.sensors import load_sensor
-from lidargrit.sources import load_range_images
-from lidargrit.tokenizers.vqvae import Vqvae
-from lidargrit.training import FitConfig
+from lidargrit.scans.sensors import load_sensor
 from lidargrit.training.checkpoint import load_checkpoint, save_checkpoint
 from lidargrit.training.engine import Engine
 from lidargrit.training.optimiser import WeightAverage, learning_rate_at, make_optimiser

@@ -10,14 +10,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidargrit.datasets import load, open_dataset
-from lidargrit.errors import DataError, OutputError, ScanError
-from lidargrit.formats import count_scans, read_scan
-from lidargrit.formats import load as load_format
-from lidargrit.projection import project
-from lidargrit.sensors import load_sensor
+from lidargrit.core.errors import DataError, OutputError, ScanError
+from lidargrit.data.datasets import load, open_dataset
+from lidargrit.data.formats import count_scans, read_scan
+from lidargrit.data.formats import load as load_format
+from lidargrit.scans.projection import project
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import Scan
 from lidargrit.simulator import simulate
-from lidargrit.structures import Scan
 
 # x right, y forward, z up, intensity, laser from the lowest
 SWEEP = np.array([[3, 40, 1, 255, 31], [-5, 2, -1, 51, 0], [0.1, -0.4, 0.2, 7, 3]], dtype="<f4")

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from lidargrit.datasets import open_dataset
-from lidargrit.errors import ScanError
-from lidargrit.formats import count_scans, ouster_pcap, read_scan
-from lidargrit.formats._packets import check_packets
-from lidargrit.sensors import load_sensor
+from lidargrit.core.errors import ScanError
+from lidargrit.data.datasets import open_dataset
+from lidargrit.data.formats import count_scans, ouster_pcap, read_scan
+from lidargrit.data.formats.shared.packets import check_packets
+from lidargrit.scans.sensors import load_sensor
 
 
 def one_line(refusal) -> str:

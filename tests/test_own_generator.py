@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-import lidargrit.generators
-import lidargrit.recipes
+import lidargrit.generation.presets
+import lidargrit.systems
 import test_generator_contract as contract
-from lidargrit import _discovery
 from lidargrit.cli import main
-from lidargrit.errors import ConfigError, UnknownNameError
-from lidargrit.generators import load
-from lidargrit.recipes import default_recipe, load_recipe
+from lidargrit.core import discovery
+from lidargrit.core.errors import ConfigError, UnknownNameError
+from lidargrit.generation.generator import load
+from lidargrit.generation.presets import default_recipe, load_recipe
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs/how-to/own-generator.md").read_text(encoding="utf-8")
@@ -26,13 +26,13 @@ QUICK = ["data.train=[simulated:2:train]", "data.val=[simulated:2:val]", "data.w
 @pytest.fixture
 def code(tmp_path, monkeypatch):
     """Add a folder to the generators in which the page's file lies, and return the path of the file."""
-    ours = _discovery._folder("generators")
-    folder = tmp_path / "generators"
-    shutil.copytree(ours, folder, ignore=shutil.ignore_patterns("__pycache__"))
-    find = _discovery._folder
-    monkeypatch.setattr(_discovery, "_folder", lambda package: folder if package == "generators" else find(package))
-    monkeypatch.setattr(lidargrit.generators, "__path__", [*lidargrit.generators.__path__, str(folder)])
-    path = folder / "mean_street.py"
+    folder, find = tmp_path / "systems", discovery._packages
+    shutil.copytree(lidargrit.systems.__path__[0], folder, ignore=shutil.ignore_patterns("__pycache__"))
+    systems = {lidargrit.systems.__name__: folder}
+    monkeypatch.setattr(discovery, "_packages", lambda kind: systems if kind == "generators" else find(kind))
+    monkeypatch.setattr(lidargrit.systems, "__path__", [*lidargrit.systems.__path__, str(folder)])
+    path = folder / "mean_street" / "system.py"
+    path.parent.mkdir()
     path.write_text(re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)[0], encoding="utf-8")
     return path
 
@@ -40,7 +40,7 @@ def code(tmp_path, monkeypatch):
 def test_the_file_of_the_page_is_compared_without_a_recipe(code, tmp_path, capsys, monkeypatch):
     lines = [line for line in code.read_text().splitlines() if line and not line.startswith(("import", "from", '"""'))]
     assert len(lines) < 40
-    monkeypatch.setattr(lidargrit.recipes, "_SCANS", 8)
+    monkeypatch.setattr(lidargrit.generation.presets, "_SCANS", 8)
     words = ["compare", str(tmp_path / "table"), "marginal", "mean_street", "--against", "simulated:2:test", "-n", "2"]
     words += ["--metrics", "bev_jsd", "--json", str(tmp_path / "table.json"), "--set", *QUICK]
     assert main(words) == 0
@@ -67,7 +67,8 @@ def test_a_default_recipe_needs_defaults_and_a_known_name(code):
     assert (recipe.model.start_m, list(recipe.training)) == (20.0, ["mean"])
     with pytest.raises(UnknownNameError, match="which is not among the recipes"):
         load_recipe("mean_streets")
-    other = code.with_name("without_default.py")
+    other = code.parents[1] / "without_default" / "system.py"
+    other.parent.mkdir()
     other.write_text(code.read_text().replace("start_m: float = 10.0", "start_m: float"), encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"without_default without a recipe .* add recipes/without_default\.py"):
+    with pytest.raises(ConfigError, match=r"without_default without a recipe .* add systems/without_default/presets"):
         default_recipe("without_default")

@@ -5,9 +5,9 @@ from dataclasses import replace
 import torch
 
 import lidargrit
-from lidargrit.formats import load
-from lidargrit.sensors import load_sensor
-from lidargrit.structures import RangeImage
+from lidargrit.data.formats import load
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage
 from lidargrit.viewer.interactive import write_page
 from lidargrit.viewer.scan_sets import ScanSet
 from served import running

@@ -10,12 +10,12 @@ from scipy.integrate import quad
 from scipy.stats import kstest, norm
 from torch import Tensor
 
-from lidargrit.errors import ConfigError
-from lidargrit.nn import phase_noise
-from lidargrit.nn.phase_noise import PhaseNoise
-from lidargrit.nn.pixel_decoder import PixelSampling
-from lidargrit.nn.pixel_phases import Phase, phases_of
-from lidargrit.structures import RangeImage
+from lidargrit.core.errors import ConfigError
+from lidargrit.generation.pixel_decoder import phase_noise
+from lidargrit.generation.pixel_decoder.phase_noise import PhaseNoise
+from lidargrit.generation.pixel_decoder.pixel_decoder import PixelSampling
+from lidargrit.generation.pixel_decoder.pixel_phases import Phase, phases_of
+from lidargrit.scans.types import RangeImage
 from pixel_decoder_examples import random_decoded, random_decoder, random_images, tiny_sensor
 
 PHASES = phases_of(4)

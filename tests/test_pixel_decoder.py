@@ -10,14 +10,20 @@ import pytest
 import torch
 from torch import Tensor
 
-from lidargrit.conditions import Condition
-from lidargrit.errors import ConfigError
-from lidargrit.nn.pixel_decoder import PixelDecoder, PixelSampling, nats_to_range_bits
-from lidargrit.nn.pixel_networks import Guide, PixelDecoderConfig
-from lidargrit.nn.pixel_phases import at_phases, completed_lattices, generated_before, join_phases, phases_of
+from lidargrit.core.errors import ConfigError
+from lidargrit.generation.pixel_decoder.pixel_decoder import PixelDecoder, PixelSampling, nats_to_range_bits
+from lidargrit.generation.pixel_decoder.pixel_networks import Guide, PixelDecoderConfig
+from lidargrit.generation.pixel_decoder.pixel_phases import (
+    at_phases,
+    completed_lattices,
+    generated_before,
+    join_phases,
+    phases_of,
+)
 from lidargrit.nn.precision import Precision
-from lidargrit.sensors import load_sensor
-from lidargrit.structures import Decoded, RangeImage
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import Decoded, RangeImage
 from mixture_loops import density_of_v
 from pixel_decoder_examples import FEATURES, random_decoded, random_decoder, random_images, tiny_sensor
 

@@ -13,13 +13,24 @@ import pytest
 import torch
 
 from lidargrit.cli import main
-from lidargrit.conditions import Condition
-from lidargrit.errors import ConfigError
+from lidargrit.core.errors import ConfigError
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.sources import load_range_images
 from lidargrit.evaluation.estimates import Estimate
 from lidargrit.evaluation.likelihood import _maps, score_likelihood
-from lidargrit.generators import lidargrit, load
-from lidargrit.generators._batches import in_batches
-from lidargrit.generators.lidargrit import (
+from lidargrit.generation.batches import in_batches
+from lidargrit.generation.generator import load
+from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
+from lidargrit.generation.range_steps import RangeSteps
+from lidargrit.generation.settings import FitConfig, Recipe
+from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
+from lidargrit.nn.decoding import CachedDecoder
+from lidargrit.nn.transformer import TransformerConfig
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage
+from lidargrit.systems.lidargrit import system as lidargrit
+from lidargrit.systems.lidargrit.system import (
     START_TOKEN,
     LidarGrit,
     LidarGritConfig,
@@ -27,17 +38,8 @@ from lidargrit.generators.lidargrit import (
     after_start,
     sample_token,
 )
-from lidargrit.generators.maskgit import MaskedSampling, MaskGit, MaskGitConfig
-from lidargrit.loading import DataConfig
-from lidargrit.nn.decoding import CachedDecoder
-from lidargrit.nn.pixel_networks import PixelDecoderConfig
-from lidargrit.nn.range_steps import RangeSteps
-from lidargrit.nn.transformer import TransformerConfig
-from lidargrit.sensors import load_sensor
-from lidargrit.sources import load_range_images
-from lidargrit.structures import RangeImage
-from lidargrit.tokenizers.vqvae import VqvaeConfig
-from lidargrit.training import FitConfig, Recipe, train
+from lidargrit.systems.maskgit.system import MaskedSampling, MaskGit, MaskGitConfig
+from lidargrit.training import train
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(512, stride=8)  # 64x64 pixels
 TOKENIZER = VqvaeConfig(

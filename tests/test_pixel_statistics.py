@@ -4,15 +4,16 @@ import numpy as np
 import pytest
 import torch
 
+from lidargrit.data.images import Pixels, Provenance, RangeImages
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.sources import load_range_images
 from lidargrit.evaluation import pixel_statistics as module
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
 from lidargrit.evaluation.pixel_statistics import pixel_statistics
-from lidargrit.loading import DataConfig, Pixels, Provenance, RangeImages
-from lidargrit.sensors import load_sensor
-from lidargrit.sources import load_range_images
-from lidargrit.structures import RangeImage
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
 

@@ -7,12 +7,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.distance import cdist, jensenshannon
 
-from lidargrit.metrics import _clouds, _farthest_points, _matching, load_metric, update_together
-from lidargrit.metrics import point_cloud_jsd as jsd
-from lidargrit.metrics._clouds import bits_reversed, sampled_clouds
-from lidargrit.metrics._farthest_points import farthest_points
-from lidargrit.sensors import SensorModel, column_azimuths_rad
-from lidargrit.structures import RangeImage
+from lidargrit.evaluation.metrics import load_metric, update_together
+from lidargrit.evaluation.metrics import point_cloud_jsd as jsd
+from lidargrit.evaluation.metrics.shared import clouds as _clouds
+from lidargrit.evaluation.metrics.shared import farthest_points as _farthest_points
+from lidargrit.evaluation.metrics.shared import matching
+from lidargrit.evaluation.metrics.shared.clouds import bits_reversed, sampled_clouds
+from lidargrit.evaluation.metrics.shared.farthest_points import farthest_points
+from lidargrit.scans.sensors import SensorModel, column_azimuths_rad
+from lidargrit.scans.types import RangeImage
 
 SENSOR = SensorModel("small", torch.linspace(0.05, -0.4, 16)[:, None], column_azimuths_rad(64), 1.0, 80.0, "spherical")
 MATCHING = ["minimum_matching_distance", "coverage", "one_nearest_neighbour"]
@@ -53,13 +56,13 @@ def test_farthest_points_are_the_programs(golden):
 @pytest.mark.shared
 def test_chamfer_matrices_are_the_programs(golden):
     data = golden("pointset")
-    assert np.allclose(_matching.chamfer_matrix(data["ref"], data["gen"]), data["M_rg"], atol=1e-6)
+    assert np.allclose(matching.chamfer_matrix(data["ref"], data["gen"]), data["M_rg"], atol=1e-6)
     for side, key in (("ref", "M_rr"), ("gen", "M_gg")):
-        ours = _matching.chamfer_matrix(data[side])
+        ours = matching.chamfer_matrix(data[side])
         assert np.isposinf(np.diag(ours)).all()
         off = ~np.eye(len(ours), dtype=bool)
         assert np.allclose(ours[off], data[key][off], atol=1e-6)
-    assert _matching.chamfer_distance(data["ref"][3], data["gen"][5]) == pytest.approx(data["M_rg"][3, 5], abs=1e-7)
+    assert matching.chamfer_distance(data["ref"][3], data["gen"][5]) == pytest.approx(data["M_rg"][3, 5], abs=1e-7)
 
 
 @pytest.mark.shared
@@ -168,20 +171,20 @@ def slow_chamfer(first, second):
 @given(st.integers(0, 2**31), st.integers(1, 30), st.integers(1, 30), st.floats(0.01, 0.5))
 def test_chamfer_distance_is_that_of_a_slow_loop(seed, n, m, scale):
     first, second = random_clouds(seed, 1, n, scale)[0], random_clouds(seed + 1, 1, m, scale)[0]
-    ours = _matching.chamfer_distance(first, second)
+    ours = matching.chamfer_distance(first, second)
     assert ours == pytest.approx(slow_chamfer(first, second), rel=1e-9)
-    assert ours == pytest.approx(_matching.chamfer_distance(second, first), rel=1e-12)
-    assert _matching.chamfer_distance(first, first) == 0
+    assert ours == pytest.approx(matching.chamfer_distance(second, first), rel=1e-12)
+    assert matching.chamfer_distance(first, first) == 0
     shuffled = np.random.default_rng(seed).permutation(first)
-    assert _matching.chamfer_distance(shuffled, first) == 0
+    assert matching.chamfer_distance(shuffled, first) == 0
 
 
 def test_chamfer_matrix_is_right_to_a_millionth():
     first, second = random_clouds(0, 6, 100), random_clouds(1, 5, 100)
     slow = [[slow_chamfer(a, b) for b in second] for a in first]
-    assert np.allclose(_matching.chamfer_matrix(first, second), slow, rtol=0, atol=1e-6)
+    assert np.allclose(matching.chamfer_matrix(first, second), slow, rtol=0, atol=1e-6)
     near = np.clip(first, -0.57, 0.57)  # in the unit sphere, all but equal: what cancels is as large as it gets
-    assert np.abs(_matching.chamfer_matrix(near, near)[np.arange(6), np.arange(6)]).max() < 1e-6
+    assert np.abs(matching.chamfer_matrix(near, near)[np.arange(6), np.arange(6)]).max() < 1e-6
 
 
 def slow_scores(generated, real):

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lidargrit.errors import ConfigError
-from lidargrit.sensors import load_sensor
-from lidargrit.simulator import labels, materials
+from lidargrit.core.errors import ConfigError
+from lidargrit.scans import labels
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.simulator import materials
 from lidargrit.simulator.beams import Beams
 from lidargrit.simulator.kitti_car import hidden_by_car
 from lidargrit.simulator.mesh import Mesh

@@ -10,11 +10,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lidargrit.datasets.kitti_odometry import KittiOdometry
-from lidargrit.errors import DataError, OutputError, ScanError
-from lidargrit.files import claim_folder
-from lidargrit.loading import DataConfig, PreparedImages, damaged_shards, prepare
-from lidargrit.loading.shards import LocalBytes
+from lidargrit.core.errors import DataError, OutputError, ScanError
+from lidargrit.core.files import claim_folder
+from lidargrit.data.datasets.kitti_odometry import KittiOdometry
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.prepared.prepare import damaged_shards, prepare
+from lidargrit.data.prepared.prepared import PreparedImages
+from lidargrit.data.prepared.shards import LocalBytes
 
 prepare_module = sys.modules[prepare.__module__]
 CONFIG = DataConfig(workers=1, columns=512, column_stride=8)

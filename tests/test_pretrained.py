@@ -13,15 +13,15 @@ import torch
 import lidargrit
 from lidargrit import project, simulate, unproject
 from lidargrit.cli import main
-from lidargrit.errors import CheckpointError
-from lidargrit.files import read_tensors
-from lidargrit.generators import Generator, load
-from lidargrit.recipes import load_recipe
-from lidargrit.run_folder import locate
-from lidargrit.serving import finished_runs
-from lidargrit.sources.samples import read_samples
-from lidargrit.structures import RangeImage
+from lidargrit.core.errors import CheckpointError
+from lidargrit.core.files import read_tensors
+from lidargrit.data.run_folder import locate
+from lidargrit.data.sources.samples import read_samples
+from lidargrit.generation.generator import Generator, load
+from lidargrit.generation.presets import load_recipe
+from lidargrit.scans.types import RangeImage
 from lidargrit.training.compute import uniform_images
+from lidargrit.viewer.serve import finished_runs
 from tiny_runs import the_one_line
 
 FOLDER = Path(lidargrit.__file__).parent / "pretrained"

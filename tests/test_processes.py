@@ -12,21 +12,21 @@ from pathlib import Path
 import pytest
 import torch
 
-from lidargrit.errors import ConfigError
-from lidargrit.files import read_tensors
-from lidargrit.generators.multiscale import Multiscale
-from lidargrit.loading import DataConfig
-from lidargrit.nn.objective import Objective
-from lidargrit.nn.phase_noise import PhaseNoise
-from lidargrit.nn.pixel_phases import phases_of
+from lidargrit.core.errors import ConfigError
+from lidargrit.core.files import read_tensors
+from lidargrit.core.reporting import Reporter
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.sources import load_range_images
+from lidargrit.generation.objective import Objective
+from lidargrit.generation.pixel_decoder.phase_noise import PhaseNoise
+from lidargrit.generation.pixel_decoder.pixel_phases import phases_of
+from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.settings import FitConfig
+from lidargrit.generation.tokenizers.vqvae import Vqvae
 from lidargrit.nn.processes import of_first_process
-from lidargrit.recipes import load_recipe
-from lidargrit.reporting import Reporter
-from lidargrit.sensors import load_sensor
-from lidargrit.sources import load_range_images
-from lidargrit.structures import RangeImage
-from lidargrit.tokenizers.vqvae import Vqvae
-from lidargrit.training import FitConfig
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage
+from lidargrit.systems.multiscale.system import Multiscale
 from lidargrit.training.engine import Engine
 from lidargrit.training.fit import Fit, begin_training
 from lidargrit.training.optimiser import make_optimiser

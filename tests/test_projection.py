@@ -8,14 +8,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidargrit import _discovery
-from lidargrit.errors import ConfigError, ScanError
-from lidargrit.projection import RangeEncoding, index_map, inspect, project, unproject
-from lidargrit.sensors import SensorModel, column_azimuths_rad, load_sensor
+from lidargrit.core import discovery
+from lidargrit.core.errors import ConfigError, ScanError
+from lidargrit.scans.projection import RangeEncoding, index_map, inspect, project, unproject
+from lidargrit.scans.sensors import SensorModel, column_azimuths_rad, load_sensor
+from lidargrit.scans.types import RangeImage, Scan
 from lidargrit.simulator import simulate
-from lidargrit.structures import RangeImage, Scan
 
-SENSORS = _discovery.names("sensors")
+SENSORS = discovery.names("sensors")
 
 
 def random_image(sensor, seed, share=0.7):

@@ -10,13 +10,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidargrit import _discovery
-from lidargrit.errors import ScanError
-from lidargrit.projection import index_map, project
-from lidargrit.projection.pixel_coordinates import pixel_coordinates
-from lidargrit.sensors import SensorModel, column_azimuths_rad, load_sensor
+from lidargrit.core import discovery
+from lidargrit.core.errors import ScanError
+from lidargrit.scans.projection import index_map, project
+from lidargrit.scans.projection.pixel_coordinates import pixel_coordinates
+from lidargrit.scans.sensors import SensorModel, column_azimuths_rad, load_sensor
+from lidargrit.scans.types import Scan
 from lidargrit.simulator import simulate
-from lidargrit.structures import Scan
 
 _FILE = Path(__file__).resolve().parents[1] / "benchmarks" / "projection.py"
 _spec = importlib.util.spec_from_file_location("benchmark_projection", _FILE)
@@ -31,7 +31,7 @@ def sensor_of(elevation_deg, width):
     return SensorModel("of a test", elevation_rad, column_azimuths_rad(width), 0.9, 120.0, "spherical")
 
 
-SENSORS = {name: load_sensor(name) for name in _discovery.names("sensors")} | {
+SENSORS = {name: load_sensor(name) for name in discovery.names("sensors")} | {
     "to the zenith": sensor_of([89.9, 60.0, 30.0, 0.0, -89.9], 360),
     "dense": sensor_of(np.linspace(0.3, -0.3, 256).tolist(), 65536),
     "one row": sensor_of([3.0], 1),

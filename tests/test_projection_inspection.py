@@ -11,15 +11,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidargrit import _discovery
 from lidargrit.cli import main
-from lidargrit.projection import closest_sensor, inspect, project, unproject
-from lidargrit.projection.fit import sensors_that_fit
-from lidargrit.projection.inspection import FATES, as_json, as_table
-from lidargrit.projection.pixel_coordinates import pixel_coordinates
-from lidargrit.sensors import load_sensor
+from lidargrit.core import discovery
+from lidargrit.scans.projection import closest_sensor, inspect, project, unproject
+from lidargrit.scans.projection.inspection import FATES, as_json, as_table
+from lidargrit.scans.projection.pixel_coordinates import pixel_coordinates
+from lidargrit.scans.projection.sensor_check import sensors_that_fit
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage, Scan
 from lidargrit.simulator import simulate
-from lidargrit.structures import RangeImage, Scan
 from lidargrit.viewer.inspection import plot_inspection
 
 
@@ -130,7 +130,7 @@ def test_a_scan_that_does_not_fit_is_reported_not_refused():
     json.dumps(as_json(nothing))
 
 
-@pytest.mark.parametrize("name", [*_discovery.names("sensors")])
+@pytest.mark.parametrize("name", [*discovery.names("sensors")])
 def test_the_closest_sensor_is_the_one_that_made_the_scan(name):
     sensor = load_sensor(name).with_columns(360)
     every = torch.ones(sensor.height, 360)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from lidargrit.projection import index_map, project
-from lidargrit.sensors import load_sensor
-from lidargrit.structures import Scan
+from lidargrit.scans.projection import index_map, project
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import Scan
 
 SYNTHETIC = ["projection_0", "projection_1", "projection_corner", "projection_rings20", "projection_rings70"]
 REAL = ["real_kitti360_drive0000_0000000000", "real_odometry00_000095"]
@@ -56,7 +56,7 @@ def test_reference_index_map_is_the_programs(golden, shared, name, method, key):
 )
 @pytest.mark.parametrize("index", [0, 1])
 def test_reference_range_image_and_network_input(golden, name, sensor_name, columns, stride, index):
-    from lidargrit.projection import RangeEncoding
+    from lidargrit.scans.projection import RangeEncoding
 
     data = golden(name)
     sensor = load_sensor(sensor_name).with_columns(columns, stride)
@@ -78,8 +78,8 @@ def test_reference_range_image_and_network_input(golden, name, sensor_name, colu
 def test_decoding_and_unprojecting_through_a_measured_angle_table(golden, key, sensor_name):
     from dataclasses import replace
 
-    from lidargrit.projection import RangeEncoding, points_of_pixels
-    from lidargrit.structures import RangeImage
+    from lidargrit.scans.projection import RangeEncoding, points_of_pixels
+    from lidargrit.scans.types import RangeImage
 
     data = golden("lidargrit_depth_xyz")
     base = load_sensor(sensor_name)

@@ -17,21 +17,22 @@ import yaml
 from PIL import Image
 
 import lidargrit
-from lidargrit import configuration
 from lidargrit.cli import main
-from lidargrit.datasets import _files, data_set_and_split, load, open_dataset
-from lidargrit.datasets import folder as folder_of_scans
-from lidargrit.datasets.kitti_odometry import KittiOdometry
-from lidargrit.errors import CheckpointError, ConfigError
-from lidargrit.files import write_json
-from lidargrit.generators import Generator
-from lidargrit.generators.lidargrit import LidarGrit
-from lidargrit.generators.marginal import Marginal
-from lidargrit.loading import Provenance
+from lidargrit.core import configuration
+from lidargrit.core.errors import CheckpointError, ConfigError
+from lidargrit.core.files import write_json
+from lidargrit.data.datasets import data_set_and_split, load, open_dataset
+from lidargrit.data.datasets import folder as folder_of_scans
+from lidargrit.data.datasets.kitti_odometry import KittiOdometry
+from lidargrit.data.datasets.shared import files as _files
+from lidargrit.data.images import Provenance
+from lidargrit.data.sources import data_set_of
+from lidargrit.generation.generator import Generator
+from lidargrit.generation.presets import load_recipe
 from lidargrit.publishing import publish
 from lidargrit.publishing.card import model_card
-from lidargrit.recipes import load_recipe
-from lidargrit.sources import data_set_of
+from lidargrit.systems.lidargrit.system import LidarGrit
+from lidargrit.systems.marginal.system import Marginal
 from lidargrit.training.taken_stages import taken_facts
 from tiny_runs import MODEL, SHORT, contents, the_one_line
 
@@ -229,8 +230,10 @@ def test_a_folder_begun_for_another_run_is_refused(run, tmp_path, capsys):
 
 def test_no_source_of_a_run_is_searched(monkeypatch):
     """A run's own words about its data may name anything, such as the root of the disk."""
-    monkeypatch.setattr("lidargrit.datasets._files.scans_below", lambda root: pytest.fail(f"searches {root}"))
-    monkeypatch.setattr("lidargrit.datasets.folder.scans_below", lambda root: pytest.fail(f"searches {root}"))
+    monkeypatch.setattr(
+        "lidargrit.data.datasets.shared.files.scans_below", lambda root: pytest.fail(f"searches {root}")
+    )
+    monkeypatch.setattr("lidargrit.data.datasets.folder.scans_below", lambda root: pytest.fail(f"searches {root}"))
     for source in ("/", "/::all", str(Path.home()), "."):
         assert data_set_of(source)[0] in ("", "folder")
 

@@ -4,13 +4,13 @@ import pytest
 import torch
 
 from lidargrit.cli import main
-from lidargrit.errors import CheckpointError
-from lidargrit.files import read_tensors, write_tensors
-from lidargrit.generators import load
-from lidargrit.generators.dusty import Dusty
+from lidargrit.core.errors import CheckpointError
+from lidargrit.core.files import read_tensors, write_tensors
+from lidargrit.data.run_folder import WEIGHTS_FILE
+from lidargrit.generation.generator import load
 from lidargrit.nn.quantization import quantize, with_quantized, without_quantized
-from lidargrit.run_folder import WEIGHTS_FILE
-from lidargrit.sensors import load_sensor
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.systems.dusty.system import Dusty
 from tiny_runs import the_one_line
 
 SENSOR = load_sensor("hdl64e_kitti_odometry")

@@ -6,16 +6,16 @@ import math
 import pytest
 import torch
 
-from lidargrit import _discovery
-from lidargrit.conditions import Condition
-from lidargrit.errors import CheckpointError, ConfigError
-from lidargrit.generators._log_range import encode
-from lidargrit.generators.r2dm import DiffusionSampling, R2dm, R2dmConfig, load_published
+from lidargrit.core import discovery
+from lidargrit.core.errors import CheckpointError, ConfigError
+from lidargrit.data.sources.samples import read_samples, write_samples
+from lidargrit.generation.range_values import encode
 from lidargrit.nn.flops import flops_of
-from lidargrit.nn.unet import EfficientUnet, UnetConfig
-from lidargrit.sensors import load_sensor
-from lidargrit.sources.samples import read_samples, write_samples
-from lidargrit.structures import RangeImage
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage
+from lidargrit.systems.r2dm.system import DiffusionSampling, R2dm, R2dmConfig, load_published
+from lidargrit.systems.r2dm.unet import EfficientUnet, UnetConfig
 from reference_unet import SlowUnet
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
@@ -207,7 +207,7 @@ def test_sizes_that_the_weights_do_not_have_are_refused_before_a_network_is_buil
             load_published(tmp_path / "weights.pth")
 
 
-@pytest.mark.parametrize("name", _discovery.names("sensors"))
+@pytest.mark.parametrize("name", discovery.names("sensors"))
 def test_a_value_beyond_the_far_limit_is_cut_to_it_and_keeps_its_return(name):
     """The program cuts values to [-1, 1]; in 32 bits the limit of 80 m decodes to just below 80 m, so it is kept."""
     sensor = load_sensor(name).with_columns(32)

@@ -8,15 +8,15 @@ import torch
 
 import lidargrit
 from lidargrit.cli import main
-from lidargrit.errors import CheckpointError, ConfigError
-from lidargrit.generators._flow import FlowPairs, ReflowConfig, as_kept
-from lidargrit.generators._log_range import decode, encode
-from lidargrit.generators.r2flow import FlowSampling, R2flow, R2flowConfig
-from lidargrit.nn import flow
-from lidargrit.nn.hdit import Hdit, HditConfig
-from lidargrit.recipes import load_recipe
-from lidargrit.sensors import load_sensor
-from lidargrit.structures import RangeImage
+from lidargrit.core.errors import CheckpointError, ConfigError
+from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.range_values import decode, encode
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage
+from lidargrit.systems.r2flow import flow
+from lidargrit.systems.r2flow.hdit import Hdit, HditConfig
+from lidargrit.systems.r2flow.rectified_flow import FlowPairs, ReflowConfig, as_kept
+from lidargrit.systems.r2flow.system import FlowSampling, R2flow, R2flowConfig
 from lidargrit.training import compute
 from lidargrit.training.taken_stages import taken_stages
 from test_hdit import reference_network

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from lidargrit.nn.pixel_phases import Phase, phases_of
-from lidargrit.nn.range_candidates import RangeCandidates
-from lidargrit.sensors import SensorModel
-from lidargrit.structures import RangeImage
+from lidargrit.generation.pixel_decoder.pixel_phases import Phase, phases_of
+from lidargrit.generation.pixel_decoder.range_candidates import RangeCandidates
+from lidargrit.scans.sensors import SensorModel
+from lidargrit.scans.types import RangeImage
 from pixel_decoder_examples import random_images, tiny_sensor
 
 ROWS, COLUMNS = 16, 64

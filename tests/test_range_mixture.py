@@ -10,9 +10,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from lidargrit.nn.range_mixture import RangeMixture
-from lidargrit.nn.range_steps import RangeSteps
-from lidargrit.sensors import load_sensor
+from lidargrit.generation.pixel_decoder.range_mixture import RangeMixture
+from lidargrit.generation.range_steps import RangeSteps
+from lidargrit.scans.sensors import load_sensor
 from mixture_loops import density_of_v, mass_between
 
 SENSOR = load_sensor("hdl64e_kitti_odometry")

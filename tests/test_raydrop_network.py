@@ -5,19 +5,20 @@ from dataclasses import replace
 import pytest
 import torch
 
-from lidargrit.conditions import Condition, fills
-from lidargrit.conditions.fills import ranges_from_others
-from lidargrit.conditions.marks import read_marks
-from lidargrit.datasets import open_dataset
-from lidargrit.errors import ConfigError
+from lidargrit.core.errors import ConfigError
+from lidargrit.data.datasets import open_dataset
 from lidargrit.evaluation.realism import simulate_pair
-from lidargrit.generators import load
-from lidargrit.generators.lidargrit import LidarGrit, TokenSampling
-from lidargrit.nn.raydrop_network import RaydropConfig, RaydropNetwork
-from lidargrit.nn.raydrop_objective import RaydropObjective
-from lidargrit.projection import project
-from lidargrit.sensors import load_sensor
-from lidargrit.structures import RangeImage
+from lidargrit.generation.generator import load
+from lidargrit.scans import fills
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.fills import ranges_from_others
+from lidargrit.scans.marks import read_marks
+from lidargrit.scans.projection import project
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage
+from lidargrit.systems.lidargrit.system import LidarGrit, TokenSampling
+from lidargrit.systems.raydrop.raydrop_network import RaydropConfig, RaydropNetwork
+from lidargrit.systems.raydrop.raydrop_objective import RaydropObjective
 from tiny_runs import learn
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)

@@ -9,15 +9,15 @@ import torch
 from matplotlib.axes import Axes
 
 from lidargrit.cli import main
-from lidargrit.errors import ConfigError, DataError
+from lidargrit.core.errors import ConfigError, DataError
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.sources import load_range_images
 from lidargrit.evaluation import realism
+from lidargrit.evaluation.metrics import load_metric
 from lidargrit.evaluation.realism import CURVES, SimulatedScans, as_table, compare, drop_independently, simulate_pair
-from lidargrit.generators.lidargrit import LidarGrit
-from lidargrit.loading import DataConfig
-from lidargrit.metrics import load_metric
-from lidargrit.sensors import load_sensor
-from lidargrit.sources import load_range_images
-from lidargrit.structures import RangeImage
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage
+from lidargrit.systems.lidargrit.system import LidarGrit
 from lidargrit.viewer.curves import plot_curves
 
 SENSOR = load_sensor("hdl64e_kitti_odometry")

@@ -7,11 +7,11 @@ import pytest
 import torch
 from scipy.spatial.distance import jensenshannon
 
-from lidargrit.errors import ConfigError, DataError
-from lidargrit.metrics import load_metric
-from lidargrit.metrics._curves import LocalSurface, compare_shares, divergence
-from lidargrit.sensors import SensorModel, load_sensor
-from lidargrit.structures import RangeImage
+from lidargrit.core.errors import ConfigError, DataError
+from lidargrit.evaluation.metrics import load_metric
+from lidargrit.evaluation.metrics.shared.curves import LocalSurface, compare_shares, divergence
+from lidargrit.scans.sensors import SensorModel, load_sensor
+from lidargrit.scans.types import RangeImage
 
 SENSOR = SensorModel(
     name="small",

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from lidargrit.errors import ConfigError, DataError, ScanError
+from lidargrit.core.errors import ConfigError, DataError, ScanError
 from lidargrit.evaluation import reconstruction
 from lidargrit.evaluation.reconstruction import ReconstructionScore
-from lidargrit.sensors import load_sensor
-from lidargrit.structures import RangeImage
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(128)
 

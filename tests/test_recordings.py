@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from lidargrit.datasets import open_dataset
-from lidargrit.errors import ScanError
+from lidargrit.core.errors import ScanError
+from lidargrit.data.datasets import open_dataset
 
 
 def put(path, content):

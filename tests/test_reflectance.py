@@ -6,15 +6,15 @@ import pytest
 import torch
 
 from lidargrit.cli import main
-from lidargrit.conditions import Condition
-from lidargrit.errors import ConfigError
-from lidargrit.formats.kitti_bin import KittiBin
-from lidargrit.generators.lidargrit import LidarGrit, LidarGritConfig, TokenSampling
-from lidargrit.nn.pixel_networks import PixelDecoderConfig
+from lidargrit.core.errors import ConfigError
+from lidargrit.data.formats.kitti_bin import KittiBin
+from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
+from lidargrit.generation.tokenizers.vqvae import Vqvae, VqvaeConfig
 from lidargrit.nn.transformer import TransformerConfig
-from lidargrit.sensors import load_sensor
-from lidargrit.structures import RangeImage
-from lidargrit.tokenizers.vqvae import Vqvae, VqvaeConfig
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage
+from lidargrit.systems.lidargrit.system import LidarGrit, LidarGritConfig, TokenSampling
 from tiny_runs import the_one_line, train_words
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)

@@ -8,25 +8,25 @@ import torch
 from torch import Tensor
 
 from lidargrit.cli import main
-from lidargrit.conditions import Condition
-from lidargrit.conditions.fills import FILLS, fill, fill_lacking
-from lidargrit.conditions.hints import hints_of
-from lidargrit.conditions.marks import mark, read_marks
-from lidargrit.errors import ConfigError
-from lidargrit.formats.kitti_bin import KittiBin
-from lidargrit.generators import load
-from lidargrit.generators.lidargrit import LidarGrit, TokenSampling
-from lidargrit.loading import DataConfig
-from lidargrit.nn.completion_network import CompletionNetwork, CompletionNetworkConfig
-from lidargrit.nn.completion_objective import CompletionObjective, random_patterns
-from lidargrit.nn.objective import hidden_in_some
-from lidargrit.nn.raydrop_network import RaydropConfig, RaydropNetwork
-from lidargrit.nn.raydrop_objective import RaydropObjective
-from lidargrit.nn.reflectance import TYPICAL_REFLECTANCE
-from lidargrit.projection import unproject
-from lidargrit.sensors import load_sensor
-from lidargrit.structures import RangeImage, Scan
-from lidargrit.training.config import Recipe
+from lidargrit.core.errors import ConfigError
+from lidargrit.data.formats.kitti_bin import KittiBin
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.generation.generator import load
+from lidargrit.generation.objective import hidden_in_some
+from lidargrit.generation.reflectance import TYPICAL_REFLECTANCE
+from lidargrit.generation.settings import Recipe
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.fills import FILLS, fill, fill_lacking
+from lidargrit.scans.marks import mark, read_marks
+from lidargrit.scans.projection import unproject
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage, Scan
+from lidargrit.systems.completion_only.completion_network import CompletionNetwork, CompletionNetworkConfig
+from lidargrit.systems.completion_only.completion_objective import CompletionObjective, random_patterns
+from lidargrit.systems.completion_only.hints import hints_of
+from lidargrit.systems.lidargrit.system import LidarGrit, TokenSampling
+from lidargrit.systems.raydrop.raydrop_network import RaydropConfig, RaydropNetwork
+from lidargrit.systems.raydrop.raydrop_objective import RaydropObjective
 from lidargrit.training.taken_stages import taken_stages
 from tiny_runs import every_fourth_row, learn, the_one_line, train_words
 

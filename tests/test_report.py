@@ -13,8 +13,8 @@ from lidargrit.evaluation.comparison import EvalConfig, compare_sources
 from lidargrit.evaluation.intervals import Interval, RealAgainstReal, Score
 from lidargrit.evaluation.profiles import matches, profile, searched_scans
 from lidargrit.evaluation.scorecard import LeftOut
-from lidargrit.projection import points_of_pixels
-from lidargrit.structures import MetricResult
+from lidargrit.scans.projection import points_of_pixels
+from lidargrit.scans.types import MetricResult
 from lidargrit.viewer._page import document
 from lidargrit.viewer.report import page, write_report
 from lidargrit.viewer.report_charts import line_chart, score_chart

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from lidargrit import reporting
-from lidargrit.demo import _INTERRUPTED, _Clock
-from lidargrit.files import read_json
-from lidargrit.reporting import Schedule, TerminalReporter
-from lidargrit.run_folder import RUN_FILE
+from lidargrit.core import reporting
+from lidargrit.core.files import read_json
+from lidargrit.core.reporting import Schedule, TerminalReporter
+from lidargrit.data.run_folder import RUN_FILE
+from lidargrit.viewer.demo import _INTERRUPTED, _Clock
 
 
 class Clock:

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from lidargrit import configuration
 from lidargrit.cli import main
-from lidargrit.datasets import load
-from lidargrit.errors import ConfigError
+from lidargrit.core import configuration
+from lidargrit.core.errors import ConfigError
+from lidargrit.data.datasets import load
 from lidargrit.evaluation.protocols import load_protocol
 from lidargrit.evaluation.reproduction import TABLES, Reproduction, reproduce
 from lidargrit.evaluation.tables import published
-from lidargrit.recipes import load_recipe
+from lidargrit.generation.presets import load_recipe
 from lidargrit.training import train
 from tiny_runs import MODEL, SIMULATED
 

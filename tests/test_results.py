@@ -6,9 +6,9 @@ import json
 import pytest
 
 from lidargrit.cli import _results, main
-from lidargrit.errors import OutputError
+from lidargrit.core.errors import OutputError
+from lidargrit.core.files import write_json
 from lidargrit.evaluation.tables import side_by_side
-from lidargrit.files import write_json
 from test_verdict import card, score
 
 

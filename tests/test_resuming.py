@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from lidargrit.errors import OutputError
-from lidargrit.recipes import load_recipe
-from lidargrit.sensors import load_sensor
+from lidargrit.core.errors import OutputError
+from lidargrit.generation.presets import load_recipe
+from lidargrit.scans.sensors import load_sensor
 from lidargrit.simulator import simulate
 from lidargrit.training import train
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from format_examples import refused_within
-from lidargrit.errors import ScanError
-from lidargrit.formats import count_scans, read_scan, ros_bag
+from lidargrit.core.errors import ScanError
+from lidargrit.data.formats import count_scans, read_scan, ros_bag
 
 rosbag1 = pytest.importorskip("rosbags.rosbag1")
 typesys = pytest.importorskip("rosbags.typesys")

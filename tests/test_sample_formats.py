@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 import torch
 
-from lidargrit import _discovery
-from lidargrit.errors import DataError, ScanError, UnknownNameError
-from lidargrit.projection import unproject
-from lidargrit.sources import open_images, open_source
-from lidargrit.sources.sample_formats import (
+from lidargrit.core import discovery
+from lidargrit.core.errors import DataError, ScanError, UnknownNameError
+from lidargrit.data.sources import open_images, open_source
+from lidargrit.data.sources.sample_formats import (
     _paths,
     is_tensor_folder,
     load_sample_format,
@@ -23,6 +22,7 @@ from lidargrit.sources.sample_formats import (
     recognise,
     sensor_of_tensors,
 )
+from lidargrit.scans.projection import unproject
 
 SIZE = (64, 1024)
 
@@ -53,10 +53,10 @@ WRITERS = {"r2dm": r2dm, "lidargen": lidargen, "lidargrit": lidargrit}
 
 
 def test_every_sample_format_is_tested():
-    assert sorted(WRITERS) == _discovery.names("sources.sample_formats")
+    assert sorted(WRITERS) == discovery.names("sample-formats")
     for name in WRITERS:
         assert load_sample_format(name).source
-        assert 20 < len(_discovery.summary("sources.sample_formats", name)) < 180
+        assert 20 < len(discovery.summary("sample-formats", name)) < 180
 
 
 @pytest.mark.parametrize("name", WRITERS)
@@ -157,7 +157,7 @@ def nested() -> torch.Tensor:
     "what", ["text", "cut", "no tensor", "swollen", "bomb", "whole numbers", "empty", "sparse", "meta", "nested"]
 )
 def test_what_is_no_tensor_is_refused(what, tmp_path, monkeypatch):
-    monkeypatch.setattr("lidargrit.sources.sample_formats._BYTES_AT_MOST", 16 << 20)
+    monkeypatch.setattr("lidargrit.data.sources.sample_formats._BYTES_AT_MOST", 16 << 20)
     path = tmp_path / "0.pth"
     contents = {
         "no tensor": {"a": 1},

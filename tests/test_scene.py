@@ -5,8 +5,9 @@ import inspect
 import numpy as np
 import pytest
 
-from lidargrit.errors import ConfigError
-from lidargrit.simulator import labels, materials
+from lidargrit.core.errors import ConfigError
+from lidargrit.scans import labels
+from lidargrit.simulator import materials
 from lidargrit.simulator.scene import SENSOR_HEIGHT_M, sample_scene
 from lidargrit.simulator.scene.layout import driving, parked
 from lidargrit.simulator.scene.objects import Placements

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 import torch
 
-from lidargrit.errors import ConfigError, LidarGritError, UnknownNameError
+from lidargrit.core.errors import ConfigError, LidarGritError, UnknownNameError
+from lidargrit.data.images import Pixels, Provenance, RangeImages
 from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.evaluation.intervals import Resampling, Score
+from lidargrit.evaluation.metrics import load_metric
+from lidargrit.evaluation.metrics.shared.networks.network import PretrainedNetwork
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
 from lidargrit.evaluation.protocols import MetricChoice
 from lidargrit.evaluation.scoring import MetricFactory, score_metrics
-from lidargrit.loading import Pixels, Provenance, RangeImages
-from lidargrit.metrics import load_metric
-from lidargrit.metrics._networks.network import PretrainedNetwork
-from lidargrit.sensors import SensorModel, column_azimuths_rad
+from lidargrit.scans.sensors import SensorModel, column_azimuths_rad
 from seeded_networks import weights_folder
 
 SENSOR = SensorModel(

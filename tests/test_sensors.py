@@ -11,13 +11,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidargrit import _discovery
-from lidargrit.errors import ConfigError, LidarGritError
-from lidargrit.projection import project, unproject
-from lidargrit.sensors import SensorModel, column_azimuths_rad, continuous_azimuths_rad, load_sensor
-from lidargrit.structures import RangeImage, Scan
+from lidargrit.core import discovery
+from lidargrit.core.errors import ConfigError, LidarGritError
+from lidargrit.scans.projection import project, unproject
+from lidargrit.scans.sensors import SensorModel, column_azimuths_rad, continuous_azimuths_rad, load_sensor
+from lidargrit.scans.types import RangeImage, Scan
 
-NAMES = _discovery.names("sensors")
+NAMES = discovery.names("sensors")
 SIZES = {  # rows and columns, top and bottom row in degrees, from the makers' tables
     "hdl32e": (32, 1084, 10.67, -30.67),
     "hdl64e_kitti_360": (64, 1024, 2.78125, -24.78125),

@@ -14,14 +14,14 @@ from waitress.server import TcpWSGIServer
 import lidargrit
 from browser import Browser
 from lidargrit.cli import main
-from lidargrit.errors import ConfigError, ScanError
-from lidargrit.formats import load, read_scan
-from lidargrit.projection import unproject
-from lidargrit.serving import server
-from lidargrit.serving.jobs import JobQueue
-from lidargrit.serving.requests import SampleRequest, parse_json_object, parse_request, sampling_settings
-from lidargrit.serving.worker import compute_result
-from lidargrit.structures import Scan
+from lidargrit.core.errors import ConfigError, ScanError
+from lidargrit.data.formats import load, read_scan
+from lidargrit.scans.projection import unproject
+from lidargrit.scans.types import Scan
+from lidargrit.viewer.serve import server
+from lidargrit.viewer.serve.jobs import JobQueue
+from lidargrit.viewer.serve.requests import SampleRequest, parse_json_object, parse_request, sampling_settings
+from lidargrit.viewer.serve.worker import compute_result
 from served import LIMITS, MODELS, running
 from test_generator_contract import made
 

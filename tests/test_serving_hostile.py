@@ -20,12 +20,12 @@ import numpy as np
 import pytest
 
 import lidargrit
-from lidargrit.errors import OutputError
-from lidargrit.formats import load, read_scan
-from lidargrit.serving import application
-from lidargrit.serving.application import is_own
-from lidargrit.serving.requests import TASKS
-from lidargrit.serving.server import _listening
+from lidargrit.core.errors import OutputError
+from lidargrit.data.formats import load, read_scan
+from lidargrit.viewer.serve import application
+from lidargrit.viewer.serve.application import is_own
+from lidargrit.viewer.serve.requests import TASKS
+from lidargrit.viewer.serve.server import _listening
 from served import LIMITS, running
 
 QUICK = {"steps": 3, "resamples": 2}

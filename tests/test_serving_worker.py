@@ -10,12 +10,12 @@ import pytest
 import torch
 
 import lidargrit
-from lidargrit.completion.inputs import ScanReader
-from lidargrit.errors import ScanError
-from lidargrit.formats import load, read_scan
-from lidargrit.serving.requests import TASKS, SampleRequest
-from lidargrit.serving.worker import PIXELS_FILE, compute_result, describe_model, run_worker
-from lidargrit.structures import Scan
+from lidargrit.core.errors import ScanError
+from lidargrit.data.formats import load, read_scan
+from lidargrit.inference.complete.inputs import ScanReader
+from lidargrit.scans.types import Scan
+from lidargrit.viewer.serve.requests import TASKS, SampleRequest
+from lidargrit.viewer.serve.worker import PIXELS_FILE, compute_result, describe_model, run_worker
 from test_generator_contract import made
 
 

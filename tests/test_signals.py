@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from lidargrit.cli._signals import raising_on_signals
-from lidargrit.errors import Terminated
+from lidargrit.core.errors import Terminated
 
 SIGNALS = {signal.SIGTERM: Terminated, signal.SIGINT: KeyboardInterrupt}
 

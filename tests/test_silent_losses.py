@@ -12,22 +12,24 @@ import pytest
 import torch
 
 from lidargrit.cli import main
-from lidargrit.conditions import Condition
-from lidargrit.datasets import open_dataset
-from lidargrit.errors import ConfigError, DataError, OutputError, ScanError
-from lidargrit.fitting import fit_sensor
-from lidargrit.formats import read_scan
-from lidargrit.formats.kitti_bin import KittiBin
-from lidargrit.formats.ouster_pcap import sensor_of
-from lidargrit.generators.multiscale import Multiscale
-from lidargrit.loading import DataConfig, PreparedImages, prepare, prepare_and_describe
-from lidargrit.loading.workers import make_some_shards
-from lidargrit.reporting import Reporter
-from lidargrit.sensors import load_sensor
+from lidargrit.core.errors import ConfigError, DataError, OutputError, ScanError
+from lidargrit.core.reporting import Reporter
+from lidargrit.data.datasets import open_dataset
+from lidargrit.data.drives import DriveConfig, write_drives
+from lidargrit.data.formats import read_scan
+from lidargrit.data.formats.kitti_bin import KittiBin
+from lidargrit.data.formats.ouster_pcap import sensor_of
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.prepared.prepare import prepare, prepare_and_describe
+from lidargrit.data.prepared.prepared import PreparedImages
+from lidargrit.data.prepared.workers import make_some_shards
+from lidargrit.data.sources import open_source
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.fit_sensor import fit_sensor
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import Scan
 from lidargrit.simulator import simulate
-from lidargrit.simulator.drives import DriveConfig, write_drives
-from lidargrit.sources import open_source
-from lidargrit.structures import Scan
+from lidargrit.systems.multiscale.system import Multiscale
 
 K360, VLP16 = load_sensor("hdl64e_kitti_360"), load_sensor("vlp16")
 
@@ -201,7 +203,7 @@ def interrupted(*_):
     raise KeyboardInterrupt
 workers.make_some_shards = interrupted
 sys.argv = ["", "folder", "1"]
-runpy.run_module("lidargrit.loading", run_name="__main__")
+runpy.run_module("lidargrit.data.prepared", run_name="__main__")
 """
     buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
     command, pipe = [sys.executable, "-c", code], subprocess.PIPE

@@ -7,11 +7,12 @@ import pytest
 import torch
 
 from lidargrit.cli import main
-from lidargrit.errors import ConfigError
-from lidargrit.projection import project, unproject
-from lidargrit.projection.unfolding import rings_from_firing_order
-from lidargrit.sensors import load_sensor
-from lidargrit.simulator import RaydropModel, labels, observe, scene_of, simulate
+from lidargrit.core.errors import ConfigError
+from lidargrit.scans import labels
+from lidargrit.scans.projection import project, unproject
+from lidargrit.scans.projection.unfolding import rings_from_firing_order
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.simulator import RaydropModel, observe, scene_of, simulate
 
 SEEDS = range(8)
 MODEL = RaydropModel()

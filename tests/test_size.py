@@ -8,11 +8,11 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from torch import nn
 
-from lidargrit.errors import CheckpointError, ConfigError
-from lidargrit.generators import load
+from lidargrit.core.errors import CheckpointError, ConfigError
+from lidargrit.data.run_folder import PRETRAINED
+from lidargrit.generation.generator import load
+from lidargrit.generation.presets import load_recipe
 from lidargrit.nn.size import numbers_at_most
-from lidargrit.recipes import load_recipe
-from lidargrit.run_folder import PRETRAINED
 
 
 def test_weights_and_buffers_of_all_modules_are_counted():

@@ -6,12 +6,12 @@ import torch
 from scipy import ndimage
 from scipy.stats import wasserstein_distance
 
-from lidargrit.errors import ConfigError
-from lidargrit.metrics import sliced_wasserstein as swd
-from lidargrit.metrics.sliced_wasserstein import SlicedWasserstein
-from lidargrit.projection import RangeEncoding
-from lidargrit.sensors import SensorModel, column_azimuths_rad, load_sensor
-from lidargrit.structures import RangeImage
+from lidargrit.core.errors import ConfigError
+from lidargrit.evaluation.metrics import sliced_wasserstein as swd
+from lidargrit.evaluation.metrics.sliced_wasserstein import SlicedWasserstein
+from lidargrit.scans.projection import RangeEncoding
+from lidargrit.scans.sensors import SensorModel, column_azimuths_rad, load_sensor
+from lidargrit.scans.types import RangeImage
 
 VARIANTS = ["reference", "textbook"]
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(128)

@@ -8,15 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lidargrit import sources
 from lidargrit.cli import main
-from lidargrit.errors import CheckpointError, ConfigError, DataError, ScanError, UnknownNameError
-from lidargrit.evaluation.benchmark import Benchmark
-from lidargrit.evaluation.comparison import EvalConfig, compare_sources
-from lidargrit.evaluation.intervals import Resampling
-from lidargrit.loading import DataConfig, PreparedImages, prepare
-from lidargrit.sensors import load_sensor
-from lidargrit.sources import (
+from lidargrit.core.errors import CheckpointError, ConfigError, DataError, ScanError, UnknownNameError
+from lidargrit.data import sources
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.prepared.prepare import prepare
+from lidargrit.data.prepared.prepared import PreparedImages
+from lidargrit.data.sources import (
     DatasetSource,
     PreparedSource,
     RunSource,
@@ -25,8 +23,12 @@ from lidargrit.sources import (
     load_range_images,
     open_source,
 )
-from lidargrit.sources.image_files import ImageFileSource
-from lidargrit.sources.samples import write_samples
+from lidargrit.data.sources.image_files import ImageFileSource
+from lidargrit.data.sources.samples import write_samples
+from lidargrit.evaluation.benchmark import Benchmark
+from lidargrit.evaluation.comparison import EvalConfig, compare_sources
+from lidargrit.evaluation.intervals import Resampling
+from lidargrit.scans.sensors import load_sensor
 from test_generator_contract import made
 
 ONE = DataConfig(workers=1)
@@ -162,13 +164,12 @@ def test_the_data_set_of_prepared_scans_is_told_when_the_scans_are_gone(tmp_path
 
 
 def test_nobody_else_asks_what_a_source_is():
-    """Only ``sources`` recognises; ``loading`` and the data sets define what it recognises by."""
+    """Only ``data`` recognises: its sources, by what data sets and prepared scans define."""
     asking = {"is_prepared", "is_sample_folder", "is_tensor_folder", "open_dataset", "PreparedFolder"}
-    root = Path(sources.__file__).parents[1]
-    allowed = {"sources", "datasets", "loading"}
+    root = Path(sources.__file__).parents[2]
     found = {}
     for path in root.rglob("*.py"):
-        if path.relative_to(root).parts[0] not in allowed:
+        if path.relative_to(root).parts[0] != "data":
             names = {node.id for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Name)}
             if asked := sorted(names & asking):
                 found[path.relative_to(root).as_posix()] = asked

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from lidargrit import _discovery
-from lidargrit.datasets import load, open_dataset
+from lidargrit.core import discovery
+from lidargrit.data.datasets import load, open_dataset
 from lidargrit.evaluation.protocols import load_protocol
 from lidargrit.evaluation.reproduction import TABLES, Reproduction
-from lidargrit.recipes import load_recipe
+from lidargrit.generation.presets import load_recipe
 
 TREES = {  # every drive that was released
     "kitti_360": ("data_3d_raw/2013_05_28_drive_{:04d}_sync/velodyne_points/data", (0, *range(2, 8), 9, 10)),
@@ -17,7 +17,7 @@ TREES = {  # every drive that was released
 PROTOCOLS = {"kitti_360": "lidargrit_kitti_360", "kitti_odometry": "lidargrit_kitti_odometry"}
 ON_KITTI = {  # recipe → its data set
     name: source.partition(":")[0]
-    for name in _discovery.names("recipes")
+    for name in discovery.names("recipes")
     for source in load_recipe(name).data.train
     if source.partition(":")[0] in TREES
 }

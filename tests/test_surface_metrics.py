@@ -7,11 +7,11 @@ import pytest
 import torch
 from scipy.spatial.distance import jensenshannon
 
-from lidargrit.metrics import load_metric
-from lidargrit.metrics import wall_straightness as walls
-from lidargrit.projection import points_of_pixels
-from lidargrit.sensors import SensorModel, column_azimuths_rad
-from lidargrit.structures import RangeImage
+from lidargrit.evaluation.metrics import load_metric
+from lidargrit.evaluation.metrics import wall_straightness as walls
+from lidargrit.scans.projection import points_of_pixels
+from lidargrit.scans.sensors import SensorModel, column_azimuths_rad
+from lidargrit.scans.types import RangeImage
 
 SENSOR = SensorModel("small", torch.linspace(0.05, -0.3, 16)[:, None], column_azimuths_rad(96), 1.0, 100.0, "spherical")
 GAPS_M = np.geomspace(1.0, 64.0, 13)

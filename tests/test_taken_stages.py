@@ -7,14 +7,15 @@ from dataclasses import replace
 import pytest
 import torch
 
-from lidargrit.errors import ConfigError
-from lidargrit.files import read_tensors
-from lidargrit.generators import load_class
-from lidargrit.generators.lidargrit import TokenSampling
-from lidargrit.generators.maskgit import MaskGitConfig
-from lidargrit.loading import DataConfig
-from lidargrit.recipes import load_recipe
-from lidargrit.training import FitConfig, Recipe, plan_training, train
+from lidargrit.core.errors import ConfigError
+from lidargrit.core.files import read_tensors
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.generation.generator import load_class
+from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.settings import FitConfig, Recipe
+from lidargrit.systems.lidargrit.system import TokenSampling
+from lidargrit.systems.maskgit.system import MaskGitConfig
+from lidargrit.training import plan_training, train
 from lidargrit.training.plan import check_stages
 from lidargrit.training.taken_stages import taken_stages
 from test_pixel_stage import PIXELS, SENSOR, TOKENIZER, TRANSFORMER, made, recipe_of

@@ -8,18 +8,19 @@ from dataclasses import replace
 import pytest
 import torch
 
-from lidargrit import configuration
 from lidargrit.cli import main
-from lidargrit.errors import ConfigError, LidarGritError, OutputError
-from lidargrit.generators import load, load_class
-from lidargrit.generators.lidargrit import LidarGritConfig
-from lidargrit.generators.maskgit import MaskGitConfig
-from lidargrit.loading import DataConfig
+from lidargrit.core import configuration
+from lidargrit.core.errors import ConfigError, LidarGritError, OutputError
+from lidargrit.core.reporting import Reporter
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.generation.generator import load, load_class
+from lidargrit.generation.settings import FitConfig, Recipe
+from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
 from lidargrit.nn.transformer import TransformerConfig
-from lidargrit.reporting import Reporter
-from lidargrit.serving.worker import run_worker
-from lidargrit.tokenizers.vqvae import VqvaeConfig
-from lidargrit.training import FitConfig, Recipe, train
+from lidargrit.systems.lidargrit.system import LidarGritConfig
+from lidargrit.systems.maskgit.system import MaskGitConfig
+from lidargrit.training import train
+from lidargrit.viewer.serve.worker import run_worker
 from toy_tokenizer import NAME, installed
 
 CONFIGS = {"lidargrit": LidarGritConfig, "maskgit": MaskGitConfig}

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lidargrit.sensors import load_sensor
-from lidargrit.simulator import labels, materials
+from lidargrit.scans import labels
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.simulator import materials
 from lidargrit.simulator.beams import REVOLUTION_S, Beams, footprint
 from lidargrit.simulator.echoes import detect_echoes, edges
 from lidargrit.simulator.mesh import Mesh

@@ -6,7 +6,7 @@ import types
 import pytest
 
 from lidargrit.cli import main
-from lidargrit.recipes import load_recipe
+from lidargrit.generation.presets import load_recipe
 from lidargrit.training.tracking import tracked
 from tiny_runs import the_one_line, train_words
 

@@ -4,10 +4,11 @@ import json
 
 import pytest
 
-from lidargrit.errors import CheckpointError
-from lidargrit.loading import DataConfig, Provenance
-from lidargrit.run_folder import trained_on, write_trained_on
-from lidargrit.sources import load_range_images
+from lidargrit.core.errors import CheckpointError
+from lidargrit.data.images import Provenance
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.run_folder import trained_on, write_trained_on
+from lidargrit.data.sources import load_range_images
 from lidargrit.training.run import _write_trained_on
 
 

@@ -10,18 +10,20 @@ from pathlib import Path
 import pytest
 import torch
 
-from lidargrit import configuration
-from lidargrit.datasets.kitti_odometry import KittiOdometry
-from lidargrit.errors import CheckpointError, ConfigError, OutputError, TrainingError
-from lidargrit.files import claim_folder, read_tensors, write_json, write_tensors
-from lidargrit.loading import Batches, DataConfig
-from lidargrit.nn.objective import Objective
-from lidargrit.recipes import load_recipe
-from lidargrit.reporting import Reporter
-from lidargrit.sensors import load_sensor
-from lidargrit.sources import load_range_images
-from lidargrit.tokenizers.vqvae import Vqvae
-from lidargrit.training import FitConfig, check_folder, measure, train, training_flops
+from lidargrit.core import configuration
+from lidargrit.core.errors import CheckpointError, ConfigError, OutputError, TrainingError
+from lidargrit.core.files import claim_folder, read_tensors, write_json, write_tensors
+from lidargrit.core.reporting import Reporter
+from lidargrit.data.batches import Batches
+from lidargrit.data.datasets.kitti_odometry import KittiOdometry
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.sources import load_range_images
+from lidargrit.generation.objective import Objective
+from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.settings import FitConfig
+from lidargrit.generation.tokenizers.vqvae import Vqvae
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.training import check_folder, measure, train, training_flops
 from lidargrit.training.checkpoint import load_checkpoint, save_checkpoint
 from lidargrit.training.fit import Fit
 from lidargrit.training.log import Log, read_log

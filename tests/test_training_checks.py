@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 
 from lidargrit.cli import main
-from lidargrit.errors import ConfigError, DataError, Terminated
-from lidargrit.loading import Batches, Pixels, Provenance
-from lidargrit.loading.images import RangeImages
-from lidargrit.loading.workers import _made_by_processes
-from lidargrit.recipes import load_recipe
-from lidargrit.reporting import Reporter
-from lidargrit.sensors import load_sensor
-from lidargrit.sources import load_range_images
-from lidargrit.structures import RangeImage
+from lidargrit.core.errors import ConfigError, DataError, Terminated
+from lidargrit.core.reporting import Reporter
+from lidargrit.data.batches import Batches
+from lidargrit.data.images import Pixels, Provenance, RangeImages
+from lidargrit.data.prepared.workers import _made_by_processes
+from lidargrit.data.sources import load_range_images
+from lidargrit.generation.presets import load_recipe
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage
 from lidargrit.training import train
 from lidargrit.training.engine import Engine
 from lidargrit.training.fit import Fit
@@ -181,7 +181,7 @@ def test_a_process_that_dies_ends_the_others(tmp_path, monkeypatch):
     script = tmp_path / "worker.py"
     script.write_text("import sys, time\ntime.sleep(60 * (sys.argv[-1] == '1'))\nsys.exit(9)\n")
     command = [sys.executable, str(script)]
-    monkeypatch.setattr("lidargrit.loading.workers.module_command", lambda *_: command)
+    monkeypatch.setattr("lidargrit.data.prepared.workers.module_command", lambda *_: command)
     with pytest.raises(DataError, match="a process that died while projecting"):
         list(_made_by_processes(tmp_path, [[0], [1]]))
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 from scipy import stats
 
-from lidargrit.generators.lidargrit import START_TOKEN, TokenSampling, after_start, sample_token
 from lidargrit.nn.decoding import CachedDecoder
 from lidargrit.nn.transformer import CausalTransformer, TransformerConfig, resample_positions
+from lidargrit.systems.lidargrit.system import START_TOKEN, TokenSampling, after_start, sample_token
 from reference_weights import seeded_weights
 
 GREEDY = TokenSampling(temperature=0.0)
@@ -38,8 +38,8 @@ def golden_transformer(golden):
     ("recipe", "parameters"), [("lidargrit_kitti_360", 10_264_064), ("lidargrit_kitti_odometry", 5_263_360)]
 )
 def test_published_sizes(recipe, parameters):
-    from lidargrit.generators.lidargrit import LidarGrit
-    from lidargrit.recipes import load_recipe
+    from lidargrit.generation.presets import load_recipe
+    from lidargrit.systems.lidargrit.system import LidarGrit
 
     recipe = load_recipe(recipe)
     generator = LidarGrit(recipe.model, recipe.data.load_sensor())
@@ -210,8 +210,8 @@ def test_the_start_token_is_an_ordinary_one():
 def test_the_cost_is_what_torch_counts(guidance, layers):
     from torch.utils.flop_counter import FlopCounterMode
 
-    from lidargrit.generators.lidargrit import LidarGrit
-    from lidargrit.recipes import load_recipe
+    from lidargrit.generation.presets import load_recipe
+    from lidargrit.systems.lidargrit.system import LidarGrit
 
     changes = [f"model.guidance={guidance}", f"model.transformer.layers={layers}", "model.transformer.width=32"]
     recipe = load_recipe("small", [*changes, "data.columns=512", "data.column_stride=8"])
@@ -223,9 +223,9 @@ def test_the_cost_is_what_torch_counts(guidance, layers):
 
 
 def test_a_changed_weight_is_noticed_and_token_bits_are_those_of_the_transformer():
-    from lidargrit.generators.lidargrit import LidarGrit
-    from lidargrit.nn.range_steps import RangeSteps
-    from lidargrit.recipes import load_recipe
+    from lidargrit.generation.presets import load_recipe
+    from lidargrit.generation.range_steps import RangeSteps
+    from lidargrit.systems.lidargrit.system import LidarGrit
 
     recipe = load_recipe("small", ["model.transformer.width=32", "data.columns=512", "data.column_stride=8"])
     torch.manual_seed(0)

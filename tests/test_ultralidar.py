@@ -7,17 +7,17 @@ import torch
 
 import lidargrit
 from lidargrit.cli import main
-from lidargrit.errors import CheckpointError, ConfigError
-from lidargrit.generators.ultralidar import UltraLidar, UltraLidarConfig, VoxelSampling
-from lidargrit.nn import codebook_care
-from lidargrit.nn.codebook_care import CodebookCare
-from lidargrit.nn.swin import SwinConfig
-from lidargrit.nn.voxel_autoencoder import VoxelAutoencoderConfig
-from lidargrit.nn.voxel_prior import FillSampling, forbid, generate_tokens, likeliest_codes
-from lidargrit.projection.voxels import VoxelGrid, images_of_voxels, voxels_of_images
-from lidargrit.recipes import load_recipe
-from lidargrit.sensors import load_sensor
-from lidargrit.structures import RangeImage
+from lidargrit.core.errors import CheckpointError, ConfigError
+from lidargrit.generation.presets import load_recipe
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage
+from lidargrit.systems.ultralidar import codebook_care
+from lidargrit.systems.ultralidar.codebook_care import CodebookCare
+from lidargrit.systems.ultralidar.swin import SwinConfig
+from lidargrit.systems.ultralidar.system import UltraLidar, UltraLidarConfig, VoxelSampling
+from lidargrit.systems.ultralidar.voxel_autoencoder import VoxelAutoencoderConfig
+from lidargrit.systems.ultralidar.voxel_prior import FillSampling, forbid, generate_tokens, likeliest_codes
+from lidargrit.systems.ultralidar.voxels import VoxelGrid, images_of_voxels, voxels_of_images
 from lidargrit.training.compute import training_flops
 from tiny_runs import the_one_line
 

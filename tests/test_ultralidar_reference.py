@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 import torch
 
-from lidargrit.nn.swin import SwinConfig, sine_cosine_positions
-from lidargrit.nn.ultralidar_checkpoint import of_ours
-from lidargrit.nn.voxel_autoencoder import (
+from lidargrit.systems.ultralidar.swin import SwinConfig, sine_cosine_positions
+from lidargrit.systems.ultralidar.ultralidar_checkpoint import of_ours
+from lidargrit.systems.ultralidar.voxel_autoencoder import (
     VoxelAutoencoder,
     VoxelAutoencoderConfig,
     occupied_at_random,
     reconstruction_loss,
 )
-from lidargrit.nn.voxel_prior import (
+from lidargrit.systems.ultralidar.voxel_prior import (
     FillSampling,
     VoxelPrior,
     generate_tokens,
@@ -23,7 +23,7 @@ from lidargrit.nn.voxel_prior import (
     hidden_token_loss,
     number_hidden,
 )
-from lidargrit.projection.voxels import VoxelGrid, occupied_voxels, points_of_voxels
+from lidargrit.systems.ultralidar.voxels import VoxelGrid, occupied_voxels, points_of_voxels
 from reference_weights import seeded_weights
 
 pytestmark = pytest.mark.shared

@@ -11,15 +11,12 @@ import numpy as np
 import pytest
 
 from lidargrit.api import load_scan
-from lidargrit.arrays import open_archive, parse_array, read_arrays
 from lidargrit.cli import main
-from lidargrit.compression import archive
-from lidargrit.configuration import override
-from lidargrit.errors import CheckpointError, ConfigError, DataError, LidarGritError, ScanError, UsageError
-from lidargrit.files import read_json, read_text, write_json
-from lidargrit.generators import load_class
-from lidargrit.nn.devices import usable_device
-from lidargrit.untrusted import (
+from lidargrit.core.arrays import open_archive, parse_array, read_arrays
+from lidargrit.core.configuration import override
+from lidargrit.core.errors import CheckpointError, ConfigError, DataError, LidarGritError, ScanError, UsageError
+from lidargrit.core.files import read_json, read_text, write_json
+from lidargrit.core.untrusted import (
     check_path,
     parse_json,
     positive_number,
@@ -28,6 +25,9 @@ from lidargrit.untrusted import (
     user_path,
     whole_number,
 )
+from lidargrit.generation.generator import load_class
+from lidargrit.inference.compress import archive
+from lidargrit.nn.devices import usable_device
 
 
 @pytest.mark.parametrize(

@@ -5,13 +5,13 @@ from dataclasses import replace
 import pytest
 
 from lidargrit.cli import main
-from lidargrit.errors import DataError
+from lidargrit.core.errors import DataError
+from lidargrit.core.files import read_json, write_json
 from lidargrit.evaluation.intervals import Interval, RealAgainstReal, Score
 from lidargrit.evaluation.scorecard import EvalSetRecord, Scorecard
 from lidargrit.evaluation.tables import side_by_side
 from lidargrit.evaluation.verdict import counted_first, verdict
-from lidargrit.files import read_json, write_json
-from lidargrit.structures import MetricResult
+from lidargrit.scans.types import MetricResult
 
 FACTS = EvalSetRecord("a", "samples", "", 9, 9, "s 8x8", "spherical, exact", "ab" * 32)
 

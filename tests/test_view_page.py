@@ -14,13 +14,12 @@ import torch
 
 from browser import Browser
 from lidargrit.cli import main
-from lidargrit.errors import ConfigError, ScanError
-from lidargrit.formats import read_scan
-from lidargrit.loading import DataConfig
-from lidargrit.loading.config import ScanSettings
-from lidargrit.projection import unproject
-from lidargrit.sensors import load_sensor
-from lidargrit.structures import RangeImage
+from lidargrit.core.errors import ConfigError, ScanError
+from lidargrit.data.formats import read_scan
+from lidargrit.data.prepared.config import DataConfig, ScanSettings
+from lidargrit.scans.projection import unproject
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage
 from lidargrit.viewer import interactive, scan_sets
 from lidargrit.viewer.interactive import page, write_page
 from lidargrit.viewer.scan_sets import ScanSet, load_scan_sets
@@ -128,7 +127,7 @@ def test_labels_stand_where_their_points_are():
 
 
 def test_scans_that_cannot_be_used_are_refused_or_left_out(tmp_path):
-    from lidargrit.formats.kitti_bin import KittiBin
+    from lidargrit.data.formats.kitti_bin import KittiBin
 
     scan = unproject(scans(SENSOR.with_columns(2048, 8))[0])
     order = (scan.ring * 10 + torch.atan2(*scan.points_xyz_m[:, :2].double().T.flip(0)) % (2 * torch.pi)).argsort()

@@ -14,15 +14,15 @@ from PIL import Image
 
 from lidargrit import simulate
 from lidargrit.cli import main
-from lidargrit.errors import ConfigError, OutputError
-from lidargrit.formats import load as load_format
-from lidargrit.generators import load_class
-from lidargrit.loading.config import ScanSettings
-from lidargrit.reporting import Reporter
-from lidargrit.sensors import load_sensor
-from lidargrit.sources import open_source
-from lidargrit.sources.samples import write_samples
-from lidargrit.structures import RangeImage
+from lidargrit.core.errors import ConfigError, OutputError
+from lidargrit.core.reporting import Reporter
+from lidargrit.data.formats import load as load_format
+from lidargrit.data.prepared.config import ScanSettings
+from lidargrit.data.sources import open_source
+from lidargrit.data.sources.samples import write_samples
+from lidargrit.generation.generator import load_class
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage
 from lidargrit.viewer import pictures, plot_comparison, scan_sets, view
 from lidargrit.viewer.scan_sets import load_scan_sets
 

@@ -5,10 +5,10 @@ import math
 import pytest
 import torch
 
-from lidargrit.errors import ConfigError
-from lidargrit.projection.voxels import VoxelGrid, images_of_voxels, points_of_voxels, voxels_of_images
-from lidargrit.sensors import load_sensor
-from lidargrit.structures import RangeImage
+from lidargrit.core.errors import ConfigError
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage
+from lidargrit.systems.ultralidar.voxels import VoxelGrid, images_of_voxels, points_of_voxels, voxels_of_images
 
 SENSOR = load_sensor("hdl64e_kitti_360").with_columns(24)
 GRID = VoxelGrid((-12.0, -9.0, -3.0), (0.75, 0.5, 0.5), (32, 32, 10))

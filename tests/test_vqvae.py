@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from lidargrit.errors import ConfigError
+from lidargrit.core.errors import ConfigError
+from lidargrit.generation.tokenizers.vqvae import Vqvae, VqvaeConfig, reconstruction_loss
 from lidargrit.nn.convolution import FoldedUpsample, Upsample
-from lidargrit.projection import RangeEncoding
-from lidargrit.sensors import load_sensor
-from lidargrit.structures import RangeImage, TokenGrid
-from lidargrit.tokenizers.vqvae import Vqvae, VqvaeConfig, reconstruction_loss
+from lidargrit.scans.projection import RangeEncoding
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage, TokenGrid
 from reference_weights import seeded_weights
 
 SMALL = VqvaeConfig(channels=32, channel_multipliers=(1, 1), code_dim=8, num_codes=16, dropout=0.0)
@@ -34,7 +34,7 @@ def images_of(sensor, batch=2, seed=0):
     [("lidargrit_kitti_360", 17_295_618, (8, 128)), ("lidargrit_kitti_odometry", 3_148_418, (16, 64))],
 )
 def test_published_sizes(recipe, parameters, grid):
-    from lidargrit.recipes import load_recipe
+    from lidargrit.generation.presets import load_recipe
 
     recipe = load_recipe(recipe)
     vqvae = Vqvae(recipe.model.tokenizer, recipe.data.load_sensor())

@@ -15,12 +15,17 @@ import numpy as np
 import pytest
 import torch
 
-from lidargrit.errors import WeightsError
-from lidargrit.metrics import load_metric
-from lidargrit.metrics._networks import weights as published_weights
-from lidargrit.metrics._networks.network import NETWORKS, load_network
-from lidargrit.metrics._networks.weights import PublishedWeights, _HttpsOnly, find_weights, read_weights
-from lidargrit.reporting import Reporter
+from lidargrit.core.errors import WeightsError
+from lidargrit.core.reporting import Reporter
+from lidargrit.evaluation.metrics import load_metric
+from lidargrit.evaluation.metrics.shared.networks import weights as published_weights
+from lidargrit.evaluation.metrics.shared.networks.network import NETWORKS, load_network
+from lidargrit.evaluation.metrics.shared.networks.weights import (
+    PublishedWeights,
+    _HttpsOnly,
+    find_weights,
+    read_weights,
+)
 from seeded_networks import saved, weights, write_archive
 
 FILE = PublishedWeights("tiny", "https://example.org/tiny.pth", "free to use", 100_000)

@@ -7,18 +7,18 @@ import pytest
 import torch
 
 from lidargrit.cli import main
-from lidargrit.errors import CheckpointError
+from lidargrit.core.errors import CheckpointError
+from lidargrit.core.files import write_json
+from lidargrit.data.images import Provenance
+from lidargrit.data.sources.samples import MANIFEST, full_rows_of, write_samples
 from lidargrit.evaluation.comparison import EvalConfig, compare_sources
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.scorecard import NOT_APPLICABLE, Scorecard
 from lidargrit.evaluation.tables import side_by_side
-from lidargrit.files import write_json
-from lidargrit.generators.dusty import Dusty
-from lidargrit.generators.lidargan import LidarGan
-from lidargrit.loading import Provenance
 from lidargrit.publishing.card import model_card
-from lidargrit.sensors import load_sensor
-from lidargrit.sources.samples import MANIFEST, full_rows_of, write_samples
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.systems.dusty.system import Dusty
+from lidargrit.systems.lidargan.system import LidarGan
 from lidargrit.viewer.report import page
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)

@@ -6,9 +6,9 @@ import subprocess
 
 import pytest
 
-from lidargrit import _discovery
 from lidargrit.cli import build_parser, main
-from lidargrit.errors import nearest_names
+from lidargrit.core import discovery
+from lidargrit.core.errors import nearest_names
 
 MISTAKES = {
     "simulte": "lidargrit: got 'simulte'; wanted one such as simulate; see: lidargrit --help",
@@ -78,11 +78,11 @@ def test_what_follows_two_dashes_is_no_option(capsys):
 
 def test_the_metric_that_was_meant_is_named():
     with pytest.raises(ImportError, match="cannot import name 'SlicdWasserstein'"):
-        from lidargrit.metrics import SlicdWasserstein  # noqa: F401
-    import lidargrit.metrics
+        from lidargrit.evaluation.metrics import SlicdWasserstein  # noqa: F401
+    import lidargrit.evaluation.metrics
 
     with pytest.raises(AttributeError, match="did you mean SlicedWasserstein"):
-        _ = lidargrit.metrics.SlicdWasserstein
+        _ = lidargrit.evaluation.metrics.SlicdWasserstein
     assert nearest_names("swd", ["bev_jsd", "sliced_wasserstein"], 1)
 
 
@@ -106,7 +106,7 @@ def test_every_verb_that_reports_knows_json():
     silent = {"complete", "completion", "demo", "export", "import-weights", "publish", "raydrop", "sample", "serve"}
     silent |= {"compress", "decompress", "simulate", "upsample", "view"}
     parsers = {parser.prog.split()[1]: parser for parser in build_parser().verbs()}
-    assert parsers.keys() == {name.replace("_", "-") for name in _discovery.names("cli")}
+    assert parsers.keys() == {name.replace("_", "-") for name in discovery.names("cli")}
     assert {name for name, parser in parsers.items() if "--json" not in parser.format_help()} <= silent
 
 
@@ -132,7 +132,7 @@ def test_a_shell_learns_all_verbs_and_what_may_follow(shell, capsys, tmp_path):
     assert main(["completion", shell]) == 0
     script = tmp_path / "script"
     script.write_text(capsys.readouterr().out)
-    for word in (*_discovery.names("cli"), *_discovery.names("recipes"), "lidargrit-kitti-360", "dry-run"):
+    for word in (*discovery.names("cli"), *discovery.names("recipes"), "lidargrit-kitti-360", "dry-run"):
         assert word in script.read_text() or word.replace("_", "-") in script.read_text()
     if shutil.which(shell):
         subprocess.run([shell, "-n", str(script)], check=True)

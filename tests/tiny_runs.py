@@ -6,9 +6,9 @@ from pathlib import Path
 
 import torch
 
-from lidargrit.conditions import Condition
-from lidargrit.nn.objective import Objective
-from lidargrit.structures import RangeImage
+from lidargrit.generation.objective import Objective
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.types import RangeImage
 
 MODEL = [  # 64x64 range images, 8x8 tokens
     "data.columns=512",

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from lidargrit.simulator import labels, materials
+from lidargrit.scans import labels
+from lidargrit.simulator import materials
 from lidargrit.simulator.mesh import Mesh
 
 HEIGHT_M = 1.73

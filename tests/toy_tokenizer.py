@@ -15,10 +15,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from lidargrit import _discovery
-from lidargrit.sensors import SensorModel
-from lidargrit.structures import Decoded, MaskDecoding, RangeImage, TokenGrid
-from lidargrit.tokenizers import Tokenizer, TokenizerConfig
+from lidargrit.core import discovery
+from lidargrit.generation.tokenizers import Tokenizer, TokenizerConfig
+from lidargrit.scans.sensors import SensorModel
+from lidargrit.scans.types import Decoded, MaskDecoding, RangeImage, TokenGrid
 
 NAME = "toy_tokenizer"
 
@@ -95,13 +95,13 @@ class ToyTokenizer(Tokenizer[ToyConfig]):
 
 def installed(monkeypatch) -> type[TokenizerConfig]:
     """Make this file a tokenizer of the package, as if it lay in its folder, and return its configuration."""
-    name = f"lidargrit.tokenizers.{NAME}"
+    name = f"lidargrit.generation.tokenizers.{NAME}"
     spec = importlib.util.spec_from_file_location(name, Path(__file__))
     module = importlib.util.module_from_spec(spec)
     monkeypatch.setitem(sys.modules, name, module)
     spec.loader.exec_module(module)
-    known = _discovery.names
+    known = discovery.names
     monkeypatch.setattr(
-        _discovery, "names", lambda package: sorted([*known(package), *([NAME] if package == "tokenizers" else [])])
+        discovery, "names", lambda package: sorted([*known(package), *([NAME] if package == "tokenizers" else [])])
     )
     return module.ToyConfig

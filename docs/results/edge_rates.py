@@ -8,7 +8,7 @@ or farther, than both of their neighbours, where these agree within a tenth of t
 
 import argparse
 
-from lidargrit.sources import open_images
+from lidargrit.data.sources import open_images
 
 FAR_M, BESIDE_M, ONE_SURFACE = 2.0, 1.0, 0.1
 

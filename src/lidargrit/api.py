@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from lidargrit import formats
-from lidargrit.conditions import Condition
+from lidargrit.data import formats
+from lidargrit.data.formats import BadPoints
 from lidargrit.evaluation.comparison import EvalConfig, compare_sources
 from lidargrit.evaluation.scorecard import Scorecard
-from lidargrit.formats import BadPoints
-from lidargrit.generators import load
-from lidargrit.projection import inspect, project, unproject
-from lidargrit.sensors import load_sensor
+from lidargrit.generation.generator import load
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.projection import inspect, project, unproject
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import Scan
 from lidargrit.simulator import simulate
-from lidargrit.structures import Scan
 
 __all__ = ["Condition", "evaluate", "inspect", "load", "load_scan", "load_sensor", "project", "simulate", "unproject"]
 

@@ -24,9 +24,9 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from format_examples import NAMES, small_files
-from lidargrit.errors import ScanError
-from lidargrit.formats import ScanFormat, load, read_scan
-from lidargrit.structures import Scan
+from lidargrit.core.errors import ScanError
+from lidargrit.data.formats import ScanFormat, load, read_scan
+from lidargrit.scans.types import Scan
 
 SECONDS_AT_MOST = 2.0  # for one input
 MEGABYTES_AT_MOST = 300  # that one format's reader may take in all; inputs are below 2 MB

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lidargrit.cli import main
-from lidargrit.datasets import load
+from lidargrit.data.datasets import load
 from tiny_runs import contents, the_one_line, train_words
 
 

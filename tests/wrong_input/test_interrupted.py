@@ -15,10 +15,10 @@ from pathlib import Path
 
 import pytest
 
-from lidargrit import reporting
 from lidargrit.cli import main
-from lidargrit.files import read_tensors
-from lidargrit.sources.samples import read_samples
+from lidargrit.core import reporting
+from lidargrit.core.files import read_tensors
+from lidargrit.data.sources.samples import read_samples
 from tiny_runs import LONG, contents, the_one_line, train_words
 
 
@@ -219,8 +219,8 @@ def test_a_full_disk_while_logging(tmp_path, interrupt, capsys):
 KILLER = """
 import os, random, signal, sys, time
 import lightning_fabric, safetensors.torch
-import lidargrit.cli, lidargrit.sources.samples, lidargrit.generators.lidargrit
-import lidargrit.recipes, lidargrit.training
+import lidargrit.cli, lidargrit.data.sources.samples, lidargrit.systems.lidargrit.system
+import lidargrit.generation.presets, lidargrit.training
 
 rng = random.Random(int(sys.argv[1]))
 for _ in range(int(sys.argv[2])):

@@ -12,11 +12,11 @@ import torch
 
 import lidargrit
 from lidargrit.cli import main
-from lidargrit.formats.numpy_array import NumpyArray
-from lidargrit.loading import DataConfig
-from lidargrit.sources import load_range_images
-from lidargrit.sources.samples import read_samples
-from lidargrit.structures import Scan
+from lidargrit.data.formats.numpy_array import NumpyArray
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.sources import load_range_images
+from lidargrit.data.sources.samples import read_samples
+from lidargrit.scans.types import Scan
 from tiny_runs import the_one_line, train_words
 
 

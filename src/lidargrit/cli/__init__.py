@@ -11,10 +11,11 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from lidargrit import __version__, _discovery
+from lidargrit import __version__
 from lidargrit.cli._parser import EXIT_CODES, HelpFormatter, Parser
 from lidargrit.cli._signals import raising_on_signals
-from lidargrit.errors import LidarGritError, Terminated, UsageError
+from lidargrit.core import discovery
+from lidargrit.core.errors import LidarGritError, Terminated, UsageError
 
 _EXAMPLES = """\
 examples:
@@ -46,7 +47,7 @@ def _run(words: list[str]) -> int:
     try:
         options = _parsed(parser, words)
     except UsageError as error:
-        verb = words[0] if words and words[0].replace("-", "_") in _discovery.names("cli") else ""
+        verb = words[0] if words and words[0].replace("-", "_") in discovery.names("cli") else ""
         print(f"lidargrit {verb}".rstrip() + f": {error}", file=sys.stderr)
         return 2
     if options.verb is None:
@@ -100,11 +101,11 @@ def build_parser() -> Parser:
     parser = Parser(prog="lidargrit", usage="lidargrit VERB ...", description=_EXAMPLES, **raw)
     parser.add_argument("--version", action="version", version=f"lidargrit {__version__}")
     verbs = parser.add_subparsers(title="verbs", metavar="", dest="verb", prog="lidargrit")
-    for name in _discovery.names("cli"):
+    for name in discovery.names("cli"):
         verb = importlib.import_module(f"lidargrit.cli.{name}")
         sub = verbs.add_parser(
             name.removesuffix("_").replace("_", "-"),
-            help=_discovery.summary("cli", name),
+            help=discovery.summary("cli", name),
             description=f"examples:\n{verb.EXAMPLES}",
             **raw,
         )

@@ -21,7 +21,7 @@ DEFAULTS: dict[str, Any] = {
 
 def wanted(options: argparse.Namespace) -> tuple[list[str], Benchmark]:
     """Return the systems to compare, and what they have in common."""
-    from lidargrit.errors import ConfigError
+    from lidargrit.core.errors import ConfigError
     from lidargrit.evaluation.benchmark import Benchmark
     from lidargrit.evaluation.comparison import EvalConfig
     from lidargrit.evaluation.table_folder import read_table

@@ -6,10 +6,10 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lidargrit.untrusted import seed_number
+from lidargrit.core.untrusted import seed_number
 
 if TYPE_CHECKING:
-    from lidargrit.loading.config import ScanSettings
+    from lidargrit.data.prepared.config import ScanSettings
 
 
 def add_bad_points(parser: argparse.ArgumentParser, default: str | None = "refuse") -> None:
@@ -58,7 +58,7 @@ def scan_settings(options: argparse.Namespace, **more: int | None) -> ScanSettin
         options: parsed options of a verb to which :func:`add_scans` was applied.
         more: further settings of :class:`DataConfig` that the verb has options for; None for those not given.
     """
-    from lidargrit.loading.config import ScanSettings
+    from lidargrit.data.prepared.config import ScanSettings
 
     names = ("sensor", "projection", "projection_variant", "bad_points", "bad_scans")
     return ScanSettings.read(options.set, **{name: vars(options).get(name) for name in names}, **more)

@@ -8,8 +8,8 @@ import re
 from pathlib import Path
 from typing import Any, NoReturn
 
-from lidargrit.errors import UsageError, nearest_names, one_of
-from lidargrit.untrusted import check_path, check_word, positive_number, whole_number
+from lidargrit.core.errors import UsageError, nearest_names, one_of
+from lidargrit.core.untrusted import check_path, check_word, positive_number, whole_number
 
 EXIT_CODES = """\
 exit codes: 0 done, 1 a fault of lidargrit's own (with a traceback), 2 a mistake of the user (explained in one line),

@@ -14,9 +14,9 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from lidargrit.errors import OutputError, UsageError, printable
-from lidargrit.files import plain, refuse_to_overwrite, write_json
-from lidargrit.untrusted import check_path
+from lidargrit.core.errors import OutputError, UsageError, printable
+from lidargrit.core.files import plain, refuse_to_overwrite, write_json
+from lidargrit.core.untrusted import check_path
 
 STANDARD_OUTPUT = Path("-")
 

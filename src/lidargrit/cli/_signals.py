@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Any
 
-from lidargrit.errors import Terminated
+from lidargrit.core.errors import Terminated
 
 _IMPORTING = "<frozen importlib._bootstrap>"
 _AGAIN_S = 0.05

@@ -44,11 +44,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run the benchmark, write the table and its page, and print it."""
+    from lidargrit.core.files import write_text
+    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.evaluation.benchmark import as_json, as_table
     from lidargrit.evaluation.benchmark import run as run_benchmark
     from lidargrit.evaluation.table_folder import TABLE, write_table
-    from lidargrit.files import write_text
-    from lidargrit.reporting import TerminalReporter
     from lidargrit.viewer.table_page import table_page
 
     refuse_taken(options, options.out / TABLE)

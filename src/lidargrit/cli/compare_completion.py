@@ -6,7 +6,7 @@ import argparse
 
 from lidargrit.cli._options import add_device, add_scans, scan_settings
 from lidargrit.cli._results import add_json, print_result, refuse_taken
-from lidargrit.untrusted import seed_number
+from lidargrit.core.untrusted import seed_number
 
 EXAMPLES = """\
   lidargrit compare-completion simulated:64:test
@@ -35,12 +35,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Complete, measure and print a table."""
-    from lidargrit.completion import is_classical, open_completers
-    from lidargrit.completion.inputs import images_for, sensor_of
-    from lidargrit.conditions.fills import FILLS
-    from lidargrit.conditions.patterns import Pattern
+    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.evaluation.completion import PATTERNS, as_json, as_table, compare_completion
-    from lidargrit.reporting import TerminalReporter
+    from lidargrit.inference.complete import is_classical, open_completers
+    from lidargrit.inference.complete.inputs import images_for, sensor_of
+    from lidargrit.inference.complete.patterns import Pattern
+    from lidargrit.scans.fills import FILLS
 
     refuse_taken(options)
     patterns = [Pattern(text) for text in options.observed or PATTERNS]

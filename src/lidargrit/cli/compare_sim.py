@@ -7,7 +7,7 @@ from pathlib import Path
 
 from lidargrit.cli._options import add_device, add_scans, scan_settings
 from lidargrit.cli._results import add_json, print_result, refuse_taken
-from lidargrit.untrusted import seed_number
+from lidargrit.core.untrusted import seed_number
 
 EXAMPLES = """\
   lidargrit compare-sim /data/kitti_odometry
@@ -35,11 +35,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Simulate, compare, print a table and plot the curves."""
-    from lidargrit.errors import ConfigError
+    from lidargrit.core.errors import ConfigError
+    from lidargrit.core.files import refuse_to_overwrite
+    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.evaluation.raydrop import raydrop_json, raydrop_model, raydrop_table, scores_of_model
     from lidargrit.evaluation.realism import as_json, as_table, compare, scans_of_both
-    from lidargrit.files import refuse_to_overwrite
-    from lidargrit.reporting import TerminalReporter
     from lidargrit.viewer.curves import plot_curves
 
     if options.device and not options.model:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from lidargrit.cli._options import add_bad_scans, add_completion
-from lidargrit.errors import counted_scans
+from lidargrit.core.errors import counted_scans
 
 EXAMPLES = """\
   lidargrit complete /data/scans whole                             fill in every ray without a point
@@ -29,13 +29,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Complete the scans, and say where they are."""
-    from lidargrit.completion import is_classical, open_completer
-    from lidargrit.completion.command import complete_scans
-    from lidargrit.completion.files import OutputConfig
-    from lidargrit.completion.inputs import sensor_of
-    from lidargrit.conditions.patterns import Pattern
-    from lidargrit.loading import DataConfig
-    from lidargrit.reporting import TerminalReporter
+    from lidargrit.core.reporting import TerminalReporter
+    from lidargrit.data.prepared.config import DataConfig
+    from lidargrit.inference.complete import is_classical, open_completer
+    from lidargrit.inference.complete.command import complete_scans
+    from lidargrit.inference.complete.files import OutputConfig
+    from lidargrit.inference.complete.inputs import sensor_of
+    from lidargrit.inference.complete.patterns import Pattern
 
     pattern = Pattern(options.observed)
     named = options.sensor or is_classical(options.model)

@@ -24,8 +24,8 @@ def run(options: argparse.Namespace) -> None:
     """Print the script."""
     import shtab
 
-    from lidargrit.catalogue import entries
     from lidargrit.cli import build_parser
+    from lidargrit.cli._catalogue import entries
 
     parser = build_parser()
     for verb in parser.verbs():

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from lidargrit.cli._options import add_bad_scans
-from lidargrit.errors import counted_scans
+from lidargrit.core.errors import counted_scans
 
 EXAMPLES = """\
   lidargrit compress /data/kitti_odometry scans.lgz
@@ -30,10 +30,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Compress the scans, and say how small they are."""
-    from lidargrit.compression.command import compress_scans
-    from lidargrit.files import refuse_to_overwrite
-    from lidargrit.loading import DataConfig
-    from lidargrit.reporting import TerminalReporter
+    from lidargrit.core.files import refuse_to_overwrite
+    from lidargrit.core.reporting import TerminalReporter
+    from lidargrit.data.prepared.config import DataConfig
+    from lidargrit.inference.compress.command import compress_scans
 
     refuse_to_overwrite(options.out, options.overwrite, ".lgz")
     config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from lidargrit.errors import counted_scans
-from lidargrit.untrusted import whole_number
+from lidargrit.core.errors import counted_scans
+from lidargrit.core.untrusted import whole_number
 
 EXAMPLES = """\
   lidargrit decompress scans.lgz restored                    range images in metres as .npy
@@ -30,8 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Restore the scans."""
-    from lidargrit.compression.command import decompress_scans
-    from lidargrit.reporting import TerminalReporter
+    from lidargrit.core.reporting import TerminalReporter
+    from lidargrit.inference.compress.command import decompress_scans
 
     named = (options.file, options.out, options.model, options.format, options.only)
     count = decompress_scans(*named, TerminalReporter())

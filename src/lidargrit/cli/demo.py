@@ -27,9 +27,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run the demo and say where its results lie."""
-    from lidargrit.datasets import root_of
-    from lidargrit.demo import PAGE, demo
-    from lidargrit.reporting import TerminalReporter
+    from lidargrit.core.reporting import TerminalReporter
+    from lidargrit.data.datasets import root_of
+    from lidargrit.viewer.demo import PAGE, demo
 
     out = options.out or Path("runs") / (f"demo-{root_of(options.data).resolve().name}" if options.data else "demo")
     folder = demo(options.data, out, options.set, TerminalReporter(), options.anew)

@@ -26,7 +26,7 @@ def run(options: argparse.Namespace) -> None:
 
     import torch
 
-    from lidargrit.environment import cache_folder
+    from lidargrit.core.environment import cache_folder
     from lidargrit.nn.precision import has_bf16
 
     refuse_taken(options)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from lidargrit.cli._options import add_scans, scan_settings
 from lidargrit.cli._results import add_json, files_told, print_result, refuse_taken
-from lidargrit.untrusted import seed_number
+from lidargrit.core.untrusted import seed_number
 
 EXAMPLES = """\
   lidargrit evaluate samples /data/held_out --report report.html
@@ -44,9 +44,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Score and print a table."""
+    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.evaluation.command import check_modes, evaluate, read_config
     from lidargrit.evaluation.tables import read_tables
-    from lidargrit.reporting import TerminalReporter
     from lidargrit.viewer.report import write_report
 
     refuse_taken(options)

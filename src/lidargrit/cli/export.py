@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from lidargrit.cli._options import add_bad_scans
-from lidargrit.errors import counted_scans
+from lidargrit.core.errors import counted_scans
 
 EXAMPLES = """\
   lidargrit export samples clouds --format pcd                what a model generated, a file a scan
@@ -39,10 +39,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Write the files, and say how many."""
-    from lidargrit.export import export_scans
-    from lidargrit.loading import DataConfig
-    from lidargrit.reporting import TerminalReporter
-    from lidargrit.sensors import load_sensor
+    from lidargrit.core.reporting import TerminalReporter
+    from lidargrit.data.export import export_scans
+    from lidargrit.data.prepared.config import DataConfig
+    from lidargrit.scans.sensors import load_sensor
 
     sensor = load_sensor(options.sensor) if options.sensor else None
     config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)

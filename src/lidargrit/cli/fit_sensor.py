@@ -29,10 +29,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Fit, print a table, write the sensor file and perhaps a picture."""
-    from lidargrit.files import refuse_to_overwrite, write_json
-    from lidargrit.fitting import fit_sensor_to_dataset
-    from lidargrit.fitting.table import as_json, as_table
-    from lidargrit.sources import open_source
+    from lidargrit.core.files import refuse_to_overwrite, write_json
+    from lidargrit.data.sources import open_source
+    from lidargrit.scans.fit_sensor import fit_sensor_to_dataset
+    from lidargrit.scans.fit_sensor.table import as_json, as_table
 
     refuse_to_overwrite(options.out, options.overwrite, ".json")
     refuse_to_overwrite(options.picture, options.overwrite, ".png")

@@ -27,12 +27,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Project one scan and print what became of it."""
     from lidargrit.api import load_scan
-    from lidargrit.files import refuse_to_overwrite
-    from lidargrit.projection.fit import closest_sensor, projection_that_fits
-    from lidargrit.projection.inspection import as_json, as_table, inspect
-    from lidargrit.reporting import TerminalReporter
-    from lidargrit.sensors import load_sensor
-    from lidargrit.sources import open_source
+    from lidargrit.core.files import refuse_to_overwrite
+    from lidargrit.core.reporting import TerminalReporter
+    from lidargrit.data.sources import open_source
+    from lidargrit.scans.projection.inspection import as_json, as_table, inspect
+    from lidargrit.scans.projection.sensor_check import closest_sensor, projection_that_fits
+    from lidargrit.scans.sensors import load_sensor
     from lidargrit.viewer.inspection import plot_inspection
 
     refuse_to_overwrite(options.out, options.overwrite, ".png")

@@ -35,10 +35,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Count the bits and print a table."""
+    from lidargrit.core.files import refuse_to_overwrite
+    from lidargrit.core.reporting import TerminalReporter
+    from lidargrit.data.prepared.config import DataConfig
     from lidargrit.evaluation.likelihood import likelihood_of_source
-    from lidargrit.files import refuse_to_overwrite
-    from lidargrit.loading import DataConfig
-    from lidargrit.reporting import TerminalReporter
 
     refuse_taken(options)
     if options.map is not None:

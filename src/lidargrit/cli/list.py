@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import textwrap
 
-from lidargrit.catalogue import KINDS
+from lidargrit.cli._catalogue import KINDS
 from lidargrit.cli._results import add_json, print_result, refuse_taken
 
 EXAMPLES = """\
@@ -17,16 +17,16 @@ EXAMPLES = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
-    parser.add_argument("kind", nargs="?", choices=[*KINDS], help="list one kind only, with all that is known of it")
+    parser.add_argument("kind", nargs="?", choices=KINDS, help="list one kind only, with all that is known of it")
     add_json(parser)
 
 
 def run(options: argparse.Namespace) -> None:
     """Print every name with its summary; of one kind, all facts of each name."""
-    from lidargrit.catalogue import entries, lines
+    from lidargrit.cli._catalogue import entries, lines
 
     refuse_taken(options)
-    kinds = [options.kind] if options.kind else list(KINDS)
+    kinds = [options.kind] if options.kind else KINDS
     found = {kind: entries(kind, bool(options.kind)) for kind in kinds}
     wrapper = textwrap.TextWrapper(116, initial_indent=" " * 6, subsequent_indent=" " * 10, break_on_hyphens=False)
     printed = []

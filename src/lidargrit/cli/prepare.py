@@ -36,9 +36,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Prepare, and say what was made."""
-    from lidargrit.loading import prepare_and_describe
-    from lidargrit.reporting import TerminalReporter
-    from lidargrit.sources import open_source
+    from lidargrit.core.reporting import TerminalReporter
+    from lidargrit.data.prepared.prepare import prepare_and_describe
+    from lidargrit.data.sources import open_source
 
     refuse_taken(options)
     names = ("columns", "column_stride", "max_scans", "workers")

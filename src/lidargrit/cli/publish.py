@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Write the folder."""
-    from lidargrit.files import read_text
+    from lidargrit.core.files import read_text
     from lidargrit.publishing import publish
 
     notes = read_text(options.notes) if options.notes else ""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from lidargrit.cli._options import add_bad_scans, add_completion
-from lidargrit.errors import counted_scans
+from lidargrit.core.errors import counted_scans
 
 EXAMPLES = """\
   lidargrit raydrop /data/carla_scans dropped
@@ -25,11 +25,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Drop returns, and say where the scans are."""
-    from lidargrit.completion import open_completer
-    from lidargrit.completion.command import raydrop_scans
-    from lidargrit.completion.files import OutputConfig
-    from lidargrit.loading import DataConfig
-    from lidargrit.reporting import TerminalReporter
+    from lidargrit.core.reporting import TerminalReporter
+    from lidargrit.data.prepared.config import DataConfig
+    from lidargrit.inference.complete import open_completer
+    from lidargrit.inference.complete.command import raydrop_scans
+    from lidargrit.inference.complete.files import OutputConfig
 
     completer = open_completer(options.model, "surfaces", None, options.set, options.device)
     output = OutputConfig(options.count, options.seed, options.format, options.probability)

@@ -38,9 +38,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Reproduce the table, or print the plan."""
+    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.evaluation.benchmark import as_json
     from lidargrit.evaluation.reproduction import Reproduction, plan, plan_as_text, reproduce, table_of
-    from lidargrit.reporting import TerminalReporter
 
     refuse_taken(options)
     wanted = Reproduction(

@@ -7,8 +7,8 @@ import os
 from pathlib import Path
 
 from lidargrit.cli._options import add_device, add_rank, add_settings
-from lidargrit.errors import counted_scans
-from lidargrit.untrusted import seed_number, seeds_in_a_row
+from lidargrit.core.errors import counted_scans
+from lidargrit.core.untrusted import seed_number, seeds_in_a_row
 
 EXAMPLES = """\
   lidargrit sample pretrained samples                     by a model that comes with the package, 64x256
@@ -36,12 +36,12 @@ def run(options: argparse.Namespace) -> None:
     """Sample to disk."""
     import torch
 
-    from lidargrit.generators import load
+    from lidargrit.core.processes import rank_and_world_size
+    from lidargrit.core.reporting import TerminalReporter
+    from lidargrit.data.run_folder import locate
+    from lidargrit.data.sources.samples import write_samples
+    from lidargrit.generation.generator import load
     from lidargrit.nn.devices import usable_device
-    from lidargrit.processes import rank_and_world_size
-    from lidargrit.reporting import TerminalReporter
-    from lidargrit.run_folder import locate
-    from lidargrit.sources.samples import write_samples
 
     seeds = seeds_in_a_row(options.seed, options.count)
     rank, world_size = rank_and_world_size(options.rank, options.world_size)

@@ -33,8 +33,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Serve until interrupted."""
-    from lidargrit.run_folder import locate
-    from lidargrit.serving import Limits, finished_runs, serve
+    from lidargrit.data.run_folder import locate
+    from lidargrit.viewer.serve import Limits, finished_runs, serve
 
     say = partial(print, flush=True)
     runs = [locate(run) for run in options.runs] or finished_runs(Path("runs"), say)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from lidargrit.errors import counted_scans
-from lidargrit.untrusted import seed_number
+from lidargrit.core.errors import counted_scans
+from lidargrit.core.untrusted import seed_number
 
 EXAMPLES = """\
   lidargrit simulate streets -n 1000
@@ -42,9 +42,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Simulate, and say where the files are."""
-    from lidargrit.reporting import TerminalReporter
-    from lidargrit.sensors import load_sensor
-    from lidargrit.simulator.drives import DriveConfig, write_drives
+    from lidargrit.core.reporting import TerminalReporter
+    from lidargrit.data.drives import DriveConfig, write_drives
+    from lidargrit.scans.sensors import load_sensor
 
     config = DriveConfig(
         sensor=load_sensor(options.sensor),

@@ -33,10 +33,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Train, or print the plan."""
-    from lidargrit.errors import ConfigError
-    from lidargrit.generators import load_class
-    from lidargrit.recipes import load_recipe
-    from lidargrit.reporting import TerminalReporter
+    from lidargrit.core.errors import ConfigError
+    from lidargrit.core.reporting import TerminalReporter
+    from lidargrit.generation.generator import load_class
+    from lidargrit.generation.presets import load_recipe
     from lidargrit.training import measure, open_data, plan_training, train
 
     recipe = load_recipe(options.recipe, options.set)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from lidargrit.cli._options import add_bad_scans, add_completion
-from lidargrit.errors import counted_scans
+from lidargrit.core.errors import counted_scans
 
 EXAMPLES = """\
   lidargrit upsample /data/vlp16 dense --sensor vlp16                          by pretrained, a model in the package
@@ -25,13 +25,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Add the rows, and say where the scans are."""
-    from lidargrit.completion import open_completer
-    from lidargrit.completion.command import upsample_scans
-    from lidargrit.completion.files import OutputConfig
-    from lidargrit.completion.inputs import sensor_of
-    from lidargrit.loading import DataConfig
-    from lidargrit.reporting import TerminalReporter
-    from lidargrit.sensors import load_sensor
+    from lidargrit.core.reporting import TerminalReporter
+    from lidargrit.data.prepared.config import DataConfig
+    from lidargrit.inference.complete import open_completer
+    from lidargrit.inference.complete.command import upsample_scans
+    from lidargrit.inference.complete.files import OutputConfig
+    from lidargrit.inference.complete.inputs import sensor_of
+    from lidargrit.scans.sensors import load_sensor
 
     scans_sensor = sensor_of(options.scans, options.sensor)
     wanted_sensor = load_sensor(options.to) if options.to else None

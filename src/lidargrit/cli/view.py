@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from lidargrit.cli._options import add_device, add_scans, scan_settings
-from lidargrit.untrusted import seed_number
+from lidargrit.core.untrusted import seed_number
 
 EXAMPLES = """\
   lidargrit view /data/scans                           range image, return mask and bird's-eye view
@@ -37,9 +37,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Render the picture, or write the page."""
-    from lidargrit.errors import ConfigError
-    from lidargrit.files import refuse_to_overwrite
-    from lidargrit.reporting import TerminalReporter
+    from lidargrit.core.errors import ConfigError
+    from lidargrit.core.files import refuse_to_overwrite
+    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.viewer import view
 
     if options.model and options.color != "surprise":

@@ -17,27 +17,28 @@ from typing import Any
 import torch
 
 from lidargrit import __version__
-from lidargrit.configuration import name_and_settings
-from lidargrit.errors import ConfigError, LidarGritError
+from lidargrit.core.configuration import name_and_settings
+from lidargrit.core.errors import ConfigError, LidarGritError
+from lidargrit.core.files import claim_folder, read_json, write_json
+from lidargrit.core.processes import check_processes, process_pool
+from lidargrit.core.reporting import Reporter
+from lidargrit.data.run_folder import is_run, locate, weights_sha256
+from lidargrit.data.sources import Source, data_set_of, open_source
+from lidargrit.data.sources.samples import read_samples, write_samples
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair, metric_factory, open_pair
 from lidargrit.evaluation.costs import COSTS, Costs, costs_block, read_costs
+from lidargrit.evaluation.metrics import load_metric
 from lidargrit.evaluation.pairs import EvalPair, require_same_rays
 from lidargrit.evaluation.protocols import MetricChoice, load_protocol, public_name
 from lidargrit.evaluation.scorecard import NOT_APPLICABLE, Scorecard
 from lidargrit.evaluation.tables import Format, render, side_by_side
 from lidargrit.evaluation.verdict import MEMORISED, PIXEL_STATISTICS
-from lidargrit.files import claim_folder, read_json, write_json
-from lidargrit.generators import Generator, load, load_class
-from lidargrit.metrics import load_metric
+from lidargrit.generation.generator import Generator, load, load_class
+from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.settings import Recipe
 from lidargrit.nn.devices import usable_device
-from lidargrit.processes import check_processes, process_pool
-from lidargrit.recipes import load_recipe
-from lidargrit.reporting import Reporter
-from lidargrit.run_folder import is_run, locate, weights_sha256
-from lidargrit.sensors import SensorModel
-from lidargrit.sources import Source, data_set_of, open_source
-from lidargrit.sources.samples import read_samples, write_samples
-from lidargrit.training import Recipe, check_folder, train, with_budget
+from lidargrit.scans.sensors import SensorModel
+from lidargrit.training import check_folder, train, with_budget
 from lidargrit.training.compute import duration
 from lidargrit.training.plan import check_stages
 

@@ -8,20 +8,20 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from lidargrit import _discovery
-from lidargrit.errors import ConfigError, nearest_names, one_of
+from lidargrit.core import discovery
+from lidargrit.core.errors import ConfigError, nearest_names, one_of
+from lidargrit.core.files import refuse_to_overwrite
+from lidargrit.core.reporting import Reporter
+from lidargrit.data.prepared.config import DataConfig, ScanSettings
+from lidargrit.data.sources import RunSource, SampleSource, Source, TensorSource, open_source
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair, open_pair
 from lidargrit.evaluation.intervals import Resampling
+from lidargrit.evaluation.metrics import load_metric
 from lidargrit.evaluation.pairs import EvalPair
 from lidargrit.evaluation.protocols import DEFAULT, public_name
 from lidargrit.evaluation.reconstruction import score_run
 from lidargrit.evaluation.scorecard import Scorecard
-from lidargrit.files import refuse_to_overwrite
-from lidargrit.loading.config import DataConfig, ScanSettings
-from lidargrit.metrics import load_metric
 from lidargrit.nn.devices import usable_device
-from lidargrit.reporting import Reporter
-from lidargrit.sources import RunSource, SampleSource, Source, TensorSource, open_source
 
 _OF_TABLES = ("tables", "format", "json", "overwrite", "debug", "verb")  # options that printing takes as well
 
@@ -130,7 +130,7 @@ def _weights(words: Sequence[str]) -> dict[str, Path]:
     """Turn words such as ``pointnet=FILE`` into files by the name of their network."""
     if not words:
         return {}
-    known = {load_metric(name).needs_weights for name in _discovery.names("metrics")} - {""}
+    known = {load_metric(name).needs_weights for name in discovery.names("metrics")} - {""}
     files = {}
     for word in words:
         name, equals, path = word.partition("=")

@@ -10,19 +10,19 @@ from pathlib import Path
 from typing import Any
 
 from lidargrit import __version__
-from lidargrit.errors import ConfigError, LidarGritError, counted_scans, nearest_names, one_of
+from lidargrit.core.errors import ConfigError, LidarGritError, counted_scans, nearest_names, one_of
+from lidargrit.core.reporting import Reporter
+from lidargrit.core.untrusted import COUNT_AT_MOST, SEED_AT_MOST
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.sources import Source, open_source
 from lidargrit.evaluation.intervals import Resampling, Score
+from lidargrit.evaluation.metrics import load_metric
 from lidargrit.evaluation.pairs import EvalPair, pair_for_protocol
 from lidargrit.evaluation.protocols import DEFAULT, MetricChoice, Protocol, load_protocol, public_name
 from lidargrit.evaluation.scorecard import NOT_APPLICABLE, LeftOut, Scorecard
 from lidargrit.evaluation.scoring import MetricFactory, score_metrics
-from lidargrit.loading import DataConfig
-from lidargrit.metrics import load_metric
-from lidargrit.projection import ProjectionVariant
-from lidargrit.reporting import Reporter
-from lidargrit.sensors import load_sensor
-from lidargrit.sources import Source, open_source
-from lidargrit.untrusted import COUNT_AT_MOST, SEED_AT_MOST
+from lidargrit.scans.projection import ProjectionVariant
+from lidargrit.scans.sensors import load_sensor
 
 _FEW = 100  # scans: below that the interval itself rests on too little, and values hardly differ from real against real
 

@@ -13,18 +13,18 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lidargrit.completion import Completer
-from lidargrit.conditions import Condition
-from lidargrit.conditions.patterns import Pattern
-from lidargrit.determinism import derive_seed, scan_seed
-from lidargrit.errors import ConfigError, DataError, UsageError, counted_scans
+from lidargrit.core.determinism import derive_seed, scan_seed
+from lidargrit.core.errors import ConfigError, DataError, UsageError, counted_scans
+from lidargrit.core.reporting import Reporter
+from lidargrit.data.images import RangeImages
 from lidargrit.evaluation.estimates import Estimate
-from lidargrit.loading import RangeImages
-from lidargrit.metrics import load_metric
-from lidargrit.nn.semantic_classes import NUM_CLASSES, class_indices
-from lidargrit.projection import points_of_pixels
-from lidargrit.reporting import Reporter
-from lidargrit.structures import RangeImage
+from lidargrit.evaluation.metrics import load_metric
+from lidargrit.generation.semantic_classes import NUM_CLASSES, class_indices
+from lidargrit.inference.complete import Completer
+from lidargrit.inference.complete.patterns import Pattern
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.projection import points_of_pixels
+from lidargrit.scans.types import RangeImage
 
 PATTERNS = ("rows:4", "sector:45,315", "pixels:0.1")
 """Patterns that are compared unless others are named: every fourth row, all but 90 degrees ahead, a tenth."""

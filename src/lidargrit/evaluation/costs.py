@@ -7,14 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lidargrit.errors import CheckpointError, ConfigError
+from lidargrit.core.errors import CheckpointError, ConfigError
+from lidargrit.core.files import read_json, write_json
+from lidargrit.core.reporting import Reporter
 from lidargrit.evaluation.likelihood import bits_per_return
 from lidargrit.evaluation.pairs import EvalSet
 from lidargrit.evaluation.tables import TableBlock
-from lidargrit.files import read_json, write_json
-from lidargrit.generators import Generator
-from lidargrit.reporting import Reporter
-from lidargrit.training import Recipe, training_flops
+from lidargrit.generation.generator import Generator
+from lidargrit.generation.settings import Recipe
+from lidargrit.training import training_flops
 
 COSTS = "costs.json"
 _ENTRIES = {  # entry of the file → name and unit in the table, and whether a system may lack it

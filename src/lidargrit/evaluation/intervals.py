@@ -23,9 +23,9 @@ from itertools import pairwise
 import numpy as np
 from scipy.special import stdtrit
 
-from lidargrit.errors import ConfigError, DataError
-from lidargrit.metrics import Metric
-from lidargrit.structures import MetricResult
+from lidargrit.core.errors import ConfigError, DataError
+from lidargrit.evaluation.metrics import Metric
+from lidargrit.scans.types import MetricResult
 
 _HALVINGS = 5  # of the reference against itself: their mean is reported, not their spread
 _AT_LEAST = 4  # groups: fewer have too few halves

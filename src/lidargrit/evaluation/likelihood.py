@@ -10,17 +10,18 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from lidargrit.determinism import evenly_spaced
+from lidargrit.core.determinism import evenly_spaced
+from lidargrit.core.files import atomic_path
+from lidargrit.core.reporting import Reporter
+from lidargrit.data.images import RangeImages
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.run_folder import locate
+from lidargrit.data.sources import RunSource, open_source, overlap
 from lidargrit.evaluation.estimates import Estimate
 from lidargrit.evaluation.pairs import EvalSet
-from lidargrit.files import atomic_path
-from lidargrit.generators import Generator
-from lidargrit.loading import DataConfig, RangeImages
+from lidargrit.generation.generator import Generator
 from lidargrit.nn.devices import usable_device
-from lidargrit.reporting import Reporter
-from lidargrit.run_folder import locate
-from lidargrit.sources import RunSource, open_source, overlap
-from lidargrit.structures import ScanBits
+from lidargrit.scans.types import ScanBits
 
 _BATCH = 4
 _COMPARED_AT_MOST = 64  # scans: enough to tell systems apart, and seconds where all would take minutes

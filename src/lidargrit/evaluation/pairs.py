@@ -7,16 +7,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from lidargrit.determinism import evenly_spaced
-from lidargrit.errors import ConfigError
+from lidargrit.core.determinism import evenly_spaced
+from lidargrit.core.errors import ConfigError
+from lidargrit.core.reporting import Reporter
+from lidargrit.data.images import RangeImages
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.sources import DatasetSource, SampleSource, Source, overlap
+from lidargrit.data.sources.samples import full_rows_of
 from lidargrit.evaluation.protocols import Protocol
 from lidargrit.evaluation.scorecard import EvalSetRecord
-from lidargrit.loading import DataConfig, RangeImages
-from lidargrit.reporting import Reporter
-from lidargrit.sensors import SensorModel
-from lidargrit.sources import DatasetSource, SampleSource, Source, overlap
-from lidargrit.sources.samples import full_rows_of
-from lidargrit.structures import RangeImage
+from lidargrit.scans.sensors import SensorModel
+from lidargrit.scans.types import RangeImage
 
 _BATCH = 16
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import torch
 
 from lidargrit.evaluation.pairs import EvalSet
-from lidargrit.structures import RangeImage
+from lidargrit.scans.types import RangeImage
 
 _PIXELS_AT_ONCE = 1 << 24  # shuffled in memory: 1,024 scans of 64x256
 

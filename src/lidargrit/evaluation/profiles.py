@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float64
 
-from lidargrit.determinism import evenly_spaced
+from lidargrit.core.determinism import evenly_spaced
 from lidargrit.evaluation.pairs import EvalSet
-from lidargrit.projection import points_of_pixels
+from lidargrit.scans.projection import points_of_pixels
 
 HALF_VIEW_M = 50.0  # beyond it a 64-row sensor sees little but walls
 _CELLS = 100  # of 1 m, along each axis

@@ -9,15 +9,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lidargrit.conditions import Condition
-from lidargrit.conditions.fills import ranges_from_others
-from lidargrit.errors import ConfigError
+from lidargrit.core.errors import ConfigError
+from lidargrit.data.images import RangeImages
+from lidargrit.data.run_folder import locate
 from lidargrit.evaluation.realism import SimulatedScans, distance, drop_independently
-from lidargrit.generators import Generator, load
-from lidargrit.loading import RangeImages
+from lidargrit.generation.generator import Generator, load
 from lidargrit.nn.devices import usable_device
-from lidargrit.run_folder import locate
-from lidargrit.structures import MetricResult, RangeImage
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.fills import ranges_from_others
+from lidargrit.scans.types import MetricResult, RangeImage
 
 RAYDROP_CURVES = (
     "return_rate_per_ring",

@@ -9,15 +9,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from lidargrit.errors import ConfigError, DataError, counted_scans
-from lidargrit.loading import DataConfig, RangeImages
-from lidargrit.metrics import load_metric
-from lidargrit.projection import project, unproject
-from lidargrit.reporting import Reporter
-from lidargrit.sensors import SensorModel, load_sensor
+from lidargrit.core.errors import ConfigError, DataError, counted_scans
+from lidargrit.core.reporting import Reporter
+from lidargrit.data.images import RangeImages
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.sources import open_source
+from lidargrit.evaluation.metrics import load_metric
+from lidargrit.scans.projection import project, unproject
+from lidargrit.scans.sensors import SensorModel, load_sensor
+from lidargrit.scans.types import MetricResult, RangeImage
 from lidargrit.simulator import Observation, observe
-from lidargrit.sources import open_source
-from lidargrit.structures import MetricResult, RangeImage
 
 CURVES = (
     "return_rate_per_ring",

@@ -8,13 +8,14 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
-from lidargrit.errors import ConfigError, DataError, ScanError
+from lidargrit.core.errors import ConfigError, DataError, ScanError
+from lidargrit.core.reporting import Reporter
+from lidargrit.data.images import RangeImages
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.sources import RunSource, Source, overlap
 from lidargrit.evaluation.likelihood import score_likelihood
-from lidargrit.loading import DataConfig, RangeImages
-from lidargrit.reporting import Reporter
-from lidargrit.sources import RunSource, Source, overlap
-from lidargrit.structures import RangeImage
-from lidargrit.tokenizers import Tokenizer
+from lidargrit.generation.tokenizers import Tokenizer
+from lidargrit.scans.types import RangeImage
 
 _BATCH = 16
 _LEAST_M = 1e-3  # of a decoded range in a logarithm or a ratio: ours are longer, others' may be 0 or negative

@@ -8,16 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lidargrit.errors import ConfigError
+from lidargrit.core.errors import ConfigError
+from lidargrit.core.reporting import Reporter
+from lidargrit.data.run_folder import is_run
+from lidargrit.data.sources import load_range_images, open_source
 from lidargrit.evaluation.benchmark import Benchmark, as_table
 from lidargrit.evaluation.benchmark import run as run_benchmark
 from lidargrit.evaluation.comparison import EvalConfig
+from lidargrit.evaluation.metrics import load_metric
 from lidargrit.evaluation.protocols import load_protocol
 from lidargrit.evaluation.tables import Format
-from lidargrit.metrics import load_metric
-from lidargrit.reporting import Reporter
-from lidargrit.run_folder import is_run
-from lidargrit.sources import load_range_images, open_source
 from lidargrit.training import computing_time, plan_training
 
 SIMULATED = "simulated"  # in place of a root

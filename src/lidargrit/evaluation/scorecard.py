@@ -7,11 +7,11 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from lidargrit.errors import DataError
+from lidargrit.core.errors import DataError
+from lidargrit.core.files import read_json
 from lidargrit.evaluation.intervals import Interval, RealAgainstReal, Score
 from lidargrit.evaluation.verdict import counted_first, verdict
-from lidargrit.files import read_json
-from lidargrit.structures import MetricResult
+from lidargrit.scans.types import MetricResult
 
 LEFT_OUT, NOT_APPLICABLE = "left out", "not applicable"
 

@@ -9,14 +9,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from lidargrit.determinism import scan_seed
-from lidargrit.errors import DataError, LidarGritError, ScanError
+from lidargrit.core.determinism import scan_seed
+from lidargrit.core.errors import DataError, LidarGritError, ScanError
+from lidargrit.core.reporting import Reporter
 from lidargrit.evaluation.intervals import Part, Resampling, Score, blocks, interval_of, merged, real_against_real
+from lidargrit.evaluation.metrics import Metric, WholeImages, load_metric, update_together
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
 from lidargrit.evaluation.pixel_statistics import pixel_statistics
 from lidargrit.evaluation.protocols import MetricChoice
-from lidargrit.metrics import Metric, WholeImages, load_metric, update_together
-from lidargrit.reporting import Reporter
 
 _BATCH = 16
 

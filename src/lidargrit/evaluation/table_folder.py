@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from lidargrit.errors import ConfigError
+from lidargrit.core.errors import ConfigError
+from lidargrit.core.files import read_json, write_json
 from lidargrit.evaluation.benchmark import Benchmark, as_json
 from lidargrit.evaluation.comparison import EvalConfig
-from lidargrit.files import read_json, write_json
 
 TABLE = "table.json"
 _CURE = "name the systems and settings once more: lidargrit compare OUT SYSTEM ..."

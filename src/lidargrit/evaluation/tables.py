@@ -10,11 +10,11 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
-from lidargrit.errors import DataError, printable
+from lidargrit.core.errors import DataError, printable
+from lidargrit.core.files import read_json
 from lidargrit.evaluation.intervals import Score
 from lidargrit.evaluation.scorecard import NOT_APPLICABLE, LeftOut, Scorecard, format_value
 from lidargrit.evaluation.verdict import MEMORISED, PIXEL_STATISTICS, value_of_halves, verdict
-from lidargrit.files import read_json
 
 Format = Literal["text", "markdown", "latex"]
 Column = tuple[str, str]  # metric, variant

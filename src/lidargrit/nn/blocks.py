@@ -8,7 +8,7 @@ import torch
 from torch import nn
 from torch.utils.checkpoint import checkpoint
 
-from lidargrit.errors import ConfigError
+from lidargrit.core.errors import ConfigError
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
 

@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from lidargrit.errors import ConfigError
+from lidargrit.core.errors import ConfigError
 from lidargrit.nn.threads import threads_for
 from lidargrit.nn.transformer import CausalTransformer
 

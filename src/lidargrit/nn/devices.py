@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from lidargrit.errors import ConfigError
+from lidargrit.core.errors import ConfigError
 
 
 def usable_device(name: str) -> torch.device:

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Shaped
 from torch import Tensor, nn
 
-from lidargrit.errors import CheckpointError
+from lidargrit.core.errors import CheckpointError
 
 
 def load_exactly(module: nn.Module, weights: dict[str, Tensor], source: Path) -> None:

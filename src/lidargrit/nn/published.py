@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lidargrit.errors import CheckpointError
+from lidargrit.core.errors import CheckpointError
 
 _ZIP, _PICKLE = b"PK\x03\x04", b"\x80"  # how files of torch.save begin: since version 1.6, and before it
 

@@ -14,7 +14,7 @@ from torch.nn.modules.module import (
     register_module_parameter_registration_hook,
 )
 
-from lidargrit.errors import ConfigError
+from lidargrit.core.errors import ConfigError
 
 NUMBERS_AT_MOST = 2**30  # 4.3 GB in 32 bits, thirty times the largest network of our recipes
 _MODULES_AT_MOST = 20_000  # many small ones take minutes to build; the largest networks of our recipes have 2,000

@@ -10,12 +10,12 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from lidargrit.errors import ConfigError
+from lidargrit.core.errors import ConfigError
+from lidargrit.generation.pixel_decoder.lattice_network import Residual
 from lidargrit.nn.blocks import Network
 from lidargrit.nn.convolution import Convolution
-from lidargrit.nn.lattice_network import Residual
 from lidargrit.nn.transformer import TransformerBlock, TransformerConfig
-from lidargrit.sensors import SensorModel
+from lidargrit.scans.sensors import SensorModel
 
 _CELL = 8  # rows and columns of an image are multiples of it
 

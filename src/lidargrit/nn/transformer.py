@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from lidargrit.errors import ConfigError
+from lidargrit.core.errors import ConfigError
 from lidargrit.nn.attention import attend
 from lidargrit.nn.blocks import Block, Network
 

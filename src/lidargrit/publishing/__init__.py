@@ -10,16 +10,25 @@ from typing import Any
 
 import torch
 
-from lidargrit import __version__, configuration
-from lidargrit.errors import CheckpointError, ConfigError, OutputError
+from lidargrit import __version__
+from lidargrit.core import configuration
+from lidargrit.core.errors import CheckpointError, ConfigError, OutputError
+from lidargrit.core.files import claim_folder, is_taken, read_json, sha256_of, write_json
+from lidargrit.data.run_folder import (
+    CARD_FILE,
+    RUN_FILE,
+    locate,
+    taken_over,
+    trained_on,
+    weights_sha256,
+    write_trained_on,
+)
+from lidargrit.data.sources import data_set_of
 from lidargrit.evaluation.scorecard import Scorecard
-from lidargrit.files import claim_folder, is_taken, read_json, sha256_of, write_json
-from lidargrit.generators import Generator, load, load_class
+from lidargrit.generation.generator import Generator, load, load_class
+from lidargrit.generation.presets import load_recipe
 from lidargrit.nn.quantization import WeightBits, without_quantized
 from lidargrit.publishing.card import model_card
-from lidargrit.recipes import load_recipe
-from lidargrit.run_folder import CARD_FILE, RUN_FILE, locate, taken_over, trained_on, weights_sha256, write_trained_on
-from lidargrit.sources import data_set_of
 
 
 def import_weights(recipe: str, folder: Path, files: Sequence[Path], settings: Sequence[str] = ()) -> Generator:

@@ -8,16 +8,16 @@ import re
 from collections.abc import Iterable
 from typing import Any
 
-from lidargrit import _discovery
-from lidargrit.datasets import load as load_dataset
-from lidargrit.errors import one_line
+from lidargrit.core import discovery
+from lidargrit.core.errors import one_line
+from lidargrit.data.datasets import load as load_dataset
+from lidargrit.data.images import Provenance
+from lidargrit.data.run_folder import recipe_settings, taken_over
+from lidargrit.data.sources import data_set_of
 from lidargrit.evaluation.scorecard import NOT_APPLICABLE, Scorecard, format_value
 from lidargrit.evaluation.verdict import value_of_halves, verdict
-from lidargrit.generators import Generator
-from lidargrit.loading import Provenance
+from lidargrit.generation.generator import Generator
 from lidargrit.nn.quantization import WeightBits
-from lidargrit.run_folder import recipe_settings, taken_over
-from lidargrit.sources import data_set_of
 
 _PIPELINE = "unconditional-image-generation"  # of the hub's tasks the nearest; it has none for scans
 _CREATIVE_COMMONS = re.compile(r"CC ([A-Z-]+) (\d\.\d) \([a-z-]+\)")  # without terms beside it
@@ -70,7 +70,7 @@ def _what(generator: Generator, bits: WeightBits) -> str:
     rounded = {8: ", rounded to 8 bits (vectors to 16)", 16: ", rounded to 16 bits", 32: ""}[bits]
     return (
         f"# {name} for {_text(sensor.name)}\n\n"
-        f"{_discovery.summary('generators', name)}\n\n"
+        f"{discovery.summary('generators', name)}\n\n"
         f"This model generates LiDAR scans as range images of {sensor.height}x{sensor.width} pixels, "
         f"{sensor.range_min_m:g} to {sensor.range_max_m:g} m, along the rays of the sensor {_code(sensor.name)}.\n"
         f"It has {weights:,} parameters{rounded}.\n"

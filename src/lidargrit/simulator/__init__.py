@@ -6,14 +6,14 @@ from typing import get_args
 
 import numpy as np
 
-from lidargrit.errors import ConfigError
-from lidargrit.sensors import SensorModel, load_sensor
+from lidargrit.core.errors import ConfigError
+from lidargrit.scans.sensors import SensorModel, load_sensor
+from lidargrit.scans.types import Scan
 from lidargrit.simulator.beams import REVOLUTION_S
 from lidargrit.simulator.observation import Observation, ObservationConfig, observe_scene
 from lidargrit.simulator.power import RaydropModel
 from lidargrit.simulator.scene import Scene, Theme, sample_scene
 from lidargrit.simulator.scene.street_plan import sample_street_plan
-from lidargrit.structures import Scan
 
 __all__ = ["Observation", "RaydropModel", "Scene", "Theme", "frames_of", "observe", "scene_of", "simulate"]
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 from scipy.special import ndtri
 
-from lidargrit.sensors import SensorModel
+from lidargrit.scans.sensors import SensorModel
 from lidargrit.simulator.kitti_car import hidden_by_car, is_on_car
 
 REVOLUTION_S = 0.1  # KITTI's sensor turns at 10 Hz: Geiger et al., IJRR 2013, section 2

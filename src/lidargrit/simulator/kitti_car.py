@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 
-from lidargrit.sensors import SensorModel
+from lidargrit.scans.sensors import SensorModel
 
 _SENSORS = ("hdl64e_kitti_360", "hdl64e_kitti_odometry")
 

@@ -9,8 +9,9 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Float64, Int32, UInt16
 
-from lidargrit.conditions.marks import mark
-from lidargrit.sensors import SensorModel
+from lidargrit.scans.marks import mark
+from lidargrit.scans.sensors import SensorModel
+from lidargrit.scans.types import Scan
 from lidargrit.simulator.beams import REVOLUTION_S, Beams
 from lidargrit.simulator.echoes import Echoes, detect_echoes, edges
 from lidargrit.simulator.mesh import Mesh
@@ -24,7 +25,6 @@ from lidargrit.simulator.power import (
     return_probability,
 )
 from lidargrit.simulator.tracing import Tracer, in_reach
-from lidargrit.structures import Scan
 
 
 @runtime_checkable
@@ -105,7 +105,7 @@ class Observation:
     def surfaces(self, source: str, limits_m: tuple[float, float]) -> Scan:
         """Return a point on every surface within limits, without noise, in the firing order of KITTI's files.
 
-        The reflectance marks which beams came back, and how bright; see :mod:`lidargrit.conditions.marks`. Rays that
+        The reflectance marks which beams came back, and how bright; see :mod:`lidargrit.scans.marks`. Rays that
         end on the car that carries the sensor meet no surface.
 
         Args:

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float32, Int32, UInt8
 from scipy.special import ndtr
 
-from lidargrit.errors import ConfigError
-from lidargrit.sensors import SensorModel
+from lidargrit.core.errors import ConfigError
+from lidargrit.scans.sensors import SensorModel
 from lidargrit.simulator.kitti_car import LASER_GAINS, LASER_READINGS, is_on_car
 from lidargrit.simulator.materials import ASPHALT, CONCRETE, MATERIALS, Material
 from lidargrit.simulator.mesh import Mesh

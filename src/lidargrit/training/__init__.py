@@ -1,14 +1,11 @@
 """Recipe → run folder, by one training loop for every generator."""
 
 from lidargrit.training.compute import computing_time, training_flops, with_budget
-from lidargrit.training.config import FitConfig, Recipe
 from lidargrit.training.measure import measure
 from lidargrit.training.plan import open_data, plan_training
 from lidargrit.training.run import check_folder, train
 
 __all__ = [
-    "FitConfig",
-    "Recipe",
     "check_folder",
     "computing_time",
     "measure",

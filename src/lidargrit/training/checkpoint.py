@@ -8,12 +8,12 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from lidargrit.errors import CheckpointError
-from lidargrit.files import read_tensors, write_tensors
+from lidargrit.core.errors import CheckpointError
+from lidargrit.core.files import read_tensors, write_tensors
+from lidargrit.core.untrusted import WHOLE_NUMBER_AT_MOST
 from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.published import weights_below
 from lidargrit.training.optimiser import WeightAverage
-from lidargrit.untrusted import WHOLE_NUMBER_AT_MOST
 
 
 def save_checkpoint(

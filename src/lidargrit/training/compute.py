@@ -12,15 +12,15 @@ from typing import Any
 
 import torch
 
-from lidargrit.configuration import COUNTS_SCANS
-from lidargrit.errors import ConfigError
-from lidargrit.generators import Generator
+from lidargrit.core.configuration import COUNTS_SCANS
+from lidargrit.core.errors import ConfigError
+from lidargrit.generation.generator import Generator
+from lidargrit.generation.objective import Objective
+from lidargrit.generation.settings import FitConfig, Recipe
 from lidargrit.nn.flops import FlopCounter
-from lidargrit.nn.objective import Objective
 from lidargrit.nn.precision import Precision
-from lidargrit.sensors import SensorModel
-from lidargrit.structures import RangeImage
-from lidargrit.training.config import FitConfig, Recipe
+from lidargrit.scans.sensors import SensorModel
+from lidargrit.scans.types import RangeImage
 from lidargrit.training.taken_stages import donors_of_stages
 
 _SCANS = 2  # in a counted batch: some objectives compare the scans of a batch
@@ -197,7 +197,7 @@ def _with_fewer_scans(model: Any, share: float) -> Any:
 def uniform_images(sensor: SensorModel, count: int) -> RangeImage:
     """Return range images whose every pixel returns at 10 m, for counting operations and measuring speed.
 
-    Their reflectance is also a mark of surfaces that return; see lidargrit.conditions.marks.
+    Their reflectance is also a mark of surfaces that return; see lidargrit.scans.marks.
     """
     range_m = torch.full((count, sensor.height, sensor.width), 10.0).clamp(sensor.range_min_m, sensor.range_max_m)
     mask, label = torch.ones_like(range_m, dtype=torch.bool), torch.full(range_m.shape, 40)

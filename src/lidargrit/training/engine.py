@@ -16,12 +16,12 @@ import torch
 from torch import Tensor, nn
 from torch.distributed import DistError
 
-from lidargrit.determinism import derive_seed
-from lidargrit.errors import ConfigError, LidarGritError, TrainingError
-from lidargrit.nn.objective import Objective
+from lidargrit.core.determinism import derive_seed
+from lidargrit.core.errors import ConfigError, LidarGritError, TrainingError
+from lidargrit.core.processes import rank_and_world_size
+from lidargrit.generation.objective import Objective
 from lidargrit.nn.precision import Precision, dtype_of
-from lidargrit.processes import rank_and_world_size
-from lidargrit.structures import RangeImage
+from lidargrit.scans.types import RangeImage
 
 
 class Engine:

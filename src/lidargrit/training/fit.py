@@ -13,17 +13,18 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from lidargrit.determinism import derive_seed, evenly_spaced
-from lidargrit.errors import ConfigError, Terminated, TrainingError
-from lidargrit.files import remove_partials
-from lidargrit.loading import Batches, RangeImages
+from lidargrit.core.determinism import derive_seed, evenly_spaced
+from lidargrit.core.errors import ConfigError, Terminated, TrainingError
+from lidargrit.core.files import remove_partials
+from lidargrit.core.reporting import Reporter
+from lidargrit.data.batches import Batches
+from lidargrit.data.images import RangeImages
+from lidargrit.data.run_folder import CHECKPOINT_FILE
+from lidargrit.generation.objective import Objective
+from lidargrit.generation.settings import FitConfig
 from lidargrit.nn.blocks import prepare_for_training
-from lidargrit.nn.objective import Objective
-from lidargrit.reporting import Reporter
-from lidargrit.run_folder import CHECKPOINT_FILE
-from lidargrit.structures import RangeImage
+from lidargrit.scans.types import RangeImage
 from lidargrit.training.checkpoint import load_checkpoint, save_checkpoint
-from lidargrit.training.config import FitConfig
 from lidargrit.training.engine import Engine
 from lidargrit.training.log import Log
 from lidargrit.training.optimiser import WeightAverage, learning_rate_at, make_optimiser

@@ -7,9 +7,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from lidargrit.errors import OutputError
-from lidargrit.files import plain, write_text
-from lidargrit.untrusted import parse_json
+from lidargrit.core.errors import OutputError
+from lidargrit.core.files import plain, write_text
+from lidargrit.core.untrusted import parse_json
 
 LOG_FILE = "log.jsonl"
 _LINE_BYTES_AT_MOST = 2**16  # of one entry; an entry of twenty terms has a thousandth

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import torch
 
+from lidargrit.generation.settings import Recipe
 from lidargrit.training.compute import duration, training_flops, uniform_images
-from lidargrit.training.config import Recipe
 from lidargrit.training.fit import begin_training
 
 _WARM_UP_STEPS, _TIMED_STEPS = 1, 3  # the first one allocates and chooses kernels

@@ -10,10 +10,10 @@ import torch
 from torch import nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
-from lidargrit.errors import ConfigError
+from lidargrit.core.errors import ConfigError
+from lidargrit.generation.objective import Objective
+from lidargrit.generation.settings import FitConfig
 from lidargrit.nn.blocks import Block
-from lidargrit.nn.objective import Objective
-from lidargrit.training.config import FitConfig
 
 
 def make_optimiser(objective: nn.Module, config: FitConfig) -> torch.optim.Optimizer:

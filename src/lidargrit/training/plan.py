@@ -8,14 +8,14 @@ from typing import Any
 
 import torch
 
-from lidargrit import configuration
-from lidargrit.errors import ConfigError
-from lidargrit.loading import RangeImages
-from lidargrit.nn.objective import Objective
+from lidargrit.core import configuration
+from lidargrit.core.errors import ConfigError
+from lidargrit.data.images import RangeImages
+from lidargrit.data.sources import DatasetSource, PreparedSource, open_to_train
+from lidargrit.generation.objective import Objective
+from lidargrit.generation.settings import Recipe
 from lidargrit.nn.precision import Precision
-from lidargrit.sources import DatasetSource, PreparedSource, open_to_train
 from lidargrit.training.compute import computing_time, training_flops
-from lidargrit.training.config import Recipe
 from lidargrit.training.fit import follow_settings
 from lidargrit.training.optimiser import memory_of_weights
 from lidargrit.training.taken_stages import donors_of_stages, taken_stages

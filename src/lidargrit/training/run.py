@@ -15,18 +15,19 @@ from typing import Any
 
 import torch
 
-from lidargrit import __version__, configuration
-from lidargrit.determinism import derive_seed
-from lidargrit.errors import CheckpointError, OutputError
-from lidargrit.files import claim_folder, claimed_manifest, is_taken, read_json, write_json
-from lidargrit.generators import Generator
-from lidargrit.loading import Provenance, RangeImages
-from lidargrit.nn.objective import Objective
-from lidargrit.reporting import Reporter
-from lidargrit.run_folder import RUN_FILE, TRAINED_ON_FILE, locate, recipe_settings, trained_on, write_trained_on
-from lidargrit.sources import joined_images
+from lidargrit import __version__
+from lidargrit.core import configuration
+from lidargrit.core.determinism import derive_seed
+from lidargrit.core.errors import CheckpointError, OutputError
+from lidargrit.core.files import claim_folder, claimed_manifest, is_taken, read_json, write_json
+from lidargrit.core.reporting import Reporter
+from lidargrit.data.images import Provenance, RangeImages
+from lidargrit.data.run_folder import RUN_FILE, TRAINED_ON_FILE, locate, recipe_settings, trained_on, write_trained_on
+from lidargrit.data.sources import joined_images
+from lidargrit.generation.generator import Generator
+from lidargrit.generation.objective import Objective
+from lidargrit.generation.settings import Recipe
 from lidargrit.training.checkpoint import fingerprint
-from lidargrit.training.config import Recipe
 from lidargrit.training.engine import Engine
 from lidargrit.training.fit import Fit
 from lidargrit.training.plan import CheckedStages, OpenedData, check_stages, open_data

@@ -9,14 +9,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lidargrit import configuration
-from lidargrit.errors import ConfigError
-from lidargrit.files import read_json
-from lidargrit.generators import Generator, load
-from lidargrit.nn.objective import Objective
-from lidargrit.run_folder import CHECKPOINT_FILE, RUN_FILE, locate, taken_over
+from lidargrit.core import configuration
+from lidargrit.core.errors import ConfigError
+from lidargrit.core.files import read_json
+from lidargrit.data.run_folder import CHECKPOINT_FILE, RUN_FILE, locate, taken_over
+from lidargrit.generation.generator import Generator, load
+from lidargrit.generation.objective import Objective
+from lidargrit.generation.settings import Recipe
 from lidargrit.training.checkpoint import load_average
-from lidargrit.training.config import Recipe
 
 _UNKNOWN_SCANS = "a run that does not say on which scans it was trained"  # in the place of a source
 _NOT_LEARNED = ("range_temperature", "distilled_steps", "distilled_pairs")  # of sampling, and of another stage

@@ -8,10 +8,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from lidargrit import configuration
-from lidargrit.errors import ConfigError
-from lidargrit.processes import rank_and_world_size
-from lidargrit.training.config import Recipe
+from lidargrit.core import configuration
+from lidargrit.core.errors import ConfigError
+from lidargrit.core.processes import rank_and_world_size
+from lidargrit.generation.settings import Recipe
 
 
 @contextmanager

@@ -12,7 +12,7 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lidargrit.files import atomic_path
+from lidargrit.core.files import atomic_path
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.gridspec import GridSpec, SubplotSpec
 from matplotlib.ticker import NullFormatter, ScalarFormatter
 
-from lidargrit.errors import ConfigError
+from lidargrit.core.errors import ConfigError
 from lidargrit.evaluation.realism import CurveScore
 from lidargrit.viewer._matplotlib import DOTS_PER_INCH, write_png
 

@@ -15,11 +15,11 @@ from jaxtyping import Float, Int
 from matplotlib import colormaps
 
 from lidargrit import __version__
+from lidargrit.core.files import write_text
 from lidargrit.evaluation.reconstruction import ReconstructionErrors
 from lidargrit.evaluation.scorecard import Scorecard
-from lidargrit.files import write_text
-from lidargrit.nn.pixel_phases import Lattice
-from lidargrit.structures import Decoded, RangeImage, TokenGrid
+from lidargrit.generation.pixel_decoder.pixel_phases import Lattice
+from lidargrit.scans.types import Decoded, RangeImage, TokenGrid
 from lidargrit.viewer import interactive
 from lidargrit.viewer._page import document, figure
 from lidargrit.viewer.interactive import button

@@ -11,9 +11,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import BoundaryNorm, ListedColormap, LogNorm
 from matplotlib.figure import Figure
 
-from lidargrit.projection.fit import elevations_deg
-from lidargrit.projection.inspection import FATES, Inspection
-from lidargrit.projection.pixel_coordinates import row_elevation_rad
+from lidargrit.scans.projection.inspection import FATES, Inspection
+from lidargrit.scans.projection.pixel_coordinates import row_elevation_rad
+from lidargrit.scans.projection.sensor_check import elevations_deg
 from lidargrit.viewer._matplotlib import DOTS_PER_INCH, write_png
 from lidargrit.viewer.report_pictures import NO_RETURN
 

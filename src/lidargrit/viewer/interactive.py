@@ -19,11 +19,11 @@ import numpy as np
 from matplotlib import colormaps
 
 from lidargrit import __version__
-from lidargrit.errors import ConfigError
-from lidargrit.files import write_text
-from lidargrit.projection import points_of_pixels
+from lidargrit.core.errors import ConfigError
+from lidargrit.core.files import write_text
+from lidargrit.scans.classes import name_and_colour
+from lidargrit.scans.projection import points_of_pixels
 from lidargrit.viewer._page import document
-from lidargrit.viewer.classes import name_and_colour
 from lidargrit.viewer.scan_sets import SURPRISED_BITS, ScanSet
 
 PAGE_SCANS_AT_MOST = 100  # of each source: about 15 MB of a KITTI-360 size image, which browsers still open at once

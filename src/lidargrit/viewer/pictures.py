@@ -16,9 +16,9 @@ from matplotlib.colors import Colormap, ListedColormap, LogNorm, Normalize
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from lidargrit.errors import ConfigError
-from lidargrit.projection import points_of_pixels
-from lidargrit.structures import RangeImage
+from lidargrit.core.errors import ConfigError
+from lidargrit.scans.projection import points_of_pixels
+from lidargrit.scans.types import RangeImage
 from lidargrit.viewer._matplotlib import DOTS_PER_INCH, write_png
 from lidargrit.viewer.report_pictures import NO_RETURN
 from lidargrit.viewer.scan_sets import SURPRISED_BITS
@@ -49,7 +49,7 @@ def plot_comparison(
         title: title of the whole picture.
         labels: names of the scans; "scan 1", ... if not given.
         surprise: bits of every pixel beyond the expected ones, by group, plotted in place of the return mask; see
-            :meth:`lidargrit.structures.ScanBits.surprise`.
+            :meth:`lidargrit.scans.types.ScanBits.surprise`.
 
     Raises:
         ConfigError: no group, no or too many images in one, a limit of range that is not positive, or fewer labels

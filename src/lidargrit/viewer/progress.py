@@ -6,9 +6,9 @@ from pathlib import Path
 
 import torch
 
-from lidargrit.determinism import evenly_spaced
-from lidargrit.generators import Generator
-from lidargrit.loading import RangeImages
+from lidargrit.core.determinism import evenly_spaced
+from lidargrit.data.images import RangeImages
+from lidargrit.generation.generator import Generator
 from lidargrit.viewer.pictures import plot_comparison
 
 _SCANS = 2  # a glance; more would take training's time

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from lidargrit.determinism import evenly_spaced
-from lidargrit.errors import without_folders
+from lidargrit.core.determinism import evenly_spaced
+from lidargrit.core.errors import without_folders
+from lidargrit.core.files import write_text
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
 from lidargrit.evaluation.profiles import (
     HALF_VIEW_M,
@@ -25,7 +26,6 @@ from lidargrit.evaluation.profiles import (
     searched_scans,
 )
 from lidargrit.evaluation.scorecard import NOT_APPLICABLE, EvalSetRecord, LeftOut, Scorecard
-from lidargrit.files import write_text
 from lidargrit.viewer._page import document, figure
 from lidargrit.viewer.report_charts import line_chart
 from lidargrit.viewer.report_pictures import (

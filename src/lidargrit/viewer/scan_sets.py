@@ -8,18 +8,17 @@ from dataclasses import dataclass, replace
 from jaxtyping import Float
 from torch import Tensor
 
-from lidargrit.determinism import evenly_spaced
-from lidargrit.errors import ConfigError, DataError, ScanError
-from lidargrit.generators import Generator
-from lidargrit.loading import DataConfig
-from lidargrit.loading.config import ScanSettings
+from lidargrit.core.determinism import evenly_spaced
+from lidargrit.core.errors import ConfigError, DataError, ScanError
+from lidargrit.core.reporting import Reporter
+from lidargrit.core.untrusted import seeds_in_a_row
+from lidargrit.data.prepared.config import DataConfig, ScanSettings
+from lidargrit.data.sources import DatasetSource, RunSource, Source, open_source
+from lidargrit.generation.generator import Generator
 from lidargrit.nn.devices import usable_device
-from lidargrit.projection import project
-from lidargrit.reporting import Reporter
-from lidargrit.sensors import SensorModel
-from lidargrit.sources import DatasetSource, RunSource, Source, open_source
-from lidargrit.structures import RangeImage
-from lidargrit.untrusted import seeds_in_a_row
+from lidargrit.scans.projection import project
+from lidargrit.scans.sensors import SensorModel
+from lidargrit.scans.types import RangeImage
 
 _PIXELS_AT_MOST = 200_000  # of a scan on a page: what browsers still turn smoothly
 _BATCH = 8  # scans computed at once: what a laptop has memory for
@@ -35,8 +34,8 @@ class ScanSet:
         name: name of the scans' source, or of what a model made of it.
         images: a batch of range images.
         scan_names: name of each image.
-        surprise: bits of every pixel beyond those expected, see :meth:`lidargrit.structures.ScanBits.surprise`; None if
-            no model was asked.
+        surprise: bits of every pixel beyond those expected, see :meth:`lidargrit.scans.types.ScanBits.surprise`; None
+            if no model was asked.
     """
 
     name: str

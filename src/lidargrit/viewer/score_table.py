@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from html import escape
 
 from lidargrit.evaluation.intervals import Score
+from lidargrit.evaluation.metrics import load_metric
 from lidargrit.evaluation.scorecard import NOT_APPLICABLE, LeftOut, format_value
 from lidargrit.evaluation.verdict import counted_first, verdict
-from lidargrit.metrics import load_metric
 from lidargrit.viewer.report_charts import score_chart
 
 REAL_AGAINST_REAL = (

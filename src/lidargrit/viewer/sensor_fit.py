@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from lidargrit.fitting import SensorFit
+from lidargrit.scans.fit_sensor import SensorFit
 from lidargrit.viewer._matplotlib import DOTS_PER_INCH, write_png
 
 _POINT, _ROW, _BAD = "#3b6ea5", "#d95f02", "#b2182b"

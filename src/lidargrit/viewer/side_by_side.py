@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidargrit.errors import ConfigError
-from lidargrit.generators import Generator, load
-from lidargrit.loading.config import ScanSettings
+from lidargrit.core.errors import ConfigError
+from lidargrit.core.reporting import Reporter
+from lidargrit.data.prepared.config import ScanSettings
+from lidargrit.generation.generator import Generator, load
 from lidargrit.nn.devices import usable_device
-from lidargrit.reporting import Reporter
-from lidargrit.structures import RangeImage
+from lidargrit.scans.types import RangeImage
 from lidargrit.viewer.interactive import PAGE_SCANS_AT_MOST, write_page
 from lidargrit.viewer.pictures import SCANS_AT_MOST, plot_comparison
 from lidargrit.viewer.scan_sets import load_scan_sets

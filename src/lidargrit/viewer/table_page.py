@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from html import escape
 from typing import Any
 
-from lidargrit.errors import without_folders
+from lidargrit.core.errors import without_folders
 from lidargrit.evaluation.scorecard import format_value
 from lidargrit.evaluation.verdict import MEMORISED, PIXEL_STATISTICS
 from lidargrit.viewer._page import document

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from lidargrit import _discovery
-from lidargrit.errors import UnknownNameError, one_of
-from lidargrit.projection import ProjectionVariant
-from lidargrit.sensors import SensorModel, load_sensor
+from lidargrit.core import discovery
+from lidargrit.core.errors import UnknownNameError, one_of
+from lidargrit.scans.projection import ProjectionVariant
+from lidargrit.scans.sensors import SensorModel, load_sensor
 
 DEFAULT = "exact"
 
@@ -84,10 +84,10 @@ def load_protocol(name: str) -> Protocol:
         >>> load_protocol("lidargrit-kitti-360").num_scans
         5000
     """
-    name, known = public_name(name), _discovery.names("evaluation.protocols")
+    name, known = public_name(name), discovery.names("protocols")
     if name not in known:
         raise UnknownNameError(f"the protocol {name!r}", f"one of {one_of(sorted(known))}", "choose one")
-    return _discovery.load_instance("evaluation.protocols", name, Protocol)
+    return discovery.load_instance("protocols", name, Protocol)
 
 
 def public_name(name: str) -> str:

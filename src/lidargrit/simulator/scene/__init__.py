@@ -8,7 +8,7 @@ from typing import get_args
 import numpy as np
 from jaxtyping import Float64
 
-from lidargrit.errors import ConfigError
+from lidargrit.core.errors import ConfigError
 from lidargrit.simulator.mesh import Mesh
 from lidargrit.simulator.scene.buildings import add_houses
 from lidargrit.simulator.scene.layout import add_furniture, add_gardens, add_greenery, traffic

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int, Num
 
-from lidargrit.simulator import labels, materials
+from lidargrit.scans import labels
+from lidargrit.simulator import materials
 from lidargrit.simulator.scene.shapes import MeshBuilder, boxes, owners, quads, rows_of
 from lidargrit.simulator.scene.street_plan import Poses, StreetPlan
 

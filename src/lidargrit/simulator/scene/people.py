@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidargrit.simulator import labels, materials
+from lidargrit.scans import labels
+from lidargrit.simulator import materials
 from lidargrit.simulator.scene.objects import ObjectBatch, Placements
 from lidargrit.simulator.scene.shapes import quads, tubes
 

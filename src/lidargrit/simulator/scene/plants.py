@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Num
 
-from lidargrit.simulator import labels, materials
+from lidargrit.scans import labels
+from lidargrit.simulator import materials
 from lidargrit.simulator.scene.buildings import Houses
 from lidargrit.simulator.scene.shapes import MeshBuilder, leaves, owners, rows_of, tubes
 from lidargrit.simulator.scene.street_plan import StreetPlan

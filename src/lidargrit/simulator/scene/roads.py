@@ -6,7 +6,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from lidargrit.simulator import labels, materials
+from lidargrit.scans import labels
+from lidargrit.simulator import materials
 from lidargrit.simulator.scene.shapes import MeshBuilder, quads
 from lidargrit.simulator.scene.street_plan import EXTENT_M, StreetPlan
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
-from lidargrit.simulator import labels, materials
+from lidargrit.scans import labels
+from lidargrit.simulator import materials
 from lidargrit.simulator.scene.objects import ObjectBatch, Placements
 from lidargrit.simulator.scene.shapes import boxes, fans, loft, quads, rows_of, tubes
 

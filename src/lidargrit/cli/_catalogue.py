@@ -1,0 +1,96 @@
+"""What a user can choose from: a kind such as "datasets" → all its names, with the facts of each."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from lidargrit.core import discovery
+
+KINDS = tuple(kind for kind in discovery.FOLDERS if kind != "cli")
+"""Each kind as a user types it."""
+
+
+def entries(kind: str, in_full: bool = False) -> list[dict[str, Any]]:
+    """Return the name and the summary of every entry of a kind, as plain values.
+
+    Args:
+        kind: one of ``KINDS``.
+        in_full: whether the facts of each class are added: licence, splits and leaks of data sets; endings of formats;
+            size and limits of sensors; capabilities, origin, licences and sampling settings of generators; direction,
+            variants and weights of metrics.
+
+    Example:
+        >>> entries("sensors")[0]["name"]
+        'hdl32e'
+    """
+    about = _ABOUT.get(kind) if in_full else None
+    found = []
+    for name in discovery.names(kind):
+        shown = name.replace("_", "-") if kind == "protocols" else name
+        summary = re.sub(r":\w+:`(\w+)`", r"\1", discovery.summary(kind, name))
+        found.append({"name": shown, "summary": summary, **(about(name) if about else {})})
+    return found
+
+
+def lines(kind: str, entry: dict[str, Any]) -> list[str]:
+    """Return the facts of one entry as lines for people; none for kinds that have only a summary."""
+    if kind == "datasets":
+        facts = [f"{name}: {entry[name]}" for name in ("layout", "sensor", "licence", "cite")]
+        for number, scheme in enumerate(entry["schemes"]):
+            parts = ", ".join(part if number == 0 else f"{scheme['name']}/{part}" for part in scheme["parts"])
+            facts += [f"splits: {parts} ({scheme['name']}: {scheme['source']})", f"    leak: {scheme['leak']}"]
+        return facts
+    return entry["facts"] if kind in ("formats", "generators") else []
+
+
+def _of_dataset(name: str) -> dict[str, Any]:
+    from lidargrit.data.datasets import load
+
+    cls = load(name)
+    schemes = [
+        {
+            "name": scheme,
+            "source": of.source,
+            "leak": of.leak,
+            "parts": {part: list(all_) for part, all_ in of.parts.items()},
+        }
+        for scheme, of in cls.schemes.items()
+    ]
+    return {"layout": cls.tree, "sensor": cls.sensor, "licence": cls.licence, "cite": cls.citation, "schemes": schemes}
+
+
+def _of_format(name: str) -> dict[str, Any]:
+    from lidargrit.data.formats import load
+
+    cls = load(name)
+    return {"endings": list(cls.suffixes), "can_write": cls.can_write(), "extra": cls.extra, "facts": cls.about()}
+
+
+def _of_generator(name: str) -> dict[str, Any]:
+    from lidargrit.core import configuration
+    from lidargrit.generation.generator import load_class
+
+    cls = load_class(name)
+    sampling, origin = configuration.to_json(cls.Sampling()), configuration.to_json(cls.facts)
+    return {"capabilities": sorted(cls.capabilities), **origin, "sampling": sampling, "facts": cls.about()}
+
+
+def _of_metric(name: str) -> dict[str, Any]:
+    from lidargrit.evaluation.metrics import load_metric
+
+    cls = load_metric(name)
+    facts = {"higher_is_better": cls.higher_is_better, "variants": list(cls.variants)}
+    return {"title": cls.title, **facts, "needs_weights": cls.needs_weights}
+
+
+def _of_sensor(name: str) -> dict[str, Any]:
+    from lidargrit.scans.sensors import load_sensor
+
+    sensor = load_sensor(name)
+    image = {"rows": sensor.height, "columns": sensor.width, "projection": sensor.projection}
+    return {**image, "range_min_m": sensor.range_min_m, "range_max_m": sensor.range_max_m}
+
+
+_ABOUT = {"datasets": _of_dataset, "formats": _of_format, "generators": _of_generator}
+_ABOUT |= {"metrics": _of_metric, "sensors": _of_sensor}

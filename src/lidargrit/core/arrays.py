@@ -1,0 +1,116 @@
+"""Arrays that others wrote: the bytes of an .npy or .npz → numpy arrays, their sizes checked before memory is taken."""
+
+from __future__ import annotations
+
+import math
+import struct
+import warnings
+import zipfile
+from io import BufferedReader, BytesIO
+
+import numpy as np
+
+from lidargrit.core.errors import first_words
+
+ARRAY_BYTES_AT_MOST = 512 * 2**20  # unpacked; four million points of 16 columns
+HEADER_BYTES_AT_MOST = 1024  # of an array; numpy writes 118, and reads it as a Python expression
+DIRECTORY_BYTES_AT_MOST = 65_536  # of an archive: a thousand arrays
+DIMENSIONS_AT_MOST = 4
+_END_BYTES, _END_BYTES_64 = 22, 20  # of the records that end an archive; the second only in archives over 4 GB
+_PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+
+
+def parse_array(data: bytes) -> np.ndarray:
+    """Return the array in the bytes of an .npy file; it shares their memory.
+
+    Args:
+        data: content of a whole .npy file.
+
+    Raises:
+        ValueError: a damaged header, other than numbers or truth values, or fewer bytes than the shape needs.
+    """
+    file = BytesIO(data)
+    try:
+        version = np.lib.format.read_magic(file)
+        size_bytes = 2 if version == (1, 0) else 4
+        length = struct.unpack("<H" if version == (1, 0) else "<I", file.read(size_bytes))[0]
+        if version not in ((1, 0), (2, 0)) or length > HEADER_BYTES_AT_MOST:
+            raise ValueError(f"version {version}, a header of {length} bytes")
+        file.seek(-size_bytes, 1)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        with warnings.catch_warnings(action="ignore"):  # of headers that Python 2 wrote
+            shape, by_column, dtype = read(file, max_header_size=HEADER_BYTES_AT_MOST)
+    except Exception as error:  # a damaged header is met with errors of many kinds
+        raise ValueError(f"a damaged array ({first_words(error)})") from None
+    # True is an int to numpy's reader, but not to those that then use the shape.
+    plain = all(type(size) is int and size >= 0 for size in shape)
+    if dtype.kind not in "fiub" or not plain or len(shape) > DIMENSIONS_AT_MOST:
+        raise ValueError(f"an array of {ascii(dtype)[:40]} and shape {str(shape)[:60]}")
+    there, needed = len(data) - file.tell(), math.prod(shape) * dtype.itemsize
+    if there < needed:
+        raise ValueError(f"{there:,} bytes of an array that needs {needed:,}")
+    values = np.frombuffer(data, dtype, math.prod(shape), file.tell())
+    return values.reshape(shape, order="F" if by_column else "C")
+
+
+def open_archive(file: BytesIO | BufferedReader) -> zipfile.ZipFile:
+    """Open an .npz archive.
+
+    Args:
+        file: archive (.npz) that is open for reading, from its first byte to its last.
+
+    Raises:
+        ValueError: it is no archive, or its directory is too large.
+    """
+    try:
+        size = file.seek(0, 2)
+        file.seek(max(0, size - _END_BYTES - _END_BYTES_64))
+        end = file.read()
+        directory_bytes = struct.unpack("<4s8xI6x", end[-_END_BYTES:])[1]
+        is_large = end.startswith(b"PK\6\7") or directory_bytes > DIRECTORY_BYTES_AT_MOST
+        if end[-_END_BYTES:][:4] != b"PK\5\6" or is_large:
+            raise ValueError(f"no directory of at most {DIRECTORY_BYTES_AT_MOST} bytes at its end")
+        return zipfile.ZipFile(file)
+    except Exception as error:  # a damaged directory is met with errors of many kinds
+        raise ValueError(first_words(error)) from None
+
+
+def read_member(
+    archive: zipfile.ZipFile, info: zipfile.ZipInfo, bytes_at_most: int = ARRAY_BYTES_AT_MOST
+) -> np.ndarray:
+    """Unpack one array of an archive.
+
+    Args:
+        archive: archive that :func:`open_archive` opened.
+        info: directory entry of the array.
+        bytes_at_most: largest size of the unpacked .npy, in bytes.
+
+    Raises:
+        ValueError: it says that it is larger, is packed by another method than numpy's, or is damaged.
+    """
+    if info.file_size > bytes_at_most or info.compress_type not in _PACKED:
+        raise ValueError(f"{info.file_size:,} bytes in one array, packed by method {info.compress_type}")
+    try:
+        with archive.open(info) as file:
+            data = file.read(info.file_size)  # never more, whatever the packed bytes would unpack to
+    except Exception as error:  # a damaged archive is met with errors of many kinds
+        raise ValueError(f"a damaged array ({first_words(error)})") from None
+    return parse_array(data)
+
+
+def read_arrays(
+    file: BytesIO | BufferedReader, names: tuple[str, ...], bytes_at_most: int = ARRAY_BYTES_AT_MOST
+) -> dict[str, np.ndarray]:
+    """Read those arrays of an .npz that are wanted and there; the others are not unpacked.
+
+    Args:
+        file: archive (.npz) that is open for reading, from its first byte to its last.
+        names: names of the wanted arrays, without ``.npy``.
+        bytes_at_most: largest size of each unpacked .npy, in bytes.
+
+    Raises:
+        ValueError: it is no archive, or a wanted array is too large or damaged.
+    """
+    with open_archive(file) as archive:
+        members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+        return {name: read_member(archive, members[name], bytes_at_most) for name in names if name in members}

@@ -1,0 +1,221 @@
+"""Untrusted words and JSON → values of bounded size, or an error of one line.
+
+All bounds of what a command line, a JSON file or a message may ask for stand here; those of arrays in ``arrays.py``.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from pathlib import Path
+from typing import Any, NoReturn
+
+from lidargrit.core.errors import CheckpointError, DataError, LidarGritError, UsageError
+
+JSON_BYTES_AT_MOST = 64 * 2**20  # the scans of the largest data set, 400,000, take 40 MB; parsed, bytes become tenfold
+TEXT_BYTES_AT_MOST = 2**20  # notes for a model card
+JSON_DEPTH_AT_MOST = 32  # our own files nest 8 deep; Python gives up at about 1,000
+SEED_AT_MOST = 2**32 - 1  # PyTorch's generator on a CPU takes the last 32 bits of any other
+WHOLE_NUMBER_AT_MOST = 2**63 - 1  # of settings: what 64 bits hold
+COUNT_AT_MOST = 10_000_000  # scans, columns, steps, processes: ten times the largest data set
+TEMPERATURE_AT_LEAST = 1e-6  # besides 0: by a smaller one, logits and densities overflow
+STEPS_AT_MOST = 100_000  # of a sampler: a hundred times those of any published one
+SEARCH_STEPS_AT_MOST = 10_000  # of a search for latents, which keeps random numbers for each: ten times the published
+NUMBER_AT_MOST = 1e30  # operations of the largest training ever: 1e27
+PATH_BYTES_AT_MOST = 4096  # Linux; others allow less
+NAME_BYTES_AT_MOST = 255  # of one file or folder, on all common file systems
+
+
+def parse_json(
+    data: bytes | str,
+    source: str,
+    kind: type = dict,
+    error: type[LidarGritError] = CheckpointError,
+    wanted: str = "JSON that lidargrit wrote",
+    cure: str = "restore the file",
+    at_most: int = JSON_BYTES_AT_MOST,
+) -> Any:
+    """Parse JSON of bounded size and depth.
+
+    Args:
+        data: JSON in UTF-8.
+        source: name of the file or message, for the error.
+        kind: required type of the whole, dict or list.
+        error: class of the error that is raised.
+        wanted: description of valid content, for the error.
+        cure: advice to the user, for the error.
+        at_most: largest size, in bytes.
+
+    Raises:
+        LidarGritError: it is too large, too deep, not JSON, not of this type, or holds NaN or a number that no float
+            can hold; of the class ``error``.
+
+    Example:
+        >>> parse_json('{"seed": 1}', "a message")
+        {'seed': 1}
+    """
+    try:
+        if len(data) > at_most:
+            raise ValueError(f"more than {at_most:,} bytes")
+        value = json.loads(data, parse_constant=_refuse_constant, parse_float=_finite)
+        if _is_deep(value):
+            raise RecursionError
+        if not isinstance(value, kind):
+            raise TypeError(f"{_JSON_NAMES[type(value)]} in place of {_JSON_NAMES[kind]}")
+    except RecursionError:
+        why = f"nested more than {JSON_DEPTH_AT_MOST} deep"
+        raise error(f"{source}, which cannot be used ({why})", wanted, cure) from None
+    except (ValueError, TypeError) as why:
+        raise error(f"{source}, which cannot be used ({_reason(why)})", wanted, cure) from None
+    return value
+
+
+def check_word(word: str) -> str:
+    """Return a word of the command line if messages, files and other programs can hold it.
+
+    Raises:
+        UsageError: it holds NUL, is not UTF-8, or the locale cannot show it: libraries fail at such text.
+    """
+    shown = ascii(word if len(word) <= 40 else word[:40] + "...")
+    if "\0" in word:
+        raise UsageError(f"{shown} with a NUL in it", "a word without one", "correct it")
+    try:
+        os.fsencode(word).decode("utf-8")
+    except UnicodeError:
+        raise UsageError(f"{shown}, which is not UTF-8", "a name in UTF-8", "rename the file") from None
+    if any("\ud800" <= letter <= "\udfff" for letter in word):  # bytes that Python could not decode
+        raise UsageError(f"{shown} in a locale without such letters", "a locale of UTF-8", "set PYTHONUTF8=1")
+    return word
+
+
+def check_path(word: str) -> Path:
+    """Return a path that the file system can hold.
+
+    Raises:
+        UsageError: as :func:`check_word`, or the word is empty, or a name in it is too long.
+    """
+    check_word(word)
+    if not word.strip():
+        raise UsageError(repr(word), "the name of a file or folder", "write one")
+    data = os.fsencode(word)
+    if len(data) > PATH_BYTES_AT_MOST or max(map(len, data.split(b"/"))) > NAME_BYTES_AT_MOST:
+        raise UsageError(
+            f"{word[:40] + '...'!a}, a path of {len(data):,} bytes",
+            f"at most {NAME_BYTES_AT_MOST} bytes a name and {PATH_BYTES_AT_MOST:,} in all",
+            "choose a shorter one",
+        )
+    return Path(word)
+
+
+def user_path(text: str, error: type[LidarGritError] = DataError) -> Path:
+    """Return a path with ``~`` and ``~user`` replaced by home folders.
+
+    Raises:
+        LidarGritError: there is no such user, or no file can be called so; of the class ``error``.
+    """
+    try:
+        return check_path(text).expanduser()
+    except RuntimeError:  # what pathlib raises
+        raise error(f"{text}, in a home folder that is not there", "an existing user's", "check the path") from None
+    except UsageError as why:
+        raise error(why.got, why.wanted, why.cure) from None
+
+
+def whole_number(word: str, at_most: int = COUNT_AT_MOST) -> int:
+    """Return a whole number from 0 on.
+
+    Raises:
+        UsageError: the word is no whole number, or it is negative or too large.
+    """
+    try:
+        value = int(word) if len(word) <= 40 else -1  # Python needs quadratic time for long ones
+    except ValueError:
+        raise UsageError(repr(word), "a whole number", "correct it") from None
+    if not 0 <= value <= at_most:
+        raise UsageError(word[:40], f"a whole number from 0 to {at_most:,}", "correct it")
+    return value
+
+
+def seed_number(word: str) -> int:
+    """Return a seed, from 0 to :data:`SEED_AT_MOST`, or raise UsageError as :func:`whole_number`."""
+    return whole_number(word, SEED_AT_MOST)
+
+
+def seeds_in_a_row(first: int, count: int) -> range:
+    """Return the seeds of a number of scans from a first one on, the next scan with the next seed.
+
+    Raises:
+        UsageError: no scan, or the last seed is above :data:`SEED_AT_MOST`.
+    """
+    if count < 1:
+        raise UsageError(f"-n {count}", "at least one scan", "raise it")
+    if first + count - 1 > SEED_AT_MOST:
+        got = f"--seed {first} with -n {count}, of which the last scan has the seed {first + count - 1}"
+        raise UsageError(got, f"seeds up to {SEED_AT_MOST}", "lower one of the two")
+    return range(first, first + count)
+
+
+def is_temperature(value: float) -> bool:
+    """Return whether a number is 0 or at least :data:`TEMPERATURE_AT_LEAST`."""
+    return value == 0 or value >= TEMPERATURE_AT_LEAST
+
+
+def positive_number(word: str) -> float:
+    """Return a number from 0 on that is neither NaN nor infinite.
+
+    Raises:
+        UsageError: the word is no number, or it is negative or too large.
+    """
+    try:
+        value = float(word)
+    except ValueError:
+        raise UsageError(repr(word[:40]), "a number", "correct it") from None
+    if not 0 <= value <= NUMBER_AT_MOST:  # refuses NaN too
+        raise UsageError(word[:40], f"a number from 0 to {NUMBER_AT_MOST:g}", "correct it")
+    return value
+
+
+_JSON_NAMES: dict[type, str] = {
+    dict: "an object",
+    list: "a list",
+    str: "a text",
+    bool: "true or false",
+    int: "a number",
+    float: "a number",
+    type(None): "null",
+    object: "anything",
+}
+
+
+def _refuse_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name}, which is not JSON")
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text[:40]}, which no float can hold")
+    return value
+
+
+def _is_deep(value: Any) -> bool:
+    """Return whether a value nests deeper than is allowed, level by level: recursion is what it protects from."""
+    level = [value]
+    for _ in range(JSON_DEPTH_AT_MOST + 1):
+        level = [
+            child
+            for parent in level
+            if isinstance(parent, (dict, list))
+            for child in (parent.values() if isinstance(parent, dict) else parent)
+            if isinstance(child, (dict, list))
+        ]
+        if not level:
+            return False
+    return True
+
+
+def _reason(why: Exception) -> str:
+    if isinstance(why, OSError) and why.strerror:
+        return why.strerror
+    return " ".join(str(why).split())[:120] or type(why).__name__

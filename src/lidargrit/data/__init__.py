@@ -1,0 +1,1 @@
+"""Where scans and images come from and go to: formats, data sets, sources, prepared scans, run folders."""

@@ -1,0 +1,96 @@
+"""Training batches as a function of the scans seen so far; the number of threads that read ahead has no influence."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+
+import torch
+
+from lidargrit.core.determinism import derive_seed
+from lidargrit.core.errors import ConfigError
+from lidargrit.data.images import RangeImages
+from lidargrit.scans.augmentation import Augmentation, augment
+from lidargrit.scans.types import RangeImage
+
+_THREADS_AT_MOST = 128
+_AHEAD = 8  # batches that wait beyond those that are being read: enough for no thread to idle
+
+
+class Batches:
+    """Training batches as a function of the scans seen so far: a resumed run sees the same as one that ran through.
+
+    Args:
+        images: range images to learn from; each comes once an epoch, in an order that the seed determines.
+        batch_size: number of scans in a batch, over all processes.
+        augmentations: kinds of augmentation, applied in this order.
+        any_columns: whether an image may begin at any fine column; see :class:`FitConfig`.
+        seed: seed of order and augmentation.
+        rank: number of this process, from 0; it takes its share of every batch.
+        world_size: number of processes that train together.
+        workers: number of threads that read ahead.
+    """
+
+    def __init__(
+        self,
+        images: RangeImages,
+        batch_size: int,
+        augmentations: Sequence[Augmentation],
+        any_columns: bool,
+        seed: int,
+        rank: int = 0,
+        world_size: int = 1,
+        workers: int = 1,
+    ) -> None:
+        if batch_size % world_size:
+            raise ConfigError(
+                f"batch_size={batch_size} on {world_size} processes",
+                "a multiple of the processes",
+                "change one of them",
+            )
+        self.images, self.batch_size, self.augmentations = images, batch_size, tuple(augmentations)
+        self.any_columns, self.seed, self.rank, self.world_size = any_columns, seed, rank, world_size
+        self.workers = workers
+        self._epoch, self._order = -1, torch.empty(0)
+
+    def stream(self, scans_seen: int, until: int) -> Iterator[RangeImage]:
+        """Yield the batches from ``scans_seen`` scans on, up to the last that begins before ``until`` scans."""
+        waiting: deque[Future[RangeImage]] = deque()
+        threads = min(self.workers, _THREADS_AT_MOST)
+        with ThreadPoolExecutor(threads, thread_name_prefix="reading scans") as pool:
+            try:
+                for position in range(scans_seen, until, self.batch_size):
+                    waiting.append(pool.submit(self._read, *self._chosen(position)))
+                    if len(waiting) > threads + min(threads, _AHEAD):  # few enough to hold in memory
+                        yield waiting.popleft().result()
+                while waiting:
+                    yield waiting.popleft().result()
+            finally:
+                pool.shutdown(wait=True, cancel_futures=True)
+
+    def at(self, scans_seen: int) -> RangeImage:
+        """Return this process's share of the batch that follows ``scans_seen`` scans."""
+        return self._read(*self._chosen(scans_seen))
+
+    def _chosen(self, scans_seen: int) -> tuple[list[int], list[int]]:
+        """Return the indices of a batch's scans, and a seed for each scan's column and augmentation."""
+        share = self.batch_size // self.world_size
+        positions = range(scans_seen + self.rank * share, scans_seen + (self.rank + 1) * share)
+        return [self._scan_at(position) for position in positions], [derive_seed(self.seed, 1, p) for p in positions]
+
+    def _read(self, indices: list[int], seeds: list[int]) -> RangeImage:
+        # Each scan has its own random numbers, so that it looks the same however many processes share a batch.
+        rngs = [torch.Generator().manual_seed(seed) for seed in seeds]
+        columns = [int(torch.randint(self.images.sensor.column_stride, (1,), generator=rng)) for rng in rngs]
+        images = self.images.batch(indices, columns if self.any_columns else None)
+        if not self.augmentations:
+            return images
+        return RangeImage.stack([augment(images[i : i + 1], self.augmentations, rng)[0] for i, rng in enumerate(rngs)])
+
+    def _scan_at(self, position: int) -> int:
+        epoch, index = divmod(position, len(self.images))
+        if epoch != self._epoch:
+            rng = torch.Generator().manual_seed(derive_seed(self.seed, 0, epoch))
+            self._epoch, self._order = epoch, torch.randperm(len(self.images), generator=rng)
+        return int(self._order[index])

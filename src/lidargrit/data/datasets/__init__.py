@@ -1,0 +1,250 @@
+"""Data sets of scans, recorded and simulated: "NAME:ROOT:SPLIT" → :class:`ScanDataset`."""
+
+from __future__ import annotations
+
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+from lidargrit.core import discovery
+from lidargrit.core.errors import DataError
+from lidargrit.core.untrusted import user_path
+from lidargrit.data.formats import BadPoints
+from lidargrit.scans.types import Scan
+
+_SHARE = re.compile(r"\[[^\]/]*\]$")
+
+
+@dataclass(frozen=True)
+class SplitScheme:
+    """One division of a data set into parts, as a paper or program defines it.
+
+    Args:
+        source: publication or program that defines it.
+        leak: one sentence on what the parts share but should not, for everyone who compares scores on them.
+        parts: sequences of each part: train, val, test.
+    """
+
+    source: str
+    leak: str
+    parts: Mapping[str, tuple[str, ...]]
+
+
+class ScanDataset(ABC):
+    """An ordered collection of scans that one sensor made.
+
+    A split is ``all``, a part of a scheme such as ``lidargen-code/train``, or sequences (drives), joined by "+" as in
+    ``00+03``; ``train`` alone is the part of the first scheme. A share in brackets takes one
+    contiguous block of the scans in order: ``all[:90%]`` and ``all[90%:]`` have no scan in common. Blocks keep
+    neighbours in time together, but where one ends within a drive, the same street is seen from both sides of the cut:
+    scans near it leak from one share to the other. Whole drives leak least.
+
+    A part takes those of its sequences that are on disk, so that part of a data set can be used.
+
+    Args:
+        root: the folder that ``tree`` starts from.
+        split: name or range of the wanted scans, such as ``val`` or ``all[:10%]``.
+        bad_points: ``refuse`` a scan with NaN, infinite or all-zero coordinates, or ``drop`` such points.
+
+    Raises:
+        DataError: the folder does not hold the tree, no scan, or not the split.
+    """
+
+    title: ClassVar[str]
+    """What the data set calls itself."""
+    licence: ClassVar[str]
+    """Under what terms its scans may be used."""
+    tree: ClassVar[str]
+    """How its files lie below the root."""
+    citation: ClassVar[str] = ""
+    """The paper that describes it."""
+    sensor: str
+    """Name of the sensor that made the scans."""
+    schemes: ClassVar[dict[str, SplitScheme]] = {}
+    """The published ways to divide it by name; the first is the default."""
+
+    def __init__(self, root: Path, split: str = "all", bad_points: BadPoints = "refuse") -> None:
+        self.root, self.split = root, split
+        self.bad_points: BadPoints = bad_points
+
+    @classmethod
+    def public_name(cls) -> str:
+        """Return the name that a user types: the file that defines the class."""
+        return cls.__module__.rpartition(".")[2]
+
+    @classmethod
+    def origin_of(cls, root: Path) -> str:
+        """Return the data set that made the scans of a tree; "" if it is not known.
+
+        It is another one where the program itself wrote the tree, as ``simulate`` and ``export`` do.
+        """
+        return cls.public_name()
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """Count the scans."""
+
+    @abstractmethod
+    def scan(self, index: int) -> Scan:
+        """Read one scan.
+
+        Raises:
+            ScanError: the file cannot be used.
+        """
+
+    @abstractmethod
+    def name(self, index: int) -> str:
+        """Name one scan, the same on every machine and in every split: "00/000012"."""
+
+    def recording(self, index: int) -> str:
+        """Name the recording that a scan was cut from, the same in every data set that has it; "" if it is alone."""
+        return ""
+
+    def path(self, index: int) -> Path | None:
+        """Return the file that holds a scan; None where scans are not in files."""
+        return None
+
+    def companions(self, index: int) -> tuple[Path, ...]:
+        """Return the other files that a scan is read from, such as a calibration, where they are there."""
+        return ()
+
+    def takes_files_in(self, folder: Path) -> bool:
+        """Return whether scans that are written to a folder would become scans of this data set."""
+        return False
+
+    @classmethod
+    def splits(cls) -> dict[str, tuple[str, ...]]:
+        """Return the sequences of every named split: "train" of the first scheme, "SCHEME/train" of each."""
+        named = {f"{name}/{part}": of for name, scheme in cls.schemes.items() for part, of in scheme.parts.items()}
+        default = next(iter(cls.schemes.values()), None)
+        return {**(default.parts if default else {}), **named}
+
+    @classmethod
+    @abstractmethod
+    def matches(cls, root: Path) -> bool:
+        """Return whether a folder looks like this tree."""
+
+    @classmethod
+    @abstractmethod
+    def write_example(cls, root: Path, num_scans: int) -> None:
+        """Write simulated scans as a small tree of this layout.
+
+        Raises:
+            OutputError: a file of it exists already.
+        """
+
+
+def open_dataset(source: str, bad_points: BadPoints = "refuse") -> ScanDataset:
+    """Open a data set by its name and its folder.
+
+    Args:
+        source: "NAME:ROOT" or "NAME:ROOT:SPLIT"; "ROOT" or "ROOT:SPLIT" to have the layout recognised;
+            "simulated:COUNT" or "simulated:COUNT:SPLIT" for scans of procedural streets, "simulated:COUNT@SENSOR" for
+            those that another sensor makes of them.
+        bad_points: see :class:`ScanDataset`.
+
+    Raises:
+        UnknownNameError: no data set of that name; names its nearest neighbours.
+        DataError: the folder does not hold the tree, no scan, or not the split.
+
+    Example:
+        >>> open_dataset("simulated:100:val").name(0)
+        'seed_1000000'
+    """
+    if not source.strip():
+        raise DataError("an empty source", "a folder, or NAME:ROOT", "name one; a comma at the end leaves an empty one")
+    share = _SHARE.search(source)
+    head, colon, rest = source.partition(":")
+    if share and share.start() < len(head):  # the first colon is that of the share
+        head, colon, rest = source[: share.start()], "", ""
+    root, split = _root_and_split(source)
+    is_path = "/" in head or _is_there(head) or (head != "" and root.exists())  # a name may have a colon
+    if head in discovery.names("datasets") and (colon or not is_path):
+        if not rest:
+            raise DataError(
+                f"the source {source!r} alone",
+                f"{head}: followed by {load(head).tree}",
+                "type NAME:ROOT, such as kitti_raw:/data/kitti_raw, or simulated:1000",
+            )
+        root, split = _root_and_split(rest)
+        return load(head)(root, split, bad_points)
+    if colon and not is_path:
+        load(head)  # raises: no such name
+    name = recognise(root)
+    if name is None:
+        cure = "check the path, or see the layouts with: lidargrit list datasets"
+        if root.is_dir() and not any(root.iterdir()):
+            raise DataError(f"{root}, which is an empty folder", "one with scans in it", cure)
+        got = "holds no layout we know" if root.is_dir() else "is not a folder" if root.exists() else "does not exist"
+        raise DataError(f"{root}, which {got}", "scans: a file, a folder or the root of a data set", cure)
+    return load(name)(root, split, bad_points)
+
+
+def data_set_and_split(source: str) -> tuple[str, str]:
+    """Return the data set and the split of a source, without its folder; "" for what is not known.
+
+    Example:
+        >>> data_set_and_split("kitti_360:/data/kitti_360:train")
+        ('kitti_360', 'train')
+    """
+    name, root, split = _name_root_and_split(source)
+    if not name and root.is_dir():
+        name = recognise(root, crawl=False) or "folder"
+    origin = load(name).origin_of(root) if name else ""
+    if origin != name:
+        return origin, ""
+    known = load(name).splits() if name else {}
+    part = split.partition("[")[0]
+    return name, split if part in known or "/" not in part else ""
+
+
+def root_of(source: str) -> Path:
+    """Return the folder of a source, without its data set and split."""
+    return _name_root_and_split(source)[1]
+
+
+def _name_root_and_split(source: str) -> tuple[str, Path, str]:
+    """Take a source apart; the name is "" where none is typed."""
+    head, colon, rest = source.partition(":")
+    name = head if colon and head in discovery.names("datasets") else ""
+    return name, *_root_and_split(rest if name else source)
+
+
+def load(name: str) -> type[ScanDataset]:
+    """Return a data set's class by its name, or raise UnknownNameError."""
+    return discovery.load_class("datasets", name, ScanDataset)
+
+
+def recognise(root: Path, crawl: bool = True) -> str | None:
+    """Return the name of the data set whose layout a folder has: the most specific match, None if there is none.
+
+    Args:
+        root: folder to look into.
+        crawl: also try layouts whose files may lie at any depth, for which the whole folder is searched.
+    """
+    every = {name: load(name).tree for name in discovery.names("datasets")}
+    trees = {name: tree for name, tree in every.items() if crawl or "**" not in tree}
+    most_specific_first = sorted(trees, key=lambda name: ("**" in trees[name], -trees[name].count("/"), name))
+    return next((name for name in most_specific_first if load(name).matches(root)), None)
+
+
+def _is_there(text: str) -> bool:
+    try:
+        return user_path(text).exists()
+    except DataError:  # no file can be called so
+        return False
+
+
+def _root_and_split(text: str) -> tuple[Path, str]:
+    if _is_there(text):  # colons and brackets of a folder that exists are its own
+        return user_path(text), "all"
+    share = _SHARE.search(text)
+    before = text[: share.start()] if share else text
+    root, colon, split = before.rpartition(":")
+    if not colon:
+        root, split = before, "all"
+    folder = user_path(root) if root else Path()  # published runs name a data set and a split, and no folder
+    return folder, split + (share[0] if share else "")

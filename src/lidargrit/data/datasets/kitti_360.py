@@ -1,0 +1,68 @@
+"""KITTI-360: ROOT/data_3d_raw/2013_05_28_drive_SSSS_sync/velodyne_points/data/*.bin → scans of 9 long drives."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import ClassVar
+
+from lidargrit.data.datasets import SplitScheme
+from lidargrit.data.datasets.shared.files import FileDataset
+
+
+class Kitti360(FileDataset):
+    """The raw Velodyne scans of KITTI-360. There is no official split of scans for generation, and no two papers agree.
+
+    To choose a checkpoint without a leak, train on ``train_without_val`` and validate on ``val``; ``train`` is for
+    numbers to set beside published ones. All drives, the test drives too, are of one city and one car.
+    """
+
+    title = "KITTI-360"
+    licence = "CC BY-NC-SA 3.0 (non-commercial)"
+    tree = "ROOT/data_3d_raw/2013_05_28_drive_SSSS_sync/velodyne_points/data/*.bin"
+    sensor = "hdl64e_kitti_360"
+    format = "kitti_bin"
+    citation = "Liao, Xie, Geiger: KITTI-360, IEEE PAMI 2022"
+    schemes: ClassVar[dict[str, SplitScheme]] = {
+        "paper": SplitScheme(
+            source="LiDARGen (Zyrianov et al., ECCV 2022), R2DM, R2Flow and LidarGRIT, as their papers say",
+            leak="val (0005, which LidarGRIT chooses its VQ-VAE on) lies in train; train_without_val leaves it out.",
+            parts={
+                "train": ("0003", "0004", "0005", "0006", "0007", "0009", "0010"),
+                "train_without_val": ("0003", "0004", "0006", "0007", "0009", "0010"),
+                "val": ("0005",),
+                "test": ("0000", "0002"),
+            },
+        ),
+        "lidargrit-code": SplitScheme(
+            source="hamedhaghighi/LidarGRIT@a3f86e7",
+            leak="The VQ-VAE is chosen on 0005, which it trains on; the transformer on 0000, which it is tested on.",
+            parts={
+                "train": ("0003", "0004", "0005", "0006", "0007", "0009", "0010"),
+                "val_tokenizer": ("0005",),
+                "val_transformer": ("0000",),
+                "test": ("0000", "0002"),
+            },
+        ),
+        "lidargen-code": SplitScheme(
+            source="vzyrianov/lidargen, the program",
+            leak="It leaves out 0000, and 0001, which was never released: so it trains on 0002, and tests on it.",
+            parts={
+                "train": ("0002", "0003", "0004", "0005", "0006", "0007", "0009", "0010"),
+                "test": ("0000", "0002"),
+            },
+        ),
+        "lidm": SplitScheme(
+            source="hancyran/LiDAR-Diffusion@4c94f10, the program",
+            leak="It trains on 0000 and 0002, the test drives of all others, and has no test drives of its own.",
+            parts={"train": ("0000", "0002", "0004", "0005", "0006", "0007", "0008", "0009", "0010"), "val": ("0003",)},
+        ),
+    }
+    patterns = ("data_3d_raw/2013_05_28_drive_????_sync/velodyne_points/data/*.bin",)
+    examples = (
+        "data_3d_raw/2013_05_28_drive_0000_sync/velodyne_points/data/{index:010d}.bin",
+        "data_3d_raw/2013_05_28_drive_0003_sync/velodyne_points/data/{index:010d}.bin",
+    )
+
+    def sequence_of(self, relative: Path) -> str:
+        """Name the drive by its number: "0003"."""
+        return relative.parts[-4].removeprefix("2013_05_28_drive_").removesuffix("_sync")

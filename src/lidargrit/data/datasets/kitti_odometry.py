@@ -1,0 +1,113 @@
+"""KITTI odometry: ROOT/sequences/SS/velodyne/*.bin → scans of 22 drives, 11 of them with a pose."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import torch
+
+from lidargrit.core.errors import ScanError
+from lidargrit.data.datasets import SplitScheme
+from lidargrit.data.datasets.shared.files import FileDataset, unnamed_recording
+from lidargrit.data.formats import read_bytes, usable_points
+from lidargrit.scans.types import Scan
+
+_LABEL_BYTES = 4  # uint32: class in the lower 16 bits, instance in the upper
+_LABELS = "one uint32 for each point, as SemanticKITTI has them"
+_LABEL_BYTES_AT_MOST = 16_000_000  # of as many points as a file of scans may have
+_RAW_DRIVES = {  # which drive of KITTI raw a sequence was cut from; that of 11 to 21 was not published
+    "00": "2011_10_03_drive_0027",
+    "01": "2011_10_03_drive_0042",
+    "02": "2011_10_03_drive_0034",
+    "03": "2011_09_26_drive_0067",
+    "04": "2011_09_30_drive_0016",
+    "05": "2011_09_30_drive_0018",
+    "06": "2011_09_30_drive_0020",
+    "07": "2011_09_30_drive_0027",
+    "08": "2011_09_30_drive_0028",
+    "09": "2011_09_30_drive_0033",
+    "10": "2011_09_30_drive_0034",
+}
+
+
+class KittiOdometry(FileDataset):
+    """The 22 sequences of the KITTI odometry benchmark, motion-corrected; ROOT/dataset/sequences is found too.
+
+    Sequences 00 to 10 are drives of KITTI raw: a scan of each may be in the other, differing by the car's motion.
+    A scan has labels where ``labels/NNNNNN.label`` of SemanticKITTI lies beside ``velodyne``.
+
+    Source:
+        The drives: readme.txt of the benchmark's development kit.
+        Labels: Behley et al., SemanticKITTI, ICCV 2019.
+    """
+
+    title = "KITTI odometry"
+    licence = "CC BY-NC-SA 3.0 (non-commercial)"
+    tree = "ROOT/sequences/SS/velodyne/*.bin"
+    sensor = "hdl64e_kitti_odometry"
+    format = "kitti_bin"
+    citation = "Geiger, Lenz, Urtasun: Are we ready for autonomous driving?, CVPR 2012"
+    schemes: ClassVar[dict[str, SplitScheme]] = {
+        "paper": SplitScheme(
+            source="LidarGRIT (Haghighi et al., 2024) and DUSty (Nakashima et al., IROS 2021)",
+            leak="val (08) is of the same day, city and car as 04 to 07, 09 and 10 in train.",
+            parts={
+                "train": ("00", "01", "02", "03", "04", "05", "06", "07", "09", "10"),
+                "val": ("08",),
+                "test": tuple(f"{sequence:02d}" for sequence in range(11, 22)),
+            },
+        )
+    }
+    patterns = ("sequences/*/velodyne/*.bin", "dataset/sequences/*/velodyne/*.bin")
+    examples = ("sequences/00/velodyne/{index:06d}.bin", "sequences/08/velodyne/{index:06d}.bin")
+
+    @classmethod
+    def origin_of(cls, root: Path) -> str:
+        """Return ``simulated`` for a tree of ``simulate``, and "" for one of ``export``, whatever its source."""
+        if (root / "simulated.json").is_file():
+            return "simulated"
+        return "" if (root / "export.json").is_file() else cls.public_name()
+
+    @cached_property
+    def _is_of_kitti(self) -> bool:
+        return self.origin_of(self.root) == self.public_name()  # asked for every scan, and looked up once
+
+    def scan(self, index: int) -> Scan:
+        """Read one scan, with its labels if there are any."""
+        scan, path = super().scan(index), self.path(index)
+        (labels,) = self.companions(index)
+        if not labels.is_file():
+            return scan
+        data = np.frombuffer(read_bytes(labels, _LABEL_BYTES_AT_MOST, _LABELS), dtype=np.uint8)
+        rows = np.fromfile(path, dtype="<f4").reshape(-1, 4)
+        if len(data) != _LABEL_BYTES * len(rows):
+            raise ScanError(
+                f"{len(data)} bytes of labels in {labels}, and {len(rows)} points in {path}",
+                f"{_LABELS}: {_LABEL_BYTES * len(rows)} bytes",
+                "download both again, or move the labels away",
+            )
+        label = torch.from_numpy(data.view("<u4").astype(np.int64))
+        if len(scan) != len(label):  # points were dropped, and their labels go with them
+            points = torch.from_numpy(rows)
+            label = label[usable_points(points[:, :3], points[:, 3])]
+        return replace(scan, label=label)
+
+    def companions(self, index: int) -> tuple[Path, ...]:
+        """Return the file of a scan's labels."""
+        path = self.path(index)
+        return (path.parents[1] / "labels" / f"{path.stem}.label",)
+
+    def sequence_of(self, relative: Path) -> str:
+        """Name the sequence: "00"."""
+        return relative.parts[-3]
+
+    def recording_of(self, path: Path) -> str:
+        """Name the drive of KITTI raw that a sequence was cut from, if it is known."""
+        if not self._is_of_kitti:
+            return unnamed_recording(path)
+        sequence = self.sequence_of(path.relative_to(self.root))
+        return f"kitti/{_RAW_DRIVES[sequence]}" if sequence in _RAW_DRIVES else f"kitti_odometry/{sequence}"

@@ -1,0 +1,215 @@
+"""Simulated drives as files: seeds → a tree laid out as KITTI odometry and SemanticKITTI are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from lidargrit.core.errors import ConfigError, DataError, OutputError, counted_scans
+from lidargrit.core.files import (
+    atomic_path,
+    claim_folder,
+    claimed_manifest,
+    is_taken,
+    read_json,
+    write_json,
+    write_text,
+)
+from lidargrit.core.processes import process_pool
+from lidargrit.core.reporting import Reporter
+from lidargrit.data.formats.kitti_bin import KittiBin
+from lidargrit.scans.sensors import SensorModel
+from lidargrit.simulator import FRAME_S, FRAMES_AT_MOST, Theme, check_settings, observe, scene_of
+
+MANIFEST = "simulated.json"
+_SCANS_PER_SEQUENCE = 10_000  # of streets seen once each: a folder that any file browser still opens
+# KITTI's poses are those of its left camera: x right, y down, z forward. Ours sits in the sensor itself.
+_CAMERA_FROM_SENSOR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+
+
+@dataclass(frozen=True)
+class DriveConfig:
+    """Settings of simulated drives.
+
+    Args:
+        sensor: sensor to simulate.
+        seed: seed of the first street; each further street has the next seed.
+        frames: scans of each street, 0.1 s apart; with 1, every scan shows another street. A street ends after 100 m.
+        theme: kind of street.
+        motion: whether scans keep the distortion by the car's own motion; KITTI odometry has it removed.
+        wet: wetness of the ground, from 0 (dry) to 1 (soaked).
+        clean: whether ``observation/NNNNNN.npz`` is written, too, from which raydrop models are trained and judged: the
+            clean range of every pixel, the probability of a return, the sampled mask, reflectance and label.
+    """
+
+    sensor: SensorModel
+    seed: int = 0
+    frames: int = 1
+    theme: Theme = "mixed"
+    motion: bool = False
+    wet: float = 0.0
+    clean: bool = False
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.frames <= FRAMES_AT_MOST:
+            raise ConfigError(f"frames={self.frames}", f"1 to {FRAMES_AT_MOST:,} scans of a street", "correct it")
+        check_settings(self.seed, self.theme, wet=self.wet)
+
+    def street_of(self, scan: int) -> tuple[int, int]:
+        """Return the seed of a scan's street and its frame there."""
+        return self.seed + scan // self.frames, scan % self.frames
+
+    def sequence_and_number(self, scan: int) -> tuple[str, int]:
+        """Return a scan's sequence and its number in it: a drive each, or many single streets together."""
+        return f"{scan // self.scans_per_sequence:02d}", scan % self.scans_per_sequence
+
+    @property
+    def scans_per_sequence(self) -> int:
+        """Number of scans in a sequence."""
+        return self.frames if self.frames > 1 else _SCANS_PER_SEQUENCE
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all that the scans depend on."""
+        return {**vars(self), "sensor": self.sensor.to_json()}
+
+
+def write_drives(
+    out: Path, num_scans: int, config: DriveConfig, workers: int = 1, reporter: Reporter | None = None
+) -> int:
+    """Write scans, labels and poses; scans that are there already are not simulated again.
+
+    The tree is ``sequences/SS/{velodyne/NNNNNN.bin, labels/NNNNNN.label, poses.txt, times.txt, calib.txt}``. The poses
+    lie in ``poses/SS.txt``, too: SemanticKITTI has them in the sequence, KITTI's own tools look there.
+
+    Args:
+        out: an empty folder, or a folder that the same simulation began; scans can be added to it.
+        num_scans: total number of scans.
+        config: settings of the simulation.
+        workers: number of parallel processes.
+        reporter: receiver of progress messages.
+
+    Returns:
+        Number of scans that are there now.
+
+    Raises:
+        ConfigError: no scan, no process, or more frames than a street has.
+        OutputError: the folder holds something else.
+        DataError: a street of which no ray returns.
+    """
+    if num_scans < 1 or workers < 1:
+        raise ConfigError(
+            f"{counted_scans(num_scans)} by {workers} process{'' if workers == 1 else 'es'}",
+            "at least one of each",
+            "correct it",
+        )
+    for last in range(config.frames - 1, num_scans + config.frames - 1, config.frames):  # of each street
+        street, frame = config.street_of(min(last, num_scans - 1))
+        check_settings(street, config.theme, frame)
+    with claim_folder(out), claimed_manifest(out / MANIFEST):
+        _claim(out, config)
+        there = max(num_scans, _last_scan(out, config) + 1)  # an earlier call may have made more
+        missing = [scan for scan in range(there) if not _label_file(out, config, scan).exists()]
+        write = partial(_write_scan, out, config)
+        with (reporter or Reporter()).progress("simulating", there, there - len(missing)) as progress:
+            if min(workers, len(missing)) <= 1:
+                for scan in missing:
+                    write(scan)
+                    progress.advance(1)
+            else:
+                with process_pool(workers) as pool:
+                    for _ in pool.map(write, missing, chunksize=4):
+                        progress.advance(1)
+        _write_sequence_files(out, config, there)
+    return there
+
+
+def _claim(out: Path, config: DriveConfig) -> None:
+    facts = config.to_json()
+    if (out / MANIFEST).exists():
+        if read_json(out / MANIFEST) != facts:
+            raise OutputError(
+                f"{out}, which holds scans simulated in another way", "an empty folder", "choose another folder"
+            )
+    elif is_taken(out):
+        raise OutputError(f"{out}, which is not empty and holds no simulation", "an empty folder", "choose another")
+    else:
+        write_json(out / MANIFEST, facts)
+
+
+def _write_scan(out: Path, config: DriveConfig, scan: int) -> None:
+    """Write one scan's files; its labels come last and say that the others are there."""
+    seed, frame = config.street_of(scan)
+    seen = observe(seed, config.sensor, theme=config.theme, frame=frame, motion=config.motion, wet=config.wet)
+    if not seen.return_mask.any():
+        raise DataError(
+            f"no return in the simulated street {seed} by the sensor {config.sensor.name!r}",
+            "rays that meet the street within the sensor's range limits",
+            "choose another sensor",
+        )
+    points = seen.scan(f"simulated scan {seed}")
+    assert points.label is not None
+    label_file = _label_file(out, config, scan)
+    folder, name = label_file.parent.parent, label_file.stem
+    KittiBin.write(folder / "velodyne" / f"{name}.bin", points)
+    if config.clean:
+        with atomic_path(folder / "observation" / f"{name}.npz") as temporary, temporary.open("wb") as file:
+            np.savez_compressed(
+                file,
+                clean_range_m=seen.clean_range_m,
+                return_probability=seen.return_probability.astype(np.float16),
+                return_mask=seen.return_mask,
+                range_m=seen.range_m,
+                reflectance=seen.reflectance,
+                label=seen.label,
+                cos_incidence=seen.cos_incidence.astype(np.float16),
+            )
+    with atomic_path(label_file) as temporary:
+        temporary.write_bytes(points.label.numpy().astype("<u4").tobytes())
+
+
+def _label_file(out: Path, config: DriveConfig, scan: int) -> Path:
+    sequence, number = config.sequence_and_number(scan)
+    return out / "sequences" / sequence / "labels" / f"{number:06d}.label"
+
+
+def _last_scan(out: Path, config: DriveConfig) -> int:
+    """Return the last scan that is there, after which an interrupted call may have left gaps; -1 for none."""
+    last = -1
+    for file in out.glob("sequences/*/labels/[!.]*.label"):
+        sequence, number = file.parent.parent.name, file.stem
+        if sequence.isdecimal() and number.isdecimal():
+            scan = int(sequence) * config.scans_per_sequence + int(number)
+            if file == _label_file(out, config, scan):  # else it is a file of the user's
+                last = max(last, scan)
+    return last
+
+
+def _write_sequence_files(out: Path, config: DriveConfig, num_scans: int) -> None:
+    """Write what a sequence has once: poses in KITTI's form, times and calibration."""
+    poses: dict[str, list[Float64[np.ndarray, "4 4"]]] = {}
+    for first in range(0, num_scans, config.frames):
+        scene = scene_of(config.street_of(first)[0], config.theme) if config.frames > 1 else None
+        for scan in range(first, min(first + config.frames, num_scans)):
+            relative = np.eye(4)
+            if scene is not None:
+                moved = np.linalg.inv(scene.sensor_pose()) @ scene.sensor_pose(FRAME_S * (scan - first))
+                relative = _CAMERA_FROM_SENSOR @ moved @ np.linalg.inv(_CAMERA_FROM_SENSOR)
+            poses.setdefault(config.sequence_and_number(scan)[0], []).append(relative)
+    projection = _numbers(np.eye(3, 4))
+    calibration = [f"P{camera}: {projection}" for camera in range(4)] + [f"Tr: {_numbers(_CAMERA_FROM_SENSOR[:3])}"]
+    for sequence, relative in poses.items():
+        folder = out / "sequences" / sequence
+        lines = "".join(f"{_numbers(pose[:3])}\n" for pose in relative)
+        write_text(out / "poses" / f"{sequence}.txt", lines)
+        write_text(folder / "poses.txt", lines)
+        write_text(folder / "times.txt", "".join(f"{number * FRAME_S:e}\n" for number in range(len(relative))))
+        write_text(folder / "calib.txt", "".join(f"{line}\n" for line in calibration))
+
+
+def _numbers(matrix: Float64[np.ndarray, "3 4"]) -> str:
+    return " ".join(f"{value:.9e}" for value in matrix.ravel())

@@ -1,0 +1,238 @@
+"""Files of scans: a path → :class:`Scan`, whichever sensor or program wrote it; one format = one file here."""
+
+from __future__ import annotations
+
+import functools
+import os
+from abc import ABC, abstractmethod
+from io import BufferedReader
+from pathlib import Path
+from typing import ClassVar, Literal
+
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from lidargrit.core import discovery
+from lidargrit.core.errors import OutputError, ScanError, first_words
+from lidargrit.scans.types import Scan
+
+BadPoints = Literal["refuse", "drop"]
+POINTS_AT_MOST = 4_000_000  # thirty revolutions of an HDL-64E; a larger file is a map, or no scan at all
+
+
+class ScanFormat(ABC):
+    """A file format of scans; the class has no state and is used without an instance."""
+
+    title: ClassVar[str]
+    """One line for lists."""
+    suffixes: ClassVar[tuple[str, ...]]
+    """How names of such files end, in lower case."""
+    reflectance: ClassVar[str]
+    """What the file's values are, and what they are divided by to lie in [0, 1]."""
+    frame: ClassVar[str] = "x forward, y left, z up"
+    """The axes in the file; scans that are read always have x forward, y left, z up."""
+    sensor: ClassVar[str] = ""
+    """The sensor that makes such files, if it is always the same."""
+    several: ClassVar[bool] = False
+    """Whether one file may hold more than one scan."""
+    sensors: ClassVar[int] = 1
+    """How many sensors a file has a scan of each; a set of scans is of the first, for the others have other rays."""
+    keeps: ClassVar[tuple[str, ...]] = ()
+    """What :meth:`write` keeps of a scan besides its points, in files of the first suffix: reflectance, ring, label."""
+    companion: ClassVar[str] = ""
+    """The file that must lie beside such a file for it to be read, if it needs one."""
+    extra: ClassVar[str] = ""
+    """Which optional part of this program reads them: pip install 'lidargrit[EXTRA]'."""
+
+    @classmethod
+    def public_name(cls) -> str:
+        """Return the name that a user types: the file that defines the class."""
+        return cls.__module__.rpartition(".")[2]
+
+    @classmethod
+    def about(cls) -> list[str]:
+        """Return the facts of the format, one a line."""
+        facts = [f"endings: {', '.join(cls.suffixes)}", f"reflectance: {cls.reflectance}", f"axes: {cls.frame}"]
+        facts += [f"sensor: {cls.sensor}"] if cls.sensor else []
+        facts += ["several scans in one file"] if cls.several else []
+        facts += ["can be written: lidargrit export"] if cls.can_write() else []
+        return facts + ([f"needs: pip install 'lidargrit[{cls.extra}]'"] if cls.extra else [])
+
+    @classmethod
+    def can_write(cls) -> bool:
+        """Return whether :meth:`write` writes."""
+        return "write" in cls.__dict__
+
+    @staticmethod
+    @abstractmethod
+    def recognises(path: Path) -> bool:
+        """Return whether a file looks like this format, from its first bytes; False if it cannot be read."""
+
+    @staticmethod
+    def count(path: Path) -> int:
+        """Count the scans in a file, or raise ScanError."""
+        return 1
+
+    @staticmethod
+    @abstractmethod
+    def read(path: Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
+        """Read one scan of a file, or raise ScanError."""
+
+    @staticmethod
+    def companions(path: Path) -> tuple[Path, ...]:
+        """Return the other files that :meth:`read` reads, where they are there."""
+        return ()
+
+    @classmethod
+    def write(cls, path: Path, scan: Scan) -> None:
+        """Write a scan to a new file."""
+        raise OutputError(
+            f"a scan to write as {cls.title}",
+            "a format that can be written",
+            "choose another format, such as bin or ply",
+        )
+
+
+def load(name: str) -> type[ScanFormat]:
+    """Return a format's class by its name, or raise UnknownNameError."""
+    return discovery.load_class("formats", name, ScanFormat)
+
+
+def candidates(path: Path) -> tuple[type[ScanFormat], ...]:
+    """Return the formats whose files end as this one does; of several endings that fit, the longest counts."""
+    return _formats_of_suffixes().get(_suffix(path), ())
+
+
+def stem(path: Path) -> str:
+    """Return a file's name without the ending of its format, which may hold several dots."""
+    return path.name[: len(path.name) - len(_suffix(path))] if _suffix(path) else path.stem
+
+
+def recognise(path: Path) -> type[ScanFormat]:
+    """Return the format of a file, by its name and, where several formats share an ending, by what is in it.
+
+    Raises:
+        ScanError: no format has this ending, or there is no file to look at.
+    """
+    named = candidates(path)
+    open_file(path, named[0].title if named else "a file of a scan").close()
+    if not named:
+        known = ", ".join(sorted(_formats_of_suffixes()))
+        raise ScanError(f"{path}, whose ending we do not know", f"one of {known}", "convert or rename the file")
+    if len(named) == 1:
+        return named[0]
+    return next((one for one in named if one.recognises(path)), named[0])  # the first says best what is wrong with it
+
+
+def read_scan(path: Path | str, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
+    """Read a scan from a file of any format that we know.
+
+    Args:
+        path: the file.
+        index: number of the scan in the file, from 0.
+        bad_points: ``drop`` removes points with NaN or infinite coordinates and points at the origin.
+
+    Raises:
+        ScanError: the file cannot be used; says what is wrong and what to do.
+    """
+    form = recognise(Path(path))
+    if index:  # counting reads a whole recording
+        count = form.count(Path(path))
+        if not 0 <= index < count:
+            raise ScanError(f"scan number {index} of {path}", f"one of its {count}, counted from 0", "take another")
+    return form.read(Path(path), index, bad_points)
+
+
+def count_scans(path: Path) -> int:
+    """Count the scans in a file; one, too, where the file cannot be read, which is said when it is."""
+    if not any(one.several for one in candidates(path)):
+        return 1  # without opening it: a folder may hold a hundred thousand
+    try:
+        return recognise(path).count(path)
+    except ScanError:
+        return 1
+
+
+def _suffix(path: Path) -> str:
+    fitting = [suffix for suffix in _formats_of_suffixes() if path.name.lower().endswith(suffix)]
+    return max(fitting, key=len, default="")
+
+
+@functools.cache
+def _formats_of_suffixes() -> dict[str, tuple[type[ScanFormat], ...]]:
+    table: dict[str, list[type[ScanFormat]]] = {}
+    for name in discovery.names("formats"):
+        for suffix in load(name).suffixes:
+            table.setdefault(suffix, []).append(load(name))
+    return {suffix: tuple(ones) for suffix, ones in table.items()}
+
+
+def scan_of(
+    points_xyz_m: Float[Tensor, "n 3"],
+    reflectance: Float[Tensor, "n"] | None,
+    ring: Int[Tensor, "n"] | None,
+    source: str,
+    bad_points: BadPoints,
+    label: Int[Tensor, "n"] | None = None,
+    full_scale: int = 0,
+) -> Scan:
+    """Make a scan of what a file holds, without points that are no returns if ``bad_points`` is ``drop``."""
+    if bad_points == "drop":
+        kept = usable_points(points_xyz_m, reflectance)
+        points_xyz_m = points_xyz_m[kept]
+        reflectance, ring, label = (None if one is None else one[kept] for one in (reflectance, ring, label))
+    return Scan(points_xyz_m.contiguous(), reflectance, ring, label, source, full_scale)
+
+
+def usable_points(points_xyz_m: Float[Tensor, "n 3"], reflectance: Float[Tensor, "n"] | None) -> Bool[Tensor, "n"]:
+    """Return which points are returns: finite, away from the origin, and with a reflectance if any has one."""
+    usable = points_xyz_m.isfinite().all(dim=1) & (points_xyz_m != 0).any(dim=1)
+    return usable if reflectance is None else usable & ~reflectance.isnan()
+
+
+def open_file(path: Path, wanted: str) -> BufferedReader:
+    """Open a file to read its bytes.
+
+    Raises:
+        ScanError: it is not there, not a file or unreadable.
+    """
+    try:
+        if not path.is_file():  # opening a pipe or a device would hang
+            what = "not a file" if path.exists() else "not there"
+            raise ScanError(f"{path}, which is {what}", wanted, "check the path")
+        return path.open("rb")
+    except OSError as error:
+        raise ScanError(f"{path}, which cannot be read ({error.strerror})", wanted, "check the path") from None
+
+
+def read_bytes(path: Path, at_most: int, wanted: str) -> bytes:
+    """Read a whole file of limited size.
+
+    Raises:
+        ScanError: it is not a file, empty, unreadable or larger.
+    """
+    with open_file(path, wanted) as file:
+        try:
+            size = os.fstat(file.fileno()).st_size
+            data = file.read(size) if size <= at_most else b""  # read() makes room for all that it is asked for
+        except OSError as error:
+            raise ScanError(f"{path}, which cannot be read ({error.strerror})", wanted, "check the disk") from None
+    if size > at_most:
+        raise ScanError(f"{size:,} bytes in {path}", f"at most {at_most:,}: {wanted}", "split it into revolutions")
+    if not data:
+        raise ScanError(f"an empty file, {path}", wanted, "download it again, or remove it")
+    return data
+
+
+def first_bytes(path: Path, at_most: int) -> bytes:
+    """Read the beginning of a file to recognise it by; nothing if it cannot be read."""
+    try:
+        with open_file(path, "") as file:
+            return file.read(at_most)
+    except (ScanError, OSError):
+        return b""
+
+
+def damaged(path: Path, wanted: str, error: Exception) -> ScanError:
+    """Return the error of a file that a library could not read, with the library's reason in one line."""
+    return ScanError(f"{path}, a damaged file ({first_words(error)})", wanted, "download it again, or remove it")

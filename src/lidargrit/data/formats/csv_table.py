@@ -1,0 +1,113 @@
+"""Tables of text (.csv) with a header that names x, y and z ⇄ :class:`Scan`."""
+
+from __future__ import annotations
+
+import warnings
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+
+from lidargrit.core.errors import ScanError, first_words
+from lidargrit.core.files import atomic_path
+from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, ScanFormat, first_bytes, read_bytes
+from lidargrit.data.formats.shared.columns import (
+    BYTES_AT_MOST,
+    REFLECTANCE_RULE,
+    check_lines,
+    columns_of,
+    known_name,
+    scan_of_columns,
+)
+from lidargrit.scans.types import Scan
+
+_FORMAT = "lines of numbers below a line that names the columns, x, y and z among them"
+_HEADER_BYTES = 4096
+_SEPARATORS = (",", ";", "\t", " ")
+
+
+class CsvTable(ScanFormat):
+    """Text with a first line of names, such as ``x,y,z,intensity``; separated by commas, semicolons, tabs or blanks.
+
+    Names may stand in quotation marks and in capitals, and "#" or "//" before the first of them. Numbers have a decimal
+    point. Columns of other names are left alone.
+    """
+
+    title = "table of text with a header (.csv)"
+    suffixes = (".csv",)
+    reflectance = REFLECTANCE_RULE
+    keeps = ("reflectance", "ring", "label")
+
+    @staticmethod
+    def recognises(path: Path) -> bool:
+        """Return whether the first line names x, y and z."""
+        return {"x", "y", "z"} <= {name.lower() for name in _names(first_bytes(path, _HEADER_BYTES))[0]}
+
+    @staticmethod
+    def read(path: Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
+        """Read the scan in a file."""
+        data = read_bytes(path, BYTES_AT_MOST, _FORMAT)
+        names, separator = _names(data[:_HEADER_BYTES])
+        wanted: dict[str, int] = {}
+        for number, name in enumerate(names):
+            if name.lower() in {"x", "y", "z"} or known_name(name):
+                wanted.setdefault(name, number)
+        if not {"x", "y", "z"} <= {name.lower() for name in wanted}:
+            there = ", ".join(map(ascii, names[:8]))[:120] or "nothing"
+            raise ScanError(
+                f"{path}, whose first line names {there}", _FORMAT, "put a line such as x,y,z,intensity before the rest"
+            )
+        body = data[data.find(b"\n") + 1 :] if b"\n" in data else b""
+        check_lines(body, path, _FORMAT)
+        _check_fields(body, len(names), separator, path)
+        try:
+            with warnings.catch_warnings(action="ignore"):  # of a table without lines: said below
+                table = np.loadtxt(
+                    BytesIO(body),
+                    np.float64,
+                    comments=None,
+                    delimiter=None if separator == " " else separator,
+                    usecols=list(wanted.values()),
+                    max_rows=POINTS_AT_MOST + 1,
+                    ndmin=2,
+                    encoding="latin1",
+                )
+        except Exception as error:  # whatever the text makes the parser stumble over
+            what = f"{path}, whose lines cannot be read ({first_words(error)})"
+            raise ScanError(what, _FORMAT, "give every line a number in each column, with a decimal point") from None
+        if not 1 <= len(table) <= POINTS_AT_MOST:
+            raise ScanError(f"{len(table):,} lines in {path}", f"1 to {POINTS_AT_MOST:,}", "give one revolution a file")
+        return scan_of_columns(dict(zip(wanted, table.T, strict=True)), path, bad_points)
+
+    @classmethod
+    def write(cls, path: Path, scan: Scan) -> None:
+        """Write a scan to a new file, coordinates with all their digits."""
+        columns = columns_of(scan)
+        form = ["%.9g" if of.dtype.kind == "f" else "%d" for of in columns.values()]
+        table = np.column_stack([of.astype(np.float64) for of in columns.values()])
+        with atomic_path(path) as temporary:
+            np.savetxt(temporary, table, form, ",", header=",".join(columns), comments="", encoding="ascii")
+
+
+def _check_fields(body: bytes, at_most: int, separator: str, path: Path) -> None:
+    """Refuse a line of more fields than there are names: which of them is x could not be told."""
+    mark = separator.encode()
+    for line in BytesIO(body):
+        if separator == " ":
+            fields = len(line.split())
+        elif line.count(mark) < at_most:
+            continue
+        else:  # empty ones at the end name nothing, and some programs write one
+            fields = line.rstrip(b"\r\n\t " + mark).count(mark) + 1
+        if fields > at_most:
+            what = f"a line of {fields} fields below {at_most} names in {path}"
+            raise ScanError(what, _FORMAT, "name every column in the first line, and give no line more")
+
+
+def _names(start: bytes) -> tuple[list[str], str]:
+    """Return the names in the first line, and what separates them."""
+    line = start.partition(b"\n")[0].decode("latin1").removeprefix("\u00ef\u00bb\u00bf").strip()
+    line = line.removeprefix("#").removeprefix("//").strip()  # numpy.savetxt and CloudCompare write them there
+    separator = next((each for each in _SEPARATORS if each in line), ",")
+    names = line.split() if separator == " " else line.split(separator)
+    return [name.strip().strip("\"'").strip() for name in names], separator

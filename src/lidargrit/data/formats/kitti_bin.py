@@ -1,0 +1,68 @@
+"""KITTI .bin: float32 rows x, y, z, reflectance ⇄ :class:`Scan`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from lidargrit.core.errors import ScanError
+from lidargrit.core.files import atomic_path
+from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, ScanFormat, first_bytes, read_bytes, scan_of
+from lidargrit.data.formats.shared.bare_rows import wide_row
+from lidargrit.scans.types import Scan
+
+_ROW_BYTES = 16  # x, y, z, reflectance
+_ROWS_TO_LOOK_AT = 4096  # enough to tell reflectance from a coordinate
+_FORMAT = "float32 rows x, y, z, reflectance, 16 bytes a point"
+
+
+class KittiBin(ScanFormat):
+    """Velodyne files as KITTI writes them, little-endian, points in the order in which they were fired.
+
+    Source:
+        Geiger et al., Vision meets Robotics: the KITTI dataset, IJRR 2013.
+    """
+
+    title = "KITTI .bin (float32 x, y, z, reflectance)"
+    suffixes = (".bin",)
+    reflectance = "0 to 1, as it is"
+    keeps = ("reflectance",)
+
+    @staticmethod
+    def recognises(path: Path) -> bool:
+        """Return whether rows of four, and no wider ones, hold a reflectance in [0, 1] at their end."""
+        start = first_bytes(path, _ROW_BYTES * _ROWS_TO_LOOK_AT)
+        if not start or path.stat().st_size % _ROW_BYTES:
+            return False
+        values = np.frombuffer(start, dtype="<f4")
+        last = values[3::4]
+        return bool(((last >= 0) & (last <= 1)).all()) and not wide_row(values)
+
+    @staticmethod
+    def read(path: Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
+        """Read the scan in a file."""
+        data = read_bytes(path, POINTS_AT_MOST * _ROW_BYTES, _FORMAT)
+        if width := wide_row(np.frombuffer(data, "<f4", min(len(data) // 4, 4 * _ROWS_TO_LOOK_AT))):
+            nuscenes = "if nuScenes wrote it, name it .pcd.bin; else " if width == 5 else ""
+            cure = f"{nuscenes}keep x, y, z and reflectance from 0 to 1, or save named columns as .npz"
+            raise ScanError(f"rows of {width} numbers in {path}", _FORMAT, cure)
+        if len(data) % _ROW_BYTES:
+            nuscenes = len(data) % 20 == 0
+            raise ScanError(
+                f"{len(data)} bytes in {path}, {len(data) % _ROW_BYTES} more than whole points",
+                _FORMAT,
+                ("if its rows have 5 columns, as nuScenes writes them, name it .pcd.bin; else " if nuscenes else "")
+                + "download it again: the file was cut short or is of another format",
+            )
+        rows = torch.from_numpy(np.frombuffer(bytearray(data), dtype="<f4").reshape(-1, 4))
+        return scan_of(rows[:, :3], rows[:, 3].contiguous(), None, str(path), bad_points)
+
+    @classmethod
+    def write(cls, path: Path, scan: Scan) -> None:
+        """Write a scan to a new file, with reflectance 0 if it has none."""
+        reflectance = torch.zeros(len(scan)) if scan.reflectance is None else scan.reflectance
+        rows = torch.cat((scan.points_xyz_m, reflectance[:, None]), dim=1)
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(rows.numpy().astype("<f4").tobytes())

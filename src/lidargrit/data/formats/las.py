@@ -1,0 +1,153 @@
+"""LAS files of the surveying world, uncompressed ⇄ :class:`Scan`."""
+
+from __future__ import annotations
+
+import struct
+import warnings
+from datetime import date
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidargrit.core.errors import OutputError, ScanError
+from lidargrit.core.files import atomic_path
+from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, ScanFormat, damaged, first_bytes, read_bytes
+from lidargrit.data.formats.shared.columns import (
+    BYTES_AT_MOST,
+    REFLECTANCE_RULE,
+    columns_of,
+    known_name,
+    scan_of_columns,
+)
+from lidargrit.scans.types import Scan
+
+_FORMAT = "an uncompressed LAS file of version 1.0 to 1.4"
+_INSTALL = "pip install 'lidargrit[las]'"
+_HEADER_BYTES = 227  # the shortest, of versions 1.0 to 1.2
+_HEADER_BYTES_14 = 375
+_COMPRESSED = 0xC0  # bits of the point format that LAZ sets
+_POINT_FORMATS = 11  # 0 to 10
+_RECORDS_AT_MOST = 1000  # of remarks between header and points; real files have 1 to 10
+_STEP_M = 1e-4  # in which coordinates are kept: a twentieth of a sensor's own step, and 214 km in 32 bits
+_OURS = "lidargrit"  # the program that writes a file
+_INTENSITY_STEPS = 65_535  # 16 bits, as the standard wants them
+_WRITTEN_ON = date(2000, 1, 1)  # the same scan gives the same bytes on every day
+
+
+class Las(ScanFormat):
+    """LAS 1.0 to 1.4; compressed files (LAZ) have to be unpacked first.
+
+    Reflectance is LAS's intensity, and none where all of it is 0, which is how LAS says so. Files that this program
+    writes have it from 0 to 1, too, in an extra dimension of that name, as they have ring and label; the classes of LAS
+    are others than SemanticKITTI's and left alone. Files are written as version 1.4, point format 0, with coordinates
+    in steps of 0.1 mm.
+
+    Source:
+        LAS Specification 1.4 R15, American Society for Photogrammetry and Remote Sensing, 2019.
+    """
+
+    title = "LAS (surveying)"
+    suffixes = (".las",)
+    reflectance = REFLECTANCE_RULE
+    keeps = ("reflectance", "ring", "label")
+    extra = "las"
+
+    @staticmethod
+    def recognises(path: Path) -> bool:
+        """Return whether a file begins with a header of uncompressed LAS."""
+        try:
+            _check_header(first_bytes(path, _HEADER_BYTES_14), None, path)
+        except ScanError:
+            return False
+        return True
+
+    @staticmethod
+    def read(path: Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
+        """Read the scan in a file."""
+        data = read_bytes(path, BYTES_AT_MOST, _FORMAT)
+        _check_header(data[:_HEADER_BYTES_14], len(data), path)
+        try:
+            import laspy  # noqa: PLC0415  an optional part
+        except ImportError:
+            raise ScanError(f"{path}, which takes laspy to read", "it installed", _INSTALL) from None
+        try:
+            with (
+                warnings.catch_warnings(action="ignore"),  # of remarks that it cannot read, and of huge coordinates
+                laspy.LasReader(BytesIO(data), read_evlrs=False) as reader,
+            ):
+                columns = _columns(reader.read_points(-1), reader.header.generating_software == _OURS)
+        except Exception as error:  # the library meets a damaged file with whatever it stumbles over
+            raise damaged(path, _FORMAT, error) from None
+        return scan_of_columns(columns, path, bad_points)
+
+    @classmethod
+    def write(cls, path: Path, scan: Scan) -> None:
+        """Write a scan to a new file.
+
+        Raises:
+            OutputError: laspy is not installed, or a coordinate beyond 214 km.
+        """
+        try:
+            import laspy  # noqa: PLC0415  an optional part
+        except ImportError:
+            raise OutputError(f"no laspy to write {path}", "it installed", _INSTALL) from None
+        columns = columns_of(scan)
+        farthest_m = float(scan.points_xyz_m.abs().max())
+        if farthest_m >= _STEP_M * np.iinfo(np.int32).max:
+            raise OutputError(f"a coordinate of {farthest_m:g} m", "at most 214 km", "choose .ply")
+        header = laspy.LasHeader(version="1.4", point_format=0)
+        header.scales, header.offsets = np.full(3, _STEP_M), np.zeros(3)
+        header.generating_software, header.creation_date = _OURS, _WRITTEN_ON
+        extra = {name: columns[name] for name in ("ring", "label") if name in columns}
+        if "intensity" in columns:  # the intensity alone does not say what its full scale is
+            extra["reflectance"] = columns["intensity"].astype(np.float32)
+        header.add_extra_dims([laspy.ExtraBytesParams(name, values.dtype) for name, values in extra.items()])
+        cloud: Any = laspy.LasData(header)
+        cloud.xyz = scan.points_xyz_m.double().numpy()
+        if "intensity" in columns:
+            cloud.intensity = _steps(columns["intensity"])
+        for name, values in extra.items():
+            cloud[name] = values
+        with atomic_path(path) as temporary, temporary.open("wb") as file:
+            cloud.write(file, do_compress=False)
+
+
+def _columns(points: Any, ours: bool) -> dict[str, np.ndarray]:
+    """Return the columns that a scan has room for."""
+    columns = {axis: np.asarray(points[axis], dtype=np.float64) for axis in "xyz"}
+    intensity = np.asarray(points["intensity"])
+    if intensity.any():
+        columns["intensity"] = intensity
+    for name in points.point_format.extra_dimension_names:
+        values = np.asarray(points[name])
+        if known_name(name) and values.ndim == 1:
+            columns[name] = values
+    if ours and "reflectance" in columns and not np.array_equal(intensity, _steps(columns["reflectance"])):
+        del columns["reflectance"]  # of before another program changed the intensity
+    return columns
+
+
+def _steps(reflectance: np.ndarray) -> np.ndarray:
+    """Return the intensity that is written for reflectance from 0 to 1."""
+    return (_INTENSITY_STEPS * reflectance.astype(np.float64).clip(0, 1)).round().astype(np.uint16)
+
+
+def _check_header(header: bytes, size: int | None, path: Path) -> None:
+    """Refuse a header that asks for more than the file has; a size of None is not known yet."""
+    if len(header) < _HEADER_BYTES or header[:4] != b"LASF" or header[24] != 1 or header[25] > 4:
+        raise ScanError(f"{path}, which is no LAS file", _FORMAT, "convert it, or download it again")
+    start, records, kind, row_bytes, points = struct.unpack_from("<IIBHI", header, 96)
+    if header[25] == 4 and len(header) >= _HEADER_BYTES_14:
+        points = struct.unpack_from("<Q", header, 247)[0]
+    if kind & _COMPRESSED:
+        raise _refused("compressed points (LAZ)", path, "unpack it, for instance with: laszip")
+    if kind >= _POINT_FORMATS or records > _RECORDS_AT_MOST:
+        raise _refused(f"points of format {kind} after {records} records", path)
+    if not 0 < points <= POINTS_AT_MOST or (size is not None and start + points * row_bytes > size):
+        raise _refused(f"{points} points of {row_bytes} bytes{'' if size is None else f' in {size} bytes'}", path)
+
+
+def _refused(what: str, path: Path, cure: str = "download it again, or convert it") -> ScanError:
+    return ScanError(f"{path}, a LAS file of {what}", _FORMAT, cure)

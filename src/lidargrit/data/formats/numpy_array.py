@@ -1,0 +1,133 @@
+"""NumPy's .npz of named arrays, or .npy of rows x, y, z, reflectance, ring ⇄ :class:`Scan`."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import BufferedReader, BytesIO
+from pathlib import Path
+
+import numpy as np
+
+from lidargrit.core.arrays import HEADER_BYTES_AT_MOST, open_archive, parse_array, read_member
+from lidargrit.core.errors import ScanError
+from lidargrit.core.files import atomic_path
+from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, ScanFormat, damaged, first_bytes, open_file, read_bytes
+from lidargrit.data.formats.shared.columns import (
+    BYTES_AT_MOST,
+    REFLECTANCE_RULE,
+    columns_of,
+    known_name,
+    scan_of_columns,
+)
+from lidargrit.scans.types import Scan
+
+_FORMAT = "an .npy of n rows of 3 to 5 numbers, or an .npz with an array points of n rows"
+_VALUE_BYTES_AT_MOST = 16  # numpy's widest number
+_ROWS = ("x", "y", "z", "intensity", "ring")
+_POINTS = ("points", "xyz", "points_xyz_m")
+
+
+class NumpyArray(ScanFormat):
+    """Arrays as numpy saves them; objects, which are code, are never loaded.
+
+    An ``.npy`` holds a row of x, y, z for every point, and reflectance and ring if the rows are longer. An ``.npz``
+    holds such rows as ``points`` (or xyz), and if they are there reflectance (or reflectivity, intensity, remission,
+    i), ring (or channel) and label as arrays of their own. The ``.npy`` of a scan with rings but without reflectance
+    is given a reflectance of 0.
+    """
+
+    title = "NumPy array (.npz, .npy)"
+    suffixes = (".npz", ".npy")
+    reflectance = REFLECTANCE_RULE
+    keeps = ("reflectance", "ring", "label")
+
+    @staticmethod
+    def recognises(path: Path) -> bool:
+        """Return whether a file is an array, or an archive with an array of points."""
+        if first_bytes(path, 6) == b"\x93NUMPY":
+            return True
+        try:
+            with open_file(path, _FORMAT) as file, _archive(file, path) as archive:
+                return bool({f"{name}.npy" for name in _POINTS} & set(archive.namelist()))
+        except (ScanError, OSError):
+            return False
+
+    @staticmethod
+    def read(path: Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
+        """Read the scan in a file."""
+        data = read_bytes(path, BYTES_AT_MOST, _FORMAT)
+        if data.startswith(b"\x93NUMPY"):
+            try:
+                rows = parse_array(data)
+            except ValueError as error:
+                raise damaged(path, _FORMAT, error) from None
+            columns = _row_columns(rows, path)
+        else:
+            with _archive(BytesIO(data), path) as archive:
+                columns = _archive_columns(archive, path)
+        return scan_of_columns(columns, path, bad_points)
+
+    @classmethod
+    def write(cls, path: Path, scan: Scan) -> None:
+        """Write a scan to a new file, an ``.npy`` if the path ends so, which has no place for labels."""
+        columns = columns_of(scan)
+        points = np.stack([columns.pop(axis) for axis in "xyz"], axis=1)
+        with atomic_path(path) as temporary, temporary.open("wb") as file:
+            if path.suffix.lower() != ".npy":
+                np.savez(file, points=points, **columns)  # pyright: ignore[reportArgumentType]  it fears a column "allow_pickle"
+                return
+            if "ring" in columns:
+                columns.setdefault("intensity", np.zeros(len(scan), dtype=np.float32))
+            np.save(file, np.column_stack([points, *(columns[name] for name in _ROWS[3:] if name in columns)]))
+
+
+def _row_columns(rows: np.ndarray, path: Path) -> dict[str, np.ndarray]:
+    if rows.dtype.kind == "b":
+        raise _refused("truth values as points", path)
+    if rows.ndim != 2 or not 3 <= rows.shape[1] <= len(_ROWS) or len(rows) > POINTS_AT_MOST:
+        raise _refused(f"an array of shape {rows.shape}", path)
+    return dict(zip(_ROWS, rows.T, strict=False))
+
+
+def _archive_columns(archive: zipfile.ZipFile, path: Path) -> dict[str, np.ndarray]:
+    members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+    points_name = next((name for name in _POINTS if name in members), None)
+    if points_name is None and "range_m" in members:
+        raise ScanError(
+            f"{path}, a range image from a folder of samples",
+            _FORMAT,
+            f"name the whole folder: {path.absolute().parent}",
+        )
+    if points_name is None:
+        raise _refused(f"the arrays {', '.join(map(ascii, list(members)[:8]))[:120]}", path)
+    columns = _row_columns(read_member(archive, members.pop(points_name), BYTES_AT_MOST), path)
+    at_most = _VALUE_BYTES_AT_MOST * len(columns["x"]) + HEADER_BYTES_AT_MOST
+    for member, info in members.items():
+        name = known_name(member)
+        # What else is in the archive is not unpacked, nor the same name again: with other capitals there are hundreds.
+        if not name or name in columns:
+            continue
+        columns[name] = read_member(archive, info, at_most)
+        if columns[name].dtype.kind == "b":
+            raise _refused(f"truth values as {name}", path)
+        if columns[name].shape != columns["x"].shape:
+            raise _refused(f"{len(columns['x'])} points, but {name} of shape {columns[name].shape}", path)
+    return columns
+
+
+@contextmanager
+def _archive(file: BytesIO | BufferedReader, path: Path) -> Iterator[zipfile.ZipFile]:
+    """Open an archive, or say in one line what is wrong with it or with an array that is read from it."""
+    try:
+        with open_archive(file) as archive:
+            yield archive
+    except ScanError:
+        raise
+    except ValueError as error:
+        raise damaged(path, _FORMAT, error) from None
+
+
+def _refused(what: str, path: Path) -> ScanError:
+    return ScanError(f"{path}, which holds {what}", _FORMAT, "save the points anew, or remove the file")

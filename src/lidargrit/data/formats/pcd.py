@@ -1,0 +1,188 @@
+"""PCD files of the Point Cloud Library, text, binary or compressed ⇄ :class:`Scan`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from io import BufferedReader, BytesIO
+from pathlib import Path
+
+import numpy as np
+
+from lidargrit.core.errors import ScanError
+from lidargrit.core.files import atomic_path
+from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, ScanFormat, damaged, first_bytes, read_bytes
+from lidargrit.data.formats.shared.columns import (
+    BYTES_AT_MOST,
+    REFLECTANCE_RULE,
+    columns_of,
+    scan_of_columns,
+    text_rows,
+    whole_number,
+)
+from lidargrit.scans.types import Scan
+
+_FORMAT = "a PCD file with the fields x, y and z"
+_HEADER_BYTES_AT_MOST = 65_536  # real ones take 200 to 500
+_ROW_BYTES_AT_MOST = 4096  # real ones take 12 to 48; histograms of features up to 1 kB
+_SIZES = {"F": (4, 8), "U": (1, 2, 4, 8), "I": (1, 2, 4, 8)}
+
+
+class Pcd(ScanFormat):
+    """Point Cloud Data, version 0.7 and its forerunners; ordered clouds too, whose placeholders are NaN.
+
+    Fields are found by their names: x, y, z, and if they are there reflectance (or reflectivity, intensity,
+    remission, i), ring (or channel) and label. The viewpoint is left alone. Written files are binary.
+
+    Source:
+        https://pointclouds.org/documentation/tutorials/pcd_file_format.html
+    """
+
+    title = "PCD (Point Cloud Library)"
+    suffixes = (".pcd",)
+    reflectance = REFLECTANCE_RULE
+    keeps = ("reflectance", "ring", "label")
+
+    @staticmethod
+    def recognises(path: Path) -> bool:
+        """Return whether a file begins with a header of PCD."""
+        try:
+            _Header.parse(first_bytes(path, _HEADER_BYTES_AT_MOST), path)
+        except ScanError:
+            return False
+        return True
+
+    @staticmethod
+    def read(path: Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
+        """Read the scan in a file."""
+        data = read_bytes(path, BYTES_AT_MOST, _FORMAT)
+        header = _Header.parse(data, path)
+        body = data[header.end :]
+        if header.data == "ascii":
+            columns = text_rows(body, header.points, header.column_names(), path, _FORMAT)
+        else:
+            columns = _binary(header, body, path)
+        return scan_of_columns(
+            {field: columns[name] for field, name in header.single_fields().items()}, path, bad_points
+        )
+
+    @classmethod
+    def write(cls, path: Path, scan: Scan) -> None:
+        """Write a scan to a new binary file."""
+        from pypcd4.pypcd4 import Encoding, PointCloud  # noqa: PLC0415  for quick starts of what reads other files
+
+        columns = columns_of(scan)
+        cloud = PointCloud.from_points(
+            list(columns.values()), list(columns), [values.dtype for values in columns.values()]
+        )
+        with atomic_path(path) as temporary:
+            cloud.save(temporary, Encoding.BINARY)
+
+
+@dataclass(frozen=True)
+class _Header:
+    """What the first lines of a file say, after it has been checked: nothing in it asks for more than the file has."""
+
+    fields: tuple[str, ...]
+    sizes: tuple[int, ...]
+    types: tuple[str, ...]
+    counts: tuple[int, ...]
+    points: int
+    data: str
+    end: int
+
+    @classmethod
+    def parse(cls, data: bytes, path: Path) -> _Header:
+        words, end = _entries(data, path)
+        fields, types = words.get("FIELDS", words.get("COLUMNS", ())), words.get("TYPE", ())
+        sizes = tuple(map(whole_number, words.get("SIZE", ())))
+        counts = tuple(map(whole_number, words["COUNT"])) if "COUNT" in words else (1,) * len(fields)
+        width, height = (whole_number("".join(words.get(key, ()))) for key in ("WIDTH", "HEIGHT"))
+        points = whole_number("".join(words["POINTS"])) if "POINTS" in words else width * height
+        if not len(fields) == len(types) == len(sizes) == len(counts) > 0:
+            raise _refused(f"{len(fields)} fields, {len(sizes)} sizes, {len(types)} types, {len(counts)} counts", path)
+        if unknown := [(t, s) for t, s in zip(types, sizes, strict=True) if s not in _SIZES.get(t, ())]:
+            raise _refused(f"a field of type {unknown[0][0][:10]!r} and size {unknown[0][1]}", path)
+        row_bytes = sum(size * count for size, count in zip(sizes, counts, strict=True))
+        if min(counts) < 1 or row_bytes > _ROW_BYTES_AT_MOST:
+            raise _refused(f"counts from {min(counts)} to {max(counts)} values a point", path)
+        if not 0 < points <= POINTS_AT_MOST or min(width, height) < 0 or width * height != points:
+            raise _refused(f"{points} points in {width} columns and {height} rows", path)
+        if row_bytes * points > BYTES_AT_MOST:
+            raise _refused(f"{points} points of {row_bytes} bytes", path)
+        return cls(tuple(fields), sizes, tuple(types), counts, points, "".join(words["DATA"]).lower(), end)
+
+    @property
+    def row_bytes(self) -> int:
+        """Bytes of one point."""
+        return sum(size * count for size, count in zip(self.sizes, self.counts, strict=True))
+
+    def column_names(self) -> list[str]:
+        """Name every value of a point, as pypcd4 does it: "f1", or "f1__0000", "f1__0001" where a field has several."""
+        return [
+            f"f{index}" if count == 1 else f"f{index}__{part:04d}"
+            for index, count in enumerate(self.counts)
+            for part in range(count)
+        ]
+
+    def single_fields(self) -> dict[str, str]:
+        """Return the column of every field that has one value a point; of fields of one name, that of the first."""
+        columns: dict[str, str] = {}
+        for index, (field, count) in enumerate(zip(self.fields, self.counts, strict=True)):
+            if count == 1:
+                columns.setdefault(field, f"f{index}")
+        return columns
+
+    def canonical(self) -> bytes:
+        """Return a header that any reader understands, without the file's own names and liberties."""
+        lines = {
+            "VERSION": ("0.7",),
+            "FIELDS": [f"f{index}" for index in range(len(self.fields))],
+            "SIZE": self.sizes,
+            "TYPE": self.types,
+            "COUNT": self.counts,
+            "WIDTH": (self.points,),
+            "HEIGHT": (1,),
+            "VIEWPOINT": (0, 0, 0, 1, 0, 0, 0),
+            "POINTS": (self.points,),
+            "DATA": (self.data,),
+        }
+        return "".join(f"{key} {' '.join(map(str, values))}\n" for key, values in lines.items()).encode()
+
+
+def _entries(data: bytes, path: Path) -> tuple[dict[str, list[str]], int]:
+    """Return the words after every key of the header, and where the points begin."""
+    words: dict[str, list[str]] = {}
+    end = 0
+    while "DATA" not in words:
+        start, end = end, data.find(b"\n", end, _HEADER_BYTES_AT_MOST) + 1
+        if not end:
+            raise _refused("a header that does not end with DATA", path)
+        key, *values = data[start:end].decode("latin1").split() or ["#"]
+        if not key.startswith("#"):
+            words[key.upper()] = values
+    return words, end
+
+
+def _binary(header: _Header, body: bytes, path: Path) -> dict[str, np.ndarray]:
+    wanted_bytes = there = header.row_bytes * header.points
+    if header.data == "binary":
+        there = len(body)
+    elif header.data == "binary_compressed" and len(body) >= 8:
+        packed_bytes, unpacked_bytes = np.frombuffer(body, "<u4", 2).tolist()
+        if packed_bytes > len(body) - 8 or unpacked_bytes != wanted_bytes:  # before room is made for them
+            raise _refused(f"{len(body) - 8} of {packed_bytes} bytes, {unpacked_bytes} unpacked", path)
+    else:
+        raise _refused(f"{len(body)} bytes of DATA {header.data[:20]!r}", path)
+    if there < wanted_bytes:
+        raise _refused(f"{there} bytes of points instead of {wanted_bytes}", path)
+    from pypcd4.pypcd4 import PointCloud  # noqa: PLC0415  for quick starts of what reads other files
+
+    try:
+        cloud = PointCloud.from_fileobj(BufferedReader(BytesIO(header.canonical() + body)))
+    except Exception as error:  # the library meets a damaged file with whatever it stumbles over
+        raise damaged(path, _FORMAT, error) from None
+    return {name: cloud.pc_data[name] for name in header.column_names()}
+
+
+def _refused(what: str, path: Path) -> ScanError:
+    return ScanError(f"{path}, a PCD file of {what}", _FORMAT, "download it again, or convert it")

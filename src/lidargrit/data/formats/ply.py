@@ -1,0 +1,202 @@
+"""PLY files, text or binary of either byte order ⇄ :class:`Scan`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from lidargrit.core.errors import ScanError
+from lidargrit.core.files import atomic_path
+from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, ScanFormat, first_bytes, read_bytes
+from lidargrit.data.formats.shared.columns import (
+    BYTES_AT_MOST,
+    REFLECTANCE_RULE,
+    columns_of,
+    scan_of_columns,
+    text_rows,
+    whole_number,
+)
+from lidargrit.scans.types import Scan
+
+_FORMAT = "a PLY file whose vertices have x, y and z"
+_HEADER_BYTES_AT_MOST = 65_536  # real ones take 200 bytes to a few kB of comments
+_PROPERTIES_AT_MOST = 256  # of one element; real ones have 3 to 70
+_BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+_TYPES = {
+    "char": "i1",
+    "int8": "i1",
+    "uchar": "u1",
+    "uint8": "u1",
+    "short": "i2",
+    "int16": "i2",
+    "ushort": "u2",
+    "uint16": "u2",
+    "int": "i4",
+    "int32": "i4",
+    "uint": "u4",
+    "uint32": "u4",
+    "float": "f4",
+    "float32": "f4",
+    "double": "f8",
+    "float64": "f8",
+}
+_TYPE_NAMES = {"<f4": "float", "<u2": "ushort", "<u4": "uint"}  # of what is written
+
+
+class Ply(ScanFormat):
+    """Polygon files, of which only the vertices are read.
+
+    Properties are found by their names, with or without the "scalar_" that CloudCompare puts before them: x, y, z, and
+    if they are there reflectance (or reflectivity, intensity, remission, i), ring (or channel) and label. Written files
+    are binary, little-endian.
+
+    Source:
+        Turk, The PLY Polygon File Format, 1994; the names of types of fixed size are of later programs.
+    """
+
+    title = "PLY (polygon file)"
+    suffixes = (".ply",)
+    reflectance = REFLECTANCE_RULE
+    keeps = ("reflectance", "ring", "label")
+
+    @staticmethod
+    def recognises(path: Path) -> bool:
+        """Return whether a file begins with a header of PLY."""
+        try:
+            _Header.parse(first_bytes(path, _HEADER_BYTES_AT_MOST), path)
+        except ScanError:
+            return False
+        return True
+
+    @staticmethod
+    def read(path: Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
+        """Read the scan in a file."""
+        data = read_bytes(path, BYTES_AT_MOST, _FORMAT)
+        header = _Header.parse(data, path)
+        if header.byte_order:
+            row = np.dtype([(name, header.byte_order + kind) for name, kind in header.properties.items()])
+            first = header.end + header.bytes_before
+            if len(data) < first + header.points * row.itemsize:
+                raise _refused(f"{len(data)} bytes instead of {first + header.points * row.itemsize}", path)
+            vertices = np.frombuffer(data, row, header.points, first)
+            columns = {name: vertices[name] for name in header.properties}
+        else:
+            columns = text_rows(_below(data, header, path), header.points, list(header.properties), path, _FORMAT)
+        return scan_of_columns(columns, path, bad_points)
+
+    @classmethod
+    def write(cls, path: Path, scan: Scan) -> None:
+        """Write a scan to a new binary file."""
+        columns = {name: values.astype(values.dtype.newbyteorder("<")) for name, values in columns_of(scan).items()}
+        lines = [f"property {_TYPE_NAMES[values.dtype.str]} {name}" for name, values in columns.items()]
+        header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(scan)}", *lines, "end_header", ""]
+        rows = np.rec.fromarrays(list(columns.values()), [(name, values.dtype) for name, values in columns.items()])
+        with atomic_path(path) as temporary:
+            temporary.write_bytes("\n".join(header).encode() + rows.tobytes())
+
+
+@dataclass(frozen=True)
+class _Header:
+    """What the first lines of a file say, after it has been checked.
+
+    Args:
+        byte_order: numpy's sign for the byte order; empty for text.
+        points: number of vertices.
+        properties: numpy type of each property, by its name.
+        rows_before: number of rows of the elements before the vertices.
+        bytes_before: size of the elements before the vertices, in bytes.
+        end: position of the first element in the file, in bytes.
+    """
+
+    byte_order: str
+    points: int
+    properties: dict[str, str]
+    rows_before: int
+    bytes_before: int
+    end: int
+
+    @classmethod
+    def parse(cls, data: bytes, path: Path) -> _Header:
+        lines, end = _lines(data, path)
+        match lines[1:2]:
+            case [["format", encoding, *_]] if encoding in _BYTE_ORDERS:
+                byte_order = _BYTE_ORDERS[encoding]
+            case other:
+                raise _refused(f"the format {' '.join(other[0] if other else [])[:40]!r}", path)
+        elements = _elements(lines[2:], path)
+        index = next((index for index, element in enumerate(elements) if element.name == "vertex"), None)
+        if index is None:
+            raise _refused("no vertices", path)
+        before, vertices = elements[:index], elements[index]
+        if not 0 < vertices.rows <= POINTS_AT_MOST:
+            raise _refused(f"{vertices.rows} vertices", path)
+        rows_before = sum(element.rows for element in before)
+        if rows_before > POINTS_AT_MOST:
+            raise _refused(f"{rows_before} rows before its vertices", path)
+        for element in before:
+            if not 0 <= element.rows <= POINTS_AT_MOST or "list" in element.properties.values():
+                raise _refused(f"{element.rows} rows of {element.name[:20]!r} before its vertices", path)
+        row_bytes = [sum(np.dtype(kind).itemsize for kind in element.properties.values()) for element in before]
+        return cls(
+            byte_order,
+            vertices.rows,
+            vertices.properties,
+            rows_before,
+            sum(element.rows * size for element, size in zip(before, row_bytes, strict=True)),
+            end,
+        )
+
+
+def _below(data: bytes, header: _Header, path: Path) -> bytes:
+    """Return the text below the rows of the elements before the vertices, without making lines of those."""
+    end = header.end
+    for row in range(header.rows_before):
+        end = data.find(b"\n", end) + 1
+        if not end:
+            raise _refused(f"{row} of the {header.rows_before} rows before its vertices", path)
+    return data[end:]
+
+
+class _Element(NamedTuple):
+    name: str
+    rows: int
+    properties: dict[str, str]
+
+
+def _lines(data: bytes, path: Path) -> tuple[list[list[str]], int]:
+    """Return the words of every line of the header, comments left out, and where the elements begin."""
+    lines: list[list[str]] = []
+    end = 0
+    while lines[-1:] != [["end_header"]]:
+        start, end = end, data.find(b"\n", end, _HEADER_BYTES_AT_MOST) + 1
+        words = data[start:end].decode("latin1").split()
+        if not end or (start == 0 and words != ["ply"]):
+            raise ScanError(f"{path}, which is no PLY file", _FORMAT, "convert the file, or download it again")
+        if words and words[0] not in ("comment", "obj_info"):
+            lines.append(words)
+    return lines[:-1], end
+
+
+def _elements(lines: list[list[str]], path: Path) -> list[_Element]:
+    """Return every element, with numpy's type of each of its properties, or "list" for a list of values."""
+    elements: list[_Element] = []
+    for line in lines:
+        match line:
+            case ["element", name, count]:
+                elements.append(_Element(name, whole_number(count), {}))
+            case ["property", kind, name] if elements and kind in _TYPES and name not in elements[-1].properties:
+                elements[-1].properties[name] = _TYPES[kind]
+            case ["property", "list", _, _, name] if elements and elements[-1].name != "vertex":
+                elements[-1].properties[name] = "list"
+            case _:
+                raise _refused(f"{' '.join(line)[:60]!r} in its header", path)
+        if elements and len(elements[-1].properties) > _PROPERTIES_AT_MOST:
+            raise _refused(f"over {_PROPERTIES_AT_MOST} properties", path)
+    return elements
+
+
+def _refused(what: str, path: Path) -> ScanError:
+    return ScanError(f"{path}, a PLY file of {what}", _FORMAT, "download it again, or convert it")

@@ -1,0 +1,1 @@
+"""Data sources → range images, projected once and kept on disk."""

@@ -1,0 +1,101 @@
+"""Settings of the data: which scans are read, and how they become range images."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+from lidargrit.core.configuration import override
+from lidargrit.core.errors import ConfigError
+from lidargrit.data.formats import BadPoints
+from lidargrit.scans.projection import ProjectionVariant
+from lidargrit.scans.sensors import SensorModel, load_sensor
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """Which scans are read, and how they become range images.
+
+    Args:
+        train: sources of training scans: "NAME:ROOT:SPLIT", a folder, "simulated:COUNT", or a prepared folder or URL.
+        val: sources of validation scans, which the model is tried on and does not learn from.
+        sensor: name of a sensor, or path of a sensor's ``.json`` file.
+        columns: number of fine columns over the whole circle; 0 for the sensor's own number.
+        column_stride: step between the fine columns that an image keeps, such as 8 for every eighth.
+        projection: ``spherical`` (rows by elevation), ``unfolding`` (rows by ring), or ``sensor`` for the sensor's own.
+        projection_variant: ``exact``, or ``reference`` to repeat the projection of LidarGRIT's released program.
+        max_scans: largest number of scans taken from each source, evenly spaced over it; 0 for all.
+        bad_points: ``refuse`` a scan with points that are NaN, infinite or at the origin, or ``drop`` these points.
+        bad_scans: ``refuse`` to go on when a scan cannot be used, or ``skip`` that scan with a message.
+        workers: number of processes that prepare scans, and of threads that read ahead during training.
+    """
+
+    train: tuple[str, ...] = ()
+    val: tuple[str, ...] = ()
+    sensor: str = "hdl64e_kitti_odometry"
+    columns: int = 0
+    column_stride: int = 1
+    projection: Literal["sensor", "spherical", "unfolding"] = "sensor"
+    projection_variant: ProjectionVariant = "exact"
+    max_scans: int = 0
+    bad_points: BadPoints = "refuse"
+    bad_scans: Literal["refuse", "skip"] = "refuse"
+    workers: int = 2
+
+    def __post_init__(self) -> None:
+        if self.max_scans < 0:
+            raise ConfigError(f"max_scans={self.max_scans}", "at least 1, or 0 for all", "raise it")
+        if self.column_stride != 1 and not self.columns:
+            got = f"column_stride={self.column_stride} without columns"
+            raise ConfigError(got, "both, or neither", "give the number of fine columns too, as columns=2048")
+        if not 1 <= self.workers <= 1024:
+            raise ConfigError(f"workers={self.workers}", "1 to 1024", "choose about as many as there are cores")
+
+    def load_sensor(self) -> SensorModel:
+        """Return the sensor with these columns and this projection."""
+        return self.imaged(load_sensor(self.sensor))
+
+    def imaged(self, sensor: SensorModel) -> SensorModel:
+        """Return another sensor with these columns and this projection."""
+        if self.columns:
+            sensor = sensor.with_columns(self.columns, self.column_stride)
+        return sensor if self.projection == "sensor" else replace(sensor, projection=self.projection)
+
+
+@dataclass(frozen=True)
+class ScanSettings:
+    """Settings of reading scans from a command line, the same for all commands.
+
+    Args:
+        data: settings of reading and projecting scans.
+        sensor: name or ``.json`` file of the sensor; "" if none is named.
+        projection_variant: variant of the projection; None if none is named.
+    """
+
+    data: DataConfig = field(default_factory=DataConfig)
+    sensor: str = ""
+    projection_variant: ProjectionVariant | None = None
+
+    @classmethod
+    def read(cls, settings: Sequence[str] = (), **options: str | int | None) -> ScanSettings:
+        """Read words such as ``data.projection=spherical``, and options that have a name of their own.
+
+        Args:
+            settings: words of the form data.NAME=VALUE.
+            options: values by the names of :class:`DataConfig`; None or "" for those that the user did not give. They
+                come after the words.
+
+        Raises:
+            ConfigError: no such setting, or a value out of its bounds.
+        """
+        words = [*settings, *(f"data.{name}={value}" for name, value in options.items() if value not in (None, ""))]
+        owner, cure = "reading scans", "name one with data. before it, as data.projection=spherical"
+        data = override(cls(), words, owner, cure, ("data.train", "data.val", "sensor", "projection_variant")).data
+        named = {word.partition("=")[0].strip() for word in words}
+        variant = data.projection_variant if "data.projection_variant" in named else None
+        return cls(data, data.sensor if "data.sensor" in named else "", variant)
+
+    def load_sensor(self) -> SensorModel | None:
+        """Return the sensor that is named, with the wanted columns and projection; None if none is named."""
+        return self.data.load_sensor() if self.sensor else None

@@ -1,0 +1,79 @@
+"""A few scans of a set → the projection for all of them, and signs of a wrong sensor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from lidargrit.core.determinism import evenly_spaced
+from lidargrit.core.errors import ScanError
+from lidargrit.core.reporting import Reporter
+from lidargrit.data.datasets import ScanDataset
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.scans.projection import doubts_about_rays, projection_that_fits
+from lidargrit.scans.projection.sensor_check import told_doubt
+from lidargrit.scans.sensors import SensorModel
+from lidargrit.scans.types import Scan
+
+_PROBES = 3  # scans that are looked at: the first would do, were a folder not sometimes a mixture
+
+
+@dataclass(frozen=True, eq=False)
+class Imaging:
+    """Settings by which the scans of one set become images.
+
+    Args:
+        sensor: sensor of the images, with the projection that fits the scans.
+        config: settings of the projection, with the variant that fits the scans.
+        notes: sentences on what was chosen in place of what the sensor and the settings say.
+        doubts: sentences that tell why another sensor than this one may have made the scans.
+    """
+
+    sensor: SensorModel
+    config: DataConfig
+    notes: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
+
+    def report(self, reporter: Reporter) -> None:
+        """Report what was chosen, and warn of what is in doubt."""
+        for line in (*self.notes, *(f"WARNING: {doubt}" for doubt in self.doubts)):
+            reporter.message(line)
+
+
+def choose_imaging(source: str, dataset: ScanDataset, sensor: SensorModel, config: DataConfig) -> Imaging:
+    """Look at a few scans of a set, and choose the projection for all of them.
+
+    Points that are not in firing order get their rows by elevation, in the exact variant, since their order does not
+    show their rows. ``projection=unfolding`` keeps the order nevertheless, and such scans are then refused one by one.
+
+    Args:
+        source: name of the set, for notes and doubts.
+        dataset: scans of the set. Simulated ones are looked at only if they are of another sensor.
+        sensor: sensor of the images.
+        config: settings of the projection; one that is named there comes before the sensor's own.
+    """
+    if config.projection != "sensor":
+        sensor = replace(sensor, projection=config.projection)
+    probes = _probes(dataset, sensor)
+    notes: list[str] = []
+    fitting = {projection_that_fits(scan, sensor) for scan in probes} if config.projection == "sensor" else set()
+    if fitting - {sensor.projection}:
+        sensor, config = replace(sensor, projection="spherical"), replace(config, projection_variant="exact")
+        notes.append(f"{source}: points that are not in firing order, so rows go by elevation (projection=spherical)")
+    doubts_of_scans = (doubts_about_rays(scan, sensor, sensor.projection) for scan in probes)
+    doubt = next((each for each in doubts_of_scans if each), "")
+    told = told_doubt(source, sensor, doubt)
+    return Imaging(sensor, config, tuple(notes), (told,) if told else ())
+
+
+def _probes(dataset: ScanDataset, sensor: SensorModel) -> list[Scan]:
+    """Read a few scans, without those that cannot be used, which are refused or left out later."""
+    files = {dataset.path(index): index for index in reversed(evenly_spaced(_PROBES, len(dataset)))}
+    if None in files and dataset.sensor == sensor.name:
+        return []
+    found = []
+    for index in files.values():
+        try:
+            found.append(dataset.scan(index))
+        except ScanError:
+            continue
+    return found

@@ -1,0 +1,316 @@
+"""Sources of scans → prepared range images, projected once by many processes, and resumed where they were stopped."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Sequence
+from contextlib import nullcontext, suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from lidargrit import __version__
+from lidargrit.core.determinism import evenly_spaced
+from lidargrit.core.environment import cache_folder
+from lidargrit.core.errors import DataError, OutputError, counted_scans
+from lidargrit.core.files import claim_folder, is_taken, remove_partials, write_json, write_text
+from lidargrit.core.processes import rank_and_world_size
+from lidargrit.core.reporting import Reporter
+from lidargrit.data.datasets import ScanDataset, open_dataset
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.prepared.imaging import choose_imaging
+from lidargrit.data.prepared.prepared import (
+    FORMAT,
+    PLAN_FILE,
+    SCANS_FILE,
+    PreparedFolder,
+    PreparedImages,
+    PreparedSpec,
+    shard_name,
+)
+from lidargrit.data.prepared.shards import LocalBytes, range_step_m, read_index
+from lidargrit.data.prepared.workers import make_shards
+from lidargrit.scans.sensors import SensorModel, load_sensor
+
+_SHARD_SCANS = 128  # 12 MB of KITTI-360 size images, and 625 files for 80,000 scans
+_BAD = ("bad_points", "bad_scans")  # the settings that refuse what cannot be used, or leave it out
+_WAIT_S, _PATIENCE_S = 0.5, 1800.0  # for shards that other machines make
+
+
+def prepare(
+    source: str,
+    config: DataConfig,
+    folder: Path | None = None,
+    reporter: Reporter | None = None,
+    sensor: SensorModel | None = None,
+    rank: int | None = None,
+    world_size: int | None = None,
+    dataset: ScanDataset | None = None,
+) -> Path:
+    """Project every scan of a source into a folder of shards; shards that are there already are kept.
+
+    Args:
+        source: source of scans, as :func:`lidargrit.data.datasets.open_dataset` takes it.
+        config: settings by which scans become images, number of processes, and treatment of bad scans.
+        folder: prepared folder; if not given, one in the cache, named by everything that the pixels depend on.
+        reporter: receiver of progress and messages.
+        sensor: sensor of the images, in place of the config's.
+        rank: number of this machine, from 0; it makes its part of the shards and waits for those of the others. If not
+            given, the environment's ``RANK``, else 0.
+        world_size: number of machines that share the work; if not given, the environment's ``WORLD_SIZE``, else 1.
+        dataset: data set of the source, where it is open already.
+
+    Returns:
+        the folder, complete.
+
+    Raises:
+        OutputError: the folder holds something else, or images of scans or settings that have changed since.
+        ScanError: a scan that cannot be used; names it.
+    """
+    reporter, sensor = reporter or Reporter(), sensor or config.load_sensor()
+    rank, world_size = rank_and_world_size(rank, world_size)
+    dataset = open_dataset(source, config.bad_points) if dataset is None else dataset
+    spec, scans = _spec(source, dataset, sensor, config)
+    facts = json.dumps({**asdict(spec), "source": ""}, sort_keys=True).encode()  # the digest names the scans
+    folder = folder or cache_folder() / hashlib.sha256(facts).hexdigest()[:24]
+    _claim(folder, spec, scans)
+    missing = [shard for shard in range(spec.num_shards) if not _is_whole(folder, spec, shard)]
+    if missing:  # a complete folder may be one that this user can only read
+        try:
+            with claim_folder(folder, shared=True):  # with other machines, and with whoever needs the same cache
+                if not (folder / PLAN_FILE).exists():  # another machine has failed meanwhile, and taken its plan back
+                    _claim(folder, spec, scans)
+                mine = [shard for shard in missing if shard % world_size == rank]
+                make_shards(folder, spec, mine, dataset, config.workers, reporter)
+                _wait_for(folder, spec, [shard for shard in missing if shard % world_size != rank], reporter)
+        except BaseException:
+            _take_back(folder)
+            raise
+    remove_partials(folder)
+    for left in folder.glob("*.unfinished"):  # by a process that was killed after it had written the shard
+        with suppress(OSError):  # of a folder that this user can only read
+            left.unlink()
+    return folder
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Size and content of a prepared folder.
+
+    Args:
+        folder: path of the folder.
+        images: number of images.
+        rows: number of rows of an image.
+        columns: number of fine columns of an image.
+        size: size of all shards, in bytes.
+        seconds: time that the preparation took, in seconds.
+        left_out: reasons why scans were left out, one line for each scan.
+    """
+
+    folder: Path
+    images: int
+    rows: int
+    columns: int
+    size: int
+    seconds: float
+    left_out: tuple[str, ...]
+
+    def as_text(self) -> str:
+        """Return all of it as a line for a person."""
+        return (
+            f"{self.images} range images of {self.rows}x{self.columns} in {self.folder}: "
+            f"{self.size / 1e6:.1f} MB, {self.size / 1e3 / max(self.images, 1):.0f} KB each, in {self.seconds:.1f} s"
+            + (f"; {counted_scans(len(self.left_out))} left out" if self.left_out else "")
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all of it as plain values."""
+        return {**vars(self), "folder": str(self.folder), "left_out": list(self.left_out)}
+
+
+def prepare_and_describe(
+    source: str,
+    dataset: ScanDataset,
+    config: DataConfig,
+    folder: Path | None,
+    reporter: Reporter,
+    rank: int | None = None,
+    world_size: int | None = None,
+    verify: bool = False,
+) -> Prepared:
+    """Prepare a source and return what the folder holds.
+
+    Args:
+        source, dataset, config, folder, reporter, rank, world_size: the arguments of :func:`prepare`.
+        verify: whether to read every image back and make damaged shards again.
+
+    Raises:
+        OutputError, ScanError: as for :func:`prepare`.
+    """
+    begun = time.monotonic()
+    imaging = choose_imaging(source, dataset, config.load_sensor(), config)
+    imaging.report(reporter)
+    config, sensor = imaging.config, imaging.sensor
+    folder = prepare(source, config, folder, reporter, sensor, rank, world_size, dataset)
+    if verify and (damaged := damaged_shards(folder, reporter, rank, world_size)):
+        reporter.message(f"damaged and made again: {', '.join(map(shard_name, damaged))}")
+        for shard in damaged:
+            (folder / shard_name(shard)).unlink(missing_ok=True)  # another process may have removed it
+        prepare(source, config, folder, reporter, sensor, rank, world_size, dataset)
+    images, seconds = PreparedImages(str(folder)), time.monotonic() - begun
+    for remark in images.remarks():
+        reporter.message(remark)
+    if not len(images):
+        raise DataError(f"no usable scan in {source}", "at least one", "see the messages above")
+    size = sum(path.stat().st_size for path in folder.glob("*.shard"))
+    shape = images.sensor.height, images.sensor.width
+    return Prepared(folder, len(images), *shape, size, seconds, tuple(images.left_out.values()))
+
+
+def damaged_shards(
+    folder: Path, reporter: Reporter | None = None, rank: int | None = None, world_size: int | None = None
+) -> list[int]:
+    """Read every image of this machine's shards of a prepared folder, and return the numbers of damaged shards.
+
+    A machine does not look at the shards of others: these may be making a damaged one again at this moment.
+    """
+    rank, world_size = rank_and_world_size(rank, world_size)
+    images = PreparedImages(str(folder))
+    mine = [index for index in range(len(images)) if images.shard_of(index) % world_size == rank]
+    damaged: set[int] = set()
+    with (reporter or Reporter()).progress("verifying", len(mine)) as progress:
+        for index in mine:
+            try:
+                images.read(index, verify=True)
+            except DataError:
+                damaged.add(images.shard_of(index))
+            progress.advance(1)
+    return sorted(damaged)
+
+
+def _spec(
+    source: str, dataset: ScanDataset, sensor: SensorModel, config: DataConfig
+) -> tuple[PreparedSpec, list[tuple[str, str, int, int]]]:
+    """Return the specification of the folder, and for every scan its name, drive, file size and time."""
+    fine, scans, beside = sensor.fine(), [], []
+    for index in evenly_spaced(config.max_scans or len(dataset), len(dataset)):
+        path = dataset.path(index)
+        try:
+            status = None if path is None else path.stat()
+        except OSError:
+            if config.bad_scans == "refuse":
+                raise DataError(f"{path}, which cannot be read", "files that are there", "remove the link") from None
+            status = None  # it is left out, and named, when it is read
+        name = (
+            dataset.name(index)
+            if path is None
+            else "".join((str(path.resolve()), *dataset.name(index).partition("#")[1:]))
+        )
+        size, time_ns = (status.st_size, status.st_mtime_ns) if status else (0, 0)
+        scans.append((name, dataset.recording(index), size, time_ns))
+        beside += filter(None, map(_state, dataset.companions(index)))
+    others = json.dumps(beside) if beside else ""
+    # A file of a sensor by which scans are simulated may change, and its name stays the same.
+    if dataset.sensor.lower().endswith(".json"):
+        others += json.dumps(load_sensor(dataset.sensor).to_json())
+    spec = PreparedSpec(
+        format=FORMAT,
+        version=__version__,
+        source=source,
+        sensor=fine.to_json(),
+        variant=config.projection_variant,
+        bad_points=config.bad_points,
+        bad_scans=config.bad_scans,
+        max_scans=config.max_scans,
+        range_step_m=range_step_m(fine),
+        shard_scans=_SHARD_SCANS,
+        num_scans=len(scans),
+        digest=hashlib.sha256((json.dumps(scans) + others).encode()).hexdigest(),
+    )
+    return spec, scans
+
+
+def _state(path: Path) -> tuple[str, int, int] | None:
+    """Return the name, the size and the time of a file that is read beside a scan; None if it is not there."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return path.name, status.st_size, status.st_mtime_ns
+
+
+def _claim(folder: Path, spec: PreparedSpec, scans: list[tuple[str, str, int, int]]) -> None:
+    """Write the plan into a free folder, or check that the folder's plan is the same."""
+    listing, path = json.dumps(scans), folder / SCANS_FILE
+    if (folder / PLAN_FILE).exists():
+        planned = PreparedFolder(str(folder)).read_spec()
+        # The digest tells whether these are other scans; the same folder may be named in another way.
+        differing = [name for name in spec.differences(planned) if name != "source"]
+        # No scan was left out so far, and none was bad, so all that is there is as a more lenient treatment has it.
+        lenient = planned.bad_scans == "refuse" and all(
+            name in _BAD and getattr(planned, name) == "refuse" for name in differing
+        )
+        if differing and not lenient:
+            raise OutputError(
+                f"{folder}, which is stale: prepared with {_other(differing)}",
+                "an empty folder, or what was prepared from these very scans in this very way",
+                "prepare into another folder, or remove this one",
+            )
+        with nullcontext() if differing else suppress(OutputError):  # a complete folder may not be ours to change
+            if spec != planned:
+                write_json(folder / PLAN_FILE, asdict(spec))
+            if not path.is_file() or path.read_bytes() != listing.encode():  # damaged: the plan's digest is of the list
+                write_text(path, listing)
+        return
+    # In this order: another process may be claiming the folder for the same scans at this moment.
+    if is_taken(folder) and not (path.is_file() and path.read_bytes() == listing.encode()):
+        raise OutputError(f"{folder}, which holds something else", "an empty folder", "choose another one")
+    write_text(path, listing)
+    write_json(folder / PLAN_FILE, asdict(spec))  # last: it says that the folder is ours
+
+
+def _take_back(folder: Path) -> None:
+    """Remove a plan of which nothing has been made, so that a corrected command is not refused as another.
+
+    A machine that still works by the plan holds the folder, and keeps it.
+    """
+    with suppress(OutputError, OSError), claim_folder(folder):
+        if not any(path.suffix in (".shard", ".unfinished") for path in folder.iterdir()):
+            for name in (PLAN_FILE, SCANS_FILE):
+                (folder / name).unlink(missing_ok=True)
+
+
+def _other(differing: Sequence[str]) -> str:
+    """Name what differs between two plans in words for a person."""
+    settings = [f"another {name}" for name in differing if name not in ("digest", "num_scans")]
+    return ", ".join([*settings, *(["other scans"] if len(settings) < len(differing) else [])])
+
+
+def _is_whole(folder: Path, spec: PreparedSpec, shard: int) -> bool:
+    path = folder / shard_name(shard)
+    try:
+        entries, left_out = read_index(LocalBytes(path), path.name)
+    except (OSError, ValueError):  # ValueError: an empty file, and our own errors
+        return False
+    return spec.is_shard(shard, entries, left_out)
+
+
+def _wait_for(folder: Path, spec: PreparedSpec, shards: list[int], reporter: Reporter) -> None:
+    """Wait until other machines have made their shards."""
+    last = time.monotonic()
+    with reporter.progress("waiting for others", len(shards)) as progress:
+        while shards:
+            still = [shard for shard in shards if not _is_whole(folder, spec, shard)]
+            if len(still) < len(shards):
+                last = time.monotonic()
+                progress.advance(len(shards) - len(still))
+            elif time.monotonic() - last > _PATIENCE_S:
+                raise DataError(
+                    f"{len(still)} shards of {folder} still missing after {_PATIENCE_S / 60:.0f} minutes",
+                    "the other processes to make them",
+                    "see what became of them, or prepare on each where they share no folder; then go on",
+                )
+            shards = still
+            time.sleep(_WAIT_S if still else 0)

@@ -1,0 +1,145 @@
+"""The folder of a finished run: its name → its files, and what they say of its training."""
+
+from __future__ import annotations
+
+import json
+import string
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+from lidargrit.core import configuration
+from lidargrit.core.errors import CheckpointError
+from lidargrit.core.files import is_taken, read_json, sha256_of, write_text
+from lidargrit.data.images import Provenance
+from lidargrit.scans.projection import ProjectionVariant
+
+CONFIG_FILE, WEIGHTS_FILE, CARD_FILE = "config.json", "model.safetensors", "README.md"  # the names that the hub knows
+RUN_FILE = "run.json"  # ``origin`` in it says that the weights beside it were not trained in this folder
+CHECKPOINT_FILE = "checkpoint.safetensors"  # of a stage, in its own folder
+TRAINED_ON_FILE = "trained_on.json"  # in a run's folder and beside its samples: which drives, which pixels
+_NAMES_AT_MOST = 10_000_000  # that a file stands for by their first and last
+PRETRAINED = Path(__file__).parents[1] / "pretrained"
+PACKAGED = (PRETRAINED, PRETRAINED.with_name("pretrained_wide"))  # their names go wherever a run is wanted
+
+
+def locate(run: str | Path) -> Path:
+    """Return the folder of a run; the package has ``pretrained`` and ``pretrained_wide``, unless you have your own."""
+    packaged = {folder.name: folder for folder in PACKAGED}
+    return Path(run) if is_taken(Path(run)) else packaged.get(str(run), Path(run))
+
+
+def is_run(folder: Path) -> bool:
+    """Return whether a folder is that of a finished run."""
+    return (folder / CONFIG_FILE).is_file()
+
+
+def is_unfinished(folder: Path) -> bool:
+    """Return whether a folder is that of a run whose training has not ended, or of one of its stages."""
+    return not is_run(folder) and any((folder / name).is_file() for name in (RUN_FILE, CHECKPOINT_FILE))
+
+
+def weights_sha256(folder: Path) -> str:
+    """Return the hash of the weights of a run, by which they are told from others."""
+    return sha256_of(folder / WEIGHTS_FILE)
+
+
+def recipe_settings(about: Any) -> dict[str, Any]:
+    """Return every setting of the recipe in a ``run.json`` by its name of today; none where there is no recipe."""
+    return configuration.leaves(about.get("recipe") if isinstance(about, dict) else {})
+
+
+def taken_over(about: Any) -> dict[str, Any]:
+    """Return what a ``run.json`` says of weights that came from other runs: ``train``, ``files`` and ``training``.
+
+    Those are the sources of their training scans, the files of imported weights, and the settings of stages that were
+    not trained in the run.
+    """
+    return {"train": [], "files": [], "training": {}, **about.get("taken", {})}
+
+
+def recorded_projection(folder: Path) -> str:
+    """Return by which variant of the projection the training scans of a run became images; "" if it is not known."""
+    path = folder / RUN_FILE
+    variant = recipe_settings(read_json(path) if path.is_file() else {}).get("data.projection_variant")
+    return variant if isinstance(variant, str) else ""
+
+
+def projection_variant(folder: Path) -> ProjectionVariant:
+    """Return the variant by which scans become images for the model of a run; "exact" if it is not known."""
+    return "reference" if recorded_projection(folder) == "reference" else "exact"
+
+
+def trained_on(folder: Path) -> Provenance:
+    """Return what the model of a run, or of a folder of samples, learned from; empty where that is not known.
+
+    Raises:
+        CheckpointError: a file that lidargrit did not write.
+    """
+    if not (folder / TRAINED_ON_FILE).is_file():
+        return Provenance()
+    try:
+        facts = {name: tuple(of) for name, of in read_json(folder / TRAINED_ON_FILE).items()}
+        facts["recordings"] = tuple(_each_name(facts["recordings"]))
+        if not all(isinstance(each, str) for of in facts.values() for each in of):
+            raise TypeError("something is no text")
+        return Provenance(**facts)
+    except (TypeError, KeyError, ValueError, AttributeError) as error:
+        raise CheckpointError(
+            f"{folder / TRAINED_ON_FILE}, in which {error}", "what lidargrit wrote", "restore it, or remove it"
+        ) from None
+
+
+def write_trained_on(folder: Path, provenance: Provenance) -> None:
+    """Write what a model learned from, without names of the user's files, so that its samples can tell it, too.
+
+    Names of recordings that differ in a number alone, as those of simulated streets do, are written as the first and
+    the last of them.
+    """
+    listed = {
+        "recordings": _first_and_last({*provenance.recordings} - {""}),
+        "fingerprints": sorted({*provenance.fingerprints}),
+        "range_fingerprints": sorted({*provenance.range_fingerprints}),
+    }
+    write_text(folder / TRAINED_ON_FILE, json.dumps(listed, separators=(",", ":")) + "\n")
+
+
+def _first_and_last(names: Iterable[str]) -> list[str | dict[str, str]]:
+    """Return sorted names, with the first and the last in place of three or more that are numbered consecutively."""
+    groups: list[list[str]] = []
+    for name in sorted(names):
+        if groups and name == _next_name(groups[-1][-1]):
+            groups[-1].append(name)
+        else:
+            groups.append([name])
+    written: list[str | dict[str, str]] = []
+    for group in groups:
+        written += [{"first": group[0], "last": group[-1]}] if len(group) > 2 else group
+    return written
+
+
+def _next_name(name: str) -> str | None:
+    """Return the name that ends in the next number, of as many digits; None if there is none."""
+    stem, digits = _split(name)
+    following = f"{int(digits) + 1:0{len(digits)}d}" if digits else ""
+    return stem + following if digits and len(following) == len(digits) else None
+
+
+def _each_name(written: Iterable[object]) -> Iterator[object]:
+    """Yield the names that :func:`_first_and_last` wrote."""
+    left = _NAMES_AT_MOST
+    for each in written:
+        if not isinstance(each, dict):
+            yield each
+            continue
+        (stem, first), (other_stem, last) = _split(each["first"]), _split(each["last"])
+        left -= int(last or 0) - int(first or 0)
+        if stem != other_stem or len(first) != len(last) or not first < last or left < 0:
+            raise ValueError(f"{each['first']} to {each['last']} are no numbered names, or more than {_NAMES_AT_MOST}")
+        yield from (f"{stem}{number:0{len(first)}d}" for number in range(int(first), int(last) + 1))
+
+
+def _split(name: str) -> tuple[str, str]:
+    """Return a name without the digits at its end, and these digits."""
+    stem = name.rstrip(string.digits)
+    return stem, name[len(stem) :]

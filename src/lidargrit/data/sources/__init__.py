@@ -1,0 +1,363 @@
+"""Sources of scans, by what a user types → one object with the kind, the data and the provenance of the source."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+
+from lidargrit.core.errors import DataError, LidarGritError
+from lidargrit.core.reporting import Reporter
+from lidargrit.data.datasets import ScanDataset, data_set_and_split, open_dataset
+from lidargrit.data.formats import BadPoints
+from lidargrit.data.images import Provenance, RangeImages
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.prepared.imaging import Imaging, choose_imaging
+from lidargrit.data.prepared.prepare import prepare
+from lidargrit.data.prepared.prepared import PreparedFolder, PreparedImages, is_prepared
+from lidargrit.data.run_folder import is_run, is_unfinished, locate, recorded_projection, trained_on
+from lidargrit.data.sources.image_files import ImageFileSource, image_files
+from lidargrit.data.sources.sample_formats import (
+    is_tensor_folder,
+    load_sample_format,
+    read_tensor_folder,
+    recognise,
+    sensor_of_tensors,
+)
+from lidargrit.data.sources.samples import is_sample_folder, projection_of, read_samples, weights_of
+from lidargrit.data.sources.source import Source
+from lidargrit.generation.generator import Generator, load
+from lidargrit.scans.sensors import SensorModel, load_sensor
+
+
+class DatasetSource(Source):
+    """Scans of a data set: files in a known layout, or simulated scans.
+
+    Args:
+        text: name of the source.
+        bad_points: treatment of NaN, infinite and origin points.
+    """
+
+    kind = "scans"
+
+    def __init__(self, text: str, bad_points: BadPoints = "refuse") -> None:
+        super().__init__(text)
+        self._dataset = open_dataset(text, bad_points)
+        self.data_set, self.split = self._dataset.public_name(), self._dataset.split
+        self._imaged_by = ""
+
+    @property
+    def sensor(self) -> SensorModel:
+        """Sensor that made the scans."""
+        return load_sensor(self._dataset.sensor)
+
+    def projection_variant(self, config: DataConfig) -> str:
+        """Return the variant of the images that were opened last, else the one that the configuration names."""
+        return self._imaged_by or config.projection_variant
+
+    def scans(self) -> ScanDataset:
+        """Return the data set, as it was opened."""
+        return self._dataset
+
+    def images(
+        self, sensor: SensorModel | None = None, config: DataConfig | None = None, reporter: Reporter | None = None
+    ) -> RangeImages:
+        """Project the scans once, and find them in the cache from then on."""
+        config, reporter = config or DataConfig(), reporter or Reporter()
+        imaging = self.imaging(sensor, config)
+        imaging.report(reporter)
+        sensor, config = imaging.sensor, imaging.config
+        folder = prepare(self.text, config, reporter=reporter, sensor=sensor, dataset=self._dataset)
+        prepared = PreparedImages(str(folder))
+        self.doubts, self._imaged_by = (*imaging.doubts, *prepared.doubts()), config.projection_variant
+        _require_some(self.text, prepared, reporter)
+        return RangeImages(sensor, [prepared])
+
+    def imaging(self, sensor: SensorModel | None, config: DataConfig) -> Imaging:
+        """Choose how the scans become images: see :func:`lidargrit.data.prepared.imaging.choose_imaging`.
+
+        Args:
+            sensor: sensor of the images; the data set's own, with the configuration's columns, if not given.
+            config: settings of the projection.
+        """
+        return choose_imaging(self.text, self._dataset, sensor or config.imaged(self.sensor), config)
+
+
+class PreparedSource(Source):
+    """Range images that ``lidargrit prepare`` wrote into a folder, here or behind a URL."""
+
+    kind = "prepared range images"
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self._prepared = PreparedImages(text)
+        self.data_set, self.split = _data_set_or_nothing(self._prepared.spec.source)
+
+    @property
+    def sensor(self) -> SensorModel:
+        """Sensor of the images, with all its fine columns."""
+        return self._prepared.sensor
+
+    def projection_variant(self, config: DataConfig) -> str:
+        """Return the variant that the scans were prepared by."""
+        return self._prepared.spec.variant
+
+    def images(
+        self, sensor: SensorModel | None = None, config: DataConfig | None = None, reporter: Reporter | None = None
+    ) -> RangeImages:
+        """Read the images, with all columns that were prepared, or with fewer if the sensor has fewer."""
+        config, sensor, reporter = config or DataConfig(), sensor or self.sensor, reporter or Reporter()
+        chosen = self._prepared.evenly_spaced(config.max_scans) if config.max_scans else self._prepared
+        store = chosen.on_rays_of(sensor, config.projection_variant)
+        if store is not chosen:
+            columns = f"{self.sensor.width} columns gathered into {sensor.width * sensor.column_stride}"
+            reporter.message(f"{self.text}: {columns}, of each pixel the nearest return")
+        _require_some(self.text, chosen, reporter)
+        self.doubts = chosen.doubts()
+        return RangeImages(sensor, [store])
+
+
+class SampleSource(Source):
+    """A folder of samples that ``lidargrit sample`` wrote."""
+
+    kind, data_set = "generated range images", "samples"
+
+    def __init__(self, text: str, folder: Path) -> None:
+        super().__init__(text)
+        self.folder = folder
+
+    @property
+    def sensor(self) -> SensorModel:
+        """Sensor of the samples."""
+        return read_samples(self.folder).sensor
+
+    def projection_variant(self, config: DataConfig) -> str:
+        """Return the variant by which the training scans of the model became images."""
+        return projection_of(self.folder)
+
+    def images(
+        self, sensor: SensorModel | None = None, config: DataConfig | None = None, reporter: Reporter | None = None
+    ) -> RangeImages:
+        """Read the samples, or so many of them, evenly spaced."""
+        return read_samples(self.folder, (config or DataConfig()).max_scans or None)
+
+    def learned_from(self) -> Provenance:
+        """Return the training scans of the model that generated the samples."""
+        return trained_on(self.folder)
+
+    def weights_sha256(self) -> str:
+        """Return the hash of the weights of this model."""
+        return weights_of(self.folder)
+
+
+class TensorSource(Source):
+    """A folder of samples as another program writes them, in files of tensors.
+
+    Args:
+        text: name of the source.
+        folder: folder of ``.pth`` files.
+        samples_format: name of the sample format; recognised from the first file if empty.
+    """
+
+    kind, data_set = "generated range images", "samples"
+
+    def __init__(self, text: str, folder: Path, samples_format: str = "") -> None:
+        super().__init__(text)
+        self._folder, self.split = folder, samples_format or recognise(folder)
+        self._format = load_sample_format(self.split)
+
+    @property
+    def sensor(self) -> SensorModel:
+        """Sensor that the size of the first tensor fits."""
+        return sensor_of_tensors(self._folder, self.split)
+
+    def projection_variant(self, config: DataConfig) -> str:
+        """Return the variant that the program projects its training scans by."""
+        return self._format.variant
+
+    def images(
+        self, sensor: SensorModel | None = None, config: DataConfig | None = None, reporter: Reporter | None = None
+    ) -> RangeImages:
+        """Read the samples, or so many of them, evenly spaced."""
+        return read_tensor_folder(self._folder, self.split, (config or DataConfig()).max_scans or None)
+
+
+class RunSource(Source):
+    """A finished run: it holds no scans, but scans can be generated with it."""
+
+    kind = "a trained model"
+
+    def __init__(self, text: str, folder: Path) -> None:
+        super().__init__(text)
+        self.folder = folder
+
+    @cached_property
+    def generator(self) -> Generator:
+        """Trained generator, read when it is first asked for."""
+        return load(self.folder)
+
+    @property
+    def sensor(self) -> SensorModel:
+        """Sensor of the scans that are generated."""
+        return self.generator.sensor
+
+    def projection_variant(self, config: DataConfig) -> str:
+        """Return the variant by which the training scans became images."""
+        return recorded_projection(self.folder)
+
+    def images(
+        self, sensor: SensorModel | None = None, config: DataConfig | None = None, reporter: Reporter | None = None
+    ) -> RangeImages:
+        """Refuse: scans have to be generated first.
+
+        Raises:
+            DataError: always.
+        """
+        cure = f"generate some first with: lidargrit sample {self.text} FOLDER"
+        raise DataError(f"{self.text}, which holds {self.kind}", "scans or samples", cure)
+
+    def learned_from(self) -> Provenance:
+        """Return the training scans of the model."""
+        return trained_on(self.folder)
+
+
+def open_source(text: str, bad_points: BadPoints = "refuse", samples_format: str = "") -> Source:
+    """Recognise the kind of a source, and open it.
+
+    Args:
+        text: folder of a finished run, ``pretrained`` or ``pretrained_wide``; folder of samples, of ours or of another
+            program (``.pth``); folder or URL of prepared scans; range images as ``.npy``, one file or a folder of
+            nothing else; or a data set as in :func:`lidargrit.data.datasets.open_dataset` ("kitti_raw:ROOT:SPLIT",
+            "FOLDER", "simulated:COUNT", ...).
+        bad_points: treatment of NaN, infinite and origin points in scans.
+        samples_format: program that wrote a folder of ``.pth`` files; recognised from the first file if empty.
+
+    Raises:
+        DataError: nothing that is known lies there.
+        UnknownNameError: no data set or sample format of that name.
+
+    Example:
+        >>> open_source("simulated:8:test").data_set
+        'simulated'
+    """
+    try:
+        folder = Path(locate(text)).expanduser()
+        here = folder.is_dir()
+    except RuntimeError:  # what pathlib raises
+        raise DataError(f"{text[:40]!r}, in a home folder that is not there", "another user's", "check it") from None
+    except PermissionError:
+        raise DataError(
+            f"{text}, which may not be read", "a source that you may read", "change its permissions"
+        ) from None
+    except (OSError, ValueError) as error:  # a name too long, or with NUL
+        if ":" not in text:
+            raise DataError(f"{text[:40]!r}, which names no folder ({error})", "a source", "check the path") from None
+        folder, here = Path(), False
+    if samples_format:
+        return TensorSource(text, folder, samples_format)
+    if here and is_run(folder):
+        return RunSource(text, folder)
+    if here and is_sample_folder(folder):
+        return SampleSource(text, folder)
+    if here and is_unfinished(folder):
+        load(folder)  # which says so
+    if here and is_tensor_folder(folder):
+        return TensorSource(text, folder)
+    if "://" in text or (here and is_prepared(text)):
+        return PreparedSource(text)
+    images = image_files(folder) if text and (here or folder.is_file()) else []
+    return ImageFileSource(text, images) if images else DatasetSource(text, bad_points)
+
+
+def load_range_images(
+    sources: Sequence[str], config: DataConfig, reporter: Reporter | None = None, sensor: SensorModel | None = None
+) -> RangeImages:
+    """Open the range images of several sources as one set, to train from or to watch.
+
+    Scans are projected once and then found in the cache: ``$LIDARGRIT_CACHE``, else ``lidargrit`` in the user's cache
+    folder. It may be deleted at any time.
+
+    Args:
+        sources: names of data sets, folders of scans, and prepared folders, as in :class:`DataConfig`.
+        config: settings of projecting scans; its own sources are ignored.
+        reporter: receiver of progress.
+        sensor: sensor to project with, in place of the configuration's.
+
+    Raises:
+        DataError: no source, a source without a scan, generated scans, or prepared scans of another sensor.
+        ScanError: a scan that cannot be used; ``bad_scans=skip`` leaves it out.
+    """
+    return joined_images(open_to_train(sources, config), config, reporter, sensor)
+
+
+def joined_images(
+    opened: Sequence[DatasetSource | PreparedSource],
+    config: DataConfig,
+    reporter: Reporter | None = None,
+    sensor: SensorModel | None = None,
+) -> RangeImages:
+    """Return the range images of sources that :func:`open_to_train` has opened as one set."""
+    sensor = sensor or config.load_sensor()
+    return RangeImages.joined(sensor, [source.images(sensor, config, reporter) for source in opened])
+
+
+def open_to_train(sources: Sequence[str], config: DataConfig) -> list[DatasetSource | PreparedSource]:
+    """Open sources of real or simulated scans, or raise DataError where :func:`load_range_images` would."""
+    if not sources:
+        raise DataError("no source of scans", "at least one", "name one with --set data.train=FOLDER")
+    opened = []
+    for text in sources:
+        source = open_source(text, config.bad_points)
+        if not isinstance(source, (DatasetSource, PreparedSource)):
+            cure = "export samples first if you do want to learn from them: lidargrit export SAMPLES FOLDER"
+            raise DataError(f"{text}, which holds {source.kind}", "scans, or scans that were prepared", cure)
+        opened.append(source)
+    return opened
+
+
+def open_images(
+    text: str, sensor: SensorModel | None = None, config: DataConfig | None = None, reporter: Reporter | None = None
+) -> RangeImages:
+    """Open the range images of one source; see :func:`open_source` and :meth:`Source.images`."""
+    return open_source(text, config.bad_points if config else "refuse").images(sensor, config, reporter)
+
+
+def overlap(source: Source, images: RangeImages | None, reference: RangeImages) -> str:
+    """Return in a few words which scans a source, or the model behind it, shares with the reference; "" for none.
+
+    Args:
+        source: source of the set; of samples and runs, the training scans of the model count, too.
+        images: images of the set, where it holds any.
+        reference: set that it is compared with.
+    """
+    own = Provenance() if images is None else images.provenance
+    learned_from = source.learned_from() or Provenance()
+    return own.overlap(reference.provenance) or learned_from.overlap(reference.provenance)
+
+
+def data_set_of(text: str) -> tuple[str, str]:
+    """Return the data set and the split of a source without opening its scans; "" for what is not known.
+
+    Prepared scans are of the data set that they were prepared from. A URL is not asked: that may take long.
+    """
+    if "://" in text:
+        return "", ""
+    try:
+        return _data_set_or_nothing(PreparedFolder(text).read_spec().source if is_prepared(text) else text)
+    except LidarGritError:
+        return "", ""
+
+
+def _data_set_or_nothing(text: str) -> tuple[str, str]:
+    try:
+        return data_set_and_split(text)
+    except LidarGritError:
+        return "", ""
+
+
+def _require_some(text: str, prepared: PreparedImages, reporter: Reporter) -> None:
+    """Tell which scans were left out and what some lack, and raise DataError if none is left."""
+    for remark in prepared.remarks():
+        reporter.message(remark)
+    if not len(prepared):
+        raise DataError(f"no usable scan in {text}", "at least one", "see the messages above")

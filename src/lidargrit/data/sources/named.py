@@ -1,0 +1,156 @@
+"""An opened source → its scans one after the other, each with the name of the file that is written for it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from lidargrit.core.determinism import evenly_spaced
+from lidargrit.core.errors import OutputError
+from lidargrit.data.datasets import ScanDataset
+from lidargrit.data.images import RangeImages
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.sources import DatasetSource
+from lidargrit.data.sources.image_files import ImageFileSource
+from lidargrit.data.sources.source import Source
+from lidargrit.scans.projection import unproject
+from lidargrit.scans.sensors import SensorModel
+from lidargrit.scans.types import RangeImage, Scan
+
+
+class NamedScans(ABC):
+    """Scans of a source, evenly spaced where fewer than all are wanted."""
+
+    @abstractmethod
+    def __len__(self) -> int: ...
+
+    @abstractmethod
+    def name(self, index: int) -> str:
+        """Return the name of the file that is written for a scan, without the ending."""
+
+    @abstractmethod
+    def identity(self, index: int) -> str:
+        """Return what identifies a scan, so that another scan is not taken for it."""
+
+    def number(self, index: int) -> int:
+        """Return the number of a scan in its source, whatever other scans are taken."""
+        return index
+
+    @abstractmethod
+    def scan(self, index: int) -> Scan:
+        """Return the points of a scan; those of a range image lie on the rays of its pixels."""
+
+    def path(self, index: int) -> Path | None:
+        """Return the file that holds the points of a scan; None where there is none."""
+        return None
+
+    @abstractmethod
+    def check_output(self, out: Path) -> None:
+        """Refuse a folder whose files would become scans of the source.
+
+        Raises:
+            OutputError: the folder is the source, or lies in it.
+        """
+
+
+class PointScans(NamedScans):
+    """Scans of a data set, by their own names.
+
+    Args:
+        dataset: data set.
+        max_scans: number of scans; 0 for all.
+    """
+
+    def __init__(self, dataset: ScanDataset, max_scans: int) -> None:
+        self._dataset, self._indices = dataset, evenly_spaced(max_scans or len(dataset), len(dataset))
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    def name(self, index: int) -> str:
+        """Return its name in the data set."""
+        return self._dataset.name(self._indices[index])
+
+    def identity(self, index: int) -> str:
+        """Return its name in the data set."""
+        return self.name(index)
+
+    def number(self, index: int) -> int:
+        """Return its number in the data set."""
+        return self._indices[index]
+
+    def scan(self, index: int) -> Scan:
+        """Read its points."""
+        return self._dataset.scan(self._indices[index])
+
+    def path(self, index: int) -> Path | None:
+        """Return its file."""
+        return self._dataset.path(self._indices[index])
+
+    def check_output(self, out: Path) -> None:
+        """Refuse a folder in which the data set would find the written files."""
+        if self._dataset.takes_files_in(out):
+            got = f"{out}, which lies in {self._dataset.root}: what is written there would be read as further scans"
+            raise OutputError(got, "a folder outside the source", "choose another folder")
+
+
+class ImageScans(NamedScans):
+    """Range images as scans.
+
+    Args:
+        images: range images of the source.
+        names: name of each.
+        numbers: numbers of those that are taken.
+    """
+
+    def __init__(self, images: RangeImages, names: Sequence[str], numbers: Sequence[int]) -> None:
+        self.images, self._names, self._numbers = images, names, numbers
+
+    def __len__(self) -> int:
+        return len(self._numbers)
+
+    def name(self, index: int) -> str:
+        """Return its name."""
+        return self._names[self._numbers[index]]
+
+    def identity(self, index: int) -> str:
+        """Return which file it is, which model's seed, or whose scan it was projected from."""
+        return self.images.provenance.names[self._numbers[index]]
+
+    def number(self, index: int) -> int:
+        """Return its number in the source."""
+        return self._numbers[index]
+
+    def image(self, index: int) -> RangeImage:
+        """Return its pixels (H, W)."""
+        return self.images.batch([self._numbers[index]])[0]
+
+    def scan(self, index: int) -> Scan:
+        """Return a point for each return."""
+        return unproject(self.image(index))
+
+    def check_output(self, out: Path) -> None:
+        """Accept every folder: images are looked for in one folder alone, by names that are not written there."""
+
+
+def named_scans(source: Source, config: DataConfig, sensor: SensorModel | None = None) -> PointScans | ImageScans:
+    """Return the scans of a source: named as in their data set or as their image's file, else by their index.
+
+    Args:
+        source: opened source.
+        config: number of scans.
+        sensor: sensor of range images that do not name theirs; see :meth:`Source.images`.
+    """
+    if isinstance(source, DatasetSource):
+        return PointScans(source.scans(), config.max_scans)
+    images = source.images(sensor, source.as_projected(replace(config, max_scans=0)))
+    names = [f"{number:06d}" for number in range(len(images))]
+    if isinstance(source, ImageFileSource):
+        names = [_name_of(Path(name)) for name in images.provenance.names]
+    return ImageScans(images, names, evenly_spaced(config.max_scans or len(images), len(images)))
+
+
+def _name_of(image: Path) -> str:
+    return image.stem if image.suffix == ".npy" else image.name  # beside scan.npy there may lie scan.NPY

@@ -1,0 +1,232 @@
+"""Samples as other programs write them, one tensor a file: folder of .pth → range images."""
+
+from __future__ import annotations
+
+import math
+import re
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidargrit.core import discovery
+from lidargrit.core.determinism import evenly_spaced
+from lidargrit.core.errors import DataError, ScanError, UnknownNameError, nearest_names
+from lidargrit.data import formats
+from lidargrit.data.images import Pixels, Provenance, RangeImages
+from lidargrit.scans.sensors import SensorModel, load_sensor
+
+_BYTES_AT_MOST = 1 << 30  # of one file, unpacked: a batch of 500 scans of 5 channels has 655 MB
+_SCANS_AT_MOST = 1 << 20
+
+Decoded = tuple[Float[Tensor, "H W"], Float[Tensor, "H W"] | None]
+"""Metres, 0 where nothing returned; reflectance in [0, 1] if there is one."""
+
+
+@dataclass(frozen=True)
+class SampleFormat:
+    """The format in which one program stores its samples.
+
+    Args:
+        title: name of the program that writes such samples.
+        source: origin of the facts.
+        channels: number of channels of its tensors, which are (channels, rows, columns) or (scans, channels, rows,
+            columns).
+        sensors: possible sensors, each as a name, the number of fine columns (0 for the sensor's own), and the step
+            between the columns that are kept.
+        variant: projection variant of its training scans.
+        decode: function from the values of a tensor to metres.
+    """
+
+    title: str
+    source: str
+    channels: int
+    sensors: tuple[tuple[str, int, int], ...]
+    variant: str
+    decode: Callable[[Tensor], Decoded]
+
+    def sensor_of(self, rows: int, columns: int) -> SensorModel | None:
+        """Return the sensor that has images of a size, None if there is none."""
+        for name, fine_columns, stride in self.sensors:
+            sensor = load_sensor(name)
+            sensor = sensor.with_columns(fine_columns, stride) if fine_columns else sensor
+            if (sensor.height, sensor.width) == (rows, columns):
+                return sensor
+        return None
+
+
+def load_sample_format(name: str) -> SampleFormat:
+    """Return a sample_format by its name, or raise UnknownNameError."""
+    name, known = name.replace("-", "_"), discovery.names("sample-formats")
+    if name not in known:
+        raise UnknownNameError(f"samples of {name!r}", f"those of {nearest_names(name, known, 9)}", "choose one")
+    return discovery.load_instance("sample-formats", name, SampleFormat)
+
+
+def is_tensor_folder(folder: Path) -> bool:
+    """Return whether a folder holds samples as tensors, and no scans, beside which weights may lie."""
+    try:
+        tensors = folder.is_dir() and any(True for _ in folder.glob("[!.]*.pth"))
+        return tensors and not any(formats.candidates(path) for path in folder.iterdir())
+    except OSError:  # a name longer than names can be
+        return False
+
+
+def recognise(folder: Path) -> str:
+    """Name the program that wrote a folder of tensors, by the number of channels of the first.
+
+    Raises:
+        ScanError: a tensor of none of them.
+    """
+    path = _paths(folder)[0]
+    shape = tuple(read_tensor(path).shape)
+    known = {load_sample_format(name).channels: name for name in discovery.names("sample-formats")}
+    if len(shape) < 3 or shape[-3] not in known:
+        wanted = ", ".join(f"{channels} channels ({name})" for channels, name in sorted(known.items()))
+        raise ScanError(f"a tensor of {shape} in {path}", wanted, "name what wrote it with --samples-format")
+    return known[shape[-3]]
+
+
+def read_tensor_folder(folder: Path, name: str = "", count: int | None = None) -> RangeImages:
+    """Return the samples of a folder of tensors, in the order of their numbers; read when asked for.
+
+    Args:
+        folder: folder of ``.pth`` files, with one scan or one batch of scans each.
+        name: name of the sample format; recognised from the number of channels if empty.
+        count: largest number of scans, evenly spaced; all if not given.
+
+    Raises:
+        DataError: no tensor in the folder.
+        ScanError: a file that is damaged, too large, more than a tensor, or not of this sample_format.
+    """
+    form = load_sample_format(name or recognise(folder))
+    store = _Tensors(_paths(folder), form, count)
+    return RangeImages(store.sensor, [store])
+
+
+def sensor_of_tensors(folder: Path, name: str = "") -> SensorModel:
+    """Return the sensor that the first file of a folder of tensors fits.
+
+    Raises:
+        DataError: no tensor in the folder.
+        ScanError: a file that is damaged, too large, more than a tensor, or not of this sample format.
+    """
+    path = _paths(folder)[0]
+    return _sensor_of(read_tensor(path), path, load_sample_format(name or recognise(folder)))
+
+
+def read_tensor(path: Path) -> Tensor:
+    """Read the one tensor that a file holds; nothing else in it is looked at, and no code in it is run.
+
+    Raises:
+        ScanError: no tensor, or larger than scans are.
+    """
+    wanted, cure = f"one tensor of at most {_BYTES_AT_MOST >> 20} MB", "save it as one: torch.save(tensor, path)"
+    try:
+        if not path.is_file():  # a pipe would hang
+            raise ValueError("not a file")
+        with zipfile.ZipFile(path) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+        if size > _BYTES_AT_MOST:
+            raise ValueError(f"{size} bytes")
+        tensor: Any = torch.load(path, map_location="cpu", weights_only=True)
+        if not isinstance(tensor, Tensor) or tensor.layout != torch.strided or tensor.is_nested or tensor.is_meta:
+            raise TypeError(f"a {type(tensor).__name__} that holds no plain array of numbers")
+        if tensor.numel() * tensor.element_size() > tensor.untyped_storage().nbytes():
+            raise ValueError("a tensor larger than what the file holds")  # a stride of 0 can name terabytes
+        if not tensor.is_floating_point():
+            raise TypeError(f"numbers of type {tensor.dtype}")
+    except Exception as error:  # damaged bytes make torch raise many kinds, for one cause
+        reason = str(error).partition("\n")[0][:120]
+        raise ScanError(f"{path}, which cannot be used ({type(error).__name__}: {reason})", wanted, cure) from None
+    return tensor.detach().float()
+
+
+class _Tensors:
+    """Files of tensors as a store of images."""
+
+    def __init__(self, paths: list[Path], form: SampleFormat, count: int | None) -> None:
+        self._format, self._last = form, (Path(), torch.empty(0))
+        first = self._tensor(paths[0])
+        self.sensor = _sensor_of(first, paths[0], form)
+        self._scans: list[tuple[Path, int | None]] = []
+        for path in paths:
+            if first.ndim == 3:
+                self._scans.append((path, None))
+            else:
+                self._scans += [(path, index) for index in range(min(len(self._batch(path)), _SCANS_AT_MOST))]
+        if count:
+            self._scans = [self._scans[index] for index in evenly_spaced(count, len(self._scans))]
+        if not self._scans:
+            raise DataError(f"no scan in {paths[0].parent}", "samples as tensors", "remove empty files, or sample anew")
+        self.provenance = Provenance(tuple(f"{path} {index or 0}" for path, index in self._scans))
+
+    def __len__(self) -> int:
+        return len(self._scans)
+
+    def read(self, index: int) -> Pixels:
+        path, index_in_file = self._scans[index]
+        tensor = self._tensor(path)
+        scan = tensor if index_in_file is None else tensor[index_in_file]
+        if tuple(scan.shape) != (self._format.channels, self.sensor.height, self.sensor.width):
+            wanted = f"{self._format.channels}x{self.sensor.height}x{self.sensor.width}, as the first"
+            raise ScanError(f"a tensor of {tuple(scan.shape)} in {path}", wanted, "remove the file")
+        range_m, reflectance = self._format.decode(scan)
+        if not bool(((range_m >= 0) & (range_m < math.inf)).all()):
+            raise ScanError(f"ranges that are negative or no number in {path}", "metres", "check what wrote it")
+        return Pixels(_array(range_m), None if reflectance is None else _array(reflectance.nan_to_num().clamp(0, 1)))
+
+    def _tensor(self, path: Path) -> Tensor:
+        known, tensor = self._last  # one pair, replaced at once: safe from several threads
+        if known != path:
+            tensor = read_tensor(path)
+            self._last = (path, tensor)
+        return tensor
+
+    def _batch(self, path: Path) -> Tensor:
+        tensor = self._tensor(path)
+        if tensor.ndim != 4:
+            wanted = "a batch of scans, as the first"
+            raise ScanError(f"a tensor of {tuple(tensor.shape)} in {path}", wanted, "remove the file")
+        return tensor
+
+
+def _sensor_of(first: Tensor, path: Path, form: SampleFormat) -> SensorModel:
+    """Return the sensor whose images are as large as the tensor of a folder's first file."""
+    shape = tuple(first.shape)
+    fits = len(shape) in {3, 4} and shape[-3] == form.channels
+    sensor = form.sensor_of(*shape[-2:]) if fits else None
+    if sensor is None:
+        sizes = " or ".join(f"{form.channels}x{h}x{w}" for h, w in _sizes(form))
+        raise ScanError(f"a tensor of {shape} in {path}", f"{sizes}: {form.title}", "check the format")
+    return sensor
+
+
+def _sizes(form: SampleFormat) -> list[tuple[int, int]]:
+    found = []
+    for name, fine_columns, stride in form.sensors:
+        sensor = load_sensor(name)
+        found.append((sensor.height, fine_columns // stride if fine_columns else sensor.width))
+    return found
+
+
+def _array(values: Tensor) -> np.ndarray[Any, np.dtype[np.float32]]:
+    return values.contiguous().numpy().astype(np.float32, copy=False)
+
+
+def _paths(folder: Path) -> list[Path]:
+    found = sorted(folder.glob("[!.]*.pth"), key=_order)
+    if not found:
+        raise DataError(f"no .pth file in {folder}", "samples as tensors, one file each", "check the folder")
+    return found
+
+
+def _order(path: Path) -> tuple[list[int], str]:
+    """Return the numbers in a file's name, 10 after 9, then the name, since file systems have orders of their own."""
+    return [int(number) for number in re.findall(r"\d{1,18}", path.stem)], path.name

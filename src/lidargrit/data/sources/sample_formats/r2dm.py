@@ -1,0 +1,21 @@
+"""R2DM and R2Flow: (5, 64, 1024) tensors of range in metres, x, y, z and reflectance → metres and reflectance."""
+
+from torch import Tensor
+
+from lidargrit.data.sources.sample_formats import Decoded, SampleFormat
+
+
+def decode(scan: Tensor) -> Decoded:
+    """Take the range as it is, 0 where it lay outside of 1.45 to 80 m, and the last channel."""
+    range_m = scan[0]
+    return range_m, scan[4] * (range_m > 0)
+
+
+r2dm = SampleFormat(
+    title="R2DM's sample_and_save.py",
+    source="kazuto1011/r2dm@004a1e4: sample_and_save.py, utils/lidar.py",
+    channels=5,
+    sensors=(("hdl64e_kitti_360", 0, 1),),  # by elevation, its default; its images by ring look the same
+    variant="exact",
+    decode=decode,
+)

@@ -1,0 +1,79 @@
+"""What every source of scans or images answers, whatever its kind."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import replace
+from typing import ClassVar
+
+from lidargrit.core.errors import DataError
+from lidargrit.core.reporting import Reporter
+from lidargrit.data.datasets import ScanDataset
+from lidargrit.data.images import Provenance, RangeImages
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.scans.sensors import SensorModel
+
+
+class Source(ABC):
+    """A source of scans or range images; :func:`lidargrit.data.sources.open_source` recognises its kind.
+
+    Args:
+        text: name of the source, as the user typed it.
+    """
+
+    kind: ClassVar[str]
+    """What the source is, in words for a message."""
+    data_set: str = ""
+    """Name of the data set; ``samples`` for what a generator made; "" where it is not known."""
+    split: str = ""
+    """Part of the data set, or the sample format of tensors; "" where there is none."""
+    doubts: tuple[str, ...] = ()
+    """Reasons to doubt the images that were opened last: made by another sensor, or of mixed scales of reflectance."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+
+    @property
+    @abstractmethod
+    def sensor(self) -> SensorModel:
+        """Sensor whose rays the scans or images lie on."""
+
+    @abstractmethod
+    def projection_variant(self, config: DataConfig) -> str:
+        """Return the variant of the projection by which scans become, or became, images; "" where it is not known."""
+
+    def as_projected(self, config: DataConfig) -> DataConfig:
+        """Return a configuration with the variant by which scans that are images already were projected."""
+        return replace(config, projection_variant=self.projection_variant(config) or config.projection_variant)
+
+    @abstractmethod
+    def images(
+        self, sensor: SensorModel | None = None, config: DataConfig | None = None, reporter: Reporter | None = None
+    ) -> RangeImages:
+        """Return the range images of the source; pixels are read when they are asked for.
+
+        Args:
+            sensor: sensor that scans are projected with; the source's own if not given. Samples keep theirs.
+            config: settings of reading and projecting scans; its sources and sensor are ignored.
+            reporter: receiver of progress, and of messages about scans that are left out.
+
+        Raises:
+            DataError: no usable scan, or prepared scans of another sensor or projection.
+            ScanError: a scan or a sample that cannot be used.
+        """
+
+    def scans(self) -> ScanDataset:
+        """Return the points of the scans; only a data set has them.
+
+        Raises:
+            DataError: a source that holds range images, or a run.
+        """
+        raise DataError(f"{self.text}, which holds {self.kind}", "the points of scans", "name a data set or its folder")
+
+    def learned_from(self) -> Provenance | None:
+        """Return the training scans of the model behind the source; None where no model is behind it."""
+        return None
+
+    def weights_sha256(self) -> str:
+        """Return the hash of the weights that generated the scans; "" where there are none, or it is not known."""
+        return ""

@@ -1,0 +1,1 @@
+"""What a generator is, and what several systems share and knows scans."""

@@ -1,0 +1,63 @@
+"""Facts about a generative system: what it generates and where it comes from → lines for a person."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from lidargrit.core.configuration import TypedSettings
+
+CAPABILITIES = {  # name → what a generator with it can do besides sampling, for messages
+    "tokens": "turn scans into tokens and back",
+    "encode": "encode scans and reconstruct them",
+    "complete": "fill in the pixels of a scan that were not observed",
+    "invert": "invert a scan: search the latent whose scan is nearest to it",
+    "likelihood": "compute the likelihood of a scan",
+}
+
+
+@dataclass(frozen=True)
+class NoSampling(TypedSettings):
+    """Settings of a generator that leaves nothing to choose."""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Cost of sampling one scan, counted and not timed, so the same on every machine.
+
+    Args:
+        network_evaluations: number of passes through a network, one after the other.
+        flops: number of floating-point operations in products and convolutions, two for a multiply-add.
+    """
+
+    network_evaluations: int
+    flops: int
+
+
+@dataclass(frozen=True)
+class SystemFacts:
+    """What a generator writes and where its method comes from; ``lidargrit list generators`` prints it.
+
+    Args:
+        generates: values of a generated scan, and the rule by which a ray has no return.
+        paper: authors, title, conference and year; empty for a method of this project.
+        program: program of the authors, ``OWNER/REPOSITORY@COMMIT``, with its licence; empty where there is none.
+        weights_licence: licence of the weights that the authors published; empty where they published none.
+        first_command: command of ``lidargrit`` by which a trained run shows what it learned; ``RUN`` is its folder.
+    """
+
+    generates: str
+    paper: str = ""
+    program: str = ""
+    weights_licence: str = ""
+    first_command: str = "sample RUN samples -n 16"
+
+    def lines(self, capabilities: Iterable[str]) -> list[str]:
+        """Return the facts as lines for a person, and between them what a generator with these capabilities can do."""
+        origin = "; ".join(part for part in (self.paper, self.program) if part) or "this project"
+        return [
+            f"generates {self.generates}",
+            *(f"can {what} ({name})" for name, what in CAPABILITIES.items() if name in capabilities),
+            f"from: {origin}",
+            f"published weights: {self.weights_licence or 'none'}",
+        ]

@@ -1,0 +1,395 @@
+"""Base class of generators: seeds → range images; saving to a folder, and loading."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import chain, islice
+from pathlib import Path
+from typing import Any, ClassVar, Generic, TypeVar, final
+
+import torch
+
+from lidargrit.core import configuration, discovery
+from lidargrit.core.errors import CheckpointError, ConfigError, LidarGritError, nearest_names, one_of
+from lidargrit.core.files import read_json, read_tensors
+from lidargrit.data.images import RangeImages
+from lidargrit.data.run_folder import CONFIG_FILE, PACKAGED, WEIGHTS_FILE, is_run, locate
+from lidargrit.generation.batches import BatchSeeds, in_batches, one_by_one
+from lidargrit.generation.checks import check_condition, check_images, check_seeds
+from lidargrit.generation.facts import CAPABILITIES, Cost, NoSampling, SystemFacts
+from lidargrit.generation.hub import download
+from lidargrit.generation.objective import Objective
+from lidargrit.generation.range_steps import RangeSteps
+from lidargrit.generation.saved import ConfigT, SavedModel, told_of
+from lidargrit.generation.tokenizers import Tokenizer
+from lidargrit.nn.precision import Precision
+from lidargrit.nn.quantization import without_quantized
+from lidargrit.nn.size import numbers_at_most
+from lidargrit.scans.condition import Condition, ConditionKind
+from lidargrit.scans.sensors import SensorModel
+from lidargrit.scans.types import RangeImage, ScanBits
+
+SamplingT = TypeVar("SamplingT")
+
+
+class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
+    """A system that generates new scans of one sensor.
+
+    It is made from a ``Config`` and a sensor, and trained in ``stages``, one after the other, each by its own
+    objective. Every generator can ``sample``, by the settings of its ``Sampling``. What else it can do is named in
+    ``capabilities``; asked for more, it answers which generators can.
+
+    The public methods check their arguments and form batches, the same for all. A subclass writes ``_sample``, and for
+    its capabilities ``_complete``, ``_invert``, ``_reconstruct``, ``_bits`` and ``get_tokenizer``; these get valid
+    arguments on the generator's device, in evaluation mode and without gradients.
+    """
+
+    Sampling: ClassVar[type] = NoSampling
+    not_of_sampling: ClassVar[frozenset[str]] = frozenset()
+    """Names of those settings in ``Sampling`` that only completing or inverting a scan reads."""
+
+    capabilities: ClassVar[frozenset[str]] = frozenset()
+    facts: ClassVar[SystemFacts] = SystemFacts(generates="range images")
+    training_precision: ClassVar[Precision] = "auto"
+    """Precision in which stages are trained where no recipe names one."""
+
+    published_files: ClassVar[tuple[str, ...]] = ()
+    """Contents of the files in which the system's authors published weights, in order; empty if we read none."""
+
+    @classmethod
+    @abstractmethod
+    def smallest_config(cls, sensor: SensorModel) -> ConfigT:
+        """Return settings of networks as small as can be, for images whose rows and columns are multiples of 32."""
+
+    @classmethod
+    def quickest_sampling(cls) -> SamplingT:
+        """Return the settings that take the least time to sample, complete or invert, for tests and first trials."""
+        return cls.Sampling()
+
+    @classmethod
+    def completion_sampling(cls) -> SamplingT:
+        """Return the settings by which scans are completed if the caller names none."""
+        return cls.Sampling()
+
+    @classmethod
+    @final
+    def parse_sampling(cls, words: Iterable[str], completing: bool = False) -> SamplingT:
+        """Return the settings by which it samples or completes, with those changed that words NAME=VALUE name.
+
+        Raises:
+            ConfigError: an unknown name, one that sampling does not read, or a value of another type.
+        """
+        verb, cure = ("completion" if completing else "sampling"), "see all with: lidargrit list generators"
+        settings = cls.completion_sampling() if completing else cls.Sampling()
+        unread = frozenset() if completing else cls.not_of_sampling
+        return configuration.override(settings, words, f"{verb} with {cls.public_name()!r}", cure, unread)
+
+    @property
+    def conditions(self) -> frozenset[ConditionKind]:
+        """Kinds of conditions that :meth:`complete` accepts; they may depend on ``config``."""
+        return frozenset({"pixels"} if "complete" in self.capabilities else set())
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """Names of the stages of training, in their order; they may depend on ``config``."""
+        return ()
+
+    @property
+    def full_rows(self) -> range | None:
+        """Rows in which every ray returns, none in the others; None for a generator with raydrop."""
+        return None
+
+    @property
+    def compute_batch(self) -> int:
+        """Number of scans that are computed at once, always; the last batch is filled up with copies.
+
+        Kernels differ by the size of a batch, and a seed is to give the same scan whatever else is asked for.
+        """
+        return 1
+
+    @property
+    def device(self) -> torch.device:
+        """Device on which the weights lie and scans are computed."""
+        return next(chain(self.parameters(), self.buffers())).device
+
+    def fit_statistics(self, images: RangeImages) -> None:
+        """Compute statistics of the training scans that need no objective; called once, before the stages."""
+
+    def objective(self, stage: str) -> Objective:
+        """Return what a stage minimises; :meth:`load_stage` takes its trained weights."""
+        raise NotImplementedError(f"{self.public_name()} has no stage {stage!r}")
+
+    def load_stage(self, stage: str, objective: Objective) -> None:
+        """Load the weights of a stage's trained objective."""
+        raise NotImplementedError(f"{self.public_name()} has no stage {stage!r}")
+
+    def after_training(self) -> None:
+        """Fit what depends on all trained stages."""
+
+    @final
+    @torch.no_grad()
+    def sample(self, seeds: Sequence[int], sampling: SamplingT | None = None) -> RangeImage:
+        """Generate one scan for each seed; a seed gives the same scan whatever the others are, bit for bit.
+
+        Args:
+            seeds: seeds, one for each scan, from 0 to 2^32 - 1.
+            sampling: settings of the generator's own ``Sampling``; its defaults if not given.
+
+        Raises:
+            ConfigError: no seed or one out of bounds, or settings of another generator.
+
+        Example::
+
+            lidargrit.load("runs/demo").sample(seeds=[0, 1, 2, 3])
+        """
+        check_seeds(seeds)
+        settings = self._settings(sampling, self.Sampling)
+        self.eval()
+        return in_batches(seeds, self.compute_batch, lambda _, some: self._sample(some, settings))
+
+    @final
+    def stream(self, seeds: Iterable[int], sampling: SamplingT | None = None) -> Iterator[RangeImage]:
+        """Yield the scans of :meth:`sample` one by one; seeds may be without end, such as ``itertools.count(0)``."""
+        remaining = iter(seeds)
+        while some := list(islice(remaining, self.compute_batch)):
+            images = self.sample(some, sampling)
+            yield from (images[index] for index in range(len(images)))
+
+    @abstractmethod
+    def cost(self, sampling: SamplingT | None = None) -> Cost:
+        """Return the cost of sampling one scan."""
+
+    def get_tokenizer(self) -> Tokenizer[Any]:
+        """Return the tokenizer whose tokens the generator samples (capability ``tokens``)."""
+        raise self._cannot("tokens")
+
+    @final
+    @torch.no_grad()
+    def reconstruct(self, images: RangeImage) -> RangeImage:
+        """Encode each scan and decode it again, by itself (capability ``encode``).
+
+        Args:
+            images: batch of range images (B, H, W).
+
+        Raises:
+            ConfigError: images of other rays, or a generator without the capability.
+        """
+        self._require("encode")
+        check_images(images, self.sensor)
+        self.eval()
+        return RangeImage.cat([self._reconstruct(image) for image in one_by_one(images.to(self.device))])
+
+    @final
+    @torch.no_grad()
+    def complete(
+        self,
+        condition: Condition,
+        seeds: Sequence[int],
+        sampling: SamplingT | None = None,
+    ) -> RangeImage:
+        """Return scans that keep all observed values, bit for bit, and generate the rest (capability ``complete``).
+
+        Reflectance and labels that the generator does not write are filled in from the observed returns; a batch has
+        them if any of its scans has observed some.
+
+        Args:
+            condition: observed part of each scan, such as ``Condition.of_pixels(images, observed)``, of the kinds in
+                :attr:`conditions`.
+            seeds: seeds, one for each scan, from 0 to 2^32 - 1.
+            sampling: settings of the generator's own ``Sampling``; :meth:`completion_sampling` if not given.
+
+        Raises:
+            ConfigError: images of other rays, a condition of a kind that the generator does not take, seeds that are
+                too many, too few or out of bounds, settings of another generator, or one without the capability.
+        """
+        from lidargrit.scans.fills import fill_lacking  # noqa: PLC0415  loads scipy, and only this needs it
+
+        self._require("complete")
+        check_condition(condition, self.conditions, self.sensor, self.public_name())
+        check_seeds(seeds, len(condition))
+        settings, condition = self._settings(sampling, self.completion_sampling), condition.to(self.device)
+        self.eval()
+        generated = in_batches(
+            seeds, self.compute_batch, lambda at, some: self._complete(condition[at], some, settings)
+        )
+        return condition.put_into(fill_lacking(generated, condition))
+
+    @final
+    @torch.no_grad()
+    def invert(self, images: RangeImage, seeds: Sequence[int], sampling: SamplingT | None = None) -> RangeImage:
+        """Return for each scan the nearest one that the generator can generate (capability ``invert``).
+
+        Args:
+            images: batch of range images (B, H, W).
+            seeds: seeds, one for each image, from 0 to 2^32 - 1; the search starts at random.
+            sampling: settings of the generator's own ``Sampling``; its defaults if not given.
+
+        Raises:
+            ConfigError: see :meth:`complete`.
+        """
+        self._require("invert")
+        check_images(images, self.sensor)
+        check_seeds(seeds, len(images))
+        settings, images = self._settings(sampling, self.Sampling), images.to(self.device)
+        self.eval()
+        return in_batches(seeds, self.compute_batch, lambda at, some: self._invert(images[at], some, settings))
+
+    @final
+    @torch.no_grad()
+    def bits(self, images: RangeImage, step_mm: int = 10, expected: bool = False) -> ScanBits:
+        """Return the negative log-likelihood of each scan in bits, each computed by itself (capability ``likelihood``).
+
+        It is exact for generators without tokens. With tokens it is an upper bound, since tokens other than the
+        encoder's could stand for the same scan.
+        Ranges are rounded to a step, since a real number would need infinitely many bits. Systems can be compared
+        by their bits at one step if these are of the whole scan (:attr:`ScanBits.is_whole`).
+
+        Args:
+            images: batch of range images (B, H, W).
+            step_mm: step of the ranges in whole millimetres.
+            expected: whether the expected number of bits (the entropy) is computed, too, for :meth:`ScanBits.surprise`.
+
+        Raises:
+            ConfigError: images of other rays, another step, or a generator without the capability.
+        """
+        self._require("likelihood")
+        check_images(images, self.sensor)
+        steps = RangeSteps(self.sensor, step_mm)
+        self.eval()
+        rounded = steps.round(images.to(self.device))
+        return ScanBits.cat([self._bits(image, steps, expected) for image in one_by_one(rounded)])
+
+    @abstractmethod
+    def _sample(self, seeds: BatchSeeds, sampling: SamplingT) -> RangeImage:
+        """Generate one scan for each of ``compute_batch`` seeds; scans of copies at their end may be left out."""
+
+    def _complete(self, condition: Condition, seeds: BatchSeeds, sampling: SamplingT) -> RangeImage:
+        """Generate scans that agree with the observed values, which the caller then puts in."""
+        raise NotImplementedError
+
+    def _invert(self, images: RangeImage, seeds: BatchSeeds, sampling: SamplingT) -> RangeImage:
+        raise NotImplementedError
+
+    def _reconstruct(self, images: RangeImage) -> RangeImage:
+        """Encode and decode a batch of one scan."""
+        raise NotImplementedError
+
+    def _bits(self, images: RangeImage, steps: RangeSteps, expected: bool) -> ScanBits:
+        """Return the bits of a batch of one scan."""
+        raise NotImplementedError
+
+    def _settings(self, given: SamplingT | None, default: Callable[[], SamplingT]) -> SamplingT:
+        if given is not None and not isinstance(given, self.Sampling):
+            got, wanted = type(given).__name__, self.Sampling.__name__
+            raise ConfigError(f"settings of type {got}", wanted, "make them with generator.Sampling(...)")
+        return default() if given is None else given
+
+    def _require(self, capability: str) -> None:
+        if capability not in self.capabilities:
+            raise self._cannot(capability)
+
+    def _cannot(self, capability: str) -> ConfigError:
+        able = [name for name in discovery.names("generators") if capability in load_class(name).capabilities]
+        return ConfigError(
+            f"a generator {self.public_name()!r}, which cannot {CAPABILITIES[capability]}",
+            f"one that can: {', '.join(able) or 'none of ours'}",
+            "see what each can do with: lidargrit list generators",
+        )
+
+    @classmethod
+    def about(cls) -> list[str]:
+        """Return lines for a person: the system's facts, and the sampling settings with their defaults."""
+        facts = cls.facts.lines(cls.capabilities)
+        defaults = configuration.leaves(cls.Sampling())
+        for verb, names in (("sample", defaults.keys() - cls.not_of_sampling), ("complete", cls.not_of_sampling)):
+            settings = [f"{name}={value}" for name, value in defaults.items() if name in names]
+            also = " besides" if verb == "complete" else ""
+            facts += [f"{verb} --set{also}: {', '.join(settings)}"] if settings else []
+        return facts
+
+    @classmethod
+    def from_published(cls, files: Sequence[Path], config: ConfigT, sensor: SensorModel) -> Generator[Any, Any]:
+        """Make a generator with the weights that the system's authors published, or that their program saved.
+
+        Args:
+            files: one file for each of ``published_files``, in that order; code in them is not run.
+            config: sizes of the networks, used where the files do not tell them.
+            sensor: sensor whose rays are the pixels of the authors' images.
+
+        Raises:
+            CheckpointError: other files, or weights of other sizes.
+        """
+        able = [name for name in discovery.names("generators") if load_class(name).published_files]
+        raise ConfigError(
+            f"a generator {cls.public_name()!r}, of which nobody published weights",
+            f"a recipe of {', '.join(able)}",
+            "see which generator a recipe has with: lidargrit train RECIPE OUT --dry-run",
+        )
+
+    @classmethod
+    def from_pretrained(cls, name: str | Path, revision: str | None = None) -> Generator[Any, Any]:
+        """Read a generator from a folder, or from a repository of the Hugging Face hub.
+
+        Args:
+            name: folder of a run or of a published generator, or else "USER/REPOSITORY" on the hub.
+            revision: branch, tag or commit of the repository; its main branch if not given.
+
+        Raises:
+            CheckpointError: no such folder or repository, a damaged one, or another kind of generator in it.
+            ConfigError: a revision of a folder, which has none.
+        """
+        here = locate(name)
+        if here.is_dir() and revision is not None:
+            got = f"revision={revision!r} of {name}, which is a folder here"
+            raise ConfigError(
+                got, "a repository on the hub, or no revision", "leave it out, or start in another folder"
+            )
+        generator = load(here if here.is_dir() else download(str(name), revision, ["*.json", WEIGHTS_FILE]))
+        if not isinstance(generator, cls):
+            raise CheckpointError(
+                f"{name}, which holds a generator {generator.public_name()!r}",
+                f"one of {cls.public_name()!r}",
+                "read it with Generator.from_pretrained",
+            )
+        return generator
+
+
+def load(folder: str | Path) -> Generator:
+    """Read a trained generator from a run's folder; ``pretrained`` and ``pretrained_wide`` come with the package.
+
+    Raises:
+        CheckpointError: no finished model in the folder, a damaged file, or weights of another configuration.
+    """
+    folder = locate(folder)
+    if not is_run(folder):
+        packaged = [each.name for each in PACKAGED]
+        if not folder.exists():
+            wanted = f"a run's folder, or {nearest_names(folder.name, packaged)}"
+            raise CheckpointError(f"{folder}, which does not exist", wanted, "check the path")
+        raise CheckpointError(
+            f"{folder}, which holds no finished model",
+            f"a run's folder with {CONFIG_FILE} and {WEIGHTS_FILE}, or {one_of(packaged)}",
+            "finish the training (lidargrit train with the same words goes on), or check the path",
+        )
+    about = read_json(folder / CONFIG_FILE)
+    with told_of(folder / CONFIG_FILE):
+        try:
+            config, sensor, name = about["config"], SensorModel.from_json(about["sensor"]), str(about["generator"])
+        except LidarGritError:
+            raise
+        except (KeyError, TypeError, ValueError) as error:  # the last from tables that are not rectangular
+            got = f"{folder / CONFIG_FILE}, which cannot be used ({error})"
+            raise CheckpointError(got, "what lidargrit wrote", "restore the file") from None
+        cls = load_class(name)
+        config = configuration.from_json(cls.Config, config, str(folder / CONFIG_FILE))
+        weights = without_quantized(read_tensors(folder / WEIGHTS_FILE)[0])
+        expected = sum(tensor.numel() for tensor in weights.values())
+        # Twice as many as the file holds, for what is built besides: a wrong file is refused before it fills memory.
+        with numbers_at_most(2 * expected + 2**20, f"{folder / CONFIG_FILE} with a network", "restore both files"):
+            return cls.from_weights(config, sensor, weights, folder / WEIGHTS_FILE)
+
+
+def load_class(name: str) -> type[Generator]:
+    """Return the generator class of a name, or raise UnknownNameError."""
+    return discovery.load_class("generators", name, Generator)

@@ -1,0 +1,1 @@
+"""Mask and ranges with exact probabilities, in phases from coarse to fine."""

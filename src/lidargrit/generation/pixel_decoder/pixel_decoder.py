@@ -1,0 +1,290 @@
+"""Pixels generated in phases from coarse to fine, with exact probabilities: output of a decoder → range images."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from lidargrit.core.configuration import TypedSettings
+from lidargrit.core.errors import ConfigError
+from lidargrit.core.untrusted import is_temperature
+from lidargrit.generation.pixel_decoder.pixel_networks import Guide, MaskNetwork, PixelDecoderConfig, RangeNetwork
+from lidargrit.generation.pixel_decoder.pixel_phases import Lattice, Phase, at_phases, join_phases, one_of_phases
+from lidargrit.generation.range_steps import RangeSteps
+from lidargrit.nn.precision import Precision, autocast_to
+from lidargrit.nn.processes import mean_over_processes
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.sensors import SensorModel
+from lidargrit.scans.types import Decoded, RangeImage
+
+_Guided = tuple[
+    dict[Lattice, Tensor], dict[Lattice, Tensor]
+]  # by lattice: the guide's part of the first layers, of both
+
+_ALL_PHASES_AREA = 16  # training counts all phases of lattices with one in so many pixels, or fewer
+
+_NOISE_AT_MOST = 1e6  # beyond, the components' scales have no finite numbers; with 100 all ranges are noise already
+
+BITS_STEP_M = 0.01  # bits of a return are those of naming its range to a centimetre
+
+
+@dataclass(frozen=True)
+class PixelSampling(TypedSettings):
+    """Settings of sampling masks, and ranges from their mixtures.
+
+    By default samples are sharper than the mixtures themselves, which are ragged where a surface is uncertain. Only
+    pixels that are sampled with 1, 1 and a correlation of 0 follow the distribution, given the tokens, whose likelihood
+    the model computes.
+
+    Args:
+        range_temperature: temperature of the mixture's density on one surface; 1 leaves it unchanged, below 1 prefers
+            the densest of the components there. Surfaces that lie apart keep their probabilities. 0 takes the model's
+            own temperature (``model.pixels.range_temperature``).
+        range_noise: multiplier of the components' scales; 1 takes them as they are.
+        mask_correlation: multiplier of how much of their noise close pixels of a mask share that are sampled at once,
+            so that drops cluster; 1 takes what was learned in training, 0 samples them independently.
+        precision: number type of the networks' products. ``fp32`` is exact; ``bf16`` is quicker and moves some pixels;
+            ``auto`` is ``bf16`` where the machine has instructions for it.
+    """
+
+    range_temperature: float = 0.0
+    range_noise: float = 0.7
+    mask_correlation: float = 2.0
+    precision: Precision = "fp32"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not (
+            is_temperature(self.range_temperature)
+            and self.range_temperature < math.inf
+            and 0 < self.range_noise <= _NOISE_AT_MOST
+        ):
+            raise ConfigError(
+                f"range_temperature={self.range_temperature}, range_noise={self.range_noise}",
+                "positive numbers, a temperature of at least 1e-6, or of 0 for the model's own, a noise up to 1e6",
+                "take 1 for both, and mask_correlation=0, to sample from the model's own distribution",
+            )
+        if not 0 <= self.mask_correlation < math.inf:
+            raise ConfigError(
+                f"mask_correlation={self.mask_correlation}",
+                "a number that is at least 0",
+                "take 0 for independent pixels",
+            )
+
+
+class PixelNll(NamedTuple):
+    """Negative log-likelihood of every pixel in nats.
+
+    Args:
+        mask: negative log-likelihood of the mask (a return or none), given the earlier pixels.
+        range: negative log-likelihood of the range, given the whole mask and the earlier ranges; 0 without a return. It
+            is that of a step where ranges have steps, and otherwise of a density per metre.
+    """
+
+    mask: Float[Tensor, "B H W"]
+    range: Float[Tensor, "B H W"]
+
+
+class PixelDecoder(nn.Module):
+    """Mask and range of every pixel, phase by phase, each phase given all earlier ones.
+
+    Reflectance is not sampled: it is the mean that the tokenizer's decoder gives, if it gives one.
+
+    First comes the whole mask, one Bernoulli number a pixel, then the range of what returned, from a mixture that may
+    stand on either side of an edge. The pixels of one phase are independent of one another, given the earlier ones, but
+    for the noise that their masks may share (:class:`PhaseNoise`).
+
+    Args:
+        config: sizes of the networks.
+        sensor: sensor with the rays and limits of the range images.
+        features: number of channels of the tokenizer's features; 0 for a decoder without a tokenizer.
+
+    Source:
+        Reed et al., Parallel Multiscale Autoregressive Density Estimation, 2017: phases from coarse to fine.
+    """
+
+    def __init__(self, config: PixelDecoderConfig, sensor: SensorModel, features: int) -> None:
+        super().__init__()
+        rows, columns = (
+            config.coarsest_cell * 2**halvings for halvings in (config.row_halvings, config.column_halvings)
+        )
+        if sensor.height % rows or sensor.width % columns:
+            raise ConfigError(
+                f"range images of {sensor.height}x{sensor.width} for a pixel decoder of cells of {rows}x{columns}",
+                "cells that divide both sides",
+                "lower coarsest_cell, column_halvings or row_halvings, or choose another number of columns",
+            )
+        self.config, self.sensor = config, sensor
+        self.mask, self.range = MaskNetwork(config, sensor, features), RangeNetwork(config, sensor, features)
+
+    def forward(self, decoded: Decoded | None, images: RangeImage, steps: RangeSteps | None = None) -> PixelNll:
+        """Return the exact negative log-likelihood of every pixel, given what was decoded from the tokens.
+
+        Args:
+            decoded: output of the tokenizer's decoder; None without a tokenizer.
+            images: range images, rounded to the steps if there are any.
+            steps: steps whose probability is the likelihood of a range; without them it is a density per metre.
+        """
+        guide = self.guide(decoded, len(images))
+        guided = self.mask.guided(guide), self.range.guided(guide)
+        mask_nll, range_nll = None, None  # of the pixels of a lattice, from the coarsest to the whole image
+        for phases in self.mask.by_lattice():
+            of_mask, of_range = self._nll(phases, guided, guide, images, steps)
+            mask_nll, range_nll = join_phases(mask_nll, of_mask), join_phases(range_nll, of_range)
+        assert mask_nll is not None
+        assert range_nll is not None
+        return PixelNll(mask_nll, range_nll)
+
+    def guide(self, decoded: Decoded | None, count: int) -> Guide:
+        """Return the inputs of the networks for every pixel of a number of scans before the first phase."""
+        return Guide.nothing(self.mask.rows, count, self.sensor) if decoded is None else Guide.of(decoded)
+
+    def expected(self, decoded: Decoded | None, images: RangeImage, steps: RangeSteps) -> PixelNll:
+        """Return the expected value of :meth:`forward` for each pixel (its entropy), given the earlier ones."""
+        guide = self.guide(decoded, len(images))
+        guided = self.mask.guided(guide), self.range.guided(guide)
+        mask, v = images.return_mask, images.range_m.log1p()
+        mask_nats, range_nats = None, None
+        for phases in self.mask.by_lattice():
+            logits = self.mask.logits(phases, guided[0], guide, mask)
+            # H(p) = ln(1 + e^z) - z p of the logit z
+            mask_nats = join_phases(mask_nats, F.softplus(logits) - logits * logits.sigmoid())
+            entropy = self.range.distributions(phases, guided[1], guide, mask, v).entropy(steps)
+            range_nats = join_phases(range_nats, torch.where(at_phases(mask, phases), entropy, 0.0))
+        assert mask_nats is not None
+        assert range_nats is not None
+        return PixelNll(mask_nats, range_nats)
+
+    def bits(
+        self, decoded: Decoded | None, images: RangeImage, steps: RangeSteps, expected: bool
+    ) -> tuple[Float[Tensor, "B H W"], Float[Tensor, "B H W"], Float[Tensor, "B H W"] | None]:
+        """Return the bits of :meth:`forward` for mask and range, and those of :meth:`expected` together if asked for.
+
+        They are what :class:`~lidargrit.scans.types.ScanBits` has of every pixel.
+        """
+        mask, range_ = (nats / math.log(2) for nats in self(decoded, images, steps))
+        if not expected:
+            return mask, range_, None
+        usual = self.expected(decoded, images, steps)
+        return mask, range_, (usual.mask + usual.range) / math.log(2)
+
+    def estimate(
+        self, decoded: Decoded | None, images: RangeImage, rng: torch.Generator
+    ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
+        """Return the mean nats of the mask a pixel and of the range a return, estimated by some of the phases.
+
+        Of a fine lattice one phase counts for all: a step costs a third to a half, and there are as many more steps.
+        Coarse lattices have few pixels to learn from, and all their phases count. The estimate of the mask is unbiased.
+        """
+        guide = self.guide(decoded, len(images))
+        guided = self.mask.guided(guide), self.range.guided(guide)
+        mask_nats, range_nats = guide.v.new_zeros(()), guide.v.new_zeros(())
+        returns = guide.v.new_zeros(())
+        for phases in self.mask.by_lattice():
+            chosen = one_of_phases(phases, rng) if phases[0].lattice.area < _ALL_PHASES_AREA else phases
+            of_mask, of_range = self._nll(chosen, guided, guide, images)
+            share = len(phases) / len(chosen)
+            mask_nats = mask_nats + share * of_mask.sum()
+            range_nats = range_nats + share * of_range.sum()
+            returns = returns + share * at_phases(images.return_mask, chosen).sum()
+        if self.training:  # as many returns as one process with the whole batch would divide by, for each process
+            returns = mean_over_processes(returns)
+        return mask_nats / guide.v.numel(), range_nats / returns.clamp(min=1)
+
+    @property
+    def num_evaluations(self) -> int:
+        """Number of passes through a network, one after the other, for one scan."""
+        return len(self.mask.phases) + len(self.range.phases)
+
+    def flops(self) -> int:
+        """Return the floating-point operations of sampling one scan."""
+        return self.mask.flops() + self.range.flops()
+
+    def _nll(
+        self, phases: list[Phase], guided: _Guided, guide: Guide, images: RangeImage, steps: RangeSteps | None = None
+    ) -> tuple[Float[Tensor, "P B h w"], Float[Tensor, "P B h w"]]:
+        """Return the negative log-likelihood of mask and range at phases of one lattice."""
+        mask, v = images.return_mask, images.range_m.log1p()
+        returned = at_phases(mask, phases)
+        of_mask = self.mask.phase_nll(phases, guided[0], guide, mask)
+        # Where nothing returned, any range within the limits stands in: its likelihood is not used.
+        range_m = torch.where(returned, at_phases(images.range_m, phases), self.sensor.range_min_m)
+        mixture = self.range.distributions(phases, guided[1], guide, mask, v)
+        if steps is None:
+            likelihood = mixture.log_density(range_m)
+        else:
+            likelihood = mixture.log_mass(*steps.edges_m(steps.indices(range_m))).float()
+        return of_mask, torch.where(returned, -likelihood, 0.0)
+
+    def sample(
+        self,
+        decoded: Decoded | None,
+        rngs: Sequence[torch.Generator],
+        sampling: PixelSampling | None = None,
+        condition: Condition | None = None,
+    ) -> RangeImage:
+        """Return one scan for each random generator; a scan does not depend on the others of its batch.
+
+        Args:
+            decoded: output of the tokenizer's decoder for as many scans; None without a tokenizer.
+            rngs: random generators on the CPU, one for each scan.
+            sampling: settings of the sampling of masks and ranges.
+            condition: observed part of the scans; nothing if not given. Observed returns and ranges are kept as they
+                are when their phase comes: later phases know of them, earlier ones do not.
+        """
+        guide, size = self.guide(decoded, len(rngs)), (3, self.sensor.height, self.sensor.width)
+        choices = sampling or PixelSampling()
+        uniform = torch.stack([torch.rand(size, generator=rng) for rng in rngs])
+        shares = self.mask.noise.shares(choices.mask_correlation)
+        for numbers, rng in zip(uniform, rngs, strict=True):
+            numbers[0] = self.mask.noise(numbers[0], rng, shares)
+        uniform = uniform.to(guide.v.device)
+        condition = (condition or Condition.nothing(self.sensor, len(rngs))).to(guide.v.device)
+        # One scan after the other on a CPU: with other batch sizes its sums have other rounding errors.
+        step = 1 if guide.v.device.type == "cpu" else len(uniform)
+        images = []
+        for first in range(0, len(uniform), step):
+            part = slice(first, first + step)
+            some = guide.part(part)
+            with autocast_to(choices.precision, guide.v.device):
+                mask = self.mask.sample(some, uniform[part, 0], condition[part])
+                range_m = self._sample_range(some, uniform[part, 1:], mask, condition[part], choices)
+            reflectance = None if decoded is None or decoded.reflectance is None else decoded.reflectance[part]
+            images.append(RangeImage.masked(range_m, mask, self.sensor, reflectance))
+        return RangeImage.cat(images)
+
+    def _sample_range(
+        self,
+        guide: Guide,
+        uniform: Float[Tensor, "B 2 H W"],
+        mask: Bool[Tensor, "B H W"],
+        condition: Condition,
+        sampling: PixelSampling,
+    ) -> Float[Tensor, "B H W"]:
+        """Return the ranges of a whole mask, sampled phase by phase around the observed ones."""
+        temperature = sampling.range_temperature or self.config.range_temperature
+        guided = self.range.guided(guide)
+        range_m, v = torch.zeros_like(guide.v), torch.zeros_like(guide.v)
+        for phase in self.range.phases:
+            pixels = (..., *phase.pixels)
+            mixture = self.range.distributions([phase], guided, guide, mask, v)
+            unknown = mask[pixels] & ~condition.range_observed[pixels]
+            component, within = (random[unknown] for random in uniform[pixels].unbind(1))
+            sampled = mixture.at(unknown[None]).sample(component, within, temperature, sampling.range_noise)
+            found = torch.where(mask[pixels], condition.range_m[pixels], 0.0)
+            found[unknown] = sampled
+            range_m[pixels] = found
+            v[pixels] = range_m[pixels].log1p()
+        return range_m
+
+
+def nats_to_range_bits(nats: Float[Tensor, "*P"]) -> Float[Tensor, "*P"]:
+    """Return the bits of naming a range to :data:`BITS_STEP_M`, from the negative log-density per metre in nats."""
+    return (nats - math.log(BITS_STEP_M)) / math.log(2)

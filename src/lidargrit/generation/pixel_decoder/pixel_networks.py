@@ -1,0 +1,400 @@
+"""The two networks of a pixel decoder: pixels so far → mask and range of the next phase's pixels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from lidargrit.core.errors import ConfigError
+from lidargrit.core.untrusted import TEMPERATURE_AT_LEAST
+from lidargrit.generation.pixel_decoder.lattice_network import LatticeNetwork
+from lidargrit.generation.pixel_decoder.phase_noise import PhaseNoise
+from lidargrit.generation.pixel_decoder.pixel_phases import (
+    Lattice,
+    Phase,
+    at_phases,
+    cells_of,
+    generated_before,
+    one_of_phases,
+    phases_of,
+    pixels_around,
+)
+from lidargrit.generation.pixel_decoder.range_candidates import RangeCandidates
+from lidargrit.generation.pixel_decoder.range_mixture import RangeMixture
+from lidargrit.nn.precision import at_least_32_bits
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.sensors import SensorModel
+from lidargrit.scans.types import TYPICAL_LOG_RANGE, Decoded
+
+LOGIT_BOUND = 8.0  # of the decoder's return logits, beyond which it is as good as sure
+_HALVINGS_AT_MOST = 8  # of one side alone
+_MAY_BE_0 = ("column_halvings", "row_halvings", "coarse_range_width")
+_COARSE_AREA = 64  # lattices with one in so many pixels, or fewer, are coarse
+_FINEST_M, _COARSEST_M = math.exp(-6), math.exp(4)  # scales of a component: 2.5 mm to 55 m
+
+
+@dataclass(frozen=True)
+class PixelDecoderConfig:
+    """Sizes of the pixel decoder.
+
+    Args:
+        coarsest_cell: shorter side of the cells of which the first phase generates one pixel each; a power of 2. Cells
+            divide both sides of the image.
+        column_halvings: number of halvings of the distance between columns alone, which come last, so that pixels know
+            of others in their own row; cells have as many columns as rows, times 2 for each.
+        row_halvings: number of halvings of the distance between rows alone, which come last, so that pixels know of
+            others in their own column, for images whose columns are farther apart than their rows; cells have as many
+            rows as columns, times 2 for each. It is 0 if column_halvings is not.
+        mask_features: number of channels of the tokenizer's features that the mask network sees, if any.
+        range_features: number of channels of the tokenizer's features that the range network sees, if any.
+        row_channels: number of learned values of every row.
+        mask_width: number of channels of the mask network's layers.
+        range_width: number of channels of the range network's layers.
+        coarse_range_width: number of channels of the range network's layers of lattices with one in 64 pixels or
+            fewer; 0 for ``range_width``. Channels cost little there, and coarse ranges decide how straight walls are.
+        blocks: number of residual blocks of each network.
+        free_components: number of components of a range's distribution that begin at the decoded range; 6 more begin at
+            neighbours.
+        surface_components: whether 8 more components begin on planes and straight lines through neighbours, so that the
+            surfaces on both sides of an edge are continued.
+        gravity_components: whether 8 more components begin on vertical planes through two earlier pixels and on
+            horizontal ones through a neighbour, so that walls and the ground are continued from fewer pixels. They
+            assume that the sensor is level.
+        range_temperature: temperature at which ranges are sampled where the caller names none. What suits a model
+            depends on its columns and its training: choose it by samples against validation scans.
+    """
+
+    coarsest_cell: int = 8
+    column_halvings: int = 0
+    row_halvings: int = 0
+    mask_features: int = 12
+    range_features: int = 12
+    row_channels: int = 4
+    mask_width: int = 32
+    range_width: int = 48
+    coarse_range_width: int = 0
+    blocks: int = 2
+    free_components: int = 4
+    surface_components: bool = False
+    gravity_components: bool = False
+    range_temperature: float = 0.35
+
+    def __post_init__(self) -> None:
+        if not TEMPERATURE_AT_LEAST <= self.range_temperature < math.inf:
+            raise ConfigError(f"range_temperature={self.range_temperature}", "at least 1e-6", "correct it")
+        for name, value in vars(self).items():
+            least = 0 if isinstance(value, (bool, float)) or name in _MAY_BE_0 else 1
+            if value < least:
+                raise ConfigError(f"{name}={value}", f"at least {least}", "raise it")
+            if name.endswith("halvings") and value > _HALVINGS_AT_MOST:
+                raise ConfigError(f"{name}={value}", f"at most {_HALVINGS_AT_MOST}", "lower it")
+        phases_of(self.coarsest_cell, self.column_halvings, self.row_halvings)
+
+
+class Guide(NamedTuple):
+    """Output of a tokenizer's decoder for every pixel; without a tokenizer, the same numbers for all pixels.
+
+    Args:
+        features: features of the decoder's last layer; none without a tokenizer.
+        v: ln(1 + decoded range in metres).
+        return_logits: logits of the probability of a return, bounded.
+        observed: True where it was observed whether there is a return; None if nothing was observed.
+    """
+
+    features: Float[Tensor, "B C H W"]
+    v: Float[Tensor, "B H W"]
+    return_logits: Float[Tensor, "B H W"]
+    observed: Bool[Tensor, "B H W"] | None = None
+
+    def part(self, some: slice) -> Guide:
+        """Return the guide of some of the scans."""
+        observed = None if self.observed is None else self.observed[some]
+        return Guide(self.features[some], self.v[some], self.return_logits[some], observed)
+
+    @classmethod
+    def of(cls, decoded: Decoded) -> Guide:
+        """Return the guide from the output of the tokenizer's decoder.
+
+        Raises:
+            ConfigError: a tokenizer whose decoder gives no features.
+        """
+        if decoded.features is None:
+            raise ConfigError(
+                "a tokenizer whose decoder gives no features",
+                "one that gives them (Decoded.features)",
+                "leave the pixel decoder out, or choose the tokenizer vqvae",
+            )
+        logits = at_least_32_bits(decoded.return_logits).clamp(-LOGIT_BOUND, LOGIT_BOUND)
+        return cls(at_least_32_bits(decoded.features), at_least_32_bits(decoded.range_m).log1p(), logits)
+
+    @classmethod
+    def nothing(cls, like: Tensor, count: int, sensor: SensorModel) -> Guide:
+        """Return the guide of scans of which no token tells anything, as numbers of the type of another tensor."""
+        size = (count, sensor.height, sensor.width)
+        return cls(like.new_zeros(count, 0, *size[1:]), like.new_full(size, TYPICAL_LOG_RANGE), like.new_zeros(size))
+
+
+class PhaseNetwork(nn.Module):
+    """Base of the mask's and the range's network: a small network for each lattice, run anew for every phase."""
+
+    def __init__(
+        self,
+        config: PixelDecoderConfig,
+        sensor: SensorModel,
+        features: int,
+        kept: int,
+        widths: tuple[int, int],
+        outputs: int,
+    ) -> None:
+        super().__init__()
+        self.phases = phases_of(config.coarsest_cell, config.column_halvings, config.row_halvings)
+        self.sensor = sensor
+        self.guided_by_tokens = features > 0
+        kept = kept if features else 0
+        self.features = nn.Conv2d(features, kept, 1) if features else nn.Identity()
+        self.rows = nn.Parameter(torch.zeros(config.row_channels, sensor.height))
+        guide = 4 * (kept + config.row_channels + 2)
+        self.networks = nn.ModuleDict()
+        for phases in self.by_lattice():
+            context = self.context_channels + (0 if features else self.added_without_tokens)
+            lattice = phases[0].lattice
+            width = widths[lattice.area >= _COARSE_AREA]
+            network = LatticeNetwork(guide, context, width, config.blocks, len(phases), outputs)
+            self.networks[lattice.name] = network
+
+    context_channels: int
+    added_without_tokens = 0
+
+    def guided(self, guide: Guide) -> dict[Lattice, Tensor]:
+        """Return the first layer's output for the guide, (B, C, h, w), by lattice, the same for all phases."""
+        rows = self.rows[None, :, :, None].expand(len(guide.v), -1, -1, guide.v.shape[-1])
+        decoded = torch.stack((guide.v - TYPICAL_LOG_RANGE, guide.return_logits / 4), 1)
+        maps = torch.cat((self.features(guide.features), rows, decoded), 1)
+        return {lattice: network.guide(cells_of(maps, lattice)) for lattice, network in self._networks()}
+
+    def outputs(
+        self, phases: list[Phase], guided: dict[Lattice, Tensor], contexts: Float[Tensor, "P B D h w"]
+    ) -> Float[Tensor, "P B O h w"]:
+        """Return the network's outputs for consecutive phases of one lattice, from what is known before each."""
+        lattice = phases[0].lattice
+        first = [phase for phase in self.phases if phase.lattice == lattice].index(phases[0])
+        return self.networks[lattice.name](guided[lattice], contexts, first)
+
+    def flops(self) -> int:
+        """Return the floating-point operations of all phases of one scan: two for each multiplication and addition."""
+        pixels = self.sensor.height * self.sensor.width
+        total = 2 * pixels * sum(weight.numel() for weight in self.features.parameters() if weight.ndim == 4)
+        for lattice, network in self._networks():
+            once = network.guide.weight.numel() + sum(layer.get_parameter("weight").numel() for layer in network.out)
+            each = sum(weight.numel() for weight in network.blocks.parameters() if weight.ndim == 4)
+            each += network.context.weight.numel()
+            total += 2 * (pixels // (4 * lattice.area)) * (once + len(network.out) * each)
+        return total
+
+    def by_lattice(self) -> list[list[Phase]]:
+        """Return the phases, those of one lattice together."""
+        lattices = dict.fromkeys(phase.lattice for phase in self.phases)
+        return [[phase for phase in self.phases if phase.lattice == lattice] for lattice in lattices]
+
+    def _networks(self) -> list[tuple[Lattice, LatticeNetwork]]:
+        networks = [(phases[0].lattice, self.networks[phases[0].lattice.name]) for phases in self.by_lattice()]
+        return [(lattice, network) for lattice, network in networks if isinstance(network, LatticeNetwork)]
+
+
+class MaskNetwork(PhaseNetwork):
+    """The logits of P(return), given which of the earlier pixels returned: a correction of the decoder's logits."""
+
+    context_channels = 4 * 2
+
+    def __init__(self, config: PixelDecoderConfig, sensor: SensorModel, features: int) -> None:
+        super().__init__(config, sensor, features, config.mask_features, (config.mask_width, config.mask_width), 1)
+        self.row_bias = nn.Parameter(torch.zeros(sensor.height))
+        self.noise = PhaseNoise(self.phases)
+
+    @classmethod
+    def behind(cls, features: int, width: int, sensor: SensorModel) -> MaskNetwork:
+        """Return a network that samples masks behind another network than a tokenizer's decoder, all of whose features
+        it sees.
+
+        Args:
+            features: channels of the other network's features.
+            width: channels of the layers.
+            sensor: the rays of the range images.
+        """
+        return cls(PixelDecoderConfig(mask_features=features, mask_width=width), sensor, features)
+
+    def context(
+        self, phases: list[Phase], guide: Guide, return_mask: Bool[Tensor, "B H W"]
+    ) -> Float[Tensor, "P B D h w"]:
+        """Return for each pixel of a cell whether it is known to have returned, and whether it is known not to.
+
+        Later pixels have no influence.
+        """
+        lattice = phases[0].lattice
+        returned = cells_of(return_mask[:, None].to(guide.v.dtype), lattice)
+        certain = generated_before(phases, returned)
+        if guide.observed is not None:
+            certain = torch.maximum(certain, cells_of(guide.observed[:, None].to(guide.v.dtype), lattice))
+        return torch.cat((certain * returned, certain * (1 - returned)), 2)
+
+    def uniform(self, rngs: Sequence[torch.Generator]) -> Float[Tensor, "B H W"]:
+        """Return random numbers for one mask of each generator, correlated as learned, on the device of the network."""
+        size, shares = (self.sensor.height, self.sensor.width), self.noise.shares()
+        numbers = [self.noise(torch.rand(size, generator=rng), rng, shares) for rng in rngs]
+        return torch.stack(numbers).to(self.row_bias.device)
+
+    def sample(self, guide: Guide, uniform: Float[Tensor, "B H W"], condition: Condition) -> Bool[Tensor, "B H W"]:
+        """Return the mask, sampled phase by phase around its observed pixels.
+
+        Args:
+            guide: output of the decoder for every pixel.
+            uniform: random numbers in [0, 1): independent ones, or those that ``noise`` makes of them.
+            condition: observed part of the scans, whose returns are kept as they are.
+        """
+        guided = self.guided(guide)
+        mask = condition.return_mask & condition.return_observed
+        for phase in self.phases:
+            pixels = (..., *phase.pixels)
+            sampled = uniform[pixels] < self.logits([phase], guided, guide, mask)[0].sigmoid()
+            mask[pixels] = torch.where(condition.return_observed[pixels], mask[pixels], sampled)
+        return mask
+
+    def logits(
+        self, phases: list[Phase], guided: dict[Lattice, Tensor], guide: Guide, return_mask: Bool[Tensor, "B H W"]
+    ) -> Float[Tensor, "P B h w"]:
+        """Return the logits of the pixels of phases of one lattice; later pixels of the mask have no influence."""
+        output = self.outputs(phases, guided, self.context(phases, guide, return_mask))
+        decoded = guide.return_logits + self.row_bias[:, None]
+        return output[:, :, 0] + at_phases(decoded, phases)
+
+    def phase_nll(
+        self, phases: list[Phase], guided: dict[Lattice, Tensor], guide: Guide, returned: Bool[Tensor, "B H W"]
+    ) -> Float[Tensor, "P B h w"]:
+        """Return the negative log-likelihood in nats of the pixels of phases of one lattice, 0 for observed ones.
+
+        In training the noise learns from them how pixels of one phase depend on one another.
+        """
+        logits = self.logits(phases, guided, guide, returned)
+        truth = at_phases(returned, phases)
+        nll = F.binary_cross_entropy_with_logits(logits, truth.float(), reduction="none")
+        known = None if guide.observed is None else at_phases(guide.observed, phases)
+        if self.training:
+            self.noise.learn(phases, logits if known is None else logits.masked_fill(known, torch.inf), truth)
+        return nll if known is None else nll * ~known
+
+    def nats(
+        self, guide: Guide, returned: Bool[Tensor, "B H W"], rng: torch.Generator | None = None
+    ) -> Float[Tensor, " B"]:
+        """Return the negative log-likelihood of the unknown part of each mask in nats.
+
+        Args:
+            guide: output of a decoder for every pixel, and what is known before the first phase.
+            returned: true masks.
+            rng: chooses one phase of each lattice, which stands for all; every phase is counted without it.
+        """
+        guided, total = self.guided(guide), guide.v.new_zeros(len(returned))
+        for phases in self.by_lattice():
+            chosen = phases if rng is None else one_of_phases(phases, rng)
+            nll = self.phase_nll(chosen, guided, guide, returned)
+            total = total + nll.sum((0, 2, 3)) * (len(phases) / len(chosen))
+        return total
+
+
+class RangeNetwork(PhaseNetwork):
+    """The distribution of a range, given the whole mask and the ranges of earlier pixels.
+
+    Its components are free, or begin at what the neighbours suggest: at an edge the range may be that of either side.
+    Where no tokens tell what to expect of a pixel, the mean of its neighbours stands in.
+    """
+
+    added_without_tokens = 1  # the expected range
+
+    def __init__(self, config: PixelDecoderConfig, sensor: SensorModel, features: int) -> None:
+        phases = phases_of(config.coarsest_cell, config.column_halvings, config.row_halvings)
+        suggest = RangeCandidates(sensor, phases, config.surface_components, config.gravity_components)
+        self.context_channels = 4 * 3 + suggest.count + suggest.distances
+        components = config.free_components + suggest.count
+        widths = (config.range_width, config.coarse_range_width or config.range_width)
+        super().__init__(config, sensor, features, config.range_features, widths, 3 * components)
+        self.suggest = suggest
+        self.limits_m = (sensor.range_min_m, sensor.range_max_m)
+        self.free = config.free_components
+        spread = torch.linspace(-0.2, 0.2, self.free) if self.free > 1 else torch.zeros(1)
+        scale = torch.cat((torch.zeros(self.free), torch.full((suggest.count,), -2.0)))
+        self.register_buffer("begin", spread[:, None, None], persistent=False)
+        self.register_buffer("begin_scale", scale[:, None, None], persistent=False)
+
+    begin: Tensor
+    begin_scale: Tensor
+
+    def distributions(
+        self,
+        phases: list[Phase],
+        guided: dict[Lattice, Tensor],
+        guide: Guide,
+        return_mask: Bool[Tensor, "B H W"],
+        v: Float[Tensor, "B H W"],
+    ) -> RangeMixture:
+        """Return the distributions of the ranges at phases of one lattice; later ranges have no influence."""
+        candidates = self.candidates(phases, guide, return_mask, v)
+        contexts = self.context(phases, guide, return_mask, v, candidates)
+        return self.mixture(self.outputs(phases, guided, contexts), candidates)
+
+    def context(
+        self,
+        phases: list[Phase],
+        guide: Guide,
+        return_mask: Bool[Tensor, "B H W"],
+        v: Float[Tensor, "B H W"],
+        candidates: Float[Tensor, "P B K h w"],
+    ) -> Float[Tensor, "P B D h w"]:
+        """Return the mask, the known ranges beside the decoded ones, and how far the candidates are apart."""
+        candidates, expected = candidates[:, :, :-1], candidates[:, :, -1:]
+        maps = cells_of(torch.stack((return_mask.to(v.dtype), v - guide.v), 1), phases[0].lattice)
+        returned, beside = maps.chunk(2, 1)
+        generated = generated_before(phases, returned) * returned
+        apart = self.suggest.differences(candidates.flatten(0, 1)).unflatten(0, candidates.shape[:2])
+        dropped = (1 - returned).expand_as(generated)
+        parts = [generated, dropped, generated * beside, (candidates - expected).clamp(-2, 2), apart]
+        if not self.guided_by_tokens:
+            parts[2] = generated * (beside - (expected - TYPICAL_LOG_RANGE)).clamp(-2, 2)
+            parts.append(expected - TYPICAL_LOG_RANGE)
+        return torch.cat(parts, 2)
+
+    def candidates(
+        self, phases: list[Phase], guide: Guide, return_mask: Bool[Tensor, "B H W"], v: Float[Tensor, "B H W"]
+    ) -> Float[Tensor, "P B K h w"]:
+        """Return what neighbours suggest, as ln(1 + range), and last what is expected without them.
+
+        Expected is the decoded range, or without tokens the mean of the neighbours.
+        """
+        return torch.stack([self._candidates(phase, guide, return_mask, v) for phase in phases])
+
+    def _candidates(
+        self, phase: Phase, guide: Guide, return_mask: Bool[Tensor, "B H W"], v: Float[Tensor, "B H W"]
+    ) -> Float[Tensor, "B K h w"]:
+        expected = guide.v[(..., *phase.pixels)]
+        if not self.guided_by_tokens and phase.rank:
+            near, known = pixels_around(phase, v, return_mask, phase.neighbours)
+            count, total = known.sum(1), torch.where(known, near, 0.0).sum(1)
+            expected = torch.where(count > 0, total / count.clamp(min=1), expected)
+        return torch.cat((self.suggest(phase, v, return_mask, expected), expected[:, None]), 1)
+
+    def mixture(self, output: Float[Tensor, "P B O h w"], candidates: Float[Tensor, "P B K h w"]) -> RangeMixture:
+        """Return the distributions of the ranges of the pixels of phases of one lattice."""
+        logits, moved, scales = output.chunk(3, 2)
+        free = candidates[:, :, -1:] + 2 * (moved[:, :, : self.free] + self.begin)
+        centres = torch.cat((free, candidates[:, :, :-1] + 0.1 * moved[:, :, self.free :]), 2)
+        low, high = (math.log1p(limit) for limit in self.limits_m)
+        centres = centres.clamp(low, high)
+        log_scales_m = (1.5 * (scales + self.begin_scale)).clamp(math.log(_FINEST_M), math.log(_COARSEST_M))
+        log_scales = log_scales_m - centres  # dv = d range / (1 + range): so the scale is one in metres
+        logits, centres, log_scales = (part.movedim(2, -1).contiguous() for part in (logits, centres, log_scales))
+        return RangeMixture(logits, centres, log_scales, self.limits_m)

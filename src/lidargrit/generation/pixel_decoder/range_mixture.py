@@ -1,0 +1,159 @@
+"""A mixture of logistic distributions of a range, cut off at the sensor's limits: numbers → density, random ranges."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from numpy.polynomial.legendre import leggauss
+from torch import Tensor
+
+from lidargrit.generation.range_steps import RangeSteps
+from lidargrit.nn.random_choices import sample_index
+
+# Quantiles and their shares in a mean. At the ends of a logistic distribution -ln of its density has no bound, so nodes
+# are dense there: u = s^2 (3 - 2s) of Gauss-Legendre's s.
+_NODES = tuple(
+    (s * s * (3 - 2 * s), 3 * s * (1 - s) * float(weight))
+    for s, weight in (((1 + float(at)) / 2, weight) for at, weight in zip(*leggauss(8), strict=True))
+)
+_SURFACE_V = 0.1  # half the width of a surface in v: a tenth of its range
+_LARGEST_EXPONENT = 80.0  # its exponential stays finite in 32 bits
+_LEAST_MASS = 1e-6  # of a component within the limits; the logarithm stays finite
+
+
+@dataclass(frozen=True)
+class RangeMixture:
+    """The distribution of v = ln(1 + range in metres) of one pixel, for many pixels.
+
+    Every component is cut off at the limits and rescaled, so that ranges of the sensor have probability 1 together.
+
+    Args:
+        logits: logits of the components' weights.
+        centres: centres of the components, in v, within the limits.
+        log_scales: natural logarithm of the components' scales, in v.
+        limits_m: shortest and longest range of the sensor in metres.
+
+    Source:
+        Salimans et al., PixelCNN++, 2017, section 2.1: a mixture of logistics; there of bins, here of a density.
+    """
+
+    logits: Float[Tensor, "*P K"]
+    centres: Float[Tensor, "*P K"]
+    log_scales: Float[Tensor, "*P K"]
+    limits_m: tuple[float, float]
+
+    def at(self, pixels: Bool[Tensor, "*P"]) -> RangeMixture:
+        """Return the distributions of some pixels, one after the other."""
+        return RangeMixture(self.logits[pixels], self.centres[pixels], self.log_scales[pixels], self.limits_m)
+
+    def log_density(self, range_m: Float[Tensor, "*P"]) -> Float[Tensor, "*P"]:
+        """Return the natural logarithm of the probability density per metre."""
+        v = range_m.log1p()[..., None]
+        z = (v - self.centres) * (-self.log_scales).exp()
+        # The logistic density is sigmoid'(z) / scale, and ln sigmoid'(z) = -z - 2 softplus(-z).
+        component = -z - 2 * F.softplus(-z) - self.log_scales - self._mass().clamp(min=_LEAST_MASS).log()
+        weighted = self.logits.log_softmax(-1) + component
+        return weighted.logsumexp(-1) - v[..., 0]  # dv / d range = 1 / (1 + range) = exp(-v)
+
+    def log_mass(self, low_m: Float[Tensor, "*P"], high_m: Float[Tensor, "*P"]) -> Float[Tensor, "*P"]:
+        """Return the natural logarithm of the probability of a range between two ranges within the limits.
+
+        It is computed from the width of the interval, so that it is exact where the interval holds next to nothing.
+        """
+        inverse = (-self.log_scales).exp()
+        below = (low_m.log1p()[..., None] - self.centres) * inverse
+        width = ((high_m - low_m) / (1 + low_m)).log1p()[..., None] * inverse  # dv = ln((1 + high) / (1 + low))
+        # s(b) - s(a) = s(b) s(-a) (1 - exp(a - b)) of the logistic function s.
+        component = F.logsigmoid(below + width) + F.logsigmoid(-below) + (-(-width).expm1()).log()
+        weighted = self.logits.log_softmax(-1) + component - self._mass().clamp(min=_LEAST_MASS).log()
+        return weighted.logsumexp(-1)
+
+    def entropy(self, steps: RangeSteps) -> Float[Tensor, "*P"]:
+        """Return the expected -ln of the probability of a step, by Gauss-Legendre quadrature over the quantiles of
+        every component."""
+        low, mass = self._bounds()[0], self._mass()
+        total = torch.zeros_like(self.centres[..., 0])
+        weights = self.logits.softmax(-1)
+        for quantile, share in _NODES:
+            level = (low + quantile * mass).clamp(1e-6, 1 - 1e-6)
+            v = self.centres + self.log_scales.exp() * level.logit()
+            for component in range(v.shape[-1]):
+                edges_m = steps.edges_m(steps.indices(v[..., component].expm1()))
+                nats = -self.log_mass(*edges_m).to(total.dtype)
+                total = total + weights[..., component] * nats * share
+        return total
+
+    def sample(
+        self, component: Float[Tensor, "*P"], within: Float[Tensor, "*P"], temperature: float = 1.0, noise: float = 1.0
+    ) -> Float[Tensor, "*P"]:
+        """Return one range in metres for each pixel.
+
+        Args:
+            component: uniform random numbers in [0, 1) that choose a component.
+            within: uniform random numbers in [0, 1) that choose a range of the component.
+            temperature: temperature of the density on one surface; 1 leaves it unchanged, below 1 prefers the densest
+                of the components there. Surfaces that lie apart keep their probabilities.
+            noise: multiplier of the components' scales.
+        """
+        scaled = RangeMixture(
+            self._tempered_logits(temperature),
+            self.centres,
+            self.log_scales + torch.tensor(noise, dtype=self.log_scales.dtype).log(),
+            self.limits_m,
+        )
+        chosen = sample_index(scaled.logits, component)[..., None]
+        low, high = (bound.gather(-1, chosen)[..., 0].double() for bound in scaled._bounds())
+        centre = scaled.centres.gather(-1, chosen)[..., 0].double()
+        scale = scaled.log_scales.gather(-1, chosen)[..., 0].double().exp()
+        level = (low + within.double() * (high - low)).clamp(1e-9, 1 - 1e-9)
+        return (centre + scale * level.logit()).expm1().clamp(*self.limits_m).float()
+
+    def _tempered_logits(self, temperature: float) -> Float[Tensor, "*P K"]:
+        """Return the logits of the components' weights at a temperature T of the density on each surface.
+
+        The surface of a component is what lies within ``_SURFACE_V`` of its centre. The component's weight is
+        multiplied by d^(1/T - 1) of the density d at its centre, and divided by the mean of that power over the
+        surface: over all components, each counted by its probability there, cut-offs left out. So components compete
+        with those that reach the same surface: a pole loses little to the wall behind it, and only where it is so broad
+        that the wall lies within its spread. A temperature of the whole density would take half of all poles away.
+        """
+        if temperature == 1:
+            return self.logits
+        log_weights = self.logits.log_softmax(-1)
+        inverse = (-self.log_scales).exp()
+        power = (1 / temperature - 1) * self._log_density_at_centres(log_weights)
+        parts = (self.centres, inverse, log_weights.exp(), power)
+        mass, total = torch.zeros_like(self.centres), torch.zeros_like(self.centres)
+        for centre, steepness, weight, of_other in zip(*(part.split(1, -1) for part in parts), strict=True):
+            z, half = (self.centres - centre).abs_().mul_(-steepness), _SURFACE_V * steepness
+            # The other's probability there. A negative z keeps its digits where it is next to nothing.
+            there = (z + half).sigmoid_().sub_((z - half).sigmoid_()).mul_(weight)
+            mass += there
+            total += there.mul_((of_other - power).clamp_(max=_LARGEST_EXPONENT).exp_())
+        least = torch.finfo(mass.dtype).tiny  # the logarithm stays finite
+        return log_weights + mass.clamp(min=least).log() - total.clamp(min=least).log()
+
+    def _log_density_at_centres(self, log_weights: Float[Tensor, "*P K"]) -> Float[Tensor, "*P K"]:
+        """Return the natural logarithm of the density of v at every component's centre."""
+        inverse = (-self.log_scales).exp()
+        heights = (log_weights - self.log_scales - self._mass().clamp(min=_LEAST_MASS).log()).exp()
+        parts = (self.centres, inverse, heights)
+        density = torch.zeros_like(self.centres)
+        # One component after the other takes less memory than all pairs at once, and half the time.
+        for centre, steepness, height in zip(*(part.split(1, -1) for part in parts), strict=True):
+            s = ((self.centres - centre) * steepness).sigmoid_()
+            density += s.addcmul_(s, s, value=-1).mul_(height)  # the logistic density is s (1 - s) / scale
+        return density.clamp(min=torch.finfo(density.dtype).tiny).log()
+
+    def _bounds(self) -> tuple[Float[Tensor, "*P K"], Float[Tensor, "*P K"]]:
+        """Return each component's distribution function at the two limits."""
+        low, high = torch.tensor(self.limits_m, dtype=self.centres.dtype, device=self.centres.device).log1p()
+        inverse = (-self.log_scales).exp()
+        return ((low - self.centres) * inverse).sigmoid(), ((high - self.centres) * inverse).sigmoid()
+
+    def _mass(self) -> Float[Tensor, "*P K"]:
+        low, high = self._bounds()
+        return high - low

@@ -1,0 +1,108 @@
+"""A network with its configuration and sensor ⇄ the two files in which it is saved."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, ClassVar, Generic, TypeVar
+
+from torch import Tensor, nn
+
+from lidargrit.core import configuration
+from lidargrit.core.errors import CheckpointError, ConfigError, UnknownNameError
+from lidargrit.core.files import write_json, write_tensors, write_text
+from lidargrit.data.run_folder import CARD_FILE, CONFIG_FILE, WEIGHTS_FILE
+from lidargrit.nn.exact_weights import load_exactly
+from lidargrit.nn.quantization import WeightBits, with_quantized
+from lidargrit.scans.sensors import SensorModel
+
+ConfigT = TypeVar("ConfigT")
+ModelT = TypeVar("ModelT", bound=nn.Module)
+
+
+@contextmanager
+def told_of(path: Path) -> Iterator[None]:
+    """Turn what the ``with`` block meets in a file of settings into a CheckpointError that names the file."""
+    try:
+        yield
+    except (ConfigError, UnknownNameError) as error:
+        names_it = str(path) in error.got
+        got = error.got if names_it else f"{path}, in which stands {error.got}"
+        raise CheckpointError(got, error.wanted, error.cure if names_it else "restore the file") from None
+
+
+class SavedModel(nn.Module, Generic[ConfigT]):
+    """A network that is made from a configuration and a sensor, and that can be written to a folder.
+
+    Args:
+        config: settings of the network, an instance of ``Config``.
+        sensor: sensor whose range images the network takes or generates.
+    """
+
+    Config: ClassVar[type]
+
+    def __init__(self, config: ConfigT, sensor: SensorModel) -> None:
+        super().__init__()
+        self.config, self.sensor = config, sensor
+
+    @classmethod
+    def public_name(cls) -> str:
+        """Return the name of the folder in which ``system.py`` defines the class."""
+        return cls.__module__.removesuffix(".system").rpartition(".")[2]
+
+    def weights(self, bits: WeightBits = 32) -> dict[str, Tensor]:
+        """Return the tensors that are saved, by name.
+
+        Args:
+            bits: bits of a parameter; a network that reads them computes in 32 bits as before. With 8, matrices and
+                kernels are quantized, and vectors such as biases have 16 bits. Buffers are saved as they are.
+
+        Raises:
+            ConfigError: a parameter is beyond what 16 bits hold, and not to be stored in 32.
+        """
+        named = {} if bits == 32 else {name: each.detach() for name, each in self.named_parameters()}
+        halved = {name: each.half() for name, each in named.items()}
+        for name, weight in halved.items():
+            if not weight.isfinite().all():
+                largest = named[name].abs().max()
+                raise ConfigError(f"weights {name!r} of up to {largest:g}", "at most 65,504", "store 32 bits")
+        matrices = {name: each for name, each in named.items() if bits == 8 and each.ndim >= 2}
+        return with_quantized({**self.state_dict(), **halved, **matrices}, matrices.keys())
+
+    def save(self, folder: Path, bits: WeightBits = 32) -> None:
+        """Write :meth:`weights` and, last, the configuration that says they are there."""
+        write_tensors(folder / WEIGHTS_FILE, self.weights(bits))
+        config = {
+            "generator": self.public_name(),
+            "config": configuration.to_json(self.config),
+            "sensor": self.sensor.to_json(),
+        }
+        write_json(folder / CONFIG_FILE, config)
+
+    @classmethod
+    def from_weights(
+        cls: type[ModelT], config: Any, sensor: SensorModel, weights: dict[str, Tensor], source: Path
+    ) -> ModelT:
+        """Make a generator with given weights.
+
+        Raises:
+            CheckpointError: weights of another configuration.
+        """
+        generator = cls(config, sensor)
+        load_exactly(generator, weights, source)
+        return generator.eval()
+
+    def save_pretrained(self, folder: str | Path, card: str = "", bits: WeightBits = 32) -> None:
+        """Write what a repository of the Hugging Face hub holds: weights, configuration, and a model card if given.
+
+        These are the files of :meth:`save`. ``lidargrit publish`` writes the card from a run.
+
+        Args:
+            folder: folder that gets the files.
+            card: text of ``README.md``, in Markdown; no such file if empty.
+            bits: bits of a parameter, 8, 16 or 32; see :meth:`weights`.
+        """
+        self.save(Path(folder), bits)
+        if card:
+            write_text(Path(folder) / CARD_FILE, card)

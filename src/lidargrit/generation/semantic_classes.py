@@ -1,0 +1,86 @@
+"""The classes that networks learn, those of SemanticKITTI's benchmark: numbers of labels ⇄ indices and channels.
+
+Source: Behley et al., SemanticKITTI, ICCV 2019: the 19 classes of its single-scan benchmark, in which what stands and
+what moves is one class. Other structures, other objects and outliers are none of them.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from lidargrit.core.errors import ConfigError
+
+CLASSES: Final[dict[str, tuple[int, ...]]] = {  # numbers of the labels of each; the first is written
+    "car": (10, 252),
+    "bicycle": (11,),
+    "motorcycle": (15,),
+    "truck": (18, 258),
+    "other vehicle": (20, 13, 16, 256, 257, 259),
+    "person": (30, 254),
+    "cyclist": (31, 253),
+    "motorcyclist": (32, 255),
+    "road": (40, 60),
+    "parking": (44,),
+    "pavement": (48,),
+    "other ground": (49,),
+    "building": (50,),
+    "fence": (51,),
+    "vegetation": (70,),
+    "trunk": (71,),
+    "terrain": (72,),
+    "pole": (80,),
+    "traffic sign": (81,),
+}
+NUM_CLASSES: Final = len(CLASSES)
+# 0 for labels of no class, such as those that are not known; the last stands for all numbers from there on.
+_INDEX = torch.zeros(max(number for numbers in CLASSES.values() for number in numbers) + 2, dtype=torch.int64)
+for _index, _numbers in enumerate(CLASSES.values()):
+    _INDEX[list(_numbers)] = _index + 1
+_NUMBER = torch.tensor([0, *(numbers[0] for numbers in CLASSES.values())])
+
+
+def class_indices(label: Int[Tensor, "*B"]) -> Int[Tensor, "*B"]:
+    """Return the class of each label, from 1 to 19; 0 for labels of no class."""
+    return _INDEX.to(label.device)[label.clamp(0, len(_INDEX) - 1)]
+
+
+def labels_of(indices: Int[Tensor, "*B"]) -> Int[Tensor, "*B"]:
+    """Return the label that is written for each class, by SemanticKITTI's numbers; 0 for the class 0."""
+    return _NUMBER.to(indices.device)[indices]
+
+
+class ClassMaps(nn.Module):
+    """Labels of pixels → a few learned channels for each, all of them 0 where the class is not known.
+
+    Args:
+        channels: number of channels of a label.
+    """
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.embedding = nn.Embedding(NUM_CLASSES + 1, channels, padding_idx=0)
+
+    def forward(self, indices: Int[Tensor, "B S H W"]) -> Float[Tensor, "B C H W"]:
+        """Return the channels of all labels of a pixel, one label after the other."""
+        return self.embedding(indices).permute(0, 1, 4, 2, 3).flatten(1, 2)
+
+
+def votes(indices: Int[Tensor, "B S H W"], weights: Float[Tensor, "B S H W"]) -> Float[Tensor, "B 19 H W"]:
+    """Return for each class the sum of the weights of the labels that are of this class."""
+    size = (len(indices), NUM_CLASSES + 1, *indices.shape[2:])
+    return weights.new_zeros(size).scatter_add(1, indices, weights)[:, 1:]
+
+
+def labels_to_learn(label: Int[Tensor, "B H W"] | None) -> Int[Tensor, "B H W"]:
+    """Return the labels of training scans; refuse scans without them, with ConfigError."""
+    if label is None:
+        raise ConfigError(
+            "training scans without labels, for a network with labels=true",
+            "scans with labels, such as simulated:512:train",
+            "name such scans, or prepare them anew; or leave labels out",
+        )
+    return label

@@ -1,0 +1,166 @@
+"""An experiment as settings: its data, its model, and the training of each of its stages."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from lidargrit.core.errors import ConfigError
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.generation.generator import Generator, load_class
+from lidargrit.nn.size import numbers_at_most
+from lidargrit.scans.augmentation import Augmentation
+from lidargrit.scans.sensors import SensorModel
+
+_BATCH_AT_MOST = 65_536  # scans: 4 GB of the smallest images, and more than any step learns from
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """How one stage of a generator is trained; every duration is a number of scans seen.
+
+    Args:
+        scans: number of scans seen over the whole training of the stage.
+        batch_size: number of scans in a batch, over all processes.
+        accumulate: number of parts in which each process takes its share of a batch, one after the other. More parts
+            need less memory. The step is the same in expectation: each part has random numbers of its own, a loss that
+            is divided by the returns of a batch is divided by those of a part, and codes move or restart after a part.
+        learning_rate: highest learning rate.
+        schedule: course of the learning rate. ``constant``; ``cosine`` falls to 0 over all scans;
+            ``linear_second_half`` stays constant for the first half and falls to 0 over the second, as LidarGRIT's
+            program does for its KITTI-360 transformer.
+        warmup_scans: number of scans over which the learning rate rises linearly from 0.
+        optimiser: ``adamw``, as in all papers here, or ``muon``: Muon for the linear layers in a transformer's blocks,
+            whose updates it makes orthogonal (Jordan et al., 2024), and AdamW for all other weights. A transformer
+            learns more from equally many scans with it.
+        betas: decay rates of Adam's two moments.
+        weight_decay: decay of the weights of linear layers; other weights do not decay, as in LidarGRIT's program.
+        gradient_clip: largest norm of the gradient; 0 for no limit.
+        average_over_scans: half-life, in scans, of the moving average of the weights; the averaged weights are
+            validated and become the model. 0 for no averaging.
+        precision: ``bf16`` computes convolutions and matrix products in 16 bits, sums and losses in 32. ``auto`` does
+            so where the machine has instructions for it; elsewhere 16 bits are many times slower.
+        recompute: whether to drop the activations within blocks and compute them again for the gradients: less memory,
+            the same gradients, about a third more operations.
+        compile: whether to use ``torch.compile``, which needs a C++ compiler, and minutes before the first step.
+        augmentations: kinds of augmentation, applied in this order; see lidargrit.scans.augmentation.
+        any_columns: whether an image may begin at any of the first n fine columns where the sensor keeps every n-th,
+            so that each scan gives n different images. LidarGRIT's program always begins at the first.
+        validate_every: number of scans between two validations.
+        validation_scans: largest number of scans in a validation, evenly spaced over the validation set.
+        checkpoint_every: number of scans between two checkpoints.
+        pictures_every: number of scans between two pictures of reconstructed or sampled scans; 0 for none.
+    """
+
+    scans: int
+    batch_size: int
+    learning_rate: float
+    schedule: Literal["constant", "cosine", "linear_second_half"] = "constant"
+    warmup_scans: int = 0
+    optimiser: Literal["adamw", "muon"] = "adamw"
+    betas: tuple[float, float] = (0.9, 0.95)
+    weight_decay: float = 0.0
+    gradient_clip: float = 1.0
+    average_over_scans: int = 1000
+    accumulate: int = 1
+    precision: Literal["fp32", "bf16", "auto"] = "fp32"
+    recompute: bool = False
+    compile: bool = False
+    augmentations: tuple[Augmentation, ...] = ()
+    any_columns: bool = False
+    validate_every: int = 1000
+    validation_scans: int = 64
+    checkpoint_every: int = 1000
+    pictures_every: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("scans", "batch_size", "accumulate", "validate_every", "validation_scans", "checkpoint_every"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"{name}={getattr(self, name)}", "at least 1", "raise it")
+        for name in ("warmup_scans", "weight_decay", "gradient_clip", "average_over_scans", "pictures_every"):
+            if not getattr(self, name) >= 0:
+                raise ConfigError(f"{name}={getattr(self, name)}", "0 or more", "raise it")
+        if self.batch_size > _BATCH_AT_MOST:
+            raise ConfigError(f"batch_size={self.batch_size}", f"at most {_BATCH_AT_MOST}", "lower it")
+        if not all(0 <= beta < 1 for beta in self.betas):
+            raise ConfigError(f"betas={self.betas}", "two numbers in [0, 1)", "e.g. [0.9,0.95]")
+        if not self.learning_rate > 0:
+            raise ConfigError(f"learning_rate={self.learning_rate}", "a positive number", "raise it")
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """One experiment.
+
+    Args:
+        title: description of the experiment in one line.
+        generator: name of the generator in lidargrit.generation.generator.
+        model: configuration of the generator, of its own ``Config`` class.
+        data: settings of the data.
+        training: settings of the training, by the name of the stage.
+        seed: seed of everything random: weights, order, augmentation, dropout.
+        published: scores that a paper reports for the experiment, for the reader; empty if no paper does.
+        tokenizer_from: folder of a finished run whose tokenizer is used as it is; if empty, a tokenizer is trained.
+        stages_from: folder of a finished run whose stages are all used as they are; only stages that it lacks are
+            trained, such as a pixel decoder over a finished model.
+        train_anew: names of stages that are trained from new weights although the run of ``stages_from`` has them.
+        fine_tune: names of stages that start from the weights of the run of ``stages_from`` and are trained further.
+    """
+
+    title: str
+    generator: str
+    model: Any
+    data: DataConfig
+    training: dict[str, FitConfig]
+    seed: int = 0
+    published: str = ""
+    tokenizer_from: str | None = None
+    stages_from: str | None = None
+    train_anew: tuple[str, ...] = ()
+    fine_tune: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for setting in ("tokenizer_from", "stages_from"):
+            if getattr(self, setting) == "":  # not the current folder
+                object.__setattr__(self, setting, None)
+        if self.tokenizer_from is not None and self.stages_from is not None:
+            raise ConfigError(
+                "tokenizer_from and stages_from together",
+                "one of them: the stages of a run include its tokenizer",
+                "leave tokenizer_from out",
+            )
+        for setting, stages in (("fine_tune", self.fine_tune), ("train_anew", self.train_anew)):
+            if stages and self.stages_from is None:
+                raise ConfigError(
+                    f"{setting}={stages[0]} without stages_from",
+                    "the run that has this stage",
+                    "set stages_from as well",
+                )
+        if self.seed < 0:
+            raise ConfigError(f"seed={self.seed}", "0 or more", "choose another seed")
+
+    def settings_of(self, stage: str) -> FitConfig:
+        """Return the settings of a stage's training.
+
+        Raises:
+            ConfigError: the recipe has none for this stage.
+        """
+        if stage not in self.training:
+            raise ConfigError(
+                f"a recipe without training.{stage}, a stage of model={self.generator}",
+                "the settings of every stage's training",
+                f"leave out the model.* that adds {stage}, or begin with a recipe that trains it",
+            )
+        return self.training[stage]
+
+    def build_generator(self, sensor: SensorModel | None = None) -> Generator:
+        """Return the generator with new random weights.
+
+        Args:
+            sensor: sensor of its scans; that of the data if not given.
+
+        Raises:
+            ConfigError: the generator does not fit the sensor, or is too large.
+        """
+        with numbers_at_most():
+            return load_class(self.generator)(self.model, sensor or self.data.load_sensor())

@@ -1,0 +1,140 @@
+"""The contract of a tokenizer, which turns range images into tokens and back, and how a configuration names it."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Generic, TypeVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidargrit.core import discovery
+from lidargrit.core.configuration import NamedConfig
+from lidargrit.generation.objective import Objective
+from lidargrit.nn.precision import Precision
+from lidargrit.nn.quantiser import VectorQuantiser
+from lidargrit.scans.sensors import SensorModel
+from lidargrit.scans.types import Decoded, MaskDecoding, RangeImage, TokenGrid
+
+_COLLAPSED_BELOW = 0.05  # perplexity over number of codes; healthy codebooks of ours keep above a half
+
+
+@dataclass(frozen=True)
+class TokenizerConfig(NamedConfig):
+    """Base of the tokenizers' configurations; the file that defines one, and the tokenizer with it, is its name."""
+
+    package: ClassVar[str] = "tokenizers"
+    default_name: ClassVar[str] = "vqvae"
+
+
+Config = TypeVar("Config", bound=TokenizerConfig)
+
+
+class Tokenizer(Objective, Generic[Config]):
+    """Turns range images of one sensor into a grid of tokens and back; an objective of training as it stands.
+
+    A new tokenizer is one file of this folder with two public classes: a ``TokenizerConfig`` and the ``Tokenizer`` that
+    is made of it and a sensor. Every generator over tokens takes it by its configuration.
+
+    Attributes:
+        config: its configuration.
+        sensor: the rays and limits of its range images.
+        num_codes: number of different tokens.
+        grid_size: rows and columns of the token grid.
+        num_features: channels of ``Decoded.features``; 0 if ``decode`` gives none.
+    """
+
+    num_codes: int
+    grid_size: tuple[int, int]
+    num_features: int = 0
+
+    def __init__(self, config: Config, sensor: SensorModel) -> None:
+        super().__init__(sensor)
+        self.config = config
+
+    @abstractmethod
+    def encode(self, images: RangeImage) -> TokenGrid:
+        """Return the tokens (B, h, w) of a batch."""
+
+    @abstractmethod
+    def decode(self, tokens: TokenGrid) -> Decoded:
+        """Decode a batch of tokens (B, h, w) to ranges and return logits of every pixel."""
+
+    @abstractmethod
+    def decoding_flops(self) -> int:
+        """Return the floating-point operations of decoding one scan as :meth:`for_decoding` does."""
+
+    def for_decoding(self, precision: Precision) -> Tokenizer[Config]:
+        """Return a tokenizer with the same weights that only decodes, perhaps quicker or in 16 bits."""
+        return self
+
+    def sample(
+        self, tokens: TokenGrid, rngs: Sequence[torch.Generator], mask: MaskDecoding = "bernoulli"
+    ) -> RangeImage:
+        """Return one scan for each token grid of a batch, its random numbers from its own generator.
+
+        Args:
+            tokens: token grids (B, h, w).
+            rngs: random generators on the CPU, one for each scan.
+            mask: ``bernoulli`` samples each return with its probability (the authors' program); ``threshold`` keeps a
+                return whose probability is at least 0.5 (the paper).
+        """
+        decoded = self.decode(tokens)
+        return decoded.threshold() if mask == "threshold" else decoded.sample(rngs)
+
+    @torch.no_grad()
+    def reconstruct(self, images: RangeImage) -> RangeImage:
+        """Encode and decode a batch of scans, the mask by threshold."""
+        return self.decode(self.encode(images)).threshold()
+
+
+class CodebookTokenizer(Tokenizer[Config]):
+    """A tokenizer whose tokens are the codes nearest to continuous latents.
+
+    A generator may sample latents instead of tokens, and have them quantised before they are decoded.
+
+    Attributes:
+        quantize: codebook.
+    """
+
+    quantize: VectorQuantiser
+
+    @abstractmethod
+    def latents(self, images: RangeImage) -> Float[Tensor, "B D h w"]:
+        """Return the continuous latents of a batch, before quantisation."""
+
+    def encode(self, images: RangeImage) -> TokenGrid:
+        """Return the tokens (B, h, w) of a batch."""
+        return self.quantised(self.latents(images).float())
+
+    def quantised(self, latents: Float[Tensor, "B D h w"]) -> TokenGrid:
+        """Return the tokens (B, h, w) of latents."""
+        tokens = self.quantize.nearest(latents.movedim(1, -1).flatten(0, -2))
+        return TokenGrid(tokens.unflatten(0, (len(latents), *latents.shape[2:])), self.num_codes)
+
+    def warnings(self) -> list[str]:
+        """Return a line with the remedy if the codebook has collapsed."""
+        perplexity, used = float(self.quantize.perplexity()), self.quantize.used_share()
+        if perplexity >= _COLLAPSED_BELOW * self.num_codes:
+            return []
+        remedy = (
+            "raise the budget or lower model.tokenizer.num_codes"
+            if self.quantize.restart_dead
+            else "--set model.tokenizer.restart_dead_codes=true model.tokenizer.codebook_loss=ema"
+        )
+        return [
+            f"the codebook has collapsed: {perplexity:.1f} of {self.num_codes} codes in effect, {used:.0%} alive; "
+            f"the remedy: {remedy}"
+        ]
+
+
+def make_tokenizer(config: TokenizerConfig, sensor: SensorModel) -> Tokenizer[Any]:
+    """Return a tokenizer of the kind that the configuration is of, with fresh weights."""
+    return _load_class(config.name())(config, sensor)
+
+
+def _load_class(name: str) -> type[Tokenizer[Any]]:
+    return discovery.load_class("tokenizers", name, Tokenizer)

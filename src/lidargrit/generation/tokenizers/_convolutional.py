@@ -1,0 +1,123 @@
+"""Base of the VQ-VAEs: checks of sizes, levels of residual blocks, encoder, decoder and codebook."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterable
+
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from lidargrit.core.errors import ConfigError
+from lidargrit.generation.tokenizers import CodebookTokenizer, Config
+from lidargrit.nn.blocks import Network
+from lidargrit.nn.convolution import Convolution
+from lidargrit.nn.quantiser import CodebookLoss, VectorQuantiser
+from lidargrit.scans.types import RangeImage
+
+
+def check_sizes(channels: int, residual_blocks: int, code_dim: int, num_codes: int, norm_groups: int) -> None:
+    """Refuse sizes of which no network can be built.
+
+    Raises:
+        ConfigError: channels that the norms' groups do not divide, or a number out of bounds.
+    """
+    if norm_groups < 1:
+        raise ConfigError(f"norm_groups={norm_groups}", "at least 1", "32 are published")
+    if channels < 1 or channels % norm_groups:
+        wanted, cure = f"a positive multiple of {norm_groups}", f"the norms share {norm_groups} groups: round it up"
+        raise ConfigError(f"channels={channels}", wanted, cure)
+    sizes = {"residual_blocks": residual_blocks, "code_dim": code_dim, "num_codes": num_codes}
+    most = {"residual_blocks": 100, "code_dim": 16_384, "num_codes": 65_536}
+    for name, size in sizes.items():
+        if not 1 <= size <= most[name]:
+            raise ConfigError(f"{name}={size}", f"1 to {most[name]}", "correct it")
+
+
+class Level(nn.Module):
+    """One resolution of an encoder or a decoder: residual blocks, then perhaps a change of resolution.
+
+    Args:
+        blocks: residual blocks, in their order.
+    """
+
+    def __init__(self, blocks: Iterable[nn.Module]) -> None:
+        super().__init__()
+        self.block = nn.ModuleList(blocks)
+        self.downsample: nn.Module | None = None
+        self.upsample: nn.Module | None = None
+
+    def forward(self, x: Float[Tensor, "B C H W"]) -> Float[Tensor, "B D h w"]:
+        """Return the feature maps of the next level."""
+        for block in self.block:
+            x = block(x)
+        if self.downsample is not None:
+            x = self.downsample(x)
+        return x if self.upsample is None else self.upsample(x)
+
+
+class ConvolutionalEncoder(Network):
+    """The network from encoded images (B, channels, H, W) to latents (B, code_dim, h, w)."""
+
+    conv_in: Convolution
+    down: nn.ModuleList
+    mid: nn.Module
+    norm_out: nn.Module
+    conv_out: Convolution
+
+    def forward(self, x: Float[Tensor, "B C H W"]) -> Float[Tensor, "B D h w"]:
+        """Shrink the image to its latents."""
+        x = self.conv_in(x)
+        for level in self.down:
+            x = level(x)
+        return self.conv_out(F.silu(self.norm_out(self.mid(x))))
+
+
+class ConvolutionalDecoder(Network):
+    """The network from latents (B, code_dim, h, w) to the channels of an image."""
+
+    conv_in: Convolution
+    mid: nn.Module
+    up: nn.ModuleList
+    norm_out: nn.Module
+    conv_out: Convolution
+
+    def forward(self, z: Float[Tensor, "B D h w"]) -> Float[Tensor, "B heads H W"]:
+        """Grow the latents to an image."""
+        return self.conv_out(self.features(z))
+
+    def features(self, z: Float[Tensor, "B D h w"]) -> Float[Tensor, "B C H W"]:
+        """Return the feature maps that the last convolution reads, at the image's full resolution, in 32 bits."""
+        x = self.mid(self.conv_in(z.to(self.conv_in.weight)))
+        for level in reversed(self.up):  # the references number their levels from the finest
+            x = level(x)
+        return F.silu(self.norm_out(x.to(self.conv_out.weight.dtype)))
+
+
+class ConvolutionalTokenizer(CodebookTokenizer[Config]):
+    """A VQ-VAE: encoder, 1x1 convolution, codebook, 1x1 convolution, decoder."""
+
+    encoder: ConvolutionalEncoder
+    quant_conv: nn.Conv2d
+    post_quant_conv: nn.Conv2d
+
+    def _add_codebook(self, num_codes: int, code_dim: int, loss: CodebookLoss, restart_dead: bool) -> None:
+        """Make what lies between encoder and decoder."""
+        self.num_codes = num_codes
+        self.quantize = VectorQuantiser(num_codes, code_dim, loss, restart_dead)
+        self.quant_conv, self.post_quant_conv = (nn.Conv2d(code_dim, code_dim, 1) for _ in range(2))
+
+    @abstractmethod
+    def _encoded(self, images: RangeImage) -> Float[Tensor, "B C H W"]:
+        """Map the images of a batch to the encoder's input channels."""
+
+    def latents(self, images: RangeImage) -> Float[Tensor, "B D h w"]:
+        """Return the continuous latents of a batch, before quantisation.
+
+        Raises:
+            ConfigError: a single image.
+        """
+        if images.range_m.ndim != 3:
+            raise ConfigError("a single range image", "a batch", "make one with RangeImage.stack([image])")
+        return self.quant_conv(self.encoder(self._encoded(images)))

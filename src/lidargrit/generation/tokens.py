@@ -1,0 +1,278 @@
+"""Base of generators of tokens, with any tokenizer and any order of sampling."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from dataclasses import dataclass, field, fields, replace
+from typing import Literal, TypeVar
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from lidargrit.core.errors import ConfigError
+from lidargrit.generation.encoding_cache import EncodingCache, Frozen
+from lidargrit.generation.facts import Cost
+from lidargrit.generation.generator import Generator
+from lidargrit.generation.objective import Objective
+from lidargrit.generation.pixel_decoder.pixel_decoder import PixelDecoder, PixelSampling, nats_to_range_bits
+from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
+from lidargrit.generation.range_steps import RangeSteps
+from lidargrit.generation.tokenizers import Tokenizer, TokenizerConfig, make_tokenizer
+from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
+from lidargrit.nn.precision import without_autocast
+from lidargrit.nn.processes import sum_over_processes
+from lidargrit.nn.transformer import Transformer, TransformerConfig, resample_positions
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.fills import fill_from_nearest
+from lidargrit.scans.sensors import SensorModel
+from lidargrit.scans.types import RangeImage, ScanBits, TokenGrid
+
+_DECODED_AT_ONCE = 4  # scans; enough to keep a GPU busy, and more would only take memory: 35 MB a layer at 64x1024
+
+
+PixelChoice = Literal["auto", "pixels", "bernoulli", "threshold"]
+"""How the pixels of sampled tokens are decided: by the pixel decoder, or by the tokenizer's decoder alone."""
+
+
+@dataclass(frozen=True)
+class TokenGeneratorConfig:
+    """The networks of a generator of tokens.
+
+    Args:
+        tokenizer: configuration of any tokenizer.
+        transformer: sizes of the transformer that models the tokens.
+        pixels: sizes of a pixel decoder, which samples returns and ranges in phases; none in the paper.
+    """
+
+    tokenizer: TokenizerConfig = field(default_factory=VqvaeConfig)
+    transformer: TransformerConfig = field(default_factory=TransformerConfig)
+    pixels: PixelDecoderConfig | None = None
+
+
+TokenConfigT = TypeVar("TokenConfigT", bound=TokenGeneratorConfig)
+SamplingT = TypeVar("SamplingT")
+
+
+class TokenGenerator(Generator[TokenConfigT, SamplingT]):
+    """A tokenizer, trained first, and a ``transformer`` over its tokens, trained over the frozen tokenizer.
+
+    A third stage, ``pixels``, trains a pixel decoder over the frozen tokenizer, if the configuration has one.
+    """
+
+    Config = TokenGeneratorConfig
+    capabilities = frozenset({"tokens", "encode", "likelihood"})
+
+    def __init__(self, config: TokenConfigT, sensor: SensorModel) -> None:
+        super().__init__(config, sensor)
+        self.tokenizer = make_tokenizer(config.tokenizer, sensor)
+        self.pixels: PixelDecoder | None = None
+        if config.pixels is not None:
+            if not self.tokenizer.num_features:
+                raise ConfigError(
+                    f"model.pixels over the tokenizer {config.tokenizer.name()!r}, whose decoder gives no features",
+                    "a tokenizer with features, such as vqvae",
+                    "choose another tokenizer, or leave model.pixels out",
+                )
+            self.pixels = PixelDecoder(config.pixels, sensor, self.tokenizer.num_features)
+
+    @abstractmethod
+    def transformer_objective(self) -> Objective:
+        """Return the objective of the transformer over the frozen tokenizer."""
+
+    def objective(self, stage: str) -> Objective:
+        """Return the tokenizer itself, or the objective of a network over the frozen tokenizer."""
+        if stage == "pixels" and self.pixels is not None:
+            return PixelObjective(self.pixels, self.tokenizer)
+        return self.tokenizer if stage == "tokenizer" else self.transformer_objective()
+
+    @classmethod
+    def smallest_config(cls, sensor: SensorModel) -> TokenConfigT:
+        """Return a VQ-VAE of one block a level, and a transformer of one layer."""
+        tokenizer = VqvaeConfig(channels=32, channel_multipliers=(1, 1, 1, 1), code_dim=8, num_codes=32)
+        return cls.Config(tokenizer, TransformerConfig(layers=1, heads=2, width=16))
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """The tokenizer, then the transformer over its tokens, then the pixel decoder, if there is one."""
+        stages = ("tokenizer", "transformer")
+        return stages if self.config.pixels is None else (*stages, "pixels")
+
+    def load_stage(self, stage: str, objective: Objective) -> None:
+        """Take over a stage's trained weights."""
+        if stage == "tokenizer":
+            self.tokenizer.load_state_dict(objective.state_dict())
+        else:
+            self.get_submodule(stage).load_state_dict(objective.get_submodule(stage).state_dict())
+
+    def get_tokenizer(self) -> Tokenizer:
+        """Return the tokenizer."""
+        return self.tokenizer
+
+    def _reconstruct(self, images: RangeImage) -> RangeImage:
+        """Return what the tokens keep of a batch of scans, the mask by threshold."""
+        return self.tokenizer.reconstruct(images)
+
+    def check_choice(self, mask: PixelChoice, pixels: PixelSampling) -> None:
+        """Refuse, before any token is sampled, a choice of the pixel decoder where there is none, and changed settings
+        of it where it samples nothing, with ConfigError."""
+        if mask == "pixels" and self.pixels is None:
+            raise ConfigError(
+                "mask=pixels for a model without a pixel decoder",
+                "a model with one",
+                "leave mask out, or train a recipe with the stage pixels, such as compact_pixels",
+            )
+        if self.pixels is None or mask not in ("auto", "pixels"):
+            of_networks = replace(PixelSampling(), precision=pixels.precision)  # that of the tokenizer's decoder, too
+            for each in fields(pixels):
+                if getattr(pixels, each.name) != getattr(of_networks, each.name):
+                    without = "a model without one" if self.pixels is None else f"mask={mask}"
+                    got = f"{each.name}={getattr(pixels, each.name)}, which the pixel decoder reads, for {without}"
+                    cure = "leave it out" if self.pixels is None else "leave it out, or take mask=pixels"
+                    raise ConfigError(got, "settings that have an effect", cure)
+
+    def decode(
+        self,
+        tokens: Int[Tensor, "B T"],
+        wanted: int,
+        rngs: list[torch.Generator],
+        mask: PixelChoice,
+        pixels: PixelSampling,
+        tokenizer: Tokenizer,
+        condition: Condition | None = None,
+    ) -> RangeImage:
+        """Decode sampled tokens to scans: those that are wanted, and the rest of the last one's batch.
+
+        Scans are decoded in batches of one size, as tokens are sampled, because kernels differ by the size.
+
+        Args:
+            tokens: tokens of ``compute_batch`` scans in raster order.
+            wanted: number of scans to return; the rest are the copies of ``BatchSeeds``.
+            rngs: random generators on the CPU, one for each scan.
+            mask: method by which returns and ranges are decided, checked by :meth:`check_choice`.
+            pixels: settings by which the pixel decoder samples masks and ranges.
+            tokenizer: the generator's own tokenizer, or its copy for decoding only.
+            condition: observed part of the scans, which a pixel decoder keeps.
+
+        """
+        images = []
+        for first in range(0, wanted, _DECODED_AT_ONCE):
+            some = slice(first, first + _DECODED_AT_ONCE)
+            grid = TokenGrid(tokens[some].unflatten(1, tokenizer.grid_size), tokenizer.num_codes)
+            if self.pixels is not None and mask in ("auto", "pixels"):
+                part = None if condition is None else condition[some]
+                images.append(self.pixels.sample(tokenizer.decode(grid), rngs[some], pixels, part))
+            else:
+                images.append(tokenizer.sample(grid, rngs[some], "threshold" if mask == "threshold" else "bernoulli"))
+        return RangeImage.cat(images)
+
+    def observed_tokens(self, condition: Condition) -> Int[Tensor, "B T"]:
+        """Return the tokens of all cells with an observed pixel, and -1 for the others.
+
+        They are the tokens of scans in which every unobserved pixel is a copy of the nearest observed one by angle.
+        """
+        observed = condition.return_observed | condition.range_observed
+        filled = fill_from_nearest(condition.surfaces, observed)
+        rows, columns = self.tokenizer.grid_size
+        cell = (self.sensor.height // rows, self.sensor.width // columns)
+        seen = F.max_pool2d(observed[:, None].float(), cell)[:, 0] > 0
+        return torch.where(seen, self.tokenizer.encode(filled).tokens, -1).flatten(1)
+
+    def _bits(self, images: RangeImage, steps: RangeSteps, expected: bool) -> ScanBits:
+        """Return the bits of the tokens, and those of mask and ranges given the tokens, if there is a pixel decoder."""
+        grid = self.tokenizer.encode(images)
+        tokens = self.token_bits(grid)
+        if self.pixels is None:
+            return ScanBits(steps.step_mm, images.return_mask, tokens)
+        decoded = self.tokenizer.decode(grid)
+        return ScanBits(steps.step_mm, images.return_mask, tokens, *self.pixels.bits(decoded, images, steps, expected))
+
+    def token_bits(self, grid: TokenGrid) -> Float[Tensor, "B h w"]:
+        """Return the bits of each token if all tokens are equally likely.
+
+        A generator whose transformer gives exact probabilities of tokens returns their bits instead.
+        """
+        return torch.full(grid.tokens.shape, math.log2(grid.num_codes), device=grid.tokens.device)
+
+    def decoding_cost(self, mask: PixelChoice) -> Cost:
+        """Return the cost of decoding the tokens of one scan, and of its pixel decoder if that samples them."""
+        flops = self.tokenizer.decoding_flops()
+        if self.pixels is None or mask not in ("auto", "pixels"):
+            return Cost(1, flops)
+        return Cost(1 + self.pixels.num_evaluations, flops + self.pixels.flops())
+
+
+class TokenObjective(Objective):
+    """Base of the objectives of transformers over the tokens of a frozen tokenizer."""
+
+    over = ("tokenizer",)
+    token_counts: Tensor
+
+    def __init__(self, tokenizer: Tokenizer, transformer: Transformer) -> None:
+        super().__init__(tokenizer.sensor)
+        self.transformer, self._grid_size = transformer, tokenizer.grid_size
+        self._tokens = EncodingCache(tokenizer, _tokens)
+        self.register_buffer("token_counts", torch.ones(transformer.num_tokens))
+
+    def weights_from(self, trained: Objective) -> dict[str, Tensor]:
+        """Return the weights of a trained transformer, with its positions resampled to this one's columns of tokens."""
+        weights = super().weights_from(trained)
+        if isinstance(trained, TokenObjective):
+            ours, theirs = self._grid_size, trained._grid_size
+            if ours[0] == theirs[0] and ours != theirs:
+                name = "transformer.pos_emb"
+                weights[name] = resample_positions(weights[name], theirs, ours[1])
+        return weights
+
+    @torch.no_grad()
+    def encode(self, images: RangeImage) -> tuple[Int[Tensor, "B T"], Float[Tensor, "B T"]]:
+        """Return the tokens, and their negative log-likelihood in nats by a model that knows only token frequencies."""
+        tokens = self._tokens(images).long().flatten(1)
+        if self.training:
+            ones = torch.ones_like(tokens, dtype=self.token_counts.dtype).flatten()
+            self.token_counts += sum_over_processes(
+                torch.zeros_like(self.token_counts).index_add_(0, tokens.flatten(), ones)
+            )
+        return tokens, -(self.token_counts / self.token_counts.sum()).log()[tokens]
+
+
+class PixelObjective(Objective):
+    """Objective of a pixel decoder: negative log-likelihood of the pixels, given the tokens of a tokenizer if any.
+
+    Args:
+        pixels: the pixel decoder.
+        tokenizer: the frozen tokenizer; None for a pixel decoder without tokens.
+    """
+
+    reaches_all_weights = False  # some phases stand for all
+
+    def __init__(self, pixels: PixelDecoder, tokenizer: Tokenizer | None = None) -> None:
+        super().__init__(pixels.sensor)
+        self.pixels = pixels
+        self._tokens = None if tokenizer is None else EncodingCache(tokenizer, _tokens)
+        self._decoding = None if tokenizer is None else Frozen(tokenizer.for_decoding("fp32"))
+        self.over = () if tokenizer is None else ("tokenizer",)
+
+    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+        """Return the nats of the mask a pixel plus those of the range a return as ``loss``, and each of them in bits.
+
+        In training some phases of each scan stand for all; in validation all are counted.
+        """
+        decoded = None
+        if self._tokens is not None and self._decoding is not None:
+            tokenizer = self._decoding.network(images.range_m.device)
+            with torch.no_grad(), without_autocast(images.range_m.device):  # as when scans are sampled
+                decoded = tokenizer.decode(TokenGrid(self._tokens(images).long(), tokenizer.num_codes))
+        if self.training:
+            mask_nats, range_nats = self.pixels.estimate(decoded, images, rng)
+        else:
+            nll = self.pixels(decoded, images)
+            mask_nats, range_nats = nll.mask.mean(), nll.range.sum() / images.return_mask.sum().clamp(min=1)
+        bits = {"mask_bits": mask_nats / math.log(2), "range_bits": nats_to_range_bits(range_nats)}
+        return {"loss": mask_nats + range_nats, **{name: value.detach() for name, value in bits.items()}}
+
+
+def _tokens(tokenizer: Tokenizer, images: RangeImage) -> Int[Tensor, "B h w"]:
+    return tokenizer.encode(images).tokens.int()  # half as many bytes to keep

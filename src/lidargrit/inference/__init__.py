@@ -1,0 +1,1 @@
+"""A trained run used: completed scans and compressed ones."""

@@ -1,0 +1,244 @@
+"""A user's scans → range images on the grid of a sensor, and the points that lie in their pixels."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Int64
+from torch import Tensor
+
+from lidargrit.core.errors import ConfigError, ScanError
+from lidargrit.core.reporting import Reporter
+from lidargrit.data import formats
+from lidargrit.data.formats import ScanFormat
+from lidargrit.data.images import RangeImages
+from lidargrit.data.prepared.config import DataConfig, ScanSettings
+from lidargrit.data.sources import open_images, open_source
+from lidargrit.data.sources.named import ImageScans, PointScans, named_scans
+from lidargrit.inference.complete import Completer, LearnedCompleter
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.projection import ProjectionVariant, doubts_about_rays, index_map, project, unproject
+from lidargrit.scans.projection.sensor_check import has_few_rings, projection_that_fits, ring_count, told_doubt
+from lidargrit.scans.sensors import ProjectionName, SensorModel, load_sensor
+from lidargrit.scans.types import RangeImage, Scan
+
+_KEPT_UNTOLD = 0.95  # of a scan's points; the rest are strays, or nearer than the sensor's limit
+
+
+@dataclass(frozen=True, eq=False)
+class InputScan:
+    """One scan of a user.
+
+    Args:
+        image: range image (H, W).
+        points: points of the scan; None where it was an image.
+        point_of_pixel: index of the point that fills each pixel, -1 for none; None where it was an image.
+        on_grid: True for pixels that the scan covers; None for all.
+        doubt: sign that another sensor than the named one made the scan, for a person; "" if there is none.
+    """
+
+    image: RangeImage
+    points: Scan | None = None
+    point_of_pixel: Int64[Tensor, "H W"] | None = None
+    on_grid: Bool[Tensor, "H W"] | None = None
+    doubt: str = ""
+
+    def joined(self, completed: RangeImage, condition: Condition) -> Scan:
+        """Return the points of a completed scan: its own where ranges were observed, elsewhere points on the pixels'
+        rays.
+
+        Reflectance and label are kept where the whole completed scan has them; observed points keep their instances.
+        Where a model gives reflectance to points whose ranges alone were observed, it takes the place of their own.
+        """
+        kept = condition.range_observed[0] & completed.return_mask
+        if self.points is None or self.point_of_pixel is None or not bool(kept.any()):
+            return unproject(completed)
+        own = self.points
+        at = self.point_of_pixel[kept]
+        added = completed.return_mask & ~kept
+        new = RangeImage.masked(completed.range_m, added, completed.sensor, completed.reflectance, completed.label)
+        rows = torch.arange(completed.sensor.height)[:, None].expand_as(kept)
+        reflectance = None if own.reflectance is None else own.reflectance[at]
+        whole = Scan(
+            own.points_xyz_m[at],
+            reflectance if completed.reflectance is None else completed.reflectance[kept],
+            rows[kept],
+            None if own.label is None else own.label[at],
+            own.source,
+        )
+        return _together(whole, unproject(new)) if bool(added.any()) else whole
+
+
+class Inputs:
+    """The scans of a source, one after the other.
+
+    Args:
+        scans: scans of the source.
+        reader: projection of points to range images.
+        reporter: receiver of how many points of the first scan have a pixel, and of the first doubt about the sensor.
+    """
+
+    def __init__(self, scans: PointScans | ImageScans, reader: ScanReader, reporter: Reporter) -> None:
+        self._scans, self._reader, self._reporter = scans, reader, reporter
+        self._counted = self._doubted = False
+
+    def __len__(self) -> int:
+        return len(self._scans)
+
+    def name(self, index: int) -> str:
+        """Return the name of its file, without the ending."""
+        return self._scans.name(index)
+
+    def identity(self, index: int) -> str:
+        """Return what identifies it, so that another scan is not taken for it."""
+        return self._scans.identity(index)
+
+    def number(self, index: int) -> int:
+        """Return its number in the source, whatever other scans are taken."""
+        return self._scans.number(index)
+
+    def check_output(self, out: Path) -> None:
+        """Refuse a folder whose files would become scans of the source, with an OutputError."""
+        self._scans.check_output(out)
+
+    def suffix(self, index: int) -> str:
+        """Return the ending of its file; "" where it is not in a file of points."""
+        path = self._scans.path(index)
+        return "" if path is None else path.name[len(formats.stem(path)) :]
+
+    def form(self, index: int) -> type[ScanFormat] | None:
+        """Return the format of its file; None where it has none."""
+        path = self._scans.path(index)
+        return None if path is None or not formats.candidates(path) else formats.recognise(path)
+
+    def read(self, index: int) -> InputScan:
+        """Read one scan; tell once how many of its points have a pixel, and if another sensor seems to have made it.
+
+        Raises:
+            ScanError: a scan that cannot be used, or of another sensor.
+        """
+        if isinstance(self._scans, ImageScans):
+            return InputScan(self._scans.image(index))
+        scan = self._reader.read(self._scans.scan(index))
+        if not self._counted and scan.points is not None:
+            self._tell_points(scan.image, len(scan.points))
+        if scan.doubt and not self._doubted:
+            self._reporter.message(f"WARNING: {scan.doubt}")
+            self._doubted = True
+        return scan
+
+    def _tell_points(self, image: RangeImage, num_points: int) -> None:
+        kept, self._counted = int(image.return_mask.sum()), True
+        if kept < _KEPT_UNTOLD * num_points:
+            self._reporter.message(
+                f"the image of {image.sensor.height}x{image.sensor.width} holds {kept:,} of the {num_points:,} points "
+                "of the first scan, one a pixel; the others are left out (a sensor or model of more columns keeps more)"
+            )
+
+
+@dataclass(frozen=True)
+class ScanReader:
+    """How points become a range image.
+
+    Args:
+        sensor: sensor of the image.
+        variant: variant of the projection.
+        partial: whether a scan of a part of the circle is accepted.
+    """
+
+    sensor: SensorModel
+    variant: ProjectionVariant = "exact"
+    partial: bool = False
+
+    def read(self, scan: Scan) -> InputScan:
+        """Project a scan; by elevation if its rings or its firing order do not fit, but not a file that was cut off."""
+        if has_few_rings(scan, self.sensor):
+            raise ScanError(
+                f"{ring_count(scan)} rings in {scan.source}",
+                f"the {self.sensor.height} of the sensor {self.sensor.name!r}",
+                "add the missing rows with: lidargrit upsample; a classical method completes them on their own sensor",
+            )
+        method = projection_that_fits(scan, self.sensor)
+        try:
+            return self._read(scan, method)
+        except ScanError:
+            # Points without a ring that are in firing order, and too few, are a file that was cut off.
+            if method == "spherical" or (scan.ring is None and not self.partial):
+                raise
+            with contextlib.suppress(ScanError):
+                return self._read(scan, "spherical")
+            raise
+
+    def _read(self, scan: Scan, method: ProjectionName) -> InputScan:
+        # The reference variant of a projection by elevation knows no sensor.
+        variant = self.variant if method == self.sensor.projection else "exact"
+        image = project(scan, self.sensor, method, variant, self.partial)
+        at = index_map(scan, self.sensor, method, variant, self.partial)[:, :: self.sensor.column_stride]
+        doubt = doubts_about_rays(scan, self.sensor, method)
+        said = told_doubt(scan.source, self.sensor, doubt)
+        return InputScan(image, scan, torch.from_numpy(at.astype(np.int64)), doubt=said)
+
+
+def images_for(completers: Sequence[Completer], source: str, settings: ScanSettings, reporter: Reporter) -> RangeImages:
+    """Return whole scans as range images that all completers are compared on.
+
+    They are projected as the first model's training scans were, unless a variant is named, with a warning if another
+    model learned from images of another variant.
+
+    Args:
+        completers: models and classical methods.
+        source: name of the scans.
+        settings: settings of reading and projecting them.
+        reporter: receiver of progress and of the warning.
+    """
+    learned = [one.projection_variant for one in completers if isinstance(one, LearnedCompleter)]
+    variant = settings.projection_variant or next(iter(learned), "exact")
+    if {*learned} - {variant}:
+        reporter.message(f"WARNING: scans are projected by {variant!r}, and some models learned from other images")
+    data = replace(settings.data, projection_variant=variant)
+    return open_images(source, data.imaged(completers[0].sensor), data, reporter)
+
+
+def open_inputs(source: str, reader: ScanReader, config: DataConfig, reporter: Reporter) -> Inputs:
+    """Open the scans that a user named.
+
+    Args:
+        source: a file, a folder or another source of scans, samples, prepared scans, or range images as ``.npy``.
+        reader: projection of points to range images.
+        config: number of scans, and what to do with unusable points.
+        reporter: receiver of a warning about scans that another sensor seems to have made.
+
+    Raises:
+        ConfigError: range images of other rays than the reader's sensor.
+    """
+    scans = named_scans(open_source(source, config.bad_points), config, reader.sensor)
+    if isinstance(scans, ImageScans) and not scans.images.sensor.same_rays(reader.sensor):
+        of, wanted = scans.images.sensor, reader.sensor
+        raise ConfigError(
+            f"range images of {of.height}x{of.width} of the sensor {of.name!r} in {source}",
+            f"images of the model's {wanted.height}x{wanted.width} of {wanted.name!r}, with the same rays",
+            "name a model for such images with --model, or give the scans as points",
+        )
+    return Inputs(scans, reader, reporter)
+
+
+def sensor_of(source: str, name: str = "") -> SensorModel:
+    """Return the sensor of a source of scans, or the one that is named for it by a name or a ``.json`` file."""
+    return load_sensor(name) if name else open_source(source).sensor
+
+
+def _together(own: Scan, added: Scan) -> Scan:
+    assert own.ring is not None
+    assert added.ring is not None
+    reflectance, label = None, None
+    if own.reflectance is not None and added.reflectance is not None:
+        reflectance = torch.cat((own.reflectance, added.reflectance))
+    if own.label is not None and added.label is not None:
+        label = torch.cat((own.label, added.label))
+    points = torch.cat((own.points_xyz_m, added.points_xyz_m))
+    return Scan(points, reflectance, torch.cat((own.ring, added.ring)), label, own.source)

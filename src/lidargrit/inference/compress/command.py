@@ -1,0 +1,173 @@
+"""A source of scans → one file of compressed range images, and back into a file for each scan."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from lidargrit import __version__
+from lidargrit.core.errors import CheckpointError, DataError, ScanError, UsageError
+from lidargrit.core.files import claim_folder
+from lidargrit.core.reporting import Reporter
+from lidargrit.data.export import IMAGE, check_names, claimed_scans, writable_format, write_array
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.run_folder import locate, projection_variant
+from lidargrit.generation.generator import load
+from lidargrit.inference.complete.inputs import ScanReader, open_inputs
+from lidargrit.inference.compress.archive import Archive, writing
+from lidargrit.inference.compress.coder import not_reproduced
+from lidargrit.inference.compress.scan_codec import ScanCodec
+from lidargrit.scans.projection import unproject
+from lidargrit.scans.types import RangeImage
+
+
+@dataclass(frozen=True)
+class Compressed:
+    """Size and content of a file of compressed scans.
+
+    Args:
+        num_scans: number of scans.
+        num_returns: number of returns of all scans.
+        num_bytes: size of the whole file in bytes.
+    """
+
+    num_scans: int
+    num_returns: int
+    num_bytes: int
+
+    @property
+    def bits_per_return(self) -> float:
+        """Bits of the whole file divided by the number of returns."""
+        return 8 * self.num_bytes / max(self.num_returns, 1)
+
+
+def compress_scans(
+    source: str, out: Path, model: str, step_mm: int, config: DataConfig, reporter: Reporter
+) -> Compressed:
+    """Write the range images of a source into one file, each compressed by itself and read again before it is kept.
+
+    Args:
+        source: a file, a folder or another source of scans, samples, prepared scans, or range images as ``.npy``.
+        out: file to write, which appears when it is whole; the same command goes on with one that was interrupted.
+        model: run with a pixel decoder; scans are projected with its sensor, in the way of its training.
+        step_mm: step in millimetres that ranges are rounded to.
+        config: number of scans, and what to do with unusable points and scans.
+        reporter: receiver of progress and messages.
+
+    Raises:
+        ConfigError: a model without a pixel decoder, a step that is not one, or no range coder.
+        DataError: no usable scan, or two of one name.
+        OutputError: an unfinished file of another command, or one that cannot be written.
+        ScanError: a scan that cannot be used.
+    """
+    codec = ScanCodec(load(model), step_mm)
+    reader = ScanReader(codec.sensor, projection_variant(locate(model)))
+    inputs = open_inputs(source, reader, config, reporter)
+    check_names(source, [inputs.name(index) for index in range(len(inputs))])  # of which a file has each once
+    chosen = {"source": source, "max_scans": config.max_scans}
+    chosen |= {"bad_points": config.bad_points, "bad_scans": config.bad_scans}
+    told = False
+    with writing(out, _header(codec, model), chosen) as writer:
+        done = writer.go_on(inputs.identity(index) for index in range(len(inputs)))
+        with reporter.progress("compressing", len(inputs), done) as progress:
+            for index in range(done, len(inputs)):
+                scan = inputs.name(index), inputs.identity(index)
+                try:
+                    image = inputs.read(index).image
+                    data, returns = codec.compress(image), int(image.return_mask.sum())
+                except ScanError as error:
+                    if config.bad_scans == "refuse":
+                        raise
+                    reporter.message(f"left out: {error}")
+                    writer.add(*scan, b"", 0)
+                else:
+                    writer.add(*scan, data, returns)
+                    if not told and (lost := _not_kept(image)):
+                        told = True
+                        reporter.message(f"{out.suffix} keeps no {lost}")
+                progress.advance(1)
+        if not writer.num_scans:
+            raise DataError(f"no usable scan in {source}", "at least one", "see the messages above")
+    return Compressed(writer.num_scans, writer.num_returns, out.stat().st_size)
+
+
+def decompress_scans(path: Path, out: Path, model: str, kind: str, chosen: Sequence[int], reporter: Reporter) -> int:
+    """Write the scans of a compressed file as they were, and return their number.
+
+    The whole file is checked before anything is written, and each scan's pixels before its own file.
+
+    Args:
+        path: file that :func:`compress_scans` wrote.
+        out: an empty folder, or one that the same command began: files that are there are not written again.
+        model: run by which it was compressed.
+        kind: ``image`` for range images (H, W) in metres as ``.npy``, or name or ending of a format for points.
+        chosen: indices of the scans that are wanted; all if there is none.
+        reporter: receiver of progress.
+
+    Raises:
+        ScanError: a file that was cut off or altered, or that this machine cannot reproduce.
+        CheckpointError: another model than the file's.
+        UnknownNameError: a format that is none, or that cannot be written.
+        UsageError: an index that the file does not have.
+    """
+    form, suffix = (None, ".npy") if kind == IMAGE else writable_format(kind, IMAGE)
+    archive = Archive(path)
+    wrong = [index for index in chosen if not 0 <= index < len(archive)]
+    if wrong:
+        wanted = f"indices from 0 to {len(archive) - 1}" if len(archive) else f"no index: {path} holds no scans"
+        raise UsageError(f"--only {wrong[0]}", wanted, "correct it" if len(archive) else "name another file")
+    archive.check()
+    codec = _codec_of(archive, model)
+    files = {index: archive.names[index] + suffix for index in chosen or range(len(archive))}
+    scans = {file: archive.names[index] for index, file in files.items()}
+    missing = [index for index, file in files.items() if not (out / file).exists()]
+    facts = {"source": path.name, "index_crc32": archive.index_crc32}
+    facts |= {"step_mm": codec.steps.step_mm, "format": kind}
+    with (
+        claim_folder(out),
+        claimed_scans(out / "decompressed.json", {**facts, "scans": scans}),
+        reporter.progress("decompressing", len(files), len(files) - len(missing)) as progress,
+    ):
+        for index in missing:
+            image = codec.decompress(archive.read(index))
+            if form is None:
+                write_array(out / files[index], image.range_m)
+            else:
+                form.write(out / files[index], unproject(image))
+            progress.advance(1)
+    return len(files)
+
+
+def _not_kept(image: RangeImage) -> str:
+    """Return what an image holds besides the ranges, which alone are compressed."""
+    held = (("reflectance", image.reflectance), ("labels", image.label))
+    return " and no ".join(name for name, pixels in held if pixels is not None)
+
+
+def _header(codec: ScanCodec, model: str) -> dict[str, Any]:
+    sensor = codec.sensor
+    return {
+        "model": Path(model).name,
+        "model_sha256": codec.digest(),
+        "step_mm": codec.steps.step_mm,
+        "sensor": sensor.name,
+        "size": [sensor.height, sensor.width],
+        "lidargrit": __version__,
+        "torch": torch.__version__,
+    }
+
+
+def _codec_of(archive: Archive, model: str) -> ScanCodec:
+    step_mm, digest = archive.header.get("step_mm"), archive.header.get("model_sha256")
+    if not (isinstance(step_mm, int) and isinstance(digest, str)):
+        raise not_reproduced()
+    codec = ScanCodec(load(model), step_mm)
+    if codec.digest() != digest:
+        archive_of = f"{archive.path}, compressed by the model {archive.header.get('model')!r} of hash {digest[:12]}"
+        cure = f"name that run with --model: {model} has the hash {codec.digest()[:12]}"
+        raise CheckpointError(archive_of, "the same model to decompress it", cure)
+    return codec

@@ -1,0 +1,120 @@
+"""Range images → randomly changed ones for training; range, return mask, reflectance and label change together."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from lidargrit.scans.types import RangeImage
+
+Augmentation = Literal["flip", "roll", "geometric", "geometric_reference"]
+
+_MAX_ROTATION_RAD = math.radians(30)  # the program: random affine of up to 30 degrees, ...
+_MAX_SHIFT = 0.1  # ... shifts of a tenth of the image, ...
+_MAX_SCALE_CHANGE = 0.1  # ... and scales from 0.9 to 1.1
+_EXTRA_ROTATION_RAD = math.radians(45)  # the program rotates by up to 45 degrees before that
+
+
+def augment(images: RangeImage, kinds: Sequence[Augmentation], rng: torch.Generator) -> RangeImage:
+    """Change every image of a batch at random.
+
+    Args:
+        images: batch of range images (B, H, W).
+        kinds: kinds of change, made one after the other. ``flip`` mirrors left and right with probability 1/2. ``roll``
+            turns the scan about the vertical axis by a random number of columns. ``geometric`` is the paper's geometric
+            preservation: with probability 1/2, an affine map and flips along both axes; pixels from outside the image
+            are *no return*. ``geometric_reference`` is the same with the larger rotation of the authors' program, which
+            fills such pixels with returns at the longest range.
+        rng: source of all random numbers, on the CPU.
+
+    Source:
+        Haghighi et al., LidarGRIT, 2024, section 3.2.2 (the paper gives no numbers); numbers from the program,
+        hamedhaghighi/LidarGRIT@a3f86e7.
+    """
+    for kind in kinds:
+        images = {"flip": _flip, "roll": _roll, "geometric": _geometric, "geometric_reference": _geometric_reference}[
+            kind
+        ](images, rng)
+    return images
+
+
+def _coin(images: RangeImage, rng: torch.Generator) -> Tensor:
+    return (torch.rand(len(images), generator=rng) < 0.5).to(images.range_m.device)[:, None, None]
+
+
+def _flip(images: RangeImage, rng: torch.Generator) -> RangeImage:
+    flipped = _coin(images, rng)
+    return _pick(flipped, images.mapped(lambda pixels: pixels.flip(-1)), images)
+
+
+def _roll(images: RangeImage, rng: torch.Generator) -> RangeImage:
+    width = images.range_m.shape[-1]
+    shift = torch.randint(width, (len(images), 1, 1), generator=rng).to(images.range_m.device)
+    column = ((torch.arange(width, device=shift.device) + shift) % width).expand_as(images.range_m)
+    return images.mapped(lambda pixels: pixels.gather(-1, column))
+
+
+def _geometric(images: RangeImage, rng: torch.Generator) -> RangeImage:
+    return _distort(images, rng, extra_rotation_rad=0.0, fill_m=0.0)
+
+
+def _geometric_reference(images: RangeImage, rng: torch.Generator) -> RangeImage:
+    return _distort(images, rng, extra_rotation_rad=_EXTRA_ROTATION_RAD, fill_m=images.sensor.range_max_m)
+
+
+def _distort(images: RangeImage, rng: torch.Generator, extra_rotation_rad: float, fill_m: float) -> RangeImage:
+    batch, height, width = images.range_m.shape
+
+    def uniform(limit: float) -> Tensor:
+        return (torch.rand(batch, generator=rng) * 2 - 1) * limit
+
+    angle = uniform(_MAX_ROTATION_RAD) + uniform(extra_rotation_rad)
+    scale = 1 + uniform(_MAX_SCALE_CHANGE)
+    flip_columns, flip_rows = ((torch.rand(batch, generator=rng) < 0.5) * -2.0 + 1 for _ in range(2))
+    cos, sin = angle.cos() / scale, angle.sin() / scale
+    # A rotation keeps shapes in pixels, but affine_grid counts in halves of the image: hence the ratio of its sides.
+    matrix = torch.stack(
+        (
+            torch.stack((flip_columns * cos, flip_columns * -sin * height / width, uniform(2 * _MAX_SHIFT)), 1),
+            torch.stack((flip_rows * sin * width / height, flip_rows * cos, uniform(2 * _MAX_SHIFT)), 1),
+        ),
+        1,
+    ).to(images.range_m.device)
+    grid = F.affine_grid(matrix, [batch, 1, height, width], align_corners=False)
+
+    def warp(pixels: Float[Tensor, "B H W"]) -> Float[Tensor, "B H W"]:
+        return F.grid_sample(pixels[:, None], grid, mode="nearest", padding_mode="zeros", align_corners=False)[:, 0]
+
+    if fill_m:
+        outside = warp(torch.ones_like(images.range_m)) == 0
+        warped = images.mapped(lambda pixels: warp(pixels.float()).to(pixels.dtype))
+        warped = replace(
+            warped,
+            range_m=torch.where(outside, fill_m, warped.range_m),
+            return_mask=warped.return_mask | outside,
+        )
+    else:
+        warped = images.mapped(lambda pixels: warp(pixels.float()).to(pixels.dtype))
+    return _pick(_coin(images, rng), warped, images)
+
+
+def _pick(chosen: Tensor, changed: RangeImage, images: RangeImage) -> RangeImage:
+    reflectance, label = None, None
+    if changed.reflectance is not None and images.reflectance is not None:
+        reflectance = torch.where(chosen, changed.reflectance, images.reflectance)
+    if changed.label is not None and images.label is not None:
+        label = torch.where(chosen, changed.label, images.label)
+    return replace(
+        images,
+        range_m=torch.where(chosen, changed.range_m, images.range_m),
+        return_mask=torch.where(chosen, changed.return_mask, images.return_mask),
+        reflectance=reflectance,
+        label=label,
+    )

@@ -1,0 +1,205 @@
+"""The observed part of a scan that is to be completed: range images and masks → :class:`Condition`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from lidargrit.core.errors import ConfigError, ScanError
+from lidargrit.scans.sensors import SensorModel
+from lidargrit.scans.types import RangeImage
+
+ConditionKind = Literal["pixels", "surfaces"]
+"""What a condition knows of a pixel: whether the beam returned, and how far; or only how far the surface is."""
+
+KINDS: dict[ConditionKind, str] = {
+    "pixels": "pixels of which range and return are known",
+    "surfaces": "ranges of surfaces of which it is not known whether they return",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Condition:
+    """The observed part of a batch of scans, on the sensor's grid; everything else is generated.
+
+    Every quantity has a mask of its own that says where it was observed. Values elsewhere have no influence.
+
+    Args:
+        range_m: range of the surface that the beam meets, in metres, kept in 32 bits.
+        range_observed: True where the range is known.
+        return_mask: True where the beam came back.
+        return_observed: True where it is known whether the beam came back.
+        sensor: sensor whose rays the pixels are.
+        reflectance: reflectance in [0, 1] of the observed returns, kept in 32 bits; None if it is not known.
+        label: class of the surface by SemanticKITTI's numbers, 0 where it is not known; None if it is not known
+            anywhere.
+
+    Raises:
+        ConfigError: masks of another size or type than the ranges, labels that are no whole numbers, or no batch.
+        ScanError: an observed range that is not positive and finite, an observed return without a range, or its
+            reflectance outside [0, 1].
+    """
+
+    range_m: Float[Tensor, "B H W"]
+    range_observed: Bool[Tensor, "B H W"]
+    return_mask: Bool[Tensor, "B H W"]
+    return_observed: Bool[Tensor, "B H W"]
+    sensor: SensorModel
+    reflectance: Float[Tensor, "B H W"] | None = None
+    label: Int[Tensor, "B H W"] | None = None
+
+    def __post_init__(self) -> None:
+        check_observed(self.range_observed, self.range_m)
+        check_observed(self.return_observed, self.range_m)
+        check_observed(self.return_mask, self.range_m, "a mask of returns")
+        object.__setattr__(self, "range_m", self.range_m.float())  # those of NumPy often have 64 bits
+        if self.reflectance is not None:
+            object.__setattr__(self, "reflectance", self.reflectance.float())
+        size = (len(self.range_m), self.sensor.height, self.sensor.width)
+        for name in ("range_m", "reflectance", "label"):
+            pixels: Tensor | None = getattr(self, name)
+            if pixels is not None and pixels.shape != size:
+                raise ConfigError(f"{name} of {tuple(pixels.shape)}", f"{size}, of the sensor", "give all one shape")
+        if self.label is not None and (self.label.is_floating_point() or self.label.dtype == torch.bool):
+            raise ConfigError(f"labels of type {self.label.dtype}", "whole numbers", "make them of type torch.int32")
+        range_m = self.range_m[self.range_observed]
+        if not bool(((range_m > 0) & range_m.isfinite()).all()):
+            raise ScanError("an observed range of 0 metres, NaN or infinity", "positive metres", "mark it as unknown")
+        if bool((self.return_observed & self.return_mask & ~self.range_observed).any()):
+            raise ScanError("an observed return of unknown range", "both, or neither", "mark it as unknown")
+        if self.reflectance is not None:
+            reflectance = self.reflectance[self.return_observed & self.return_mask]
+            if not bool(((reflectance >= 0) & (reflectance <= 1)).all()):  # NaN is neither
+                got = "an observed return whose reflectance is NaN, below 0 or above 1"
+                raise ScanError(got, "values in [0, 1]", "scale it, e.g. divide an intensity of 0..255 by 255")
+
+    @classmethod
+    def of_pixels(cls, images: RangeImage, observed: Bool[Tensor, "B H W"]) -> Condition:
+        """Return the condition that some pixels of scans were observed, whether they have a return or not.
+
+        Args:
+            images: batch of range images (B, H, W); pixels that were not observed have no influence.
+            observed: True for observed pixels.
+        """
+        check_observed(observed, images.range_m)
+        returned = images.return_mask & observed
+        range_m = torch.where(returned, images.range_m, 0.0)
+        reflectance = None if images.reflectance is None else torch.where(returned, images.reflectance, 0.0)
+        label = None if images.label is None else torch.where(returned, images.label, 0)
+        return cls(range_m, returned, returned, observed, images.sensor, reflectance, label)
+
+    @classmethod
+    def of_surfaces(cls, clean: RangeImage, unknown: Bool[Tensor, "B H W"] | None = None) -> Condition:
+        """Return the condition that the ranges of all surfaces are known, and that only surfaces can return.
+
+        Args:
+            clean: batch of range images (B, H, W) in which every beam that meets a surface returns.
+            unknown: True for pixels of which nothing is known; none if not given.
+        """
+        unknown = torch.zeros_like(clean.return_mask) if unknown is None else unknown
+        check_observed(unknown, clean.range_m, "unknown pixels")
+        hit = clean.return_mask & ~unknown
+        label = None if clean.label is None else torch.where(hit, clean.label, 0)
+        return cls(clean.range_m, hit, torch.zeros_like(hit), ~clean.return_mask & ~unknown, clean.sensor, label=label)
+
+    @classmethod
+    def nothing(cls, sensor: SensorModel, count: int) -> Condition:
+        """Return the condition of a number of scans of which nothing was observed."""
+        none = torch.zeros(count, sensor.height, sensor.width, dtype=torch.bool)
+        return cls(none.float(), none, none, none, sensor)
+
+    @classmethod
+    def cat(cls, conditions: Sequence[Condition]) -> Condition:
+        """Return the conditions of several batches as one; reflectance and label are kept if every batch has them."""
+        reflectance = [one.reflectance for one in conditions if one.reflectance is not None]
+        label = [one.label for one in conditions if one.label is not None]
+        return cls(
+            torch.cat([one.range_m for one in conditions]),
+            torch.cat([one.range_observed for one in conditions]),
+            torch.cat([one.return_mask for one in conditions]),
+            torch.cat([one.return_observed for one in conditions]),
+            conditions[0].sensor,
+            torch.cat(reflectance) if len(reflectance) == len(conditions) else None,
+            torch.cat(label) if len(label) == len(conditions) else None,
+        )
+
+    def __len__(self) -> int:
+        return len(self.range_m)
+
+    def __getitem__(self, index: slice | list[int]) -> Condition:
+        """Return the conditions of some of the scans."""
+        return self._mapped(lambda pixels: pixels[index])
+
+    def to(self, device: torch.device | str) -> Condition:
+        """Return the condition with its pixels on another device."""
+        return self._mapped(lambda pixels: pixels.to(device))
+
+    def _mapped(self, change: Callable[[Tensor], Tensor]) -> Condition:
+        return replace(
+            self,
+            range_m=change(self.range_m),
+            range_observed=change(self.range_observed),
+            return_mask=change(self.return_mask),
+            return_observed=change(self.return_observed),
+            reflectance=None if self.reflectance is None else change(self.reflectance),
+            label=None if self.label is None else change(self.label),
+        )
+
+    @property
+    def kinds(self) -> frozenset[ConditionKind]:
+        """Kinds of observations in the condition; empty if there are none."""
+        found: dict[ConditionKind, Tensor] = {
+            "pixels": self.return_observed,
+            "surfaces": self.range_observed & ~self.return_observed,
+        }
+        return frozenset(kind for kind, mask in found.items() if bool(mask.any()))
+
+    @property
+    def has_all_surfaces(self) -> bool:
+        """Whether each ray's range is observed, or that it does not return, and the return of some rays is open."""
+        return bool((self.range_observed | self.return_observed).all()) and "surfaces" in self.kinds
+
+    @property
+    def images(self) -> RangeImage:
+        """The observed returns as range images, without a return in all other pixels."""
+        kept = self.return_mask & self.return_observed
+        return RangeImage.masked(self.range_m, kept, self.sensor, self.reflectance, self.label)
+
+    @property
+    def surfaces(self) -> RangeImage:
+        """Range images in which every surface of known range returns."""
+        return RangeImage.masked(self.range_m, self.range_observed, self.sensor, self.reflectance, self.label)
+
+    def put_into(self, generated: RangeImage) -> RangeImage:
+        """Return generated scans in which all observed values are put in, bit for bit.
+
+        Labels are kept where both have them; reflectance as well, and where no return was observed.
+        """
+        returned = torch.where(self.return_observed, self.return_mask, generated.return_mask)
+        range_m = torch.where(self.range_observed, self.range_m, generated.range_m)
+        reflectance, label = None, None
+        observed = self.return_observed & self.return_mask
+        if generated.reflectance is not None and self.reflectance is not None:
+            reflectance = torch.where(observed, self.reflectance, generated.reflectance)
+        elif not bool(observed.any()):
+            reflectance = generated.reflectance
+        if generated.label is not None and self.label is not None:
+            label = torch.where(self.range_observed, self.label, generated.label)
+        return RangeImage.masked(range_m, returned, self.sensor, reflectance, label)
+
+
+def check_observed(observed: Bool[Tensor, "..."], range_m: Float[Tensor, "..."], what: str = "observed pixels") -> None:
+    """Refuse a mask whose shape is not that of the ranges, with ConfigError that says ``what`` it is."""
+    if range_m.ndim != 3:
+        raise ConfigError(f"ranges of shape {tuple(range_m.shape)}", "(B, H, W), a batch of images", "add a batch axis")
+    if observed.shape != range_m.shape or observed.dtype != torch.bool:
+        raise ConfigError(
+            f"{what} of shape {tuple(observed.shape)} and type {observed.dtype}",
+            f"{tuple(range_m.shape)} and torch.bool, one for each pixel of a batch of images",
+            "give a mask for each image",
+        )

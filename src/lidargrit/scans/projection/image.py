@@ -1,0 +1,104 @@
+"""Scan → range image, by spherical projection or by scan unfolding."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Int32
+
+from lidargrit.core.errors import ScanError
+from lidargrit.scans.projection.pixel_coordinates import ProjectionVariant, pixel_coordinates, within_limits
+from lidargrit.scans.projection.sensor_check import fit_problems
+from lidargrit.scans.sensors import ProjectionName, SensorModel
+from lidargrit.scans.types import CLASS_BITS, RangeImage, Scan
+
+
+def project(
+    scan: Scan,
+    sensor: SensorModel,
+    method: ProjectionName | None = None,
+    variant: ProjectionVariant = "exact",
+    partial: bool = False,
+) -> RangeImage:
+    """Assign each point of a scan to the pixel whose ray it lies on; the nearest point wins a pixel.
+
+    Column w spans azimuths [edge - 2 pi w/W, edge - 2 pi (w+1)/W), where the sensor's ``first_edge_rad`` is the edge,
+    +pi for most: pixel centres sit at w + 1/2, so that the first and last columns are as wide as the others. With a
+    column stride, the columns between the kept ones are left out.
+
+    Args:
+        scan: points in the sensor's frame; for ``unfolding`` in firing order, or with their ring.
+        sensor: sensor with the rays of the image and the range limits.
+        method: projection method, ``spherical`` (rows by elevation) or ``unfolding`` (rows by ring); the sensor's own
+            if not given.
+        variant: ``exact`` floors, leaves out points beyond the sensor's span or limits before the nearest one wins, and
+            refuses a scan that does not fit. ``reference`` repeats LidarGRIT's program: it rounds, clips points outside
+            into the border pixels, and loses a pixel whose nearest point is beyond the limits; of scans that do not fit
+            only those are refused of which most points would lie in rows where the sensor does not look.
+        partial: whether a scan of a part of the circle is accepted. A pixel without a point is then unknown; it does
+            not mean a beam that did not return.
+
+    Returns:
+        range_m (H, W) in metres and return_mask (H, W), with reflectance and label if the scan has them.
+
+    Raises:
+        ConfigError: no method or variant of that name.
+        ScanError: the scan does not fit the sensor, or its points are not in firing order; names the sensors that
+            would fit, or the projection.
+
+    Source:
+        Haghighi et al., LidarGRIT, 2024, section 3.1; program hamedhaghighi/LidarGRIT@a3f86e7.
+    """
+    nearest = _nearest(scan, sensor, method, variant, partial, refuse=True)
+    point_of_pixel, range_m = (array[:, :: sensor.column_stride] for array in nearest)
+    filled = point_of_pixel >= 0
+    if variant == "reference":  # there the limits are applied to the winner, and strictly
+        filled &= (range_m > sensor.range_min_m) & (range_m < sensor.range_max_m)
+        point_of_pixel = np.where(filled, point_of_pixel, -1)
+    if not filled.any():
+        raise ScanError(
+            f"no point between {sensor.range_min_m:g} and {sensor.range_max_m:g} m in {scan.source}",
+            "returns within the sensor's range limits",
+            "check that the file is in metres, or choose another sensor",
+        )
+    range_m = np.where(filled, range_m, np.float32(0))
+    reflectance = None
+    if scan.reflectance is not None:
+        of_point = np.append(scan.reflectance.numpy(), np.float32(0))  # that of no point, -1, is the last
+        reflectance = torch.from_numpy(of_point.take(point_of_pixel))
+    label = None
+    if scan.label is not None:
+        of_point = np.append(scan.label.long().numpy() & CLASS_BITS, 0)  # 8 bits do not hold that mask
+        label = torch.from_numpy(of_point.take(point_of_pixel))
+    return RangeImage(torch.from_numpy(range_m), torch.from_numpy(filled), sensor, reflectance, label)
+
+
+def index_map(
+    scan: Scan,
+    sensor: SensorModel,
+    method: ProjectionName | None = None,
+    variant: ProjectionVariant = "exact",
+    partial: bool = False,
+) -> Int32[np.ndarray, "H fine_W"]:
+    """Return the index of the point that fills each pixel, -1 for none, before any column is left out.
+
+    Args, Raises: as for :func:`project`; the ``reference`` variant takes every scan here, as its program does.
+    """
+    return _nearest(scan, sensor, method, variant, partial, refuse=variant == "exact")[0]
+
+
+def _nearest(
+    scan: Scan,
+    sensor: SensorModel,
+    method: ProjectionName | None,
+    variant: ProjectionVariant,
+    partial: bool,
+    refuse: bool,
+) -> tuple[Int32[np.ndarray, "H fine_W"], Float32[np.ndarray, "H fine_W"]]:
+    method = method or sensor.projection
+    pixels = pixel_coordinates(scan, sensor, method, variant)
+    for problem in fit_problems(scan, sensor, method, pixels, partial, variant) if refuse else ():
+        raise problem
+    if variant == "reference":
+        return pixels.nearest(np.ones(len(scan), dtype=bool))
+    return pixels.nearest(pixels.in_rows() & within_limits(pixels.range_m, sensor))

@@ -1,0 +1,367 @@
+"""The data types that packages pass to one another: scan, range image, token grid, decoded scans, metric result.
+
+Each is valid once it exists. Ranges are always metres and the return mask is always True = a return. Normalised
+tensors live inside one model.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from lidargrit.core.errors import ConfigError, ScanError
+from lidargrit.scans.sensors import SensorModel
+
+TYPICAL_LOG_RANGE = 2.5  # ln(1 + range in metres) in the middle of what scans hold: subtracted, inputs are near 0
+CLASS_BITS = 0xFFFF  # of a label: its class; the bits above number the instance
+
+MaskDecoding = Literal["bernoulli", "threshold"]
+"""How returns are decided from their probabilities: each at random, or wherever a return is likelier than none."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """The points of one revolution, in the sensor's frame (x forward, y left, z up).
+
+    Args:
+        points_xyz_m: coordinates in metres, kept in 32 bits.
+        reflectance: reflectance of every point, in [0, 1], kept in 32 bits.
+        ring: index of the laser of every point, 0 = the highest.
+        label: class of every point by SemanticKITTI's numbers, with its instance in the upper 16 of 32 bits.
+        source: file or other origin of the scan, for messages.
+        full_scale: number that reflectance was divided by, 1, 255 or 65,535, where the file does not tell and the
+            largest value decided; 0 elsewhere.
+
+    Raises:
+        ScanError: no point, a coordinate that is not finite, a point at the origin, or a reflectance outside [0, 1].
+    """
+
+    points_xyz_m: Float[Tensor, "n 3"]
+    reflectance: Float[Tensor, "n"] | None = None
+    ring: Int[Tensor, "n"] | None = None
+    label: Int[Tensor, "n"] | None = None
+    source: str = "a scan"
+    full_scale: int = 0
+
+    def __post_init__(self) -> None:
+        if len(self) == 0:
+            raise ScanError(f"no point in {self.source}", "a full revolution", "leave this scan out")
+        object.__setattr__(self, "points_xyz_m", self.points_xyz_m.float())  # those of NumPy often have 64 bits
+        if self.reflectance is not None:
+            object.__setattr__(self, "reflectance", self.reflectance.float())
+        for name in ("reflectance", "ring", "label"):
+            values: Tensor | None = getattr(self, name)
+            if values is not None and values.shape != (len(self),):
+                raise ScanError(
+                    f"{name} of shape {tuple(values.shape)} in {self.source}",
+                    f"one for each of {len(self)} points",
+                    "fix it",
+                )
+        # Point by point takes twenty times as long as over all coordinates at once, and is seldom needed.
+        low, high = self.points_xyz_m.aminmax()  # NaN where any is: no comparison holds
+        if not (bool(low > -torch.inf) and bool(high < torch.inf)):
+            self._refuse(~self.points_xyz_m.isfinite().all(dim=1), "with NaN or infinite coordinates")
+        if self.points_xyz_m.count_nonzero() < self.points_xyz_m.numel():
+            self._refuse((self.points_xyz_m == 0).all(dim=1), "at the origin (placeholders for no return)")
+        if self.reflectance is not None:
+            low, high = (float(v) for v in self.reflectance.aminmax())  # NaN where any is
+            if math.isnan(low):
+                self._refuse(self.reflectance.isnan(), "with NaN for reflectance", "a number for each")
+            if not (low >= 0 and high <= 1):
+                raise ScanError(
+                    f"reflectance from {low:g} to {high:g} in {self.source}",
+                    "values in [0, 1]",
+                    "scale the fourth column, e.g. divide an intensity of 0..255 by 255"
+                    if low >= 0
+                    else "check the layout: the file may have three or five columns, not x, y, z, reflectance",
+                )
+
+    def _refuse(
+        self, bad: Bool[Tensor, "n"], what: str, wanted: str = "finite coordinates away from the origin"
+    ) -> None:
+        if bool(bad.any()):
+            raise ScanError(
+                f"{int(bad.sum())} of {len(self)} points {what} in {self.source}",
+                wanted,
+                "remove these points, or drop them by --set data.bad_points=drop (train) or --bad-points drop",
+            )
+
+    def __len__(self) -> int:
+        return self.points_xyz_m.shape[0]
+
+
+@dataclass(frozen=True, eq=False)
+class RangeImage:
+    """One range image or a batch: row 0 is the highest elevation, column 0 the azimuth +pi, falling to the right.
+
+    Args:
+        range_m: Euclidean distance to the return, in metres, kept in 32 bits; 0 where there is none.
+        return_mask: whether the beam came back.
+        sensor: sensor whose rays the pixels are.
+        reflectance: reflectance of the return, in [0, 1], kept in 32 bits; 0 where there is none.
+        label: class of what returned by SemanticKITTI's numbers, without its instance; 0 where there is no return or
+            the class is not known.
+
+    Raises:
+        ScanError: a range that is not finite, not positive on a return, or not 0 elsewhere.
+        ConfigError: an image whose size is not the sensor's.
+    """
+
+    range_m: Float[Tensor, "*batch H W"]
+    return_mask: Bool[Tensor, "*batch H W"]
+    sensor: SensorModel
+    reflectance: Float[Tensor, "*batch H W"] | None = None
+    label: Int[Tensor, "*batch H W"] | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "range_m", self.range_m.float())  # those of NumPy often have 64 bits
+        if self.reflectance is not None:
+            object.__setattr__(self, "reflectance", self.reflectance.float())
+        size = tuple(self.range_m.shape[-2:])
+        if size != (self.sensor.height, self.sensor.width):
+            raise ConfigError(
+                f"a range image of {size[0]}x{size[1]}",
+                f"the {self.sensor.height}x{self.sensor.width} of the sensor {self.sensor.name!r}",
+                "use the sensor's own size, or sensor.with_columns(...)",
+            )
+        for name in ("return_mask", "reflectance", "label"):
+            pixels: Tensor | None = getattr(self, name)
+            if pixels is not None and pixels.shape != self.range_m.shape:
+                raise ConfigError(
+                    f"{name} of {tuple(pixels.shape)}",
+                    f"the {tuple(self.range_m.shape)} of range_m",
+                    "give all one shape",
+                )
+        if not self._is_valid():
+            valid = torch.where(self.return_mask, (self.range_m > 0) & self.range_m.isfinite(), self.range_m == 0)
+            raise ScanError(
+                f"{int((~valid).sum())} pixels whose range contradicts their return mask",
+                "a positive finite range on every return and 0 elsewhere",
+                "build the image with RangeImage.masked",
+            )
+
+    def _is_valid(self) -> bool:
+        if not self.range_m.numel() or self.range_m.is_meta:  # without values, where operations are only counted
+            return True
+        nearest, farthest = self.range_m.aminmax()  # NaN where any is: no comparison holds
+        positive = self.range_m > 0
+        return bool(nearest >= 0) and bool(farthest < torch.inf) and torch.equal(positive, self.return_mask)
+
+    @classmethod
+    def masked(
+        cls,
+        range_m: Float[Tensor, "*batch H W"],
+        return_mask: Bool[Tensor, "*batch H W"],
+        sensor: SensorModel,
+        reflectance: Float[Tensor, "*batch H W"] | None = None,
+        label: Int[Tensor, "*batch H W"] | None = None,
+    ) -> RangeImage:
+        """Make a range image of a clean range and a mask: whatever else it has is set to 0 where nothing returned."""
+        kept = None if reflectance is None else torch.where(return_mask, reflectance, 0.0)
+        classes = None if label is None else torch.where(return_mask, label, 0)
+        return cls(torch.where(return_mask, range_m, 0.0), return_mask, sensor, kept, classes)
+
+    @classmethod
+    def stack(cls, images: Sequence[RangeImage]) -> RangeImage:
+        """Make one batch of single images of one sensor; reflectance and label are kept if every image has them."""
+        return cls._joined(images, torch.stack)
+
+    @classmethod
+    def cat(cls, batches: Sequence[RangeImage]) -> RangeImage:
+        """Make one batch of several batches of one sensor; reflectance and label are kept if every batch has them."""
+        return cls._joined(batches, torch.cat)
+
+    @classmethod
+    def _joined(cls, images: Sequence[RangeImage], join: Callable[[list[Tensor]], Tensor]) -> RangeImage:
+        reflectance = [image.reflectance for image in images if image.reflectance is not None]
+        label = [image.label for image in images if image.label is not None]
+        return cls(
+            join([image.range_m for image in images]),
+            join([image.return_mask for image in images]),
+            images[0].sensor,
+            join(reflectance) if len(reflectance) == len(images) else None,
+            join(label) if len(label) == len(images) else None,
+        )
+
+    def __len__(self) -> int:
+        return self.range_m.shape[0] if self.range_m.ndim > 2 else 1
+
+    def __getitem__(self, index: int | slice | list[int]) -> RangeImage:
+        """Return one image of a batch, or a batch of some of its images."""
+        return self.mapped(lambda pixels: pixels[index])
+
+    def to(self, device: torch.device | str) -> RangeImage:
+        """Return the image with its pixels on another device."""
+        return self.mapped(lambda pixels: pixels.to(device))
+
+    def mapped(self, change: Callable[[Tensor], Tensor]) -> RangeImage:
+        """Return the image in which range, mask and whatever else it has are changed alike."""
+        return replace(
+            self,
+            range_m=change(self.range_m),
+            return_mask=change(self.return_mask),
+            reflectance=None if self.reflectance is None else change(self.reflectance),
+            label=None if self.label is None else change(self.label),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class TokenGrid:
+    """The discrete tokens of a batch of range images, in the layout of the latent grid.
+
+    Args:
+        tokens: indices of codes.
+        num_codes: number of codes in the codebook; every token is below it.
+
+    Raises:
+        ConfigError: a token outside [0, num_codes).
+    """
+
+    tokens: Int[Tensor, "*batch h w"]
+    num_codes: int
+
+    def __post_init__(self) -> None:
+        if self.tokens.is_meta or not self.tokens.numel():  # without values, where operations are only counted
+            return
+        if not (int(self.tokens.min()) >= 0 and int(self.tokens.max()) < self.num_codes):
+            raise ConfigError(
+                f"tokens from {int(self.tokens.min())} to {int(self.tokens.max())}",
+                f"tokens of a codebook of {self.num_codes} codes",
+                "use the tokenizer that made them",
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Decoded:
+    """Output of a decoder for every pixel of a batch of scans, before returns are sampled.
+
+    Args:
+        range_m: range of the surface that the beam meets, in metres, whether or not it returns.
+        return_logits: logits of the probability that the beam returns.
+        sensor: sensor whose rays the pixels are.
+        reflectance: reflectance of that surface, in [0, 1]; None from a decoder without reflectance.
+        features: feature maps of the decoder, for networks that refine its output; None if it gives none.
+    """
+
+    range_m: Float[Tensor, "B H W"]
+    return_logits: Float[Tensor, "B H W"]
+    sensor: SensorModel
+    reflectance: Float[Tensor, "B H W"] | None = None
+    features: Float[Tensor, "B C H W"] | None = None
+
+    def threshold(self) -> RangeImage:
+        """Return the scans in which every beam returns whose probability is at least 0.5."""
+        return self._masked(self.return_logits >= 0)
+
+    def sample(self, rngs: Sequence[torch.Generator]) -> RangeImage:
+        """Return scans in which every beam returns with its probability, independently of the others.
+
+        Args:
+            rngs: random generators on the CPU, one for each scan, so that no scan depends on its neighbours.
+        """
+        uniform = torch.stack([torch.rand(self.range_m.shape[1:], generator=rng) for rng in rngs])
+        return self._masked(uniform.to(self.return_logits.device) < self.return_logits.sigmoid())
+
+    def _masked(self, return_mask: Bool[Tensor, "B H W"]) -> RangeImage:
+        return RangeImage.masked(self.range_m, return_mask, self.sensor, self.reflectance)
+
+
+@dataclass(frozen=True, eq=False)
+class ScanBits:
+    """Negative log-likelihood of each scan of a batch in bits, by parts.
+
+    Args:
+        step_mm: step in millimetres that ranges are rounded to.
+        return_mask: returns of the scans.
+        tokens: bits of each token, given those before it.
+        mask: bits of the return or ray drop of each pixel, given the tokens; None from a model that has no such
+            probability.
+        range: bits of the range of each pixel, given tokens and mask, 0 where there is no return; None from a model
+            that has no such probability.
+        expected: expected bits of mask and range of each pixel (the entropy), given all that comes before it; None if
+            not asked for.
+    """
+
+    step_mm: int
+    return_mask: Bool[Tensor, "B H W"]
+    tokens: Float[Tensor, "B h w"]
+    mask: Float[Tensor, "B H W"] | None = None
+    range: Float[Tensor, "B H W"] | None = None
+    expected: Float[Tensor, "B H W"] | None = None
+
+    @classmethod
+    def cat(cls, batches: Sequence[ScanBits]) -> ScanBits:
+        """Make one batch of several batches of one model, by one step."""
+        first = batches[0]
+        parts = {
+            name: torch.cat([getattr(batch, name) for batch in batches])
+            for name in ("return_mask", "tokens", "mask", "range", "expected")
+            if getattr(first, name) is not None
+        }
+        return replace(first, **parts)
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the bits name the whole scan; tokens alone leave open what is lost in encoding."""
+        return self.mask is not None and self.range is not None
+
+    def per_scan(self) -> dict[str, Float[Tensor, "B"]]:
+        """Return the bits of each part of each scan, by the part's name, in 64 bits."""
+        parts = {"tokens": self.tokens, "mask": self.mask, "range": self.range}
+        return {name: bits.double().sum((1, 2)) for name, bits in parts.items() if bits is not None}
+
+    def total(self) -> Float[Tensor, "B"]:
+        """Return the bits of each scan, all parts together, in 64 bits."""
+        return torch.stack([*self.per_scan().values()]).sum(0)
+
+    def per_pixel(self) -> Float[Tensor, "B H W"]:
+        """Return the bits of each pixel: of its mask, its range, and an even share of its token's."""
+        height, width = self.return_mask.shape[1:]
+        rows, columns = height // self.tokens.shape[1], width // self.tokens.shape[2]
+        bits = self.tokens.repeat_interleave(rows, 1).repeat_interleave(columns, 2) / (rows * columns)
+        for part in (self.mask, self.range):
+            bits = bits if part is None else bits + part
+        return bits
+
+    def surprise(self) -> Float[Tensor, "B H W"]:
+        """Return by how many bits each pixel's mask and range exceed their expected bits; 0 on average for usual scans.
+
+        Raises:
+            ConfigError: the expected bits were not asked for, or the model does not tell them.
+        """
+        if self.mask is None or self.range is None or self.expected is None:
+            raise ConfigError(
+                "bits without those that were expected",
+                "both, from a model with a pixel decoder",
+                "ask for them: model.bits(images, expected=True)",
+            )
+        return self.mask + self.range - self.expected
+
+
+@dataclass(frozen=True)
+class MetricResult:
+    """The value of a metric, with what is needed to read it.
+
+    Args:
+        metric: name of the metric.
+        value: value of the metric, in its unit.
+        higher_is_better: whether a larger value is better.
+        num_generated: number of generated scans.
+        num_reference: number of real scans.
+        variant: name of the definition, such as ``exact`` or ``reference``.
+        details: further numbers by name, such as the value at every level.
+    """
+
+    metric: str
+    value: float
+    higher_is_better: bool
+    num_generated: int
+    num_reference: int
+    variant: str
+    details: dict[str, Any] = field(default_factory=dict)

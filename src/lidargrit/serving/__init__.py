@@ -1,6 +1,0 @@
-"""Trained runs in a browser: run folders → a page on this machine that generates, completes, compares and saves."""
-
-from lidargrit.serving.limits import Limits
-from lidargrit.serving.server import finished_runs, serve
-
-__all__ = ["Limits", "finished_runs", "serve"]

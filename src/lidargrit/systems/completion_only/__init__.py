@@ -1,0 +1,1 @@
+"""The system ``completion_only``; see system.py."""

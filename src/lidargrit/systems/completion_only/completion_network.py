@@ -1,0 +1,211 @@
+"""A network that completes scans: observed pixels and classical fills → range, return, reflectance and class."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from lidargrit.core.errors import ConfigError
+from lidargrit.generation.pixel_decoder.pixel_networks import LOGIT_BOUND, Guide, MaskNetwork
+from lidargrit.generation.reflectance import TYPICAL_REFLECTANCE
+from lidargrit.generation.semantic_classes import NUM_CLASSES, ClassMaps, class_indices, labels_of, votes
+from lidargrit.nn.small_unet import Part, SmallUnet, SmallUnetConfig, check_image
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.sensors import SensorModel, mean_azimuths_rad
+from lidargrit.scans.types import RangeImage
+from lidargrit.systems.completion_only.hints import (
+    LABELLED,
+    NUM_CANDIDATES,
+    NUM_LABELS,
+    NUM_MAPS,
+    NUM_REFLECTANCES,
+    REFLECTING,
+    Hints,
+    hints_of,
+)
+
+_TRUST = 3.0  # logit by which triangulation is preferred to the other candidates at first
+_CLASS_CHANNELS = 4  # learned, of each label that the network sees
+_VOTE = 5.0  # logit of a class for which all observed labels around a pixel speak
+_ONE_SURFACE = 0.1  # of ln(1 + range): a return so much farther or nearer than a pixel has a logit lower by 1
+
+
+@dataclass(frozen=True)
+class CompletionNetworkConfig:
+    """Sizes of the network that completes scans.
+
+    Args:
+        widths: numbers of channels at a half, a quarter and an eighth of the image's rows and columns.
+        blocks: number of residual blocks at an eighth of the image's size.
+        attention_layers: number of attention layers between all pixels at an eighth of the image's size, among the
+            residual blocks: a wide gap is filled by what stands on the other side of the street, too.
+        heads: number of attention heads of each layer.
+        features: number of channels that the phases of the mask see.
+        mask_width: number of channels of the layers of the mask's phases.
+        row_channels: number of learned values of every row.
+        labels: whether the network sees the classes of observed pixels, where scans have them, and estimates those of
+            the others: the 19 classes of SemanticKITTI's benchmark.
+        reflectance: whether the network sees the reflectance of observed pixels, where scans have it, and estimates
+            that of the others.
+    """
+
+    widths: tuple[int, int, int] = (48, 64, 128)
+    blocks: int = 4
+    attention_layers: int = 2
+    heads: int = 4
+    features: int = 32
+    mask_width: int = 24
+    row_channels: int = 2
+    labels: bool = False
+    reflectance: bool = False
+
+    def __post_init__(self) -> None:
+        sizes = (*self.widths, self.blocks, self.heads, self.features, self.mask_width, self.row_channels)
+        if min(sizes) < 1 or self.attention_layers < 0:
+            raise ConfigError(f"{self}", "sizes of at least 1", "raise the one that is lower")
+        if self.attention_layers > self.blocks or self.widths[-1] % self.heads:
+            raise ConfigError(
+                f"{self.attention_layers} layers of attention of {self.heads} heads, {self.widths[-1]} channels",
+                f"at most {self.blocks} layers, one after each residual block, and heads that divide the channels",
+                "change model.completion.attention_layers or .heads",
+            )
+
+
+class Point(NamedTuple):
+    """Point estimate of every pixel by the network.
+
+    Args:
+        guide: inputs of the phases of the mask.
+        v: ln(1 + range in metres), with its gradient.
+        return_logits: logits of the probability of a return by itself, with their gradient.
+        class_logits: logits of the classes, with their gradient; None from a network without classes.
+        reflectance: reflectance, with its gradient, not yet limited to [0, 1]; None from a network without it.
+    """
+
+    guide: Guide
+    v: Float[Tensor, "B H W"]
+    return_logits: Float[Tensor, "B H W"]
+    class_logits: Float[Tensor, "B 19 H W"] | None = None
+    reflectance: Float[Tensor, "B H W"] | None = None
+
+
+class CompletionNetwork(nn.Module):
+    """A small U-Net that weighs the ranges of classical methods, and a mask that is sampled in phases behind it.
+
+    Range and reflectance are point estimates, the best single guess, and no samples; the mask is sampled, each phase
+    given the observed pixels and the earlier phases, so that drops cluster as real ones do.
+
+    Args:
+        config: sizes of the network.
+        sensor: sensor with the rays and limits of the range images.
+    """
+
+    def __init__(self, config: CompletionNetworkConfig, sensor: SensorModel) -> None:
+        super().__init__()
+        check_image(sensor, "a network that completes scans")
+        self.config = config
+        self.limits_v = (math.log1p(sensor.range_min_m), math.log1p(sensor.range_max_m))
+        self.rows = nn.Parameter(torch.zeros(config.row_channels, sensor.height))
+        azimuth_rad = mean_azimuths_rad(sensor.azimuth_rad).float()
+        self.register_buffer("azimuth", torch.stack((azimuth_rad.sin(), azimuth_rad.cos())), persistent=False)
+        sizes = SmallUnetConfig(config.widths, config.blocks, config.attention_layers, config.heads)
+        self.classes = ClassMaps(_CLASS_CHANNELS) if config.labels else None
+        self.outputs = [config.features, NUM_CANDIDATES, 1, 1]
+        parts = {}
+        if config.labels:
+            parts["labels"] = Part(NUM_LABELS * _CLASS_CHANNELS, NUM_CLASSES + NUM_LABELS)
+        if config.reflectance:
+            parts["reflectance"] = Part(NUM_REFLECTANCES, 1 + NUM_REFLECTANCES)
+        self.unet = SmallUnet(sizes, NUM_MAPS + config.row_channels + 2, sum(self.outputs), parts)
+        self.mask = MaskNetwork.behind(config.features, config.mask_width, sensor)
+        preferred = torch.zeros(NUM_CANDIDATES)
+        preferred[0] = _TRUST
+        self.register_buffer("preferred", preferred[:, None, None], persistent=False)
+
+    preferred: Tensor
+    azimuth: Tensor
+
+    def forward(self, hints: Hints, observed: Bool[Tensor, "B H W"]) -> Point:
+        """Return the estimate of every pixel.
+
+        Args:
+            hints: classical fills of the observed pixels.
+            observed: True where it was observed whether there is a return.
+        """
+        rows = self.rows[None, :, :, None].expand(len(observed), -1, -1, observed.shape[-1])
+        columns = self.azimuth[None, :, None].expand(len(observed), -1, observed.shape[-2], -1)
+        more: dict[str, Tensor] = {}
+        seen, indices = hints.reflectances, None
+        if self.classes is not None:
+            label = hints.labels
+            if label is None:
+                label = hints.maps.new_zeros((len(observed), NUM_LABELS, *observed.shape[1:]), dtype=torch.int64)
+            indices = class_indices(label)
+            more["labels"] = self.classes(indices)
+        if self.config.reflectance:
+            if seen is None:
+                seen = hints.maps.new_full((len(observed), NUM_REFLECTANCES, *observed.shape[1:]), TYPICAL_REFLECTANCE)
+            more["reflectance"] = seen - TYPICAL_REFLECTANCE
+        output, of_parts = self.unet(torch.cat((hints.maps, rows, columns), 1), more)
+        features, weights, moved, logits = output.float().split(self.outputs, 1)
+        shares = (4 * weights + self.preferred).softmax(1)
+        v = (shares * hints.candidates).sum(1) + 0.3 * moved[:, 0]
+        return_logits = (2 * logits[:, 0] + 1.5).clamp(-LOGIT_BOUND, LOGIT_BOUND)
+        v = v.clamp(*self.limits_v)
+        class_logits, reflectance = None, None
+        if indices is not None:
+            alone, trust = of_parts["labels"].float().split([NUM_CLASSES, NUM_LABELS], 1)
+            class_logits = 2 * alone + _VOTE * votes(indices, self._shares(trust, hints.candidates[:, LABELLED], v))
+        if self.config.reflectance and seen is not None:
+            alone, trust = of_parts["reflectance"].float().split([1, NUM_REFLECTANCES], 1)
+            reflectance = alone[:, 0] + (seen * self._shares(trust, hints.candidates[:, REFLECTING], v)).sum(1)
+        guide = Guide(features, v.detach(), return_logits.detach(), observed)
+        return Point(guide, v, return_logits, class_logits, reflectance)
+
+    def _shares(
+        self, trust: Float[Tensor, "B S H W"], candidates: Float[Tensor, "B S H W"], v: Float[Tensor, "B H W"]
+    ) -> Float[Tensor, "B S H W"]:
+        """Return the shares of what is known at candidates of the range, of which the first is preferred at first.
+
+        At first those on the surface on which the range lies are preferred, too.
+        """
+        apart = (candidates - v.detach()[:, None]).abs()
+        return (4 * trust + self.preferred[: trust.shape[1]] - apart / _ONE_SURFACE).softmax(1)
+
+    def sample(self, condition: Condition, rngs: Sequence[torch.Generator]) -> RangeImage:
+        """Return completed scans: the range estimated, the mask sampled; a scan does not depend on the others.
+
+        The range is the mean of two estimates, of the scan and of its mirror image, and so are the reflectance and the
+        logits of classes. A scan gets reflectance and labels if it has some and the network has learned them.
+
+        Args:
+            condition: observed pixels of as many scans.
+            rngs: random generators on the CPU, one for each scan.
+        """
+        images, uniform = [], self.mask.uniform(rngs)
+        for index in range(len(rngs)):
+            one = condition[index : index + 1]
+            shown = replace(  # what the network has not learned needs no hints
+                one,
+                label=one.label if self.config.labels else None,
+                reflectance=one.reflectance if self.config.reflectance else None,
+            )
+            hints = hints_of(shown)
+            point, mirrored = self(hints, one.return_observed), self(hints.mirrored(), one.return_observed.flip(-1))
+            v = (point.v + mirrored.v.flip(-1)) / 2
+            mask = self.mask.sample(point.guide, uniform[index : index + 1], one)
+            low_m, high_m = condition.sensor.range_min_m, condition.sensor.range_max_m
+            label, reflectance = None, None
+            if hints.labels is not None and point.class_logits is not None and mirrored.class_logits is not None:
+                label = labels_of((point.class_logits + mirrored.class_logits.flip(-1)).argmax(1) + 1)
+            if hints.reflectances is not None and point.reflectance is not None and mirrored.reflectance is not None:
+                reflectance = ((point.reflectance + mirrored.reflectance.flip(-1)) / 2).clamp(0, 1)
+            range_m = v.expm1().clamp(low_m, high_m)
+            images.append(RangeImage.masked(range_m, mask, condition.sensor, reflectance, label))
+        return RangeImage.cat(images)

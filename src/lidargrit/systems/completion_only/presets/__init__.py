@@ -1,0 +1,1 @@
+"""Experiments with ``completion_only``, one a file."""

@@ -1,0 +1,1 @@
+"""The system ``dusty``; see system.py."""

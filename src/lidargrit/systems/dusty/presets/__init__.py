@@ -1,0 +1,1 @@
+"""Experiments with ``dusty``, one a file."""

@@ -1,0 +1,1 @@
+"""The system ``lidargan``; see system.py."""

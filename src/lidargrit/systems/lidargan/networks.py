@@ -1,0 +1,161 @@
+"""LidarGAN's two convolutional networks, and the losses of GAN and VAE: latents → images, images → vectors."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from lidargrit.core.errors import ConfigError
+from lidargrit.nn.blocks import Network
+
+IMAGE_CHANNELS = 2  # horizontal distance and height
+
+AdversarialLoss = Literal["relativistic", "plain"]
+
+_SLOPE = 0.2  # of the leaky rectifier below 0
+
+
+class Decoder(Network):
+    """Latents → images with values between -1 and 1.
+
+    A transposed convolution spreads the latent over a grid of n x w pixels, the next one makes (2n + 1) x 2w of it, and
+    three more double both: 2x16, 5x32, 10x64, 20x128, 40x256. Batch norm follows all but the last. Names of weights are
+    the program's.
+
+    Args:
+        latent_dim: length of a latent.
+        channels: number of channels of the finest level; each of the three coarser levels has twice as many.
+        size: rows and columns of the image; see lidargrit.systems.lidargan.filled_rows.
+        initial_std: standard deviation of new weights.
+
+    Source:
+        Caccia et al., Deep Generative Modeling of LiDAR Data, IROS 2019; sizes from
+        pclucas14/lidar_generation@2a2c8bc.
+    """
+
+    def __init__(self, latent_dim: int, channels: int, size: tuple[int, int], initial_std: float = 0.02) -> None:
+        super().__init__()
+        widths = [channels << level for level in (3, 2, 1, 0)]
+        kernels = [_coarsest(size), (3, 4), (4, 4), (4, 4), (4, 4)]
+        layers: list[nn.Module] = []
+        for level, (inputs, outputs) in enumerate(zip([latent_dim, *widths], [*widths, IMAGE_CHANNELS], strict=True)):
+            stride, padding = _step(level)
+            layers.append(nn.ConvTranspose2d(inputs, outputs, kernels[level], stride, padding, bias=False))
+            layers += [nn.BatchNorm2d(outputs), nn.ReLU()] if level < len(widths) else [nn.Tanh()]
+        self.main = nn.Sequential(*layers)
+        _start(self, initial_std)
+
+    def forward(self, latents: Float[Tensor, "B D"]) -> Float[Tensor, "B 2 H W"]:
+        """Generate images."""
+        return self.main(latents[..., None, None]).float()
+
+
+class Encoder(Network):
+    """Images → vectors: one number for the discriminator, or the mean and log-variance of a latent for the encoder.
+
+    Its convolutions are those of :class:`Decoder` in the opposite order.
+
+    Args:
+        outputs: number of numbers.
+        channels: number of channels of the finest level; each of the three coarser levels has twice as many.
+        size: rows and columns of the image.
+        initial_std: standard deviation of new weights.
+    """
+
+    def __init__(self, outputs: int, channels: int, size: tuple[int, int], initial_std: float = 0.02) -> None:
+        super().__init__()
+        widths = [channels << level for level in (0, 1, 2, 3)]
+        kernels = [(4, 4), (4, 4), (4, 4), (3, 4)]
+        layers: list[nn.Module] = []
+        for level, (inputs, width) in enumerate(zip([IMAGE_CHANNELS, *widths], widths, strict=False)):
+            stride, padding = _step(len(widths) - level)
+            layers.append(nn.Conv2d(inputs, width, kernels[level], stride, padding, bias=False))
+            layers += [nn.BatchNorm2d(width)] if level else []
+            layers.append(nn.LeakyReLU(_SLOPE))
+        self.main = nn.Sequential(*layers)
+        self.out = nn.Conv2d(widths[-1], outputs, _coarsest(size), bias=False)
+        _start(self, initial_std)
+
+    def forward(self, images: Float[Tensor, "B 2 H W"]) -> Float[Tensor, "B outputs"]:
+        """Return one vector for each image."""
+        return self.out(self.main(images)).float()[..., 0, 0]
+
+
+def check_initial_std(initial_std: float) -> None:
+    """Refuse a standard deviation of new weights that is none."""
+    if not 0 < initial_std <= 1:
+        raise ConfigError(f"initial_std={initial_std}", "above 0, at most 1", "0.02 is published")
+
+
+def _coarsest(size: tuple[int, int]) -> tuple[int, int]:
+    return (size[0] // 8 - 1) // 2, size[1] // 16
+
+
+def _step(level: int) -> tuple[int, tuple[int, int]]:
+    """Return stride and padding of a transposed convolution, 0 being the coarsest level."""
+    return (1, (0, 0)) if level == 0 else (2, (0, 1)) if level == 1 else (2, (1, 1))
+
+
+def _start(network: nn.Module, initial_std: float) -> None:
+    for module in network.modules():
+        if isinstance(module, (nn.Conv2d, nn.ConvTranspose2d)):
+            nn.init.normal_(module.weight, 0.0, initial_std)
+        elif isinstance(module, nn.BatchNorm2d):
+            nn.init.normal_(module.weight, 1.0, initial_std)
+
+
+def discriminator_loss(of_real: Float[Tensor, "B"], of_generated: Float[Tensor, "B"], kind: AdversarialLoss) -> Tensor:
+    """Return the least-squares loss of the discriminator.
+
+    Args:
+        of_real: output of the discriminator for real images.
+        of_generated: output for generated images.
+        kind: ``plain`` compares each output with a constant, 1 for real and 0 for generated (Mao et al., LSGAN, 2017).
+            ``relativistic`` compares it with the mean output for the other images: 1 above it, 1 below it
+            (Jolicoeur-Martineau, The relativistic discriminator, 2019).
+    """
+    if kind == "plain":
+        return ((of_real - 1).square().mean() + of_generated.square().mean()) / 2
+    return (
+        (of_real - of_generated.mean() - 1).square().mean() + (of_generated - of_real.mean() + 1).square().mean()
+    ) / 2
+
+
+def generator_loss(of_real: Float[Tensor, "B"], of_generated: Float[Tensor, "B"], kind: AdversarialLoss) -> Tensor:
+    """Return the loss of the generator; the arguments are those of :func:`discriminator_loss`."""
+    if kind == "plain":
+        return (of_generated - 1).square().mean()
+    return discriminator_loss(of_generated, of_real, kind)
+
+
+def kl_nats(mean: Float[Tensor, "B D"], log_variance: Float[Tensor, "B D"]) -> Float[Tensor, "B"]:
+    """Return the Kullback-Leibler divergence of each latent's normal distribution from the standard one."""
+    return (mean.square() + log_variance.exp() - 1 - log_variance).sum(dim=1) / 2
+
+
+def vae_loss(
+    images: Float[Tensor, "B 2 H W"],
+    reconstructed: Float[Tensor, "B 2 H W"],
+    kl: Float[Tensor, "B"],
+    kl_weight: float | Tensor,
+    free_nats: float,
+) -> dict[str, Tensor]:
+    """Return ``loss``, the absolute error summed over the values of an image plus the weighted divergence, and both.
+
+    Args:
+        images: images that were encoded.
+        reconstructed: images that were decoded.
+        kl: divergence of each latent.
+        kl_weight: weight of the divergence, from 0 to 1.
+        free_nats: divergence of a latent, in nats, below which it adds nothing to the loss.
+    """
+    error = (reconstructed - images).abs().sum(dim=(1, 2, 3)).mean()
+    loss = error + kl_weight * kl.clamp(min=free_nats).mean()
+    return {"loss": loss, "absolute_error": error.detach(), "kl_nats": kl.detach().mean()}
+
+
+def without_counters(weights: dict[str, Tensor], module: nn.Module) -> dict[str, Tensor]:
+    """Return weights with the module's own counters of batches, which files of old programs lack and nothing reads."""
+    return weights | {name: of for name, of in module.state_dict().items() if name.endswith("num_batches_tracked")}

@@ -1,0 +1,1 @@
+"""Experiments with ``lidargan``, one a file."""

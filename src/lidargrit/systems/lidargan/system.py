@@ -1,0 +1,198 @@
+"""LidarGAN: a GAN of distance and height in 40 rows without holes; seeds → range images without raydrop."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.func import functional_call
+
+from lidargrit.core.errors import CheckpointError, ConfigError
+from lidargrit.data.images import RangeImages
+from lidargrit.generation.facts import Cost, NoSampling, SystemFacts
+from lidargrit.generation.generator import Generator
+from lidargrit.generation.objective import Objective
+from lidargrit.nn.exact_weights import load_exactly
+from lidargrit.nn.flops import flops_of
+from lidargrit.nn.published import read_checkpoint
+from lidargrit.nn.random import normal_latents
+from lidargrit.nn.size import numbers_of_file
+from lidargrit.scans.sensors import SensorModel
+from lidargrit.scans.types import RangeImage
+from lidargrit.systems.lidargan.filled_rows import FilledRows
+from lidargrit.systems.lidargan.networks import (
+    IMAGE_CHANNELS,
+    AdversarialLoss,
+    Decoder,
+    Encoder,
+    check_initial_std,
+    discriminator_loss,
+    generator_loss,
+    without_counters,
+)
+
+_BYTES_AT_MOST = 1 << 29  # the published network takes 16 MB
+
+
+@dataclass(frozen=True)
+class LidarGanConfig:
+    """Networks and loss of LidarGAN; the defaults are the published ones.
+
+    Args:
+        latent_dim: length of a latent.
+        channels: number of channels of the finest level of both networks; each of the three coarser levels has twice as
+            many.
+        rows: number of rows that are generated: 24, 40, 56 or more in steps of 16.
+        first_row: index of the highest of these rows. The program leaves out the highest 17 and the lowest 7 of 64.
+        loss: least-squares loss of both networks. ``relativistic`` compares the discriminator's outputs for real and
+            generated images with each other, as in the released run; ``plain`` with constants.
+        initial_std: standard deviation of the new weights of both networks.
+    """
+
+    latent_dim: int = 100
+    channels: int = 64
+    rows: int = 40
+    first_row: int = 17
+    loss: AdversarialLoss = "relativistic"
+    initial_std: float = 0.02
+
+    def __post_init__(self) -> None:
+        for name in ("latent_dim", "channels"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"{name}={getattr(self, name)}", "at least 1", "raise it")
+        check_initial_std(self.initial_std)
+
+
+class LidarGan(Generator[LidarGanConfig, NoSampling]):
+    """A generative adversarial network over horizontal distance and height, of scans whose holes were filled.
+
+    Every ray of its rows returns, and no ray of the others: see :attr:`full_rows`.
+
+    Source:
+        Caccia et al., Deep Generative Modeling of LiDAR Data, IROS 2019; numbers from
+        pclucas14/lidar_generation@2a2c8bc.
+    """
+
+    Config = LidarGanConfig
+    facts = SystemFacts(
+        generates="range; every ray of 40 rows returns, and no ray of the others",
+        paper="Caccia et al., Deep Generative Modeling of LiDAR Data, IROS 2019",
+        program="pclucas14/lidar_generation@2a2c8bc (no licence)",
+        weights_licence="no licence stated",
+    )
+    published_files = ("generator",)
+
+    def __init__(self, config: LidarGanConfig, sensor: SensorModel) -> None:
+        super().__init__(config, sensor)
+        self.image = FilledRows(sensor, config.first_row, config.rows)
+        size = (config.rows, sensor.width)
+        self.decoder = Decoder(config.latent_dim, config.channels, size, config.initial_std)
+
+    @classmethod
+    def smallest_config(cls, sensor: SensorModel) -> LidarGanConfig:
+        """Return networks of 2 to 16 channels for 24 rows, with weights so large that untrained scans differ."""
+        return LidarGanConfig(latent_dim=4, channels=2, rows=24, first_row=sensor.height - 24, initial_std=0.5)
+
+    @property
+    def full_rows(self) -> range:
+        """Rows that are generated."""
+        return self.image.range
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """One stage, of two players."""
+        return ("adversarial",)
+
+    def fit_statistics(self, images: RangeImages) -> None:
+        """Take the scale of the images from the training scans."""
+        self.image.fit(images)
+
+    def objective(self, stage: str) -> Objective:
+        """Return the losses of the network and of a discriminator."""
+        return LidarGanObjective(self.decoder, self.image, self.config)
+
+    def load_stage(self, stage: str, objective: Objective) -> None:
+        """Take over the trained network and the scale of its images; its discriminator has done its work."""
+        assert isinstance(objective, LidarGanObjective)
+        self.image.load_state_dict(objective.image.state_dict())
+        self.decoder.load_state_dict(objective.decoder.state_dict())
+
+    def _sample(self, seeds: Sequence[int], sampling: NoSampling) -> RangeImage:
+        latents = normal_latents(seeds, self.config.latent_dim).to(self.device)
+        return self.image.decode(self.decoder(latents))
+
+    def cost(self, sampling: NoSampling | None = None) -> Cost:
+        """Return one pass of the network."""
+        return Cost(1, flops_of(self.decoder, (1, self.config.latent_dim)))
+
+    @classmethod
+    def from_published(cls, files: Sequence[Path], config: LidarGanConfig, sensor: SensorModel) -> LidarGan:
+        """Make a generator of one file of weights, such as ``gen_999.pth``, which tells its own sizes.
+
+        The file does not tell the scale of the images: it is 41.1245 m, the farthest that the box around the car
+        reaches, which the largest coordinate of many scans is next to.
+
+        Args:
+            files: file of the program; code in it is not run.
+            config: rows of the image.
+            sensor: sensor whose rays are the pixels of the authors' images.
+
+        Raises:
+            CheckpointError: another file, or a model of another form.
+        """
+        (path,) = files
+        weights = read_checkpoint(path, (), _BYTES_AT_MOST)
+        try:
+            (latent_dim, *_), (channels, image_channels, *_) = (
+                weights[f"main.{layer}.weight"].shape for layer in (0, 12)
+            )
+        except (KeyError, ValueError):
+            raise CheckpointError(
+                f"{path}, which holds no generator of LidarGAN", "one that its program saved", "check the path"
+            ) from None
+        if image_channels != IMAGE_CHANNELS:
+            raise CheckpointError(
+                f"{path}, which generates {image_channels} coordinates", "distance and height", "use another file"
+            )
+        with numbers_of_file(files[0]):
+            generator = cls(LidarGanConfig(latent_dim, channels, config.rows, config.first_row, config.loss), sensor)
+        load_exactly(generator.decoder, without_counters(weights, generator.decoder), path)
+        return generator.eval()
+
+
+class LidarGanObjective(Objective):
+    """LidarGAN's adversarial losses: two players take turns, with the same real scans and latents.
+
+    The program takes other real scans for the second player.
+    """
+
+    players = ("discriminator", "generator")
+
+    def __init__(self, decoder: Decoder, image: FilledRows, config: LidarGanConfig) -> None:
+        super().__init__(image.sensor)
+        self.config, self.decoder, self.image = config, decoder, image
+        size = (config.rows, image.sensor.width)
+        self.discriminator = Encoder(1, config.channels, size, config.initial_std)
+
+    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+        """Return a player's loss, and the discriminator's mean output for real and generated images."""
+        real = self.image.encode(images)
+        latents = torch.randn(len(real), self.config.latent_dim, generator=rng, device=rng.device)
+        if player == "discriminator":
+            with torch.no_grad():
+                generated = self.decoder(latents)
+            of_real, of_generated = self._judged(real, {}), self._judged(generated, {})
+            loss = discriminator_loss(of_real, of_generated, self.config.loss)
+        else:
+            frozen = {name: weight.detach() for name, weight in self.discriminator.named_parameters()}
+            of_real, of_generated = self._judged(real, frozen), self._judged(self.decoder(latents), frozen)
+            loss = generator_loss(of_real, of_generated, self.config.loss)
+        return {"loss": loss, "of_real": of_real.detach().mean(), "of_generated": of_generated.detach().mean()}
+
+    def _judged(self, images: Float[Tensor, "B 2 H W"], weights: dict[str, Tensor]) -> Float[Tensor, "B"]:
+        """Return the discriminator's outputs, by given weights in place of its own."""
+        return functional_call(self.discriminator, weights, (images,))[:, 0]

@@ -1,0 +1,1 @@
+"""The system ``lidargen``; see system.py."""

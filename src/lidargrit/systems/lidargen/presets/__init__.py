@@ -1,0 +1,1 @@
+"""Experiments with ``lidargen``, one a file."""

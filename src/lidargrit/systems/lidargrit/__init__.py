@@ -1,0 +1,1 @@
+"""The system ``lidargrit``; see system.py."""

@@ -1,0 +1,1 @@
+"""Experiments with ``lidargrit``, one a file."""

@@ -1,0 +1,11 @@
+"""The ablation for two CPU cores, first row: as ablation_raydrop_small, without raydrop loss."""
+
+from dataclasses import replace
+
+from lidargrit.core.configuration import override
+from lidargrit.systems.lidargrit.presets import ablation_raydrop_small
+
+RECIPE = replace(
+    override(ablation_raydrop_small.RECIPE, ["model.tokenizer.raydrop_loss=false"]),
+    title="the ablation, small, row 1: without raydrop loss and geometric preservation",
+)

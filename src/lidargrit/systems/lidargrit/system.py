@@ -1,0 +1,370 @@
+"""LidarGRIT: a transformer generates the tokens of a VQ-VAE one by one, and its decoder makes range images of them."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import partial
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from lidargrit.core.configuration import TypedSettings
+from lidargrit.core.errors import ConfigError
+from lidargrit.core.untrusted import is_temperature
+from lidargrit.generation.batches import BatchSeeds
+from lidargrit.generation.facts import Cost, SystemFacts
+from lidargrit.generation.objective import Objective
+from lidargrit.generation.pixel_decoder.pixel_decoder import PixelSampling
+from lidargrit.generation.tokenizers import Tokenizer
+from lidargrit.generation.tokens import PixelChoice, TokenGenerator, TokenGeneratorConfig, TokenObjective
+from lidargrit.nn.decoding import CachedDecoder, WeightPrecision, flops_of_step
+from lidargrit.nn.exact_weights import load_exactly
+from lidargrit.nn.precision import Precision
+from lidargrit.nn.published import read_checkpoint
+from lidargrit.nn.random import rngs_of
+from lidargrit.nn.random_choices import sample_index
+from lidargrit.nn.transformer import CausalTransformer
+from lidargrit.scans.condition import Condition, ConditionKind
+from lidargrit.scans.sensors import SensorModel
+from lidargrit.scans.types import RangeImage, TokenGrid
+from lidargrit.systems.completion_only.completion_network import CompletionNetwork, CompletionNetworkConfig
+from lidargrit.systems.completion_only.completion_objective import CompletionObjective
+from lidargrit.systems.raydrop.raydrop_network import RaydropConfig, RaydropNetwork
+from lidargrit.systems.raydrop.raydrop_objective import RaydropObjective
+
+START_TOKEN = 0  # the reference prepends an ordinary token, shared with the first code, not one of its own
+_PUBLISHED_BYTES_AT_MOST = 2 << 30  # the first release's transformer of 126 M weights, with its optimiser, takes 1.6 GB
+_PUBLISHED_NETWORKS = {  # by our name: the program's name, and entries of its checkpoint that are no weights
+    "tokenizer": ("VQ", ("loss.*",)),  # a discriminator and an image network, whose terms have the weight 0
+    "transformer": ("Transformer", ("*.attn.mask",)),  # a triangle of ones
+}
+_COUNTERS = ("quantize.usage", "quantize.code_sums")  # of our training, which other programs do not keep
+_GUIDANCE_AT_MOST = 100  # far beyond what is of use, and safe in 32 bits
+_OF_NETWORKS = {"completion", "weights", "decoder"}  # settings that change nothing of what a network completes
+
+
+@dataclass(frozen=True)
+class TokenSampling(TypedSettings):
+    """Settings of sampling tokens, returns and ranges.
+
+    Args:
+        temperature: divisor of the logits: above 1 scans vary more than the model's own, below 1 less; 0 takes the
+            likeliest token.
+        top_k: number of the likeliest tokens that are sampled from. 0 takes all, since the paper names no number. The
+            released program takes 100, which makes the scans of a barely trained model bland.
+        top_p: total probability of the likeliest tokens that are sampled from; 1 for all.
+        guidance: weight w of logits weaker + w (own - weaker), by which tokens are sampled. The weaker logits are those
+            of the same transformer without the attention of its last block but one, or of its only one. Above 1, scans
+            and regions differ more from one another; 1 leaves the transformer's own distribution; 0 takes the model's
+            setting (``model.guidance``).
+        mask: method by which returns and ranges are decided. ``pixels`` samples both by the pixel decoder, phase by
+            phase. ``bernoulli`` samples each return with its probability, independently of the others, and keeps the
+            decoded ranges (the released program, so what the paper's scores were computed with). ``threshold`` keeps a
+            return that is at least as likely as not (the paper's eq. 1). ``auto`` is ``pixels`` where there is a pixel
+            decoder, and ``bernoulli`` elsewhere.
+        range_temperature: temperature of the pixel decoder's density of ranges on one surface; below 1 ranges keep to
+            the surface more precisely; 0 takes the model's own (``model.pixels.range_temperature``). Only scans sampled
+            with 1, a noise of 1, a correlation of 0 and a guidance of 1 follow the distribution whose likelihood the
+            model gives.
+        range_noise: multiplier of the pixel decoder's spread of ranges about a surface.
+        mask_correlation: multiplier of how much of their noise close pixels of the pixel decoder's mask share that are
+            sampled at once; 0 samples them independently. The networks for completion and raydrop always take 1.
+        completion: method by which scans are completed. ``network`` takes the network that was trained for what was
+            observed: the one for completion where pixels were, the one for raydrop where all surfaces were. ``tokens``
+            samples the tokens without any observed pixel, and then all pixels that were not observed. ``auto`` is
+            ``network`` where a model has one. A network refuses the settings above, which it does not have.
+        weights: number type of the transformer's weights. ``fp32`` is exact; ``bf16`` and ``int8`` (CPUs only) read
+            less memory for a token and change probabilities a little, see docs/performance.md.
+        decoder: number type of the tokenizer's decoder and of the pixel decoder. ``fp32`` is exact; ``bf16`` is
+            quicker, moves ranges a little and a few pixels to another surface; ``auto`` is ``bf16`` where the machine
+            has instructions for it.
+    """
+
+    temperature: float = 1.0
+    top_k: int = 0
+    top_p: float = 1.0
+    guidance: float = 0.0
+    mask: PixelChoice = "auto"
+    range_temperature: float = PixelSampling.range_temperature
+    range_noise: float = PixelSampling.range_noise
+    mask_correlation: float = PixelSampling.mask_correlation
+    completion: Literal["auto", "network", "tokens"] = "auto"
+    weights: WeightPrecision = "fp32"
+    decoder: Precision = "fp32"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.pixels()
+        if not (is_temperature(self.temperature) and self.top_k >= 0 and 0 < self.top_p <= 1):
+            raise ConfigError(
+                f"temperature={self.temperature}, top_k={self.top_k}, top_p={self.top_p}",
+                "temperature 0 or at least 1e-6, top_k >= 0, 0 < top_p <= 1",
+                "correct the one that is out of bounds",
+            )
+        if self.guidance and not 1 <= self.guidance <= _GUIDANCE_AT_MOST:
+            wanted = f"1 to {_GUIDANCE_AT_MOST}, or 0 for the model's own"
+            raise ConfigError(f"guidance={self.guidance}", wanted, "correct it")
+
+    def pixels(self) -> PixelSampling:
+        """Return the settings of the pixel decoder."""
+        return PixelSampling(self.range_temperature, self.range_noise, self.mask_correlation, self.decoder)
+
+
+@dataclass(frozen=True)
+class LidarGritConfig(TokenGeneratorConfig):
+    """Configuration of the tokenizer, the transformer, and optional networks that the paper does not have.
+
+    Args:
+        completion: sizes of a network that completes scans; none in the paper.
+        raydrop: sizes of a network that tells which surfaces of clean scans return; none in the paper.
+        guidance: value of :attr:`TokenSampling.guidance` where the caller names none; 1 in the paper. What suits a
+            model is found on validation scans.
+    """
+
+    completion: CompletionNetworkConfig | None = None
+    raydrop: RaydropConfig | None = None
+    guidance: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.guidance <= _GUIDANCE_AT_MOST:
+            raise ConfigError(f"guidance={self.guidance}", f"1 to {_GUIDANCE_AT_MOST}", "correct it")
+
+
+class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
+    """The paper's system.
+
+    Source:
+        Haghighi et al., Taming Transformers for Realistic Lidar Point Cloud Generation, 2024.
+    """
+
+    Config = LidarGritConfig
+    facts = SystemFacts(
+        generates="range and raydrop, decoded apart from each other; reflectance if model.tokenizer.reflectance is set "
+        "(completed scans: that of model.completion or model.raydrop, or filled in)",
+        paper="Haghighi et al., Taming Transformers for Realistic Lidar Point Cloud Generation, 2024",
+        program="hamedhaghighi/LidarGRIT@a3f86e7 (no licence)",
+        weights_licence="no licence stated",
+    )
+    Sampling = TokenSampling
+    not_of_sampling = frozenset({"completion"})
+    published_files = tuple(_PUBLISHED_NETWORKS)
+    capabilities = TokenGenerator.capabilities | {"complete"}
+
+    def __init__(self, config: LidarGritConfig, sensor: SensorModel) -> None:
+        super().__init__(config, sensor)
+        height, width = self.tokenizer.grid_size
+        self.transformer = CausalTransformer(config.transformer, self.tokenizer.num_codes, height * width)
+        self._prepared: _Prepared | None = None
+        self._one_at_a_time = threading.Lock()
+        self.completion: CompletionNetwork | None = None
+        if config.completion is not None:
+            self.completion = CompletionNetwork(config.completion, sensor)
+        self.raydrop: RaydropNetwork | None = None
+        if config.raydrop is not None:
+            self.raydrop = RaydropNetwork(config.raydrop, sensor)
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """Those of every generator of tokens, then the networks for completion and for raydrop, if there are any."""
+        further = {"completion": self.config.completion, "raydrop": self.config.raydrop}
+        return (*super().stages, *(name for name, config in further.items() if config is not None))
+
+    def objective(self, stage: str) -> Objective:
+        """Return the objective of a stage."""
+        if stage == "completion" and self.completion is not None:
+            return CompletionObjective(self.completion, self.sensor)
+        if stage == "raydrop" and self.raydrop is not None:
+            return RaydropObjective(self.raydrop, self.sensor)
+        return super().objective(stage)
+
+    def transformer_objective(self) -> Objective:
+        """Return the likelihood of each token given those before it."""
+        return NextToken(self.tokenizer, self.transformer)
+
+    @property
+    def compute_batch(self) -> int:
+        """Number of scans whose tokens are sampled at once; a step for several takes little longer than for one."""
+        return 8 if self.device.type == "cpu" else 32
+
+    def _sample(self, seeds: BatchSeeds, sampling: TokenSampling) -> RangeImage:
+        return self._by_tokens(None, rngs_of(seeds), seeds.num_asked_for, sampling)
+
+    @property
+    def conditions(self) -> frozenset[ConditionKind]:
+        """Observed pixels, and ranges of surfaces whose returns are sampled."""
+        return frozenset({"pixels", "surfaces"})
+
+    def _complete(self, condition: Condition, seeds: BatchSeeds, sampling: TokenSampling) -> RangeImage:
+        """Complete each scan by the network for what is known of it, or by tokens, whatever the others' conditions."""
+        rngs, count = rngs_of(seeds), seeds.num_asked_for
+        networks = [self._completing_network(condition[[index]], sampling) for index in range(count)]
+        found: dict[int, RangeImage] = {}
+        for network in (self.completion, self.raydrop):
+            own = [index for index, each in enumerate(networks) if each is not None and each is network]
+            if network is not None and own:
+                completed = network.sample(condition[own], [rngs[index] for index in own])
+                found |= {index: completed[[at]] for at, index in enumerate(own)}
+        if None in networks:  # the whole batch, whose size decides how sums are rounded
+            completed = self._by_tokens(condition, rngs, count, sampling)
+            found |= {index: completed[[index]] for index, each in enumerate(networks) if each is None}
+        return RangeImage.cat([found[index] for index in range(count)])
+
+    def _by_tokens(
+        self, condition: Condition | None, rngs: list[torch.Generator], count: int, sampling: TokenSampling
+    ) -> RangeImage:
+        """Generate the tokens without any observed pixel, and with a pixel decoder the pixels around observed ones.
+
+        Tokens come row by row, and pixels in phases. Each is conditioned on the observed ones before it, not on later
+        ones.
+
+        Args:
+            condition: observed part of the scans; None for new ones.
+            rngs: random generators on the CPU, one for each scan of a batch.
+            count: number of scans to return.
+            sampling: settings of sampling.
+        """
+        self.check_choice(sampling.mask, sampling.pixels())
+        uniform = torch.stack([torch.rand(self.transformer.context_length, generator=rng) for rng in rngs])
+        tokens = None if condition is None else self.observed_tokens(condition)
+        with self._one_at_a_time:  # threads would write into one cache
+            decoder, tokenizer = self._prepare(len(rngs), sampling)
+            if tokens is None or bool((tokens < 0).any()):
+                tokens = decoder.generate(uniform.to(self.device), tokens)
+        return self.decode(tokens, count, rngs, sampling.mask, sampling.pixels(), tokenizer, condition)
+
+    def _completing_network(
+        self, condition: Condition, sampling: TokenSampling
+    ) -> CompletionNetwork | RaydropNetwork | None:
+        """Return the network that was trained for such conditions and is to complete them; None for tokens."""
+        if sampling.completion == "tokens":
+            return None
+        network = self.raydrop if condition.has_all_surfaces else None
+        if condition.kinds == {"pixels"}:
+            network = self.completion
+        if network is None and sampling.completion == "network":
+            raise ConfigError(
+                "completion=network for a model without a network for what is known of these scans",
+                "a model with one",
+                "leave completion out, or train a recipe with its stage: compact_completion or compact_raydrop",
+            )
+        changed = [
+            f"{each.name}={getattr(sampling, each.name)}"
+            for each in fields(sampling)
+            if each.name not in _OF_NETWORKS and getattr(sampling, each.name) != each.default
+        ]
+        if network is not None and changed:
+            raise ConfigError(
+                f"{changed[0]}, which the network that completes these scans does not have",
+                "settings that have an effect",
+                "leave it out, or add completion=tokens",
+            )
+        return network
+
+    def token_bits(self, grid: TokenGrid) -> Float[Tensor, "B h w"]:
+        """Return the bits of each token given those before it."""
+        tokens = grid.tokens.flatten(1)
+        logits = self.transformer(after_start(tokens[:, :-1]))
+        nats = F.cross_entropy(logits.double().movedim(-1, 1), tokens, reduction="none")
+        return (nats / math.log(2)).float().view(grid.tokens.shape)
+
+    def cost(self, sampling: TokenSampling | None = None) -> Cost:
+        """Return the cost of one step of the transformer for each token, with a cache, and of one decoding."""
+        tokens = self.transformer.context_length
+        sampling = sampling or TokenSampling()
+        guidance = self._guidance(sampling)
+        flops = sum(flops_of_step(self.transformer, position, guidance) for position in range(tokens))
+        decoding = self.decoding_cost(sampling.mask)
+        return Cost(tokens + decoding.network_evaluations, flops + decoding.flops)
+
+    def _guidance(self, sampling: TokenSampling) -> float:
+        return sampling.guidance or self.config.guidance
+
+    @torch.inference_mode(False)  # what is kept may be used outside of it, too
+    @torch.no_grad()
+    def _prepare(self, batch_size: int, sampling: TokenSampling) -> tuple[CachedDecoder, Tokenizer]:
+        """Return what generates tokens and what decodes them, kept from the last call if nothing has changed since."""
+        weights = tuple((each.data_ptr(), -1 if each.is_inference() else each._version) for each in self.parameters())
+        guidance = self._guidance(sampling)
+        choices = (sampling.temperature, sampling.top_k, sampling.top_p, guidance, sampling.weights, sampling.decoder)
+        key = (batch_size, choices, weights)
+        if self._prepared is None or self._prepared.key != key:
+            self._prepared = None  # its cache is given back before the next is taken
+            by_choices = partial(sample_token, sampling=sampling)
+            decoder = CachedDecoder(
+                self.transformer, batch_size, by_choices, START_TOKEN, sampling.weights, guidance=guidance
+            )
+            self._prepared = _Prepared(key, decoder, self.tokenizer.for_decoding(sampling.decoder))
+        return self._prepared.decoder, self._prepared.tokenizer
+
+    def __getstate__(self) -> dict[str, object]:
+        """Leave out what can be made again: functions and locks cannot be pickled."""
+        return {name: value for name, value in self.__dict__.items() if name not in ("_prepared", "_one_at_a_time")}
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        """Make again what was left out."""
+        super().__setstate__(state)
+        self._prepared, self._one_at_a_time = None, threading.Lock()
+
+    @classmethod
+    def from_published(cls, files: Sequence[Path], config: LidarGritConfig, sensor: SensorModel) -> LidarGrit:
+        """Make a generator of a VQ-VAE's and a transformer's checkpoint, in which weights have the names of ours.
+
+        The files tell neither the number of attention heads nor the order of tokens: only the order of the paper, row
+        by row over the whole image, is known here.
+
+        Source:
+            hamedhaghighi/LidarGRIT@a3f86e7, models/base_model.py.
+        """
+        generator = cls(config, sensor)
+        for (part, (name, ignored)), path in zip(_PUBLISHED_NETWORKS.items(), files, strict=True):
+            network = generator.get_submodule(part)
+            weights = read_checkpoint(path, (name,), _PUBLISHED_BYTES_AT_MOST, ignored)
+            counters = {ours: of for ours, of in network.state_dict().items() if ours in _COUNTERS}
+            load_exactly(network, weights | counters, path)
+        return generator.eval()
+
+
+class _Prepared(NamedTuple):
+    key: object
+    decoder: CachedDecoder
+    tokenizer: Tokenizer
+
+
+class NextToken(TokenObjective):
+    """The transformer's objective: negative log-likelihood of each token after those before it, in nats per token."""
+
+    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+        """Return eq. 6 of the paper per token, beside it that of a model which knows only how often tokens occur."""
+        tokens, unigram_nll = self.encode(images)
+        logits = self.transformer(after_start(tokens[:, :-1]))
+        loss = F.cross_entropy(logits.float().flatten(0, 1), tokens.flatten())
+        return {"loss": loss, "unigram_nll": unigram_nll.mean()}
+
+
+def after_start(tokens: Int[Tensor, "B T"]) -> Int[Tensor, "B T+1"]:
+    """Prepend the start token."""
+    return F.pad(tokens, (1, 0), value=START_TOKEN)
+
+
+def sample_token(
+    logits: Float[Tensor, "B K"], uniform: Float[Tensor, "B"], sampling: TokenSampling
+) -> Int[Tensor, "B"]:
+    """Sample one token for each row of logits, by its uniform number in [0, 1)."""
+    if sampling.temperature == 0:
+        return logits.argmax(dim=1)
+    logits = logits.double() / sampling.temperature
+    if 0 < sampling.top_k < logits.shape[1]:
+        weakest = logits.topk(sampling.top_k, dim=1).values[:, -1:]
+        logits = logits.masked_fill(logits < weakest, -torch.inf)  # ties with the weakest are kept, as in the program
+    if sampling.top_p < 1:
+        ordered, order = logits.softmax(dim=1).sort(dim=1, descending=True)
+        spare = ordered.cumsum(dim=1) - ordered >= sampling.top_p  # the likelier ones hold enough
+        logits = logits.masked_fill(torch.zeros_like(spare).scatter(1, order, spare), -torch.inf)
+    return sample_index(logits, uniform)

@@ -1,0 +1,1 @@
+"""The system ``lidarvae``; see system.py."""

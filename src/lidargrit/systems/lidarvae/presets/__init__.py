@@ -1,0 +1,1 @@
+"""Experiments with ``lidarvae``, one a file."""

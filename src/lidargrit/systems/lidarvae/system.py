@@ -1,0 +1,255 @@
+"""LiDAR-VAE: a variational autoencoder of distance and height in 40 rows without holes; seeds → range images."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidargrit.core.configuration import COUNTS_SCANS, TypedSettings
+from lidargrit.core.errors import CheckpointError, ConfigError
+from lidargrit.core.untrusted import SEARCH_STEPS_AT_MOST
+from lidargrit.data.images import RangeImages
+from lidargrit.generation.facts import Cost, SystemFacts
+from lidargrit.generation.generator import Generator
+from lidargrit.generation.objective import Objective
+from lidargrit.nn.exact_weights import load_exactly
+from lidargrit.nn.flops import flops_of
+from lidargrit.nn.latent_search import search_latents
+from lidargrit.nn.processes import num_processes
+from lidargrit.nn.published import read_checkpoint
+from lidargrit.nn.random import normal_latents
+from lidargrit.nn.size import numbers_of_file
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.sensors import SensorModel
+from lidargrit.scans.types import RangeImage
+from lidargrit.systems.lidargan.filled_rows import FilledRows
+from lidargrit.systems.lidargan.networks import (
+    IMAGE_CHANNELS,
+    Decoder,
+    Encoder,
+    check_initial_std,
+    kl_nats,
+    vae_loss,
+    without_counters,
+)
+
+_BYTES_AT_MOST = 1 << 29  # the largest published network takes 120 MB
+
+
+@dataclass(frozen=True)
+class LidarVaeConfig:
+    """Networks and objective of the VAE; the defaults are the published ones.
+
+    Args:
+        latent_dim: length of a latent; models of 128, 256 and 512 are published.
+        channels: number of channels of the finest level of both networks; each of the three coarser levels has twice as
+            many.
+        rows: number of rows that are encoded and generated: 24, 40, 56 or more in steps of 16.
+        first_row: index of the highest of these rows. The program leaves out the highest 17 and the lowest 7 of 64.
+        warmup_scans: number of training scans over which the weight of the divergence rises linearly from 0 to 1; 0
+            for a weight of 1 from the start.
+        free_nats: KL divergence of a scan's latent, in nats, below which it adds nothing to the loss (free bits).
+        initial_std: standard deviation of the new weights of both networks.
+    """
+
+    latent_dim: int = 128
+    channels: int = 64
+    rows: int = 40
+    first_row: int = 17
+    warmup_scans: int = field(default=0, metadata={COUNTS_SCANS: True})
+    free_nats: float = 5.0
+    initial_std: float = 0.02
+
+    def __post_init__(self) -> None:
+        for name, least in (("latent_dim", 1), ("channels", 1), ("warmup_scans", 0), ("free_nats", 0)):
+            if not least <= getattr(self, name) < math.inf:
+                raise ConfigError(f"{name}={getattr(self, name)}", f"at least {least}, and finite", "correct it")
+        check_initial_std(self.initial_std)
+
+
+@dataclass(frozen=True)
+class VaeSampling(TypedSettings):
+    """Settings of completing and inverting scans; sampling itself has none.
+
+    Args:
+        spread: factor on the standard deviations by which a latent is sampled around the mean latent of the observed
+            pixels when a scan is completed; 0 takes the mean, as the paper does in its evaluation.
+        search_steps: number of steps of the optimiser that searches for a latent.
+        search_rate: highest learning rate of that optimiser.
+    """
+
+    spread: float = 1.0
+    search_steps: int = 300
+    search_rate: float = 0.05
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.search_steps > SEARCH_STEPS_AT_MOST:
+            got = f"search_steps={self.search_steps}"
+            raise ConfigError(got, f"at most {SEARCH_STEPS_AT_MOST:,}", "lower it")
+        for name, least in (("spread", 0), ("search_steps", 1), ("search_rate", 0)):
+            if not least <= getattr(self, name) < math.inf:
+                raise ConfigError(f"{name}={getattr(self, name)}", f"at least {least}, and finite", "correct it")
+
+
+class LidarVae(Generator[LidarVaeConfig, VaeSampling]):
+    """A variational autoencoder over horizontal distance and height, of scans whose holes were filled.
+
+    Every ray of its rows returns, and no ray of the others: see :attr:`full_rows`. To complete a scan, it fills
+    unobserved pixels as it fills other holes, encodes the result and decodes it.
+
+    Source:
+        Caccia et al., Deep Generative Modeling of LiDAR Data, IROS 2019; numbers from
+        pclucas14/lidar_generation@2a2c8bc.
+    """
+
+    Config = LidarVaeConfig
+    Sampling = VaeSampling
+    not_of_sampling = frozenset({"spread", "search_steps", "search_rate"})
+    facts = SystemFacts(
+        generates="range; every ray of 40 rows returns, and no ray of the others",
+        paper="Caccia et al., Deep Generative Modeling of LiDAR Data, IROS 2019",
+        program="pclucas14/lidar_generation@2a2c8bc (no licence)",
+        weights_licence="no licence stated",
+    )
+    capabilities = frozenset({"encode", "complete", "invert"})
+    published_files = ("autoencoder",)
+
+    def __init__(self, config: LidarVaeConfig, sensor: SensorModel) -> None:
+        super().__init__(config, sensor)
+        size = (config.rows, sensor.width)
+        self.image = FilledRows(sensor, config.first_row, config.rows)
+        self.encode = Encoder(2 * config.latent_dim, config.channels, size, config.initial_std)
+        self.decode = Decoder(config.latent_dim, config.channels, size, config.initial_std)
+
+    @classmethod
+    def smallest_config(cls, sensor: SensorModel) -> LidarVaeConfig:
+        """Return networks of 2 to 16 channels for 24 rows, with weights so large that untrained scans differ."""
+        return LidarVaeConfig(latent_dim=4, channels=2, rows=24, first_row=sensor.height - 24, initial_std=0.5)
+
+    @classmethod
+    def quickest_sampling(cls) -> VaeSampling:
+        """Return a search of 4 steps."""
+        return VaeSampling(search_steps=4)
+
+    @property
+    def full_rows(self) -> range:
+        """Rows that are generated."""
+        return self.image.range
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """One stage."""
+        return ("autoencoder",)
+
+    def fit_statistics(self, images: RangeImages) -> None:
+        """Take the scale of the images from the training scans."""
+        self.image.fit(images)
+
+    def objective(self, stage: str) -> Objective:
+        """Return the objective of both networks."""
+        return LidarVaeObjective(self.encode, self.decode, self.image, self.config)
+
+    def load_stage(self, stage: str, objective: Objective) -> None:
+        """Take over the trained networks and the scale of their images."""
+        assert isinstance(objective, LidarVaeObjective)
+        self.image.load_state_dict(objective.image.state_dict())
+        self.encode.load_state_dict(objective.encode.state_dict())
+        self.decode.load_state_dict(objective.decode.state_dict())
+
+    def _sample(self, seeds: Sequence[int], sampling: VaeSampling) -> RangeImage:
+        return self.image.decode(self.decode(self._latents(seeds)))
+
+    def cost(self, sampling: VaeSampling | None = None) -> Cost:
+        """Return one pass of the decoder."""
+        return Cost(1, flops_of(self.decode, (1, self.config.latent_dim)))
+
+    def _reconstruct(self, images: RangeImage) -> RangeImage:
+        mean, _ = self.encode(self.image.encode(images)).chunk(2, dim=1)
+        return self.image.decode(self.decode(mean))
+
+    def _complete(self, condition: Condition, seeds: Sequence[int], sampling: VaeSampling) -> RangeImage:
+        mean, log_variance = self.encode(self.image.encode(condition.images)).chunk(2, dim=1)
+        latents = mean + sampling.spread * (log_variance / 2).exp() * self._latents(seeds)
+        return self.image.decode(self.decode(latents))
+
+    def _invert(self, images: RangeImage, seeds: Sequence[int], sampling: VaeSampling) -> RangeImage:
+        """Search from the encoder's mean for the latent whose image is nearest in mean absolute difference."""
+        target = self.image.encode(images)
+
+        def error_of(latents: Tensor) -> Tensor:
+            return (self.decode(latents) - target).abs().mean(dim=(1, 2, 3))
+
+        noise = self._latents(seeds, sampling.search_steps + 1)
+        noise[:, 0] = self.encode(target).chunk(2, dim=1)[0]
+        # Means of dimensions that tell nothing lie near 0, far within the sphere of random latents.
+        return self.image.decode(self.decode(search_latents(error_of, noise, sampling.search_rate, on_sphere=False)))
+
+    def _latents(self, seeds: Sequence[int], *count: int) -> Float[Tensor, "B *count D"]:
+        return normal_latents(seeds, *count, self.config.latent_dim).to(self.device)
+
+    @classmethod
+    def from_published(cls, files: Sequence[Path], config: LidarVaeConfig, sensor: SensorModel) -> LidarVae:
+        """Make a generator of one file of weights, such as ``gen_299.pth``, which tells its own sizes.
+
+        The file does not tell the scale of the images: it is 41.1245 m, the farthest that the box around the car
+        reaches, which the largest coordinate of many scans is next to.
+
+        Args:
+            files: file of the program; code in it is not run.
+            config: rows of the image and settings of the objective.
+            sensor: sensor whose rays are the pixels of the authors' images.
+
+        Raises:
+            CheckpointError: another file, or a model of another form, such as one of three coordinates.
+        """
+        (path,) = files
+        weights = read_checkpoint(path, (), _BYTES_AT_MOST)
+        try:
+            (latent_dim, *_), (channels, image_channels, *_) = (
+                weights[name].shape for name in ("decode.main.0.weight", "encode.main.0.weight")
+            )
+        except (KeyError, ValueError):
+            raise CheckpointError(
+                f"{path}, which holds no autoencoder of LidarGAN's authors", "one of their program", "check the path"
+            ) from None
+        if image_channels != IMAGE_CHANNELS:
+            raise CheckpointError(
+                f"{path}, which encodes {image_channels} coordinates", "distance and height", "use another file"
+            )
+        sizes = (latent_dim, channels, config.rows, config.first_row)
+        with numbers_of_file(files[0]):
+            generator = cls(LidarVaeConfig(*sizes, config.warmup_scans, config.free_nats), sensor)
+        weights |= {"image.scale_m": generator.image.scale_m}
+        load_exactly(generator, without_counters(weights, generator), path)
+        return generator.eval()
+
+
+class LidarVaeObjective(Objective):
+    """The VAE's loss: the absolute error of the decoded image, and the divergence of its latent from the prior."""
+
+    scans_seen: Tensor
+
+    def __init__(self, encode: Encoder, decode: Decoder, image: FilledRows, config: LidarVaeConfig) -> None:
+        super().__init__(image.sensor)
+        self.config, self.encode, self.decode, self.image = config, encode, decode, image
+        self.register_buffer("scans_seen", torch.zeros((), dtype=torch.int64))
+
+    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+        """Return the loss and its two parts."""
+        real = self.image.encode(images)
+        mean, log_variance = self.encode(real).chunk(2, dim=1)
+        latents = mean
+        if self.training:
+            self.scans_seen += len(real) * num_processes()
+            noise = torch.randn(mean.shape, generator=rng, device=rng.device)
+            latents = mean + (log_variance / 2).exp() * noise
+        weight = (self.scans_seen / max(self.config.warmup_scans, 1)).clamp(max=1.0)
+        kl_weight = weight if self.config.warmup_scans else 1.0
+        return vae_loss(real, self.decode(latents), kl_nats(mean, log_variance), kl_weight, self.config.free_nats)

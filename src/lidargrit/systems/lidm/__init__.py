@@ -1,0 +1,1 @@
+"""The system ``lidm``; see system.py."""

@@ -1,0 +1,1 @@
+"""Experiments with ``lidm``, one a file."""

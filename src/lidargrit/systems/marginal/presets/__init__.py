@@ -1,0 +1,1 @@
+"""Experiments with ``marginal``, one a file."""

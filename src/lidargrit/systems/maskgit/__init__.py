@@ -1,0 +1,1 @@
+"""The system ``maskgit``; see system.py."""

@@ -1,0 +1,1 @@
+"""The system ``memorised``; see system.py."""

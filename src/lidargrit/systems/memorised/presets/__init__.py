@@ -1,0 +1,1 @@
+"""Experiments with ``memorised``, one a file."""

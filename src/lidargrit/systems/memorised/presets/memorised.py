@@ -1,0 +1,13 @@
+"""Memorised training scans, as a reference row; simulated or your own scans; trains in seconds."""
+
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.generation.settings import Recipe
+from lidargrit.systems.memorised.system import MemorisedConfig
+
+RECIPE = Recipe(
+    title="memorised: training scans given back; few models can score better",
+    generator="memorised",
+    model=MemorisedConfig(),
+    data=DataConfig(train=("simulated:2000:train",), val=("simulated:32:val",)),
+    training={},
+)

@@ -1,0 +1,1 @@
+"""The system ``multiscale``; see system.py."""

@@ -1,0 +1,1 @@
+"""Experiments with ``multiscale``, one a file."""

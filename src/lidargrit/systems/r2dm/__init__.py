@@ -1,0 +1,1 @@
+"""The system ``r2dm``; see system.py."""

@@ -1,0 +1,1 @@
+"""Experiments with ``r2dm``, one a file."""

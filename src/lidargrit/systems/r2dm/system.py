@@ -1,0 +1,251 @@
+"""R2DM: a diffusion model of log range and reflectance, raydrop by a window of ranges; seeds → range images."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidargrit.core.configuration import TypedSettings
+from lidargrit.core.determinism import evenly_spaced, scan_seed
+from lidargrit.core.errors import ConfigError
+from lidargrit.core.untrusted import STEPS_AT_MOST
+from lidargrit.data.images import RangeImages
+from lidargrit.generation.facts import Cost, SystemFacts
+from lidargrit.generation.generator import Generator
+from lidargrit.generation.objective import Objective
+from lidargrit.generation.range_values import decode, encode
+from lidargrit.nn.exact_weights import load_exactly
+from lidargrit.nn.flops import flops_of
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.sensors import SensorModel, load_sensor
+from lidargrit.scans.types import RangeImage
+from lidargrit.systems.r2dm import diffusion
+from lidargrit.systems.r2dm.diffusion import Sampler, SeededNoise
+from lidargrit.systems.r2dm.r2dm_checkpoint import read_r2dm_checkpoint
+from lidargrit.systems.r2dm.unet import EfficientUnet, UnetConfig
+
+_BATCH = 8
+_PUBLISHED_SENSOR = "hdl64e_kitti_360"
+_SHARE_SCANS = 1000  # whose returns are counted: more would not change their share
+_CALIBRATION_SEED = 1 << 40  # mixed with a scan's number, so that its seed is none of a user's first
+
+
+@dataclass(frozen=True)
+class R2dmConfig:
+    """Channels and network of R2DM.
+
+    Args:
+        unet: sizes of the U-Net.
+        reflectance: whether reflectance is learned beside the range, as published; set it to false where scans have
+            none, or for a sharper range (the authors' own remark).
+        calibration_scans: number of scans sampled at the end of training to fit the threshold of the ``calibrated``
+            raydrop; 0 for none.
+    """
+
+    unet: UnetConfig = field(default_factory=UnetConfig)
+    reflectance: bool = True
+    calibration_scans: int = 16
+
+    def __post_init__(self) -> None:
+        if self.calibration_scans < 0:
+            raise ConfigError(f"calibration_scans={self.calibration_scans}", "0 or more", "raise it")
+
+
+@dataclass(frozen=True)
+class DiffusionSampling(TypedSettings):
+    """Settings of sampling, and the rule by which a pixel is a return.
+
+    Args:
+        steps: number of evaluations of the network; 256 are published, and 32 for completion.
+        sampler: ``ddpm`` adds fresh noise after each step (published), ``ddim`` only at the beginning.
+        raydrop: rule by which a pixel is a return. ``published``: its range lies inside the sensor's limits.
+            ``calibrated`` (not in the paper): its value is above a threshold, fitted so that as many rays return as in
+            the training scans; a barely trained model may lose near returns by it.
+        resamples: number of times that each step is taken when a scan is completed.
+    """
+
+    steps: int = 256
+    sampler: Sampler = "ddpm"
+    raydrop: Literal["published", "calibrated"] = "published"
+    resamples: int = 16
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 1 <= min(self.steps, self.resamples) <= max(self.steps, self.resamples) <= STEPS_AT_MOST:
+            got = f"steps={self.steps}, resamples={self.resamples}"
+            raise ConfigError(got, f"1 to {STEPS_AT_MOST:,} of both", "256 and 16 are the default")
+
+
+_CALIBRATION = DiffusionSampling(steps=32)
+
+
+class R2dm(Generator[R2dmConfig, DiffusionSampling]):
+    """Generates the image of log ranges, in which a missing return is a range that no return has.
+
+    Source:
+        Nakashima and Kurazume, LiDAR Data Synthesis with Denoising Diffusion Probabilistic Models, ICRA 2024; numbers
+        from kazuto1011/r2dm@1c5963d (MIT).
+    """
+
+    Config = R2dmConfig
+    facts = SystemFacts(
+        generates="range and reflectance; a range outside the sensor's limits is no return",
+        paper="Nakashima and Kurazume, LiDAR Data Synthesis with Denoising Diffusion Probabilistic Models, ICRA 2024",
+        program="kazuto1011/r2dm@1c5963d (MIT)",
+        weights_licence="MIT, as the program",
+    )
+    Sampling = DiffusionSampling
+    not_of_sampling = frozenset({"resamples"})
+    capabilities = frozenset({"complete"})
+    published_files = ("settings and network",)
+    return_share: Tensor
+    return_threshold: Tensor
+
+    def __init__(self, config: R2dmConfig, sensor: SensorModel) -> None:
+        super().__init__(config, sensor)
+        self.shape = (1 + config.reflectance, sensor.height, sensor.width)
+        angles = torch.broadcast_tensors(sensor.elevation_rad, sensor.azimuth_rad)
+        self.network = EfficientUnet(config.unet, self.shape[0], *(angle.contiguous() for angle in angles))
+        self.register_buffer("return_share", torch.tensor(math.nan))
+        self.register_buffer("return_threshold", torch.tensor(math.nan))
+
+    @classmethod
+    def smallest_config(cls, sensor: SensorModel) -> R2dmConfig:
+        """Return a U-Net of two levels and 8 channels."""
+        return R2dmConfig(UnetConfig(8, (1, 1), (1, 1), norm_groups=2, attention_heads=2))
+
+    @classmethod
+    def quickest_sampling(cls) -> DiffusionSampling:
+        """Return 3 steps, each taken twice when a scan is completed."""
+        return DiffusionSampling(steps=3, resamples=2)
+
+    @classmethod
+    def completion_sampling(cls) -> DiffusionSampling:
+        """Return 32 steps with 16 resamples each, as in the authors' demonstration."""
+        return DiffusionSampling(steps=32)
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """One stage."""
+        return ("diffusion",)
+
+    def fit_statistics(self, images: RangeImages) -> None:
+        """Count how many of the training scans' rays return."""
+        chosen = evenly_spaced(_SHARE_SCANS, len(images))
+        shares = [
+            images.batch(chosen[first : first + _BATCH]).return_mask.float().mean((1, 2))
+            for first in range(0, len(chosen), _BATCH)
+        ]
+        self.return_share.fill_(float(torch.cat(shares).mean()))
+
+    def objective(self, stage: str) -> Objective:
+        """Return the denoising of the network."""
+        return Denoising(self.network, self.sensor)
+
+    def load_stage(self, stage: str, objective: Objective) -> None:
+        """Take over the trained network."""
+        assert isinstance(objective, Denoising)
+        self.network.load_state_dict(objective.network.state_dict())
+
+    def after_training(self) -> None:
+        """Fit the threshold of the calibrated raydrop: as many values lie above it as rays returned in training."""
+        seeds = [scan_seed(_CALIBRATION_SEED, number) for number in range(self.config.calibration_scans)]
+        if not seeds or not bool(self.return_share.isfinite()):
+            return
+        parts = [
+            self._sample_values(seeds[first : first + _BATCH], _CALIBRATION) for first in range(0, len(seeds), _BATCH)
+        ]
+        levels = torch.cat([part[:, 0].flatten() for part in parts]).sort().values
+        dropped = min(round((1 - float(self.return_share)) * len(levels)), len(levels) - 1)
+        self.return_threshold.fill_(float(levels[dropped]))
+
+    def _sample(self, seeds: Sequence[int], sampling: DiffusionSampling) -> RangeImage:
+        self._check(sampling)
+        return self._decoded(self._sample_values(seeds, sampling), sampling)
+
+    def _complete(self, condition: Condition, seeds: Sequence[int], sampling: DiffusionSampling) -> RangeImage:
+        """Generate scans that agree with the observed pixels, by RePaint over DDPM."""
+        self._check(sampling)
+        if sampling.sampler != "ddpm":
+            raise ConfigError(f"sampler={sampling.sampler} for completion", "sampler=ddpm", "RePaint adds fresh noise")
+        noise, clean = SeededNoise(seeds, self.shape, self.device), encode(condition.images, self.config.reflectance)
+        observed = condition.return_observed[:, None]
+        generated = diffusion.repaint(self.network, noise, clean, observed, sampling.steps, sampling.resamples)
+        return self._decoded(generated, sampling)
+
+    def cost(self, sampling: DiffusionSampling | None = None) -> Cost:
+        """Return the network's passes, one a step."""
+        steps = (sampling or DiffusionSampling()).steps
+        return Cost(steps, steps * flops_of(self.network, (1, *self.shape), (1,)))
+
+    @classmethod
+    def from_published(cls, files: Sequence[Path], config: R2dmConfig, sensor: SensorModel) -> R2dm:
+        """Make a generator of one checkpoint, which tells its own sizes; see :func:`load_published`."""
+        return load_published(files[0], sensor)
+
+    @torch.no_grad()
+    def _sample_values(self, seeds: Sequence[int], sampling: DiffusionSampling) -> Float[Tensor, "B C H W"]:
+        self.eval()
+        noise = SeededNoise(seeds, self.shape, self.device)
+        return diffusion.sample(self.network, noise, sampling.steps, sampling.sampler)
+
+    def _decoded(self, sampled: Float[Tensor, "B C H W"], sampling: DiffusionSampling) -> RangeImage:
+        returned = sampled[:, 0] >= self.return_threshold if sampling.raydrop == "calibrated" else None
+        return decode(sampled, self.sensor, returned)
+
+    def _check(self, sampling: DiffusionSampling) -> None:
+        if sampling.raydrop == "calibrated" and not bool(self.return_threshold.isfinite()):
+            raise ConfigError(
+                "raydrop=calibrated for a model whose threshold was never fitted",
+                "raydrop=published",
+                "train with model.calibration_scans above 0",
+            )
+
+
+class Denoising(Objective):
+    """The objective: the squared error of the predicted noise at a random time, weighed by min-SNR."""
+
+    ray_buffers = ("network.coords",)
+
+    def __init__(self, network: EfficientUnet, sensor: SensorModel) -> None:
+        super().__init__(sensor)
+        self.network = network
+
+    def check(self, images: RangeImage) -> None:
+        """Refuse images without the reflectance that is to be learned."""
+        encode(images, with_reflectance=self.network.out_conv.out_channels > 1)
+
+    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+        """Return the weighed error as ``loss``, and the plain one beside it."""
+        clean = encode(images, with_reflectance=self.network.out_conv.out_channels > 1)
+        time = torch.rand(len(clean), generator=rng, device=clean.device, dtype=torch.float64)
+        noise = torch.randn(clean.shape, generator=rng, device=clean.device)
+        log_snr = diffusion.log_snr_at(time).float()
+        predicted = self.network(diffusion.noised(clean, log_snr, noise), log_snr).float()
+        error = (predicted - noise).square().mean((1, 2, 3))
+        return {"loss": (error * diffusion.min_snr_weight(log_snr)).mean(), "noise_mse": error.mean()}
+
+
+def load_published(path: Path, sensor: SensorModel | None = None) -> R2dm:
+    """Make a generator from a checkpoint that the authors published, or that their program saved.
+
+    Args:
+        path: checkpoint in either layout of lidargrit.systems.r2dm.r2dm_checkpoint; code in it is not run.
+        sensor: sensor of the images; if not given, that of the KITTI-360 weights, with rows by elevation. The network
+            keeps the ray angles of its training, at the edges of cells; where a pixel's point lies is the sensor's.
+
+    Raises:
+        CheckpointError: another file, or a model of another form.
+    """
+    unet, reflectance, weights = read_r2dm_checkpoint(path)
+    generator = R2dm(R2dmConfig(unet, reflectance), sensor or load_sensor(_PUBLISHED_SENSOR))
+    own = {name: tensor for name, tensor in generator.state_dict().items() if not name.startswith("network.")}
+    load_exactly(generator, own | {f"network.{name}": tensor for name, tensor in weights.items()}, path)
+    return generator.eval()

@@ -1,0 +1,1 @@
+"""The system ``r2flow``; see system.py."""

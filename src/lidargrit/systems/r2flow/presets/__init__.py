@@ -1,0 +1,1 @@
+"""Experiments with ``r2flow``, one a file."""

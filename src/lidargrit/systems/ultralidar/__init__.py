@@ -1,0 +1,1 @@
+"""The system ``ultralidar``; see system.py."""

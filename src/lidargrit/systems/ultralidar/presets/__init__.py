@@ -1,0 +1,1 @@
+"""Experiments with ``ultralidar``, one a file."""

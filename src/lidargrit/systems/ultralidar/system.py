@@ -1,0 +1,295 @@
+"""UltraLiDAR: voxels seen from above as tokens, filled in by a transformer in a few passes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from lidargrit.core.errors import ConfigError
+from lidargrit.generation.checks import check_seeds
+from lidargrit.generation.encoding_cache import Frozen
+from lidargrit.generation.facts import Cost, SystemFacts
+from lidargrit.generation.generator import Generator
+from lidargrit.generation.objective import Objective
+from lidargrit.nn.exact_weights import load_exactly
+from lidargrit.nn.flops import flops_of
+from lidargrit.nn.precision import without_autocast
+from lidargrit.nn.random_choices import gumbel_of, sample_index
+from lidargrit.nn.size import numbers_of_file
+from lidargrit.scans.sensors import SensorModel
+from lidargrit.scans.types import RangeImage
+from lidargrit.systems.ultralidar.codebook_care import CodebookCare
+from lidargrit.systems.ultralidar.swin import SwinConfig
+from lidargrit.systems.ultralidar.ultralidar_checkpoint import read_ultralidar_checkpoint
+from lidargrit.systems.ultralidar.voxel_autoencoder import VoxelAutoencoder, VoxelAutoencoderConfig, reconstruction_loss
+from lidargrit.systems.ultralidar.voxel_prior import (
+    FillSampling,
+    VoxelPrior,
+    generate_tokens,
+    hidden_at_random,
+    hidden_token_loss,
+)
+from lidargrit.systems.ultralidar.voxels import VoxelGrid, VoxelVariant, images_of_voxels, voxels_of_images
+
+_CODEBOOK_WEIGHT = 10.0  # of the quantiser's loss
+_COLLAPSED_BELOW = 0.05  # of the codes in effective use
+_ROUNDS_AT_MOST = 1000
+
+
+@dataclass(frozen=True)
+class UltraLidarConfig:
+    """Cells and networks; the defaults are the program's for KITTI-360, 158,317,312 parameters.
+
+    Args:
+        autoencoder: cells, tokens and networks of the first stage.
+        prior: sizes of the transformer over the tokens.
+        flips: whether training mirrors voxels front to back and left to right, each at random. The program always does,
+            so that its scans have no front, and turns them for its scores; without, scans face forward.
+    """
+
+    autoencoder: VoxelAutoencoderConfig = field(default_factory=VoxelAutoencoderConfig)
+    prior: SwinConfig = field(default_factory=lambda: SwinConfig(blocks=24))
+    flips: bool = False
+
+
+@dataclass(frozen=True)
+class VoxelSampling(FillSampling):
+    """Settings of filling tokens in, and of turning voxels into scans.
+
+    Args:
+        rounds: number of times that a sampled scan is encoded again, half of its tokens hidden and replaced by the
+            likeliest ones; 8 are published.
+        points: rule by which voxels become ranges. ``exact`` ends every ray at the first occupied voxel, at the range
+            of its centre. ``reference`` does the same with the clouds that the program writes, whose x and y are
+            swapped, and whose points are lower corners.
+    """
+
+    rounds: int = 8
+    points: VoxelVariant = "exact"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 <= self.rounds <= _ROUNDS_AT_MOST:
+            raise ConfigError(f"rounds={self.rounds}", f"0 to {_ROUNDS_AT_MOST}", "8 are published")
+
+
+class UltraLidar(Generator[UltraLidarConfig, VoxelSampling]):
+    """Samples the tokens of voxels by MaskGIT, without those of empty space at first, then voxels at random.
+
+    It learns from the voxels that hold a return of a training image, and turns the voxels that it samples into images
+    along the sensor's rays. :meth:`sample_voxels` gives the voxels themselves.
+
+    Source:
+        Xiong et al., UltraLiDAR: Learning Compact Representations for LiDAR Completion and Generation, CVPR 2023;
+        numbers from myc634/UltraLiDAR_nusc_waymo@eb65fe0 (MIT). The authors' own program was never released.
+    """
+
+    Config = UltraLidarConfig
+    facts = SystemFacts(
+        generates="occupied voxels; as range images, the first on each ray, with no return where a ray meets none",
+        paper="Xiong et al., UltraLiDAR: Learning Compact Representations for LiDAR Completion and Generation, "
+        "CVPR 2023",
+        program="myc634/UltraLiDAR_nusc_waymo@eb65fe0 (MIT), not by the authors",
+        weights_licence="MIT, as the program",
+    )
+    Sampling = VoxelSampling
+    capabilities = frozenset({"encode"})
+    published_files = ("checkpoint",)
+
+    def __init__(self, config: UltraLidarConfig, sensor: SensorModel) -> None:
+        super().__init__(config, sensor)
+        sizes = config.autoencoder
+        self.autoencoder = VoxelAutoencoder(sizes)
+        self.prior = VoxelPrior(config.prior, sizes.tokens, sizes.num_codes, sizes.code_dim)
+
+    @classmethod
+    def smallest_config(cls, sensor: SensorModel) -> UltraLidarConfig:
+        """Return 4x4 tokens of cells of 3 m, and networks of one block."""
+        grid = VoxelGrid(cell_m=(3.125, 3.125, 1.0), cells=(32, 32, 6))
+        blocks = SwinConfig(width=16, heads=2, blocks=1)
+        return UltraLidarConfig(VoxelAutoencoderConfig(grid, 8, blocks, num_codes=32, code_dim=8), blocks)
+
+    @classmethod
+    def quickest_sampling(cls) -> VoxelSampling:
+        """Return 4 passes and one round."""
+        return VoxelSampling(steps=4, rounds=1)
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """The autoencoder of voxels, then the transformer over its tokens."""
+        return ("autoencoder", "prior")
+
+    def objective(self, stage: str) -> Objective:
+        """Return the reconstruction of voxels, or the likelihood of hidden tokens over the frozen autoencoder."""
+        if stage == "autoencoder":
+            return VoxelReconstruction(self.autoencoder, self.sensor, self.config.flips)
+        return HiddenVoxelTokens(self.autoencoder, self.prior, self.sensor, self.config.flips)
+
+    def load_stage(self, stage: str, objective: Objective) -> None:
+        """Take over a stage's trained weights."""
+        self.get_submodule(stage).load_state_dict(objective.get_submodule(stage).state_dict())
+
+    @torch.no_grad()
+    def sample_voxels(self, seeds: Sequence[int], sampling: VoxelSampling | None = None) -> Bool[Tensor, "B z y x"]:
+        """Return the occupied voxels of new scans: those whose range images :meth:`sample` returns.
+
+        ``lidargrit.systems.ultralidar.voxels.points_of_voxels`` makes points of them; the cells are those of
+        ``config.autoencoder.grid``.
+
+        Args:
+            seeds: one for each scan, from 0 to 2^32 - 1.
+            sampling: settings of sampling; its defaults if not given.
+
+        Raises:
+            ConfigError: no seed or one out of bounds, or settings of another generator.
+        """
+        check_seeds(seeds)
+        settings = self._settings(sampling, self.Sampling)
+        self.eval()
+        return torch.cat([self._voxels(int(seed), settings) for seed in seeds])
+
+    def _sample(self, seeds: Sequence[int], sampling: VoxelSampling) -> RangeImage:
+        occupied = torch.cat([self._voxels(seed, sampling) for seed in seeds])
+        return self._images(occupied, sampling.points)
+
+    def _reconstruct(self, images: RangeImage) -> RangeImage:
+        """Return what the tokens keep of a batch of scans; a voxel is occupied if that is likelier than not."""
+        grid = self.config.autoencoder.grid
+        found = []
+        for index in range(len(images)):
+            tokens = self.autoencoder.tokens(voxels_of_images(images[[index]], grid).float())
+            found.append(self._images(self.autoencoder.decoder(self.autoencoder.codes(tokens)) > 0, "exact"))
+        return RangeImage.cat(found)
+
+    def cost(self, sampling: VoxelSampling | None = None) -> Cost:
+        """Return the passes through prior, decoder and encoder, with the search for the nearest codes."""
+        sampling, rounds = sampling or VoxelSampling(), (sampling or VoxelSampling()).rounds
+        flops = (sampling.steps + rounds) * _prior_flops(self.prior, self.config.autoencoder)
+        flops += (1 + rounds) * self.autoencoder.decoding_flops() + rounds * self.autoencoder.encoding_flops()
+        return Cost(sampling.steps + 1 + 3 * rounds, flops)
+
+    @classmethod
+    def from_published(cls, files: Sequence[Path], config: UltraLidarConfig, sensor: SensorModel) -> UltraLidar:
+        """Make a generator of one checkpoint, which tells its own sizes, but not where its cells lie.
+
+        Args:
+            files: checkpoint of the program; code in it is not run.
+            config: settings that the file does not tell; its grid must have as many cells as the file's.
+            sensor: sensor along whose rays the voxels are seen.
+
+        Raises:
+            CheckpointError: another file, or a model of another form or for another number of cells.
+        """
+        (path,) = files
+        read = read_ultralidar_checkpoint(path, config.autoencoder)
+        with numbers_of_file(path):
+            generator = cls(UltraLidarConfig(read.autoencoder, read.prior, config.flips), sensor)
+        counts = {name: of for name, of in generator.state_dict().items() if name.startswith("autoencoder.quantiser.")}
+        load_exactly(generator, counts | read.weights, path)  # how often codes were used is not in the file
+        return generator.eval()
+
+    def _voxels(self, seed: int, sampling: VoxelSampling) -> Bool[Tensor, "1 z y x"]:
+        """Sample one scan; seeds do not share a pass, so that none depends on another's."""
+        rng = torch.Generator().manual_seed(seed)  # on the CPU: the same numbers on every device
+        shape = (1, *self.config.autoencoder.grid.shape)
+        length = self.prior.pos_embed.shape[1]
+
+        def uniform(*size: int) -> Tensor:
+            return torch.rand(size, generator=rng).to(self.device)
+
+        def gumbel() -> Tensor:
+            return gumbel_of(uniform(1, length))
+
+        start = torch.zeros(1, length, dtype=torch.long, device=self.device)
+        tokens = generate_tokens(
+            self._logits, start, lambda logits: sample_index(logits, uniform(1, length)), gumbel, sampling
+        )
+        occupied = self.autoencoder.sample_voxels(tokens, uniform(*shape))
+        for _ in range(sampling.rounds):
+            tokens = self.autoencoder.tokens(occupied.float())
+            hidden = hidden_at_random(uniform(1, length), 0.5)
+            tokens = torch.where(hidden, self._logits(tokens, hidden).argmax(dim=-1), tokens)
+            occupied = self.autoencoder.sample_voxels(tokens, uniform(*shape))
+        return occupied
+
+    def _logits(self, tokens: Int[Tensor, "B T"], hidden: Bool[Tensor, "B T"]) -> Float[Tensor, "B T K"]:
+        return self.prior(self.prior.hide(self.autoencoder.codes(tokens), hidden))
+
+    def _images(self, occupied: Bool[Tensor, "B z y x"], points: VoxelVariant) -> RangeImage:
+        return images_of_voxels(occupied, self.config.autoencoder.grid, self.sensor, points)
+
+
+class VoxelReconstruction(Objective):
+    """The first stage's objective: cross-entropy of voxels, and the distance of codes and latents."""
+
+    def __init__(self, autoencoder: VoxelAutoencoder, sensor: SensorModel, flips: bool) -> None:
+        super().__init__(sensor)
+        self.autoencoder, self._flips = autoencoder, flips
+        self.care = CodebookCare(autoencoder.config.num_codes, autoencoder.config.code_dim)
+
+    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+        """Return 100 times a voxel's error and 10 times its code's as ``loss``; beside it both, and the IoU."""
+        voxels = _training_voxels(images, self.autoencoder.config.grid, self._flips, rng)
+        quantised, latents = self.autoencoder.quantise(voxels)
+        logits = self.autoencoder.decoder(quantised.latents.flatten(2).transpose(1, 2))
+        reconstruction, overlap = reconstruction_loss(logits, voxels)
+        if self.training:
+            codes = self.autoencoder.quantiser.embedding.weight
+            self.care.update(codes, latents.detach().flatten(0, 1), quantised.tokens.flatten(), rng)
+        terms = {"voxel_loss": reconstruction.detach(), "codebook_loss": quantised.loss.detach(), "iou": overlap}
+        return {"loss": reconstruction + _CODEBOOK_WEIGHT * quantised.loss, **terms}
+
+    def warnings(self) -> list[str]:
+        """Return a line if few codes are in effective use."""
+        quantiser, count = self.autoencoder.quantiser, self.autoencoder.config.num_codes
+        perplexity = float(quantiser.perplexity())
+        if perplexity >= _COLLAPSED_BELOW * count:
+            return []
+        usage = f"{perplexity:.1f} of {count} codes in effect, {quantiser.used_share():.0%} alive"
+        return [f"few codes are used: {usage}; the remedy: more scans, or a lower model.autoencoder.num_codes"]
+
+
+class HiddenVoxelTokens(Objective):
+    """The second stage's objective: cross-entropy of hidden tokens given those shown, with smoothed labels."""
+
+    over = ("autoencoder",)
+
+    def __init__(self, autoencoder: VoxelAutoencoder, prior: VoxelPrior, sensor: SensorModel, flips: bool) -> None:
+        super().__init__(sensor)
+        self.prior, self._flips = prior, flips
+        self._frozen = Frozen(autoencoder)
+
+    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+        """Return the error in nats for each hidden token, of which a batch hides one share, and how many are right."""
+        autoencoder = self._frozen.network(images.range_m.device)
+        voxels = _training_voxels(images, autoencoder.config.grid, self._flips, rng)
+        with torch.no_grad(), without_autocast(voxels.device):  # tokens as outside of training
+            tokens = autoencoder.tokens(voxels)
+            codes = autoencoder.codes(tokens)
+        progress = torch.rand((), generator=rng, device=rng.device, dtype=torch.float64)
+        noise = torch.rand(tokens.shape, generator=rng, device=rng.device)
+        hidden = hidden_at_random(noise, (progress * (torch.pi / 2)).cos())
+        logits = self.prior(self.prior.hide(codes, hidden))
+        right = ((logits.detach().argmax(dim=-1) == tokens) & hidden).sum() / hidden.sum()
+        return {"loss": hidden_token_loss(logits, tokens, hidden), "accuracy": right}
+
+
+def _training_voxels(
+    images: RangeImage, grid: VoxelGrid, flips: bool, rng: torch.Generator
+) -> Float[Tensor, "B z y x"]:
+    """Return the voxels of a batch, each scan's mirrored along x and along y at random if that is wanted."""
+    voxels = voxels_of_images(images, grid)
+    if flips:
+        coins = torch.rand(2, len(voxels), 1, 1, 1, generator=rng, device=rng.device) < 0.5
+        for axis, coin in zip((-1, -2), coins, strict=True):
+            voxels = torch.where(coin, voxels.flip(axis), voxels)
+    return voxels.float()
+
+
+def _prior_flops(prior: VoxelPrior, sizes: VoxelAutoencoderConfig) -> int:
+    return flops_of(prior, (1, sizes.tokens[0] * sizes.tokens[1], sizes.code_dim))

@@ -1,0 +1,368 @@
+"""The whole pipeline: scans → range images → trained networks → new scans → scores → one page."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import torch
+
+from lidargrit.core.configuration import override
+from lidargrit.core.determinism import evenly_spaced
+from lidargrit.core.errors import CheckpointError, DataError, counted_scans
+from lidargrit.core.files import read_json, write_json
+from lidargrit.core.reporting import Reporter
+from lidargrit.data.images import RangeImages
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.run_folder import PRETRAINED, RUN_FILE
+from lidargrit.data.sources import load_range_images, open_source
+from lidargrit.data.sources.samples import read_samples, write_samples
+from lidargrit.evaluation.comparison import EvalConfig, compare_pair
+from lidargrit.evaluation.pairs import EvalPair, EvalSet
+from lidargrit.evaluation.reconstruction import ReconstructionErrors, score_reconstruction
+from lidargrit.evaluation.scorecard import Scorecard
+from lidargrit.generation.generator import Generator, load
+from lidargrit.generation.pixel_decoder.pixel_phases import completed_lattices
+from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.settings import Recipe
+from lidargrit.nn.devices import usable_device
+from lidargrit.nn.random import rngs_of
+from lidargrit.scans.types import RangeImage
+from lidargrit.systems.lidargrit.system import LidarGrit, TokenSampling
+from lidargrit.training import check_folder, train
+from lidargrit.training.log import LOG_FILE, read_log
+from lidargrit.training.taken_stages import donors_of_stages
+from lidargrit.viewer import plot_comparison
+from lidargrit.viewer.demo_page import DemoPage, write_demo_page
+from lidargrit.viewer.scan_sets import ScanSet
+
+PAGE, PICTURE, TIMINGS = "demo.html", "scans_reconstructed_generated.png", "timings.json"
+_NUM_SAMPLES = 16
+_MAX_SCANS = 400  # of the user's: more would not be seen in the demo's few minutes
+# Seconds on two cores, to estimate the time left before anything was measured.
+_SIMULATED_S, _READ_S, _SAMPLED_S, _SCORED_S = 58.0, 20.0, 30.0, 25.0
+_TRAINED_S = {"tokenizer": 0.38, "pixels": 0.16}  # for each scan seen, of 64x256 pixels
+_TRANSFORMER_S = 0.045, 0.026e-6  # for each scan seen, and for each of these and each weight of the blocks
+# A pixel decoder that was trained for a minute is unsure of every range: sharper than by default, the ground is smooth.
+_SHARPER = TokenSampling(range_temperature=0.1, range_noise=0.2)
+_DEFAULT = TokenSampling()
+_PACKAGED_SCANS = 6  # sampled by ``pretrained``, which was trained for hours
+_STAGES = {"tokenizer": "the tokenizer", "transformer": "the transformer", "pixels": "the pixel decoder"}
+_SCANS_OF_A_SET = 6  # of each set on the page: enough to step through, and half a megabyte each
+
+
+def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter, anew: bool = False) -> Path:
+    """Run everything on simulated or on the user's scans, and return the folder of the results.
+
+    On simulated scans, a transformer is trained anew over the other networks of the model in the package. On the user's
+    scans, all of that model's networks are trained further. Where its rays are not those of the scans, all are trained
+    anew.
+
+    Args:
+        data: a folder of scans or another source; None for simulated scans.
+        folder: run folder, which also gets ``demo.html``, ``samples``, ``evaluation.json`` and two pictures.
+        settings: changed settings of the recipe, as ``--set`` takes them.
+        reporter: receiver of progress and messages.
+        anew: whether all networks are trained anew, instead of beginning with those of the model in the package.
+    """
+    recipe = _recipe(data, settings, reporter, anew)
+    check_folder(folder, recipe)
+    expected_s = _expected_s(recipe, simulates=data is None)
+    minutes = max(1, round(sum(expected_s.values()) / 60))
+    about = f"about {minutes} minute{'s' if minutes > 1 else ''} on two cores"
+    reporter.message(f"lidargrit demo: {about}; stop it at any time, the same command goes on")
+    reporter.message(how_trained(recipe))
+    reporter.expect(expected_s)
+    clock = _Clock(folder / TIMINGS)
+    with clock.stage("read the scans and project them" if data else "simulate scans and project them"):
+        real = load_range_images(recipe.data.train, recipe.data, reporter)
+        val = load_range_images(recipe.data.val, recipe.data, reporter)
+    generator = train(recipe, folder, reporter)
+    clock.keep()
+    for stage in _trained_stages(recipe):
+        clock.add(f"train the {stage}", _trained_s(folder / stage / LOG_FILE))
+    sampling = _sampling(recipe)
+    with clock.stage(f"sample {_NUM_SAMPLES} new scans"):
+        generator.to(usable_device(""))
+        write_samples(generator, folder, folder / "samples", range(_NUM_SAMPLES), sampling, reporter)
+        generator.to("cpu")  # where the images of the pages and pictures are
+    samples = read_samples(folder / "samples", _NUM_SAMPLES)
+    packaged = _packaged_samples(folder / "samples_of_packaged_model", clock, reporter) if data is None else None
+    with clock.stage("score reconstruction and new scans"):
+        reconstruction = score_reconstruction(generator.get_tokenizer(), val)
+        card = _score(samples, real, reporter)
+    write_json(
+        folder / "evaluation.json",
+        {"reconstruction_on_val": asdict(reconstruction), "generated_against_train": card.to_json()},
+    )
+    reporter.message(
+        f"reconstruction of {reconstruction.num_scans} scans never trained on: range error "
+        f"{reconstruction.range_mae_m:.2f} m, mask accuracy {reconstruction.mask_accuracy:.3f}, dropped rays found "
+        f"{reconstruction.drop_recall:.2f} with precision {reconstruction.drop_precision:.2f}"
+    )
+    reporter.message(card.as_table())
+    reporter.message(
+        "(scores after a few minutes of training on little data; they cannot be compared with published tables)"
+    )
+    kind = "real" if data else "simulated"
+    _plot_pictures(generator, kind, val, samples, sampling, folder)
+    scans = f"{len(real):,} {kind} scans to learn from and {len(val):,} held out, of the sensor {generator.sensor.name}"
+    results = reconstruction, card, clock.seconds, _facts(recipe, generator, scans), folder
+    write_results_page(generator, kind, val, samples, *results, packaged, sampling)
+    return folder
+
+
+def _facts(recipe: Recipe, generator: Generator, scans: str) -> tuple[str, ...]:
+    """Return short sentences about the model and its training, with one about the scans."""
+    weights = sum(weight.numel() for weight in generator.parameters()) / 1e6
+    facts = (how_trained(recipe), f"LidarGRIT at a small size: {weights:.1f} million weights", scans)
+    if _sampling(recipe) == _DEFAULT:
+        return facts
+    return (
+        *facts,
+        f"ranges sampled sharper than by default (range_temperature={_SHARPER.range_temperature}, "
+        f"range_noise={_SHARPER.range_noise}), because so little training leaves them uncertain",
+    )
+
+
+def how_trained(recipe: Recipe) -> str:
+    """Return which networks the demo trains anew, trains further and takes as they are, in a sentence for each."""
+    stages = _trained_stages(recipe)
+    further = [stage for stage in stages if stage in recipe.fine_tune]
+    sentences = (
+        ([stage for stage in _STAGES if stage not in stages], "comes", "come", "as trained, from {package}"),
+        (further, "learns", "learn", "further here, from the weights of {package}"),
+        ([stage for stage in stages if stage not in further], "learns", "learn", "anew here"),
+    )
+    package = "the model in the package, which learned from simulated streets for hours of one core"
+    said = []
+    for which, one, several, what in sentences:
+        if which:
+            *others, last = [_STAGES[stage] for stage in which]
+            subject = f"{', '.join(others)} and {last}" if others else last
+            verb = several if others else one
+            said.append(f"{subject[0].upper()}{subject[1:]} {verb} {what.format(package=package)}.")
+            package = "that model"
+    return " ".join(said)
+
+
+def write_results_page(
+    generator: Generator,
+    kind: str,
+    val: RangeImages,
+    samples: RangeImages,
+    errors: ReconstructionErrors,
+    card: Scorecard,
+    seconds: dict[str, float],
+    facts: tuple[str, ...],
+    folder: Path,
+    packaged: RangeImages | None = None,
+    sampling: TokenSampling = _DEFAULT,
+) -> None:
+    """Write the page ``demo.html`` into a run's folder.
+
+    Args:
+        generator: a generator over tokens.
+        kind: kind of the scans: "real" or "simulated".
+        val: held-out scans; the page follows the first of them.
+        samples: scans that the generator sampled.
+        errors: errors of reconstruction.
+        card: scores of the samples against training scans, with real against real and pixel statistics.
+        seconds: time that each stage took, in seconds, by its name.
+        facts: short sentences about the model and its training.
+        folder: folder of the run.
+        packaged: scans sampled by the model in the package, which show what longer training gives; None to leave them
+            out.
+        sampling: settings by which pixels of reconstructed scans are sampled, as those of ``samples`` were.
+    """
+    tokenizer, held_out = generator.get_tokenizer(), val.batch(evenly_spaced(_SCANS_OF_A_SET, len(val)))
+    new = samples.batch(range(min(_SCANS_OF_A_SET, len(samples))))
+    names = tuple(val.provenance.names[index].rpartition("/")[2] for index in evenly_spaced(_SCANS_OF_A_SET, len(val)))
+    with torch.no_grad():
+        tokens = tokenizer.encode(held_out[:1])
+        decoded = tokenizer.decode(tokens)
+        sampled = tokenizer.sample(tokens, rngs_of([0]))
+        reconstructed = _reconstructed(generator, held_out, sampling)
+    by_phases, lattices = None, []
+    if isinstance(generator, LidarGrit) and generator.pixels is not None:
+        by_phases, lattices = reconstructed[:1], completed_lattices(generator.pixels.mask.phases)
+    seeds = tuple(f"seed {seed}" for seed in range(len(new)))
+    sets = [
+        ScanSet(f"{kind}, held out", held_out, names),
+        ScanSet("reconstructed", reconstructed, names),
+        ScanSet("new", new, seeds),
+    ]
+    if packaged is not None:
+        sets.append(ScanSet("new, by the packaged model", packaged.batch(range(len(packaged))), seeds[: len(packaged)]))
+    results = errors, card, seconds, facts, folder
+    write_demo_page(
+        DemoPage(kind, names[0], held_out[:1], tokens, decoded, sampled, by_phases, lattices, sets, *results),
+        folder / PAGE,
+    )
+
+
+def _reconstructed(generator: Generator, images: RangeImage, sampling: TokenSampling) -> RangeImage:
+    """Return scans decoded from the tokens of others just as those of new scans are, with sampled return masks."""
+    tokenizer = generator.get_tokenizer()
+    tokens, rngs = tokenizer.encode(images), rngs_of(range(len(images)))
+    if isinstance(generator, LidarGrit) and generator.pixels is not None:
+        return generator.pixels.sample(tokenizer.decode(tokens), rngs, sampling.pixels())
+    return tokenizer.sample(tokens, rngs)
+
+
+def _packaged_samples(folder: Path, clock: _Clock, reporter: Reporter) -> RangeImages:
+    """Sample from the model in the package, which was trained for hours, for comparison."""
+    with clock.stage(f"sample {_PACKAGED_SCANS} scans from the packaged model"):
+        write_samples(
+            load(PRETRAINED).to(usable_device("")), PRETRAINED, folder, range(_PACKAGED_SCANS), reporter=reporter
+        )
+    return read_samples(folder, _PACKAGED_SCANS)
+
+
+def divided(data: str, reporter: Reporter) -> DataConfig:
+    """Divide a user's scans into train and val, by whole drives where there are several.
+
+    The same drive in both would leak. Held out is the drive that is nearest to 15 % of the scans; where there is only
+    one, its last scans are held out, and a warning says so.
+
+    Raises:
+        DataError: too few scans to hold any out.
+    """
+    dataset = open_source(data).scans()
+    if len(dataset) < 4:
+        raise DataError(f"{counted_scans(len(dataset))} in {data}", "at least 4, to hold one out", "add scans")
+    source, split = f"{dataset.public_name()}:{dataset.root}", dataset.split
+    scans = Counter(dataset.name(index).rpartition("/")[0] for index in range(len(dataset)))
+    drives = sorted(scans)
+    has_drives = dataset.public_name() != "folder" and all(drive and "/" not in drive for drive in drives)
+    if has_drives and len(drives) > 1 and "[" not in split:
+        held_out = min(reversed(drives), key=lambda drive: abs(scans[drive] / len(dataset) - 0.15))
+        train = f"{source}:{'+'.join(drive for drive in drives if drive != held_out)}"
+        val = f"{source}:{held_out}"
+    elif "[" in split:
+        raise DataError(
+            f"{data} with a share", "whole drives, or a folder", "leave the brackets out: demo divides the scans"
+        )
+    else:
+        reporter.message(
+            "WARNING: the last scans are held out; if they are of the same drive, they show the same streets"
+        )
+        train, val = f"{source}:{split}[:85%]", f"{source}:{split}[85%:]"
+    return DataConfig(train=(train,), val=(val,), sensor=dataset.sensor, max_scans=_MAX_SCANS)
+
+
+def _recipe(data: str | None, settings: list[str], reporter: Reporter, anew: bool) -> Recipe:
+    """Return the recipe that suits the scans: from the model in the package, if that is wanted and has their rays."""
+    config = None if data is None else divided(data, reporter)
+
+    def recipe_of(name: str) -> Recipe:
+        recipe = load_recipe(name)
+        return override(recipe if config is None else replace(recipe, data=config), settings)
+
+    if not anew:
+        recipe = recipe_of("demo_transformer" if config is None else "demo_fine_tuned")
+        if recipe.data.load_sensor().same_rays(load(PRETRAINED).sensor):
+            return recipe
+        reporter.message("the model in the package is of another sensor or image size, so all is trained anew")
+    return recipe_of("demo_pixels")
+
+
+def _trained_stages(recipe: Recipe) -> list[str]:
+    """Return the stages that a recipe trains, in their order."""
+    donors = donors_of_stages(recipe, tuple(_STAGES))
+    return [stage for stage in _STAGES if stage in recipe.training and stage not in donors]
+
+
+def _sampling(recipe: Recipe) -> TokenSampling:
+    """Return how new scans are sampled: sharper where the pixel decoder was trained anew."""
+    begun_anew = "pixels" in _trained_stages(recipe) and "pixels" not in recipe.fine_tune
+    return _SHARPER if begun_anew else _DEFAULT
+
+
+def _expected_s(recipe: Recipe, simulates: bool) -> dict[str, float]:
+    """Return the expected time of each long step of the demo on two cores, in seconds."""
+    sensor, sizes = recipe.data.load_sensor(), recipe.model.transformer
+    each_s, (encoded_s, weight_s) = dict(_TRAINED_S), _TRANSFORMER_S
+    each_s["transformer"] = encoded_s + weight_s * 12 * sizes.layers * sizes.width**2
+    share = sensor.height * sensor.width / (64 * 256)
+    stages = _trained_stages(recipe)
+    training_s = {f"training {stage}": recipe.training[stage].scans * share * each_s[stage] for stage in stages}
+    return {
+        "projecting scans": _SIMULATED_S if simulates else _READ_S,
+        **training_s,
+        "sampling": _SAMPLED_S,
+        "scoring": _SCORED_S,
+    }
+
+
+def _score(samples: RangeImages, real: RangeImages, reporter: Reporter) -> Scorecard:
+    """Score new scans against training scans, with both reference rows."""
+    count = min(len(samples), len(real))
+
+    def some(name: str, images: RangeImages) -> EvalSet:
+        return EvalSet(name, images, evenly_spaced(count, len(images)))
+
+    pair = EvalPair(some("samples", samples), some("train", real))
+    return compare_pair(pair, EvalConfig(pixel_statistics=True), reporter)
+
+
+_INTERRUPTED = " (interrupted)"  # end of the name of a stage that is not done yet, with the time that it took so far
+
+
+class _Clock:
+    """The time that each stage took until it was done, kept in a file: the same command does no stage again.
+
+    Stages that were interrupted keep the time that they had taken. The file is written once a run lies beside it,
+    because a folder that holds anything else is refused.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.seconds: dict[str, float] = read_json(path) if path.is_file() else {}
+        if not all(type(seconds) in (int, float) for seconds in self.seconds.values()):
+            raise CheckpointError(f"{path} with times that are no numbers", "seconds by stage", "remove the file")
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        begun, ended = time.monotonic(), False
+        try:
+            yield
+            ended = True
+        finally:
+            took = time.monotonic() - begun + self.seconds.pop(name + _INTERRUPTED, 0.0)
+            self.add(name if ended or name in self.seconds else name + _INTERRUPTED, took)
+            self.keep()
+
+    def add(self, name: str, seconds: float) -> None:
+        self.seconds.setdefault(name, round(seconds, 1))
+
+    def keep(self) -> None:
+        if (self._path.parent / RUN_FILE).is_file():
+            write_json(self._path, self.seconds)
+
+
+def _trained_s(log: Path) -> float:
+    """Return the training time of a stage by its log, whose clock starts at 0 whenever training goes on."""
+    before, total = 0.0, 0.0
+    for entry in read_log(log):
+        seconds = float(entry["seconds"])
+        total += seconds - before if seconds >= before else seconds
+        before = seconds
+    return total
+
+
+def _plot_pictures(
+    generator: Generator, kind: str, val: RangeImages, samples: RangeImages, sampling: TokenSampling, folder: Path
+) -> None:
+    real = val.batch(evenly_spaced(3, len(val)))
+    title = f"{kind} scans never trained on, what the tokens keep of them, and new scans"
+    plot_comparison(
+        {kind: real, "reconstructed": _reconstructed(generator, real, sampling), "generated": samples.batch(range(3))},
+        folder / PICTURE,
+        title=title,
+    )
+    plot_comparison({"generated": samples.batch(range(3, 11))}, folder / "generated.png", title="generated scans")

@@ -1,0 +1,198 @@
+"""A client's JSON → a request whose every value is checked; and the numbers of a generator that a client may set."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import math
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, get_type_hints
+
+from lidargrit.core.discovery import names
+from lidargrit.core.errors import CheckpointError, ConfigError, nearest_names
+from lidargrit.core.untrusted import SEED_AT_MOST, parse_json
+from lidargrit.data import formats
+from lidargrit.viewer.serve.limits import Limits
+
+UPSAMPLED = {"vlp16": "a VLP-16", "hdl32e": "an HDL-32E", "vlp32c": "a VLP-32C"}  # sensors with few rows
+TASKS = {  # what a model makes of an uploaded scan → its description on the page
+    "returns": "fill in rays without a point",
+    "ahead": "fill in the quarter ahead",
+    "rows": "fill in three rows of four",
+    "region": "fill in a region",
+    **{sensor: f"add the rows {name} lacks" for sensor, name in UPSAMPLED.items()},
+    "raydrop": "drop returns of a clean scan",
+}
+_WHOLE_AT_MOST = 1024  # steps and the like: four times what any published sampler takes
+_FRACTION_AT_MOST = 100.0  # temperatures and the like: far beyond, everything is noise
+
+
+@dataclass(frozen=True)
+class SamplingSetting:
+    """A number that a client may set when a generator samples.
+
+    Args:
+        name: name of the field in the generator's ``Sampling``.
+        whole: whether it is a whole number.
+        default: default value; None where the generator computes one itself.
+        at_most: largest value that is accepted.
+        about: description, from the docstring of ``Sampling``.
+    """
+
+    name: str
+    whole: bool
+    default: int | float | None
+    at_most: int | float
+    about: str
+
+
+@dataclass(frozen=True)
+class SampleRequest:
+    """What a client asks for: new scans, or a completed or reconstructed uploaded scan.
+
+    Args:
+        model: index of the model among those that are served.
+        seed: seed of the first scan; the next scan has the next seed.
+        count: number of scans.
+        sampling: values of the sampling settings that the client changed, by name.
+        task: name of the work on the uploaded scan, a key of :data:`TASKS`.
+        region: left, top, right and bottom edge of the region that is to be filled in, as shares of the image's width
+            and height; empty if none was drawn.
+        file: path of the uploaded scan; "" if there is none.
+        name: name of the uploaded file on the client's side, for display.
+    """
+
+    model: int
+    seed: int = 0
+    count: int = 1
+    sampling: dict[str, int | float] = field(default_factory=dict)
+    task: str = "returns"
+    region: tuple[float, ...] = ()
+    file: str = ""
+    name: str = ""
+
+
+def sampling_settings(sampling: Any) -> list[SamplingSetting]:
+    """Return the numbers among the fields of a generator's ``Sampling``."""
+    hints = get_type_hints(type(sampling))
+    found = []
+    for one in dataclasses.fields(sampling):
+        kind, default = hints[one.name], getattr(sampling, one.name)
+        if kind not in (int, float, int | None, float | None):
+            continue
+        whole = kind in (int, int | None)
+        at_most = max(_WHOLE_AT_MOST if whole else _FRACTION_AT_MOST, default or 0)
+        found.append(SamplingSetting(one.name, whole, default, at_most, _about(type(sampling), one.name)))
+    return found
+
+
+def parse_json_object(data: bytes) -> dict[str, Any]:
+    """Parse the JSON object of a request.
+
+    Raises:
+        ConfigError: the bytes are not a JSON object.
+    """
+    try:
+        return parse_json(data, "a request")
+    except CheckpointError:
+        raise ConfigError(
+            "a request that is not a JSON object", '{"model": 0, "seed": 0, ...}', "use the page"
+        ) from None
+
+
+def parse_request(values: dict[str, Any], settings: list[list[SamplingSetting]], limits: Limits) -> SampleRequest:
+    """Check every value of a request.
+
+    Args:
+        values: values by name; a missing one has its default.
+        settings: sampling settings of each model that is served.
+        limits: bounds on what may be asked for.
+
+    Raises:
+        ConfigError: an unknown name, a value of another type, or one out of its bounds.
+    """
+    known = ("model", "seed", "count", "sampling", "task", "region", "name")
+    for name in values:
+        if name not in known:
+            raise ConfigError(f"the word {name[:40]!r}", f"one of {', '.join(known)}", "use the page")
+    model = _whole("model", values.get("model", 0), 0, len(settings) - 1)
+    task = values.get("task", "returns")
+    if not isinstance(task, str) or task not in TASKS:
+        raise ConfigError(f"task={str(task)[:40]!r}", f"one of {', '.join(TASKS)}", "choose one")
+    changed = values.get("sampling", {})
+    if not isinstance(changed, dict):
+        raise ConfigError("sampling that is not a JSON object", "numbers by name", "use the page")
+    by_name = {setting.name: setting for setting in settings[model]}
+    for name in changed:
+        if name not in by_name:
+            wanted = f"one such as {nearest_names(name[:40], by_name)}" if by_name else "none: it has no such settings"
+            raise ConfigError(f"the setting {name[:40]!r}, which this model does not have", wanted, "use the page")
+    seed = _whole("seed", values.get("seed", 0), 0, SEED_AT_MOST)
+    count = _whole("count", values.get("count", 1), 1, limits.scans)
+    if seed + count - 1 > SEED_AT_MOST:  # told here, not once the job has waited for its turn
+        got = f"seed={seed} for {count} scans, each with the next seed"
+        raise ConfigError(got, f"seeds up to {SEED_AT_MOST}", "lower one of the two")
+    return SampleRequest(
+        model,
+        seed,
+        count,
+        {name: _number(by_name[name], value) for name, value in changed.items()},
+        task,
+        _region(values.get("region", [])),
+        name=_harmless_name(values.get("name", "")),
+    )
+
+
+def upload_ending(name: str) -> str:
+    """Return the ending of a file's name if a format reads such a file by itself, else ""."""
+    fitting = [ending for ending in upload_endings() if name.lower().endswith(ending)]
+    of_format = {ending for form in formats.candidates(Path(name)) for ending in form.suffixes}
+    return max((ending for ending in fitting if ending in of_format), key=len, default="")
+
+
+def upload_endings() -> list[str]:
+    """Return the endings of files that can be uploaded: all but those that need a second file beside them."""
+    forms = [formats.load(name) for name in names("formats")]
+    return sorted({ending for form in forms if not form.companion for ending in form.suffixes})
+
+
+def _about(sampling: type, name: str) -> str:
+    """Return what a class's docstring says of a field, in one line."""
+    text = inspect.cleandoc(sampling.__doc__ or "")
+    found = re.search(rf"^    {name}: (.*?)(?=^    \w+: |^\S|\Z)", text, re.MULTILINE | re.DOTALL)
+    return " ".join(found[1].split()).replace("``", "") if found else ""
+
+
+def _whole(name: str, value: Any, at_least: int, at_most: int) -> int:
+    if type(value) is not int or not at_least <= value <= at_most:  # nor a bool, which is an int to Python
+        raise ConfigError(f"{name}={str(value)[:40]}", f"a whole number from {at_least} to {at_most}", "correct it")
+    return value
+
+
+def _number(setting: SamplingSetting, value: Any) -> int | float:
+    if setting.whole:
+        return _whole(setting.name, value, 0, int(setting.at_most))
+    if type(value) not in (int, float) or not (abs(value) <= setting.at_most and math.isfinite(value)):
+        raise ConfigError(f"{setting.name}={str(value)[:40]}", f"a number up to {setting.at_most:g}", "correct it")
+    return float(value)
+
+
+def _region(value: Any) -> tuple[float, ...]:
+    numbers = value if isinstance(value, list) else [value]
+    if numbers and not (
+        len(numbers) == 4
+        and all(type(number) in (int, float) and 0 <= number <= 1 for number in numbers)
+        and numbers[0] < numbers[2]
+        and numbers[1] < numbers[3]
+    ):
+        wanted = "left, top, right and bottom as shares of the image"
+        raise ConfigError(f"region={str(value)[:40]}", wanted, "draw it anew")
+    return tuple(float(number) for number in numbers)
+
+
+def _harmless_name(name: Any) -> str:
+    """Return the characters of a file's name that can do no harm anywhere, without any folder."""
+    last = re.split(r"[/\\]", name if isinstance(name, str) else "")[-1]
+    return re.sub(r"[^\w.()+-]", "_", last)[-60:]

@@ -1,0 +1,252 @@
+"""Requests → range images on disk, in a process of its own that can be killed at any moment.
+
+The process reads and answers lines of JSON: no pickle passes, and the process that talks to clients never computes.
+A job that takes too long, or all memory, ends with this process; the next job starts a new one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import os
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from lidargrit.core.errors import ConfigError, LidarGritError, OutputError, ScanError, UsageError, one_of
+from lidargrit.core.files import atomic_path, write_text
+from lidargrit.data import formats
+from lidargrit.data.run_folder import locate, projection_variant
+from lidargrit.generation.generator import Generator, load
+from lidargrit.inference.complete.inputs import InputScan, ScanReader
+from lidargrit.inference.complete.patterns import Pattern
+from lidargrit.inference.complete.sparse import SparseReader, observed_rows
+from lidargrit.nn.devices import usable_device
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.projection import ProjectionVariant
+from lidargrit.scans.projection.sensor_check import has_few_rings, ring_count
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage, Scan
+from lidargrit.viewer.interactive import page_data
+from lidargrit.viewer.scan_sets import ScanSet
+from lidargrit.viewer.serve.requests import TASKS, UPSAMPLED, SampleRequest, sampling_settings
+
+PAGE_FILE, PIXELS_FILE = "page.json", "pixels.npz"  # of a result: for the page, and for files to save
+_NOT_ON_THE_PAGE = ("lidargrit ", "--", "data.", "sensor")  # words of cures that the page does not offer
+NO_ROOM = OutputError(
+    "no room on the server's disk for this scan", "some free space in its temporary folder", "try again later"
+)
+
+
+def run_worker(runs: Sequence[Path], device: str) -> None:
+    """Describe the models of the runs, then answer requests from standard input until it ends."""
+    write_line = partial(print, file=sys.stdout, flush=True)
+    sys.stdout = sys.stderr  # whatever a library prints is no answer
+    try:
+        chosen = usable_device(device)
+        loaded = [_load(run, chosen) for run in runs]
+    except LidarGritError as error:
+        _send(write_line, {"refused": [type(error).__name__, error.got, error.wanted, error.cure]})
+        return
+    except RuntimeError as error:  # most of all where a GPU has no room for them
+        got = f"models that cannot be loaded on the device ({_first_line(error)})"
+        cure = "name fewer models, or another --device"
+        _send(write_line, {"refused": ["ConfigError", got, "a device with room for all of them", cure]})
+        return
+    names = [run.resolve().name for run in runs]
+    names = [name if names.count(name) == 1 else str(run) for name, run in zip(names, runs, strict=True)]
+    models = [describe_model(name, model) for name, (model, _) in zip(names, loaded, strict=True)]
+    _send(write_line, {"models": models})
+    for line in sys.stdin:
+        message = json.loads(line)
+        request = SampleRequest(**message["request"])
+        generator, variant = loaded[request.model]
+        _send(write_line, _answer_request(generator, variant, request, Path(message["folder"])))
+
+
+def _load(run: Path, device: torch.device) -> tuple[Generator, ProjectionVariant]:
+    try:
+        return load(run).to(device), projection_variant(locate(run))
+    except LidarGritError as error:
+        if str(run) in error.got:
+            raise
+        raise type(error)(f"{run}: {error.got}", error.wanted, error.cure) from None
+
+
+def describe_model(name: str, generator: Generator) -> dict[str, Any]:
+    """Return the facts of a model that the page needs."""
+    sensor = generator.sensor
+    return {
+        "name": name,
+        "generator": generator.public_name(),
+        "sensor": f"{sensor.name}, {sensor.height} x {sensor.width}",
+        "upload": next((able for able in ("complete", "encode") if able in generator.capabilities), ""),
+        "tasks": [task for task in TASKS if _can(generator, task)],
+        "settings": _settings_of(generator),
+        "rays": sensor.to_json(),
+    }
+
+
+def _can(generator: Generator, task: str) -> bool:
+    """Return whether a model can do a task: one of upsampling wants rows between those of the other sensor."""
+    if "complete" not in generator.capabilities:
+        return False
+    if task in UPSAMPLED:
+        try:
+            SparseReader(generator.sensor, source=load_sensor(task))
+        except ConfigError:
+            return False
+    return task != "raydrop" or "surfaces" in generator.conditions
+
+
+def _settings_of(generator: Generator) -> list[dict[str, Any]]:
+    """Return the sampling settings, which say where a completion that is told nothing else takes another value.
+
+    Those that generating does not read say so: the page has one field for both.
+    """
+    settings = []
+    for one in sampling_settings(generator.Sampling()):
+        value = getattr(generator.completion_sampling(), one.name)
+        note = "" if value == one.default else f" If you leave it alone, a scan is completed with {value}."
+        note += " Only completing a scan reads it." if one.name in generator.not_of_sampling else ""
+        settings.append(dataclasses.asdict(one) | {"about": one.about + note})
+    return settings
+
+
+def compute_result(generator: Generator, request: SampleRequest, variant: ProjectionVariant = "exact") -> list[ScanSet]:
+    """Sample new scans, or complete, upsample, drop or reconstruct an uploaded scan.
+
+    Args:
+        generator: model that does it.
+        request: task and settings that the page sent.
+        variant: variant of the projection that the model learned from.
+
+    Raises:
+        LidarGritError: a file that cannot be used, or a setting out of its bounds.
+    """
+    # Settings that the client left alone stay with the generator: it may complete by other values than it samples by.
+    own = generator.completion_sampling() if request.file else generator.Sampling()
+    sampling = dataclasses.replace(own, **request.sampling) if request.sampling else None
+    seeds = range(request.seed, request.seed + request.count)
+    if not request.file:
+        names = tuple(f"seed {seed}" for seed in seeds)
+        return [ScanSet("generated", generator.sample(seeds, sampling).to("cpu"), names)]
+    seen = _read_upload(request, generator, _reader(request, generator, variant))
+    image = RangeImage.stack([seen.image])
+    sets = [ScanSet("as uploaded", image, (request.name,))]
+    if "complete" not in generator.capabilities:
+        return [*sets, ScanSet("reconstructed", generator.reconstruct(image).to("cpu"), (request.name,))]
+    if request.task == "region" and not request.region:
+        return sets  # on which the region is drawn
+    names = tuple(f"{request.name}, seed {seed}" for seed in seeds)
+    images = RangeImage.stack([image[0]] * request.count)
+    if request.task == "raydrop":
+        dropped = generator.complete(Condition.of_surfaces(images), seeds, sampling)
+        return [*sets, ScanSet("with raydrop", dropped.to("cpu"), names)]
+    observed = _observed(request, seen)
+    condition = Condition.of_pixels(images, observed.expand_as(images.return_mask))
+    if bool((images[0].return_mask & ~observed).any()):
+        sets.append(ScanSet("what the model saw", condition[0:1].images, (request.name,)))
+    return [*sets, ScanSet("completed", generator.complete(condition, seeds, sampling).to("cpu"), names)]
+
+
+def _reader(request: SampleRequest, generator: Generator, variant: ProjectionVariant) -> ScanReader:
+    """Return what projects an uploaded scan, which may be a part of the circle where lost returns are completed."""
+    completes = "complete" in generator.capabilities  # a model that does not has no task
+    if completes and request.task in UPSAMPLED:
+        return SparseReader(generator.sensor, variant, source=load_sensor(request.task))
+    return ScanReader(generator.sensor, variant, partial=completes and request.task == "returns")
+
+
+def _read_upload(request: SampleRequest, generator: Generator, reader: ScanReader) -> InputScan:
+    """Read and project an uploaded file; messages give its name on the client's side, not its path on the server."""
+    path = Path(request.file)
+    try:
+        scan = dataclasses.replace(formats.read_scan(path, bad_points="drop"), source=request.name)
+    except LidarGritError as error:
+        parts = [part.replace(str(path), request.name) for part in (error.got, error.wanted, error.cure)]
+        raise type(error)(*parts) from None
+    try:
+        return reader.read(scan)
+    except LidarGritError as error:
+        if not any(words in error.cure for words in _NOT_ON_THE_PAGE):
+            raise
+        raise type(error)(error.got, error.wanted, _cure_on_the_page(request, generator, scan)) from None
+
+
+def _cure_on_the_page(request: SampleRequest, generator: Generator, scan: Scan) -> str:
+    """Return what somebody can do on the page about a scan that another sensor made, or that has other rows."""
+    if request.task in UPSAMPLED:
+        return "choose the task that names the sensor of the scan, or choose another scan"
+    if has_few_rings(scan, generator.sensor):
+        rings = ring_count(scan)
+        tasks = [task for task in UPSAMPLED if load_sensor(task).height == rings and _can(generator, task)]
+        if tasks:
+            return f"choose the task {one_of([repr(TASKS[task]) for task in tasks])}, or a model of the scan's sensor"
+    return "choose a model of the sensor that made the scan, or choose another scan"
+
+
+def _observed(request: SampleRequest, seen: InputScan) -> Bool[Tensor, "H W"]:
+    """Return the mask of the pixels that are kept."""
+    if request.task in UPSAMPLED:
+        return observed_rows(seen)
+    if request.task == "region":
+        height, width = seen.image.range_m.shape
+        left, top, right, bottom = request.region
+        observed = torch.ones(height, width, dtype=torch.bool)
+        rows = slice(math.floor(top * height), math.ceil(bottom * height))
+        observed[rows, math.floor(left * width) : math.ceil(right * width)] = False
+        return observed
+    pattern = {"returns": "returns", "ahead": "sector:45,315", "rows": "rows:4"}[request.task]
+    try:
+        return Pattern(pattern).mask(seen.image)
+    except UsageError:  # the messages of patterns name options of the command line
+        got, wanted = f"{request.name}, in which every ray has a return", "some rays to fill in"
+    except ScanError:
+        got, wanted = f"{request.name} without a return outside the part to fill in", "some returns there"
+    raise ScanError(got, wanted, "choose another task, or another scan")
+
+
+def _answer_request(
+    generator: Generator, variant: ProjectionVariant, request: SampleRequest, folder: Path
+) -> dict[str, Any]:
+    """Write a result into a folder, and return the answer."""
+    try:
+        sets = compute_result(generator, request, variant)
+        pixels: dict[str, Any] = {}
+        for index, scans in enumerate(sets):
+            pixels[f"range_m_{index}"] = scans.images.range_m.numpy()
+            if scans.images.reflectance is not None:
+                pixels[f"reflectance_{index}"] = scans.images.reflectance.numpy()
+            if scans.images.label is not None:
+                pixels[f"label_{index}"] = scans.images.label.numpy()
+        try:
+            write_text(folder / PAGE_FILE, json.dumps(page_data(sets)))
+            with atomic_path(folder / PIXELS_FILE) as temporary, temporary.open("wb") as file:
+                np.savez(file, **pixels)
+        except OutputError:  # its message names a folder of the server
+            raise NO_ROOM from None
+    except LidarGritError as error:
+        return {"error": str(error)}
+    except Exception as error:  # the process is to go on, whatever error a network or a library raises
+        traceback.print_exc()
+        got = f"an error of the program ({_first_line(error)})"
+        return {"error": str(ConfigError(got, "a result", "try other settings, and report it"))}
+    return {"done": True}
+
+
+def _first_line(error: Exception) -> str:
+    return f"{type(error).__name__}: {str(error).partition(os.linesep)[0][:100]}"
+
+
+def _send(write_line: Callable[[str], None], message: dict[str, Any]) -> None:
+    write_line(json.dumps(message))
