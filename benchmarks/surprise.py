@@ -31,13 +31,14 @@ from lidargrit.data.sources import open_images
 from lidargrit.evaluation.estimates import Estimate
 from lidargrit.generation.generator import Generator, load
 from lidargrit.generation.range_values import encode
+from lidargrit.nn.random import SeededNoise
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 from lidargrit.simulator.mesh import Mesh
 from lidargrit.simulator.observation import ObservationConfig, observe_scene
 from lidargrit.simulator.scene import sample_scene
 from lidargrit.simulator.scene.shapes import boxes
-from lidargrit.systems.r2dm.diffusion import SeededNoise, alpha_sigma, log_snr_at, noised
+from lidargrit.systems.r2dm.diffusion import alpha_sigma, log_snr_at, noised
 from lidargrit.systems.r2dm.system import R2dm
 
 CELL = 8

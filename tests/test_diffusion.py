@@ -8,8 +8,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lidargrit.nn.random import SeededNoise
 from lidargrit.systems.r2dm.diffusion import (
-    SeededNoise,
     alpha_sigma,
     log_snr_at,
     min_snr_weight,

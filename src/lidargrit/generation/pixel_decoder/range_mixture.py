@@ -11,7 +11,7 @@ from numpy.polynomial.legendre import leggauss
 from torch import Tensor
 
 from lidargrit.generation.range_steps import RangeSteps
-from lidargrit.nn.random_choices import sample_index
+from lidargrit.nn.random import sample_index
 
 # Quantiles and their shares in a mean. At the ends of a logistic distribution -ln of its density has no bound, so nodes
 # are dense there: u = s^2 (3 - 2s) of Gauss-Legendre's s.

@@ -20,6 +20,7 @@ from lidargrit.generation.objective import Objective
 from lidargrit.generation.reflectance import reflectance_of_returns
 from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.flops import flops_of
+from lidargrit.nn.random import SeededNoise
 from lidargrit.nn.size import numbers_of_file
 from lidargrit.scans.condition import Condition
 from lidargrit.scans.sensors import SensorModel
@@ -34,7 +35,6 @@ from lidargrit.systems.lidargen.score_matching import (
     sigma_table,
     step_that_leaves_least,
 )
-from lidargrit.systems.r2dm.diffusion import SeededNoise
 
 _LEVELS_AT_MOST = 100_000
 _STEPS_AT_MOST = 100_000

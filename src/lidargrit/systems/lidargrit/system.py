@@ -28,8 +28,7 @@ from lidargrit.nn.decoding import CachedDecoder, WeightPrecision, flops_of_step
 from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.precision import Precision
 from lidargrit.nn.published import read_checkpoint
-from lidargrit.nn.random import rngs_of
-from lidargrit.nn.random_choices import sample_index
+from lidargrit.nn.random import rngs_of, sample_index
 from lidargrit.nn.transformer import CausalTransformer
 from lidargrit.scans.condition import Condition, ConditionKind
 from lidargrit.scans.sensors import SensorModel

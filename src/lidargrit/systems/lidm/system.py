@@ -22,12 +22,12 @@ from lidargrit.generation.tokenizers.curve_vqvae import CurveVqvaeConfig
 from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.published import read_checkpoint, weights_below
+from lidargrit.nn.random import SeededNoise
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import MaskDecoding, RangeImage
 from lidargrit.systems.lidm import latent_diffusion
 from lidargrit.systems.lidm.latent_axes import LatentAxes
 from lidargrit.systems.lidm.latent_unet import LatentUnet, LatentUnetConfig
-from lidargrit.systems.r2dm.diffusion import SeededNoise
 
 _PUBLISHED_BYTES_AT_MOST = 1 << 32  # the authors' file has 3.9 GB, by their README
 _FIRST_STAGE, _RAW, _AVERAGE = "first_stage_model.", "model.diffusion_model.", "model_ema."

@@ -20,8 +20,7 @@ from lidargrit.generation.objective import Objective
 from lidargrit.generation.pixel_decoder.pixel_decoder import PixelSampling
 from lidargrit.generation.tokens import PixelChoice, TokenGenerator, TokenGeneratorConfig, TokenObjective
 from lidargrit.nn.precision import Precision, autocast_to
-from lidargrit.nn.random import rngs_of
-from lidargrit.nn.random_choices import gumbel_of, sample_index
+from lidargrit.nn.random import gumbel_of, rngs_of, sample_index
 from lidargrit.nn.transformer import MaskedTransformer
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage

@@ -10,15 +10,13 @@ Source:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from itertools import pairwise
 from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-
-from lidargrit.nn.random import rngs_of
 
 Sampler = Literal["ddpm", "ddim"]
 Denoiser = Callable[[Tensor, Tensor], Tensor]
@@ -53,22 +51,6 @@ def min_snr_weight(log_snr: Float[Tensor, "*B"], most: float = 5.0) -> Float[Ten
         Hang et al., Efficient Diffusion Training via Min-SNR Weighting, 2023.
     """
     return (most * torch.exp(-log_snr)).clamp(max=1)
-
-
-class SeededNoise:
-    """Standard normal images, each sampled on the CPU by its own seed: the same on every device and in every batch."""
-
-    def __init__(self, seeds: Sequence[int], shape: tuple[int, int, int], device: torch.device) -> None:
-        self.rngs = rngs_of(seeds)
-        self._shape, self._device = shape, device
-
-    def __call__(self) -> Float[Tensor, "B C H W"]:
-        """Sample the next image of each seed."""
-        return torch.stack([torch.randn(self._shape, generator=rng) for rng in self.rngs]).to(self._device)
-
-    def uniform(self) -> Float[Tensor, "B C H W"]:
-        """Sample the next image of each seed, with values that are uniform in [0, 1)."""
-        return torch.stack([torch.rand(self._shape, generator=rng) for rng in self.rngs]).to(self._device)
 
 
 def step_back(

@@ -23,11 +23,12 @@ from lidargrit.generation.objective import Objective
 from lidargrit.generation.range_values import decode, encode
 from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.flops import flops_of
+from lidargrit.nn.random import SeededNoise
 from lidargrit.scans.condition import Condition
 from lidargrit.scans.sensors import SensorModel, load_sensor
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.r2dm import diffusion
-from lidargrit.systems.r2dm.diffusion import Sampler, SeededNoise
+from lidargrit.systems.r2dm.diffusion import Sampler
 from lidargrit.systems.r2dm.r2dm_checkpoint import read_r2dm_checkpoint
 from lidargrit.systems.r2dm.unet import EfficientUnet, UnetConfig
 

@@ -20,9 +20,9 @@ from lidargrit.generation.objective import Objective
 from lidargrit.generation.range_values import decode, encode
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.precision import without_autocast
+from lidargrit.nn.random import SeededNoise
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
-from lidargrit.systems.r2dm.diffusion import SeededNoise
 from lidargrit.systems.r2flow import flow
 from lidargrit.systems.r2flow.hdit import Hdit
 

@@ -14,10 +14,10 @@ from lidargrit.generation.objective import Objective
 from lidargrit.generation.range_values import decode
 from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.flops import flops_of
+from lidargrit.nn.random import SeededNoise
 from lidargrit.nn.size import numbers_of_file
 from lidargrit.scans.sensors import SensorModel, continuous_azimuths_rad
 from lidargrit.scans.types import RangeImage
-from lidargrit.systems.r2dm.diffusion import SeededNoise
 from lidargrit.systems.r2flow import flow
 from lidargrit.systems.r2flow.hdit import Hdit, HditConfig
 from lidargrit.systems.r2flow.r2flow_checkpoint import read_r2flow_checkpoint

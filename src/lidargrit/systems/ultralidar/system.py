@@ -19,7 +19,7 @@ from lidargrit.generation.objective import Objective
 from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.precision import without_autocast
-from lidargrit.nn.random_choices import gumbel_of, sample_index
+from lidargrit.nn.random import gumbel_of, sample_index
 from lidargrit.nn.size import numbers_of_file
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
