@@ -173,3 +173,18 @@ class ResidualBlock(Block):
         h = self.conv1(F.silu(self.norm1(x), inplace=True))
         h = self.conv2(self.dropout(F.silu(self.norm2(h), inplace=True)))
         return (self.nin_shortcut(x) if self.conv1.in_channels != self.conv1.out_channels else x) + h
+
+
+class Residual(Block):
+    """Two convolutions whose sum with the input is the input at first."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.conv1, self.conv2 = Convolution(width, width, "wrap"), Convolution(width, width, "wrap")
+        nn.init.zeros_(self.conv2.weight)
+        assert self.conv2.bias is not None
+        nn.init.zeros_(self.conv2.bias)
+
+    def forward(self, x: Float[Tensor, "B C h w"]) -> Float[Tensor, "B C h w"]:
+        """Add what the two convolutions find to the input."""
+        return x + self.conv2(F.silu(self.conv1(F.silu(x))))

@@ -11,25 +11,24 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from lidargrit.core.errors import ConfigError
-from lidargrit.generation.pixel_decoder.lattice_network import Residual
 from lidargrit.nn.blocks import Network
-from lidargrit.nn.convolution import Convolution
+from lidargrit.nn.convolution import Convolution, Residual
 from lidargrit.nn.transformer import TransformerBlock, TransformerConfig
-from lidargrit.scans.sensors import SensorModel
 
 _CELL = 8  # rows and columns of an image are multiples of it
 
 
-def check_image(sensor: SensorModel, wanted_by: str) -> None:
-    """Refuse a sensor whose images cannot be halved three times, with ConfigError.
+def check_size(rows: int, columns: int, wanted_by: str) -> None:
+    """Refuse images that cannot be halved three times, with ConfigError.
 
     Args:
-        sensor: sensor of the images.
+        rows: rows of an image.
+        columns: columns of an image.
         wanted_by: name of the network, for the message.
     """
-    if sensor.height % _CELL or sensor.width % _CELL:
+    if rows % _CELL or columns % _CELL:
         raise ConfigError(
-            f"range images of {sensor.height}x{sensor.width} for {wanted_by}",
+            f"range images of {rows}x{columns} for {wanted_by}",
             f"rows and columns in multiples of {_CELL}",
             "choose another sensor or number of columns",
         )

@@ -7,24 +7,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from lidargrit.nn.blocks import Block, Network
-from lidargrit.nn.convolution import Convolution
+from lidargrit.nn.blocks import Network
+from lidargrit.nn.convolution import Convolution, Residual
 from lidargrit.nn.precision import at_least_32_bits
-
-
-class Residual(Block):
-    """Two convolutions whose sum with the input is the input at first."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.conv1, self.conv2 = Convolution(width, width, "wrap"), Convolution(width, width, "wrap")
-        nn.init.zeros_(self.conv2.weight)
-        assert self.conv2.bias is not None
-        nn.init.zeros_(self.conv2.bias)
-
-    def forward(self, x: Float[Tensor, "B C h w"]) -> Float[Tensor, "B C h w"]:
-        """Add what the two convolutions find to the input."""
-        return x + self.conv2(F.silu(self.conv1(F.silu(x))))
 
 
 class LatticeNetwork(Network):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -12,7 +13,6 @@ from jaxtyping import Float64, Int64
 
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import ConfigError, ScanError
-from lidargrit.data.datasets import ScanDataset
 from lidargrit.scans.fit_sensor.azimuths import columns_of_scans, firing_steps_deg, first_edge_rad, offsets_deg
 from lidargrit.scans.fit_sensor.elevations import FittedRows, cluster_rows, nearest_row, rows_of_rings
 from lidargrit.scans.fit_sensor.limits import farthest_m, quantum_m
@@ -74,6 +74,19 @@ class SensorFit:
     warnings: tuple[str, ...]
 
 
+@runtime_checkable
+class ManyScans(Protocol):
+    """Scans that are read when asked for, such as a data set."""
+
+    def __len__(self) -> int:
+        """Return the number of scans."""
+        ...
+
+    def scan(self, index: int) -> Scan:
+        """Read one scan."""
+        ...
+
+
 def fit_sensor(scans: Sequence[Scan], name: str = "fitted") -> SensorFit:
     """Find the sensor that made scans: its rows, columns, limits, and how it turns.
 
@@ -130,7 +143,7 @@ def fit_sensor(scans: Sequence[Scan], name: str = "fitted") -> SensorFit:
     )
 
 
-def fit_sensor_to_dataset(dataset: ScanDataset, name: str = "fitted", num_scans: int = 20) -> SensorFit:
+def fit_sensor_to_dataset(dataset: ManyScans, name: str = "fitted", num_scans: int = 20) -> SensorFit:
     """Find the sensor that made the scans of a data set, from some of them, evenly spaced.
 
     Args:

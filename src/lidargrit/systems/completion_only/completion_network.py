@@ -15,7 +15,7 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.generation.pixel_decoder.pixel_networks import LOGIT_BOUND, Guide, MaskNetwork
 from lidargrit.generation.reflectance import TYPICAL_REFLECTANCE
 from lidargrit.generation.semantic_classes import NUM_CLASSES, ClassMaps, class_indices, labels_of, votes
-from lidargrit.nn.small_unet import Part, SmallUnet, SmallUnetConfig, check_image
+from lidargrit.nn.small_unet import Part, SmallUnet, SmallUnetConfig, check_size
 from lidargrit.scans.condition import Condition
 from lidargrit.scans.sensors import SensorModel, mean_azimuths_rad
 from lidargrit.scans.types import RangeImage
@@ -108,7 +108,7 @@ class CompletionNetwork(nn.Module):
 
     def __init__(self, config: CompletionNetworkConfig, sensor: SensorModel) -> None:
         super().__init__()
-        check_image(sensor, "a network that completes scans")
+        check_size(sensor.height, sensor.width, "a network that completes scans")
         self.config = config
         self.limits_v = (math.log1p(sensor.range_min_m), math.log1p(sensor.range_max_m))
         self.rows = nn.Parameter(torch.zeros(config.row_channels, sensor.height))

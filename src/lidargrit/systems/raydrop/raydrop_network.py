@@ -15,7 +15,7 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.generation.pixel_decoder.pixel_networks import LOGIT_BOUND, Guide, MaskNetwork
 from lidargrit.generation.reflectance import TYPICAL_REFLECTANCE
 from lidargrit.generation.semantic_classes import ClassMaps, class_indices
-from lidargrit.nn.small_unet import Part, SmallUnet, SmallUnetConfig, check_image
+from lidargrit.nn.small_unet import Part, SmallUnet, SmallUnetConfig, check_size
 from lidargrit.scans.condition import Condition
 from lidargrit.scans.sensors import SensorModel, mean_azimuths_rad
 from lidargrit.scans.types import TYPICAL_LOG_RANGE, RangeImage
@@ -90,7 +90,7 @@ class RaydropNetwork(nn.Module):
 
     def __init__(self, config: RaydropConfig, sensor: SensorModel) -> None:
         super().__init__()
-        check_image(sensor, "a network of raydrop")
+        check_size(sensor.height, sensor.width, "a network of raydrop")
         self.config = config
         self.rows = nn.Parameter(torch.zeros(config.row_channels, sensor.height))
         azimuth_rad = mean_azimuths_rad(sensor.azimuth_rad).float()
