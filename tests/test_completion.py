@@ -19,12 +19,12 @@ from lidargrit.data.formats.numpy_array import NumpyArray
 from lidargrit.data.formats.ply import Ply
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import open_images
-from lidargrit.data.sources.samples import write_samples
 from lidargrit.evaluation.raydrop import RAYDROP_CURVES, decoded_surfaces, raydrop_table, score_raydrop
 from lidargrit.generation.generator import load, load_class
 from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
 from lidargrit.inference.complete import open_completer, open_completers
 from lidargrit.inference.complete.inputs import ScanReader, open_inputs
+from lidargrit.inference.samples import write_samples
 from lidargrit.scans.condition import Condition
 from lidargrit.scans.fills import FILLS, fill
 from lidargrit.scans.projection import unproject

@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from lidargrit.core.errors import ConfigError, OutputError
-from lidargrit.data.sources.samples import read_samples, write_samples
+from lidargrit.data.sources.samples import read_samples
 from lidargrit.generation.generator import load
+from lidargrit.inference.samples import write_samples
 from lidargrit.nn.transformer import TransformerConfig
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.systems.lidargrit.system import LidarGrit, LidarGritConfig, TokenSampling

@@ -8,8 +8,9 @@ import torch
 
 from lidargrit.core import discovery
 from lidargrit.core.errors import CheckpointError, ConfigError
-from lidargrit.data.sources.samples import read_samples, write_samples
+from lidargrit.data.sources.samples import read_samples
 from lidargrit.generation.range_values import encode
+from lidargrit.inference.samples import write_samples
 from lidargrit.nn.flops import flops_of
 from lidargrit.scans.condition import Condition
 from lidargrit.scans.sensors import load_sensor

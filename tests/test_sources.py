@@ -24,10 +24,10 @@ from lidargrit.data.sources import (
     open_source,
 )
 from lidargrit.data.sources.image_files import ImageFileSource
-from lidargrit.data.sources.samples import write_samples
 from lidargrit.evaluation.benchmark import Benchmark
 from lidargrit.evaluation.comparison import EvalConfig, compare_sources
 from lidargrit.evaluation.intervals import Resampling
+from lidargrit.inference.samples import write_samples
 from lidargrit.scans.sensors import load_sensor
 from test_generator_contract import made
 

@@ -19,8 +19,8 @@ from lidargrit.core.reporting import Reporter
 from lidargrit.data.formats import load as load_format
 from lidargrit.data.prepared.config import ScanSettings
 from lidargrit.data.sources import open_source
-from lidargrit.data.sources.samples import write_samples
 from lidargrit.generation.generator import load_class
+from lidargrit.inference.samples import write_samples
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 from lidargrit.viewer import pictures, plot_comparison, scan_sets, view

@@ -10,11 +10,12 @@ from lidargrit.cli import main
 from lidargrit.core.errors import CheckpointError
 from lidargrit.core.files import write_json
 from lidargrit.data.images import Provenance
-from lidargrit.data.sources.samples import MANIFEST, full_rows_of, write_samples
+from lidargrit.data.sources.samples import MANIFEST, full_rows_of
 from lidargrit.evaluation.comparison import EvalConfig, compare_sources
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.scorecard import NOT_APPLICABLE, Scorecard
 from lidargrit.evaluation.tables import side_by_side
+from lidargrit.inference.samples import write_samples
 from lidargrit.publishing.card import model_card
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.systems.dusty.system import Dusty

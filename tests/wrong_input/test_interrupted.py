@@ -219,7 +219,7 @@ def test_a_full_disk_while_logging(tmp_path, interrupt, capsys):
 KILLER = """
 import os, random, signal, sys, time
 import lightning_fabric, safetensors.torch
-import lidargrit.cli, lidargrit.data.sources.samples, lidargrit.systems.lidargrit.system
+import lidargrit.cli, lidargrit.inference.samples, lidargrit.systems.lidargrit.system
 import lidargrit.generation.presets, lidargrit.training
 
 rng = random.Random(int(sys.argv[1]))

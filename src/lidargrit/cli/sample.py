@@ -39,8 +39,8 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.core.processes import rank_and_world_size
     from lidargrit.core.reporting import TerminalReporter
     from lidargrit.data.run_folder import locate
-    from lidargrit.data.sources.samples import write_samples
     from lidargrit.generation.generator import load
+    from lidargrit.inference.samples import write_samples
     from lidargrit.nn.devices import usable_device
 
     seeds = seeds_in_a_row(options.seed, options.count)

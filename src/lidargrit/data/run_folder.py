@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 import string
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from lidargrit.core import configuration
-from lidargrit.core.errors import CheckpointError
+from lidargrit.core.errors import CheckpointError, ConfigError, LidarGritError, UnknownNameError, nearest_names, one_of
 from lidargrit.core.files import is_taken, read_json, sha256_of, write_text
 from lidargrit.data.images import Provenance
 from lidargrit.scans.projection import ProjectionVariant
+from lidargrit.scans.sensors import SensorModel
 
 CONFIG_FILE, WEIGHTS_FILE, CARD_FILE = "config.json", "model.safetensors", "README.md"  # the names that the hub knows
 RUN_FILE = "run.json"  # ``origin`` in it says that the weights beside it were not trained in this folder
@@ -37,6 +39,60 @@ def is_run(folder: Path) -> bool:
 def is_unfinished(folder: Path) -> bool:
     """Return whether a folder is that of a run whose training has not ended, or of one of its stages."""
     return not is_run(folder) and any((folder / name).is_file() for name in (RUN_FILE, CHECKPOINT_FILE))
+
+
+class SavedConfig(NamedTuple):
+    """What the configuration of a finished run says.
+
+    Args:
+        generator: name of its generator.
+        config: configuration of the generator, as plain values.
+        sensor: sensor whose range images the generator generates.
+    """
+
+    generator: str
+    config: Any
+    sensor: SensorModel
+
+
+def read_config(folder: Path) -> SavedConfig:
+    """Read the configuration of a finished run.
+
+    Raises:
+        CheckpointError: no finished run in the folder, or a damaged file.
+    """
+    if not is_run(folder):
+        packaged = [each.name for each in PACKAGED]
+        if not folder.exists():
+            wanted = f"a run's folder, or {nearest_names(folder.name, packaged)}"
+            raise CheckpointError(f"{folder}, which does not exist", wanted, "check the path")
+        raise CheckpointError(
+            f"{folder}, which holds no finished model",
+            f"a run's folder with {CONFIG_FILE} and {WEIGHTS_FILE}, or {one_of(packaged)}",
+            "finish the training (lidargrit train with the same words goes on), or check the path",
+        )
+    path = folder / CONFIG_FILE
+    about = read_json(path)
+    with told_of(path):
+        try:
+            config, sensor, generator = about["config"], SensorModel.from_json(about["sensor"]), about["generator"]
+            return SavedConfig(str(generator), config, sensor)
+        except LidarGritError:
+            raise
+        except (KeyError, TypeError, ValueError) as error:  # the last from tables that are not rectangular
+            got = f"{path}, which cannot be used ({error})"
+            raise CheckpointError(got, "what lidargrit wrote", "restore the file") from None
+
+
+@contextmanager
+def told_of(path: Path) -> Iterator[None]:
+    """Turn what the ``with`` block meets in a file of settings into a CheckpointError that names the file."""
+    try:
+        yield
+    except (ConfigError, UnknownNameError) as error:
+        names_it = str(path) in error.got
+        got = error.got if names_it else f"{path}, in which stands {error.got}"
+        raise CheckpointError(got, error.wanted, error.cure if names_it else "restore the file") from None
 
 
 def weights_sha256(folder: Path) -> str:

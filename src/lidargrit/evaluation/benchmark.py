@@ -24,7 +24,7 @@ from lidargrit.core.processes import check_processes, process_pool
 from lidargrit.core.reporting import Reporter
 from lidargrit.data.run_folder import is_run, locate, weights_sha256
 from lidargrit.data.sources import Source, data_set_of, open_source
-from lidargrit.data.sources.samples import read_samples, write_samples
+from lidargrit.data.sources.samples import read_samples
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair, metric_factory, open_pair
 from lidargrit.evaluation.costs import COSTS, Costs, costs_block, read_costs
 from lidargrit.evaluation.metrics import load_metric
@@ -36,6 +36,7 @@ from lidargrit.evaluation.verdict import MEMORISED, PIXEL_STATISTICS
 from lidargrit.generation.generator import Generator, load, load_class
 from lidargrit.generation.presets import load_recipe
 from lidargrit.generation.settings import Recipe
+from lidargrit.inference.samples import write_samples
 from lidargrit.nn.devices import usable_device
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.training import check_folder, train, with_budget

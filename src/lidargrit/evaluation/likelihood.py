@@ -19,7 +19,7 @@ from lidargrit.data.run_folder import locate
 from lidargrit.data.sources import RunSource, open_source, overlap
 from lidargrit.evaluation.estimates import Estimate
 from lidargrit.evaluation.pairs import EvalSet
-from lidargrit.generation.generator import Generator
+from lidargrit.generation.generator import Generator, load
 from lidargrit.nn.devices import usable_device
 from lidargrit.scans.types import ScanBits
 
@@ -200,7 +200,7 @@ def likelihood_of_source(
     run = RunSource(model, locate(model))
     variant = run.projection_variant(config) or config.projection_variant
     config = replace(config, projection_variant=variant)
-    generator = run.generator.to(usable_device(device))
+    generator = load(run.folder).to(usable_device(device))
     images = open_source(text, config.bad_points).images(run.sensor, config, reporter)
     if shared := overlap(run, None, images):
         reporter.message(f"WARNING: {run.text} has learned from some of these scans ({shared}): they take fewer bits")

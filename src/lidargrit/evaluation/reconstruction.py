@@ -14,6 +14,7 @@ from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import RunSource, Source, overlap
 from lidargrit.evaluation.likelihood import score_likelihood
+from lidargrit.generation.generator import load
 from lidargrit.generation.tokenizers import Tokenizer
 from lidargrit.scans.types import RangeImage
 
@@ -232,7 +233,7 @@ def score_run(
     Raises:
         ConfigError: a run whose generator has no tokenizer.
     """
-    generator = run.generator.to(device)
+    generator = load(run.folder).to(device)
     tokenizer = generator.get_tokenizer()
     images = source.images(run.sensor, config, reporter)
     if shared := overlap(run, None, images):

@@ -11,17 +11,17 @@ from typing import Any, ClassVar, Generic, TypeVar, final
 import torch
 
 from lidargrit.core import configuration, discovery
-from lidargrit.core.errors import CheckpointError, ConfigError, LidarGritError, nearest_names, one_of
-from lidargrit.core.files import read_json, read_tensors
+from lidargrit.core.errors import CheckpointError, ConfigError
+from lidargrit.core.files import read_tensors
 from lidargrit.data.images import RangeImages
-from lidargrit.data.run_folder import CONFIG_FILE, PACKAGED, WEIGHTS_FILE, is_run, locate
+from lidargrit.data.run_folder import CONFIG_FILE, WEIGHTS_FILE, locate, read_config, told_of
 from lidargrit.generation.batches import BatchSeeds, in_batches, one_by_one
 from lidargrit.generation.checks import check_condition, check_images, check_seeds
 from lidargrit.generation.facts import CAPABILITIES, Cost, NoSampling, SystemFacts
 from lidargrit.generation.hub import download
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.range_steps import RangeSteps
-from lidargrit.generation.saved import ConfigT, SavedModel, told_of
+from lidargrit.generation.saved import ConfigT, SavedModel
 from lidargrit.generation.tokenizers import Tokenizer
 from lidargrit.nn.precision import Precision
 from lidargrit.nn.quantization import without_quantized
@@ -362,32 +362,15 @@ def load(folder: str | Path) -> Generator:
         CheckpointError: no finished model in the folder, a damaged file, or weights of another configuration.
     """
     folder = locate(folder)
-    if not is_run(folder):
-        packaged = [each.name for each in PACKAGED]
-        if not folder.exists():
-            wanted = f"a run's folder, or {nearest_names(folder.name, packaged)}"
-            raise CheckpointError(f"{folder}, which does not exist", wanted, "check the path")
-        raise CheckpointError(
-            f"{folder}, which holds no finished model",
-            f"a run's folder with {CONFIG_FILE} and {WEIGHTS_FILE}, or {one_of(packaged)}",
-            "finish the training (lidargrit train with the same words goes on), or check the path",
-        )
-    about = read_json(folder / CONFIG_FILE)
+    saved = read_config(folder)
     with told_of(folder / CONFIG_FILE):
-        try:
-            config, sensor, name = about["config"], SensorModel.from_json(about["sensor"]), str(about["generator"])
-        except LidarGritError:
-            raise
-        except (KeyError, TypeError, ValueError) as error:  # the last from tables that are not rectangular
-            got = f"{folder / CONFIG_FILE}, which cannot be used ({error})"
-            raise CheckpointError(got, "what lidargrit wrote", "restore the file") from None
-        cls = load_class(name)
-        config = configuration.from_json(cls.Config, config, str(folder / CONFIG_FILE))
+        cls = load_class(saved.generator)
+        config = configuration.from_json(cls.Config, saved.config, str(folder / CONFIG_FILE))
         weights = without_quantized(read_tensors(folder / WEIGHTS_FILE)[0])
         expected = sum(tensor.numel() for tensor in weights.values())
         # Twice as many as the file holds, for what is built besides: a wrong file is refused before it fills memory.
         with numbers_at_most(2 * expected + 2**20, f"{folder / CONFIG_FILE} with a network", "restore both files"):
-            return cls.from_weights(config, sensor, weights, folder / WEIGHTS_FILE)
+            return cls.from_weights(config, saved.sensor, weights, folder / WEIGHTS_FILE)
 
 
 def load_class(name: str) -> type[Generator]:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
 from torch import Tensor, nn
 
 from lidargrit.core import configuration
-from lidargrit.core.errors import CheckpointError, ConfigError, UnknownNameError
+from lidargrit.core.errors import ConfigError
 from lidargrit.core.files import write_json, write_tensors, write_text
 from lidargrit.data.run_folder import CARD_FILE, CONFIG_FILE, WEIGHTS_FILE
 from lidargrit.nn.exact_weights import load_exactly
@@ -19,17 +17,6 @@ from lidargrit.scans.sensors import SensorModel
 
 ConfigT = TypeVar("ConfigT")
 ModelT = TypeVar("ModelT", bound=nn.Module)
-
-
-@contextmanager
-def told_of(path: Path) -> Iterator[None]:
-    """Turn what the ``with`` block meets in a file of settings into a CheckpointError that names the file."""
-    try:
-        yield
-    except (ConfigError, UnknownNameError) as error:
-        names_it = str(path) in error.got
-        got = error.got if names_it else f"{path}, in which stands {error.got}"
-        raise CheckpointError(got, error.wanted, error.cure if names_it else "restore the file") from None
 
 
 class SavedModel(nn.Module, Generic[ConfigT]):

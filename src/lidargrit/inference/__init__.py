@@ -1,1 +1,1 @@
-"""A trained run used: completed scans and compressed ones."""
+"""A trained run used: sampled, completed and compressed scans."""

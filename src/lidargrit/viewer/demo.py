@@ -20,7 +20,7 @@ from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.run_folder import PRETRAINED, RUN_FILE
 from lidargrit.data.sources import load_range_images, open_source
-from lidargrit.data.sources.samples import read_samples, write_samples
+from lidargrit.data.sources.samples import read_samples
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
 from lidargrit.evaluation.reconstruction import ReconstructionErrors, score_reconstruction
@@ -29,6 +29,7 @@ from lidargrit.generation.generator import Generator, load
 from lidargrit.generation.pixel_decoder.pixel_phases import completed_lattices
 from lidargrit.generation.presets import load_recipe
 from lidargrit.generation.settings import Recipe
+from lidargrit.inference.samples import write_samples
 from lidargrit.nn.devices import usable_device
 from lidargrit.nn.random import rngs_of
 from lidargrit.scans.types import RangeImage

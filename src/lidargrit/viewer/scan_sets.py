@@ -14,7 +14,7 @@ from lidargrit.core.reporting import Reporter
 from lidargrit.core.untrusted import seeds_in_a_row
 from lidargrit.data.prepared.config import DataConfig, ScanSettings
 from lidargrit.data.sources import DatasetSource, RunSource, Source, open_source
-from lidargrit.generation.generator import Generator
+from lidargrit.generation.generator import Generator, load
 from lidargrit.nn.devices import usable_device
 from lidargrit.scans.projection import project
 from lidargrit.scans.sensors import SensorModel
@@ -83,7 +83,7 @@ def load_scan_sets(
     opened = [open_source(source, config.bad_points) for source in sources]
     runs, chosen = [source for source in opened if isinstance(source, RunSource)], usable_device(device)
     seeds = seeds_in_a_row(seed, count) if runs else range(0)
-    generators = {source.text: source.generator.to(chosen) for source in runs}
+    generators = {source.text: load(source.folder).to(chosen) for source in runs}
     named = settings.load_sensor()
     scans_alone = sensor is None and all(isinstance(source, DatasetSource) for source in opened)
     fine = all_columns and scans_alone and not config.columns

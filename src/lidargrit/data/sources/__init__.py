@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
 from pathlib import Path
 
 from lidargrit.core.errors import DataError, LidarGritError
@@ -15,7 +14,7 @@ from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.prepared.imaging import Imaging, choose_imaging
 from lidargrit.data.prepared.prepare import prepare
 from lidargrit.data.prepared.prepared import PreparedFolder, PreparedImages, is_prepared
-from lidargrit.data.run_folder import is_run, is_unfinished, locate, recorded_projection, trained_on
+from lidargrit.data.run_folder import is_run, is_unfinished, locate, read_config, recorded_projection, trained_on
 from lidargrit.data.sources.image_files import ImageFileSource, image_files
 from lidargrit.data.sources.sample_formats import (
     is_tensor_folder,
@@ -26,7 +25,6 @@ from lidargrit.data.sources.sample_formats import (
 )
 from lidargrit.data.sources.samples import is_sample_folder, projection_of, read_samples, weights_of
 from lidargrit.data.sources.source import Source
-from lidargrit.generation.generator import Generator, load
 from lidargrit.scans.sensors import SensorModel, load_sensor
 
 
@@ -191,15 +189,10 @@ class RunSource(Source):
         super().__init__(text)
         self.folder = folder
 
-    @cached_property
-    def generator(self) -> Generator:
-        """Trained generator, read when it is first asked for."""
-        return load(self.folder)
-
     @property
     def sensor(self) -> SensorModel:
         """Sensor of the scans that are generated."""
-        return self.generator.sensor
+        return read_config(self.folder).sensor
 
     def projection_variant(self, config: DataConfig) -> str:
         """Return the variant by which the training scans became images."""
@@ -260,7 +253,7 @@ def open_source(text: str, bad_points: BadPoints = "refuse", samples_format: str
     if here and is_sample_folder(folder):
         return SampleSource(text, folder)
     if here and is_unfinished(folder):
-        load(folder)  # which says so
+        read_config(folder)  # which says so
     if here and is_tensor_folder(folder):
         return TensorSource(text, folder)
     if "://" in text or (here and is_prepared(text)):

@@ -11,8 +11,8 @@ from lidargrit.core.configuration import name_and_settings
 from lidargrit.core.errors import ConfigError, nearest_names
 from lidargrit.data.images import Provenance
 from lidargrit.data.run_folder import PACKAGED, locate, projection_variant, trained_on
-from lidargrit.data.sources.samples import sampling_identity
 from lidargrit.generation.generator import Generator, SamplingT, load
+from lidargrit.inference.samples import sampling_identity
 from lidargrit.nn.devices import usable_device
 from lidargrit.scans.condition import KINDS, Condition, ConditionKind
 from lidargrit.scans.fills import FILLS, fill

@@ -1,0 +1,148 @@
+"""(generator, seeds) → a folder of generated scans, one a file; data/sources/samples.py reads it."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from contextlib import nullcontext
+from dataclasses import asdict
+from itertools import chain, islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidargrit.core import configuration
+from lidargrit.core.errors import OutputError
+from lidargrit.core.files import (
+    atomic_path,
+    claim_folder,
+    is_taken,
+    read_json,
+    remove_partials,
+    removed_meanwhile,
+    write_json,
+    write_text,
+)
+from lidargrit.core.reporting import Reporter
+from lidargrit.data.run_folder import TRAINED_ON_FILE, recorded_projection, weights_sha256
+from lidargrit.data.sources.samples import MANIFEST, is_sample_folder
+from lidargrit.generation.generator import Generator, SamplingT
+from lidargrit.scans.types import RangeImage
+
+
+def write_samples(
+    generator: Generator[Any, SamplingT],
+    run_folder: Path,
+    folder: Path,
+    seeds: Sequence[int],
+    sampling: SamplingT | None = None,
+    reporter: Reporter | None = None,
+) -> None:
+    """Write one file for each seed, at bounded memory; seeds that are there already are not sampled again.
+
+    Args:
+        generator: generator to sample from.
+        run_folder: folder that the generator was read from; the hash of its weights identifies the samples.
+        folder: output folder for ``samples.json`` and ``SEED.npz`` with ``range_m`` (H, W) in metres, 0 for no return,
+            and ``reflectance`` in [0, 1] if the generator writes it.
+        seeds: one seed for each scan; other processes may write other seeds into the same folder meanwhile.
+        sampling: choices of the generator's own ``Sampling``; its defaults if not given.
+        reporter: receiver of progress messages.
+
+    Raises:
+        OutputError: the folder holds samples of another model or setting, something else, cannot be written, or was
+            removed while its samples were written.
+    """
+    sampling = generator.Sampling() if sampling is None else sampling
+    manifest: dict[str, Any] = {
+        **sampling_identity(generator, run_folder, sampling),
+        "generator": generator.public_name(),
+        "cost_per_scan": asdict(generator.cost(sampling)),
+        "sensor": generator.sensor.to_json(),
+    }
+    if variant := recorded_projection(run_folder):
+        manifest["projection_variant"] = variant
+    if generator.full_rows is not None:
+        manifest["full_rows"] = [generator.full_rows.start, generator.full_rows.stop]
+    trained_on = _trained_on(run_folder)
+    begun = _is_begun(folder, manifest)
+    missing = _missing(folder, seeds)
+    images = generator.stream(missing, sampling)
+    with (
+        claim_folder(folder, shared=True) if missing else nullcontext(),
+        (reporter or Reporter()).progress("sampling", len(seeds), len(seeds) - len(missing)) as progress,
+    ):
+        first = list(islice(images, 1))  # what the model refuses is told before anything is written
+        if missing and not begun:
+            _begin(folder, manifest)
+        if trained_on is not None and not (folder / TRAINED_ON_FILE).exists() and is_sample_folder(folder):
+            write_text(folder / TRAINED_ON_FILE, trained_on)
+        for seed, image in zip(missing, chain(first, images), strict=True):
+            if not is_sample_folder(folder):  # or the write would make the folder anew, without the earlier samples
+                raise removed_meanwhile(folder)
+            _write_image(_file(folder, seed), image)
+            progress.advance(1)
+    if seeds and (not is_sample_folder(folder) or _missing(folder, seeds)):
+        raise removed_meanwhile(folder)
+    remove_partials(folder)
+
+
+def sampling_identity(generator: Generator[Any, Any], run_folder: Path, sampling: object) -> dict[str, Any]:
+    """Return what decides, beside the seed, which scan is sampled: the weights, the configuration and the settings."""
+    return {
+        "weights_sha256": weights_sha256(run_folder),
+        "config": configuration.to_json(generator.config),
+        "sampling": configuration.to_json(sampling),
+    }
+
+
+def _is_begun(folder: Path, manifest: dict[str, Any]) -> bool:
+    """Return whether a folder holds samples of the same kind; False for a free one, others are refused."""
+    if (folder / MANIFEST).exists():
+        if not _same(read_json(folder / MANIFEST), manifest):
+            raise OutputError(
+                f"{folder}, which holds samples of another model or sampled in another way",
+                "an empty folder, or one that this very command began",
+                "choose another folder",
+            )
+        return True
+    if is_taken(folder) and not (folder / MANIFEST).exists():  # another process may just have begun it
+        raise OutputError(f"{folder}, which is not empty and holds no samples", "an empty folder", "choose another one")
+    return False
+
+
+def _begin(folder: Path, manifest: dict[str, Any]) -> None:
+    """Write the manifest into a free folder, unless another process has written it meanwhile."""
+    if not _is_begun(folder, manifest):
+        write_json(folder / MANIFEST, manifest)
+
+
+def _trained_on(run_folder: Path) -> str | None:
+    """Return what the model learned from, as it is to lie beside its samples; None where the run does not tell."""
+    source = run_folder / TRAINED_ON_FILE
+    return json.dumps(read_json(source), separators=(",", ":")) + "\n" if source.is_file() else None
+
+
+def _missing(folder: Path, seeds: Sequence[int]) -> list[int]:
+    """Return the seeds whose samples are not in a folder."""
+    there = {entry.name for entry in os.scandir(folder)} if folder.exists() else set[str]()
+    return [seed for seed in seeds if _file(folder, seed).name not in there]
+
+
+def _same(there: dict[str, Any], manifest: dict[str, Any]) -> bool:
+    """Return whether samples there were sampled as these will be; their cost follows from the rest."""
+    return {**there, "cost_per_scan": None} == {**manifest, "cost_per_scan": None}
+
+
+def _write_image(path: Path, image: RangeImage) -> None:
+    pixels: dict[str, Any] = {"range_m": image.range_m.cpu().numpy()}
+    if image.reflectance is not None:
+        pixels["reflectance"] = image.reflectance.cpu().numpy()
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, **pixels)
+
+
+def _file(folder: Path, seed: int) -> Path:
+    return folder / f"{seed:08d}.npz"
