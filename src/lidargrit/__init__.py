@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+from lidargrit.core.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from lidargrit.api import Condition, evaluate, inspect, load, load_scan, load_sensor, project, simulate, unproject

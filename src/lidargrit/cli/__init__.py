@@ -11,11 +11,11 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from lidargrit import __version__
 from lidargrit.cli._parser import EXIT_CODES, HelpFormatter, Parser
 from lidargrit.cli._signals import raising_on_signals
 from lidargrit.core import discovery
 from lidargrit.core.errors import LidarGritError, Terminated, UsageError
+from lidargrit.core.version import __version__
 
 _EXAMPLES = """\
 examples:

@@ -16,12 +16,12 @@ from typing import Any
 
 import torch
 
-from lidargrit import __version__
 from lidargrit.core.configuration import name_and_settings
 from lidargrit.core.errors import ConfigError, LidarGritError
 from lidargrit.core.files import claim_folder, read_json, write_json
 from lidargrit.core.processes import check_processes, process_pool
 from lidargrit.core.reporting import Reporter
+from lidargrit.core.version import __version__
 from lidargrit.data.run_folder import is_run, locate, weights_sha256
 from lidargrit.data.sources import Source, data_set_of, open_source
 from lidargrit.data.sources.samples import read_samples

@@ -9,10 +9,10 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from lidargrit import __version__
 from lidargrit.core.errors import ConfigError, LidarGritError, counted_scans, nearest_names, one_of
 from lidargrit.core.reporting import Reporter
 from lidargrit.core.untrusted import COUNT_AT_MOST, SEED_AT_MOST
+from lidargrit.core.version import __version__
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import Source, open_source
 from lidargrit.evaluation.intervals import Resampling, Score

@@ -10,10 +10,10 @@ from typing import Any
 
 import torch
 
-from lidargrit import __version__
 from lidargrit.core import configuration
 from lidargrit.core.errors import CheckpointError, ConfigError, OutputError
 from lidargrit.core.files import claim_folder, is_taken, read_json, sha256_of, write_json
+from lidargrit.core.version import __version__
 from lidargrit.data.run_folder import (
     CARD_FILE,
     RUN_FILE,

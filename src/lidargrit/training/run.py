@@ -15,12 +15,12 @@ from typing import Any
 
 import torch
 
-from lidargrit import __version__
 from lidargrit.core import configuration
 from lidargrit.core.determinism import derive_seed
 from lidargrit.core.errors import CheckpointError, OutputError
 from lidargrit.core.files import claim_folder, claimed_manifest, is_taken, read_json, write_json
 from lidargrit.core.reporting import Reporter
+from lidargrit.core.version import __version__
 from lidargrit.data.images import Provenance, RangeImages
 from lidargrit.data.run_folder import RUN_FILE, TRAINED_ON_FILE, locate, recipe_settings, trained_on, write_trained_on
 from lidargrit.data.sources import joined_images

@@ -14,8 +14,8 @@ import torch
 from jaxtyping import Float, Int
 from matplotlib import colormaps
 
-from lidargrit import __version__
 from lidargrit.core.files import write_text
+from lidargrit.core.version import __version__
 from lidargrit.evaluation.reconstruction import ReconstructionErrors
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.generation.pixel_decoder.pixel_phases import Lattice

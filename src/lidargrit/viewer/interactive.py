@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 from matplotlib import colormaps
 
-from lidargrit import __version__
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.files import write_text
+from lidargrit.core.version import __version__
 from lidargrit.scans.classes import name_and_colour
 from lidargrit.scans.projection import points_of_pixels
 from lidargrit.viewer._page import document

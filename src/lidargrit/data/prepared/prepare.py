@@ -11,13 +11,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from lidargrit import __version__
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.environment import cache_folder
 from lidargrit.core.errors import DataError, OutputError, counted_scans
 from lidargrit.core.files import claim_folder, is_taken, remove_partials, write_json, write_text
 from lidargrit.core.processes import rank_and_world_size
 from lidargrit.core.reporting import Reporter
+from lidargrit.core.version import __version__
 from lidargrit.data.datasets import ScanDataset, open_dataset
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.prepared.imaging import choose_imaging

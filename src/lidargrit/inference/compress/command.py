@@ -9,10 +9,10 @@ from typing import Any
 
 import torch
 
-from lidargrit import __version__
 from lidargrit.core.errors import CheckpointError, DataError, ScanError, UsageError
 from lidargrit.core.files import claim_folder
 from lidargrit.core.reporting import Reporter
+from lidargrit.core.version import __version__
 from lidargrit.data.export import IMAGE, check_names, claimed_scans, writable_format, write_array
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.run_folder import locate, projection_variant

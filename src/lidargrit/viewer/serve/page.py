@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from lidargrit import __version__
 from lidargrit.core.untrusted import SEED_AT_MOST
+from lidargrit.core.version import __version__
 from lidargrit.viewer import interactive
 from lidargrit.viewer.interactive import button, filled
 from lidargrit.viewer.serve.requests import TASKS, upload_endings
