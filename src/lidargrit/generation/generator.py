@@ -15,13 +15,11 @@ from lidargrit.core.errors import CheckpointError, ConfigError
 from lidargrit.core.files import read_tensors
 from lidargrit.data.images import RangeImages
 from lidargrit.data.run_folder import CONFIG_FILE, WEIGHTS_FILE, locate, read_config, told_of
-from lidargrit.generation.batches import BatchSeeds, in_batches, one_by_one
-from lidargrit.generation.checks import check_condition, check_images, check_seeds
+from lidargrit.generation.batches import BatchSeeds, check_condition, check_images, check_seeds, in_batches, one_by_one
 from lidargrit.generation.facts import CAPABILITIES, Cost, NoSampling, SystemFacts
-from lidargrit.generation.hub import download
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.range_steps import RangeSteps
-from lidargrit.generation.saved import ConfigT, SavedModel
+from lidargrit.generation.saved import ConfigT, SavedModel, download
 from lidargrit.generation.tokenizers import Tokenizer
 from lidargrit.nn.precision import Precision
 from lidargrit.nn.quantization import without_quantized

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidargrit.core.errors import ConfigError
-from lidargrit.generation.checks import check_seeds
+from lidargrit.generation.batches import check_seeds
 from lidargrit.generation.encoding_cache import Frozen
 from lidargrit.generation.facts import Cost, SystemFacts
 from lidargrit.generation.generator import Generator
