@@ -59,7 +59,7 @@ def test_simulate_runs_nothing_from_the_current_folder(poisoned, tmp_path):
 
 POOL = """
 import os, signal, time
-from lidargrit.processes import process_pool
+from lidargrit.core.processes import process_pool
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs do not hear Ctrl-C
     with process_pool(2) as pool:

@@ -30,7 +30,7 @@ from lidargrit.data.sources.sample_formats import read_tensor
 WRITE_AND_WAIT = """
 import sys, time
 from pathlib import Path
-from lidargrit.files import atomic_path, claim_folder
+from lidargrit.core.files import atomic_path, claim_folder
 with atomic_path(Path(sys.argv[1])) as temporary:
     temporary.write_bytes(b"half")
     print("written", flush=True)
@@ -39,7 +39,7 @@ with atomic_path(Path(sys.argv[1])) as temporary:
 CLAIM_AND_WAIT = """
 import sys, time
 from pathlib import Path
-from lidargrit.files import claim_folder
+from lidargrit.core.files import claim_folder
 with claim_folder(Path(sys.argv[1]), shared=len(sys.argv) > 2):
     print("claimed", flush=True)
     time.sleep(600)
@@ -212,10 +212,11 @@ def test_a_name_as_long_as_the_disk_allows_is_written(tmp_path):
 KILLED_AND_FINISHED = """
 import os, signal, sys, time
 from pathlib import Path
-from lidargrit.export import export_scans
-from lidargrit.loading import DataConfig, prepare
-from lidargrit.sensors import load_sensor
-from lidargrit.simulator.drives import DriveConfig, write_drives
+from lidargrit.data.export import export_scans
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.prepared.prepare import prepare
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.data.drives import DriveConfig, write_drives
 
 COMMANDS = {
     "simulate": lambda out: write_drives(out, 6, DriveConfig(load_sensor("vlp16"))),

@@ -213,15 +213,16 @@ def test_a_bad_scan_met_by_another_process_is_told_here(tree, small_shards):
 KILLED_AND_FINISHED = """
 import os, signal, sys, time
 from pathlib import Path
-import lidargrit.data.prepared as loading
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.prepared.prepare import prepare
 folder = Path(sys.argv[1])
-sys.modules[loading.prepare.__module__]._SHARD_SCANS = 2
+sys.modules[prepare.__module__]._SHARD_SCANS = 2
 
 def begun():
     if child := os.fork():
         return child
     try:
-        loading.prepare("simulated:12", loading.DataConfig(workers=1), folder)
+        prepare("simulated:12", DataConfig(workers=1), folder)
         os._exit(0)
     finally:
         os._exit(1)

@@ -16,7 +16,7 @@ from lidargrit.scans.types import RangeImage
 PROCESS = """
 import pickle, sys
 import torch.distributed as distributed
-from lidargrit.metrics import BevMmd, SlicedWasserstein
+from lidargrit.evaluation.metrics import BevMmd, SlicedWasserstein
 from test_metric_reduction import images
 
 rank, meeting, out = int(sys.argv[1]), sys.argv[2], sys.argv[3]

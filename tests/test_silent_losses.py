@@ -197,7 +197,7 @@ def test_a_process_that_is_ended_while_nobody_listens_says_nothing():
     """What it was about to print would otherwise be told as an error when Python ends."""
     code = """
 import runpy, sys
-from lidargrit.loading import workers
+from lidargrit.data.prepared import workers
 def interrupted(*_):
     print(1)
     raise KeyboardInterrupt

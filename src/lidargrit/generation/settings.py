@@ -94,7 +94,7 @@ class Recipe:
 
     Args:
         title: description of the experiment in one line.
-        generator: name of the generator in lidargrit.generation.generator.
+        generator: name of the generator, a folder of lidargrit.systems.
         model: configuration of the generator, of its own ``Config`` class.
         data: settings of the data.
         training: settings of the training, by the name of the stage.

@@ -88,7 +88,7 @@ lidargrit view samples
 
 ```python
 from lidargrit import unproject
-from lidargrit.generators import Generator
+from lidargrit.generation.generator import Generator
 
 model = Generator.from_pretrained("FOLDER")  # or "USER/NAME", with the extra lidargrit[hub]
 scans = model.sample(seeds=[0, 1, 2, 3])  # one for each seed
