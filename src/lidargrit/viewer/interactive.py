@@ -20,8 +20,7 @@ from matplotlib import colormaps
 
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.files import write_text
-from lidargrit.core.version import __version__
-from lidargrit.scans.classes import name_and_colour
+from lidargrit.scans.classes import names_and_colours
 from lidargrit.scans.projection import points_of_pixels
 from lidargrit.viewer._page import document
 from lidargrit.viewer.scan_sets import SURPRISED_BITS, ScanSet
@@ -153,7 +152,7 @@ def _source(scan_set: ScanSet) -> dict[str, Any]:
     numbers = [] if label is None else label[images.return_mask].unique().tolist()
     if len(numbers) > _CLASSES_AT_MOST:
         raise ConfigError(f"{len(numbers)} classes of labels", f"at most {_CLASSES_AT_MOST}", "show fewer scans")
-    named = [(number, *name_and_colour(number)) for number in numbers]
+    named = names_and_colours(numbers)
     scans: list[dict[str, Any]] = []
     for index, name in enumerate(scan_set.scan_names):
         scan = {"name": name, "range": _packed(steps[index].numpy().astype("<u2"))}

@@ -23,6 +23,9 @@ from lidargrit.scans.types import RangeImage, Scan
 class NamedScans(ABC):
     """Scans of a source, evenly spaced where fewer than all are wanted."""
 
+    notes: tuple[str, ...] = ()
+    """Sentences on files that were left out."""
+
     @abstractmethod
     def __len__(self) -> int: ...
 
@@ -64,6 +67,7 @@ class PointScans(NamedScans):
     """
 
     def __init__(self, dataset: ScanDataset, max_scans: int) -> None:
+        self.notes = dataset.notes
         self._dataset, self._indices = dataset, evenly_spaced(max_scans or len(dataset), len(dataset))
 
     def __len__(self) -> int:
