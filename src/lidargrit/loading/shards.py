@@ -13,11 +13,11 @@ import math
 import mmap
 import resource
 from dataclasses import asdict, dataclass, replace
+from functools import cache
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
-from numcodecs.blosc import SHUFFLE, Blosc
 
 from lidargrit.errors import DataError
 from lidargrit.files import atomic_path
@@ -26,12 +26,13 @@ from lidargrit.sensors import SensorModel
 from lidargrit.structures import RangeImage
 from lidargrit.untrusted import JSON_BYTES_AT_MOST, parse_json
 
+if TYPE_CHECKING:
+    from numcodecs.blosc import Blosc
+
 _MAGIC = b"LGSHARD1"
 _TAIL = 8 + len(_MAGIC)
 _FINEST_STEP_M = 0.002  # a tenth of the scatter of a good sensor; 16 bits of it reach 131 m
 _BLOSC_HEADER = 16  # bytes: at 4 the size of the pixels, at 12 that of the blob (Blosc 1 chunk format)
-# 98 KB for a KITTI scan as 64x1024, read in 0.16 ms; level 1 takes 4 % more room, level 5 no less.
-_CODEC = Blosc(cname="zstd", clevel=3, shuffle=SHUFFLE)
 
 
 @dataclass(frozen=True)
@@ -242,8 +243,16 @@ def _fingerprint(*parts: np.ndarray | None) -> str:
     return digest.hexdigest()
 
 
+@cache
+def _codec() -> Blosc:
+    from numcodecs.blosc import SHUFFLE, Blosc  # noqa: PLC0415  training from images in memory needs no compression
+
+    # 98 KB for a KITTI scan as 64x1024, read in 0.16 ms; level 1 takes 4 % more room, level 5 no less.
+    return Blosc(cname="zstd", clevel=3, shuffle=SHUFFLE)
+
+
 def _compress(pixels: np.ndarray) -> bytes:
-    return _CODEC.encode(np.ascontiguousarray(pixels))
+    return _codec().encode(np.ascontiguousarray(pixels))
 
 
 def _decompress(blob: bytes | memoryview, shape: tuple[int, int], dtype: type) -> np.ndarray:
@@ -252,7 +261,7 @@ def _decompress(blob: bytes | memoryview, shape: tuple[int, int], dtype: type) -
     size, length = int.from_bytes(header[4:8], "little"), int.from_bytes(header[12:16], "little")
     if size != pixels.nbytes or length != len(blob):  # the library would trust these
         raise ValueError(f"{size} bytes of pixels for an image of {pixels.nbytes}")
-    _CODEC.decode(blob, pixels)
+    _codec().decode(blob, pixels)
     return pixels
 
 

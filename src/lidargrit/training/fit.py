@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import sys
@@ -45,6 +46,7 @@ class Fit:
         built_on: fingerprint of the earlier stage's weights; a checkpoint with another one is refused.
         workers: number of threads that read ahead.
         plot: function that plots the averaged objective into a file; None for no pictures.
+        deadline_s: value of ``time.monotonic()`` at which training stops as it does by SIGTERM.
     """
 
     objective: Objective
@@ -55,6 +57,7 @@ class Fit:
     built_on: str = ""
     workers: int = 1
     plot: Callable[[Objective, Path], None] | None = None
+    deadline_s: float = math.inf
 
     def __post_init__(self) -> None:
         self.engine, self.optimiser = begin_training(self.objective, self.config)
@@ -89,7 +92,7 @@ class Fit:
         Raises:
             TrainingError: the loss is not finite; names the scans seen and the last good checkpoint.
             OutputError: a checkpoint could not be written; the one before it is intact.
-            Terminated: SIGTERM was received; the step in progress was finished and saved.
+            Terminated: SIGTERM was received, or the time is over; the step in progress was finished and saved.
         """
         config = self.config
         batches = Batches(
@@ -104,7 +107,7 @@ class Fit:
         )
         begun = time.monotonic()
         progress_bar = self.reporter.progress(what, config.scans, self.scans_seen)
-        with Termination() as termination, progress_bar as progress:
+        with Termination(self.deadline_s) as termination, progress_bar as progress:
             if self.engine.any(self._lacks_validation) and self._validates():  # the process ended before it
                 self._log_terms("val", self.validate(val, termination), 0.0)
             for images in batches.stream(self.scans_seen, config.scans):

@@ -1,0 +1,172 @@
+"""One leg of a relay: a run folder and some minutes → its stages trained further on streets that are made meanwhile.
+
+The first stage comes first: tokenizer, then the pixel decoder over it, then the prior over its tokens.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import torch
+from packing import RELAY_FILE, round_finished
+from streets import Streets, ValidationStreets, simulating
+
+from lidargrit.determinism import derive_seed
+from lidargrit.errors import OutputError, Terminated
+from lidargrit.evaluation.upright_objects import kept_objects
+from lidargrit.files import read_json, write_json
+from lidargrit.generators import Generator
+from lidargrit.generators._tokens import TokenGenerator
+from lidargrit.nn.pixel_decoder import PixelDecoder
+from lidargrit.recipes import load_recipe
+from lidargrit.reporting import Reporter
+from lidargrit.structures import RangeImage
+from lidargrit.training.checkpoint import fingerprint
+from lidargrit.training.config import Recipe
+from lidargrit.training.fit import Fit
+
+_FIRST_STAGE = ("tokenizer", "pixels")
+_VALIDATION_SEED = 1_000_000  # the simulator's first validation street
+_POOL_AT_MOST = 8  # processes that simulate the validation streets
+_FOR_JUDGING_S = 15.0
+_LEAST_TRAINING_S = 5.0
+
+
+@dataclass(frozen=True)
+class Leg:
+    """What one leg is given.
+
+    Args:
+        preset: name of the recipe that is trained.
+        run: folder of the relay.
+        seconds: time that the leg may take, saving and packing left out.
+        processes: number of processes that simulate streets.
+        validation_streets: number of streets on which the leg is judged.
+    """
+
+    preset: str
+    run: Path
+    seconds: float
+    processes: int
+    validation_streets: int = 24
+
+
+def run_leg(leg: Leg, recipe: Recipe | None = None) -> None:
+    """Train the stages in turn until the time is over, and note in ``relay.json`` what was reached.
+
+    Args:
+        leg: what the leg is given.
+        recipe: recipe to train in place of the preset's.
+
+    Raises:
+        OutputError: the folder holds the relay of another preset.
+    """
+    begun = time.monotonic()
+    recipe = recipe or load_recipe(leg.preset)
+    state = _state(leg)
+    sensor = recipe.data.load_sensor()
+    generator = recipe.build_generator()
+    finished: list[str] = []
+    told: dict[str, float] = {}
+    columns = (sensor.width * sensor.column_stride, sensor.column_stride)
+    folder = leg.run / "streets"
+    with (
+        ProcessPoolExecutor(min(leg.processes, _POOL_AT_MOST), get_context("spawn")) as pool,
+        simulating(folder, recipe.data.sensor, columns, state["next_seed"], leg.processes),
+    ):
+        seeds = range(_VALIDATION_SEED, _VALIDATION_SEED + leg.validation_streets)
+        streets, validation = Streets(folder), ValidationStreets(sensor, seeds, pool)
+        for stage in _in_order(generator):
+            fit = _fit(generator, recipe, stage, leg, finished, begun)
+            before = fit.scans_seen
+            if fit.deadline_s - time.monotonic() < _LEAST_TRAINING_S and before < fit.config.scans:
+                break
+            try:
+                fit.run(streets.images(sensor), validation.images(), f"training {stage}")
+                finished.append(stage)
+                round_finished(fit.average.objective)
+            except Terminated:
+                pass
+            told |= {f"{stage}.scans": fit.scans_seen, f"{stage}.scans_of_leg": fit.scans_seen - before}
+            generator.load_stage(stage, fit.average.objective)
+            if fit.scans_seen > before:
+                losses = fit.validate(validation.images())
+                judged = _judged(generator, stage, validation.labelled, fit.engine.device)
+                told |= {f"{stage}.{name}": value for name, value in (*losses.items(), *judged)}
+            if stage not in finished:
+                break
+    told |= {"seconds": time.monotonic() - begun, "streets": streets.count}
+    state["legs"].append({name: round(value, 5) for name, value in told.items()})
+    state |= {"next_seed": streets.next_seed(state["next_seed"]), "finished": finished}
+    write_json(leg.run / RELAY_FILE, state)
+    print(json.dumps(state["legs"][-1]), flush=True)
+
+
+def _state(leg: Leg) -> dict[str, Any]:
+    path = leg.run / RELAY_FILE
+    state = read_json(path) if path.exists() else {"preset": leg.preset, "next_seed": 0, "finished": [], "legs": []}
+    if state["preset"] != leg.preset:
+        raise OutputError(f"{leg.run}, the relay of {state['preset']}", leg.preset, "take another folder")
+    write_json(path, state)
+    return state
+
+
+def _in_order(generator: Generator) -> tuple[str, ...]:
+    first = tuple(stage for stage in _FIRST_STAGE if stage in generator.stages)
+    return first + tuple(stage for stage in generator.stages if stage not in first)
+
+
+def _fit(generator: Generator, recipe: Recipe, stage: str, leg: Leg, finished: list[str], begun: float) -> Fit:
+    seed = derive_seed(recipe.seed, generator.stages.index(stage))
+    torch.manual_seed(seed)
+    built_on = fingerprint(generator.objective("tokenizer")) if finished else ""
+    fit = Fit(
+        generator.objective(stage),
+        recipe.settings_of(stage),
+        leg.run / stage,
+        seed,
+        _Lines(),
+        built_on,
+        recipe.data.workers,
+        deadline_s=begun + leg.seconds - _FOR_JUDGING_S,
+    )
+    return fit
+
+
+class _Lines(Reporter):
+    def message(self, text: str) -> None:
+        print(text, flush=True)
+
+
+@torch.no_grad()
+def _judged(generator: Generator, stage: str, truth: RangeImage, device: torch.device) -> Iterator[tuple[str, float]]:
+    """Yield what the first stage keeps of streets: ranges, and poles and trunks where they stood."""
+    if stage not in _FIRST_STAGE or not isinstance(generator, TokenGenerator):
+        return
+    generator.to(device).eval()
+    tokenizer, pixels = generator.get_tokenizer(), generator.pixels
+    images = replace(truth, label=None)
+    made = []
+    for index in range(len(truth)):
+        decoded = tokenizer.decode(tokenizer.encode(images[[index]].to(device)))
+        if stage == "pixels" and isinstance(pixels, PixelDecoder):
+            made.append(pixels.sample(decoded, [torch.Generator().manual_seed(index)]).to("cpu"))
+        else:
+            made.append(decoded.threshold().to("cpu"))
+    whole = RangeImage.cat(made)
+    both = truth.return_mask & whole.return_mask
+    error_m = (whole.range_m - truth.range_m).abs()
+    kept = kept_objects(truth, whole)
+    yield "kept_poles", float(kept.kept)
+    yield "poles", float(kept.total)
+    yield "share_of_pole_pixels", kept.share_of_pixels
+    yield "within_5_percent", float(((error_m <= 0.05 * truth.range_m) & both).sum() / truth.return_mask.sum())
+    yield "range_mae_m", float(error_m[both].mean())
+    yield "mask_agrees", float((truth.return_mask == whole.return_mask).float().mean())
