@@ -18,12 +18,12 @@ _PRESET = "fine_wide"
 def _main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     verbs = parser.add_subparsers(dest="verb", required=True)
-    leg = verbs.add_parser("leg", help="train further for some seconds, then pack")
-    leg.add_argument("run", type=Path, help="folder of the relay")
-    leg.add_argument("out", type=Path, help="folder for what must travel back")
-    leg.add_argument("--preset", default=_PRESET)
-    leg.add_argument("--seconds", type=float, default=500.0)
-    leg.add_argument("--processes", type=int, default=max(1, (os.cpu_count() or 2) - 1))
+    trained = verbs.add_parser("leg", help="train further for some seconds, then pack")
+    trained.add_argument("run", type=Path, help="folder of the relay")
+    trained.add_argument("out", type=Path, help="folder for what must travel back")
+    trained.add_argument("--preset", default=_PRESET)
+    trained.add_argument("--seconds", type=float, default=500.0)
+    trained.add_argument("--processes", type=int, default=max(1, (os.cpu_count() or 2) - 1))
     packed = verbs.add_parser("pack", help="pack in fewer bits, for a machine that takes less or for a commit")
     packed.add_argument("run", type=Path)
     packed.add_argument("out", type=Path)
@@ -38,9 +38,10 @@ def _main() -> int:
         elif given.verb == "pack":
             print(pack(given.run, given.out, int(given.room * 2**20)))
         else:
+            leg = Leg(given.preset, given.run, given.seconds, given.processes)
             try:
-                run_leg(Leg(given.preset, given.run, given.seconds, given.processes))
-            finally:  # whatever went wrong, the last checkpoint travels
+                run_leg(leg, saved=lambda: print(pack(given.run, given.out), flush=True))
+            finally:  # whatever went wrong, the last checkpoint travels; with it, what the leg reached
                 print(pack(given.run, given.out), flush=True)
     except LidarGritError as error:
         print(f"error: {error}", file=sys.stderr)

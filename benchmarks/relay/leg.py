@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
@@ -58,23 +58,20 @@ class Leg:
     validation_streets: int = 24
 
 
-def run_leg(leg: Leg, recipe: Recipe | None = None) -> None:
+def run_leg(leg: Leg, recipe: Recipe | None = None, saved: Callable[[], None] = lambda: None) -> None:
     """Train the stages in turn until the time is over, and note in ``relay.json`` what was reached.
 
     Args:
         leg: what the leg is given.
         recipe: recipe to train in place of the preset's.
+        saved: called once all is trained and saved, before it is judged, which may outlast the machine.
 
     Raises:
         OutputError: the folder holds the relay of another preset.
     """
     begun = time.monotonic()
     recipe = recipe or load_recipe(leg.preset)
-    state = _state(leg)
-    sensor = recipe.data.load_sensor()
-    generator = recipe.build_generator()
-    finished: list[str] = []
-    told: dict[str, float] = {}
+    state, sensor, generator = _state(leg), recipe.data.load_sensor(), recipe.build_generator()
     columns = (sensor.width * sensor.column_stride, sensor.column_stride)
     folder = leg.run / "streets"
     with (
@@ -83,30 +80,50 @@ def run_leg(leg: Leg, recipe: Recipe | None = None) -> None:
     ):
         seeds = range(_VALIDATION_SEED, _VALIDATION_SEED + leg.validation_streets)
         streets, validation = Streets(folder), ValidationStreets(sensor, seeds, pool)
-        for stage in _in_order(generator):
-            fit = _fit(generator, recipe, stage, leg, finished, begun)
-            before = fit.scans_seen
-            if fit.deadline_s - time.monotonic() < _LEAST_TRAINING_S and before < fit.config.scans:
-                break
-            try:
-                fit.run(streets.images(sensor), validation.images(), f"training {stage}")
-                finished.append(stage)
-                round_finished(fit.average.objective)
-            except Terminated:
-                pass
-            told |= {f"{stage}.scans": fit.scans_seen, f"{stage}.scans_of_leg": fit.scans_seen - before}
-            generator.load_stage(stage, fit.average.objective)
-            if fit.scans_seen > before:
-                losses = fit.validate(validation.images())
-                judged = _judged(generator, stage, validation.labelled, fit.engine.device)
-                told |= {f"{stage}.{name}": value for name, value in (*losses.items(), *judged)}
-            if stage not in finished:
-                break
-    told |= {"seconds": time.monotonic() - begun, "streets": streets.count}
-    state["legs"].append({name: round(value, 5) for name, value in told.items()})
+        deadline_s = begun + leg.seconds - _FOR_JUDGING_S
+        trained, finished = _train(generator, recipe, leg.run, deadline_s, streets, validation)
+    told: dict[str, float] = {"seconds": time.monotonic() - begun, "streets": streets.count}
     state |= {"next_seed": streets.next_seed(state["next_seed"]), "finished": finished}
+    state["legs"].append(told)
+    write_json(leg.run / RELAY_FILE, state)
+    saved()
+    for stage, (fit, scans) in trained.items():
+        told |= {f"{stage}.scans": fit.scans_seen, f"{stage}.scans_of_leg": scans}
+        if scans:
+            losses = fit.validate(validation.images())
+            judged = _judged(generator, stage, validation.labelled, fit.engine.device)
+            told |= {f"{stage}.{name}": round(value, 5) for name, value in (*losses.items(), *judged)}
     write_json(leg.run / RELAY_FILE, state)
     print(json.dumps(state["legs"][-1]), flush=True)
+
+
+def _train(
+    generator: Generator,
+    recipe: Recipe,
+    run: Path,
+    deadline_s: float,
+    streets: Streets,
+    validation: ValidationStreets,
+) -> tuple[dict[str, tuple[Fit, int]], list[str]]:
+    """Train until the time is over; return each stage begun with the scans of this leg, and the finished stages."""
+    trained: dict[str, tuple[Fit, int]] = {}
+    finished: list[str] = []
+    for stage in _in_order(generator):
+        fit = _fit(generator, recipe, stage, run, finished, deadline_s)
+        before = fit.scans_seen
+        if deadline_s - time.monotonic() < _LEAST_TRAINING_S and before < fit.config.scans:
+            break
+        try:
+            fit.run(streets.images(generator.sensor), validation.images(), f"training {stage}")
+            finished.append(stage)
+            round_finished(fit.average.objective)
+        except Terminated:
+            pass
+        trained[stage] = fit, fit.scans_seen - before
+        generator.load_stage(stage, fit.average.objective)
+        if stage not in finished:
+            break
+    return trained, finished
 
 
 def _state(leg: Leg) -> dict[str, Any]:
@@ -123,21 +140,12 @@ def _in_order(generator: Generator) -> tuple[str, ...]:
     return first + tuple(stage for stage in generator.stages if stage not in first)
 
 
-def _fit(generator: Generator, recipe: Recipe, stage: str, leg: Leg, finished: list[str], begun: float) -> Fit:
+def _fit(generator: Generator, recipe: Recipe, stage: str, run: Path, finished: list[str], deadline_s: float) -> Fit:
     seed = derive_seed(recipe.seed, generator.stages.index(stage))
     torch.manual_seed(seed)
     built_on = fingerprint(generator.objective("tokenizer")) if finished else ""
-    fit = Fit(
-        generator.objective(stage),
-        recipe.settings_of(stage),
-        leg.run / stage,
-        seed,
-        _Lines(),
-        built_on,
-        recipe.data.workers,
-        deadline_s=begun + leg.seconds - _FOR_JUDGING_S,
-    )
-    return fit
+    objective, config, workers = generator.objective(stage), recipe.settings_of(stage), recipe.data.workers
+    return Fit(objective, config, run / stage, seed, _Lines(), built_on, workers, deadline_s=deadline_s)
 
 
 class _Lines(Reporter):
