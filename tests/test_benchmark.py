@@ -13,7 +13,7 @@ from lidargrit.conditions.marks import read_marks
 from lidargrit.datasets import load
 from lidargrit.errors import ConfigError, LidarGritError, OutputError
 from lidargrit.evaluation import benchmark
-from lidargrit.evaluation.benchmark import Benchmark, as_table
+from lidargrit.evaluation.benchmark import Benchmark, as_json, as_table
 from lidargrit.evaluation.benchmark import run as run_benchmark
 from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.evaluation.intervals import Resampling
@@ -73,6 +73,23 @@ def test_a_recipe_is_trained_once_in_how_many_ways_ever_it_is_drawn_from(tmp_pat
     assert [path.name for path in (tmp_path / "runs").iterdir()] == ["r2dm_small"]
     assert "r2dm_small:steps=1 " in output
     assert "r2dm_small:steps=2 " in output
+
+
+def test_samples_that_are_there_are_scored_beside_systems_that_are_made(tmp_path):
+    made = run_benchmark(["memorised"], tmp_path / "first", BENCHMARK)
+    samples = str(tmp_path / "first" / "memorised" / "samples")
+    paths = run_benchmark(["marginal", samples], tmp_path / "both", BENCHMARK)
+    values = [json.loads(path.read_text())["scores"][0]["value"] for path in (*made, paths[1])]
+    assert values[0] == values[1]
+    costs = json.loads((paths[1].parent / "costs.json").read_text())
+    assert costs["parameters"] is costs["seconds_per_scan"] is None
+    cells = as_json(paths)
+    assert cells[1]["scores"]["scores"][0]["pixel_statistics"] is not None, "of the row marginal, in every file"
+    assert cells[1]["system"] in as_table(paths)
+    assert cells[1]["system"] in table_page(cells, 0.0)
+    assert json.loads(run_benchmark(["marginal", samples], tmp_path / "both", BENCHMARK)[1].read_text())["verdict"]
+    with pytest.raises(ConfigError, match="settings of sampling for samples that are there"):
+        run_benchmark([f"{samples}:steps=3"], tmp_path / "wrong", BENCHMARK)
 
 
 @pytest.mark.parametrize(

@@ -37,9 +37,9 @@ def compare_systems(name: str, card: Scorecard, other_name: str, other: Scorecar
 
     Args:
         name: name of the system.
-        card: its scores.
+        card: scores of the system.
         other_name: name of the system that it is compared with.
-        other: scores of that one.
+        other: scores of that other system.
     """
     ours, theirs = ({column_of(score): score for score in each.scores} for each in (card, other))
     asked = [*ours, *theirs, *((each.metric, each.variant) for each in (*card.left_out, *other.left_out))]

@@ -47,7 +47,7 @@ class Tally:
         worse: names of the scores that are worse by more than chance.
         better: names of those that are better by more than chance, or as ``praise`` says.
         undecided: names of all others.
-        praise: what is said of ``better``.
+        praise: word for ``better``, which real scans hardly are.
     """
 
     head: str
