@@ -218,6 +218,9 @@ def test_the_answer_has_losses_wins_and_both():
     assert answer(system(0.5, facts=FEW)).startswith("No verdict: 9 scans")
     others = replace(system(0.5, 0.5), settings={"seed": 1})
     assert answer(others).startswith("No verdict: without half-samples that both have in common")
+    for foreign in ({"groups": 0}, {"groups": "many"}, {}):
+        strange = [replace(system(0.5), settings={"resampling": foreign}) for _ in range(2)]
+        assert answer(*strange).startswith("No verdict: without half-samples")
 
 
 def test_equal_systems_seldom_differ_in_any_score():

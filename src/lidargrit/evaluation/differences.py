@@ -66,18 +66,18 @@ def compare_systems(name: str, card: Scorecard, other_name: str, other: Scorecar
 
 def _groups_in_common(card: Scorecard, other: Scorecard) -> int:
     """Return of how many groups both took the same halves; 0 if they took others."""
-    settings = [(each.settings.get("resampling"), each.settings.get("seed")) for each in (card, other)]
-    if settings[0] != settings[1]:
+    ours, theirs = ((each.settings.get("resampling"), each.settings.get("seed")) for each in (card, other))
+    if ours != theirs:
         return 0
-    groups = (settings[0][0] or {}).get("groups", Resampling.groups)
-    return len(blocks(card.reference.scans_used, int(groups)))
+    groups = ours[0].get("groups") if isinstance(ours[0], dict) else Resampling.groups
+    return len(blocks(card.reference.scans_used, groups)) if isinstance(groups, int) and groups > 1 else 0
 
 
 def _difference(ours: Score, theirs: Score, groups: int, together: int) -> Estimate:
     """Return one score minus another, with an interval where they have half-samples in common."""
     value = ours.result.value - theirs.result.value
     first, second = (each.interval.values if each.interval else () for each in (ours, theirs))
-    if not (groups and first and len(first) == len(second)):
+    if not (groups > 1 and 1 < len(first) == len(second)):
         return Estimate(value, math.nan, math.nan)
     _, reach = spread_of([one - other for one, other in zip(first, second, strict=True)], groups, together)
     return Estimate(value, value - reach, value + reach)
