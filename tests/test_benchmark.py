@@ -13,7 +13,7 @@ from lidargrit.conditions.marks import read_marks
 from lidargrit.datasets import load
 from lidargrit.errors import ConfigError, LidarGritError, OutputError
 from lidargrit.evaluation import benchmark
-from lidargrit.evaluation.benchmark import Benchmark, as_table
+from lidargrit.evaluation.benchmark import Benchmark, as_json, as_table
 from lidargrit.evaluation.benchmark import run as run_benchmark
 from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.evaluation.intervals import Resampling
@@ -25,6 +25,7 @@ from lidargrit.recipes import load_recipe
 from lidargrit.training import compute, computing_time, training_flops, with_budget
 from lidargrit.training.compute import uniform_images
 from lidargrit.viewer.table_page import table_page
+from test_verdict import FACTS, card, score
 from tiny_runs import MODEL, the_one_line
 
 FEW = ("data.train=simulated:6:train", "data.val=simulated:2:val", "data.columns=512", "data.column_stride=8")
@@ -72,6 +73,23 @@ def test_a_recipe_is_trained_once_in_how_many_ways_ever_it_is_drawn_from(tmp_pat
     assert [path.name for path in (tmp_path / "runs").iterdir()] == ["r2dm_small"]
     assert "r2dm_small:steps=1 " in output
     assert "r2dm_small:steps=2 " in output
+
+
+def test_samples_that_are_there_are_scored_beside_systems_that_are_made(tmp_path):
+    made = run_benchmark(["memorised"], tmp_path / "first", BENCHMARK)
+    samples = str(tmp_path / "first" / "memorised" / "samples")
+    paths = run_benchmark(["marginal", samples], tmp_path / "both", BENCHMARK)
+    values = [json.loads(path.read_text())["scores"][0]["value"] for path in (*made, paths[1])]
+    assert values[0] == values[1]
+    costs = json.loads((paths[1].parent / "costs.json").read_text())
+    assert costs["parameters"] is costs["seconds_per_scan"] is None
+    cells = as_json(paths)
+    assert cells[1]["scores"]["scores"][0]["pixel_statistics"] is not None, "of the row marginal, in every file"
+    assert cells[1]["system"] in as_table(paths)
+    assert cells[1]["system"] in table_page(cells, 0.0)
+    assert json.loads(run_benchmark(["marginal", samples], tmp_path / "both", BENCHMARK)[1].read_text())["verdict"]
+    with pytest.raises(ConfigError, match="settings of sampling for samples that are there"):
+        run_benchmark([f"{samples}:steps=3"], tmp_path / "wrong", BENCHMARK)
 
 
 @pytest.mark.parametrize(
@@ -288,22 +306,19 @@ def test_processes_make_a_table_that_can_be_extended(tmp_path, capfd):
 
 
 def cell_of(system, sha256="ab", metric="bev_jsd", source="real"):
-    score = {"metric": metric, "variant": "x", "higher_is_better": False, "value": 0.5, "interval": None}
-    score["real_against_real"] = {"value": 0.25, "num_scans": 4, "halvings": 2}
-    reference = {"scans_used": 4, "sha256": sha256, "source": source, "sensor": "s 8x8"}
-    scores = {"scores": [score], "inputs": {"reference": reference}, "protocol": {"name": "exact"}}
-    told = {"warnings": ["4 scans: too few"], "deviations": [], "verdict": [f"{metric} is near."]}
-    return {"system": system, "costs": {"parameters": 3}, "scores": {**scores, **told}}
+    facts = replace(FACTS, scans_used=4, sha256=sha256, source=source)
+    scores = card(score(0.5, 0.25, metric=metric), facts=facts, warnings=("4 scans were damaged",)).to_json()
+    return {"system": system, "costs": {"parameters": 3}, "scores": json.loads(json.dumps(scores))}
 
 
 def test_a_page_has_a_table_for_each_reference():
     page = table_page([cell_of("a"), cell_of("b", "cd"), cell_of("c")], 0.0)
-    first, second = page.split("<table>")[1:]
+    first, _, second = page.split("<table>")[1:]  # the second holds the differences of a and c
     assert [name in first for name in (">a<", ">b<", ">c<")] == [True, False, True]
     assert ">b<" in second
     assert first.count("real against real") == second.count("real against real") == 1
-    assert "<li>a, c: 4 scans: too few</li>" in page
-    assert "<li>b: bev_jsd is near.</li>" in page
+    assert "<li>a, c: 4 scans were damaged</li>" in page
+    assert "<li>b: No verdict: 4 scans in each set are too few" in page
 
 
 def test_a_page_of_foreign_names_holds_no_code_of_theirs():

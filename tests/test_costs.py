@@ -45,7 +45,7 @@ def test_a_time_that_is_lacking_is_added(tmp_path):
         assert json.loads(path.read_text())["seconds_per_scan"] == seconds
 
 
-@pytest.mark.parametrize("change", [{"parameters": "many"}, {"training_flops": [1]}, {"flops_per_scan": None}, None])
+@pytest.mark.parametrize("change", [{"parameters": "many"}, {"training_flops": [1]}, {"scans": None}, None])
 def test_damaged_costs_are_refused_in_one_line(change, tmp_path):
     costs = {"parameters": 3, "training_flops": None, "network_evaluations": 1, "flops_per_scan": 5.0}
     (tmp_path / "costs.json").write_text(json.dumps({**costs, "seconds_per_scan": 1, **change} if change else costs))

@@ -123,7 +123,7 @@ def test_a_scorecard_tells_all_that_is_needed_to_repeat_it(card):
         assert score["interval"]["low"] <= score["value"] <= score["interval"]["high"]
         assert score["real_against_real"]["num_scans"] == 5
         assert score["seconds"] >= 0
-    assert any("10 scans in each set" in warning for warning in card.warnings)
+    assert data["verdict"][0].startswith("No verdict: 10 scans in each set")
 
 
 def test_the_same_again_gives_the_same(card, sets):
@@ -243,10 +243,11 @@ def test_sets_that_overlap_and_projections_that_differ_are_told(sets, tmp_path):
     plain = EvalConfig(metrics=CHEAP, resampling=Resampling(halves=0))
     samples = write_scans(tmp_path / "samples", 3, 7, variant="exact")
     twice, _ = compare_sources(samples, samples, plain)
-    assert any("overlap (3 scans are in both)" in warning for warning in twice.warnings)
+    assert "overlap (3 scans are in both)" in twice.leak
+    assert any("overlap (3 scans are in both)" in sentence for sentence in twice.verdict.sentences)
     assert "the order is SAMPLES REFERENCE" in " ".join(compare_sources("simulated:3:test", samples, plain)[0].warnings)
     same, _ = compare_sources(sets[0], sets[0], plain)
-    assert any("overlap (12 scans are in both)" in warning for warning in same.warnings)
+    assert "overlap (12 scans are in both)" in same.leak
     assert [score.result.value for score in same.scores] == [0.0, 0.0]
     ours = [write_scans(tmp_path / name, 4, 5, variant=name) for name in ("exact", "reference")]
     for samples, differs in zip(ours, (True, False), strict=True):
@@ -306,9 +307,10 @@ def test_published_figures_stand_apart_and_only_beside_their_equals(card, tmp_pa
     write_json(paths[0], as_if(card, "lidargrit_kitti_odometry").to_json())
     write_json(paths[1], as_if(card, "lidargrit_kitti_odometry").to_json())
     text = side_by_side(paths[:2])
-    measured, *tables = text.split("\n\n")
+    measured, differences, *tables = text.split("\n\n")
     assert "ours" in measured
     assert "theirs" in measured
+    assert differences.startswith("Differences: score minus that of ours")
     assert "DUSty" not in measured
     assert len(tables) == 2
     assert all(table.startswith("Published, not measured here:") for table in tables)
@@ -358,7 +360,7 @@ def test_the_command_line_writes_scores_page_and_table(tmp_path, capsys, sets):
     files = ["--json", str(tmp_path / "s.json"), "--report", str(tmp_path / "s.html")]
     assert main([*words, *files]) == 0
     verdict, _, table = capsys.readouterr().out.partition("\n\n")
-    assert verdict.startswith("Within noise of real against real in 2 of 2 scores.")
+    assert verdict.startswith("No verdict: 10 scans in each set")
     head, *rows, _ = table.splitlines()
     assert " ".join(head.split()) == "metric variant score 95 % interval real against real better scans"
     assert len(rows) == 2

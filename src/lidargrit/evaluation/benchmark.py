@@ -1,4 +1,4 @@
-"""Recipes and finished runs → each trained, sampled and scored alike → one table; goes on where it stopped."""
+"""Recipes, finished runs and samples → each trained, sampled and scored alike → one table; goes on where it stopped."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from lidargrit.evaluation.costs import COSTS, Costs, costs_block, read_costs
 from lidargrit.evaluation.pairs import EvalPair, require_same_rays
 from lidargrit.evaluation.protocols import MetricChoice, load_protocol, public_name
 from lidargrit.evaluation.scorecard import NOT_APPLICABLE, Scorecard
-from lidargrit.evaluation.tables import Format, render, side_by_side
+from lidargrit.evaluation.tables import Format, render, share_pixel_statistics, side_by_side
 from lidargrit.evaluation.verdict import MEMORISED, PIXEL_STATISTICS
 from lidargrit.files import claim_folder, read_json, write_json
 from lidargrit.generators import Generator, load, load_class
 from lidargrit.metrics import load_metric
 from lidargrit.nn.devices import usable_device
 from lidargrit.processes import check_processes, process_pool
-from lidargrit.recipes import load_recipe
+from lidargrit.recipes import is_recipe, load_recipe
 from lidargrit.reporting import Reporter
 from lidargrit.run_folder import is_run, locate, weights_sha256
 from lidargrit.sensors import SensorModel
-from lidargrit.sources import Source, data_set_of, open_source
+from lidargrit.sources import SampleSource, Source, TensorSource, data_set_of, open_source
 from lidargrit.sources.samples import read_samples, write_samples
 from lidargrit.training import Recipe, check_folder, train, with_budget
 from lidargrit.training.compute import duration
@@ -102,7 +102,8 @@ def run(
 
     Args:
         systems: names of recipes or folders of finished runs, each with sampling choices after a colon if wanted:
-            ``r2dm_small:steps=32``. A recipe that occurs with several sampling choices is trained once.
+            ``r2dm_small:steps=32``; or folders of samples, of ours or of another program. A recipe that occurs with
+            several sampling choices is trained once.
         folder: output folder. It gets a run folder ``runs/RECIPE``, and for each system ``SYSTEM/samples``, scores in
             ``SYSTEM/SYSTEM.json`` and ``SYSTEM/costs.json``. Existing results are kept.
         benchmark: settings that all systems share.
@@ -146,7 +147,9 @@ def run(
                 }
                 for done in as_completed(begun):
                     remaining.without([plan.system for plan in begun[done]], done.result())
-    return [folder / name / f"{name}.json" for name in names]
+        paths = [folder / name / f"{name}.json" for name in names]
+        share_pixel_statistics(paths)
+    return paths
 
 
 def _require_a_metric(settings: EvalConfig, reporter: Reporter) -> None:
@@ -199,6 +202,9 @@ def _finish(
     for plan in plans:
         name = _folder_name(plan.system)
         reporter.message(f"{name}:")
+        if plan.samples is not None:
+            _score_samples(plan.samples, folder / name, benchmark, reporter, reference)
+            continue
         generator = (
             load(plan.run) if plan.recipe is None or is_run(plan.run) else train(plan.recipe, plan.run, reporter)
         )
@@ -211,11 +217,33 @@ def _finish(
         pair = _of_first_seeds(open_pair(open_source(str(samples)), reference, settings, reporter), samples)
         costs.add_bits(generator, pair.reference, reporter)
         _score(pair, settings, folder / name / f"{name}.json", reporter)
-        if (compared := len(pair.samples)) < benchmark.num_samples:
-            protocol_takes = load_protocol(settings.protocol).scans_at_most(benchmark.num_samples)
-            limit = f"{benchmark.reference} has" if compared < protocol_takes else f"protocol {settings.protocol} takes"
-            reporter.message(f"WARNING: {limit} {compared:,} scans, so as many are compared")
+        _warn_of_limits(pair, benchmark, reporter)
     return sampled
+
+
+def _score_samples(samples: Source, folder: Path, benchmark: Benchmark, reporter: Reporter, reference: Source) -> None:
+    """Score samples that are there, of which neither the costs nor the training are known."""
+    settings = benchmark.evaluation()
+    pair = open_pair(samples, reference, settings, reporter)
+    if isinstance(samples, SampleSource):
+        pair = _of_first_seeds(pair, samples.folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    Costs(folder / COSTS, samples.weights_sha256()).write_unknown()
+    _score(pair, settings, folder / f"{folder.name}.json", reporter)
+    _warn_of_limits(pair, benchmark, reporter)
+
+
+def _warn_of_limits(pair: EvalPair, benchmark: Benchmark, reporter: Reporter) -> None:
+    """Warn where fewer scans are compared than were asked for: systems of other numbers get another table."""
+    compared, protocol = len(pair.samples), benchmark.settings.protocol
+    if compared == benchmark.num_samples:
+        return
+    if compared == load_protocol(protocol).scans_at_most(benchmark.num_samples):
+        limit = f"protocol {protocol} takes"
+    else:
+        few = pair.samples if len(pair.samples.images) == compared else pair.reference
+        limit = f"{few.source} has"
+    reporter.message(f"WARNING: {limit} {compared:,} scans, so as many are compared; -n {compared} compares all alike")
 
 
 def _of_first_seeds(pair: EvalPair, folder: Path) -> EvalPair:
@@ -276,14 +304,15 @@ def as_json(scores: Sequence[Path]) -> list[dict[str, Any]]:
 
 @dataclass(frozen=True)
 class _Plan:
-    """How one system is made: from a finished run, or by training a recipe.
+    """How one system is made: from a finished run, or by training a recipe; or its samples, which are there.
 
     Args:
         system: name of the system, as the user typed it.
-        run: folder of a finished run, or of the one that the recipe gets.
+        run: folder of a finished run, or of the one that the recipe gets, or of samples.
         recipe: recipe that is trained; None for a finished run.
         sampling: settings of the generator's own ``Sampling``.
         sensor: sensor of the system's samples.
+        samples: the samples, if they are there; None otherwise.
     """
 
     system: str
@@ -291,6 +320,7 @@ class _Plan:
     recipe: Recipe | None
     sampling: object
     sensor: SensorModel
+    samples: Source | None = None
 
     @classmethod
     def of(cls, system: str, folder: Path, benchmark: Benchmark) -> _Plan:
@@ -299,6 +329,12 @@ class _Plan:
         if is_run(run):
             generator = load(run)
             return cls(system, run, None, generator.parse_sampling(settings), generator.sensor)
+        held = open_source(name) if run.is_dir() and not is_recipe(name) else None
+        if isinstance(held, (SampleSource, TensorSource)):
+            if settings:
+                got = f"{system}, settings of sampling for samples that are there"
+                raise ConfigError(got, "a folder of samples alone", "leave the settings out")
+            return cls(system, run, None, None, held.sensor, held)
         recipe = benchmark.recipe(name, check=not is_run(trained))
         sampling = load_class(recipe.generator).parse_sampling(settings)
         check_folder(trained, recipe)

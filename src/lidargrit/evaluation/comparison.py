@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from lidargrit import __version__
-from lidargrit.errors import ConfigError, LidarGritError, counted_scans, nearest_names, one_of
+from lidargrit.errors import ConfigError, LidarGritError, nearest_names, one_of
 from lidargrit.evaluation.intervals import Resampling, Score
 from lidargrit.evaluation.pairs import EvalPair, pair_for_protocol
 from lidargrit.evaluation.protocols import DEFAULT, MetricChoice, Protocol, load_protocol, public_name
@@ -23,8 +23,6 @@ from lidargrit.reporting import Reporter
 from lidargrit.sensors import load_sensor
 from lidargrit.sources import Source, open_source
 from lidargrit.untrusted import COUNT_AT_MOST, SEED_AT_MOST
-
-_FEW = 100  # scans: below that the interval itself rests on too little, and values hardly differ from real against real
 
 
 @dataclass(frozen=True)
@@ -157,7 +155,7 @@ def open_pair(samples: Source, reference: Source, settings: EvalConfig, reporter
         sensor = samples.sensor  # named for prepared scans and .npy, which else keep their own columns and projection
     sensor = sensor and config.imaged(sensor)
     pair = pair_for_protocol(samples, reference, protocol, config, reporter, sensor)
-    for warning in pair.warnings:
+    for warning in filter(None, (*pair.warnings, pair.leak)):
         if warning not in (*samples.doubts, *reference.doubts):  # which were told when the scans were opened
             reporter.message(f"WARNING: {warning}")
     return pair
@@ -191,7 +189,7 @@ def compare_pair(
     ]
     if errors and not scores:
         raise errors[0]
-    warnings = [*pair.warnings, *_doubts(pair, scores, settings)]
+    warnings = [*pair.warnings, *_doubts(scores, settings)]
     return Scorecard(
         public_name(settings.protocol),
         {
@@ -214,6 +212,7 @@ def compare_pair(
             "python": platform.python_version(),
             **{name: metadata.version(name) for name in ("torch", "numpy", "scipy")},
         },
+        pair.leak,
     )
 
 
@@ -262,12 +261,9 @@ def metric_factory(choice: MetricChoice, settings: EvalConfig, reporter: Reporte
     return MetricFactory(choice, settings.seed, weights, settings.device, reporter)
 
 
-def _doubts(pair: EvalPair, scores: Sequence[Score], settings: EvalConfig) -> list[str]:
+def _doubts(scores: Sequence[Score], settings: EvalConfig) -> list[str]:
     """Return warnings about the scores themselves."""
     found = []
-    count = len(pair.samples)
-    if count < _FEW:
-        found.append(f"{counted_scans(count)} in each set: too few for reliable scores and intervals")
     if settings.resampling.halves and any(score.interval is None for score in scores):
         without = [score.result.metric for score in scores if score.interval is None]
         found.append(f"too few scans for the intervals of {', '.join(dict.fromkeys(without))}")

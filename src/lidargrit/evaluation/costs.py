@@ -17,13 +17,13 @@ from lidargrit.reporting import Reporter
 from lidargrit.training import Recipe, training_flops
 
 COSTS = "costs.json"
-_ENTRIES = {  # entry of the file → name and unit in the table, and whether a system may lack it
-    "parameters": (("parameters", "all networks"), False),
-    "training_flops": (("training", "FLOPs"), True),
-    "flops_per_scan": (("sampling", "FLOPs/scan"), False),
-    "network_evaluations": (("network evaluations", "per scan"), False),
-    "seconds_per_scan": (("time", "s/scan"), True),
-    "bits_per_return": (("likelihood", "bits/return"), True),
+_ENTRIES = {  # entry of the file → name and unit in the table; None where it is not known
+    "parameters": ("parameters", "all networks"),
+    "training_flops": ("training", "FLOPs"),
+    "flops_per_scan": ("sampling", "FLOPs/scan"),
+    "network_evaluations": ("network evaluations", "per scan"),
+    "seconds_per_scan": ("time", "s/scan"),
+    "bits_per_return": ("likelihood", "bits/return"),
 }
 _NOTES = (
     "time: on this machine, in batches; likelihood: of at most 64 scans of the reference, ranges in steps of 10 mm, "
@@ -74,6 +74,10 @@ class Costs:
             },
         )
 
+    def write_unknown(self) -> None:
+        """Write that nothing is known of the costs, as of samples that were there."""
+        write_json(self.path, {"weights_sha256": self.weights_sha256, **dict.fromkeys(_ENTRIES), "scans": 0})
+
     def add_bits(self, generator: Generator, scans: EvalSet, reporter: Reporter) -> None:
         """Add the bits a return of the reference to the file, unless those of the same scans are there.
 
@@ -101,8 +105,8 @@ def read_costs(path: Path) -> dict[str, Any]:
         CheckpointError: the file cannot be read, or an entry lacks or is no number.
     """
     of = read_json(path)
-    for name, may_lack in (*((name, may) for name, (_, may) in _ENTRIES.items()), ("scans", False)):
-        if name not in of or not (type(of[name]) in (int, float) or (may_lack and of[name] is None)):
+    for name in (*_ENTRIES, "scans"):
+        if name not in of or not (type(of[name]) in (int, float) or (of[name] is None and name != "scans")):
             cure = "remove the folder of this system, and compare again"
             raise CheckpointError(f"{path}, whose {name} is no number", "what lidargrit compare wrote", cure)
     return of
@@ -123,8 +127,7 @@ def costs_block(files: Sequence[tuple[str, Path]], remarks: Sequence[str] = ()) 
         of = read_costs(path)
         numbers = [of[entry] for entry in _ENTRIES]
         rows.append((name, tuple("" if number is None else _as_text(number) for number in numbers)))
-    columns = tuple(column for column, _ in _ENTRIES.values())
-    return TableBlock("Costs", columns, tuple(rows), (*_NOTES, *remarks))
+    return TableBlock("Costs", tuple(_ENTRIES.values()), tuple(rows), (*_NOTES, *remarks))
 
 
 def _as_text(number: int | float) -> str:

@@ -14,6 +14,7 @@ Source:
 
 from __future__ import annotations
 
+import math
 import pickle
 import zlib
 from collections.abc import Sequence
@@ -69,6 +70,8 @@ class Interval:
         halves: number of half-samples.
         mean_of_halves: mean score of half-samples, which have as many scans as the halves of real against real; None in
             files of earlier versions.
+        values: scores of the half-samples; none in files of earlier versions. Systems that were scored alike, against
+            the same scans, have the same halves of these.
     """
 
     low: float
@@ -76,6 +79,7 @@ class Interval:
     standard_error: float
     halves: int
     mean_of_halves: float | None = None
+    values: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -211,11 +215,22 @@ def around(value: float, half_values: Sequence[float], groups: int, bounds: tupl
         groups: number of groups from which the half-samples were taken.
         bounds: least and greatest value that the metric can have.
     """
-    error = float(np.std(half_values, ddof=1))
-    reach = error * float(stdtrit(min(groups, len(half_values)) - 1, 0.975))
+    error, reach = spread_of(half_values, groups)
     least = max(bounds[0], 0.0) if min(value, *half_values) >= 0 else bounds[0]
-    mean = float(np.mean(half_values))
-    return Interval(max(value - reach, least), min(value + reach, bounds[1]), error, len(half_values), mean)
+    low, high = max(value - reach, least), min(value + reach, bounds[1])
+    return Interval(low, high, error, len(half_values), float(np.mean(half_values)), tuple(half_values))
+
+
+def spread_of(half_values: Sequence[float], groups: int, together: int = 1) -> tuple[float, float]:
+    """Return the standard error of a score, and half the width of its 95 % interval.
+
+    Args:
+        half_values: scores of half-samples.
+        groups: number of groups from which the half-samples were taken.
+        together: number of scores that the 95 % hold for at once (Bonferroni).
+    """
+    error = float(np.std(half_values, ddof=1))
+    return error, error * float(stdtrit(min(groups, len(half_values)) - 1, 1 - 0.025 / together))
 
 
 def real_against_real(
@@ -247,3 +262,10 @@ def real_against_real(
         except DataError:
             return None
     return RealAgainstReal(float(np.mean(values)), sum(sizes) // 2, _HALVINGS, float(np.std(values, ddof=1)))
+
+
+def format_value(value: float) -> str:
+    """Return a number with four significant digits."""
+    if value == 0 or not math.isfinite(value):
+        return f"{value:g}"
+    return f"{value:.4f}" if 1e-2 <= abs(value) < 1e3 else f"{value:.4g}"

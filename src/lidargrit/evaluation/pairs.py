@@ -101,12 +101,14 @@ class EvalPair:
         reference: second set, usually real.
         deviations: differences from what the protocol wants, one sentence each.
         warnings: reasons why the scores may mislead, one sentence each.
+        leak: sentence about scans of the reference that the model learned from, or that both sets hold; "" for none.
     """
 
     samples: EvalSet
     reference: EvalSet
     deviations: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    leak: str = ""
 
     def without_raydrop(self) -> str:
         """Return a sentence about the set without raydrop, to which metrics of raydrop do not apply; "" if none."""
@@ -152,11 +154,13 @@ def pair_for_protocol(
     require_same_rays(first.images.sensor, second.images.sensor)
     count = min(len(first.images), len(second.images), config.max_scans or len(first.images))
     pair = EvalPair(first.as_set(count, protocol.range_m), second.as_set(count, protocol.range_m))
-    warnings = (*_warnings(pair, overlap(samples, first.images, second.images)), *first.doubts, *second.doubts)
+    warnings = (*_warnings(pair), *first.doubts, *second.doubts)
+    shared = overlap(samples, first.images, second.images)
+    leak = f"{samples.text} and the reference overlap ({shared}): the scores flatter it" if shared else ""
     if reference.data_set == "samples" != samples.data_set:
         swapped = f"{reference.text} was generated, and {samples.text} was not: the order is SAMPLES REFERENCE"
         warnings = (*warnings, swapped)
-    return replace(pair, deviations=deviations(pair, protocol), warnings=warnings)
+    return replace(pair, deviations=deviations(pair, protocol), warnings=warnings, leak=leak)
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,14 +229,12 @@ def _other_images(images: EvalSet, wanted: SensorModel, variant: str) -> list[st
     return found
 
 
-def _warnings(pair: EvalPair, shared: str) -> tuple[str, ...]:
+def _warnings(pair: EvalPair) -> tuple[str, ...]:
     """Return reasons why the scores of two sets may mislead, one sentence each."""
     found = []
     first, second = pair.samples, pair.reference
     if without_raydrop := pair.without_raydrop():
         found.append(f"{without_raydrop}; metrics of pixels and points count the empty rows as missing")
-    if shared:
-        found.append(f"{first.source} and the reference overlap ({shared}): the scores flatter it")
     theirs, ours = first.projection_variant, second.projection_variant
     rows = [each.images.sensor.projection for each in (first, second)]
     if theirs and ours and (theirs != ours or rows[0] != rows[1]):

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from lidargrit.errors import DataError
-from lidargrit.evaluation.intervals import Interval, RealAgainstReal, Score
-from lidargrit.evaluation.verdict import counted_first, verdict
+from lidargrit.evaluation.intervals import Interval, RealAgainstReal, Score, format_value
+from lidargrit.evaluation.verdict import Verdict, notes_on_floors, verdict
 from lidargrit.files import read_json
 from lidargrit.structures import MetricResult
 
@@ -75,6 +74,7 @@ class Scorecard:
         warnings: sentences that a reader must know before trusting a score.
         settings: settings of the evaluation, as :meth:`EvalConfig.facts` returns them.
         versions: versions of this program and of the libraries that it uses.
+        leak: sentence about scans of the reference that the model learned from, or that both sets hold; "" for none.
     """
 
     protocol: str
@@ -87,6 +87,13 @@ class Scorecard:
     warnings: tuple[str, ...] = ()
     settings: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)
+    leak: str = ""
+
+    @property
+    def verdict(self) -> Verdict:
+        """The verdict on the samples; whoever tells it tells these sentences."""
+        left_out = [(each.metric, each.variant) for each in self.left_out]
+        return verdict(self.scores, self.reference.scans_used, left_out, self.leak)
 
     def to_json(self) -> dict[str, Any]:
         """Return everything as plain values, for a file."""
@@ -97,7 +104,8 @@ class Scorecard:
             "inputs": {"samples": asdict(self.samples), "reference": asdict(self.reference)},
             "deviations": list(self.deviations),
             "warnings": list(self.warnings),
-            "verdict": list(verdict(self.scores)),
+            "leak": self.leak,
+            "verdict": list(self.verdict.sentences),
             "settings": self.settings,
             "versions": self.versions,
             "scores": [
@@ -127,31 +135,36 @@ class Scorecard:
                 wanted = "scores of samples, which tables set side by side"
                 cure = "generate samples first with: lidargrit sample RUN FOLDER, and evaluate these"
                 raise DataError(f"{path}, which holds errors of reconstruction", wanted, cure)
-            protocol = dict(data["protocol"])
-            return cls(
-                str(protocol.pop("name")),
-                protocol,
-                _set_record(data["inputs"]["samples"]),
-                _set_record(data["inputs"]["reference"]),
-                tuple(_score(each) for each in data["scores"]),
-                tuple(LeftOut(**{name: str(of) for name, of in each.items()}) for each in data["left_out"]),
-                tuple(map(str, data["deviations"])),
-                tuple(map(str, data["warnings"])),
-                dict(data["settings"]),
-                dict(data["versions"]),
-            )
+            return cls.from_json(data)
         except DataError:
             raise
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise DataError(f"{path}, which cannot be used ({type(error).__name__}: {error})", wanted, cure) from None
 
+    @classmethod
+    def from_json(cls, data: dict[str, Any]) -> Scorecard:
+        """Return what :meth:`to_json` made plain values of; other values raise one of Python's own errors."""
+        protocol = dict(data["protocol"])
+        return cls(
+            str(protocol.pop("name")),
+            protocol,
+            _set_record(data["inputs"]["samples"]),
+            _set_record(data["inputs"]["reference"]),
+            tuple(_score(each) for each in data["scores"]),
+            tuple(LeftOut(**{name: str(of) for name, of in each.items()}) for each in data["left_out"]),
+            tuple(map(str, data["deviations"])),
+            tuple(map(str, data["warnings"])),
+            dict(data["settings"]),
+            dict(data["versions"]),
+            str(data.get("leak", "")),
+        )
+
     def as_table(self) -> str:
         """Return the scores as lines for a terminal: the verdict in words, then the numbers."""
-        counted, apart = counted_first(self.scores)
         with_pixels = any(score.pixel_statistics is not None for score in self.scores)
         pixels = ("pixel statistics",) if with_pixels else ()
         head = ("metric", "variant", "score", "95 % interval", "real against real", *pixels, "better", "scans")
-        cells = [head, *(_row(score, with_pixels) for score in (*counted, *apart))]
+        cells = [head, *(_row(score, with_pixels) for score in self.scores)]
         cells += [(each.metric, each.variant or "-", each.verdict, *[""] * (len(head) - 3)) for each in self.left_out]
         widths = [max(len(row[column]) for row in cells) for column in range(len(head))]
         rows = [
@@ -161,20 +174,10 @@ class Scorecard:
             ).rstrip()
             for row in cells
         ]
-        if apart:
-            rows.insert(1 + len(counted), "set apart: no different for pixel statistics and real scans")
-        sentences = verdict(self.scores)
-        lines = [*sentences, *([""] if sentences else []), *rows]
+        lines = [*self.verdict.sentences, "", *rows, *notes_on_floors(self.scores)]
         lines += [f"{each.verdict}: {each.metric}: {each.why}" for each in self.left_out]
         lines += [f"not the protocol {self.protocol}: {each}" for each in self.deviations]
         return "\n".join(lines)
-
-
-def format_value(value: float) -> str:
-    """Return a number with four significant digits."""
-    if value == 0 or not math.isfinite(value):
-        return f"{value:g}"
-    return f"{value:.4f}" if 1e-2 <= abs(value) < 1e3 else f"{value:.4g}"
 
 
 def _row(score: Score, with_pixels: bool) -> tuple[str, ...]:
@@ -219,6 +222,7 @@ def _score(data: dict[str, Any]) -> Score:
             float(interval["standard_error"]),
             int(interval["halves"]),
             _optional(interval.get("mean_of_halves")),
+            tuple(map(float, interval.get("values", ()))),
         ),
         None
         if real is None

@@ -11,13 +11,21 @@ from pathlib import Path
 from typing import Any, Literal
 
 from lidargrit.errors import DataError, printable
-from lidargrit.evaluation.intervals import Score
-from lidargrit.evaluation.scorecard import NOT_APPLICABLE, LeftOut, Scorecard, format_value
-from lidargrit.evaluation.verdict import MEMORISED, PIXEL_STATISTICS, value_of_halves, verdict
-from lidargrit.files import read_json
+from lidargrit.evaluation.differences import Comparison, compare_systems
+from lidargrit.evaluation.intervals import Score, format_value
+from lidargrit.evaluation.scorecard import NOT_APPLICABLE, LeftOut, Scorecard
+from lidargrit.evaluation.verdict import (
+    MEMORISED,
+    PIXEL_STATISTICS,
+    Column,
+    column_of,
+    notes_on_floors,
+    value_of_halves,
+)
+from lidargrit.files import read_json, write_json
 
+NamedCard = tuple[str, Scorecard]  # name of a system, and its scores
 Format = Literal["text", "markdown", "latex"]
-Column = tuple[str, str]  # metric, variant
 _BOUNDS = {PIXEL_STATISTICS: " (pixel statistics)", MEMORISED: " (memorised training scans)"}
 
 
@@ -30,7 +38,7 @@ class TableBlock:
         columns: metrics and variants.
         rows: name of a system with its scores, one for each column, "" where there is none.
         notes: lines printed below the rows.
-        verdicts: lines printed above the rows, one for each system.
+        verdicts: lines printed above the rows, one for each system or pair of systems.
     """
 
     title: str
@@ -57,13 +65,25 @@ def side_by_side(paths: Sequence[Path], form: Format = "text") -> str:
     """
     if not paths:
         raise DataError("no file of scores", "at least one", "write some with: lidargrit evaluate ... --json FILE")
-    measured: dict[tuple[str, str, int], list[tuple[str, Scorecard]]] = {}
-    for path, name in zip(paths, _names(paths), strict=True):
-        card = Scorecard.read(path)
+    measured = comparable([(name, Scorecard.read(path)) for path, name in zip(paths, _names(paths), strict=True)])
+    return render([block for cards in measured for block in (*_measured(cards), *_published(cards))], form)
+
+
+def comparable(cards: Sequence[NamedCard]) -> list[list[NamedCard]]:
+    """Divide the scores of systems into those that were measured by one protocol against the very same scans."""
+    found: dict[tuple[str, str, int], list[NamedCard]] = {}
+    for name, card in cards:
         key = (card.protocol, card.reference.sha256, card.reference.scans_used)
-        measured.setdefault(key, []).append((name, card))
-    blocks = [block for cards in measured.values() for block in (_measured(cards), *_published(cards))]
-    return render(blocks, form)
+        found.setdefault(key, []).append((name, card))
+    return list(found.values())
+
+
+def share_pixel_statistics(paths: Sequence[Path]) -> None:
+    """Write those of the row that holds them into the files of all systems: read alone, each gives the same verdict."""
+    for cards in comparable([(str(path.with_suffix("")), Scorecard.read(path)) for path in paths]):
+        for (name, card), (_, before) in zip(_with_pixel_statistics(cards), cards, strict=True):
+            if card != before:
+                write_json(Path(f"{name}.json"), card.to_json())
 
 
 def render(blocks: Sequence[TableBlock], form: Format = "text") -> str:
@@ -87,21 +107,60 @@ def _system(name: str) -> str:
     return Path(name).name
 
 
-def _measured(cards: Sequence[tuple[str, Scorecard]]) -> TableBlock:
+@dataclass(frozen=True)
+class Judged:
+    """Systems that were scored by one protocol against the same scans, and all that is said of them.
+
+    Args:
+        cards: name and scores of each, with the pixel statistics of the row that holds them, if there is one.
+        verdicts: a line for each system, and one for each compared with the first; none for the bounds.
+        differences: a block of these differences; none for a single system.
+    """
+
+    cards: tuple[NamedCard, ...]
+    verdicts: tuple[str, ...]
+    differences: tuple[TableBlock, ...]
+
+
+def judge(cards: Sequence[NamedCard]) -> Judged:
+    """Say of systems scored alike how each stands to the bounds, and which are better than the first of them."""
     cards = _with_pixel_statistics(cards)
+    systems = [(name, card) for name, card in cards if _system(name) not in _BOUNDS]
+    said = tuple(f"{name}: {' '.join(card.verdict.sentences)}" for name, card in systems)
+    if len(systems) < 2:
+        return Judged(tuple(cards), said, ())
+    (first, with_card), *others = systems
+    compared = [(name, compare_systems(name, card, first, with_card)) for name, card in others]
+    answers = tuple(sentence for _, of in compared for sentence in of.verdict.sentences)
+    return Judged(tuple(cards), (*said, *answers), (_differences(first, compared),))
+
+
+def _differences(first: str, compared: Sequence[tuple[str, Comparison]]) -> TableBlock:
+    columns = tuple(dict.fromkeys(each for _, of in compared for each in of.differences))
+    rows = tuple(
+        (name, tuple(of.differences[each].as_text(".3g") if each in of.differences else "" for each in columns))
+        for name, of in compared
+    )
+    title = f"Differences: score minus that of {first}, with 95 % intervals that hold for all scores of a row together"
+    return TableBlock(title, columns, rows)
+
+
+def _measured(cards: Sequence[NamedCard]) -> tuple[TableBlock, ...]:
+    judged = judge(cards)
+    cards = judged.cards
     words = [{(each.metric, each.variant): each.verdict for each in _not_applicable(card)} for _, card in cards]
-    scored = (_column(score) for _, card in cards for score in card.scores)
+    scored = (column_of(score) for _, card in cards for score in card.scores)
     columns = list(dict.fromkeys([*scored, *chain.from_iterable(words)]))
-    rows, notes = [], []
+    rows, notes = [], notes_on_floors(cards[0][1].scores)
     for (name, card), not_applicable in zip(cards, words, strict=True):
-        cells = not_applicable | {_column(score): _cell(score) for score in card.scores}
+        cells = not_applicable | {column_of(score): _cell(score) for score in card.scores}
         rows.append((f"{name}{_BOUNDS.get(_system(name), '')}", tuple(cells.get(column, "") for column in columns)))
         missing = [each for each in card.left_out if each not in _not_applicable(card)]
         left_out = [f"left out: {each.metric} ({each.variant}): {each.why}" for each in missing]
         notes += [f"{name}: {text}" for text in (*card.deviations, *card.warnings, *left_out)]
     card = cards[0][1]
     reference_row = {
-        _column(score): score.real_against_real
+        column_of(score): score.real_against_real
         for _, of in reversed(cards)  # of the first that has it
         for score in of.scores
         if score.real_against_real
@@ -116,27 +175,22 @@ def _measured(cards: Sequence[tuple[str, Scorecard]]) -> TableBlock:
         f"Measured, protocol {card.protocol}, {card.reference.scans_used:,} scans each, "
         f"against {card.reference.source} (sha256 {card.reference.sha256[:8]})"
     )
-    verdicts = tuple(
-        f"{name}: {' '.join(sentences)}"
-        for name, card in cards
-        if _system(name) not in _BOUNDS and (sentences := verdict(card.scores))
-    )
-    return TableBlock(title, tuple(columns), tuple(rows), tuple(notes), verdicts)
+    return TableBlock(title, tuple(columns), tuple(rows), tuple(notes), judged.verdicts), *judged.differences
 
 
-def _with_pixel_statistics(cards: Sequence[tuple[str, Scorecard]]) -> list[tuple[str, Scorecard]]:
+def _with_pixel_statistics(cards: Sequence[NamedCard]) -> list[NamedCard]:
     """Give every score that of the row of pixel statistics, if there is such a row."""
     rows = [card for name, card in cards if _system(name) == PIXEL_STATISTICS]
     if not rows:
         return list(cards)
-    values = {_column(score): value for score in rows[0].scores if (value := value_of_halves(score)) is not None}
+    values = {column_of(score): value for score in rows[0].scores if (value := value_of_halves(score)) is not None}
     return [
         (
             name,
             replace(
                 card,
                 scores=tuple(
-                    replace(s, pixel_statistics=values.get(_column(s), s.pixel_statistics)) for s in card.scores
+                    replace(s, pixel_statistics=values.get(column_of(s), s.pixel_statistics)) for s in card.scores
                 ),
             ),
         )
@@ -148,7 +202,7 @@ def _not_applicable(card: Scorecard) -> list[LeftOut]:
     return [each for each in card.left_out if each.verdict == NOT_APPLICABLE]
 
 
-def _published(cards: Sequence[tuple[str, Scorecard]]) -> list[TableBlock]:
+def _published(cards: Sequence[NamedCard]) -> list[TableBlock]:
     """Return the published tables of the protocol, or why they do not compare."""
     tables = [table for table in published() if table["protocol"] == cards[0][1].protocol]
     if not tables:
@@ -180,10 +234,6 @@ def _printed(values: Sequence[Any], columns: Sequence[dict[str, Any]]) -> tuple[
         "" if value is None else f"{value / column['divided_by']:.4g}"
         for value, column in zip(values, columns, strict=True)
     )
-
-
-def _column(score: Score) -> Column:
-    return score.result.metric, score.result.variant
 
 
 def _cell(score: Score) -> str:

@@ -1,4 +1,4 @@
-"""Scores between their two reference rows → a verdict in words: what beats pixel statistics, what is like real scans.
+"""Scores between their reference rows → the one verdict, which terminals, pages, cards and the demo print as it is.
 
 Every score table of this program knows three bounds, by these names alone:
 
@@ -7,18 +7,145 @@ Every score table of this program knows three bounds, by these names alone:
 - *pixel statistics*: scans each of whose pixels comes from another real scan, or scans of the generator ``marginal``,
   which samples every pixel by itself. A model must do better.
 - *memorised training scans*: scans of the generator ``memorised``. They score like real scans, and nothing is new.
+
+A score counts as lost wherever its metric sees a difference. It counts as won only where the metric tells pixel
+statistics from real scans: of one that does not, a good score says little.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass
 
-from lidargrit.evaluation.intervals import Score
+from lidargrit import _discovery
+from lidargrit.errors import counted_scans
+from lidargrit.evaluation.intervals import Score, format_value
+from lidargrit.metrics import load_metric
+
+Column = tuple[str, str]  # metric, variant
 
 PIXEL_STATISTICS, MEMORISED = "marginal", "memorised"
 """The generators whose scans may stand for the second bound, and are the third."""
 
+ENOUGH = 100
+"""Scans of each set: below, the interval itself rests on too little, and hardly any score differs from its bounds."""
+
 _SPREADS = 2.8  # Student's 97.5 % quantile for the five halvings of real against real
+_NOTHING_KNOWN = "No verdict: it takes intervals, and real against real or pixel statistics beside them."
+_WITHOUT_PIXELS = (
+    "Pixel statistics, which any model has to beat, were not scored, so that no good score is counted (evaluate "
+    "--pixel-statistics; marginal beside other systems)."
+)
+
+
+@dataclass(frozen=True)
+class Tally:
+    """All scores that were asked for, by how they stand to one bound or to those of another system.
+
+    Args:
+        head: beginning of the sentence, which names what they are compared with.
+        worse: names of the scores that are worse by more than chance.
+        better: names of those that are better by more than chance, or as ``praise`` says.
+        undecided: names of all others.
+        praise: word for ``better``, which real scans hardly are.
+    """
+
+    head: str
+    worse: tuple[str, ...]
+    better: tuple[str, ...]
+    undecided: tuple[str, ...]
+    praise: str = "better"
+
+    def __str__(self) -> str:
+        total = len(self.worse) + len(self.better) + len(self.undecided)
+        counts = (
+            (f"worse in {len(self.worse)} of {total} scores", self.worse),
+            (f"{self.praise} in {len(self.better)}", self.better),
+            (f"undecided in {len(self.undecided)}", self.undecided),
+        )
+        said = (f"{count} ({', '.join(names)})" if names else count for count, names in counts)
+        return f"{self.head}: {', '.join(said)}."
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What is said of the scores of one system.
+
+    Args:
+        tallies: counts against each bound that is known; none where there is no verdict.
+        remarks: sentences that belong to them, or say why there are none.
+    """
+
+    tallies: tuple[Tally, ...]
+    remarks: tuple[str, ...]
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """All that is said, losses first."""
+        return (*map(str, self.tallies), *self.remarks)
+
+
+def verdict(scores: Sequence[Score], scans: int, left_out: Sequence[Column] = (), leak: str = "") -> Verdict:
+    """Return how the scores of one set of samples stand to pixel statistics and to real against real.
+
+    Args:
+        scores: scores with their reference rows, where these are known.
+        scans: number of scans of each set.
+        left_out: metrics that were asked for and could not be scored, which are undecided.
+        leak: sentence about scans of the reference that the model learned from, or that both sets hold; "" for none.
+    """
+    names = names_of([*map(column_of, scores), *left_out])
+    said = [f"{leak}."] if leak else []
+    if below := [names[column_of(score)] for score in scores if score.result.value < 0]:
+        said.append(
+            f"{', '.join(below)} below 0: the unbiased estimate of a squared distance scatters around 0 for sets that "
+            "do not differ; read it as 0."
+        )
+    if scans < ENOUGH:
+        return Verdict((), (too_few(scans), *said))
+    by_pixels = {column_of(score): _standing(score, score.pixel_statistics) for score in scores}
+    by_real = {column_of(score): _standing(score, _real(score)) for score in scores}
+    seeing = {column_of(score) for score in scores if tells_apart(score)}
+    tallies = []
+    if known_pixels := any(stands is not None for stands in by_pixels.values()):
+        tallies.append(_tally("Against pixel statistics", by_pixels, (-1,), seeing, names))
+    if any(stands is not None for stands in by_real.values()):
+        tallies.append(_tally("Against real scans", by_real, (0, -1), seeing, names, "within noise"))
+    if not tallies:
+        return Verdict((), (_NOTHING_KNOWN, *said))
+    notes = [] if known_pixels else [_WITHOUT_PIXELS]
+    if blind := [names[column_of(score)] for score in scores if tells_apart(score) is False]:
+        notes.append(f"Pixel statistics pass for real scans in {', '.join(blind)}: no good score there is counted.")
+    if left_out:
+        notes.append(f"Not scored, so undecided: {', '.join(map(names.__getitem__, left_out))}.")
+    if beyond := [names[each] for each, stands in by_real.items() if stands == -1 and each in seeing]:
+        notes.append(
+            f"Better than real against real: {', '.join(beyond)}. Either the samples repeat scans of the reference, or "
+            "they vary less than real ones."
+        )
+    return Verdict(tuple(tallies), (*notes, *said))
+
+
+def too_few(scans: int) -> str:
+    """Return the sentence that stands in place of a verdict on few scans."""
+    return (
+        f"No verdict: {counted_scans(scans)} in each set are too few for reliable scores and intervals, which take "
+        f"{ENOUGH} or more."
+    )
+
+
+def column_of(score: Score) -> Column:
+    """Return the metric and the variant of a score."""
+    return score.result.metric, score.result.variant
+
+
+def names_of(columns: Sequence[Column]) -> dict[Column, str]:
+    """Return the names of metrics, each with its variant where several variants of it stand side by side."""
+    metrics = [metric for metric, _ in dict.fromkeys(columns)]
+    return {
+        (metric, variant): metric if metrics.count(metric) == 1 else f"{metric} ({variant})"
+        for metric, variant in columns
+    }
 
 
 def noise(score: Score) -> float:
@@ -28,20 +155,9 @@ def noise(score: Score) -> float:
     return max(score.interval.high - score.result.value, score.result.value - score.interval.low)
 
 
-def beats_pixel_statistics(score: Score) -> bool | None:
-    """Return whether a score beats that of pixel statistics by more than chance; None where that is not known."""
-    halves = value_of_halves(score)
-    if score.pixel_statistics is None or halves is None:
-        return None
-    return _worse_by(score, score.pixel_statistics, halves) > noise(score)
-
-
-def is_like_real(score: Score) -> bool | None:
-    """Return whether a score is not worse than real against real by more than chance; None where that is not known."""
-    real = score.real_against_real
-    if real is None or (value := value_of_halves(score)) is None:
-        return None
-    return _worse_by(score, value, real.value) <= noise(score)
+def value_of_halves(score: Score) -> float | None:
+    """Return the mean score of halves of both sets, since most metrics are worse for fewer scans; None if not known."""
+    return None if score.interval is None else score.interval.mean_of_halves
 
 
 def tells_apart(score: Score) -> bool | None:
@@ -57,65 +173,29 @@ def tells_apart(score: Score) -> bool | None:
     return _worse_by(score, score.pixel_statistics, real.value) > chance
 
 
-def counted_first(scores: Sequence[Score]) -> tuple[list[Score], list[Score]]:
-    """Divide scores into those that count, and those whose metric cannot tell pixel statistics from real scans."""
-    apart = [score for score in scores if tells_apart(score) is False]
-    return [score for score in scores if tells_apart(score) is not False], apart
+def _tally(
+    head: str,
+    stands: Mapping[Column, int | None],
+    praised: Container[int | None],
+    seeing: Container[Column],
+    names: Mapping[Column, str],
+    praise: str = "better",
+) -> Tally:
+    worse = tuple(name for each, name in names.items() if stands.get(each) == 1)
+    better = tuple(name for each, name in names.items() if each in seeing and stands.get(each) in praised)
+    return Tally(head, worse, better, tuple(name for name in names.values() if name not in (*worse, *better)), praise)
 
 
-def verdict(scores: Sequence[Score]) -> tuple[str, ...]:
-    """Return in a few sentences how scores stand to real against real and to pixel statistics.
-
-    Args:
-        scores: scores of one set of samples, with their reference rows where these are known.
-
-    Returns:
-        no sentence if there is neither reference row; else the count, then which metrics were set apart and why, then
-        what a value below 0 or better than real against real means.
-    """
-    counted, apart = counted_first(scores)
-    sentences = [sentence] if (sentence := _count(counted)) else []
-    if apart:
-        sentences.append(
-            f"Set apart, and not counted: {_names(apart)}. Here "
-            f"{'they do' if len(apart) > 1 else 'it does'} not tell pixel statistics from real scans."
-        )
-    if below := [score for score in scores if score.result.value < 0]:
-        sentences.append(
-            f"{_names(below)} below 0: the unbiased estimate of a squared distance scatters around 0 for sets that do "
-            "not differ; read it as 0."
-        )
-    if beyond := [score for score in counted if _is_beyond_real(score)]:
-        sentences.append(
-            f"Better than real against real: {_names(beyond)}. Either the samples repeat scans of the reference, or "
-            "they vary less than real ones."
-        )
-    return tuple(sentences)
+def _standing(score: Score, bound: float | None) -> int | None:
+    """Return 1 if a score is worse than a bound by more than chance, -1 if better, else 0; None if it is not known."""
+    if bound is None or (value := value_of_halves(score)) is None:
+        return None
+    by = _worse_by(score, value, bound)
+    return int(by > noise(score)) - int(-by > noise(score))
 
 
-def _count(scores: Sequence[Score]) -> str:
-    """Return the sentence that counts, or "" if neither reference row is known."""
-    beaten = [known for score in scores if (known := beats_pixel_statistics(score)) is not None]
-    real = [known for score in scores if (known := is_like_real(score)) is not None]
-    words = []
-    if beaten:
-        words.append(f"better than pixel statistics in {sum(beaten)} of {len(beaten)} scores")
-    if real:
-        words.append(f"within noise of real against real in {sum(real)}{'' if beaten else f' of {len(real)} scores'}")
-    sentence = "; ".join(words)
-    return f"{sentence[0].upper()}{sentence[1:]}." if sentence else ""
-
-
-def _is_beyond_real(score: Score) -> bool:
-    real = score.real_against_real
-    if real is None or (value := value_of_halves(score)) is None:
-        return False
-    return _worse_by(score, real.value, value) > noise(score)
-
-
-def value_of_halves(score: Score) -> float | None:
-    """Return the mean score of halves of both sets, since most metrics are worse for fewer scans; None if not known."""
-    return None if score.interval is None else score.interval.mean_of_halves
+def _real(score: Score) -> float | None:
+    return None if score.real_against_real is None else score.real_against_real.value
 
 
 def _worse_by(score: Score, value: float, other: float) -> float:
@@ -123,10 +203,15 @@ def _worse_by(score: Score, value: float, other: float) -> float:
     return other - value if score.result.higher_is_better else value - other
 
 
-def _names(scores: Sequence[Score]) -> str:
-    """Return the names of metrics, each with its variant where several variants of it were scored."""
-    metrics = [score.result.metric for score in scores]
-    return ", ".join(
-        name if metrics.count(name) == 1 else f"{name} ({score.result.variant})"
-        for name, score in zip(metrics, scores, strict=True)
-    )
+def notes_on_floors(scores: Sequence[Score]) -> list[str]:
+    """Return a note for each metric by which equal sets do not score 0, with its score of real against real."""
+    notes = []
+    for score in scores:
+        metric, variant = column_of(score)
+        if metric in _discovery.names("metrics") and (why := load_metric(metric).of_equal_sets.get(variant)):
+            real = score.real_against_real
+            floor = f"{format_value(real.value)} between {counted_scans(real.num_scans)}" if real else "not known here"
+            notes.append(
+                f"{metric} ({variant}) is not 0 for equal sets: {why}; its floor, real against real, is {floor}"
+            )
+    return notes

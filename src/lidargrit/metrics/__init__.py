@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar, final
 
@@ -94,6 +94,8 @@ class Metric(ABC, Generic[Features, Kept]):
     """Least and greatest value that the metric can have."""
     variants: ClassVar[tuple[str, ...]] = ("exact",)
     """The published definitions on offer, the default first."""
+    of_equal_sets: ClassVar[Mapping[str, str]] = {}
+    """Why equal sets do not score 0, for each variant by which they do not."""
     needs_weights: ClassVar[str] = ""
     """Name of the pretrained network whose features the metric compares; empty for most."""
     measures_raydrop: ClassVar[bool] = False

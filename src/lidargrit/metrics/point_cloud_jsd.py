@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
@@ -37,6 +37,7 @@ class PointCloudJsd(CloudMetric):
 
     title = "Jensen-Shannon divergence of point clouds in space"
     bounds = (0.0, 1.0)
+    of_equal_sets: ClassVar = {"reference": "its program adds 1e-8 to every share"}
     accumulator = SumAccumulator
 
     def summarise(self, features: Clouds, *, real: bool) -> Int64[np.ndarray, "grid"]:

@@ -12,7 +12,7 @@ from lidargrit import _discovery
 from lidargrit.datasets import load as load_dataset
 from lidargrit.errors import one_line
 from lidargrit.evaluation.scorecard import NOT_APPLICABLE, Scorecard, format_value
-from lidargrit.evaluation.verdict import value_of_halves, verdict
+from lidargrit.evaluation.verdict import notes_on_floors, value_of_halves
 from lidargrit.generators import Generator
 from lidargrit.loading import Provenance
 from lidargrit.nn.quantization import WeightBits
@@ -188,7 +188,6 @@ def _files(files: Iterable[dict[str, Any]]) -> list[str]:
 
 def _scores(card: Scorecard) -> str:
     reference = " ".join(filter(None, (card.reference.data_set, card.reference.split))) or "an unnamed data set"
-    sentences = verdict(card.scores)
     lines = [
         "## Scores",
         "",
@@ -197,8 +196,8 @@ def _scores(card: Scorecard) -> str:
         "Real against real is the score of one half of the real scans against the other half. Most distances are "
         "larger between fewer scans, so it compares with the score of halves of both sets, not with that of all.",
         "",
-        *(f"- {_text(sentence)}" for sentence in sentences),
-        *([""] if sentences else []),
+        *(f"- {_text(_without_paths(sentence, card))}" for sentence in card.verdict.sentences),
+        "",
         "| metric | variant | score | 95 % interval | score of halves | real against real | better |",
         "|---|---|---|---|---|---|---|",
     ]
@@ -215,7 +214,8 @@ def _scores(card: Scorecard) -> str:
         for each in card.left_out
         if each.verdict == NOT_APPLICABLE
     ]
-    notes = [f"- not as in the protocol: {_text(_without_paths(each, card))}" for each in card.deviations]
+    notes = [f"- {_text(note)}" for note in notes_on_floors(card.scores)]
+    notes += [f"- not as in the protocol: {_text(_without_paths(each, card))}" for each in card.deviations]
     notes += [f"- warning: {_text(_without_paths(each, card))}" for each in card.warnings]
     return "\n".join([*lines, "", *notes]).rstrip()
 

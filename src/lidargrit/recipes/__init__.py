@@ -23,15 +23,20 @@ def load_recipe(name: str, settings: Sequence[str] = ()) -> Recipe:
         UnknownNameError: no such recipe and no such generator.
         ConfigError: an unknown setting or a value that does not fit, of which it names the nearest; or a folder.
     """
-    is_generator = name not in _discovery.names("recipes") and name in _discovery.names("generators")
-    if not is_generator and name not in _discovery.names("recipes") and Path(name).is_dir():
+    if not is_recipe(name) and Path(name).is_dir():
         raise ConfigError(
             f"{name}, a folder that holds no finished run",
-            "a recipe, or where systems are compared a finished run",
-            "see lidargrit list recipes; score samples with lidargrit evaluate (--tables: side by side)",
+            "a recipe, or where systems are compared a finished run or samples",
+            "see lidargrit list recipes; score scans with lidargrit evaluate (--tables: side by side)",
         )
+    is_generator = is_recipe(name) and name not in _discovery.names("recipes")
     recipe = default_recipe(name) if is_generator else _discovery.load_instance("recipes", name, Recipe)
     return configuration.override(recipe, settings)
+
+
+def is_recipe(name: str) -> bool:
+    """Return whether :func:`load_recipe` knows a name, of a recipe or of a generator."""
+    return name in (*_discovery.names("recipes"), *_discovery.names("generators"))
 
 
 def default_recipe(generator: str) -> Recipe:

@@ -315,10 +315,9 @@ def _scores(demo: DemoPage) -> _Step:
         "half of the training scans against the other half: no model can be expected to do better. <i>Pixel "
         "statistics</i> (square) is the score of scans each of whose pixels comes from another training scan, so that "
         "no shape is left: any model should do better. Both are of half as many scans, and most metrics fall as sets "
-        "grow, so a good score may lie below real against real. With so few scans all scores are rough; the bar "
-        "behind the dot is the 95 % interval."
+        "grow, so a good score may lie below real against real. The bar behind the dot is the 95 % interval."
     )
-    return _Step("Scores of the new scans", text, score_table(demo.card.scores))
+    return _Step("Scores of the new scans", text, score_table(demo.card))
 
 
 def _timings(demo: DemoPage) -> _Step:

@@ -98,7 +98,7 @@ def _for_others(card: Scorecard, without_raydrop: str) -> tuple[Scorecard, str]:
             return replace(value, **{one.name: changed(getattr(value, one.name)) for one in fields(value)})
         return value
 
-    names = ("samples", "reference", "left_out", "deviations", "warnings", "settings")
+    names = ("samples", "reference", "left_out", "deviations", "warnings", "settings", "leak")
     return replace(card, **{name: changed(getattr(card, name)) for name in names}), changed(without_raydrop)
 
 
@@ -130,10 +130,9 @@ def _notes(title: str, lines: Sequence[str], kind: str) -> str:
 
 
 def _scores(card: Scorecard) -> str:
-    not_applicable = [each for each in card.left_out if each.verdict == NOT_APPLICABLE]
     left_out = "".join(f"<li><b>{escape(each.metric)}</b>: {escape(each.why)}</li>" for each in card.left_out)
     return (
-        f"<section><h2>Scores</h2>{score_table(card.scores, not_applicable)}<p>The dot is the score and the bar its "
+        f"<section><h2>Scores</h2>{score_table(card)}<p>The dot is the score and the bar its "
         f"95 % interval. The upright dashed line is <i>real against real</i>: {REAL_AGAINST_REAL}. The square, where "
         "there is one, is <i>pixel statistics</i>: scans each of whose pixels comes from another real scan. Any model "
         "has to beat it. Every chart begins at 0 and has its own scale.</p>"

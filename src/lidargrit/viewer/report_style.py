@@ -21,7 +21,6 @@ small{color:var(--soft);font-weight:400}
 .wide{overflow-x:auto}
 .verdict{max-width:85ch;padding-left:1.2em}
 .verdict li:first-child{font-size:1.15rem;font-weight:600}
-.apart{color:var(--soft);padding-top:1.2em}
 .pixels{fill:var(--soft);stroke:var(--paper);stroke-width:1.5}
 .warning,.note{border-left:5px solid var(--edge);background:var(--warn);padding:2px 16px 4px;margin:16px 0}
 .warning h2,.note h2{font-size:1.05rem;margin:.5em 0 0}

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from html import escape
 
 from lidargrit.evaluation.intervals import Score
-from lidargrit.evaluation.scorecard import NOT_APPLICABLE, LeftOut, format_value
-from lidargrit.evaluation.verdict import counted_first, verdict
+from lidargrit.evaluation.scorecard import NOT_APPLICABLE, Scorecard, format_value
+from lidargrit.evaluation.verdict import notes_on_floors
 from lidargrit.metrics import load_metric
 from lidargrit.viewer.report_charts import score_chart
 
@@ -18,43 +17,30 @@ REAL_AGAINST_REAL = (
 _HEADS = ("metric", "score", "95 % interval", "real against real", "pixel statistics", "chart", "better")
 
 
-def score_table(scores: Sequence[Score], not_applicable: Sequence[LeftOut] = ()) -> str:
-    """Return the verdict of some scores in words, then their table; metrics that are set apart come last.
-
-    Args:
-        scores: scores with their intervals and reference rows, as far as these are known.
-        not_applicable: metrics that do not apply to these sets, which get rows without numbers.
-    """
-    counted, apart = counted_first(scores)
-    heads = [head for head in _HEADS if head != "pixel statistics" or _has_pixel_statistics(scores)]
-    rows = "".join(_row(score, len(heads)) for score in counted)
+def score_table(card: Scorecard) -> str:
+    """Return the verdict on some scores, then their table, with a row for each metric that does not apply."""
+    with_pixels = any(score.pixel_statistics is not None for score in card.scores)
+    heads = [head for head in _HEADS if head != "pixel statistics" or with_pixels]
+    rows = "".join(_row(score, len(heads)) for score in card.scores)
     rows += "".join(
         f'<tr><th scope="row">{metric_title(each.metric, each.variant)}</th>'
         f'<td colspan="{len(heads) - 1}">{NOT_APPLICABLE}</td></tr>'
-        for each in not_applicable
+        for each in card.left_out
+        if each.verdict == NOT_APPLICABLE
     )
-    if apart:
-        rows += (
-            f'<tr><td class="apart" colspan="{len(heads)}">Set apart: these metrics do not tell pixel statistics from '
-            "real scans here, so a good score says little.</td></tr>"
-        )
-        rows += "".join(_row(score, len(heads)) for score in apart)
-    sentences = "".join(f"<li>{escape(sentence)}</li>" for sentence in verdict(scores))
+    sentences = "".join(f"<li>{escape(sentence)}</li>" for sentence in card.verdict.sentences)
     columns = "".join(f'<th scope="col">{head}</th>' for head in heads)
     return (
-        (f'<ul class="verdict">{sentences}</ul>' if sentences else "")
-        + '<div class="wide" tabindex="0" role="region" aria-label="scores"><table><thead><tr>'
-        + f"{columns}</tr></thead><tbody>{rows}</tbody></table></div>"
+        f'<ul class="verdict">{sentences}</ul>'
+        '<div class="wide" tabindex="0" role="region" aria-label="scores"><table><thead><tr>'
+        f"{columns}</tr></thead><tbody>{rows}</tbody></table></div>"
+        + "".join(f"<p>{escape(note)}</p>" for note in notes_on_floors(card.scores))
     )
 
 
 def metric_title(name: str, variant: str) -> str:
     """Return a metric's title with its name and variant below, for the head of a row."""
     return f"{escape(load_metric(name).title)}<br><small>{escape(name)}, {escape(variant)}</small>"
-
-
-def _has_pixel_statistics(scores: Sequence[Score]) -> bool:
-    return any(score.pixel_statistics is not None for score in scores)
 
 
 def _row(score: Score, columns: int) -> str:

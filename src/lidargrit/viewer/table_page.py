@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from html import escape
 from typing import Any
 
 from lidargrit.errors import without_folders
-from lidargrit.evaluation.scorecard import format_value
-from lidargrit.evaluation.verdict import MEMORISED, PIXEL_STATISTICS
+from lidargrit.evaluation.intervals import Score
+from lidargrit.evaluation.scorecard import Scorecard, format_value
+from lidargrit.evaluation.tables import NamedCard, TableBlock, comparable, judge
+from lidargrit.evaluation.verdict import Column, column_of, notes_on_floors
 from lidargrit.viewer._page import document
 from lidargrit.viewer.report_style import STYLE
 from lidargrit.viewer.score_table import REAL_AGAINST_REAL
@@ -64,16 +66,15 @@ def table_page(cells: Sequence[dict[str, Any]], flops: float) -> str:
         if flops
         else "Each recipe was trained with its own budget"
     )
-    tables: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
-    for cell in cells:
-        tables.setdefault(_comparable(cell), []).append(cell)
+    costs = {str(cell["system"]): cell["costs"] for cell in cells}
+    tables = comparable([(str(cell["system"]), Scorecard.from_json(cell["scores"])) for cell in cells])
     apart = "" if len(tables) < 2 else " Systems compared with other scans, or by another sensor, have their own table."
     content = (
         f"<h1>{_systems(len(cells))}</h1>\n"
         f"<p>{escape(budget)}. Brackets hold 95 % intervals over scans. Click on a head to sort. Lower is better where "
         f"nothing else is said. A cost that is not known is -.{apart}</p>\n"
         f"<p><em>Real against real</em>, below each table, is {REAL_AGAINST_REAL}. Behind it, n is the number of scans "
-        f"in a half.</p>\n{''.join(map(_table, tables.values()))}"
+        f"in a half.</p>\n{''.join(_table(cards, costs) for cards in tables)}"
     )
     return document(f"{_systems(len(cells))} compared", STYLE + _LOOKS, content, _SCRIPT)
 
@@ -82,70 +83,68 @@ def _systems(count: int) -> str:
     return f"{count} {'system' if count == 1 else 'systems'}"
 
 
-def _comparable(cell: dict[str, Any]) -> tuple[str, str, int]:
-    """Return what the systems of one table have in common: protocol, and scans of the reference."""
-    reference = cell["scores"]["inputs"]["reference"]
-    return str(cell["scores"]["protocol"]["name"]), str(reference["sha256"]), int(reference["scans_used"])
-
-
-def _table(cells: Sequence[dict[str, Any]]) -> str:
-    columns = list(dict.fromkeys(_column(score) for cell in cells for score in cell["scores"]["scores"]))
-    heads = ["system", *(f"{metric}<br><small>{variant}</small>" for metric, variant in columns), *_COSTS.values()]
-    head = "".join(f'<th scope="col"><button type="button">{name}</button></th>' for name in heads)
-    body = "".join(_row(cell, columns) for cell in cells)
-    reference = cells[0]["scores"]["inputs"]["reference"]
+def _table(cards: Sequence[NamedCard], costs: Mapping[str, dict[str, Any]]) -> str:
+    judged = judge(cards)
+    inputs = {scans.source for _, card in cards for scans in (card.samples, card.reference)}
+    told: dict[str, list[str]] = {}
+    for name, card in cards:
+        for line in (*card.warnings, *card.deviations):
+            told.setdefault(line, []).append(name)
+    warnings = [f"{', '.join(names)}: {line}" for line, names in told.items()]
+    scores = [score for _, card in cards for score in card.scores]
+    columns = list(dict.fromkeys(map(column_of, scores)))
+    higher = {column_of(score) for score in scores if score.result.higher_is_better}
+    heads = [_head(each, ", higher is better" if each in higher else "") for each in columns]
+    head = "".join(
+        f'<th scope="col"><button type="button">{name}</button></th>' for name in ("system", *heads, *_COSTS.values())
+    )
+    body = "".join(_row(name, card.scores, costs[name], columns) for name, card in cards)
+    reference = cards[0][1].reference
     return (
-        f"<p>{int(reference['scans_used']):,} samples of each against as many scans of "
-        f"{escape(_without_folders(str(reference['source']), cells))}, {escape(str(reference['sensor']))}</p>\n"
-        f"{_told(cells)}"
+        f"<p>{reference.scans_used:,} samples of each against as many scans of "
+        f"{escape(without_folders(reference.source, inputs))}, {escape(reference.sensor)}</p>\n"
+        f"{_notes('warning', 'Read this first', warnings, inputs)}{_notes('note', 'In words', judged.verdicts, inputs)}"
         '<div class="wide" tabindex="0" role="region" aria-label="scores and costs"><table><thead><tr>'
-        f"{head}</tr></thead><tbody>{body}</tbody><tfoot>{_real_against_real(cells, columns)}</tfoot></table></div>\n"
+        f"{head}</tr></thead><tbody>{body}</tbody><tfoot>{_real_against_real(scores, columns)}</tfoot></table></div>\n"
+        f"{''.join(f'<p>{escape(note)}</p>' for note in notes_on_floors(cards[0][1].scores))}"
+        f"{''.join(map(_block, judged.differences))}"
     )
 
 
-def _told(cells: Sequence[dict[str, Any]]) -> str:
-    """Return what a reader must know of the scores before the table: warnings, and the verdict on each system."""
-    kinds = {"warning": "Read this first", "note": "In words"}
-    said: dict[str, dict[str, list[str]]] = {kind: {} for kind in kinds}
-    for cell in cells:
-        scores, system = cell["scores"], str(cell["system"])
-        for line in (*scores.get("warnings", ()), *scores.get("deviations", ())):
-            said["warning"].setdefault(_without_folders(str(line), cells), []).append(system)
-        if (verdict := scores.get("verdict")) and system not in (PIXEL_STATISTICS, MEMORISED):
-            said["note"].setdefault(" ".join(map(str, verdict)), []).append(system)
-    return "".join(
-        f'<section class="{kind}"><h2>{title}</h2><ul>'
-        + "".join(f"<li>{escape(', '.join(systems))}: {escape(line)}</li>" for line, systems in said[kind].items())
-        + "</ul></section>\n"
-        for kind, title in kinds.items()
-        if said[kind]
+def _notes(kind: str, title: str, lines: Sequence[str], inputs: Collection[str]) -> str:
+    """Return what a reader must know of the scores before the table, without the folders of the user's machine."""
+    items = "".join(f"<li>{escape(without_folders(line, inputs))}</li>" for line in lines)
+    return f'<section class="{kind}"><h2>{title}</h2><ul>{items}</ul></section>\n' if lines else ""
+
+
+def _head(column: Column, more: str = "") -> str:
+    return f"{escape(column[0])}<br><small>{escape(column[1])}{more}</small>"
+
+
+def _block(block: TableBlock) -> str:
+    """Return a table of differences, below that of the scores."""
+    heads = "".join(f'<th scope="col">{head}</th>' for head in ("system", *map(_head, block.columns)))
+    rows = ""
+    for name, values in block.rows:
+        cells = "".join(f'<td class="number">{escape(value)}</td>' for value in values)
+        rows += f'<tr><th scope="row">{escape(name)}</th>{cells}</tr>'
+    return (
+        f'<p>{escape(block.title)}</p>\n<div class="wide" tabindex="0" role="region" aria-label="differences"><table>'
+        f"<thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table></div>\n"
     )
 
 
-def _without_folders(text: str, cells: Sequence[dict[str, Any]]) -> str:
-    """Return a text without the folders of the user's machine, for a page that others may see."""
-    inputs = (scans for cell in cells for scans in cell["scores"]["inputs"].values())
-    return without_folders(text, {str(scans["source"]) for scans in inputs})
+def _row(name: str, scores: Sequence[Score], costs: Mapping[str, Any], columns: Sequence[Column]) -> str:
+    by_column = {column_of(score): score for score in scores}
+    cells = [_score(by_column.get(column)) for column in columns] + [_number(costs.get(cost)) for cost in _COSTS]
+    return f'<tr><th scope="row">{escape(name)}</th>{"".join(cells)}</tr>'
 
 
-def _column(score: dict[str, Any]) -> tuple[str, str]:
-    better = ", higher is better" if score["higher_is_better"] else ""
-    return escape(str(score["metric"])), escape(f"{score['variant']}{better}")
-
-
-def _row(cell: dict[str, Any], columns: Sequence[tuple[str, str]]) -> str:
-    scores = {_column(score): score for score in cell["scores"]["scores"]}
-    found = [_score(scores.get(column)) for column in columns]
-    costs = [_number(cell["costs"].get(name)) for name in _COSTS]
-    return f'<tr><th scope="row">{escape(str(cell["system"]))}</th>{"".join([*found, *costs])}</tr>'
-
-
-def _score(score: dict[str, Any] | None) -> str:
-    if score is None or score["value"] is None:
+def _score(score: Score | None) -> str:
+    if score is None:
         return '<td data-value="">-</td>'
-    interval = score["interval"]
-    limits = f"[{format_value(interval['low'])}, {format_value(interval['high'])}]" if interval else ""
-    value = float(score["value"])
+    value, interval = score.result.value, score.interval
+    limits = f"[{format_value(interval.low)}, {format_value(interval.high)}]" if interval else ""
     return f'<td class="number" data-value="{value!r}">{format_value(value)} <small>{limits}</small></td>'
 
 
@@ -156,12 +155,10 @@ def _number(value: int | float | None) -> str:
     return f'<td class="number" data-value="{value!r}">{text}</td>'
 
 
-def _real_against_real(cells: Sequence[dict[str, Any]], columns: Sequence[tuple[str, str]]) -> str:
-    values, sizes = {}, set()
-    for score in (score for cell in cells for score in cell["scores"]["scores"]):
-        if score["real_against_real"] is not None:
-            values[_column(score)] = score["real_against_real"]["value"]
-            sizes.add(int(score["real_against_real"]["num_scans"]))
-    row = [f'<td class="number">{format_value(values[column]) if column in values else ""}</td>' for column in columns]
-    size = f" <small>(n = {' or '.join(f'{one:,}' for one in sorted(sizes))})</small>" if sizes else ""
-    return f'<tr><th scope="row">real against real{size}</th>{"".join(row)}<td colspan="{len(_COSTS)}"></td></tr>'
+def _real_against_real(scores: Sequence[Score], columns: Sequence[Column]) -> str:
+    found = {column_of(score): real for score in scores if (real := score.real_against_real)}
+    values = (format_value(found[column].value) if column in found else "" for column in columns)
+    row = "".join(f'<td class="number">{value}</td>' for value in values)
+    sizes = sorted({real.num_scans for real in found.values()})
+    size = f" <small>(n = {' or '.join(f'{one:,}' for one in sizes)})</small>" if sizes else ""
+    return f'<tr><th scope="row">real against real{size}</th>{row}<td colspan="{len(_COSTS)}"></td></tr>'
