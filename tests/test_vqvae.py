@@ -272,3 +272,27 @@ def test_thin_upright_things_are_found_by_a_slow_loop_and_weigh_more():
     wanted = sum(float((target[b] * weights[b] * mask[b]).sum() / (weights[b] * mask[b]).sum()) for b in range(2))
     ours = reconstruction_loss(encoded, target, mask, mask, "returns", weights)
     assert float(ours) == pytest.approx(wanted / 2, rel=1e-5)
+
+
+def test_cells_may_have_fewer_columns_than_rows():
+    sizes = VqvaeConfig(
+        channels=8, channel_multipliers=(1, 1, 1, 2), cell_columns=2, norm_groups=4, code_dim=4, dropout=0.0
+    )
+    sensor = load_sensor("hdl64e_kitti_odometry").with_columns(32, 1)
+    torch.manual_seed(0)
+    vqvae = Vqvae(sizes, sensor).eval()
+    assert vqvae.grid_size == (8, 16)
+    range_m = 5 + 15 * torch.rand((2, 64, 32))
+    tokens = vqvae.encode(RangeImage(range_m, range_m > 0, sensor))
+    decoded = vqvae.decode(tokens)
+    assert decoded.range_m.shape == (2, 64, 32)
+    quick = vqvae.for_decoding("fp32").decode(tokens)
+    assert torch.allclose(quick.range_m, decoded.range_m, atol=1e-3)
+    around = Vqvae(replace(sizes, padding="wrap"), sensor).eval()
+    before, after = (
+        around.encode(RangeImage(image, image > 0, sensor)).tokens for image in (range_m, range_m.roll(2, 2))
+    )
+    assert torch.equal(after, before.roll(1, 2)), "a turn by a cell turns the tokens by one"
+    for columns in (3, 16):
+        with pytest.raises(ConfigError, match=f"cell_columns={columns}; wanted a power of 2 up to the 8 rows"):
+            replace(sizes, cell_columns=columns)

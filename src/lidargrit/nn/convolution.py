@@ -74,41 +74,49 @@ class Convolution(nn.Conv2d):
 
 
 class Downsample(nn.Module):
-    """Halve the columns, and perhaps the rows, by a 3x3 convolution; one column is padded to the right.
+    """Halve rows, columns or both by a 3x3 convolution; an axis that is halved is padded by one at its end alone.
 
     Args:
         channels: number of channels of the input and of the output.
         padding: values beyond the last column; beyond the rows there are zeros.
-        row_stride: 2 to halve the rows, with one row padded below; 1 to keep them, with one above, too.
+        row_stride: 2 to halve the rows; 1 to keep them.
+        column_stride: 2 to halve the columns; 1 to keep them.
     """
 
-    def __init__(self, channels: int, padding: Padding, row_stride: int = 2) -> None:
+    def __init__(self, channels: int, padding: Padding, row_stride: int = 2, column_stride: int = 2) -> None:
         super().__init__()
-        self.conv = nn.Conv2d(channels, channels, 3, stride=(row_stride, 2))
+        self.conv = nn.Conv2d(channels, channels, 3, stride=(row_stride, column_stride))
         self.wraps = padding == "wrap"
-        self.above = 2 - row_stride
+        self.above, self.left = 2 - row_stride, 2 - column_stride
 
     def forward(self, x: Float[Tensor, "B C H W"]) -> Float[Tensor, "B C h w"]:
-        """Halve the columns, and the rows if so made."""
+        """Halve the axes as made."""
         if self.wraps:
-            return self.conv(F.pad(wrapped(x, left=0), (0, 0, self.above, 1)))
-        return self.conv(F.pad(x, (0, 1, self.above, 1)))
+            return self.conv(F.pad(wrapped(x, left=self.left), (0, 0, self.above, 1)))
+        return self.conv(F.pad(x, (self.left, 1, self.above, 1)))
 
 
 class Upsample(nn.Module):
-    """Double both axes by repeating pixels, then convolve."""
+    """Double the rows, and perhaps the columns, by repeating pixels, then convolve.
 
-    def __init__(self, channels: int, padding: Padding) -> None:
+    Args:
+        channels: number of channels of the input and of the output.
+        padding: values beyond the first and the last column.
+        doubles_columns: whether columns are doubled, too.
+    """
+
+    def __init__(self, channels: int, padding: Padding, doubles_columns: bool = True) -> None:
         super().__init__()
         self.conv = Convolution(channels, channels, padding)
+        self.factors = (2.0, 2.0 if doubles_columns else 1.0)
 
     def forward(self, x: Float[Tensor, "B C h w"]) -> Float[Tensor, "B C H W"]:
-        """Double the rows and the columns."""
-        return self.conv(F.interpolate(x, scale_factor=2.0, mode="nearest"))
+        """Repeat and convolve."""
+        return self.conv(F.interpolate(x, scale_factor=self.factors, mode="nearest"))
 
 
 class FoldedUpsample(nn.Module):
-    """The same function as :class:`Upsample` in 4/9 of the operations, without the repeated pixels.
+    """The same function as an :class:`Upsample` of both axes in 4/9 of the operations, without the repeated pixels.
 
     A repeated pixel meets the sum of neighbouring weights: an output pixel sees only 2x2 different inputs. Together the
     four kernels, one for each output pixel of an input's, are one transposed convolution of 4x4 weights and stride 2.

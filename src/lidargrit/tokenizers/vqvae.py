@@ -56,7 +56,9 @@ class VqvaeConfig(TokenizerConfig):
     Args:
         channels: number of channels at the finest level, a multiple of ``norm_groups``.
         channel_multipliers: channels of each level, from fine to coarse, over those of the finest; each further level
-            halves rows and columns.
+            halves rows and columns, or rows alone; see ``cell_columns``.
+        cell_columns: number of columns of the cell of pixels that a token stands for; 0 for as many as rows. With fewer
+            than rows, the first levels halve rows alone: a pole then fills its cell from side to side.
         residual_blocks: number of residual blocks of each encoder level; a decoder level has one more.
         code_dim: length of a code.
         num_codes: number of codes in the codebook.
@@ -89,6 +91,7 @@ class VqvaeConfig(TokenizerConfig):
 
     channels: int = 64
     channel_multipliers: tuple[int, ...] = (1, 1, 2)
+    cell_columns: int = 0
     residual_blocks: int = 1
     code_dim: int = 128
     num_codes: int = 512
@@ -114,26 +117,36 @@ class VqvaeConfig(TokenizerConfig):
                 f"1 to {_LEVELS_AT_MOST} positive numbers, one a level",
                 "e.g. (1,1,2)",
             )
+        if self.cell_columns not in (0, *(2**halvings for halvings in range(len(self.channel_multipliers)))):
+            rows = 2 ** (len(self.channel_multipliers) - 1)
+            wanted = f"a power of 2 up to the {rows} rows of a cell, or 0 for as many"
+            raise ConfigError(f"cell_columns={self.cell_columns}", wanted, "lower it, or add channel_multipliers")
         if not 0 <= self.dropout < 1:
             raise ConfigError(f"dropout={self.dropout}", "a share in [0, 1)", "lower it")
         for name in ("raydrop_weight", "reflectance_weight", "thin_weight"):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"{name}={getattr(self, name)}", "0 or more", "raise it")
 
+    @property
+    def cell(self) -> tuple[int, int]:
+        """Rows and columns of the cell of pixels that a token stands for."""
+        rows = 2 ** (len(self.channel_multipliers) - 1)
+        return rows, self.cell_columns or rows
+
+    def halves_columns(self, level: int) -> bool:
+        """Return whether columns are halved between a level and the next coarser one."""
+        rows, columns = self.cell
+        return rows >> (level + 1) < columns
+
 
 def _block(config: VqvaeConfig, inputs: int, outputs: int) -> ResidualBlock:
     return ResidualBlock(inputs, outputs, config.dropout, config.padding, norm_groups=config.norm_groups)
 
 
-def _level(
-    config: VqvaeConfig, inputs: int, width: int, num_blocks: int, downsamples: bool = False, upsamples: bool = False
-) -> Level:
-    """Make residual blocks, and after them what halves or doubles rows and columns if that is wanted."""
+def _level(config: VqvaeConfig, inputs: int, width: int, num_blocks: int) -> Level:
+    """Make residual blocks; what halves or doubles rows and columns after them is added by the caller."""
     widths = [inputs, *[width] * num_blocks]
-    level = Level([_block(config, *pair) for pair in pairwise(widths)])
-    level.downsample = Downsample(width, config.padding) if downsamples else None
-    level.upsample = Upsample(width, config.padding) if upsamples else None
-    return level
+    return Level([_block(config, *pair) for pair in pairwise(widths)])
 
 
 class Encoder(ConvolutionalEncoder):
@@ -143,10 +156,11 @@ class Encoder(ConvolutionalEncoder):
         super().__init__()
         c, widths = config, _widths(config)
         self.conv_in = Convolution(1 + c.reflectance, c.channels, c.padding)
-        self.down = nn.ModuleList(
-            _level(c, inputs, width, c.residual_blocks, downsamples=level < len(widths) - 1)
-            for level, (inputs, width) in enumerate(pairwise([c.channels, *widths]))
-        )
+        self.down = nn.ModuleList()
+        for level, (inputs, width) in enumerate(pairwise([c.channels, *widths])):
+            self.down.append(made := _level(c, inputs, width, c.residual_blocks))
+            if level < len(widths) - 1:
+                made.downsample = Downsample(width, c.padding, column_stride=1 + c.halves_columns(level))
         self.mid = _middle(c)
         self.norm_out = group_norm(widths[-1], c.norm_groups)
         self.conv_out = Convolution(widths[-1], c.code_dim, c.padding)
@@ -163,12 +177,11 @@ class Decoder(ConvolutionalDecoder):
         c, widths = config, _widths(config)
         self.conv_in = Convolution(c.code_dim, widths[-1], c.padding)
         self.mid = _middle(c)
-        coarse_to_fine = [
-            _level(c, inputs, width, c.residual_blocks + 1, upsamples=level > 0)
-            for level, (inputs, width) in zip(
-                reversed(range(len(widths))), pairwise([widths[-1], *reversed(widths)]), strict=True
-            )
-        ]
+        coarse_to_fine = []
+        for level, (inputs, width) in enumerate(pairwise([widths[-1], *reversed(widths)])):
+            coarse_to_fine.append(made := _level(c, inputs, width, c.residual_blocks + 1))
+            if (finer := len(widths) - 2 - level) >= 0:
+                made.upsample = Upsample(width, c.padding, c.halves_columns(finer))
         self.up = nn.ModuleList(reversed(coarse_to_fine))
         self.norm_out = group_norm(widths[0], c.norm_groups)
         self.conv_out = Convolution(widths[0], 1 + c.raydrop_loss + c.reflectance, c.padding)
@@ -181,7 +194,7 @@ class Decoder(ConvolutionalDecoder):
         fast = copy.deepcopy(self).eval().requires_grad_(False)
         for level in fast.up:
             assert isinstance(level, Level)
-            if isinstance(level.upsample, Upsample):
+            if isinstance(level.upsample, Upsample) and level.upsample.factors == (2.0, 2.0):
                 level.upsample = FoldedUpsample(level.upsample)
         for layer in (fast.conv_in, fast.mid, fast.up):
             layer.to(dtype_of(precision))
@@ -208,14 +221,19 @@ class Vqvae(ConvolutionalTokenizer[VqvaeConfig]):
 
     def __init__(self, config: VqvaeConfig, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
-        factor = 2 ** (len(config.channel_multipliers) - 1)
-        if sensor.height % factor or sensor.width % factor:
+        rows, columns = config.cell
+        if sensor.height % rows or sensor.width % columns:
+            both = (
+                f"both sizes divisible by {rows}"
+                if rows == columns
+                else f"rows divisible by {rows}, columns by {columns}"
+            )
             raise ConfigError(
                 f"range images of {sensor.height}x{sensor.width}",
-                f"both sizes divisible by {factor}, for {len(config.channel_multipliers)} levels",
+                f"{both}, for {len(config.channel_multipliers)} levels",
                 "use fewer channel_multipliers, or another number of columns",
             )
-        self.grid_size = (sensor.height // factor, sensor.width // factor)
+        self.grid_size = (sensor.height // rows, sensor.width // columns)
         self.num_features = _widths(config)[0]
         self.range_encoding = RangeEncoding(config.range_encoding, sensor.range_min_m, sensor.range_max_m)
         self.encoder, self.decoder = Encoder(config), Decoder(config)
