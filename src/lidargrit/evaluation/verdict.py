@@ -63,7 +63,8 @@ class Tally:
             (f"{self.praise} in {len(self.better)}", self.better),
             (f"undecided in {len(self.undecided)}", self.undecided),
         )
-        said = (f"{count} ({', '.join(names)})" if names else count for count, names in counts)
+        some = range(1, max(total, 2))  # of a group that is all, nobody needs the names
+        said = (f"{count} ({', '.join(names)})" if len(names) in some else count for count, names in counts)
         return f"{self.head}: {', '.join(said)}."
 
 
