@@ -154,7 +154,7 @@ class FileDataset(ScanDataset):
     def _find(cls, root: Path) -> list[Path]:
         for pattern in cls.patterns:
             _check_readable(root, pattern)
-            if found := sorted(filter(_is_scan_file, root.glob(pattern)), key=natural_order):
+            if found := natural_order(filter(_is_scan_file, root.glob(pattern))):
                 return found
         return []
 

@@ -42,7 +42,7 @@ class Folder(FileDataset):
 
     @classmethod
     def _find(cls, root: Path) -> list[Path]:
-        return sorted(scans_below(root), key=natural_order)
+        return natural_order(scans_below(root))
 
     def sequence_of(self, relative: Path) -> str:
         """Name the folder of a file."""

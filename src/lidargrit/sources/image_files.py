@@ -78,7 +78,7 @@ def image_files(path: Path) -> list[Path]:
         ScanError: the first of them is a mask.
     """
     try:
-        found = [path] if path.is_file() else sorted(path.iterdir(), key=natural_order)
+        found = [path] if path.is_file() else natural_order(path.iterdir())
     except (OSError, ValueError):
         return []
     found = [one for one in found if one.is_file() and not one.name.startswith(".") and formats.candidates(one)]
