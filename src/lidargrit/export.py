@@ -75,6 +75,7 @@ def export_scans(
     identities = {file: scans.identity(index) for index, file in enumerate(files)}
     facts = {"source": source, "format": kind, **of_images, "scans": identities}
     with claim_folder(out), claimed_scans(out / MANIFEST, facts) as left_out:
+        told = set[str]()
         told_labels, missing = layout.keeps_labels, [at for at, file in enumerate(files) if not (out / file).exists()]
         with reporter.progress("exporting", len(files), len(files) - len(missing)) as progress:
             for index in missing:
@@ -88,6 +89,9 @@ def export_scans(
                     left_out.add(files[index])
                 else:
                     told_labels = told_labels or _told_labels(scan, files[index], reporter)
+                    for note in (one for one in scan.notes if one not in told):
+                        reporter.message(f"{scan.source}: {note}")
+                    told.update(scan.notes)
                 progress.advance(1)
         if len(left_out) == len(files):
             raise DataError(f"no usable scan in {source}", "at least one", "see the messages above")

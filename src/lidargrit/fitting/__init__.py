@@ -126,7 +126,7 @@ def fit_sensor(scans: Sequence[Scan], name: str = "fitted") -> SensorFit:
         elevations_deg=np.concatenate([points.elevation_deg for points in used]),
         row_of_point=np.concatenate(row_of_point),
         steps_deg=steps[:: max(1, len(steps) // _STEPS_KEPT)],
-        warnings=_warnings(rows, rings, len(scans), columns),
+        warnings=(*_notes_of(scans), *_warnings(rows, rings, len(scans), columns)),
     )
 
 
@@ -234,6 +234,11 @@ def _projection(rows: FittedRows, rings: Rings) -> ProjectionName:
 def _are_rows(rows: FittedRows) -> bool:
     """Return whether the numbers of the rings are those of the rows: from 0 for the highest, none left out."""
     return bool((rows.number == np.arange(len(rows.number))).all())
+
+
+def _notes_of(scans: Sequence[Scan]) -> dict[str, None]:
+    """Return what readers say of the files, each sentence once."""
+    return dict.fromkeys(note for scan in scans for note in scan.notes)
 
 
 def _warnings(rows: FittedRows, rings: Rings, num_scans: int, columns: int | None) -> tuple[str, ...]:

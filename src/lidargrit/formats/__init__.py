@@ -175,13 +175,14 @@ def scan_of(
     bad_points: BadPoints,
     label: Int[Tensor, "n"] | None = None,
     full_scale: int = 0,
+    notes: tuple[str, ...] = (),
 ) -> Scan:
     """Make a scan of what a file holds, without points that are no returns if ``bad_points`` is ``drop``."""
     if bad_points == "drop":
         kept = usable_points(points_xyz_m, reflectance)
         points_xyz_m = points_xyz_m[kept]
         reflectance, ring, label = (None if one is None else one[kept] for one in (reflectance, ring, label))
-    return Scan(points_xyz_m.contiguous(), reflectance, ring, label, source, full_scale)
+    return Scan(points_xyz_m.contiguous(), reflectance, ring, label, source, full_scale, notes)
 
 
 def usable_points(points_xyz_m: Float[Tensor, "n 3"], reflectance: Float[Tensor, "n"] | None) -> Bool[Tensor, "n"]:

@@ -77,7 +77,7 @@ class CsvTable(ScanFormat):
             raise ScanError(what, _FORMAT, "give every line a number in each column, with a decimal point") from None
         if not 1 <= len(table) <= POINTS_AT_MOST:
             raise ScanError(f"{len(table):,} lines in {path}", f"1 to {POINTS_AT_MOST:,}", "give one revolution a file")
-        return scan_of_columns(dict(zip(wanted, table.T, strict=True)), path, bad_points)
+        return scan_of_columns(dict(zip(wanted, table.T, strict=True)), path, bad_points, names)
 
     @classmethod
     def write(cls, path: Path, scan: Scan) -> None:

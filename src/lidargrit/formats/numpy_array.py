@@ -18,6 +18,7 @@ from lidargrit.formats._columns import BYTES_AT_MOST, REFLECTANCE_RULE, columns_
 from lidargrit.structures import Scan
 
 _FORMAT = "an .npy of n rows of 3 to 5 numbers, or an .npz with an array points of n rows"
+_MAGIC = b"\x93NUMPY"  # of an array alone
 _VALUE_BYTES_AT_MOST = 16  # numpy's widest number
 _ROWS = ("x", "y", "z", "intensity", "ring")
 _POINTS = ("points", "xyz", "points_xyz_m")
@@ -40,7 +41,7 @@ class NumpyArray(ScanFormat):
     @staticmethod
     def recognises(path: Path) -> bool:
         """Return whether a file is an array, or an archive with an array of points."""
-        if first_bytes(path, 6) == b"\x93NUMPY":
+        if first_bytes(path, 6) == _MAGIC:
             return True
         try:
             with open_file(path, _FORMAT) as file, _archive(file, path) as archive:
@@ -52,7 +53,8 @@ class NumpyArray(ScanFormat):
     def read(path: Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
         """Read the scan in a file."""
         data = read_bytes(path, BYTES_AT_MOST, _FORMAT)
-        if data.startswith(b"\x93NUMPY"):
+        names: list[str] = []
+        if data.startswith(_MAGIC):
             try:
                 rows = parse_array(data)
             except ValueError as error:
@@ -60,8 +62,11 @@ class NumpyArray(ScanFormat):
             columns = _row_columns(rows, path)
         else:
             with _archive(BytesIO(data), path) as archive:
-                columns = _archive_columns(archive, path)
-        return scan_of_columns(columns, path, bad_points)
+                columns, names = (
+                    _archive_columns(archive, path),
+                    [one.removesuffix(".npy") for one in archive.namelist()],
+                )
+        return scan_of_columns(columns, path, bad_points, names, are_named=bool(names))
 
     @classmethod
     def write(cls, path: Path, scan: Scan) -> None:

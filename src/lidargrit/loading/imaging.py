@@ -24,7 +24,8 @@ class Imaging:
     Args:
         sensor: sensor of the images, with the projection that fits the scans.
         config: settings of the projection, with the variant that fits the scans.
-        notes: sentences on what was chosen in place of what the sensor and the settings say.
+        notes: sentences on what was chosen in place of what the sensor and the settings say, and on what was
+            left out of the files.
         doubts: sentences that tell why another sensor than this one may have made the scans.
     """
 
@@ -54,7 +55,7 @@ def choose_imaging(source: str, dataset: ScanDataset, sensor: SensorModel, confi
     if config.projection != "sensor":
         sensor = replace(sensor, projection=config.projection)
     probes = _probes(dataset, sensor)
-    notes: list[str] = []
+    notes = [f"{source}: {note}" for note in dict.fromkeys(note for scan in probes for note in scan.notes)]
     fitting = {projection_that_fits(scan, sensor) for scan in probes} if config.projection == "sensor" else set()
     if fitting - {sensor.projection}:
         sensor, config = replace(sensor, projection="spherical"), replace(config, projection_variant="exact")

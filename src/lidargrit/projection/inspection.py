@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int8, Int64
 
+from lidargrit.errors import one_line
 from lidargrit.projection.fit import fit_problems, ring_count
 from lidargrit.projection.pixel_coordinates import PixelCoordinates, ProjectionVariant, pixel_coordinates, within_limits
 from lidargrit.sensors import ProjectionName, SensorModel
@@ -119,6 +120,7 @@ def as_json(inspection: Inspection) -> dict[str, Any]:
     filled = inspection.filled()
     return {
         "scan": inspection.scan.source,
+        "notes": list(inspection.scan.notes),
         "sensor": inspection.sensor.name,
         "image": list(filled.shape),
         "projection": inspection.method,
@@ -139,7 +141,8 @@ def as_table(inspection: Inspection) -> str:
 
 def _lines(inspection: Inspection) -> Iterator[str]:
     sensor, filled, total = inspection.sensor, inspection.filled(), len(inspection.scan)
-    yield inspection.scan.source
+    yield one_line(inspection.scan.source)  # a file's name may hold anything
+    yield from (f"note: {one_line(note)}" for note in inspection.scan.notes)
     stride = f", one in {sensor.column_stride} of its columns" if sensor.column_stride > 1 else ""
     yield f"{inspection.method}, {inspection.variant}, to {sensor.height}x{sensor.width} of {sensor.name}{stride}"
     yield from (f"problem: {problem}" for problem in inspection.problems)
