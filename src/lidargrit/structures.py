@@ -53,7 +53,7 @@ class Scan:
 
     def __post_init__(self) -> None:
         if len(self) == 0:
-            raise ScanError(f"no point in {self.source}", "a full revolution", "leave this scan out")
+            raise ScanError(f"no point in {self.source}", "a full revolution", "leave it out by --bad-scans skip")
         object.__setattr__(self, "points_xyz_m", self.points_xyz_m.float())  # those of NumPy often have 64 bits
         if self.reflectance is not None:
             object.__setattr__(self, "reflectance", self.reflectance.float())

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
 from lidargrit import _discovery
-from lidargrit.errors import DataError
+from lidargrit.errors import DataError, ScanError
 from lidargrit.formats import BadPoints
 from lidargrit.structures import Scan
 from lidargrit.untrusted import user_path
 
+_TOLD_AT_MOST = 5  # scans that are left out
 _SHARE = re.compile(r"\[[^\]/]*\]$")
 
 
@@ -181,6 +182,34 @@ def open_dataset(source: str, bad_points: BadPoints = "refuse") -> ScanDataset:
         got = "holds no layout we know" if root.is_dir() else "is not a folder" if root.exists() else "does not exist"
         raise DataError(f"{root}, which {got}", "scans: a file, a folder or the root of a data set", cure)
     return load(name)(root, split, bad_points)
+
+
+def usable_scans(dataset: ScanDataset, indices: Iterable[int], at_most: int = 0) -> tuple[list[Scan], tuple[str, ...]]:
+    """Read some scans without those that cannot be used, and say which these are.
+
+    Args:
+        dataset: scans.
+        indices: numbers of the wanted scans, in order.
+        at_most: number of usable scans after which no further one is read; 0 for all.
+
+    Raises:
+        ScanError: none of them can be used; says what is wrong with the last.
+    """
+    scans, skipped = list[Scan](), list[str]()
+    error = None
+    for index in indices:
+        if at_most and len(scans) == at_most:
+            break
+        try:
+            scans.append(dataset.scan(index))
+        except ScanError as wrong:
+            error = wrong
+            skipped.append(f"left out: {wrong}")
+    if error and not scans:
+        raise error
+    if len(skipped) > _TOLD_AT_MOST:
+        skipped[_TOLD_AT_MOST:] = [f"and {len(skipped) - _TOLD_AT_MOST} more left out"]
+    return scans, tuple(skipped)
 
 
 def data_set_and_split(source: str) -> tuple[str, str]:

@@ -37,6 +37,9 @@ class FileDataset(ScanDataset):
     examples: ClassVar[tuple[str, ...]]
     """Where :meth:`write_example` puts scan number {index}, by turns."""
 
+    topic: str = ""
+    """Topic of recordings whose scans are wanted; empty for that which a format takes."""
+
     def __init__(self, root: Path, split: str = "all", bad_points: BadPoints = "refuse") -> None:
         super().__init__(root, split, bad_points)
         found = {path: self.sequence_of(path.relative_to(root)) for path in self._find(root)}
@@ -47,7 +50,7 @@ class FileDataset(ScanDataset):
         chosen = self._choose(wanted, set(found.values()))
         paths = [path for path, sequence in found.items() if sequence in chosen]
         several = not self.format or formats.load(self.format).several
-        scans = [(path, index) for path in paths for index in range(self.scans_in(path) if several else 1)]
+        scans = [(path, index) for path in paths for index in range(self.scans_in(path, self.topic) if several else 1)]
         self._scans = scans[wanted.block(len(scans))]
         self._several = {path for path, index in scans if index}
         names = Counter(
@@ -67,7 +70,7 @@ class FileDataset(ScanDataset):
     def scan(self, index: int) -> Scan:
         """Read one scan."""
         path, index_in_file = self._scans[index]
-        return self._format(path).read(path, index_in_file, self.bad_points)
+        return self._format(path).of_topic(self.topic).read(path, index_in_file, self.bad_points)
 
     def name(self, index: int) -> str:
         """Name one scan: its sequence, its file, and its index in the file if that holds several.
@@ -78,6 +81,7 @@ class FileDataset(ScanDataset):
         sequence = self.sequence_of(path.relative_to(self.root))
         stem = formats.stem(path)
         name = path.name if (sequence, stem) in self._taken else stem
+        name += f"@{self.topic.strip('/').replace('/', '_')}" if self.topic else ""
         name += f"#{index_in_file}" if path in self._several else ""
         return name if sequence == "." else f"{sequence}/{name}"
 
@@ -129,10 +133,10 @@ class FileDataset(ScanDataset):
         return unnamed_recording(path) if sequence == "." else f"{self.public_name()}/{sequence}"
 
     @classmethod
-    def scans_in(cls, path: Path) -> int:
+    def scans_in(cls, path: Path, topic: str = "") -> int:
         """Count the scans in a file that belong to the data set, which is of one sensor."""
         of_several = any(form.sensors > 1 for form in formats.candidates(path))
-        return 1 if of_several else formats.count_scans(path)
+        return 1 if of_several else formats.count_scans(path, topic)
 
     @classmethod
     def _format(cls, path: Path) -> type[formats.ScanFormat]:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 from lidargrit import formats
 from lidargrit.datasets._files import FileDataset, scans_below, unnamed_recording
 from lidargrit.determinism import natural_order
 from lidargrit.formats import BadPoints
+
+_TOPIC = re.compile(r"(/[^\[\]]+)(\[[^\]]*\])?")
 
 
 class Folder(FileDataset):
@@ -27,6 +30,9 @@ class Folder(FileDataset):
     examples = ("{index:06d}.bin", "more/{index:06d}.bin")
 
     def __init__(self, root: Path, split: str = "all", bad_points: BadPoints = "refuse") -> None:
+        found = _TOPIC.fullmatch(split)
+        if found:
+            self.topic, split = found[1], f"all{found[2] or ''}"
         super().__init__(root, split, bad_points)
         sensors = [one.sensor for one in formats.candidates(self.path(0)) if one.sensor]
         self.sensor = sensors[0] if sensors else type(self).sensor

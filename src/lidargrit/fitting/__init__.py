@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 
-from lidargrit.datasets import ScanDataset
+from lidargrit.datasets import ScanDataset, usable_scans
 from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import ConfigError, ScanError
 from lidargrit.fitting.azimuths import columns_of_scans, firing_steps_deg, first_edge_rad, offsets_deg
@@ -130,13 +131,16 @@ def fit_sensor(scans: Sequence[Scan], name: str = "fitted") -> SensorFit:
     )
 
 
-def fit_sensor_to_dataset(dataset: ScanDataset, name: str = "fitted", num_scans: int = 20) -> SensorFit:
+def fit_sensor_to_dataset(
+    dataset: ScanDataset, name: str = "fitted", num_scans: int = 20, bad_scans: Literal["refuse", "skip"] = "refuse"
+) -> SensorFit:
     """Find the sensor that made the scans of a data set, from some of them, evenly spaced.
 
     Args:
         dataset: scans, see :func:`lidargrit.datasets.open_dataset`.
         name: name of the new sensor.
         num_scans: largest number of scans to use; 0 for all.
+        bad_scans: ``refuse`` to go on when a scan cannot be used, or ``skip`` it with a warning.
 
     Raises:
         ConfigError: a negative number of scans, or a name that is blank, too long or cannot be printed in one line.
@@ -146,7 +150,11 @@ def fit_sensor_to_dataset(dataset: ScanDataset, name: str = "fitted", num_scans:
         raise ConfigError(f"-n {num_scans}", "at least 1 scan, or 0 for all", "raise it")
     _check_name(name)
     indices = evenly_spaced(num_scans or len(dataset), len(dataset))
-    return fit_sensor([dataset.scan(index) for index in indices], name)
+    if bad_scans == "refuse":
+        return fit_sensor([dataset.scan(index) for index in indices], name)
+    scans, skipped = usable_scans(dataset, indices)
+    fit = fit_sensor(scans, name)
+    return replace(fit, warnings=(*skipped, *fit.warnings))
 
 
 def _check_name(name: str) -> None:

@@ -78,6 +78,11 @@ class ScanFormat(ABC):
     def read(path: Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
         """Read one scan of a file, or raise ScanError."""
 
+    @classmethod
+    def of_topic(cls, topic: str) -> type[ScanFormat]:
+        """Return the format that reads one topic of a recording; itself where files have no topics."""
+        return cls
+
     @staticmethod
     def companions(path: Path) -> tuple[Path, ...]:
         """Return the other files that :meth:`read` reads, where they are there."""
@@ -143,12 +148,12 @@ def read_scan(path: Path | str, index: int = 0, bad_points: BadPoints = "refuse"
     return form.read(Path(path), index, bad_points)
 
 
-def count_scans(path: Path) -> int:
+def count_scans(path: Path, topic: str = "") -> int:
     """Count the scans in a file; one, too, where the file cannot be read, which is said when it is."""
     if not any(one.several for one in candidates(path)):
         return 1  # without opening it: a folder may hold a hundred thousand
     try:
-        return recognise(path).count(path)
+        return recognise(path).of_topic(topic).count(path)
     except ScanError:
         return 1
 
