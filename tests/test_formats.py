@@ -259,7 +259,7 @@ def test_reflectance_beyond_all_scales_is_refused(tmp_path, values):
         ({"ring": [np.nan, 1]}, "a ring that is not whole or out of bounds"),
         ({"label": [0, 2**32]}, "a label that is not whole or out of bounds"),
         ({"ring": [0, 1, 2]}, r"2 points, but ring of shape \(3,\)"),
-        ({"ring": [[0], [1]]}, r"2 points, but ring of shape \(2, 1\)"),
+        ({"ring": [[0, 0], [1, 1]]}, r"2 points, but ring of shape \(2, 2\)"),
         ({"points": np.ones((2, 6))}, r"an array of shape \(2, 6\)"),
         ({"points": np.ones((2, 3), complex)}, "an array of dtype"),
         ({"points": np.zeros((0, 3))}, "no point in"),

@@ -25,6 +25,7 @@ REFLECTANCE_RULE = "0 to 1, 0 to 255 or 0 to 65535: the smallest of these that h
 _RING = ("ring", "channel")  # lower case; CloudCompare puts "scalar_" before its names
 _LABEL = ("label",)
 _ALIKE = re.compile("intens|reflect|remission|scalar.?field|laser|ring|channel|beam|layer")  # of names, not values
+_NO_NUMBER = re.compile(rb"[-+]?(?:nan\([a-z0-9_]{0,20}\)|1\.?#(?:qnan|snan|ind|inf)[0-9]{0,20})", re.IGNORECASE)
 _LASERS = (16, 32, 40, 64, 80, 128, 256)  # that sensors have; the top ring may have no return, and not be in the file
 _ONE_RING_AT_MOST_RAD = math.radians(5)  # that the elevations of a sensor with one ring may span
 _LINE_BYTES_AT_MOST = 65_536  # of text; real ones take up to some hundreds
@@ -97,6 +98,14 @@ def columns_of(scan: Scan) -> dict[str, np.ndarray]:
     return columns
 
 
+def plain_text(data: bytes) -> bytes:
+    """Return text in which whatever else programs print for a number that is none is ``nan``.
+
+    The runtime of Windows prints -nan(ind), 1.#QNAN or -1.#IND0000; Linux and macOS print nan(snan) at most.
+    """
+    return _NO_NUMBER.sub(b"nan", data) if b"(" in data or b"#" in data else data
+
+
 def check_lines(data: bytes, path: Path, wanted: str) -> None:
     """Refuse text with a line longer than any of numbers: NumPy takes twenty times the memory of a line.
 
@@ -121,6 +130,7 @@ def text_rows(data: bytes, rows: int, names: list[str], path: Path, wanted: str)
     if 2 * rows * len(names) > len(data) + 1:  # a number takes a digit and a blank; room is made for all rows at once
         raise ScanError(f"{len(data)} bytes of text in {path}", promised, "download it again: the file was cut short")
     check_lines(data, path, promised)
+    data = plain_text(data)
     try:
         with warnings.catch_warnings(action="ignore"):  # of empty lines: what is missing is seen below
             table = np.loadtxt(BytesIO(data), np.float64, comments=None, max_rows=rows, ndmin=2, encoding="latin1")

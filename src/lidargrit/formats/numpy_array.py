@@ -17,18 +17,24 @@ from lidargrit.formats import POINTS_AT_MOST, BadPoints, ScanFormat, damaged, fi
 from lidargrit.formats._columns import BYTES_AT_MOST, REFLECTANCE_RULE, columns_of, known_name, scan_of_columns
 from lidargrit.structures import Scan
 
-_FORMAT = "an .npy of n rows of 3 to 5 numbers, or an .npz with an array points of n rows"
+_FORMAT = "an .npy of n rows of 3 to 5 numbers or of named ones, or an .npz with an array points of n rows"
 _MAGIC = b"\x93NUMPY"  # of an array alone
 _VALUE_BYTES_AT_MOST = 16  # numpy's widest number
 _ROWS = ("x", "y", "z", "intensity", "ring")
+_WIDTHS = range(3, 6)
+_POINTS_FOR_RINGS, _RINGS_AT_MOST = 100, 256
+_WITHIN_RINGS = 0.05  # share of the elevations' variance; reflectance of whole numbers leaves nearly all of it
+_UNNAMED = "arr_0"  # as numpy calls an array that is saved without a name
 _POINTS = ("points", "xyz", "points_xyz_m")
 
 
 class NumpyArray(ScanFormat):
     """Arrays as numpy saves them; objects, which are code, are never loaded.
 
-    An ``.npy`` holds a row of x, y, z for every point, and reflectance and ring if the rows are longer. An ``.npz``
-    holds such rows as ``points`` (or xyz), and if they are there reflectance (or reflectivity, intensity, remission,
+    An ``.npy`` holds a row of x, y, z for every point, and reflectance and ring if the rows are longer; a fourth number
+    that keeps to one elevation is the ring. Rows of named numbers, organised clouds (H, W, 3) and arrays by column
+    (3, n) are taken, too. An ``.npz`` holds such rows as ``points`` (or xyz), or as its one array without a name, and
+    if they are there reflectance (or reflectivity, intensity, remission,
     i), ring (or channel) and label as arrays of their own. The ``.npy`` of a scan with rings but without reflectance
     is given a reflectance of 0.
     """
@@ -45,7 +51,8 @@ class NumpyArray(ScanFormat):
             return True
         try:
             with open_file(path, _FORMAT) as file, _archive(file, path) as archive:
-                return bool({f"{name}.npy" for name in _POINTS} & set(archive.namelist()))
+                names = set(archive.namelist())
+                return bool({f"{name}.npy" for name in _POINTS} & names) or names == {f"{_UNNAMED}.npy"}
         except (ScanError, OSError):
             return False
 
@@ -56,10 +63,10 @@ class NumpyArray(ScanFormat):
         names: list[str] = []
         if data.startswith(_MAGIC):
             try:
-                rows = parse_array(data)
+                rows = parse_array(data, may_have_fields=True)
             except ValueError as error:
                 raise damaged(path, _FORMAT, error) from None
-            columns = _row_columns(rows, path)
+            columns, names = _row_columns(rows, path), list(rows.dtype.names or ())
         else:
             with _archive(BytesIO(data), path) as archive:
                 columns, names = (
@@ -83,16 +90,46 @@ class NumpyArray(ScanFormat):
 
 
 def _row_columns(rows: np.ndarray, path: Path) -> dict[str, np.ndarray]:
+    """Return the columns of an array: rows of named numbers, or of 3 to 5; organised (H, W, 3), or by column (3, n)."""
+    if rows.size > len(_ROWS) * POINTS_AT_MOST:
+        raise _refused(f"an array of shape {rows.shape}", path)
+    if rows.dtype.names:
+        return {
+            name: np.ascontiguousarray(rows[name]).reshape(-1)
+            for name in rows.dtype.names
+            if not rows.dtype[name].shape
+        }
     if rows.dtype.kind == "b":
         raise _refused("truth values as points", path)
-    if rows.ndim != 2 or not 3 <= rows.shape[1] <= len(_ROWS) or len(rows) > POINTS_AT_MOST:
+    if rows.ndim == 2 and rows.shape[0] in _WIDTHS and rows.shape[1] not in _WIDTHS:
+        rows = rows.T
+    if rows.ndim not in (2, 3) or rows.shape[-1] not in _WIDTHS or rows[..., 0].size > POINTS_AT_MOST:
         raise _refused(f"an array of shape {rows.shape}", path)
-    return dict(zip(_ROWS, rows.T, strict=False))
+    columns = rows.reshape(-1, rows.shape[-1]).T
+    names = ("x", "y", "z", "ring") if len(columns) == 4 and _are_rings(columns) else _ROWS
+    return dict(zip(names, columns, strict=False))
+
+
+def _are_rings(columns: np.ndarray) -> bool:
+    """Return whether a fourth column without a name numbers lasers: few whole numbers, each at one elevation."""
+    x, y, z, number = columns
+    if len(number) < _POINTS_FOR_RINGS or not np.isfinite(columns).all():
+        return False
+    values, of_point = np.unique(number, return_inverse=True)
+    if not (4 <= len(values) <= _RINGS_AT_MOST and values[0] >= 0 and values[-1] < _RINGS_AT_MOST):
+        return False
+    elevation = np.arctan2(z.astype(np.float64), np.hypot(x, y))
+    mean = np.bincount(of_point, elevation) / np.bincount(of_point)
+    return bool((values % 1 == 0).all()) and float(
+        np.square(elevation - mean[of_point]).mean()
+    ) < _WITHIN_RINGS * float(elevation.var())
 
 
 def _archive_columns(archive: zipfile.ZipFile, path: Path) -> dict[str, np.ndarray]:
     members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
     points_name = next((name for name in _POINTS if name in members), None)
+    if list(members) == [_UNNAMED]:
+        points_name = _UNNAMED
     if points_name is None and "range_m" in members:
         raise ScanError(
             f"{path}, a range image from a folder of samples",
@@ -101,8 +138,10 @@ def _archive_columns(archive: zipfile.ZipFile, path: Path) -> dict[str, np.ndarr
         )
     if points_name is None:
         raise _refused(f"the arrays {', '.join(map(ascii, list(members)[:8]))[:120]}", path)
-    columns = _row_columns(read_member(archive, members.pop(points_name), BYTES_AT_MOST), path)
-    at_most = _VALUE_BYTES_AT_MOST * len(columns["x"]) + HEADER_BYTES_AT_MOST
+    rows = read_member(archive, members.pop(points_name), BYTES_AT_MOST, may_have_fields=True)
+    columns = _row_columns(rows, path)
+    count = len(next(iter(columns.values()), ()))
+    at_most = _VALUE_BYTES_AT_MOST * count + HEADER_BYTES_AT_MOST
     for member, info in members.items():
         name = known_name(member)
         # What else is in the archive is not unpacked, nor the same name again: with other capitals there are hundreds.
@@ -111,8 +150,10 @@ def _archive_columns(archive: zipfile.ZipFile, path: Path) -> dict[str, np.ndarr
         columns[name] = read_member(archive, info, at_most)
         if columns[name].dtype.kind == "b":
             raise _refused(f"truth values as {name}", path)
-        if columns[name].shape != columns["x"].shape:
-            raise _refused(f"{len(columns['x'])} points, but {name} of shape {columns[name].shape}", path)
+        if columns[name].size == count:  # such as (n, 1), or organised as the points are
+            columns[name] = columns[name].reshape(-1)
+        if columns[name].shape != (count,):
+            raise _refused(f"{count} points, but {name} of shape {columns[name].shape}", path)
     return columns
 
 

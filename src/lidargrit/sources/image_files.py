@@ -93,6 +93,8 @@ def image_files(path: Path) -> list[Path]:
         return []
     if array.ndim != 2 or array.shape[1] <= _POINT_COLUMNS_AT_MOST:
         return []
+    if array.shape[0] <= _POINT_COLUMNS_AT_MOST and (array < 0).any():  # points by column, told as such elsewhere
+        return []
     if others:
         what = f"{path}, with range images and {others[0].name}"
         raise DataError(what, "a folder of range images alone", "move that file elsewhere")
