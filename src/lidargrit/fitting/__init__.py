@@ -150,11 +150,13 @@ def fit_sensor_to_dataset(
         raise ConfigError(f"-n {num_scans}", "at least 1 scan, or 0 for all", "raise it")
     _check_name(name)
     indices = evenly_spaced(num_scans or len(dataset), len(dataset))
+    skipped: tuple[str, ...] = ()
     if bad_scans == "refuse":
-        return fit_sensor([dataset.scan(index) for index in indices], name)
-    scans, skipped = usable_scans(dataset, indices)
+        scans = [dataset.scan(index) for index in indices]
+    else:
+        scans, skipped = usable_scans(dataset, indices)
     fit = fit_sensor(scans, name)
-    return replace(fit, warnings=(*skipped, *fit.warnings))
+    return replace(fit, warnings=(*dataset.notes, *skipped, *fit.warnings))
 
 
 def _check_name(name: str) -> None:

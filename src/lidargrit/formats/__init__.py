@@ -16,6 +16,20 @@ from lidargrit import _discovery
 from lidargrit.errors import OutputError, ScanError, first_words
 from lidargrit.structures import Scan
 
+_CURES = {  # by the ending, for files that hold scans but are not read
+    (
+        ".txt",
+        ".xyz",
+        ".asc",
+        ".pts",
+        ".xyzi",
+    ): "put a line of names such as x y z intensity first, and end its name in .csv",
+    (".laz",): "unpack it to .las, for instance with: laszip",
+    (".zst", ".zstd"): "unpack it with: zstd -d",
+    (".gz", ".bz2", ".xz", ".zip", ".7z"): "unpack it first",
+    (".bag.active",): "finish it with: rosbag reindex",
+    (".e57", ".ptx", ".pcd.lz4", ".rosbag"): "convert it to .pcd or .ply, for instance with CloudCompare",
+}
 BadPoints = Literal["refuse", "drop"]
 POINTS_AT_MOST = 4_000_000  # thirty revolutions of an HDL-64E; a larger file is a map, or no scan at all
 
@@ -123,10 +137,21 @@ def recognise(path: Path) -> type[ScanFormat]:
     open_file(path, named[0].title if named else "a file of a scan").close()
     if not named:
         known = ", ".join(sorted(_formats_of_suffixes()))
-        raise ScanError(f"{path}, whose ending we do not know", f"one of {known}", "convert or rename the file")
+        raise ScanError(f"{path}, whose ending we do not know", f"one of {known}", cure_of_ending(path))
     if len(named) == 1:
         return named[0]
     return next((one for one in named if one.recognises(path)), named[0])  # the first says best what is wrong with it
+
+
+def cure_of_ending(path: Path) -> str:
+    """Return what to do with a file whose ending no format has, or that a program packed."""
+    name = path.name.lower()
+    return next((cure for endings, cure in _CURES.items() if name.endswith(endings)), "convert it")
+
+
+def is_of_other_program(path: Path) -> bool:
+    """Return whether a file is called like scans that we do not read."""
+    return path.name.lower().endswith(tuple(ending for endings in _CURES for ending in endings))
 
 
 def read_scan(path: Path | str, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:

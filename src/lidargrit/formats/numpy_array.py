@@ -89,6 +89,21 @@ class NumpyArray(ScanFormat):
             np.save(file, np.column_stack([points, *(columns[name] for name in _ROWS[3:] if name in columns)]))
 
 
+def holds_points(path: Path) -> bool:
+    """Return whether the header of an ``.npy`` is of points: rows of named numbers, or 3 to 5 numbers in each."""
+    file = BytesIO(first_bytes(path, 2 * HEADER_BYTES_AT_MOST))
+    try:
+        read = np.lib.format.read_array_header_1_0
+        if np.lib.format.read_magic(file) != (1, 0):
+            read = np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(file, max_header_size=HEADER_BYTES_AT_MOST)
+    except Exception:  # told where it is read
+        return True
+    if dtype.names:
+        return {*"xyz"} <= {name.lower() for name in dtype.names}
+    return dtype.kind in "fiu" and len(shape) in (2, 3) and bool({shape[0], shape[-1]} & {*_WIDTHS})
+
+
 def _row_columns(rows: np.ndarray, path: Path) -> dict[str, np.ndarray]:
     """Return the columns of an array: rows of named numbers, or of 3 to 5; organised (H, W, 3), or by column (3, n)."""
     if rows.size > len(_ROWS) * POINTS_AT_MOST:

@@ -55,7 +55,8 @@ def choose_imaging(source: str, dataset: ScanDataset, sensor: SensorModel, confi
     if config.projection != "sensor":
         sensor = replace(sensor, projection=config.projection)
     probes = _probes(dataset, sensor)
-    notes = [f"{source}: {note}" for note in dict.fromkeys(note for scan in probes for note in scan.notes)]
+    told = dict.fromkeys((*dataset.notes, *(note for scan in probes for note in scan.notes)))
+    notes = [f"{source}: {note}" for note in told]
     fitting = {projection_that_fits(scan, sensor) for scan in probes} if config.projection == "sensor" else set()
     if fitting - {sensor.projection}:
         sensor, config = replace(sensor, projection="spherical"), replace(config, projection_variant="exact")

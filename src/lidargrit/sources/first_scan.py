@@ -33,6 +33,7 @@ def first_scan(text: str, config: DataConfig) -> tuple[Scan, str]:
     # The files of a folder that is no known data set tell no sensor, as a file alone tells none.
     sensor = "" if source.data_set == "folder" else dataset.sensor
     if not skips:
-        return dataset.scan(0), sensor
-    (scan,), skipped = usable_scans(dataset, range(len(dataset)), at_most=1)
-    return replace(scan, notes=(*skipped, *scan.notes)), sensor
+        scan, skipped = dataset.scan(0), ()
+    else:
+        (scan,), skipped = usable_scans(dataset, range(len(dataset)), at_most=1)
+    return replace(scan, notes=(*dataset.notes, *skipped, *scan.notes)), sensor
