@@ -9,12 +9,14 @@ from abc import abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from fnmatch import fnmatchcase
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import ClassVar
 
 from lidargrit import formats
 from lidargrit.datasets import ScanDataset, recognise
+from lidargrit.datasets._evidence import contradicts_hdl64e
 from lidargrit.datasets._splits import Split
 from lidargrit.determinism import natural_order
 from lidargrit.errors import DataError, OutputError, UsageError, nearest_names
@@ -97,7 +99,22 @@ class FileDataset(ScanDataset):
 
     def recording(self, index: int) -> str:
         """Name the recording that a scan was cut from, the same in every data set that has it."""
-        return self.recording_of(self._scans[index][0])
+        path = self._scans[index][0]
+        return self.recording_of(path) if self._is_its_own else unnamed_recording(path)
+
+    @cached_property
+    def _is_its_own(self) -> bool:
+        return self.origin_of(self.root) == self.public_name()  # asked for every scan, and looked up once
+
+    @classmethod
+    def origin_of(cls, root: Path) -> str:
+        """Return ``folder`` for a tree of this layout that another sensor filled: many programs write KITTI's."""
+        if cls.format and cls.sensor.startswith("hdl64e"):
+            found = (path for pattern in cls.patterns for path in root.glob(pattern))
+            first = next(filter(_is_scan_file, found), None)
+            if first and contradicts_hdl64e(first, cls._format(first)):
+                return "folder"
+        return cls.public_name()
 
     @classmethod
     def matches(cls, root: Path) -> bool:
