@@ -13,6 +13,7 @@ from lidargrit.datasets import SplitScheme
 from lidargrit.datasets._files import FileDataset, unnamed_recording
 from lidargrit.errors import ScanError
 from lidargrit.formats import read_bytes, usable_points
+from lidargrit.formats._labels import notes_on_labels
 from lidargrit.structures import Scan
 
 _LABEL_BYTES = 4  # uint32: class in the lower 16 bits, instance in the upper
@@ -89,7 +90,7 @@ class KittiOdometry(FileDataset):
         if len(scan) != len(label):  # points were dropped, and their labels go with them
             points = torch.from_numpy(rows)
             label = label[usable_points(points[:, :3], points[:, 3])]
-        return replace(scan, label=label)
+        return replace(scan, label=label, notes=(*scan.notes, *notes_on_labels(label)))
 
     def companions(self, index: int) -> tuple[Path, ...]:
         """Return the file of a scan's labels."""

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from lidargrit.errors import OutputError, ScanError
 from lidargrit.formats import BadPoints, damaged, scan_of
+from lidargrit.formats._labels import notes_on_labels
 from lidargrit.formats._reflectance import REFLECTANCE_NAMES, choose_reflectance, floats
 from lidargrit.structures import Scan
 
@@ -74,6 +75,7 @@ def scan_of_columns(
     reflectance, full_scale, notes = choose_reflectance(named, good, are_named)
     notes += _left_alone({*named, *map(_plain, others)})
     label = None if label is None else _whole(label, good, _LABEL_AT_MOST, "label", path)
+    notes += notes_on_labels(label)
     return scan_of(points_xyz_m, reflectance, ring, str(path), bad_points, label, full_scale, notes)
 
 

@@ -22,6 +22,7 @@ from lidargrit.untrusted import user_path
 
 PROBABILITY = ".probability.npy"  # how files end that tell the share of returns, and are no scans
 _IMAGE = "a range image: an .npy of (H, W) ranges in metres"
+_WITHIN_AT_LEAST = 0.5  # of the pixels with a return: real images have nearly all, those in another unit next to none
 _POINT_COLUMNS_AT_MOST = 5  # x, y, z, reflectance, ring: what is wider is an image
 
 
@@ -130,8 +131,12 @@ class _ImageFiles:
         with np.errstate(over="ignore"):  # infinite, and so out of the sensor's limits
             range_m = range_m.astype(np.float32)
         within = (range_m >= sensor.range_min_m) & (range_m <= sensor.range_max_m)
-        if not within.any():
-            raise ScanError(f"no range within the sensor's limits in {path}", "ranges in metres", "check the unit")
+        inside, returns = int(within.sum()), int((range_m > 0).sum())
+        if inside < _WITHIN_AT_LEAST * returns or not inside:  # a stray pixel within them shows no unit
+            what = f"{inside or 'no'} of {returns:,} ranges within the sensor's limits in {path}"
+            raise ScanError(
+                what, f"ranges in metres, {sensor.range_min_m:g} to {sensor.range_max_m:g}", "check the unit"
+            )
         return Pixels(np.where(within, range_m, np.float32(0)))
 
 
