@@ -19,6 +19,7 @@ from lidargrit.fitting.elevations import FittedRows, cluster_rows, nearest_row, 
 from lidargrit.fitting.limits import farthest_m, quantum_m
 from lidargrit.fitting.points import NOISE_RANGE_M, Points
 from lidargrit.fitting.rings import Method, Rings, recover_rings
+from lidargrit.projection.revolutions import told_revolutions
 from lidargrit.sensors import NAME_AT_MOST, ProjectionName, SensorModel, column_azimuths_rad
 from lidargrit.structures import Scan
 
@@ -247,8 +248,9 @@ def _are_rows(rows: FittedRows) -> bool:
 
 
 def _notes_of(scans: Sequence[Scan]) -> dict[str, None]:
-    """Return what readers say of the files, each sentence once."""
-    return dict.fromkeys(note for scan in scans for note in scan.notes)
+    """Return what readers say of the files, each sentence once, and whether a scan has several revolutions."""
+    turns = next((told for scan in scans if (told := told_revolutions(scan))), "")
+    return dict.fromkeys((*(note for scan in scans for note in scan.notes), *([turns] if turns else [])))
 
 
 def _warnings(rows: FittedRows, rings: Rings, num_scans: int, columns: int | None) -> tuple[str, ...]:

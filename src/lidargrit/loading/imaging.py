@@ -10,6 +10,7 @@ from lidargrit.errors import ScanError
 from lidargrit.loading.config import DataConfig
 from lidargrit.projection import doubts_about_rays, projection_that_fits
 from lidargrit.projection.fit import told_doubt
+from lidargrit.projection.revolutions import told_revolutions
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import Scan
@@ -26,7 +27,8 @@ class Imaging:
         config: settings of the projection, with the variant that fits the scans.
         notes: sentences on what was chosen in place of what the sensor and the settings say, and on what was
             left out of the files.
-        doubts: sentences that tell why another sensor than this one may have made the scans.
+        doubts: sentences that tell why another sensor than this one may have made the scans, or more than one
+            revolution lies in each.
     """
 
     sensor: SensorModel
@@ -63,8 +65,9 @@ def choose_imaging(source: str, dataset: ScanDataset, sensor: SensorModel, confi
         notes.append(f"{source}: points that are not in firing order, so rows go by elevation (projection=spherical)")
     doubts_of_scans = (doubts_about_rays(scan, sensor, sensor.projection) for scan in probes)
     doubt = next((each for each in doubts_of_scans if each), "")
-    told = told_doubt(source, sensor, doubt)
-    return Imaging(sensor, config, tuple(notes), (told,) if told else ())
+    turns = next((told for scan in probes if (told := told_revolutions(scan))), "")
+    told = (told_doubt(source, sensor, doubt), turns)
+    return Imaging(sensor, config, tuple(notes), tuple(filter(None, told)))
 
 
 def _probes(dataset: ScanDataset, sensor: SensorModel) -> list[Scan]:
