@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from lidargrit.cli import main
 from lidargrit.errors import ScanError
 from lidargrit.fitting import fit_sensor
 from lidargrit.formats import read_scan
@@ -18,14 +19,34 @@ VLP16 = load_sensor("vlp16").with_columns(COLUMNS)
 OF_A_MAP = r"coordinates of a map in .* \(5,446 km from the origin\); .*subtract the sensor's place from x, y and z"
 
 
-def test_coordinates_of_a_map_are_told(tmp_path):
-    points = xyz_of(corner()).double().numpy() + UTM_M
-    (tmp_path / "a.pcd").write_bytes(pcd_bytes(rows_of(dict(zip("xyz", points.T, strict=True)))))
-    scan = read_scan(tmp_path / "a.pcd")
+def test_coordinates_of_a_map_are_told():
+    scan = Scan((xyz_of(corner()).double() + torch.from_numpy(UTM_M)).float())
     for use in (lambda: project(scan, VLP16), lambda: fit_sensor([scan])):
         with pytest.raises(ScanError, match=OF_A_MAP):
             use()
     assert "coordinates of a map" in inspect(scan, VLP16).problems[0]
+
+
+@pytest.mark.parametrize("verb", ["inspect", "export"])
+def test_coordinates_that_32_bits_would_move_are_refused(tmp_path, verb, capsys):
+    points = xyz_of(corner()).double().numpy() + UTM_M
+    (tmp_path / "a.pcd").write_bytes(pcd_bytes(rows_of(dict(zip("xyz", points.T, strict=True)))))
+    more = [str(tmp_path / "out"), "--format", "ply"] if verb == "export" else []
+    assert main([verb, str(tmp_path / "a.pcd"), *more]) == 2
+    told = capsys.readouterr().err
+    assert "coordinates of a map in " in told
+    lost_m = np.abs(points - points.astype(np.float32)).max(axis=1)
+    moved = f"move by {np.median(lost_m):.3f} m in the median and {lost_m.max():.3f} m at most in the 32 bits"
+    assert moved in told
+    assert lost_m.max() > 0.2
+    assert "subtract the sensor's place from x, y and z" in told
+
+
+def test_doubles_near_the_sensor_are_read(tmp_path):
+    points = xyz_of(corner()).double().numpy() + np.array([0, 0, 0.000_123])
+    points[0] = 1e7  # one stray point shows no map
+    (tmp_path / "a.pcd").write_bytes(pcd_bytes(rows_of(dict(zip("xyz", points.T, strict=True)))))
+    assert np.allclose(read_scan(tmp_path / "a.pcd").points_xyz_m.numpy(), points, atol=1e-3)
 
 
 @pytest.mark.parametrize("factor", [100, 1000])

@@ -29,6 +29,7 @@ _ALIKE = re.compile("intens|reflect|remission|scalar.?field|laser|ring|channel|b
 _NO_NUMBER = re.compile(rb"[-+]?(?:nan\([a-z0-9_]{0,20}\)|1\.?#(?:qnan|snan|ind|inf)[0-9]{0,20})", re.IGNORECASE)
 _LASERS = (16, 32, 40, 64, 80, 128, 256)  # that sensors have; the top ring may have no return, and not be in the file
 _ONE_RING_AT_MOST_RAD = math.radians(5)  # that the elevations of a sensor with one ring may span
+_LOST_AT_MOST_M = 0.5e-3  # of coordinates, in the median: that of points beyond 16 km
 _LINE_BYTES_AT_MOST = 65_536  # of text; real ones take up to some hundreds
 _RING_AT_MOST = 65_535  # 16 bits, as ROS drivers store it
 _LABEL_AT_MOST = 2**32 - 1  # SemanticKITTI's: class and instance in 16 bits each
@@ -64,6 +65,7 @@ def scan_of_columns(
         there = ", ".join(map(ascii, list(columns)[:8])) or "none"
         raise ScanError(f"{path}, whose columns are {there[:120]}", "x, y and z among them", "rename its columns")
     points_xyz_m = torch.stack([floats(named[axis]) for axis in "xyz"], dim=1)
+    _refuse_lost_digits([named[axis] for axis in "xyz"], points_xyz_m, path)
     ring, label = (_first(named, names) for names in (_RING, _LABEL))
     good = points_xyz_m.isfinite().all(dim=1) & (points_xyz_m != 0).any(dim=1)
     if ring is not None and _tells_rows(ring, points_xyz_m, good):
@@ -154,6 +156,25 @@ def whole_number(text: str) -> int:
 
 def _plain(name: str) -> str:
     return name.lower().removeprefix("scalar_")
+
+
+def _refuse_lost_digits(exact: list[np.ndarray], points_xyz_m: Tensor, path: Path) -> None:
+    """Refuse coordinates that 32 bits do not keep, those of maps: every verb would move the points."""
+    if all(values.dtype.itemsize <= 4 for values in exact) or not len(points_xyz_m):
+        return
+    with np.errstate(over="ignore", invalid="ignore"):
+        kept = points_xyz_m.double().numpy()
+        lost_m = np.abs(np.stack(exact, axis=1).astype(np.float64) - kept).max(axis=1)
+    lost_m = lost_m[np.isfinite(lost_m)]
+    if not len(lost_m) or (typical_m := float(np.median(lost_m))) <= _LOST_AT_MOST_M:
+        return
+    far_km = float(np.median(np.linalg.norm(kept[np.isfinite(kept).all(axis=1)], axis=1))) / 1000
+    raise ScanError(
+        f"coordinates of a map in {path} ({far_km:,.0f} km from the origin), which would move by {typical_m:.3f} m in "
+        f"the median and {lost_m.max():.3f} m at most in the 32 bits that scans are kept in",
+        "those of a sensor, seen from its place",
+        "subtract the sensor's place from x, y and z",
+    )
 
 
 def _left_alone(named: Set[str]) -> tuple[str, ...]:
