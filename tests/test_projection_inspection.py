@@ -160,7 +160,7 @@ def test_the_verb_prints_a_table_and_writes_what_it_is_told_to(tmp_path, capsys)
     assert (tmp_path / "it.png").stat().st_size > 10_000
     assert main([*command, *files]) == 2
     assert "which is there already" in capsys.readouterr().err
-    for words in ([str(tmp_path / "nothing.bin")], ["simulated:1", "--bad-scans", "skip"], ["a", "--variant", "exact"]):
+    for words in ([str(tmp_path / "nothing.bin")], ["a", "--variant", "exact"]):
         assert main(["inspect", *words]) == 2
         assert len(capsys.readouterr().err.splitlines()) == 1
 

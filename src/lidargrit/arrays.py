@@ -20,11 +20,12 @@ _END_BYTES, _END_BYTES_64 = 22, 20  # of the records that end an archive; the se
 _PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
-def parse_array(data: bytes) -> np.ndarray:
+def parse_array(data: bytes, may_have_fields: bool = False) -> np.ndarray:
     """Return the array in the bytes of an .npy file; it shares their memory.
 
     Args:
         data: content of a whole .npy file.
+        may_have_fields: whether rows of named numbers are taken as well.
 
     Raises:
         ValueError: a damaged header, other than numbers or truth values, or fewer bytes than the shape needs.
@@ -44,7 +45,9 @@ def parse_array(data: bytes) -> np.ndarray:
         raise ValueError(f"a damaged array ({first_words(error)})") from None
     # True is an int to numpy's reader, but not to those that then use the shape.
     plain = all(type(size) is int and size >= 0 for size in shape)
-    if dtype.kind not in "fiub" or not plain or len(shape) > DIMENSIONS_AT_MOST:
+    fields = [of_field for of_field, *_ in dtype.fields.values()] if may_have_fields and dtype.fields else [dtype]
+    kinds = {of_field.base.kind for of_field in fields}
+    if not kinds <= {*"fiub"} or not dtype.itemsize or not plain or len(shape) > DIMENSIONS_AT_MOST:
         raise ValueError(f"an array of {ascii(dtype)[:40]} and shape {str(shape)[:60]}")
     there, needed = len(data) - file.tell(), math.prod(shape) * dtype.itemsize
     if there < needed:
@@ -76,7 +79,10 @@ def open_archive(file: BytesIO | BufferedReader) -> zipfile.ZipFile:
 
 
 def read_member(
-    archive: zipfile.ZipFile, info: zipfile.ZipInfo, bytes_at_most: int = ARRAY_BYTES_AT_MOST
+    archive: zipfile.ZipFile,
+    info: zipfile.ZipInfo,
+    bytes_at_most: int = ARRAY_BYTES_AT_MOST,
+    may_have_fields: bool = False,
 ) -> np.ndarray:
     """Unpack one array of an archive.
 
@@ -84,6 +90,7 @@ def read_member(
         archive: archive that :func:`open_archive` opened.
         info: directory entry of the array.
         bytes_at_most: largest size of the unpacked .npy, in bytes.
+        may_have_fields: whether rows of named numbers are taken as well.
 
     Raises:
         ValueError: it says that it is larger, is packed by another method than numpy's, or is damaged.
@@ -95,7 +102,7 @@ def read_member(
             data = file.read(info.file_size)  # never more, whatever the packed bytes would unpack to
     except Exception as error:  # a damaged archive is met with errors of many kinds
         raise ValueError(f"a damaged array ({first_words(error)})") from None
-    return parse_array(data)
+    return parse_array(data, may_have_fields)
 
 
 def read_arrays(

@@ -75,6 +75,10 @@ def export_scans(
     identities = {file: scans.identity(index) for index, file in enumerate(files)}
     facts = {"source": source, "format": kind, **of_images, "scans": identities}
     with claim_folder(out), claimed_scans(out / MANIFEST, facts) as left_out:
+        _refuse_links(out, files)
+        told = set[str]()
+        for note in scans.notes:
+            reporter.message(f"{source}: {note}")
         told_labels, missing = layout.keeps_labels, [at for at, file in enumerate(files) if not (out / file).exists()]
         with reporter.progress("exporting", len(files), len(files) - len(missing)) as progress:
             for index in missing:
@@ -88,10 +92,19 @@ def export_scans(
                     left_out.add(files[index])
                 else:
                     told_labels = told_labels or _told_labels(scan, files[index], reporter)
+                    for note in (one for one in scan.notes if one not in told):
+                        reporter.message(f"{scan.source}: {note}")
+                    told.update(scan.notes)
                 progress.advance(1)
         if len(left_out) == len(files):
             raise DataError(f"no usable scan in {source}", "at least one", "see the messages above")
         return len(files) - len(left_out)
+
+
+def _refuse_links(out: Path, files: Sequence[str]) -> None:
+    """Refuse links in place of files: what they lead to is not of this command, and would count as written."""
+    if link := next((out / file for file in files if (out / file).is_symlink()), None):
+        raise OutputError(f"{link}, which is a link", "a file of this command, or none", "remove the link")
 
 
 def check_names(source: str, names: Sequence[str]) -> None:

@@ -37,6 +37,7 @@ class Scan:
         source: file or other origin of the scan, for messages.
         full_scale: number that reflectance was divided by, 1, 255 or 65,535, where the file does not tell and the
             largest value decided; 0 elsewhere.
+        notes: sentences on what was taken or left out when the file was read, for those who look at the scan.
 
     Raises:
         ScanError: no point, a coordinate that is not finite, a point at the origin, or a reflectance outside [0, 1].
@@ -48,10 +49,11 @@ class Scan:
     label: Int[Tensor, "n"] | None = None
     source: str = "a scan"
     full_scale: int = 0
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self) == 0:
-            raise ScanError(f"no point in {self.source}", "a full revolution", "leave this scan out")
+            raise ScanError(f"no point in {self.source}", "a full revolution", "leave it out by --bad-scans skip")
         object.__setattr__(self, "points_xyz_m", self.points_xyz_m.float())  # those of NumPy often have 64 bits
         if self.reflectance is not None:
             object.__setattr__(self, "reflectance", self.reflectance.float())

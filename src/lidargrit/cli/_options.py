@@ -33,13 +33,8 @@ def add_bad_scans(parser: argparse.ArgumentParser, default: str | None = "refuse
     )
 
 
-def add_scans(parser: argparse.ArgumentParser, several: bool = True) -> None:
-    """Add the options of all verbs that read and project scans; :func:`scan_settings` reads them.
-
-    Args:
-        parser: parser of the verb.
-        several: whether the verb reads several scans, of which it may skip some.
-    """
+def add_scans(parser: argparse.ArgumentParser) -> None:
+    """Add the options of all verbs that read and project scans; :func:`scan_settings` reads them."""
     sensor = "name or .json file of the sensor (default: that of the data set, the samples, the run or the protocol)"
     parser.add_argument("--sensor", default="", help=sensor)
     rows = "rows by elevation (spherical), by ring (unfolding), or the sensor's own (default), by elevation where "
@@ -47,7 +42,7 @@ def add_scans(parser: argparse.ArgumentParser, several: bool = True) -> None:
     parser.add_argument("--projection", choices=["sensor", "spherical", "unfolding"], help=rows)
     variant = "exact, or reference to repeat the projection of the released LidarGRIT program"
     parser.add_argument("--projection-variant", choices=["exact", "reference"], help=variant)
-    (add_bad_scans if several else add_bad_points)(parser, default=None)
+    add_bad_scans(parser, default=None)
     add_settings(parser, "settings of reading scans, the same for all verbs, such as data.columns=1024")
 
 

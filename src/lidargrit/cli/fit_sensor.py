@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from lidargrit.cli._options import add_bad_points
+from lidargrit.cli._options import add_bad_scans
 from lidargrit.cli._results import add_json, print_result, refuse_taken
 
 EXAMPLES = """\
@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     some = "number of scans to fit, evenly spaced; 0 for all"
     parser.add_argument("-n", "--max-scans", type=int, default=20, help=some)
     parser.add_argument("--name", help="name of the sensor (default: the name of the sensor file)")
-    add_bad_points(parser)
+    add_bad_scans(parser)
     add_json(parser, "the files of --out, --picture and --json")
 
 
@@ -39,7 +39,7 @@ def run(options: argparse.Namespace) -> None:
     refuse_taken(options, options.out)
     name = options.out.stem if options.name is None else options.name
     dataset = open_source(options.source, options.bad_points).scans()
-    fit = fit_sensor_to_dataset(dataset, name, options.max_scans)
+    fit = fit_sensor_to_dataset(dataset, name, options.max_scans, options.bad_scans)
     if options.picture:
         from lidargrit.viewer.sensor_fit import plot_sensor_fit
 

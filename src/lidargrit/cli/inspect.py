@@ -19,35 +19,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
     parser.add_argument("scan", help="file of a scan, or a source of scans whose first scan is inspected")
     parser.add_argument("--columns", type=int, help="number of columns of the full circle (default: the sensor's)")
-    add_scans(parser, several=False)
+    add_scans(parser)
     parser.add_argument("-o", "--out", type=Path, metavar="PNG", help="also plot the range image and what is lost")
     add_json(parser, "the files of --out and --json")
 
 
 def run(options: argparse.Namespace) -> None:
     """Project one scan and print what became of it."""
-    from lidargrit.api import load_scan
     from lidargrit.files import refuse_to_overwrite
     from lidargrit.projection.fit import closest_sensor, projection_that_fits
     from lidargrit.projection.inspection import as_json, as_table, inspect
     from lidargrit.reporting import TerminalReporter
     from lidargrit.sensors import load_sensor
-    from lidargrit.sources import open_source
+    from lidargrit.sources.first_scan import first_scan
     from lidargrit.viewer.inspection import plot_inspection
 
     refuse_to_overwrite(options.out, options.overwrite, ".png")
     refuse_taken(options)
     settings = scan_settings(options, columns=options.columns)
-    name, bad_points = settings.sensor, settings.data.bad_points
-    if Path(options.scan).is_file():
-        scan = load_scan(options.scan, bad_points=bad_points)
-    else:
-        source = open_source(options.scan, bad_points)
-        dataset = source.scans()
-        scan = dataset.scan(0)
-        # The files of a folder that is no known data set tell no sensor, as a file alone tells none.
-        name = name or ("" if source.data_set == "folder" else dataset.sensor)
-    sensor, method = settings.data.imaged(load_sensor(name or closest_sensor(scan))), None
+    scan, of_data_set = first_scan(options.scan, settings.data)
+    name = settings.sensor or of_data_set or closest_sensor(scan)
+    sensor, method = settings.data.imaged(load_sensor(name)), None
     if settings.data.projection == "sensor" and (method := projection_that_fits(scan, sensor)) != sensor.projection:
         TerminalReporter().message("points that are not in firing order, so rows go by elevation")
     found = inspect(scan, sensor, method, settings.data.projection_variant)

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import ClassVar
 
-from lidargrit import _discovery
-from lidargrit.errors import DataError
+from lidargrit import _discovery, formats
+from lidargrit.errors import DataError, ScanError, printable
 from lidargrit.formats import BadPoints
 from lidargrit.structures import Scan
 from lidargrit.untrusted import user_path
 
+_FILES_TO_LOOK_AT = 10_000  # of a folder without any scan that is read
+_PACKED = {".gz", ".bz2", ".xz", ".zst", ".zstd", ".zip", ".active"}
+_TOLD_AT_MOST = 5  # scans that are left out
 _SHARE = re.compile(r"\[[^\]/]*\]$")
 
 
@@ -63,6 +68,8 @@ class ScanDataset(ABC):
     """The paper that describes it."""
     sensor: str
     """Name of the sensor that made the scans."""
+    notes: tuple[str, ...] = ()
+    """Sentences on files that were left out."""
     schemes: ClassVar[dict[str, SplitScheme]] = {}
     """The published ways to divide it by name; the first is the default."""
 
@@ -178,9 +185,59 @@ def open_dataset(source: str, bad_points: BadPoints = "refuse") -> ScanDataset:
         cure = "check the path, or see the layouts with: lidargrit list datasets"
         if root.is_dir() and not any(root.iterdir()):
             raise DataError(f"{root}, which is an empty folder", "one with scans in it", cure)
+        if root.is_dir() and (others := files_of_others(root)):
+            raise DataError(f"{root}, which holds no scan that we read but {others[0]}", "scans", others[1])
         got = "holds no layout we know" if root.is_dir() else "is not a folder" if root.exists() else "does not exist"
         raise DataError(f"{root}, which {got}", "scans: a file, a folder or the root of a data set", cure)
     return load(name)(root, split, bad_points)
+
+
+def files_of_others(root: Path) -> tuple[str, str] | None:
+    """Return which files of a folder are called like scans but are not read, in a few words, and what to do with them.
+
+    Args:
+        root: folder that is searched, with those below it.
+    """
+    counted: Counter[str] = Counter()
+    cures: dict[str, str] = {}
+    for path in islice(root.rglob("*"), _FILES_TO_LOOK_AT):
+        if not path.name.startswith(".") and formats.is_of_other_program(path) and path.is_file():
+            ending = printable("".join(path.suffixes[-2:]) if path.suffix in _PACKED else path.suffix)[:20]
+            counted[ending] += 1
+            cures[ending] = formats.cure_of_ending(path)
+    if not counted:
+        return None
+    most = counted.most_common(3)
+    found = ", ".join(f"{count:,} {'file' if count == 1 else 'files'} {ending}" for ending, count in most)
+    return found, cures[most[0][0]]
+
+
+def usable_scans(dataset: ScanDataset, indices: Iterable[int], at_most: int = 0) -> tuple[list[Scan], tuple[str, ...]]:
+    """Read some scans without those that cannot be used, and say which these are.
+
+    Args:
+        dataset: scans.
+        indices: numbers of the wanted scans, in order.
+        at_most: number of usable scans after which no further one is read; 0 for all.
+
+    Raises:
+        ScanError: none of them can be used; says what is wrong with the last.
+    """
+    scans, skipped = list[Scan](), list[str]()
+    error = None
+    for index in indices:
+        if at_most and len(scans) == at_most:
+            break
+        try:
+            scans.append(dataset.scan(index))
+        except ScanError as wrong:
+            error = wrong
+            skipped.append(f"left out: {wrong}")
+    if error and not scans:
+        raise error
+    if len(skipped) > _TOLD_AT_MOST:
+        skipped[_TOLD_AT_MOST:] = [f"and {len(skipped) - _TOLD_AT_MOST} more left out"]
+    return scans, tuple(skipped)
 
 
 def data_set_and_split(source: str) -> tuple[str, str]:

@@ -9,12 +9,14 @@ from abc import abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from fnmatch import fnmatchcase
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import ClassVar
 
 from lidargrit import formats
 from lidargrit.datasets import ScanDataset, recognise
+from lidargrit.datasets._evidence import contradicts_hdl64e
 from lidargrit.datasets._splits import Split
 from lidargrit.determinism import natural_order
 from lidargrit.errors import DataError, OutputError, UsageError, nearest_names
@@ -37,6 +39,9 @@ class FileDataset(ScanDataset):
     examples: ClassVar[tuple[str, ...]]
     """Where :meth:`write_example` puts scan number {index}, by turns."""
 
+    topic: str = ""
+    """Topic of recordings whose scans are wanted; empty for that which a format takes."""
+
     def __init__(self, root: Path, split: str = "all", bad_points: BadPoints = "refuse") -> None:
         super().__init__(root, split, bad_points)
         found = {path: self.sequence_of(path.relative_to(root)) for path in self._find(root)}
@@ -47,7 +52,7 @@ class FileDataset(ScanDataset):
         chosen = self._choose(wanted, set(found.values()))
         paths = [path for path, sequence in found.items() if sequence in chosen]
         several = not self.format or formats.load(self.format).several
-        scans = [(path, index) for path in paths for index in range(self.scans_in(path) if several else 1)]
+        scans = [(path, index) for path in paths for index in range(self.scans_in(path, self.topic) if several else 1)]
         self._scans = scans[wanted.block(len(scans))]
         self._several = {path for path, index in scans if index}
         names = Counter(
@@ -67,7 +72,7 @@ class FileDataset(ScanDataset):
     def scan(self, index: int) -> Scan:
         """Read one scan."""
         path, index_in_file = self._scans[index]
-        return self._format(path).read(path, index_in_file, self.bad_points)
+        return self._format(path).of_topic(self.topic).read(path, index_in_file, self.bad_points)
 
     def name(self, index: int) -> str:
         """Name one scan: its sequence, its file, and its index in the file if that holds several.
@@ -78,6 +83,7 @@ class FileDataset(ScanDataset):
         sequence = self.sequence_of(path.relative_to(self.root))
         stem = formats.stem(path)
         name = path.name if (sequence, stem) in self._taken else stem
+        name += f"@{self.topic.strip('/').replace('/', '_')}" if self.topic else ""
         name += f"#{index_in_file}" if path in self._several else ""
         return name if sequence == "." else f"{sequence}/{name}"
 
@@ -93,7 +99,22 @@ class FileDataset(ScanDataset):
 
     def recording(self, index: int) -> str:
         """Name the recording that a scan was cut from, the same in every data set that has it."""
-        return self.recording_of(self._scans[index][0])
+        path = self._scans[index][0]
+        return self.recording_of(path) if self._is_its_own else unnamed_recording(path)
+
+    @cached_property
+    def _is_its_own(self) -> bool:
+        return self.origin_of(self.root) == self.public_name()  # asked for every scan, and looked up once
+
+    @classmethod
+    def origin_of(cls, root: Path) -> str:
+        """Return ``folder`` for a tree of this layout that another sensor filled: many programs write KITTI's."""
+        if cls.format and cls.sensor.startswith("hdl64e"):
+            found = (path for pattern in cls.patterns for path in root.glob(pattern))
+            first = next(filter(_is_scan_file, found), None)
+            if first and contradicts_hdl64e(first, cls._format(first)):
+                return "folder"
+        return cls.public_name()
 
     @classmethod
     def matches(cls, root: Path) -> bool:
@@ -129,10 +150,10 @@ class FileDataset(ScanDataset):
         return unnamed_recording(path) if sequence == "." else f"{self.public_name()}/{sequence}"
 
     @classmethod
-    def scans_in(cls, path: Path) -> int:
+    def scans_in(cls, path: Path, topic: str = "") -> int:
         """Count the scans in a file that belong to the data set, which is of one sensor."""
         of_several = any(form.sensors > 1 for form in formats.candidates(path))
-        return 1 if of_several else formats.count_scans(path)
+        return 1 if of_several else formats.count_scans(path, topic)
 
     @classmethod
     def _format(cls, path: Path) -> type[formats.ScanFormat]:
@@ -154,7 +175,7 @@ class FileDataset(ScanDataset):
     def _find(cls, root: Path) -> list[Path]:
         for pattern in cls.patterns:
             _check_readable(root, pattern)
-            if found := sorted(filter(_is_scan_file, root.glob(pattern)), key=natural_order):
+            if found := natural_order(filter(_is_scan_file, root.glob(pattern))):
                 return found
         return []
 

@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable
 from pathlib import Path
 
 from lidargrit import formats
-from lidargrit.datasets._files import FileDataset, scans_below, unnamed_recording
+from lidargrit.datasets import files_of_others
+from lidargrit.datasets._files import FileDataset, is_recognised, scans_below, unnamed_recording
 from lidargrit.determinism import natural_order
+from lidargrit.errors import printable
 from lidargrit.formats import BadPoints
+from lidargrit.formats.numpy_array import holds_points
+
+_SHARED_ENDINGS = (".png", ".csv", ".npy")  # of pictures, poses and labels, too
+_TOPIC = re.compile(r"(/[^\[\]]+)(\[[^\]]*\])?")
 
 
 class Folder(FileDataset):
     """A folder of scans, or one file; a sequence is the folder that holds them, "." for the root itself.
 
-    Every file whose ending belongs to a format is a scan, hidden ones left out. The sensor is that of the first file's
+    Every file whose ending belongs to a format is a scan, hidden ones left out, and pictures, poses and labels beside
+    scans (.png, .csv and .npy that hold no points). The sensor is that of the first file's
     format, if such files always have the same, and the HDL-64E of KITTI otherwise; choose yours with ``data.sensor``.
     """
 
@@ -27,7 +36,11 @@ class Folder(FileDataset):
     examples = ("{index:06d}.bin", "more/{index:06d}.bin")
 
     def __init__(self, root: Path, split: str = "all", bad_points: BadPoints = "refuse") -> None:
+        found = _TOPIC.fullmatch(split)
+        if found:
+            self.topic, split = found[1], f"all{found[2] or ''}"
         super().__init__(root, split, bad_points)
+        self.notes = _left_out(root, len({path for path, _ in self._scans}))
         sensors = [one.sensor for one in formats.candidates(self.path(0)) if one.sensor]
         self.sensor = sensors[0] if sensors else type(self).sensor
 
@@ -42,7 +55,7 @@ class Folder(FileDataset):
 
     @classmethod
     def _find(cls, root: Path) -> list[Path]:
-        return sorted(scans_below(root), key=natural_order)
+        return natural_order(_without_companions(scans_below(root))[0])
 
     def sequence_of(self, relative: Path) -> str:
         """Name the folder of a file."""
@@ -51,3 +64,46 @@ class Folder(FileDataset):
     def recording_of(self, path: Path) -> str:
         """Name a recording by its folder."""
         return unnamed_recording(path)
+
+
+def _without_companions(found: Iterable[Path]) -> tuple[list[Path], list[Path]]:
+    """Divide files into scans and what lies beside them: pictures, poses and labels, voxels of SemanticKITTI.
+
+    Of endings that other files have as well, the first file in each folder tells; without scans of other endings all of
+    them count, so that reading them says what is wrong.
+    """
+    kinds: dict[tuple[Path, str], list[Path]] = {}
+    for path in found:
+        kinds.setdefault((path.parent, path.suffix.lower()), []).append(path)
+    beside = [
+        key
+        for key, paths in kinds.items()
+        if (key[1] in _SHARED_ENDINGS and not is_points(min(paths)))
+        or (key[0].name == "voxels" and any(folder == key[0].parent / "velodyne" for folder, _ in kinds))
+    ]
+    if len(beside) == len(kinds):
+        beside = []
+    scans = [path for key, paths in kinds.items() if key not in beside for path in paths]
+    return scans, [path for key in beside for path in kinds[key]]
+
+
+def is_points(path: Path) -> bool:
+    """Return whether a file that is called like a scan, and may be something else, looks like one."""
+    return is_recognised(path) and (path.suffix.lower() != ".npy" or holds_points(path))
+
+
+def _left_out(root: Path, count: int) -> tuple[str, ...]:
+    """Return notes on files of a folder that are no scans, or not read."""
+    if not root.is_dir():
+        return ()
+    beside = _without_companions(scans_below(root))[1]
+    endings = ", ".join(sorted({path.suffix.lower() for path in beside}))
+    example = f"such as {printable(beside[0].name)[:80]}" if beside else ""
+    notes = (
+        [f"{len(beside):,} {'file' if len(beside) == 1 else 'files'} {endings} beside the scans left out, {example}"]
+        if beside
+        else []
+    )
+    if others := files_of_others(root):
+        notes.append(f"{others[0]} beside {count:,} that are read left out; {others[1]}")
+    return tuple(notes)

@@ -8,6 +8,8 @@ from typing import ClassVar
 from lidargrit.datasets import SplitScheme
 from lidargrit.datasets._files import FileDataset
 
+_SAME_DRIVE = {"0018": "0002"}  # its 4,380 scans come before 0000004391, with which 0002 was published
+
 
 class Kitti360(FileDataset):
     """The raw Velodyne scans of KITTI-360. There is no official split of scans for generation, and no two papers agree.
@@ -66,3 +68,8 @@ class Kitti360(FileDataset):
     def sequence_of(self, relative: Path) -> str:
         """Name the drive by its number: "0003"."""
         return relative.parts[-4].removeprefix("2013_05_28_drive_").removesuffix("_sync")
+
+    def recording_of(self, path: Path) -> str:
+        """Name the drive; 0018, which the benchmark of perception has, is the beginning of 0002 under other names."""
+        drive = self.sequence_of(path.relative_to(self.root))
+        return f"{self.public_name()}/{_SAME_DRIVE.get(drive, drive)}"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cached_property
 from pathlib import Path
 from typing import ClassVar
 
@@ -14,6 +13,7 @@ from lidargrit.datasets import SplitScheme
 from lidargrit.datasets._files import FileDataset, unnamed_recording
 from lidargrit.errors import ScanError
 from lidargrit.formats import read_bytes, usable_points
+from lidargrit.formats._labels import notes_on_labels
 from lidargrit.structures import Scan
 
 _LABEL_BYTES = 4  # uint32: class in the lower 16 bits, instance in the upper
@@ -67,14 +67,10 @@ class KittiOdometry(FileDataset):
 
     @classmethod
     def origin_of(cls, root: Path) -> str:
-        """Return ``simulated`` for a tree of ``simulate``, and "" for one of ``export``, whatever its source."""
+        """Return ``simulated`` for a tree of ``simulate``, "" for one of ``export``, and else see the base."""
         if (root / "simulated.json").is_file():
             return "simulated"
-        return "" if (root / "export.json").is_file() else cls.public_name()
-
-    @cached_property
-    def _is_of_kitti(self) -> bool:
-        return self.origin_of(self.root) == self.public_name()  # asked for every scan, and looked up once
+        return "" if (root / "export.json").is_file() else super().origin_of(root)
 
     def scan(self, index: int) -> Scan:
         """Read one scan, with its labels if there are any."""
@@ -94,7 +90,7 @@ class KittiOdometry(FileDataset):
         if len(scan) != len(label):  # points were dropped, and their labels go with them
             points = torch.from_numpy(rows)
             label = label[usable_points(points[:, :3], points[:, 3])]
-        return replace(scan, label=label)
+        return replace(scan, label=label, notes=(*scan.notes, *notes_on_labels(label)))
 
     def companions(self, index: int) -> tuple[Path, ...]:
         """Return the file of a scan's labels."""
@@ -107,7 +103,7 @@ class KittiOdometry(FileDataset):
 
     def recording_of(self, path: Path) -> str:
         """Name the drive of KITTI raw that a sequence was cut from, if it is known."""
-        if not self._is_of_kitti:
+        if not self._is_its_own:
             return unnamed_recording(path)
         sequence = self.sequence_of(path.relative_to(self.root))
         return f"kitti/{_RAW_DRIVES[sequence]}" if sequence in _RAW_DRIVES else f"kitti_odometry/{sequence}"

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 
-from lidargrit.datasets import ScanDataset
+from lidargrit.datasets import ScanDataset, usable_scans
 from lidargrit.determinism import evenly_spaced
 from lidargrit.errors import ConfigError, ScanError
 from lidargrit.fitting.azimuths import columns_of_scans, firing_steps_deg, first_edge_rad, offsets_deg
@@ -18,6 +19,7 @@ from lidargrit.fitting.elevations import FittedRows, cluster_rows, nearest_row, 
 from lidargrit.fitting.limits import farthest_m, quantum_m
 from lidargrit.fitting.points import NOISE_RANGE_M, Points
 from lidargrit.fitting.rings import Method, Rings, recover_rings
+from lidargrit.projection.revolutions import told_revolutions
 from lidargrit.sensors import NAME_AT_MOST, ProjectionName, SensorModel, column_azimuths_rad
 from lidargrit.structures import Scan
 
@@ -126,17 +128,20 @@ def fit_sensor(scans: Sequence[Scan], name: str = "fitted") -> SensorFit:
         elevations_deg=np.concatenate([points.elevation_deg for points in used]),
         row_of_point=np.concatenate(row_of_point),
         steps_deg=steps[:: max(1, len(steps) // _STEPS_KEPT)],
-        warnings=_warnings(rows, rings, len(scans), columns),
+        warnings=(*_notes_of(scans), *_warnings(rows, rings, len(scans), columns)),
     )
 
 
-def fit_sensor_to_dataset(dataset: ScanDataset, name: str = "fitted", num_scans: int = 20) -> SensorFit:
+def fit_sensor_to_dataset(
+    dataset: ScanDataset, name: str = "fitted", num_scans: int = 20, bad_scans: Literal["refuse", "skip"] = "refuse"
+) -> SensorFit:
     """Find the sensor that made the scans of a data set, from some of them, evenly spaced.
 
     Args:
         dataset: scans, see :func:`lidargrit.datasets.open_dataset`.
         name: name of the new sensor.
         num_scans: largest number of scans to use; 0 for all.
+        bad_scans: ``refuse`` to go on when a scan cannot be used, or ``skip`` it with a warning.
 
     Raises:
         ConfigError: a negative number of scans, or a name that is blank, too long or cannot be printed in one line.
@@ -146,7 +151,13 @@ def fit_sensor_to_dataset(dataset: ScanDataset, name: str = "fitted", num_scans:
         raise ConfigError(f"-n {num_scans}", "at least 1 scan, or 0 for all", "raise it")
     _check_name(name)
     indices = evenly_spaced(num_scans or len(dataset), len(dataset))
-    return fit_sensor([dataset.scan(index) for index in indices], name)
+    skipped: tuple[str, ...] = ()
+    if bad_scans == "refuse":
+        scans = [dataset.scan(index) for index in indices]
+    else:
+        scans, skipped = usable_scans(dataset, indices)
+    fit = fit_sensor(scans, name)
+    return replace(fit, warnings=(*dataset.notes, *skipped, *fit.warnings))
 
 
 def _check_name(name: str) -> None:
@@ -234,6 +245,12 @@ def _projection(rows: FittedRows, rings: Rings) -> ProjectionName:
 def _are_rows(rows: FittedRows) -> bool:
     """Return whether the numbers of the rings are those of the rows: from 0 for the highest, none left out."""
     return bool((rows.number == np.arange(len(rows.number))).all())
+
+
+def _notes_of(scans: Sequence[Scan]) -> dict[str, None]:
+    """Return what readers say of the files, each sentence once, and whether a scan has several revolutions."""
+    turns = next((told for scan in scans if (told := told_revolutions(scan))), "")
+    return dict.fromkeys((*(note for scan in scans for note in scan.notes), *([turns] if turns else [])))
 
 
 def _warnings(rows: FittedRows, rings: Rings, num_scans: int, columns: int | None) -> tuple[str, ...]:

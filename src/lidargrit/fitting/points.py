@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from lidargrit.errors import ScanError
+from lidargrit.projection.frame import far_away
 from lidargrit.structures import Scan
 
 NOISE_RANGE_M = 1.0  # nearer points are the car that carries the sensor, or placeholders: their angles mean little
@@ -45,6 +46,8 @@ class Points:
         Raises:
             ScanError: too few points, or not a full revolution.
         """
+        if far := far_away(scan):
+            raise far
         x, y, z = scan.points_xyz_m.double().numpy().T
         flat = np.hypot(x, y)
         range_m = np.hypot(flat, z)

@@ -16,6 +16,20 @@ from lidargrit import _discovery
 from lidargrit.errors import OutputError, ScanError, first_words
 from lidargrit.structures import Scan
 
+_CURES = {  # by the ending, for files that hold scans but are not read
+    (
+        ".txt",
+        ".xyz",
+        ".asc",
+        ".pts",
+        ".xyzi",
+    ): "put a line of names such as x y z intensity first, and end its name in .csv",
+    (".laz",): "unpack it to .las, for instance with: laszip",
+    (".zst", ".zstd"): "unpack it with: zstd -d",
+    (".gz", ".bz2", ".xz", ".zip", ".7z"): "unpack it first",
+    (".bag.active",): "finish it with: rosbag reindex",
+    (".e57", ".ptx", ".pcd.lz4", ".rosbag"): "convert it to .pcd or .ply, for instance with CloudCompare",
+}
 BadPoints = Literal["refuse", "drop"]
 POINTS_AT_MOST = 4_000_000  # thirty revolutions of an HDL-64E; a larger file is a map, or no scan at all
 
@@ -78,6 +92,11 @@ class ScanFormat(ABC):
     def read(path: Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
         """Read one scan of a file, or raise ScanError."""
 
+    @classmethod
+    def of_topic(cls, topic: str) -> type[ScanFormat]:
+        """Return the format that reads one topic of a recording; itself where files have no topics."""
+        return cls
+
     @staticmethod
     def companions(path: Path) -> tuple[Path, ...]:
         """Return the other files that :meth:`read` reads, where they are there."""
@@ -118,10 +137,21 @@ def recognise(path: Path) -> type[ScanFormat]:
     open_file(path, named[0].title if named else "a file of a scan").close()
     if not named:
         known = ", ".join(sorted(_formats_of_suffixes()))
-        raise ScanError(f"{path}, whose ending we do not know", f"one of {known}", "convert or rename the file")
+        raise ScanError(f"{path}, whose ending we do not know", f"one of {known}", cure_of_ending(path))
     if len(named) == 1:
         return named[0]
     return next((one for one in named if one.recognises(path)), named[0])  # the first says best what is wrong with it
+
+
+def cure_of_ending(path: Path) -> str:
+    """Return what to do with a file whose ending no format has, or that a program packed."""
+    name = path.name.lower()
+    return next((cure for endings, cure in _CURES.items() if name.endswith(endings)), "convert it")
+
+
+def is_of_other_program(path: Path) -> bool:
+    """Return whether a file is called like scans that we do not read."""
+    return path.name.lower().endswith(tuple(ending for endings in _CURES for ending in endings))
 
 
 def read_scan(path: Path | str, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
@@ -143,12 +173,12 @@ def read_scan(path: Path | str, index: int = 0, bad_points: BadPoints = "refuse"
     return form.read(Path(path), index, bad_points)
 
 
-def count_scans(path: Path) -> int:
+def count_scans(path: Path, topic: str = "") -> int:
     """Count the scans in a file; one, too, where the file cannot be read, which is said when it is."""
     if not any(one.several for one in candidates(path)):
         return 1  # without opening it: a folder may hold a hundred thousand
     try:
-        return recognise(path).count(path)
+        return recognise(path).of_topic(topic).count(path)
     except ScanError:
         return 1
 
@@ -175,13 +205,14 @@ def scan_of(
     bad_points: BadPoints,
     label: Int[Tensor, "n"] | None = None,
     full_scale: int = 0,
+    notes: tuple[str, ...] = (),
 ) -> Scan:
     """Make a scan of what a file holds, without points that are no returns if ``bad_points`` is ``drop``."""
     if bad_points == "drop":
         kept = usable_points(points_xyz_m, reflectance)
         points_xyz_m = points_xyz_m[kept]
         reflectance, ring, label = (None if one is None else one[kept] for one in (reflectance, ring, label))
-    return Scan(points_xyz_m.contiguous(), reflectance, ring, label, source, full_scale)
+    return Scan(points_xyz_m.contiguous(), reflectance, ring, label, source, full_scale, notes)
 
 
 def usable_points(points_xyz_m: Float[Tensor, "n 3"], reflectance: Float[Tensor, "n"] | None) -> Bool[Tensor, "n"]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Set
 from io import BytesIO
 from pathlib import Path
 
@@ -15,31 +16,45 @@ from torch import Tensor
 
 from lidargrit.errors import OutputError, ScanError
 from lidargrit.formats import BadPoints, damaged, scan_of
+from lidargrit.formats._labels import notes_on_labels
+from lidargrit.formats._reflectance import REFLECTANCE_NAMES, choose_reflectance, floats
 from lidargrit.structures import Scan
 
 BYTES_AT_MOST = 256_000_000  # 4 million points of 64 bytes; sensors' own files have up to 48 a point
 REFLECTANCE_RULE = "0 to 1, 0 to 255 or 0 to 65535: the smallest of these that holds all values of a file; 8 bits: 255"
 
-# Lower case; CloudCompare puts "scalar_" before its names. Where a file has several, the first counts: reflectivity is
-# calibrated where intensity is not (Ouster).
-_REFLECTANCE = ("reflectance", "reflectivity", "intensity", "remission", "i")
-_RING = ("ring", "channel")
+_RING = ("ring", "channel")  # lower case; CloudCompare puts "scalar_" before its names
 _LABEL = ("label",)
-_FULL_SCALES = (1, 255, 65_535)
-_ABOUT_1 = 1.05  # of reflectance from 0 to 1 that a calibration took a little beyond
+_ALIKE = re.compile("intens|reflect|remission|scalar.?field|laser|ring|channel|beam|layer")  # of names, not values
+_NO_NUMBER = re.compile(rb"[-+]?(?:nan\([a-z0-9_]{0,20}\)|1\.?#(?:qnan|snan|ind|inf)[0-9]{0,20})", re.IGNORECASE)
 _LASERS = (16, 32, 40, 64, 80, 128, 256)  # that sensors have; the top ring may have no return, and not be in the file
 _ONE_RING_AT_MOST_RAD = math.radians(5)  # that the elevations of a sensor with one ring may span
+_LOST_AT_MOST_M = 0.5e-3  # of coordinates, in the median: that of points beyond 16 km
 _LINE_BYTES_AT_MOST = 65_536  # of text; real ones take up to some hundreds
 _RING_AT_MOST = 65_535  # 16 bits, as ROS drivers store it
 _LABEL_AT_MOST = 2**32 - 1  # SemanticKITTI's: class and instance in 16 bits each
 
 
-def scan_of_columns(columns: Mapping[str, Num[np.ndarray, "n"]], path: Path, bad_points: BadPoints) -> Scan:
+def scan_of_columns(
+    columns: Mapping[str, Num[np.ndarray, "n"]],
+    path: Path,
+    bad_points: BadPoints,
+    others: Iterable[str] = (),
+    are_named: bool = True,
+) -> Scan:
     """Make a scan of columns that are known by their names; others are left alone.
 
-    Reflectance is divided by 1, 255 or 65535: the smallest that no value exceeds, and 255 for columns of 8 bits. Rings
-    are counted from the top: where the file's rise with elevation, they are turned round. A ring that all points have
-    is none.
+    Reflectance is divided by 1, 255 or 65535: the smallest that no value exceeds, and 255 for columns of 8 bits. It is
+    left out, with a note, where it is none: of negative values or counts above 65535. Rings are counted from the top:
+    where the file's rise with elevation, they are turned round. A ring that all points have is none.
+
+    Args:
+        columns: values of every point by their names.
+        path: path of the file, for messages.
+        bad_points: treatment of points that are no returns.
+        others: names of columns that were not read.
+        are_named: whether the file itself has the names; where it has not, reflectance that is none shows another
+            layout, and is refused.
 
     Raises:
         ScanError: x, y or z is not there, rings or labels are not whole numbers, rings are counted from 1, or the
@@ -49,8 +64,9 @@ def scan_of_columns(columns: Mapping[str, Num[np.ndarray, "n"]], path: Path, bad
     if not {"x", "y", "z"} <= named.keys():
         there = ", ".join(map(ascii, list(columns)[:8])) or "none"
         raise ScanError(f"{path}, whose columns are {there[:120]}", "x, y and z among them", "rename its columns")
-    points_xyz_m = torch.stack([_floats(named[axis]) for axis in "xyz"], dim=1)
-    reflectance, ring, label = (_first(named, names) for names in (_REFLECTANCE, _RING, _LABEL))
+    points_xyz_m = torch.stack([floats(named[axis]) for axis in "xyz"], dim=1)
+    _refuse_lost_digits([named[axis] for axis in "xyz"], points_xyz_m, path)
+    ring, label = (_first(named, names) for names in (_RING, _LABEL))
     good = points_xyz_m.isfinite().all(dim=1) & (points_xyz_m != 0).any(dim=1)
     if ring is not None and _tells_rows(ring, points_xyz_m, good):
         ring = _whole(ring, good, _RING_AT_MOST, "ring", path)
@@ -58,14 +74,16 @@ def scan_of_columns(columns: Mapping[str, Num[np.ndarray, "n"]], path: Path, bad
         ring = _from_the_top(ring, points_xyz_m, good)
     else:
         ring = None
-    in_unit, full_scale = (None, 0) if reflectance is None else _to_unit(reflectance)
+    reflectance, full_scale, notes = choose_reflectance(named, good, are_named)
+    notes += _left_alone({*named, *map(_plain, others)})
     label = None if label is None else _whole(label, good, _LABEL_AT_MOST, "label", path)
-    return scan_of(points_xyz_m, in_unit, ring, str(path), bad_points, label, full_scale)
+    notes += notes_on_labels(label)
+    return scan_of(points_xyz_m, reflectance, ring, str(path), bad_points, label, full_scale, notes)
 
 
 def known_name(name: str) -> str:
     """Return the plain name of a column besides x, y and z that a scan has room for; "" if it has none."""
-    return _plain(name) if _plain(name) in (*_REFLECTANCE, *_RING, *_LABEL) else ""
+    return _plain(name) if _plain(name) in (*REFLECTANCE_NAMES, *_RING, *_LABEL) else ""
 
 
 def columns_of(scan: Scan) -> dict[str, np.ndarray]:
@@ -82,6 +100,14 @@ def columns_of(scan: Scan) -> dict[str, np.ndarray]:
             )
         columns[name] = values.numpy().astype(kind)
     return columns
+
+
+def plain_text(data: bytes) -> bytes:
+    """Return text in which whatever else programs print for a number that is none is ``nan``.
+
+    The runtime of Windows prints -nan(ind), 1.#QNAN or -1.#IND0000; Linux and macOS print nan(snan) at most.
+    """
+    return _NO_NUMBER.sub(b"nan", data) if b"(" in data or b"#" in data else data
 
 
 def check_lines(data: bytes, path: Path, wanted: str) -> None:
@@ -108,6 +134,7 @@ def text_rows(data: bytes, rows: int, names: list[str], path: Path, wanted: str)
     if 2 * rows * len(names) > len(data) + 1:  # a number takes a digit and a blank; room is made for all rows at once
         raise ScanError(f"{len(data)} bytes of text in {path}", promised, "download it again: the file was cut short")
     check_lines(data, path, promised)
+    data = plain_text(data)
     try:
         with warnings.catch_warnings(action="ignore"):  # of empty lines: what is missing is seen below
             table = np.loadtxt(BytesIO(data), np.float64, comments=None, max_rows=rows, ndmin=2, encoding="latin1")
@@ -131,28 +158,37 @@ def _plain(name: str) -> str:
     return name.lower().removeprefix("scalar_")
 
 
+def _refuse_lost_digits(exact: list[np.ndarray], points_xyz_m: Tensor, path: Path) -> None:
+    """Refuse coordinates that 32 bits do not keep, those of maps: every verb would move the points."""
+    if all(values.dtype.itemsize <= 4 for values in exact) or not len(points_xyz_m):
+        return
+    with np.errstate(over="ignore", invalid="ignore"):
+        kept = points_xyz_m.double().numpy()
+        lost_m = np.abs(np.stack(exact, axis=1).astype(np.float64) - kept).max(axis=1)
+    lost_m = lost_m[np.isfinite(lost_m)]
+    if not len(lost_m) or (typical_m := float(np.median(lost_m))) <= _LOST_AT_MOST_M:
+        return
+    far_km = float(np.median(np.linalg.norm(kept[np.isfinite(kept).all(axis=1)], axis=1))) / 1000
+    raise ScanError(
+        f"coordinates of a map in {path} ({far_km:,.0f} km from the origin), which would move by {typical_m:.3f} m in "
+        f"the median and {lost_m.max():.3f} m at most in the 32 bits that scans are kept in",
+        "those of a sensor, seen from its place",
+        "subtract the sensor's place from x, y and z",
+    )
+
+
+def _left_alone(named: Set[str]) -> tuple[str, ...]:
+    """Return a note on columns that are left alone although a scan lacks what they may be."""
+    missing = [name for name, names in (("intensity", REFLECTANCE_NAMES), ("ring", _RING)) if not named & {*names}]
+    alike = [name for name in sorted(named) if not known_name(name) and _ALIKE.search(name)]
+    if not missing or not alike:
+        return ()
+    what = f"{'a column' if len(alike) == 1 else 'columns'} {', '.join(map(ascii, alike[:3]))} left alone"
+    return (f"{what}; rename what is {' or '.join(missing)} to that",)
+
+
 def _first(named: Mapping[str, np.ndarray], names: tuple[str, ...]) -> np.ndarray | None:
     return next((named[name] for name in names if name in named), None)
-
-
-def _floats(values: np.ndarray) -> Tensor:
-    # A double beyond float32 becomes infinite, and is refused as such.
-    with np.errstate(over="ignore", invalid="ignore"):
-        return torch.from_numpy(values.astype(np.float32))
-
-
-def _to_unit(reflectance: np.ndarray) -> tuple[Tensor, int]:
-    """Return reflectance from 0 to 1, and its full scale if the largest value told that; 0 otherwise."""
-    values = _floats(reflectance)
-    if reflectance.dtype == np.uint8:
-        return values / 255, 0
-    highest = float(values.nan_to_num(0.0, torch.inf, 0.0).max()) if len(values) else 0.0
-    if highest <= 0:  # of any scale
-        return values, 0
-    if highest <= _ABOUT_1:
-        return values.clamp(max=1), 1
-    full_scale = next((scale for scale in _FULL_SCALES if highest <= scale), 1)
-    return values / full_scale, full_scale
 
 
 def _whole(values: np.ndarray, good: Tensor, at_most: int, what: str, path: Path) -> Tensor:

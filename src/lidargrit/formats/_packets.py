@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from io import BufferedReader
+from itertools import islice
 from pathlib import Path
 
 from lidargrit.errors import ScanError
@@ -19,6 +20,15 @@ _BLOCK_AT_MOST = 16 << 20  # bytes of a block of pcapng; libpcap takes no longer
 _LOOK = 48  # bytes of a packet in which its IP header begins, whatever it is wrapped in
 _UDP = b"\x11"  # the number of its protocol
 _UDP_HEADER = 8  # bytes
+_PACKETS_TO_LOOK_AT = 200
+_OUSTER = {7502, 7503}
+_PORTS = {
+    2368: "that of Velodyne and Hesai",
+    2369: "that of Velodyne and Hesai",
+    6699: "RoboSense's",
+    7788: "RoboSense's",
+}
+_PORTS |= {2370: "Hesai's", 56301: "Livox's", 57000: "Livox's", 57001: "Livox's"}
 _EMPTY = "take such packets out: tcpdump -r OLD.pcap -w NEW.pcap 'not udp[4:2] = 8'"
 
 
@@ -49,6 +59,36 @@ def check_packets(path: Path, wanted: str, cure: str) -> None:
             raise ScanError(f"{path}, a damaged file ({error})", wanted, cure) from None
         except OSError as error:
             raise ScanError(f"{path}, which cannot be read ({error.strerror})", wanted, "check the disk") from None
+
+
+def other_maker(path: Path) -> str:
+    """Return whose packets a recording holds, by the UDP ports in its beginning; "" if they may be an Ouster's.
+
+    Source:
+        The makers' manuals: factory settings of the port that a sensor sends its points to.
+    """
+    seen = set[int]()
+    try:
+        with path.open("rb") as file:
+            start = file.read(24)
+            packets = _packets_of_blocks(file) if start[:4] == PCAPNG else _packets_of_records(file, start)
+            for head, _ in islice(packets, _PACKETS_TO_LOOK_AT):
+                seen |= _udp_ports(head)
+    except (OSError, _DamagedError):
+        pass  # told when the recording is read
+    ports = sorted(_PORTS.keys() & seen)
+    return "" if seen & _OUSTER or not ports else f"UDP port {ports[0]} is {_PORTS[ports[0]]}"
+
+
+def _udp_ports(head: bytes) -> set[int]:
+    """Return the ports that the beginning of a packet of IP 4 or 6 is sent to, wherever its IP header begins."""
+    ports, found = set[int](), head.find(_UDP, 6, _LOOK)
+    while found >= 0:
+        starts = [found - 9 + 4 * (head[found - 9] & 15)] if found >= 9 and head[found - 9] >> 4 == 4 else []
+        starts += [found + 34] if head[found - 6] >> 4 == 6 else []
+        ports |= {int.from_bytes(head[at + 2 : at + 4]) for at in starts if at + 4 <= len(head)}
+        found = head.find(_UDP, found + 1, _LOOK)
+    return ports
 
 
 def _packets_of_records(file: BufferedReader, start: bytes) -> Iterator[tuple[bytes, int]]:

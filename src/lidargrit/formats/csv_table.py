@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from io import BytesIO
 from pathlib import Path
@@ -17,6 +18,7 @@ from lidargrit.formats._columns import (
     check_lines,
     columns_of,
     known_name,
+    plain_text,
     scan_of_columns,
 )
 from lidargrit.structures import Scan
@@ -60,6 +62,7 @@ class CsvTable(ScanFormat):
         body = data[data.find(b"\n") + 1 :] if b"\n" in data else b""
         check_lines(body, path, _FORMAT)
         _check_fields(body, len(names), separator, path)
+        body = _with_nan(plain_text(body), len(names), separator)
         try:
             with warnings.catch_warnings(action="ignore"):  # of a table without lines: said below
                 table = np.loadtxt(
@@ -77,7 +80,7 @@ class CsvTable(ScanFormat):
             raise ScanError(what, _FORMAT, "give every line a number in each column, with a decimal point") from None
         if not 1 <= len(table) <= POINTS_AT_MOST:
             raise ScanError(f"{len(table):,} lines in {path}", f"1 to {POINTS_AT_MOST:,}", "give one revolution a file")
-        return scan_of_columns(dict(zip(wanted, table.T, strict=True)), path, bad_points)
+        return scan_of_columns(dict(zip(wanted, table.T, strict=True)), path, bad_points, names)
 
     @classmethod
     def write(cls, path: Path, scan: Scan) -> None:
@@ -87,6 +90,16 @@ class CsvTable(ScanFormat):
         table = np.column_stack([of.astype(np.float64) for of in columns.values()])
         with atomic_path(path) as temporary:
             np.savetxt(temporary, table, form, ",", header=",".join(columns), comments="", encoding="ascii")
+
+
+def _with_nan(body: bytes, names: int, separator: str) -> bytes:
+    """Return lines in which empty cells between separators are ``nan``, as tables of pandas mean them."""
+    mark, lines = separator.encode(), body.count(b"\n") + 1
+    if separator == " " or body.count(mark) > (names + 1) * lines:  # lines of separators would become far longer
+        return body
+    blank = rb"[ \r]*"
+    first = re.sub(rb"(?m)^" + blank + rb"(?=" + mark + rb")", b"nan", body)
+    return re.sub(rb"(?<=" + mark + rb")" + blank + rb"(?=" + mark + rb"|\n|\Z)", b"nan", first)
 
 
 def _check_fields(body: bytes, at_most: int, separator: str, path: Path) -> None:

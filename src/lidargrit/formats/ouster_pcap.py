@@ -15,7 +15,7 @@ import torch
 from lidargrit.errors import ScanError
 from lidargrit.files import read_json
 from lidargrit.formats import BadPoints, ScanFormat, first_bytes, open_file, scan_of
-from lidargrit.formats._packets import PCAP, PCAPNG, check_packets
+from lidargrit.formats._packets import PCAP, PCAPNG, check_packets, other_maker
 from lidargrit.sensors import SensorModel, column_azimuths_rad, load_sensor
 from lidargrit.structures import Scan
 
@@ -182,6 +182,9 @@ def _metadata_of(path: Path) -> Path:
     metadata = path.with_suffix(".json")
     if metadata.is_file():
         return metadata
+    if (maker := other_maker(path)) and OusterPcap.recognises(path):
+        cure = "convert it by the maker's tool, or play it through its ROS driver and record the topic of point clouds"
+        raise ScanError(f"{path}, no recording of an Ouster ({maker})", _FORMAT, cure)
     others = sorted(one.name for one in path.parent.glob("*.json")) if path.parent.is_dir() else []
     cure = f"if it is {' or '.join(others[:3])}, give it that name" if others else _CURE
     raise ScanError(f"{path} without {metadata.name}", _FORMAT, cure)

@@ -93,23 +93,23 @@ class _Header:
     @classmethod
     def parse(cls, data: bytes, path: Path) -> _Header:
         words, end = _entries(data, path)
-        fields, types = words.get("FIELDS", words.get("COLUMNS", ())), words.get("TYPE", ())
+        fields, types = words.get("FIELDS", words.get("COLUMNS", ())), [one.upper() for one in words.get("TYPE", ())]
         sizes = tuple(map(whole_number, words.get("SIZE", ())))
         counts = tuple(map(whole_number, words["COUNT"])) if "COUNT" in words else (1,) * len(fields)
-        width, height = (whole_number("".join(words.get(key, ()))) for key in ("WIDTH", "HEIGHT"))
-        points = whole_number("".join(words["POINTS"])) if "POINTS" in words else width * height
+        points = _points(words, path)
         if not len(fields) == len(types) == len(sizes) == len(counts) > 0:
             raise _refused(f"{len(fields)} fields, {len(sizes)} sizes, {len(types)} types, {len(counts)} counts", path)
         if unknown := [(t, s) for t, s in zip(types, sizes, strict=True) if s not in _SIZES.get(t, ())]:
             raise _refused(f"a field of type {unknown[0][0][:10]!r} and size {unknown[0][1]}", path)
         row_bytes = sum(size * count for size, count in zip(sizes, counts, strict=True))
-        if min(counts) < 1 or row_bytes > _ROW_BYTES_AT_MOST:
+        if min(counts) < 0 or not 0 < row_bytes <= _ROW_BYTES_AT_MOST:
             raise _refused(f"counts from {min(counts)} to {max(counts)} values a point", path)
-        if not 0 < points <= POINTS_AT_MOST or min(width, height) < 0 or width * height != points:
-            raise _refused(f"{points} points in {width} columns and {height} rows", path)
         if row_bytes * points > BYTES_AT_MOST:
             raise _refused(f"{points} points of {row_bytes} bytes", path)
-        return cls(tuple(fields), sizes, tuple(types), counts, points, "".join(words["DATA"]).lower(), end)
+        # A field of no values takes no room: padding, as some programs write it.
+        kept = [row for row in zip(fields, sizes, types, counts, strict=True) if row[-1]]
+        fields, sizes, types, counts = (tuple(column) for column in zip(*kept, strict=True))
+        return cls(fields, sizes, types, counts, points, "".join(words["DATA"]).lower(), end)
 
     @property
     def row_bytes(self) -> int:
@@ -147,6 +147,19 @@ class _Header:
             "DATA": (self.data,),
         }
         return "".join(f"{key} {' '.join(map(str, values))}\n" for key, values in lines.items()).encode()
+
+
+def _points(words: dict[str, list[str]], path: Path) -> int:
+    """Return the number of points; PCL takes one row where no height is given, and some programs leave both at 0."""
+    width, height = (
+        whole_number("".join(words.get(key, default))) for key, default in (("WIDTH", ""), ("HEIGHT", "1"))
+    )
+    points = whole_number("".join(words["POINTS"])) if "POINTS" in words else width * height
+    if width == 0 or "WIDTH" not in words:
+        width, height = points, 1
+    if not 0 < points <= POINTS_AT_MOST or min(width, height) < 0 or width * height != points:
+        raise _refused(f"{points} points in {width} columns and {height} rows", path)
+    return points
 
 
 def _entries(data: bytes, path: Path) -> tuple[dict[str, list[str]], int]:

@@ -4,21 +4,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
-from lidargrit.errors import ScanError
+from lidargrit.errors import ScanError, first_words
 from lidargrit.files import atomic_path
 from lidargrit.formats import POINTS_AT_MOST, BadPoints, ScanFormat, first_bytes, read_bytes
 from lidargrit.formats._columns import (
     BYTES_AT_MOST,
     REFLECTANCE_RULE,
+    check_lines,
     columns_of,
+    plain_text,
     scan_of_columns,
     text_rows,
     whole_number,
 )
+from lidargrit.formats._ply_elements import Element, Property, binary_rows, text_columns
 from lidargrit.structures import Scan
 
 _FORMAT = "a PLY file whose vertices have x, y and z"
@@ -76,15 +78,12 @@ class Ply(ScanFormat):
         """Read the scan in a file."""
         data = read_bytes(path, BYTES_AT_MOST, _FORMAT)
         header = _Header.parse(data, path)
-        if header.byte_order:
-            row = np.dtype([(name, header.byte_order + kind) for name, kind in header.properties.items()])
-            first = header.end + header.bytes_before
-            if len(data) < first + header.points * row.itemsize:
-                raise _refused(f"{len(data)} bytes instead of {first + header.points * row.itemsize}", path)
-            vertices = np.frombuffer(data, row, header.points, first)
-            columns = {name: vertices[name] for name in header.properties}
-        else:
-            columns = text_rows(_below(data, header, path), header.points, list(header.properties), path, _FORMAT)
+        try:
+            columns = _binary(data, header) if header.byte_order else _text(data, header, path)
+        except ValueError as error:
+            if isinstance(error, ScanError):
+                raise
+            raise _refused(first_words(error), path) from None
         return scan_of_columns(columns, path, bad_points)
 
     @classmethod
@@ -104,23 +103,22 @@ class _Header:
 
     Args:
         byte_order: numpy's sign for the byte order; empty for text.
-        points: number of vertices.
-        properties: numpy type of each property, by its name.
-        rows_before: number of rows of the elements before the vertices.
-        bytes_before: size of the elements before the vertices, in bytes.
+        before: elements before the vertices.
+        vertices: element of the vertices.
         end: position of the first element in the file, in bytes.
+        line_end: byte that ends a line.
     """
 
     byte_order: str
-    points: int
-    properties: dict[str, str]
-    rows_before: int
-    bytes_before: int
+    before: list[Element]
+    vertices: Element
     end: int
+    line_end: bytes
 
     @classmethod
     def parse(cls, data: bytes, path: Path) -> _Header:
-        lines, end = _lines(data, path)
+        line_end = b"\r" if data[:4] == b"ply\r" and data[4:5] != b"\n" else b"\n"
+        lines, end = _lines(data, line_end, path)
         match lines[1:2]:
             case [["format", encoding, *_]] if encoding in _BYTE_ORDERS:
                 byte_order = _BYTE_ORDERS[encoding]
@@ -133,45 +131,46 @@ class _Header:
         before, vertices = elements[:index], elements[index]
         if not 0 < vertices.rows <= POINTS_AT_MOST:
             raise _refused(f"{vertices.rows} vertices", path)
-        rows_before = sum(element.rows for element in before)
-        if rows_before > POINTS_AT_MOST:
-            raise _refused(f"{rows_before} rows before its vertices", path)
-        for element in before:
-            if not 0 <= element.rows <= POINTS_AT_MOST or "list" in element.properties.values():
-                raise _refused(f"{element.rows} rows of {element.name[:20]!r} before its vertices", path)
-        row_bytes = [sum(np.dtype(kind).itemsize for kind in element.properties.values()) for element in before]
-        return cls(
-            byte_order,
-            vertices.rows,
-            vertices.properties,
-            rows_before,
-            sum(element.rows * size for element, size in zip(before, row_bytes, strict=True)),
-            end,
-        )
+        rows_before = [element.rows for element in before]
+        if min(rows_before, default=0) < 0 or sum(rows_before) > POINTS_AT_MOST:
+            raise _refused(f"{sum(rows_before)} rows before its vertices", path)
+        return cls(byte_order, before, vertices, end, line_end)
+
+
+def _binary(data: bytes, header: _Header) -> dict[str, np.ndarray]:
+    start = header.end
+    for element in header.before:
+        _, start = binary_rows(data, start, element, header.byte_order)
+    return binary_rows(data, start, header.vertices, header.byte_order)[0]
+
+
+def _text(data: bytes, header: _Header, path: Path) -> dict[str, np.ndarray]:
+    below = _below(data, header, path).replace(b"\r", b"\n")  # of two line ends the second is an empty line
+    vertices = header.vertices
+    if vertices.has_lists:
+        check_lines(below, path, _FORMAT)
+        return text_columns(plain_text(below), vertices)
+    names = [f"{at}" for at in range(len(vertices.properties))]
+    columns = text_rows(below, vertices.rows, names, path, _FORMAT)
+    return {name: columns[f"{at}"] for name, at in vertices.single().items()}
 
 
 def _below(data: bytes, header: _Header, path: Path) -> bytes:
     """Return the text below the rows of the elements before the vertices, without making lines of those."""
-    end = header.end
-    for row in range(header.rows_before):
-        end = data.find(b"\n", end) + 1
+    end, rows_before = header.end, sum(element.rows for element in header.before)
+    for row in range(rows_before):
+        end = data.find(header.line_end, end) + 1
         if not end:
-            raise _refused(f"{row} of the {header.rows_before} rows before its vertices", path)
+            raise _refused(f"{row} of the {rows_before} rows before its vertices", path)
     return data[end:]
 
 
-class _Element(NamedTuple):
-    name: str
-    rows: int
-    properties: dict[str, str]
-
-
-def _lines(data: bytes, path: Path) -> tuple[list[list[str]], int]:
+def _lines(data: bytes, line_end: bytes, path: Path) -> tuple[list[list[str]], int]:
     """Return the words of every line of the header, comments left out, and where the elements begin."""
     lines: list[list[str]] = []
     end = 0
     while lines[-1:] != [["end_header"]]:
-        start, end = end, data.find(b"\n", end, _HEADER_BYTES_AT_MOST) + 1
+        start, end = end, data.find(line_end, end, _HEADER_BYTES_AT_MOST) + 1
         words = data[start:end].decode("latin1").split()
         if not end or (start == 0 and words != ["ply"]):
             raise ScanError(f"{path}, which is no PLY file", _FORMAT, "convert the file, or download it again")
@@ -180,17 +179,19 @@ def _lines(data: bytes, path: Path) -> tuple[list[list[str]], int]:
     return lines[:-1], end
 
 
-def _elements(lines: list[list[str]], path: Path) -> list[_Element]:
-    """Return every element, with numpy's type of each of its properties, or "list" for a list of values."""
-    elements: list[_Element] = []
+def _elements(lines: list[list[str]], path: Path) -> list[Element]:
+    """Return every element with its properties."""
+    elements: list[Element] = []
     for line in lines:
         match line:
             case ["element", name, count]:
-                elements.append(_Element(name, whole_number(count), {}))
-            case ["property", kind, name] if elements and kind in _TYPES and name not in elements[-1].properties:
-                elements[-1].properties[name] = _TYPES[kind]
-            case ["property", "list", _, _, name] if elements and elements[-1].name != "vertex":
-                elements[-1].properties[name] = "list"
+                elements.append(Element(name, whole_number(count), []))
+            case ["property", kind, name] if elements and kind in _TYPES:
+                elements[-1].properties.append(Property(name, _TYPES[kind]))
+            case ["property", "list", count, kind, name] if (
+                elements and kind in _TYPES and _TYPES.get(count, "f")[0] != "f"
+            ):
+                elements[-1].properties.append(Property(name, _TYPES[kind], _TYPES[count]))
             case _:
                 raise _refused(f"{' '.join(line)[:60]!r} in its header", path)
         if elements and len(elements[-1].properties) > _PROPERTIES_AT_MOST:

@@ -26,6 +26,10 @@ _HEADER_BYTES = 26  # up to the size, the bits and the colours
 _BYTES_AT_MOST = 10_000_000  # the most columns fill 2 MB, if nothing in them can be packed
 _VALUES_PER_M = 500
 _TOP_DEG, _BOTTOM_DEG = 1.94, -25.0
+_TAKEN = (
+    f"taken as steps of {1000 // _VALUES_PER_M} mm and rows from {_TOP_DEG:+g} to {_BOTTOM_DEG:g} degrees; for other "
+    "steps or rows save ranges in metres as .npy, and name the sensor"
+)
 _FORMAT = "a 16-bit grey PNG of 64 rows: value / 500 = metres, 0 = no return"
 
 
@@ -61,7 +65,8 @@ class RangePng(ScanFormat):
         if not bool(range_m.any()):
             raise ScanError(f"no return in {path}", "a range in some pixel", "remove the file")
         image = RangeImage(range_m, range_m > 0, _rays(range_m.shape[1]))
-        return replace(unproject(image), source=str(path))
+        notes = () if range_m.shape[1] == _COLUMNS_WRITTEN else (_TAKEN,)  # which images of other programs may not mean
+        return replace(unproject(image), source=str(path), notes=notes)
 
     @classmethod
     def write(cls, path: Path, scan: Scan) -> None:

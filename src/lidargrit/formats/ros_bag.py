@@ -3,23 +3,30 @@
 from __future__ import annotations
 
 import functools
-import os
 import sqlite3
 import warnings
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection
 from contextlib import closing
+from dataclasses import replace
 from io import BytesIO
 from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol, runtime_checkable
 from urllib.parse import quote
 
-import numpy as np
-
-from lidargrit.errors import ScanError
-from lidargrit.formats import POINTS_AT_MOST, BadPoints, ScanFormat, damaged, first_bytes, open_file
+from lidargrit.errors import ScanError, printable
+from lidargrit.formats import BadPoints, ScanFormat, damaged, first_bytes, open_file
 from lidargrit.formats._columns import BYTES_AT_MOST, REFLECTANCE_RULE, scan_of_columns
+from lidargrit.formats._mcap import (
+    CHUNK_BYTES_AT_MOST,
+    Contents,
+    contents_by_index,
+    contents_by_records,
+    messages,
+    unpacked_lz4,
+)
+from lidargrit.formats._point_cloud2 import columns_of_cloud
 from lidargrit.structures import Scan
 
 _FORMAT = "a recording of ROS with messages sensor_msgs/PointCloud2"
@@ -27,15 +34,15 @@ _INSTALL = "pip install 'lidargrit[ros]'"
 _MAGIC = {".bag": b"#ROSBAG V2.0", ".mcap": b"\x89MCAP", ".db3": b"SQLite format 3\x00"}
 _TYPES = ("sensor_msgs/msg/PointCloud2", "sensor_msgs/PointCloud2")
 _MESSAGES_AT_MOST = 1_000_000  # a day at ten revolutions a second
-_CHUNK_BYTES_AT_MOST = 64_000_000  # as packed in the file: recorders write below 10 MB
 _SQLITE_STEPS_AT_MOST = 100_000_000  # of its machine, for one question: a second or two
-_NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # PointField's datatype
+_ZSTD = b"\x28\xb5\x2f\xfd"
 
 
 class RosBag(ScanFormat):
     """Recordings of ROS 1 (``.bag``) and ROS 2 (``.mcap``, ``.db3``): one scan for each message with a point cloud.
 
-    Of several topics with point clouds the one with the most messages counts, of equally many the first by name. A file
+    Of several topics with point clouds the one with the most messages counts, of equally many the first by name, unless
+    one is chosen (:meth:`of_topic`). A file
     needs no ``metadata.yaml`` beside it; each file of a split recording is read by itself.
 
     Source:
@@ -53,25 +60,33 @@ class RosBag(ScanFormat):
         """Return whether a file begins as a recording."""
         return first_bytes(path, 16).startswith(tuple(_MAGIC.values()))
 
-    @staticmethod
-    def count(path: Path) -> int:
-        """Count the point clouds of the topic."""
-        return len(_open(path).times)
+    @classmethod
+    def of_topic(cls, topic: str) -> type[RosBag]:
+        """Return the format of the clouds of one topic."""
+        methods = {"count": cls.count, "read": cls.read} if topic else {}
+        bound = {name: staticmethod(functools.partial(method, topic=topic)) for name, method in methods.items()}
+        return type(cls.__name__, (cls,), {**bound, "__module__": cls.__module__})
 
     @staticmethod
-    def read(path: Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
+    def count(path: Path, topic: str = "") -> int:
+        """Count the point clouds of the topic."""
+        return len(_open(path, topic).times)
+
+    @staticmethod
+    def read(path: Path, index: int = 0, bad_points: BadPoints = "refuse", topic: str = "") -> Scan:
         """Read one point cloud."""
-        recording = _open(path)
+        recording = _open(path, topic)
         if not 0 <= index < len(recording.times):
             what = f"scan number {index} of {path}"
             raise ScanError(what, f"one of its {len(recording.times)}, counted from 0", "take another")
         try:
-            columns = _columns(recording.message(index))
+            columns, notes = columns_of_cloud(recording.message(index))
         except ScanError:
             raise
         except Exception as error:  # the libraries meet damaged bytes with whatever they stumble over
             raise damaged(path, _FORMAT, error) from None
-        return scan_of_columns(columns, path.with_name(f"{path.name}#{index}"), bad_points)
+        scan = scan_of_columns(columns, path.with_name(f"{path.name}#{index}"), bad_points)
+        return replace(scan, notes=(*recording.notes, *notes, *scan.notes))
 
 
 @runtime_checkable
@@ -80,13 +95,15 @@ class _Recording(Protocol):
 
     times: list[int]
     """Time of each message, or another number that orders and finds them."""
+    notes: tuple[str, ...]
+    """Sentences on what is not read."""
 
     def message(self, index: int) -> Any:
         """Return one PointCloud2, by its number."""
         ...
 
 
-def _open(path: Path) -> _Recording:
+def _open(path: Path, topic: str) -> _Recording:
     with open_file(path, _FORMAT) as file:
         start = file.read(16)
     kind = next((kind for kind, magic in _MAGIC.items() if start.startswith(magic)), None)
@@ -95,7 +112,7 @@ def _open(path: Path) -> _Recording:
     try:
         status = path.stat()
         with warnings.catch_warnings(action="ignore"):  # of what a library will drop
-            recording = _opened(kind, path, (status.st_size, status.st_mtime_ns))
+            recording = _opened(kind, path, (status.st_size, status.st_mtime_ns), topic)
     except ImportError as error:
         raise ScanError(f"{path}, which takes {error.name or 'rosbags'} to read", "it installed", _INSTALL) from None
     except ScanError:
@@ -108,21 +125,44 @@ def _open(path: Path) -> _Recording:
 
 
 @functools.lru_cache(maxsize=4)
-def _opened(kind: str, path: Path, _version: tuple[int, int]) -> _Recording:
-    return {".bag": _Ros1, ".mcap": _Mcap, ".db3": _Sqlite}[kind](path)
+def _opened(kind: str, path: Path, _version: tuple[int, int], topic: str) -> _Recording:
+    return {".bag": _Ros1, ".mcap": _Mcap, ".db3": _Sqlite}[kind](path, topic)
 
 
-def _busiest(topics: Counter[str], path: Path) -> str:
-    """Return the topic with the most point clouds."""
+def _chosen(topics: Counter[str], path: Path, types: Collection[str], wanted: str) -> tuple[str, tuple[str, ...]]:
+    """Return the topic that is wanted or has the most point clouds, and a note on what was left alone.
+
+    Args:
+        topics: number of point clouds of each topic.
+        path: path of the recording.
+        types: types of all its messages.
+        wanted: topic that the user chose; "" for none.
+    """
     if not topics:
-        raise ScanError(
-            f"{path}, which has no topic of PointCloud2", _FORMAT, "record the lidar's topic, or leave it out"
-        )
-    return min(topics, key=lambda topic: (-topics[topic], topic))
+        what = f"{path}, which has no topic of PointCloud2 ({_named(types) or 'no message at all'})"
+        packets = any("packet" in each.lower() or "VelodyneScan" in each for each in types)
+        cure = "play it through the lidar's driver and record the topic of clouds" if packets else "record that topic"
+        raise ScanError(what, _FORMAT, cure)
+    if wanted and wanted not in topics:
+        there = ", ".join(printable(topic)[:80] for topic in sorted(topics)[:5])
+        raise ScanError(f"the topic {wanted!r} of {path}", f"one with point clouds: {there}", "name one of these")
+    taken, *others = sorted(topics, key=lambda topic: (-topics[topic], topic))
+    if wanted or not others:
+        taken = wanted or taken
+        return taken, ()
+    there = ", ".join(f"{printable(topic)[:80]} ({topics[topic]:,})" for topic in others[:3])
+    more = f" and {len(others) - 3} more" if len(others) > 3 else ""
+    cure = f"choose by {printable(path.name)}:{printable(others[0])[:80]}"
+    return taken, (f"topic {printable(taken)[:80]} taken ({topics[taken]:,} clouds), not {there}{more}; {cure}",)
+
+
+def _named(types: Collection[str]) -> str:
+    """Return the first few types of messages, for a message."""
+    return ", ".join(printable(each)[:60] for each in sorted(types)[:4]) + (", ..." if len(types) > 4 else "")
 
 
 class _Ros1:
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, topic: str) -> None:
         from rosbags.rosbag1 import Reader  # noqa: PLC0415  an optional part
 
         self._path, reader = path, Reader(path)
@@ -132,14 +172,14 @@ class _Ros1:
             if reader.bio is not None:
                 reader.bio.close()
         for chunk in reader.chunks.values():
-            if chunk.datasize > _CHUNK_BYTES_AT_MOST or chunk.decompressor.__module__ == "bz2":
+            if chunk.datasize > CHUNK_BYTES_AT_MOST or chunk.decompressor.__module__ == "bz2":
                 what = f"{path}, whose chunks are packed by bzip2 or larger than 64 MB"
                 raise ScanError(what, "chunks of lz4, or unpacked ones", "unpack it with: rosbag decompress")
         clouds = [each for each in reader.connections if each.msgtype in _TYPES]
         counts: Counter[str] = Counter()
         for each in clouds:
             counts[each.topic] += each.msgcount
-        topic = _busiest(counts, path)
+        topic, self.notes = _chosen(counts, path, {each.msgtype for each in reader.connections}, topic)
         if counts[topic] > _MESSAGES_AT_MOST:
             raise ValueError("more messages than a recording can have")
         entries = (entry for each in clouds if each.topic == topic for entry in reader.indexes[each.id])
@@ -158,7 +198,7 @@ class _Ros1:
             packed = file.read(chunk.datasize)
         # The library's own function would unpack whatever is there.
         is_packed = chunk.decompressor.__module__.startswith("lz4")
-        records = BytesIO(_unpacked_lz4(packed, BYTES_AT_MOST) if is_packed else packed)
+        records = BytesIO(unpacked_lz4(packed, BYTES_AT_MOST) if is_packed else packed)
         records.seek(entry.offset)
         kind, data = RecordType.CONNECTION, b""
         while kind == RecordType.CONNECTION:  # which may stand before the first message of each
@@ -169,110 +209,49 @@ class _Ros1:
         return _decoded(data, "ros1")
 
 
-def _unpacked_lz4(packed: bytes, at_most: int) -> bytes:
-    from lz4.frame import LZ4FrameDecompressor  # noqa: PLC0415  an optional part
-
-    opened = LZ4FrameDecompressor()
-    unpacked = opened.decompress(packed, max_length=at_most + 1)
-    if len(unpacked) > at_most or not opened.eof:
-        raise ValueError("a chunk that was cut off, or that unpacks to more than any recorder's")
-    return unpacked
-
-
 class _Mcap:
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, topic: str) -> None:
         self._path = path
         with path.open("rb") as file:
-            summary = _summary(file)
-            if summary is None or summary.statistics is None or not summary.chunk_indexes:
-                raise ValueError("no summary at its end: repair it with mcap recover")
-            for chunk in summary.chunk_indexes:
-                if chunk.uncompressed_size > BYTES_AT_MOST or chunk.chunk_length > _CHUNK_BYTES_AT_MOST:
-                    raise ValueError("a chunk larger than any recorder's")
-            types = {key: schema.name for key, schema in summary.schemas.items()}
-            counts = summary.statistics.channel_message_counts
-            clouds = [each for each in summary.channels.values() if types.get(each.schema_id) in _TYPES]
-            topics: Counter[str] = Counter()
-            for each in clouds:
-                topics[each.topic] += counts.get(each.id, 0)
-            topic = _busiest(topics, path)
-            if topics[topic] > _MESSAGES_AT_MOST:
-                raise ValueError("more messages than a recording can have")
-            self._encoding = next(each.message_encoding for each in clouds if each.topic == topic)
-            self._channels = {each.id for each in clouds if each.topic == topic}
-            self._chunks = sorted(summary.chunk_indexes, key=lambda chunk: chunk.chunk_start_offset)
-            found = islice(self._messages(file, self._chunks), _MESSAGES_AT_MOST + 1)
-            self.times = sorted(message.log_time for message in found)
+            there = contents_by_index(file)
+            if there is None or not self._take(file, there, topic):
+                there = contents_by_records(file, _TYPES)
+                self._take(file, there, topic)
+        if there.cut_at:
+            size, name = path.stat().st_size, path.name
+            lost = f"cut off or damaged from byte {there.cut_at:,} of {size:,} on; what lies behind is not read"
+            self.notes = (*self.notes, f"{lost}: mcap recover {name} -o whole_{name} may find more")
+
+    def _take(self, file: BinaryIO, there: Contents, wanted: str) -> bool:
+        """Take over the topic; return whether as many messages were found as there should be."""
+        clouds = [each for each in there.channels.values() if there.schemas.get(each.schema_id) in _TYPES]
+        topics: Counter[str] = Counter()
+        for each in clouds:
+            topics[each.topic] += there.counts[each.id]
+        if there.cut_at and not topics.total():
+            what = f"{self._path}, cut off or damaged at byte {there.cut_at:,}, before its first point cloud"
+            raise ScanError(what, _FORMAT, f"try: mcap recover {self._path.name} -o whole_{self._path.name}")
+        topic, self.notes = _chosen(topics, self._path, {*there.schemas.values()}, wanted)
+        if topics[topic] > _MESSAGES_AT_MOST:
+            raise ValueError("more messages than a recording can have")
+        self._encoding = next(each.message_encoding for each in clouds if each.topic == topic)
+        self._channels = {each.id for each in clouds if each.topic == topic}
+        self._places = there.places
+        found = islice(messages(file, self._places, self._channels), _MESSAGES_AT_MOST + 1)
+        self.times = sorted(message.log_time for message in found)
+        return len(self.times) == topics[topic]
 
     def message(self, index: int) -> Any:
         time, same = self.times[index], self.times[:index].count(self.times[index])
-        chunks = [each for each in self._chunks if each.message_start_time <= time <= each.message_end_time]
+        places = [each for each in self._places if each.first <= time <= each.last]
         with self._path.open("rb") as file:
-            found = (each.data for each in self._messages(file, chunks) if each.log_time == time)
+            found = (each.data for each in messages(file, places, self._channels) if each.log_time == time)
             raw = next(islice(found, same, None))
         return _decoded(raw, self._encoding)
 
-    def _messages(self, file: BinaryIO, chunks: list[Any]) -> Iterator[Any]:
-        """Read the topic's messages one by one: the library makes a list of all that a chunk says it has."""
-        from mcap.data_stream import ReadDataStream  # noqa: PLC0415  an optional part
-        from mcap.opcode import Opcode  # noqa: PLC0415
-        from mcap.records import Message  # noqa: PLC0415
-
-        for chunk in chunks:
-            if chunk.message_index_offsets and not self._channels & chunk.message_index_offsets.keys():
-                continue
-            unpacked = _unpacked_chunk(file, chunk)
-            stream = ReadDataStream(BytesIO(unpacked))
-            while stream.count < len(unpacked):
-                kind, length = stream.read1(), stream.read8()
-                if kind != Opcode.MESSAGE:
-                    stream.read(length)
-                elif (message := Message.read(stream, length)).channel_id in self._channels:
-                    yield message
-
-
-def _summary(file: BinaryIO) -> Any:
-    """Read the summary at a file's end; a chunk among its records, which the library would unpack, is refused."""
-    from mcap.reader import FOOTER_SIZE, SeekingReader  # noqa: PLC0415  an optional part
-    from mcap.records import Chunk, Footer  # noqa: PLC0415
-    from mcap.stream_reader import MAGIC_SIZE, StreamReader  # noqa: PLC0415
-
-    def records() -> Iterator[Any]:
-        return StreamReader(file, skip_magic=True, emit_chunks=True, record_size_limit=BYTES_AT_MOST).records
-
-    reader = SeekingReader(file, record_size_limit=BYTES_AT_MOST)
-    file.seek(-(FOOTER_SIZE + MAGIC_SIZE), os.SEEK_END)
-    footer = next(records())
-    if not isinstance(footer, Footer) or not footer.summary_start:
-        return None
-    file.seek(footer.summary_start)
-    if any(isinstance(each, Chunk) for each in records()):
-        raise ValueError("a chunk in its summary")
-    return reader.get_summary()
-
-
-def _unpacked_chunk(file: BinaryIO, index: Any) -> bytes:
-    """Read the records of a chunk, which must be of the size that the index says."""
-    import zstandard  # noqa: PLC0415  an optional part
-    from mcap.data_stream import ReadDataStream  # noqa: PLC0415
-    from mcap.records import Chunk  # noqa: PLC0415
-
-    file.seek(index.chunk_start_offset)
-    stream = ReadDataStream(BytesIO(file.read(index.chunk_length)))
-    stream.read(9)  # kind and length of the record
-    chunk, size = Chunk.read(stream), index.uncompressed_size
-    unpacked = chunk.data
-    if chunk.compression == "lz4":
-        unpacked = _unpacked_lz4(chunk.data, size)
-    elif chunk.compression == "zstd" and zstandard.frame_content_size(chunk.data) <= size:
-        unpacked = zstandard.decompress(chunk.data, size)  # at most that, where the frame does not say
-    if not len(unpacked) == size == chunk.uncompressed_size:
-        raise ValueError("a chunk that is not of the size that the index says")
-    return unpacked
-
 
 class _Sqlite:
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, topic: str) -> None:
         self._path = path
         log = path.with_name(f"{path.name}-wal")
         if log.is_file() and log.stat().st_size:
@@ -284,15 +263,17 @@ class _Sqlite:
             for table in ("topics", "messages"):  # and no view or virtual table, which could be anything
                 if not str(kinds.get(table, "")).upper().startswith("CREATE TABLE"):
                     raise ValueError(f"no table {table}")
-            numbers = {}
+            numbers, types = dict[str, int](), set[str]()
             for number, name, kind in database.execute("SELECT id, name, type FROM topics LIMIT 10000"):
+                types.add(str(kind))
                 if kind in _TYPES:
                     numbers[str(name)] = int(number)
                     (count,) = database.execute(
                         "SELECT COUNT(*) FROM messages WHERE topic_id = ?", (number,)
                     ).fetchone()
                     topics[str(name)] = count
-            number = numbers[_busiest(topics, path)]
+            topic, self.notes = _chosen(topics, path, types, topic)
+            number = numbers[topic]
             query = "SELECT rowid FROM messages WHERE topic_id = ? ORDER BY timestamp, rowid LIMIT ?"
             self.times = [row for (row,) in database.execute(query, (number, _MESSAGES_AT_MOST + 1))]
 
@@ -315,7 +296,19 @@ def _decoded(raw: bytes, encoding: str) -> Any:
         return _types("ROS1_NOETIC").deserialize_ros1(raw, _TYPES[0])
     if encoding != "cdr":
         raise ValueError(f"messages in {encoding[:20]}, not in cdr")
+    if raw.startswith(_ZSTD):  # rosbag2 can compress message by message; none in cdr begins so
+        raw = _unpacked_zstd(raw)
     return _types("ROS2_FOXY").deserialize_cdr(raw, _TYPES[0])
+
+
+def _unpacked_zstd(packed: bytes) -> bytes:
+    from zstandard import ZstdDecompressor  # noqa: PLC0415  an optional part
+
+    with ZstdDecompressor(max_window_size=BYTES_AT_MOST).stream_reader(packed) as stream:
+        unpacked = stream.read(BYTES_AT_MOST + 1)
+    if len(unpacked) > BYTES_AT_MOST:
+        raise ValueError("a message that unpacks to more than any point cloud")
+    return unpacked
 
 
 @functools.cache  # which takes longer to make than a scan to read
@@ -323,24 +316,3 @@ def _types(release: str) -> Any:
     from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415  an optional part
 
     return get_typestore(Stores[release])
-
-
-def _columns(cloud: Any) -> dict[str, np.ndarray]:
-    """Return the named columns of a PointCloud2; one of several numbers a point is left alone."""
-    order = ">" if cloud.is_bigendian else "<"
-    fields = [each for each in cloud.fields if each.count <= 1 and each.datatype in _NUMBERS]
-    kind = np.dtype(
-        {
-            "names": [each.name for each in fields],
-            "formats": [order + _NUMBERS[each.datatype] for each in fields],
-            "offsets": [each.offset for each in fields],
-            "itemsize": cloud.point_step,
-        }
-    )
-    data = np.ascontiguousarray(cloud.data, dtype=np.uint8)
-    width, height, row = int(cloud.width), int(cloud.height), int(cloud.row_step)
-    if width * height > POINTS_AT_MOST or width * cloud.point_step > row or row * height > len(data):
-        raise ValueError(f"{width}x{height} points in {len(data)} bytes")
-    rows = data[: row * height].reshape(height, row)[:, : width * cloud.point_step]
-    points = np.ascontiguousarray(rows).view(kind).reshape(-1)
-    return {each.name: points[each.name] for each in fields}

@@ -10,6 +10,7 @@ from lidargrit.errors import ScanError
 from lidargrit.loading.config import DataConfig
 from lidargrit.projection import doubts_about_rays, projection_that_fits
 from lidargrit.projection.fit import told_doubt
+from lidargrit.projection.revolutions import told_revolutions
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel
 from lidargrit.structures import Scan
@@ -24,8 +25,10 @@ class Imaging:
     Args:
         sensor: sensor of the images, with the projection that fits the scans.
         config: settings of the projection, with the variant that fits the scans.
-        notes: sentences on what was chosen in place of what the sensor and the settings say.
-        doubts: sentences that tell why another sensor than this one may have made the scans.
+        notes: sentences on what was chosen in place of what the sensor and the settings say, and on what was
+            left out of the files.
+        doubts: sentences that tell why another sensor than this one may have made the scans, or more than one
+            revolution lies in each.
     """
 
     sensor: SensorModel
@@ -54,15 +57,17 @@ def choose_imaging(source: str, dataset: ScanDataset, sensor: SensorModel, confi
     if config.projection != "sensor":
         sensor = replace(sensor, projection=config.projection)
     probes = _probes(dataset, sensor)
-    notes: list[str] = []
+    told = dict.fromkeys((*dataset.notes, *(note for scan in probes for note in scan.notes)))
+    notes = [f"{source}: {note}" for note in told]
     fitting = {projection_that_fits(scan, sensor) for scan in probes} if config.projection == "sensor" else set()
     if fitting - {sensor.projection}:
         sensor, config = replace(sensor, projection="spherical"), replace(config, projection_variant="exact")
         notes.append(f"{source}: points that are not in firing order, so rows go by elevation (projection=spherical)")
     doubts_of_scans = (doubts_about_rays(scan, sensor, sensor.projection) for scan in probes)
     doubt = next((each for each in doubts_of_scans if each), "")
-    told = told_doubt(source, sensor, doubt)
-    return Imaging(sensor, config, tuple(notes), (told,) if told else ())
+    turns = next((told for scan in probes if (told := told_revolutions(scan))), "")
+    told = (told_doubt(source, sensor, doubt), turns)
+    return Imaging(sensor, config, tuple(notes), tuple(filter(None, told)))
 
 
 def _probes(dataset: ScanDataset, sensor: SensorModel) -> list[Scan]:

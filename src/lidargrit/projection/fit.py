@@ -11,6 +11,7 @@ from torch import Tensor
 from lidargrit import _discovery
 from lidargrit.errors import ScanError
 from lidargrit.projection import spherical, unfolding
+from lidargrit.projection.frame import far_away
 from lidargrit.projection.pixel_coordinates import (
     PixelCoordinates,
     ProjectionVariant,
@@ -69,7 +70,9 @@ def fit_problems(
     rows = _misplaced(scan, sensor, method, pixels, variant)
     if variant == "exact":
         rows = _wrong_rows(scan, sensor, method, pixels) or rows
-    for check in (None if partial or variant != "exact" else _part_of_a_circle(scan), rows):
+    far = far_away(scan) if variant == "exact" else None
+    yield from [far] if far else []
+    for check in (None if partial or far or variant != "exact" else _part_of_a_circle(scan), rows):
         if check is not None:
             yield check
 

@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int8, Int64
 
+from lidargrit.errors import one_line
 from lidargrit.projection.fit import fit_problems, ring_count
 from lidargrit.projection.pixel_coordinates import PixelCoordinates, ProjectionVariant, pixel_coordinates, within_limits
+from lidargrit.projection.revolutions import told_revolutions
 from lidargrit.sensors import ProjectionName, SensorModel
 from lidargrit.structures import Scan
 
@@ -53,7 +55,7 @@ class Inspection:
             distance; and its parts ``across`` (azimuth) and ``up`` (elevation), as arcs in metres and in degrees.
             Empty if no point is kept.
         rings: number of rings of the scan, for ``unfolding`` only.
-        problems: reasons for which :func:`project` would refuse the scan; empty if it would not.
+        problems: reasons for which :func:`project` would refuse the scan, and signs of several revolutions.
     """
 
     scan: Scan
@@ -92,6 +94,7 @@ def inspect(
     method = method or sensor.projection
     pixels = pixel_coordinates(scan, sensor, method, variant)
     problems = [str(problem) for problem in fit_problems(scan, sensor, method, pixels, variant=variant)]
+    problems += filter(None, [told_revolutions(scan)])
     fate, wanted = _fates(pixels, sensor, variant)
     kept = np.flatnonzero(fate == _KEPT)
     if not len(kept):
@@ -119,6 +122,7 @@ def as_json(inspection: Inspection) -> dict[str, Any]:
     filled = inspection.filled()
     return {
         "scan": inspection.scan.source,
+        "notes": list(inspection.scan.notes),
         "sensor": inspection.sensor.name,
         "image": list(filled.shape),
         "projection": inspection.method,
@@ -139,7 +143,8 @@ def as_table(inspection: Inspection) -> str:
 
 def _lines(inspection: Inspection) -> Iterator[str]:
     sensor, filled, total = inspection.sensor, inspection.filled(), len(inspection.scan)
-    yield inspection.scan.source
+    yield one_line(inspection.scan.source)  # a file's name may hold anything
+    yield from (f"note: {one_line(note)}" for note in inspection.scan.notes)
     stride = f", one in {sensor.column_stride} of its columns" if sensor.column_stride > 1 else ""
     yield f"{inspection.method}, {inspection.variant}, to {sensor.height}x{sensor.width} of {sensor.name}{stride}"
     yield from (f"problem: {problem}" for problem in inspection.problems)

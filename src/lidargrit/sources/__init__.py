@@ -49,7 +49,9 @@ class DatasetSource(Source):
     def __init__(self, text: str, bad_points: BadPoints = "refuse") -> None:
         super().__init__(text)
         self._dataset = open_dataset(text, bad_points)
-        self.data_set, self.split = self._dataset.public_name(), self._dataset.split
+        is_of_others = self._dataset.origin_of(self._dataset.root) == "folder"
+        self.data_set = "folder" if is_of_others else self._dataset.public_name()
+        self.split = self._dataset.split
         self._imaged_by = ""
 
     @property

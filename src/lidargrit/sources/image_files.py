@@ -22,6 +22,7 @@ from lidargrit.untrusted import user_path
 
 PROBABILITY = ".probability.npy"  # how files end that tell the share of returns, and are no scans
 _IMAGE = "a range image: an .npy of (H, W) ranges in metres"
+_WITHIN_AT_LEAST = 0.5  # of the pixels with a return: real images have nearly all, those in another unit next to none
 _POINT_COLUMNS_AT_MOST = 5  # x, y, z, reflectance, ring: what is wider is an image
 
 
@@ -78,7 +79,7 @@ def image_files(path: Path) -> list[Path]:
         ScanError: the first of them is a mask.
     """
     try:
-        found = [path] if path.is_file() else sorted(path.iterdir(), key=natural_order)
+        found = [path] if path.is_file() else natural_order(path.iterdir())
     except (OSError, ValueError):
         return []
     found = [one for one in found if one.is_file() and not one.name.startswith(".") and formats.candidates(one)]
@@ -92,6 +93,8 @@ def image_files(path: Path) -> list[Path]:
     except LidarGritError:  # told where the file is read as the points of a scan
         return []
     if array.ndim != 2 or array.shape[1] <= _POINT_COLUMNS_AT_MOST:
+        return []
+    if array.shape[0] <= _POINT_COLUMNS_AT_MOST and (array < 0).any():  # points by column, told as such elsewhere
         return []
     if others:
         what = f"{path}, with range images and {others[0].name}"
@@ -128,8 +131,12 @@ class _ImageFiles:
         with np.errstate(over="ignore"):  # infinite, and so out of the sensor's limits
             range_m = range_m.astype(np.float32)
         within = (range_m >= sensor.range_min_m) & (range_m <= sensor.range_max_m)
-        if not within.any():
-            raise ScanError(f"no range within the sensor's limits in {path}", "ranges in metres", "check the unit")
+        inside, returns = int(within.sum()), int((range_m > 0).sum())
+        if inside < _WITHIN_AT_LEAST * returns or not inside:  # a stray pixel within them shows no unit
+            what = f"{inside or 'no'} of {returns:,} ranges within the sensor's limits in {path}"
+            raise ScanError(
+                what, f"ranges in metres, {sensor.range_min_m:g} to {sensor.range_max_m:g}", "check the unit"
+            )
         return Pixels(np.where(within, range_m, np.float32(0)))
 
 

@@ -22,6 +22,9 @@ from lidargrit.structures import RangeImage, Scan
 class NamedScans(ABC):
     """Scans of a source, evenly spaced where fewer than all are wanted."""
 
+    notes: tuple[str, ...] = ()
+    """Sentences on files that were left out."""
+
     @abstractmethod
     def __len__(self) -> int: ...
 
@@ -63,6 +66,7 @@ class PointScans(NamedScans):
     """
 
     def __init__(self, dataset: ScanDataset, max_scans: int) -> None:
+        self.notes = dataset.notes
         self._dataset, self._indices = dataset, evenly_spaced(max_scans or len(dataset), len(dataset))
 
     def __len__(self) -> int:

@@ -6,6 +6,8 @@ it. The colours are ours: what moves is warm, what stands is grey or brown, and 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 Colour = tuple[int, int, int]
 
 _CAR, _CYCLE, _LARGE, _PERSON = (74, 144, 226), (38, 183, 190), (118, 106, 232), (232, 64, 64)
@@ -51,6 +53,15 @@ CLASSES: dict[int, tuple[str, Colour]] = {
 }
 
 
-def name_and_colour(number: int) -> tuple[str, Colour]:
-    """Return the name of a class, and its colour in red, green and blue."""
-    return CLASSES.get(number, (f"class {number}", _OBJECT))
+_UNNAMED = (_CAR, _BUILDING, _PLANT, _PERSON, _ROAD, _CYCLE, _TERRAIN, _TRUNK, _LARGE, _POLE)
+
+
+def names_and_colours(numbers: Sequence[int]) -> list[tuple[int, str, Colour]]:
+    """Return each number with the name of its class, and its colour in red, green and blue.
+
+    Numbers that are not all SemanticKITTI's are of another list, in which those that it has mean something else: none
+    of them gets a name.
+    """
+    if all(number in CLASSES for number in numbers):
+        return [(number, *CLASSES[number]) for number in numbers]
+    return [(number, f"class {number}", _UNNAMED[at % len(_UNNAMED)]) for at, number in enumerate(numbers)]

@@ -23,7 +23,7 @@ from lidargrit.errors import ConfigError
 from lidargrit.files import write_text
 from lidargrit.projection import points_of_pixels
 from lidargrit.viewer._page import document
-from lidargrit.viewer.classes import name_and_colour
+from lidargrit.viewer.classes import names_and_colours
 from lidargrit.viewer.scan_sets import SURPRISED_BITS, ScanSet
 
 PAGE_SCANS_AT_MOST = 100  # of each source: about 15 MB of a KITTI-360 size image, which browsers still open at once
@@ -153,7 +153,7 @@ def _source(scan_set: ScanSet) -> dict[str, Any]:
     numbers = [] if label is None else label[images.return_mask].unique().tolist()
     if len(numbers) > _CLASSES_AT_MOST:
         raise ConfigError(f"{len(numbers)} classes of labels", f"at most {_CLASSES_AT_MOST}", "show fewer scans")
-    named = [(number, *name_and_colour(number)) for number in numbers]
+    named = names_and_colours(numbers)
     scans: list[dict[str, Any]] = []
     for index, name in enumerate(scan_set.scan_names):
         scan = {"name": name, "range": _packed(steps[index].numpy().astype("<u2"))}

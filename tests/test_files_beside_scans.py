@@ -1,0 +1,138 @@
+"""Files beside scans, and files of other programs: pictures are no scans, and what is not read is told."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from lidargrit.cli import main
+from lidargrit.datasets import open_dataset
+from lidargrit.errors import DataError, ScanError
+from lidargrit.formats import cure_of_ending, read_scan
+from street_corner import corner, xyz_of
+
+TABLE = corner()
+
+
+def write_bin(path):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rows = np.c_[xyz_of(TABLE).numpy(), TABLE["intensity"] / 255].astype("<f4")
+    path.write_bytes(rows.tobytes())
+
+
+def picture(path):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.full((48, 64, 3), 128, np.uint8)).save(path)
+
+
+def test_pictures_poses_and_labels_beside_scans_are_none(tmp_path, capsys):
+    write_bin(tmp_path / "scans/b.bin")
+    picture(tmp_path / "scans/a.png")
+    (tmp_path / "scans/poses.csv").write_text("time,tx,ty,tz\n0,1,2,3\n")
+    np.save(tmp_path / "scans/labels.npy", np.zeros(len(TABLE["x"]), np.uint32))
+    found = open_dataset(str(tmp_path / "scans"))
+    assert [found.name(index) for index in range(len(found))] == ["b"]
+    assert found.notes[0].startswith("3 files .csv, .npy, .png beside the scans left out, such as ")
+    more = ["--sensor", "vlp16", "--columns", "90"]
+    for words in (
+        ["prepare", str(tmp_path / "scans"), "-o", str(tmp_path / "p")],
+        ["inspect", str(tmp_path / "scans")],
+    ):
+        assert main([*words, *more]) == 0
+        output = capsys.readouterr()
+        assert "3 files .csv, .npy, .png beside the scans left out" in output.out + output.err
+
+
+def test_pictures_alone_are_refused_as_such(tmp_path):
+    picture(tmp_path / "a.png")
+    with pytest.raises(ScanError, match="48 rows and 64 columns"):
+        open_dataset(str(tmp_path)).scan(0)
+
+
+def test_a_sequence_given_itself_has_its_scans_alone(tmp_path):
+    for at in range(2):
+        write_bin(tmp_path / f"00/velodyne/{at:06d}.bin")
+        picture(tmp_path / f"00/image_2/{at:06d}.png")
+        (tmp_path / "00/voxels").mkdir(exist_ok=True)
+        (tmp_path / f"00/voxels/{at:06d}.bin").write_bytes(bytes(4096))
+    found = open_dataset(f"folder:{tmp_path}/00")
+    assert [found.name(index) for index in range(len(found))] == ["velodyne/000000", "velodyne/000001"]
+    assert "4 files .bin, .png beside the scans left out" in found.notes[0]
+
+
+def test_range_images_beside_scans_stay_scans(tmp_path):
+    write_bin(tmp_path / "a.bin")
+    Image.fromarray(np.full((64, 90), 500, np.uint16)).save(tmp_path / "b.png")
+    np.save(tmp_path / "c.npy", xyz_of(TABLE).numpy())
+    found = open_dataset(str(tmp_path))
+    assert len(found) == 3
+    assert found.notes == ()
+
+
+CURES = {
+    "a.txt": "put a line of names such as x y z intensity first, and end its name in .csv",
+    "a.xyz": "put a line of names such as x y z intensity first, and end its name in .csv",
+    "a.laz": "unpack it to .las",
+    "a.bin.gz": "unpack it first",
+    "a.mcap.zstd": "unpack it with: zstd -d",
+    "a.e57": "convert it to .pcd or .ply",
+    "a.bag.active": "rosbag reindex",
+}
+
+
+@pytest.mark.parametrize("name", CURES)
+def test_scans_of_other_endings_are_named_with_a_cure(tmp_path, name):
+    (tmp_path / "drive").mkdir()
+    np.savetxt(tmp_path / "drive" / name, xyz_of(TABLE).numpy())
+    ending = name[1:]
+    with pytest.raises(DataError, match=rf"no scan that we read but 1 file \{ending}; .*{CURES[name]}"):
+        open_dataset(str(tmp_path))
+    with pytest.raises(ScanError, match=f"whose ending we do not know.*{CURES[name]}"):
+        read_scan(tmp_path / "drive" / name)
+    write_bin(tmp_path / "drive" / "b.bin")
+    assert open_dataset(str(tmp_path)).notes == (
+        f"1 file {ending} beside 1 that are read left out; {cure_of_ending(Path(name))}",
+    )
+
+
+def test_the_cure_for_text_works(tmp_path):
+    np.savetxt(tmp_path / "a.csv", xyz_of(TABLE).numpy(), header="x y z", comments="")
+    assert len(read_scan(tmp_path / "a.csv")) == len(TABLE["x"])
+
+
+def packets(port):
+    payload = b"\xff\xee" + bytes(1204)
+    ip = b"\x45\0" + struct.pack(">H", 28 + len(payload)) + bytes(5) + b"\x11\0\0" + bytes(8)
+    packet = bytes(12) + b"\x08\0" + ip + struct.pack(">HHHH", port, port, 8 + len(payload), 0) + payload
+    record = struct.pack("<IIII", 1, 0, len(packet), len(packet)) + packet
+    return b"\xd4\xc3\xb2\xa1" + struct.pack("<HHiIII", 2, 4, 0, 0, 65535, 1) + 5 * record
+
+
+@pytest.mark.parametrize(("port", "maker"), [(2368, "Velodyne and Hesai"), (6699, "RoboSense's")])
+@pytest.mark.parametrize("with_json", [False, True])
+def test_packets_of_other_makers_are_told(tmp_path, port, maker, with_json):
+    (tmp_path / "a.pcap").write_bytes(packets(port))
+    if with_json:
+        (tmp_path / "my_sensor.json").write_text("{}")
+    with pytest.raises(
+        ScanError, match=f"no recording of an Ouster .UDP port {port} is .*{maker}.; .*convert it by the"
+    ):
+        read_scan(tmp_path / "a.pcap")
+
+
+def test_packets_of_an_ouster_lack_its_metadata(tmp_path):
+    (tmp_path / "a.pcap").write_bytes(packets(7502))
+    with pytest.raises(ScanError, match=r"without a\.json"):
+        read_scan(tmp_path / "a.pcap")
+
+
+def test_a_link_in_place_of_a_file_is_not_taken_as_written(tmp_path, capsys):
+    write_bin(tmp_path / "a.bin")
+    words = ["export", str(tmp_path / "a.bin"), str(tmp_path / "out"), "--format", "pcd"]
+    assert main(words) == 0
+    (tmp_path / "out" / "a.pcd").unlink()
+    (tmp_path / "out" / "a.pcd").symlink_to(tmp_path / "a.bin")
+    assert main(words) == 2
+    assert "a.pcd, which is a link; wanted a file of this command, or none; remove the link" in capsys.readouterr().err

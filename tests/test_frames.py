@@ -1,0 +1,62 @@
+"""Points that are not in their sensor's frame: coordinates of a map, other units, a car's frame."""
+
+import numpy as np
+import pytest
+import torch
+
+from lidargrit.cli import main
+from lidargrit.errors import ScanError
+from lidargrit.fitting import fit_sensor
+from lidargrit.formats import read_scan
+from lidargrit.projection import project
+from lidargrit.projection.inspection import inspect
+from lidargrit.sensors import load_sensor
+from lidargrit.structures import Scan
+from street_corner import COLUMNS, corner, pcd_bytes, rows_of, xyz_of
+
+UTM_M = np.array([458_000.123, 5_427_000.456, 112.5])  # a place in UTM zone 32N, made up
+VLP16 = load_sensor("vlp16").with_columns(COLUMNS)
+OF_A_MAP = r"coordinates of a map in .* \(5,446 km from the origin\); .*subtract the sensor's place from x, y and z"
+
+
+def test_coordinates_of_a_map_are_told():
+    scan = Scan((xyz_of(corner()).double() + torch.from_numpy(UTM_M)).float())
+    for use in (lambda: project(scan, VLP16), lambda: fit_sensor([scan])):
+        with pytest.raises(ScanError, match=OF_A_MAP):
+            use()
+    assert "coordinates of a map" in inspect(scan, VLP16).problems[0]
+
+
+@pytest.mark.parametrize("verb", ["inspect", "export"])
+def test_coordinates_that_32_bits_would_move_are_refused(tmp_path, verb, capsys):
+    points = xyz_of(corner()).double().numpy() + UTM_M
+    (tmp_path / "a.pcd").write_bytes(pcd_bytes(rows_of(dict(zip("xyz", points.T, strict=True)))))
+    more = [str(tmp_path / "out"), "--format", "ply"] if verb == "export" else []
+    assert main([verb, str(tmp_path / "a.pcd"), *more]) == 2
+    told = capsys.readouterr().err
+    assert "coordinates of a map in " in told
+    lost_m = np.abs(points - points.astype(np.float32)).max(axis=1)
+    moved = f"move by {np.median(lost_m):.3f} m in the median and {lost_m.max():.3f} m at most in the 32 bits"
+    assert moved in told
+    assert lost_m.max() > 0.2
+    assert "subtract the sensor's place from x, y and z" in told
+
+
+def test_doubles_near_the_sensor_are_read(tmp_path):
+    points = xyz_of(corner()).double().numpy() + np.array([0, 0, 0.000_123])
+    points[0] = 1e7  # one stray point shows no map
+    (tmp_path / "a.pcd").write_bytes(pcd_bytes(rows_of(dict(zip("xyz", points.T, strict=True)))))
+    assert np.allclose(read_scan(tmp_path / "a.pcd").points_xyz_m.numpy(), points, atol=1e-3)
+
+
+@pytest.mark.parametrize("factor", [100, 1000])
+def test_other_units_are_told(factor):
+    scan = Scan(xyz_of(corner()) * factor)
+    for use in (lambda: project(scan, VLP16), lambda: fit_sensor([scan])):
+        with pytest.raises(ScanError, match=r"points at .* m in the median in a scan; wanted metres; check the unit"):
+            use()
+
+
+def test_points_in_the_sensors_frame_are_not_doubted():
+    scan = Scan(xyz_of(corner()) * 10)
+    assert torch.isfinite(project(scan, VLP16).range_m).all()
