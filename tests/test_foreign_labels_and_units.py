@@ -7,7 +7,7 @@ import torch
 from lidargrit.cli import main
 from lidargrit.core.errors import ScanError
 from lidargrit.data.formats import read_scan
-from lidargrit.data.formats._labels import SEMANTIC_KITTI
+from lidargrit.data.formats.shared.labels import SEMANTIC_KITTI
 from lidargrit.data.sources import open_source
 from lidargrit.scans.classes import CLASSES, names_and_colours
 from lidargrit.scans.sensors import load_sensor

@@ -49,7 +49,8 @@ def upright_objects(images: RangeImage) -> Int[np.ndarray, "B H W"]:
     upright = np.isin(images.label.cpu().numpy(), (_TRUNK, _POLE)) & images.return_mask.cpu().numpy()
     numbers = np.zeros(upright.shape, np.int64)
     for mask, numbered in zip(upright, numbers, strict=True):
-        components, _ = ndimage.label(mask, _TOUCHING)
+        components = np.zeros(mask.shape, np.int64)
+        ndimage.label(mask, _TOUCHING, components)
         count = 0
         for index, box in enumerate(ndimage.find_objects(components), 1):
             found = components[box] == index

@@ -20,6 +20,7 @@ from matplotlib import colormaps
 
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.files import write_text
+from lidargrit.core.version import __version__
 from lidargrit.scans.classes import names_and_colours
 from lidargrit.scans.projection import points_of_pixels
 from lidargrit.viewer._page import document

@@ -5,14 +5,14 @@ from __future__ import annotations
 import re
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import ClassVar
 
 from lidargrit.core import discovery
-from lidargrit.core.errors import DataError, ScanError, printable
+from lidargrit.core.errors import DataError, printable
 from lidargrit.core.untrusted import user_path
 from lidargrit.data import formats
 from lidargrit.data.formats import BadPoints
@@ -20,7 +20,6 @@ from lidargrit.scans.types import Scan
 
 _FILES_TO_LOOK_AT = 10_000  # of a folder without any scan that is read
 _PACKED = {".gz", ".bz2", ".xz", ".zst", ".zstd", ".zip", ".active"}
-_TOLD_AT_MOST = 5  # scans that are left out
 _SHARE = re.compile(r"\[[^\]/]*\]$")
 
 
@@ -211,34 +210,6 @@ def files_of_others(root: Path) -> tuple[str, str] | None:
     most = counted.most_common(3)
     found = ", ".join(f"{count:,} {'file' if count == 1 else 'files'} {ending}" for ending, count in most)
     return found, cures[most[0][0]]
-
-
-def usable_scans(dataset: ScanDataset, indices: Iterable[int], at_most: int = 0) -> tuple[list[Scan], tuple[str, ...]]:
-    """Read some scans without those that cannot be used, and say which these are.
-
-    Args:
-        dataset: scans.
-        indices: numbers of the wanted scans, in order.
-        at_most: number of usable scans after which no further one is read; 0 for all.
-
-    Raises:
-        ScanError: none of them can be used; says what is wrong with the last.
-    """
-    scans, skipped = list[Scan](), list[str]()
-    error = None
-    for index in indices:
-        if at_most and len(scans) == at_most:
-            break
-        try:
-            scans.append(dataset.scan(index))
-        except ScanError as wrong:
-            error = wrong
-            skipped.append(f"left out: {wrong}")
-    if error and not scans:
-        raise error
-    if len(skipped) > _TOLD_AT_MOST:
-        skipped[_TOLD_AT_MOST:] = [f"and {len(skipped) - _TOLD_AT_MOST} more left out"]
-    return scans, tuple(skipped)
 
 
 def data_set_and_split(source: str) -> tuple[str, str]:

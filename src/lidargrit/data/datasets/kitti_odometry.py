@@ -13,7 +13,7 @@ from lidargrit.core.errors import ScanError
 from lidargrit.data.datasets import SplitScheme
 from lidargrit.data.datasets.shared.files import FileDataset, unnamed_recording
 from lidargrit.data.formats import read_bytes, usable_points
-from lidargrit.data.formats._labels import notes_on_labels
+from lidargrit.data.formats.shared.labels import notes_on_labels
 from lidargrit.scans.types import Scan
 
 _LABEL_BYTES = 4  # uint32: class in the lower 16 bits, instance in the upper

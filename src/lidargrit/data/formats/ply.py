@@ -10,7 +10,6 @@ import numpy as np
 from lidargrit.core.errors import ScanError, first_words
 from lidargrit.core.files import atomic_path
 from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, ScanFormat, first_bytes, read_bytes
-from lidargrit.data.formats._ply_elements import Element, Property, binary_rows, text_columns
 from lidargrit.data.formats.shared.columns import (
     BYTES_AT_MOST,
     REFLECTANCE_RULE,
@@ -21,6 +20,7 @@ from lidargrit.data.formats.shared.columns import (
     text_rows,
     whole_number,
 )
+from lidargrit.data.formats.shared.ply_elements import Element, Property, binary_rows, text_columns
 from lidargrit.scans.types import Scan
 
 _FORMAT = "a PLY file whose vertices have x, y and z"

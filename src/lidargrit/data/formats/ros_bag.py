@@ -17,7 +17,8 @@ from urllib.parse import quote
 
 from lidargrit.core.errors import ScanError, printable
 from lidargrit.data.formats import BadPoints, ScanFormat, damaged, first_bytes, open_file
-from lidargrit.data.formats._mcap import (
+from lidargrit.data.formats.shared.columns import BYTES_AT_MOST, REFLECTANCE_RULE, scan_of_columns
+from lidargrit.data.formats.shared.mcap import (
     CHUNK_BYTES_AT_MOST,
     Contents,
     contents_by_index,
@@ -25,8 +26,7 @@ from lidargrit.data.formats._mcap import (
     messages,
     unpacked_lz4,
 )
-from lidargrit.data.formats._point_cloud2 import columns_of_cloud
-from lidargrit.data.formats.shared.columns import BYTES_AT_MOST, REFLECTANCE_RULE, scan_of_columns
+from lidargrit.data.formats.shared.point_cloud2 import columns_of_cloud
 from lidargrit.scans.types import Scan
 
 _FORMAT = "a recording of ROS with messages sensor_msgs/PointCloud2"

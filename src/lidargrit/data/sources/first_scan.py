@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from lidargrit.data.datasets import usable_scans
 from lidargrit.data.formats import read_scan
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import open_source
+from lidargrit.scans.many_scans import usable_scans
 from lidargrit.scans.types import Scan
 
 

@@ -13,12 +13,12 @@ from jaxtyping import Float64, Int64
 
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import ConfigError, ScanError
-from lidargrit.data.datasets import ScanDataset, usable_scans
 from lidargrit.scans.fit_sensor.azimuths import columns_of_scans, firing_steps_deg, first_edge_rad, offsets_deg
 from lidargrit.scans.fit_sensor.elevations import FittedRows, cluster_rows, nearest_row, rows_of_rings
 from lidargrit.scans.fit_sensor.limits import farthest_m, quantum_m
 from lidargrit.scans.fit_sensor.points import NOISE_RANGE_M, Points
 from lidargrit.scans.fit_sensor.rings import Method, Rings, recover_rings
+from lidargrit.scans.many_scans import ManyScans, usable_scans
 from lidargrit.scans.projection.revolutions import told_revolutions
 from lidargrit.scans.sensors import NAME_AT_MOST, ProjectionName, SensorModel, column_azimuths_rad
 from lidargrit.scans.types import Scan
@@ -74,19 +74,6 @@ class SensorFit:
     row_of_point: Int64[np.ndarray, "n"]
     steps_deg: Float64[np.ndarray, "m"]
     warnings: tuple[str, ...]
-
-
-@runtime_checkable
-class ManyScans(Protocol):
-    """Scans that are read when asked for, such as a data set."""
-
-    def __len__(self) -> int:
-        """Return the number of scans."""
-        ...
-
-    def scan(self, index: int) -> Scan:
-        """Read one scan."""
-        ...
 
 
 def fit_sensor(scans: Sequence[Scan], name: str = "fitted") -> SensorFit:
@@ -146,7 +133,7 @@ def fit_sensor(scans: Sequence[Scan], name: str = "fitted") -> SensorFit:
 
 
 def fit_sensor_to_dataset(
-    dataset: ScanDataset, name: str = "fitted", num_scans: int = 20, bad_scans: Literal["refuse", "skip"] = "refuse"
+    dataset: ManyScans, name: str = "fitted", num_scans: int = 20, bad_scans: Literal["refuse", "skip"] = "refuse"
 ) -> SensorFit:
     """Find the sensor that made the scans of a data set, from some of them, evenly spaced.
 

@@ -19,7 +19,7 @@ from lidargrit.core.errors import DataError, OutputError, UsageError, nearest_na
 from lidargrit.core.untrusted import check_word
 from lidargrit.data import formats
 from lidargrit.data.datasets import ScanDataset, recognise
-from lidargrit.data.datasets._evidence import contradicts_hdl64e
+from lidargrit.data.datasets.shared.evidence import contradicts_hdl64e
 from lidargrit.data.datasets.shared.splits import Split
 from lidargrit.data.formats import BadPoints
 from lidargrit.scans.sensors import load_sensor

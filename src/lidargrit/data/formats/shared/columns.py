@@ -16,8 +16,8 @@ from torch import Tensor
 
 from lidargrit.core.errors import OutputError, ScanError
 from lidargrit.data.formats import BadPoints, damaged, scan_of
-from lidargrit.data.formats._labels import notes_on_labels
-from lidargrit.data.formats._reflectance import REFLECTANCE_NAMES, choose_reflectance, floats
+from lidargrit.data.formats.shared.labels import notes_on_labels
+from lidargrit.data.formats.shared.reflectance import REFLECTANCE_NAMES, choose_reflectance, floats
 from lidargrit.scans.types import Scan
 
 BYTES_AT_MOST = 256_000_000  # 4 million points of 64 bytes; sensors' own files have up to 48 a point

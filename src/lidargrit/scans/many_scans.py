@@ -1,0 +1,57 @@
+"""Many scans that are read when asked for → those of them that can be used."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Protocol, runtime_checkable
+
+from lidargrit.core.errors import ScanError
+from lidargrit.scans.types import Scan
+
+_TOLD_AT_MOST = 5  # scans that are left out
+
+
+@runtime_checkable
+class ManyScans(Protocol):
+    """Scans that are read when asked for, such as a data set."""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences that a reader of the scans should know."""
+        ...
+
+    def __len__(self) -> int:
+        """Return the number of scans."""
+        ...
+
+    def scan(self, index: int) -> Scan:
+        """Read one scan."""
+        ...
+
+
+def usable_scans(dataset: ManyScans, indices: Iterable[int], at_most: int = 0) -> tuple[list[Scan], tuple[str, ...]]:
+    """Read some scans without those that cannot be used, and say which these are.
+
+    Args:
+        dataset: scans.
+        indices: numbers of the wanted scans, in order.
+        at_most: number of usable scans after which no further one is read; 0 for all.
+
+    Raises:
+        ScanError: none of them can be used; says what is wrong with the last.
+    """
+    scans, skipped = list[Scan](), list[str]()
+    error = None
+    for index in indices:
+        if at_most and len(scans) == at_most:
+            break
+        try:
+            scans.append(dataset.scan(index))
+        except ScanError as wrong:
+            error = wrong
+            skipped.append(f"left out: {wrong}")
+    if error and not scans:
+        raise error
+    if len(skipped) > _TOLD_AT_MOST:
+        skipped[_TOLD_AT_MOST:] = [f"and {len(skipped) - _TOLD_AT_MOST} more left out"]
+    return scans, tuple(skipped)
