@@ -9,6 +9,7 @@ from lidargrit.errors import ScanError
 from lidargrit.fitting import fit_sensor
 from lidargrit.formats import read_scan
 from lidargrit.projection import project
+from lidargrit.projection.frame import told_height
 from lidargrit.projection.inspection import inspect
 from lidargrit.sensors import load_sensor
 from lidargrit.structures import Scan
@@ -60,3 +61,20 @@ def test_other_units_are_told(factor):
 def test_points_in_the_sensors_frame_are_not_doubted():
     scan = Scan(xyz_of(corner()) * 10)
     assert torch.isfinite(project(scan, VLP16).range_m).all()
+
+
+@pytest.mark.parametrize("height_m", [1.8, -0.64])
+def test_the_height_of_a_cars_frame_is_told(height_m):
+    points = xyz_of(corner()) + torch.tensor([0, 0, height_m])
+    problems = inspect(Scan(points), VLP16).problems
+    where, cure = ("below", "subtract 1.80 m from z") if height_m > 0 else ("above", "add 0.64 m to z")
+    assert f"points of a scan are seen from {abs(height_m):.2f} m {where} the sensor (vlp16)" in problems[-1]
+    assert problems[-1].endswith(cure)
+
+
+@pytest.mark.parametrize("name", ["vlp16", "vlp32c", "hdl32e", "hdl64e_kitti_odometry", "os1_64"])
+def test_no_height_is_told_of_points_in_a_sensors_own_frame(name):
+    sensor = load_sensor(name).with_columns(256)
+    scan = Scan(xyz_of(corner(0, sensor, 256)))
+    assert told_height(scan, sensor) == ""
+    assert told_height(Scan(xyz_of(corner())), sensor) == ""  # of another sensor

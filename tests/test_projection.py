@@ -207,5 +207,5 @@ def test_a_scan_beyond_the_limits_is_refused_by_both_variants(variant):
     """As of a file in millimetres: its image would be empty."""
     scan = simulate(seed=1)
     far = Scan(scan.points_xyz_m * 1000)
-    with pytest.raises(ScanError, match=r"no point between 0\.9 and 120 m in .*check that the file is in metres"):
+    with pytest.raises(ScanError, match=r"no point between 0\.9 and 120 m in .*in metres|check the unit: divide mill"):
         project(far, load_sensor("hdl64e_kitti_odometry"), variant=variant)

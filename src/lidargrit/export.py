@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidargrit import _discovery, formats
-from lidargrit.errors import ConfigError, DataError, OutputError, ScanError, UnknownNameError, one_of
+from lidargrit.errors import ConfigError, DataError, OutputError, ScanError, UnknownNameError, one_of, printable
 from lidargrit.files import atomic_path, claim_folder, claimed_manifest, is_partial, is_taken, read_json, write_json
 from lidargrit.formats import ScanFormat
 from lidargrit.formats.kitti_bin import KittiBin
@@ -72,19 +72,15 @@ def export_scans(
     scans.check_output(out)
     files = layout.files([scans.name(index) for index in range(len(scans))])
     check_names(source, files)
-    identities = {file: scans.identity(index) for index, file in enumerate(files)}
-    facts = {"source": source, "format": kind, **of_images, "scans": identities}
+    facts = {"source": source, "format": kind, **of_images}
+    facts["scans"] = {file: scans.identity(index) for index, file in enumerate(files)}
     with claim_folder(out), claimed_scans(out / MANIFEST, facts) as left_out:
-        _refuse_links(out, files)
-        told = set[str]()
-        for note in scans.notes:
-            reporter.message(f"{source}: {note}")
-        told_labels, missing = layout.keeps_labels, [at for at, file in enumerate(files) if not (out / file).exists()]
+        told_labels, missing = layout.keeps_labels, _missing(out, files)
+        told = _told_notes(source, scans.notes, set(), reporter)
         with reporter.progress("exporting", len(files), len(files) - len(missing)) as progress:
             for index in missing:
                 try:
-                    scan = scans.scan(index)
-                    layout.write(files[index], scan)
+                    layout.write(files[index], scan := scans.scan(index))
                 except ScanError as error:
                     if config.bad_scans == "refuse":
                         raise
@@ -92,19 +88,30 @@ def export_scans(
                     left_out.add(files[index])
                 else:
                     told_labels = told_labels or _told_labels(scan, files[index], reporter)
-                    for note in (one for one in scan.notes if one not in told):
-                        reporter.message(f"{scan.source}: {note}")
-                    told.update(scan.notes)
+                    told = _told_notes(scan.source, scan.notes, told, reporter)
                 progress.advance(1)
         if len(left_out) == len(files):
             raise DataError(f"no usable scan in {source}", "at least one", "see the messages above")
         return len(files) - len(left_out)
 
 
-def _refuse_links(out: Path, files: Sequence[str]) -> None:
-    """Refuse links in place of files: what they lead to is not of this command, and would count as written."""
+def _told_notes(of: str, notes: Sequence[str], told: set[str], reporter: Reporter) -> set[str]:
+    """Report notes that were not told yet, and return all that were."""
+    for note in notes:
+        if note not in told:
+            reporter.message(f"{printable(of)}: {note}")
+    return told | {*notes}
+
+
+def _missing(out: Path, files: Sequence[str]) -> list[int]:
+    """Return which files are still to be written.
+
+    Raises:
+        OutputError: a link in place of one: what it leads to is not of this command, and would count as written.
+    """
     if link := next((out / file for file in files if (out / file).is_symlink()), None):
         raise OutputError(f"{link}, which is a link", "a file of this command, or none", "remove the link")
+    return [at for at, file in enumerate(files) if not (out / file).exists()]
 
 
 def check_names(source: str, names: Sequence[str]) -> None:

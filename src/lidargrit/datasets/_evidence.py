@@ -20,7 +20,7 @@ def contradicts_hdl64e(path: Path, form: type[ScanFormat]) -> bool:
 
     Args:
         path: file of a scan.
-        form: its format.
+        form: format of that file.
     """
     try:
         points_m = form.read(path, 0, _DROP).points_xyz_m.numpy()

@@ -10,6 +10,7 @@ from lidargrit.errors import ScanError
 from lidargrit.loading.config import DataConfig
 from lidargrit.projection import doubts_about_rays, projection_that_fits
 from lidargrit.projection.fit import told_doubt
+from lidargrit.projection.frame import told_height
 from lidargrit.projection.revolutions import told_revolutions
 from lidargrit.reporting import Reporter
 from lidargrit.sensors import SensorModel
@@ -66,7 +67,8 @@ def choose_imaging(source: str, dataset: ScanDataset, sensor: SensorModel, confi
     doubts_of_scans = (doubts_about_rays(scan, sensor, sensor.projection) for scan in probes)
     doubt = next((each for each in doubts_of_scans if each), "")
     turns = next((told for scan in probes if (told := told_revolutions(scan))), "")
-    told = (told_doubt(source, sensor, doubt), turns)
+    height = next((told for scan in probes if (told := told_height(scan, sensor))), "")
+    told = (told_doubt(source, sensor, doubt), turns, height)
     return Imaging(sensor, config, tuple(notes), tuple(filter(None, told)))
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float32, Float64, Int8, Int64
 
 from lidargrit.errors import one_line
 from lidargrit.projection.fit import fit_problems, ring_count
+from lidargrit.projection.frame import told_height
 from lidargrit.projection.pixel_coordinates import PixelCoordinates, ProjectionVariant, pixel_coordinates, within_limits
 from lidargrit.projection.revolutions import told_revolutions
 from lidargrit.sensors import ProjectionName, SensorModel
@@ -55,7 +56,8 @@ class Inspection:
             distance; and its parts ``across`` (azimuth) and ``up`` (elevation), as arcs in metres and in degrees.
             Empty if no point is kept.
         rings: number of rings of the scan, for ``unfolding`` only.
-        problems: reasons for which :func:`project` would refuse the scan, and signs of several revolutions.
+        problems: reasons for which :func:`project` would refuse the scan, and signs of several
+            revolutions or of another frame.
     """
 
     scan: Scan
@@ -94,7 +96,7 @@ def inspect(
     method = method or sensor.projection
     pixels = pixel_coordinates(scan, sensor, method, variant)
     problems = [str(problem) for problem in fit_problems(scan, sensor, method, pixels, variant=variant)]
-    problems += filter(None, [told_revolutions(scan)])
+    problems += filter(None, [told_revolutions(scan), told_height(scan, sensor)])
     fate, wanted = _fates(pixels, sensor, variant)
     kept = np.flatnonzero(fate == _KEPT)
     if not len(kept):
