@@ -31,7 +31,7 @@ def plot(sets: list[ScanSet], names: list[str], path: Path) -> None:
     look = {"cmap": "turbo", "norm": LogNorm(NEAR_M, FAR_M), "aspect": "auto", "interpolation": "none"}
     for axes, scans, name in zip(grid, sets, names, strict=True):
         fine_m = scans.images.range_m.numpy()
-        ranges_m = fine_m[..., :: fine_m.shape[-1] // columns]  # of finer images every n-th column, as recipes take
+        ranges_m = fine_m[..., :: fine_m.shape[-1] // columns]  # of finer images every n-th column, as presets take
         for cell, range_m in zip(axes, ranges_m, strict=True):
             cell.imshow(np.where(range_m > 0, range_m, np.nan), **look)
             cell.set(xticks=[], yticks=[])

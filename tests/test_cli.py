@@ -24,7 +24,7 @@ from lidargrit.data.sources import load_range_images
 from lidargrit.data.sources.samples import read_samples
 from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.evaluation.scorecard import format_value
-from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.presets import load_preset
 from lidargrit.viewer.demo import divided
 from tiny_runs import MODEL, the_one_line
 
@@ -36,7 +36,7 @@ TINY = [
     "training.transformer.scans=8",
 ]
 ONE_METRIC = ("lidargrit.viewer.demo.EvalConfig", partial(EvalConfig, metrics=("bev_jsd",)))
-COUNTED = ("lidargen_kitti_360", "r2flow_kitti_360")  # counting takes seconds for each recipe
+COUNTED = ("lidargen_kitti_360", "r2flow_kitti_360")  # counting takes seconds for each preset
 PIXELS = ["training.pixels.scans=2", "model.pixels.mask_width=4", "model.pixels.range_width=4", "model.pixels.blocks=1"]
 
 
@@ -88,8 +88,8 @@ def test_train_leaves_a_run_that_says_what_it_is(run_folder):
         ),
     }
     about = json.loads((run_folder / "run.json").read_text())
-    assert about["recipe"]["data"]["train"] == ["simulated:6:train"]
-    assert about["recipe"]["training"]["tokenizer"]["scans"] == 8
+    assert about["preset"]["data"]["train"] == ["simulated:6:train"]
+    assert about["preset"]["training"]["tokenizer"]["scans"] == 8
     assert about["lidargrit"] == lidargrit.__version__
     assert about["torch"] == torch.__version__
     log = [json.loads(line) for line in (run_folder / "tokenizer" / "log.jsonl").read_text().splitlines()]
@@ -138,21 +138,21 @@ def test_dry_run_finds_prepared_scans_of_another_sensor(tmp_path, capsys):
     assert "(64x64); wanted the rays of " in the_one_line(capsys.readouterr().err, "train")
 
 
-def told_at_once(recipe, without=()):
-    return dict.fromkeys(recipe.training, 10**18)
+def told_at_once(preset, without=()):
+    return dict.fromkeys(preset.training, 10**18)
 
 
-@pytest.mark.parametrize("recipe", discovery.names("recipes"))
-def test_every_recipe_has_a_plan(recipe, tmp_path, capsys, monkeypatch):
-    if recipe not in COUNTED:
+@pytest.mark.parametrize("preset", discovery.names("presets"))
+def test_every_preset_has_a_plan(preset, tmp_path, capsys, monkeypatch):
+    if preset not in COUNTED:
         monkeypatch.setattr(sys.modules["lidargrit.training.plan"], "training_flops", told_at_once)
     monkeypatch.chdir(tmp_path)
-    is_simulated = load_recipe(recipe).data.train[0].startswith("simulated")
-    assert main(["train", recipe, "none", "--dry-run"]) == (0 if is_simulated else 2)
+    is_simulated = load_preset(preset).data.train[0].startswith("simulated")
+    assert main(["train", preset, "none", "--dry-run"]) == (0 if is_simulated else 2)
     captured = capsys.readouterr()
     assert ("data/kitti" in captured.err) is not is_simulated, "where data sets are looked for"
     assert "published: " in captured.out
-    assert (" parameters, " in captured.out) == bool(load_recipe(recipe).training)
+    assert (" parameters, " in captured.out) == bool(load_preset(preset).training)
 
 
 def test_a_plan_tells_which_stages_are_taken_and_not_trained(tmp_path, capsys, monkeypatch):
@@ -280,7 +280,7 @@ def test_processes_share_the_seeds(run_folder, tmp_path, typed):
 
 def test_list_names_everything_there_is(typed):
     output = typed("list")
-    for kind in ("datasets", "formats", "sensors", "tokenizers", "generators", "metrics", "recipes"):
+    for kind in ("datasets", "formats", "sensors", "tokenizers", "generators", "metrics", "presets"):
         in_full = typed("list", kind)
         assert in_full.splitlines()[0] == kind
         for name in discovery.names(kind):

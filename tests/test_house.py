@@ -45,7 +45,7 @@ def test_what_is_exported_is_there():
         _ = lidargrit.nothing
 
 
-@pytest.mark.parametrize("kind", ["datasets", "sensors", "tokenizers", "generators", "metrics", "recipes", "cli"])
+@pytest.mark.parametrize("kind", ["datasets", "sensors", "tokenizers", "generators", "metrics", "presets", "cli"])
 def test_every_public_file_says_what_it_is(kind):
     assert discovery.names(kind)
     for name in discovery.names(kind):

@@ -20,7 +20,7 @@ from lidargrit.data.sources import load_range_images
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.pixel_decoder.phase_noise import PhaseNoise
 from lidargrit.generation.pixel_decoder.pixel_phases import phases_of
-from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.presets import load_preset
 from lidargrit.generation.settings import FitConfig
 from lidargrit.generation.tokenizers.vqvae import Vqvae
 from lidargrit.nn.processes import of_first_process
@@ -229,10 +229,10 @@ def test_two_processes_learn_what_one_does(tmp_path):
 
 @pytest.mark.parametrize("parts", [2, 4])
 def test_a_batch_in_parts_takes_the_same_step(tmp_path, parts):
-    recipe = load_recipe("demo", train_words(tmp_path)[4:])
+    preset = load_preset("demo", train_words(tmp_path)[4:])
     config = DataConfig(train=("simulated:4:train",), columns=512, column_stride=8)
     images = load_range_images(config.train, config)
-    sizes = replace(recipe.model.tokenizer, dropout=0.0, codebook_loss="paper", restart_dead_codes=False)
+    sizes = replace(preset.model.tokenizer, dropout=0.0, codebook_loss="paper", restart_dead_codes=False)
     found = []
     for accumulate in (1, parts):
         torch.manual_seed(0)
@@ -261,7 +261,7 @@ def test_a_validation_needs_no_more_memory_than_a_step(tmp_path, monkeypatch):
     config = DataConfig(train=("simulated:4:train",), val=(), columns=512, column_stride=8)
     images = load_range_images(config.train, config)
     learn = FitConfig(scans=4, batch_size=4, accumulate=2, learning_rate=1e-3, validation_scans=4)
-    fit = Fit(Vqvae(load_recipe("demo", STEADY).model.tokenizer, images.sensor), learn, tmp_path, 0, Reporter())
+    fit = Fit(Vqvae(load_preset("demo", STEADY).model.tokenizer, images.sensor), learn, tmp_path, 0, Reporter())
     sizes = []
     monkeypatch.setattr(fit.engine, "evaluate", lambda objective, some, seed: sizes.append(len(some)) or {"loss": 1.0})
     assert fit.validate(images) == {"loss": 1.0}

@@ -16,7 +16,7 @@ from lidargrit.data.datasets import load
 from lidargrit.evaluation.protocols import load_protocol
 from lidargrit.evaluation.reproduction import TABLES, Reproduction, reproduce
 from lidargrit.evaluation.tables import published
-from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.presets import load_preset
 from lidargrit.training import train
 from tiny_runs import MODEL, SIMULATED
 
@@ -60,8 +60,8 @@ def test_a_killed_reproduction_goes_on_and_ends_with_the_table(tmp_path, capsys)
     assert "the paper's row 'with both' is measured by ablation_both_small" in captured.out
 
     # The killed run went on as if it had not been.
-    recipe = load_recipe("ablation_raydrop_small", reproduction_of(folder).benchmark().recipe_settings)
-    train(recipe, tmp_path / "whole")
+    preset = load_preset("ablation_raydrop_small", reproduction_of(folder).benchmark().preset_settings)
+    train(preset, tmp_path / "whole")
     weights = [
         (run / "model.safetensors").read_bytes() for run in (tmp_path / "whole", folder / "runs" / second.parts[-3])
     ]
@@ -82,9 +82,9 @@ def test_every_row_of_the_paper_is_measured(number):
     assert f"table {number}" in found["source"]
     assert found["protocol"] == table.protocol
     assert {row["system"] for row in found["rows"]} == {*table.rows}
-    for recipe, small in table.rows.values():
-        assert "simulated" in load_recipe(small).data.train[0]
-        assert load_recipe(recipe).published
+    for preset, small in table.rows.values():
+        assert "simulated" in load_preset(small).data.train[0]
+        assert load_preset(preset).published
 
 
 @pytest.mark.parametrize("number", TABLES)
@@ -92,7 +92,7 @@ def test_images_are_those_that_the_protocol_wants(number):
     protocol = load_protocol(TABLES[number].protocol)
     wanted = Reproduction(number, "root")
     for system in wanted.systems().values():
-        data = load_recipe(system, wanted.benchmark().recipe_settings).data
+        data = load_preset(system, wanted.benchmark().preset_settings).data
         assert data.load_sensor().same_rays(protocol.load_sensor())
         assert data.projection_variant == protocol.variant
     assert wanted.benchmark().num_samples == protocol.num_scans
@@ -100,7 +100,7 @@ def test_images_are_those_that_the_protocol_wants(number):
 
 
 def test_a_plan_tells_scans_and_cost(tmp_path, capsys, monkeypatch):
-    told_at_once = lambda recipe, taken: dict.fromkeys(recipe.training, 10**18)  # noqa: E731
+    told_at_once = lambda preset, taken: dict.fromkeys(preset.training, 10**18)  # noqa: E731
     monkeypatch.setattr(sys.modules["lidargrit.training.plan"], "training_flops", told_at_once)
     load("kitti_360").write_example(tmp_path / "root", 1)
     (scan,) = (tmp_path / "root").rglob("*.bin")
@@ -136,19 +136,19 @@ def test_another_number_and_another_place_are_refused(tmp_path, capsys):
 
 
 def differing(first: str, second: str) -> set[str]:
-    one, other = (configuration.leaves(load_recipe(name)) for name in (first, second))
+    one, other = (configuration.leaves(load_preset(name)) for name in (first, second))
     assert one.keys() == other.keys()
     return {name for name in one if one[name] != other[name]} - {"title", "published"}
 
 
 @pytest.mark.parametrize("small", [False, True])
 def test_rows_of_the_ablation_differ_in_nothing_but_what_is_ablated(small):
-    neither, raydrop, both = (recipes[small] for recipes in TABLES[3].rows.values())
+    neither, raydrop, both = (presets[small] for presets in TABLES[3].rows.values())
     assert differing(neither, raydrop) == {"model.tokenizer.raydrop_loss"}
     assert differing(raydrop, both) == {"training.tokenizer.augmentations"}
-    assert load_recipe(raydrop).training["tokenizer"].augmentations == ()
-    assert load_recipe(both).training["tokenizer"].augmentations == ("geometric",)
-    assert load_recipe(both).training["transformer"].augmentations == ()
+    assert load_preset(raydrop).training["tokenizer"].augmentations == ()
+    assert load_preset(both).training["tokenizer"].augmentations == ("geometric",)
+    assert load_preset(both).training["transformer"].augmentations == ()
 
 
 def test_released_configurations_differ_in_what_their_files_say():

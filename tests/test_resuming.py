@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from lidargrit.core.errors import OutputError
-from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.presets import load_preset
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.simulator import simulate
 from lidargrit.training import train
@@ -20,9 +20,9 @@ def test_a_run_is_not_continued_with_other_scans_of_the_same_names(tmp_path):
     (tmp_path / "scans").mkdir()
     write(0)
     data = ["data.columns=64", f"data.train={tmp_path / 'scans'}", "data.val=simulated:1:val"]
-    recipe = load_recipe("marginal", data)
-    train(recipe, tmp_path / "run")
-    train(recipe, tmp_path / "run")
+    preset = load_preset("marginal", data)
+    train(preset, tmp_path / "run")
+    train(preset, tmp_path / "run")
     write(7)
     with pytest.raises(OutputError, match="whose run began with other train scans; wanted what it began with"):
-        train(recipe, tmp_path / "run")
+        train(preset, tmp_path / "run")

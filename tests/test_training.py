@@ -19,7 +19,7 @@ from lidargrit.data.datasets.kitti_odometry import KittiOdometry
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import load_range_images
 from lidargrit.generation.objective import Objective
-from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.presets import load_preset
 from lidargrit.generation.settings import FitConfig
 from lidargrit.generation.tokenizers.vqvae import Vqvae
 from lidargrit.scans.sensors import load_sensor
@@ -54,7 +54,7 @@ TINY_GAN = [
         for setting in ("scans=24", "batch_size=2", "precision=fp32", "checkpoint_every=4", "validate_every=8")
     ],
 ]
-RECIPES = {"demo": TINY, "dusty_small": TINY_GAN}
+PRESETS = {"demo": TINY, "dusty_small": TINY_GAN}
 
 
 @pytest.fixture
@@ -95,12 +95,12 @@ class StopAfter(Reporter):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """Return a function that gives the folder of a recipe's run, trained once and without a stop; only to be read."""
+    """Return a function that gives the folder of a preset's run, trained once and without a stop; only to be read."""
 
     @functools.cache
     def run(name: str) -> Path:
         folder = tmp_path_factory.mktemp("whole") / "run"
-        train(load_recipe(name, RECIPES[name]), folder)
+        train(load_preset(name, PRESETS[name]), folder)
         return folder
 
     return run
@@ -118,10 +118,10 @@ def whole(tmp_path_factory):
     ],
 )
 def test_a_stopped_run_ends_with_the_same_bits_as_one_that_was_not(tmp_path, whole, name, stage, scans):
-    recipe = load_recipe(name, RECIPES[name])
+    preset = load_preset(name, PRESETS[name])
     with pytest.raises(StopAfterError):
-        train(recipe, tmp_path / "stopped", StopAfter(stage, scans))
-    train(recipe, tmp_path / "stopped")
+        train(preset, tmp_path / "stopped", StopAfter(stage, scans))
+    train(preset, tmp_path / "stopped")
     folders = whole(name), tmp_path / "stopped"
     unbroken, stopped = (read_tensors(folder / "model.safetensors")[0] for folder in folders)
     assert unbroken.keys() == stopped.keys()
@@ -134,7 +134,7 @@ def test_a_stopped_run_ends_with_the_same_bits_as_one_that_was_not(tmp_path, who
 def test_a_finished_run_is_not_trained_again(whole):
     folder = whole("demo")
     before = (folder / "tokenizer" / "checkpoint.safetensors").stat().st_mtime_ns
-    train(load_recipe("demo", TINY), folder)
+    train(load_preset("demo", TINY), folder)
     assert (folder / "tokenizer" / "checkpoint.safetensors").stat().st_mtime_ns == before
 
 
@@ -191,7 +191,7 @@ def test_the_linear_schedule_is_the_programs(golden):
 
 
 def test_a_loss_that_is_not_finite_stops_with_the_step(tmp_path, images):
-    vqvae = Vqvae(load_recipe("demo", TINY).model.tokenizer, images.sensor)
+    vqvae = Vqvae(load_preset("demo", TINY).model.tokenizer, images.sensor)
     vqvae.encoder.conv_in.weight.data.fill_(torch.nan)
     fit = Fit(vqvae, FitConfig(scans=4, batch_size=2, learning_rate=1e-3), tmp_path, 0, Reporter())
     with pytest.raises(TrainingError, match=r"a loss or gradient of nan after 0 scans") as error:
@@ -207,9 +207,9 @@ def test_one_real_scan_is_learned_by_heart(tmp_path, real):
     config = DataConfig(train=train, val=(), columns=2048, column_stride=64)  # 32 are quick
     scan = load_range_images(config.train, config)
     assert len(scan) == 1
-    recipe = load_recipe("small")
+    preset = load_preset("small")
     torch.manual_seed(0)
-    vqvae = Vqvae(replace(recipe.model.tokenizer, raydrop_weight=0.3), scan.sensor)
+    vqvae = Vqvae(replace(preset.model.tokenizer, raydrop_weight=0.3), scan.sensor)
     learn = FitConfig(
         scans=300, batch_size=1, learning_rate=2e-3, schedule="cosine", warmup_scans=50, precision="auto",
         average_over_scans=20, validate_every=1000, checkpoint_every=1000,
@@ -224,7 +224,7 @@ def test_one_real_scan_is_learned_by_heart(tmp_path, real):
 def test_a_tree_of_scans_trains_from_its_folder_alone(tmp_path):
     KittiOdometry.write_example(tmp_path / "tree", 4)
     settings = [f"data.train={tmp_path / 'tree'}", f"data.val={tmp_path / 'tree'}:all[:50%]"]
-    generator = train(load_recipe("demo", TINY + settings), Path(tmp_path / "run"))
+    generator = train(load_preset("demo", TINY + settings), Path(tmp_path / "run"))
     first, again = (generator.sample([5, 6]), generator.sample([6]))
     # Sums of a batch of two and of one may differ in their last bit, and a mask drawn there in a pixel.
     assert float((first.range_m[1] - again.range_m[0]).abs().gt(1e-3).float().mean()) < 1e-3
@@ -232,29 +232,29 @@ def test_a_tree_of_scans_trains_from_its_folder_alone(tmp_path):
 
 
 def test_stages_use_their_own_settings():
-    recipe = load_recipe("demo", ["training.transformer.learning_rate=0.5"])
-    assert recipe.training["transformer"].learning_rate == 0.5
-    assert recipe.training["tokenizer"] == load_recipe("demo").training["tokenizer"]
-    assert replace(recipe, seed=1) != recipe
+    preset = load_preset("demo", ["training.transformer.learning_rate=0.5"])
+    assert preset.training["transformer"].learning_rate == 0.5
+    assert preset.training["tokenizer"] == load_preset("demo").training["tokenizer"]
+    assert replace(preset, seed=1) != preset
 
 
-def test_a_run_goes_on_though_the_words_about_its_recipe_have_changed(tmp_path):
-    recipe = load_recipe("marginal")
-    older = replace(recipe, title="another title", published="other words")
-    write_json(tmp_path / "run.json", {"recipe": configuration.to_json(older)})
-    check_folder(tmp_path, recipe)
+def test_a_run_goes_on_though_the_words_about_its_preset_have_changed(tmp_path):
+    preset = load_preset("marginal")
+    older = replace(preset, title="another title", published="other words")
+    write_json(tmp_path / "run.json", {"preset": configuration.to_json(older)})
+    check_folder(tmp_path, preset)
     with pytest.raises(OutputError, match=r"there seed=0, here 1"):
-        check_folder(tmp_path, replace(recipe, seed=1))
+        check_folder(tmp_path, replace(preset, seed=1))
 
 
 def test_a_run_goes_on_with_settings_that_change_nothing_computed(tmp_path):
-    write_json(tmp_path / "run.json", {"recipe": configuration.to_json(load_recipe("demo"))})
+    write_json(tmp_path / "run.json", {"preset": configuration.to_json(load_preset("demo"))})
     stage = "training.tokenizer"
     check_folder(
-        tmp_path, load_recipe("demo", ["data.workers=7", f"{stage}.checkpoint_every=3", f"{stage}.pictures_every=5"])
+        tmp_path, load_preset("demo", ["data.workers=7", f"{stage}.checkpoint_every=3", f"{stage}.pictures_every=5"])
     )
     with pytest.raises(OutputError, match=r"training\.tokenizer\.validate_every"):
-        check_folder(tmp_path, load_recipe("demo", [f"{stage}.validate_every=3"]))
+        check_folder(tmp_path, load_preset("demo", [f"{stage}.validate_every=3"]))
 
 
 def test_settings_that_a_later_stage_cannot_follow_are_refused_before_the_first(tmp_path):
@@ -266,10 +266,10 @@ def test_settings_that_a_later_stage_cannot_follow_are_refused_before_the_first(
         (["training.tokenizer.optimiser=muon"], "optimiser=muon for networks without linear layers"),
     ):
         with pytest.raises(ConfigError, match=message):
-            train(load_recipe("demo", [*TINY, *settings]), tmp_path)
+            train(load_preset("demo", [*TINY, *settings]), tmp_path)
         assert not [*tmp_path.iterdir()]
     with pytest.raises(ConfigError, match=r"without training\.reflow"):
-        train(load_recipe("r2flow_small", ["model.reflow={}"]), tmp_path)
+        train(load_preset("r2flow_small", ["model.reflow={}"]), tmp_path)
 
 
 def test_a_folder_is_trained_in_by_one_process_at_a_time(tmp_path):
@@ -277,14 +277,14 @@ def test_a_folder_is_trained_in_by_one_process_at_a_time(tmp_path):
         claim_folder(tmp_path / "run"),
         pytest.raises(OutputError, match=rf"run, which process {os.getpid()} on .* since 2\d\d\d-.* is writing"),
     ):
-        train(load_recipe("demo", TINY), tmp_path / "run")
-    train(load_recipe("demo", TINY), tmp_path / "run")
+        train(load_preset("demo", TINY), tmp_path / "run")
+    train(load_preset("demo", TINY), tmp_path / "run")
     assert not [path for path in (tmp_path / "run").rglob("*") if path.name.startswith(".")]
 
 
 def test_pictures_change_nothing(tmp_path, whole):
     every = [f"training.{stage}.pictures_every=6" for stage in ("tokenizer", "transformer")]
-    train(load_recipe("demo", TINY + every), tmp_path / "drawn", plot=plot_progress)
+    train(load_preset("demo", TINY + every), tmp_path / "drawn", plot=plot_progress)
     plain, drawn = ((folder / "model.safetensors").read_bytes() for folder in (whole("demo"), tmp_path / "drawn"))
     assert plain == drawn
     pictures = {str(path.relative_to(tmp_path / "drawn")): path for path in (tmp_path / "drawn").rglob("*.png")}
@@ -295,7 +295,7 @@ def test_pictures_change_nothing(tmp_path, whole):
 
 
 def test_the_memory_of_weights_is_what_a_step_leaves_behind(images):
-    vqvae = Vqvae(load_recipe("demo", TINY).model.tokenizer, images.sensor)
+    vqvae = Vqvae(load_preset("demo", TINY).model.tokenizer, images.sensor)
     optimiser = make_optimiser(vqvae, FitConfig(scans=1, batch_size=1, learning_rate=1e-3))
     average = WeightAverage(vqvae, 1)
     vqvae(images.batch([0]), torch.Generator())["loss"].backward()
@@ -307,9 +307,9 @@ def test_the_memory_of_weights_is_what_a_step_leaves_behind(images):
 
 
 def test_a_measured_plan_tells_operations_time_and_memory():
-    recipe = load_recipe("demo", TINY)
-    lines = [stage.as_text() for stage in measure(recipe)]
-    for line, (stage, flops) in zip(lines, training_flops(recipe).items(), strict=True):
+    preset = load_preset("demo", TINY)
+    lines = [stage.as_text() for stage in measure(preset)]
+    for line, (stage, flops) in zip(lines, training_flops(preset).items(), strict=True):
         wanted = rf"{stage}: {flops:.2e} floating-point operations at [\d.e+]+ scans/s: [\d.]+ \w+ on cpu, [\d.]+ GiB"
         assert re.fullmatch(wanted.replace("e+", "e\\+", 1), line)
 
@@ -376,7 +376,7 @@ def test_a_checkpoint_that_does_not_fit_its_optimiser_is_refused(tmp_path):
 
 
 def test_a_run_to_take_stages_from_is_looked_at_before_any_scan(tmp_path):
-    recipe = load_recipe("demo", ("data.train=nowhere", "data.val=nowhere", f"stages_from={tmp_path / 'nothing'}"))
+    preset = load_preset("demo", ("data.train=nowhere", "data.val=nowhere", f"stages_from={tmp_path / 'nothing'}"))
     with pytest.raises(CheckpointError, match="nothing, which does not exist"):
-        train(recipe, tmp_path / "run")
+        train(preset, tmp_path / "run")
     assert not (tmp_path / "run").exists()

@@ -30,14 +30,14 @@ def images_of(sensor, batch=2, seed=0):
 
 
 @pytest.mark.parametrize(
-    ("recipe", "parameters", "grid"),
+    ("preset", "parameters", "grid"),
     [("lidargrit_kitti_360", 17_295_618, (8, 128)), ("lidargrit_kitti_odometry", 3_148_418, (16, 64))],
 )
-def test_published_sizes(recipe, parameters, grid):
-    from lidargrit.generation.presets import load_recipe
+def test_published_sizes(preset, parameters, grid):
+    from lidargrit.generation.presets import load_preset
 
-    recipe = load_recipe(recipe)
-    vqvae = Vqvae(recipe.model.tokenizer, recipe.data.load_sensor())
+    preset = load_preset(preset)
+    vqvae = Vqvae(preset.model.tokenizer, preset.data.load_sensor())
     assert sum(p.numel() for p in vqvae.parameters() if p.requires_grad) == parameters
     assert vqvae.grid_size == grid
 

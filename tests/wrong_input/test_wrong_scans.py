@@ -138,7 +138,7 @@ def test_a_sensor_that_does_not_fit_the_scan(refused, tmp_path):
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (["train", "smal", "OUT"], r"'smal', which is not among the recipes; wanted one such as small.*list recipes"),
+        (["train", "smal", "OUT"], r"'smal', which is not among the presets; wanted one such as small.*list presets"),
         (["train", "demo", "OUT", "--set", "seed"], r"the setting 'seed'; wanted NAME=VALUE; e\.g\. --set title="),
         (
             ["train", "demo", "OUT", "--set", "model.tokenizer.chanels=32"],

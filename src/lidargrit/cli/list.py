@@ -1,4 +1,4 @@
-"""List data sets, formats, sensors, generators, metrics, protocols, recipes and more."""
+"""List data sets, formats, sensors, generators, metrics, protocols, presets and more."""
 
 from __future__ import annotations
 

@@ -99,7 +99,7 @@ def from_json(cls: type[T], data: Any, source: str) -> T:
 def override(
     config: T,
     settings: Iterable[str],
-    owner: str = "this recipe",
+    owner: str = "this preset",
     cure: str = "see all with --dry-run",
     fixed: Collection[str] = (),
 ) -> T:
@@ -234,7 +234,7 @@ def _check_numbers(value: Any, where: str) -> None:
 
 
 def _parser() -> Any:
-    from jsonargparse import ArgumentParser  # noqa: PLC0415  only recipes need it, and --help should be quick
+    from jsonargparse import ArgumentParser  # noqa: PLC0415  only presets need it, and --help should be quick
 
     return ArgumentParser(exit_on_error=False)
 

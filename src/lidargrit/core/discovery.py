@@ -21,7 +21,7 @@ FOLDERS: Final = {
     "metrics": "evaluation/metrics",
     "protocols": "evaluation/protocols",
     "sample-formats": "data/sources/sample_formats",
-    "recipes": "systems/*/presets",
+    "presets": "systems/*/presets",
     "cli": "cli",
 }
 """Each kind as a user types it, and the folder whose files, or folders with a ``system.py``, are of this kind."""

@@ -1,4 +1,4 @@
-"""One experiment = one file: name → :class:`Recipe`."""
+"""One experiment = one file: name → :class:`Preset`."""
 
 from __future__ import annotations
 
@@ -9,33 +9,33 @@ from lidargrit.core import configuration, discovery
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.generation.generator import load_class
-from lidargrit.generation.settings import FitConfig, Recipe
+from lidargrit.generation.settings import FitConfig, Preset
 
-_SCANS = 2000  # of each stage of a default recipe: minutes, not hours
+_SCANS = 2000  # of each stage of a default preset: minutes, not hours
 
 
-def load_recipe(name: str, settings: Sequence[str] = ()) -> Recipe:
-    """Return a recipe by its name, with settings changed as in ``training.tokenizer.batch_size=4``.
+def load_preset(name: str, settings: Sequence[str] = ()) -> Preset:
+    """Return a preset by its name, with settings changed as in ``training.tokenizer.batch_size=4``.
 
-    The name of a generator that has no recipe of this name gives its default recipe, see :func:`default_recipe`.
+    The name of a generator that has no preset of this name gives its default preset, see :func:`default_preset`.
 
     Raises:
-        UnknownNameError: no such recipe and no such generator.
+        UnknownNameError: no such preset and no such generator.
         ConfigError: an unknown setting or a value that does not fit, of which it names the nearest; or a folder.
     """
-    is_generator = name not in discovery.names("recipes") and name in discovery.names("generators")
-    if not is_generator and name not in discovery.names("recipes") and Path(name).is_dir():
+    is_generator = name not in discovery.names("presets") and name in discovery.names("generators")
+    if not is_generator and name not in discovery.names("presets") and Path(name).is_dir():
         raise ConfigError(
             f"{name}, a folder that holds no finished run",
-            "a recipe, or where systems are compared a finished run",
-            "see lidargrit list recipes; score samples with lidargrit evaluate (--tables: side by side)",
+            "a preset, or where systems are compared a finished run",
+            "see lidargrit list presets; score samples with lidargrit evaluate (--tables: side by side)",
         )
-    recipe = default_recipe(name) if is_generator else discovery.load_instance("recipes", name, Recipe)
-    return configuration.override(recipe, settings)
+    preset = default_preset(name) if is_generator else discovery.load_instance("presets", name, Preset)
+    return configuration.override(preset, settings)
 
 
-def default_recipe(generator: str) -> Recipe:
-    """Return a recipe for a generator that has none: its default configuration, and minutes on simulated streets.
+def default_preset(generator: str) -> Preset:
+    """Return a preset for a generator that has none: its default configuration, and minutes on simulated streets.
 
     Args:
         generator: name of the generator.
@@ -49,7 +49,7 @@ def default_recipe(generator: str) -> Recipe:
     except TypeError as error:
         wanted = f"a default for every setting of {cls.Config.__name__}"
         raise ConfigError(
-            f"{generator} without a recipe ({error})", wanted, f"add systems/{generator}/presets/{generator}.py"
+            f"{generator} without a preset ({error})", wanted, f"add systems/{generator}/presets/{generator}.py"
         ) from None
     fit = FitConfig(
         scans=_SCANS,
@@ -65,4 +65,4 @@ def default_recipe(generator: str) -> Recipe:
     )
     stages = cls(config, data.load_sensor()).stages
     title = f"{generator} as its default configuration makes it, on simulated streets"
-    return Recipe(title, generator, config, data, dict.fromkeys(stages, fit))
+    return Preset(title, generator, config, data, dict.fromkeys(stages, fit))

@@ -89,7 +89,7 @@ class FitConfig:
 
 
 @dataclass(frozen=True)
-class Recipe:
+class Preset:
     """One experiment.
 
     Args:
@@ -143,13 +143,13 @@ class Recipe:
         """Return the settings of a stage's training.
 
         Raises:
-            ConfigError: the recipe has none for this stage.
+            ConfigError: the preset has none for this stage.
         """
         if stage not in self.training:
             raise ConfigError(
-                f"a recipe without training.{stage}, a stage of model={self.generator}",
+                f"a preset without training.{stage}, a stage of model={self.generator}",
                 "the settings of every stage's training",
-                f"leave out the model.* that adds {stage}, or begin with a recipe that trains it",
+                f"leave out the model.* that adds {stage}, or begin with a preset that trains it",
             )
         return self.training[stage]
 

@@ -60,9 +60,9 @@ def table_page(cells: Sequence[dict[str, Any]], flops: float) -> str:
         flops: floating-point operations of the training of each; 0 where each had its own budget.
     """
     budget = (
-        f"Each recipe was trained with {flops:.2g} floating-point operations"
+        f"Each preset was trained with {flops:.2g} floating-point operations"
         if flops
-        else "Each recipe was trained with its own budget"
+        else "Each preset was trained with its own budget"
     )
     tables: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
     for cell in cells:

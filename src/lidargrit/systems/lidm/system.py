@@ -195,7 +195,7 @@ class Lidm(Generator[LidmConfig, LidmSampling]):
             raise CheckpointError(
                 f"{path}, which holds no decoder of a tokenizer {config.tokenizer.name()!r}",
                 "a checkpoint of LiDM's diffusion model, which holds its first stage too",
-                "check the path, and use the recipe lidm_kitti_360",
+                "check the path, and use the preset lidm_kitti_360",
             )
         tokenizer = replace(config.tokenizer, mask_head=len(last_layer) > 1)
         generator = cls(replace(config, tokenizer=tokenizer, scale_latents=False), sensor)

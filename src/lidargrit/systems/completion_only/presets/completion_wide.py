@@ -2,19 +2,19 @@
 
 from dataclasses import replace
 
-from lidargrit.generation.settings import Recipe
+from lidargrit.generation.settings import Preset
 from lidargrit.systems.completion_only.system import CompletionOnlyConfig
 from lidargrit.systems.lidargrit.presets import compact_completion
 from lidargrit.systems.multiscale.presets import multiscale_wide
 
-RECIPE = Recipe(
+PRESET = Preset(
     title="a network that completes scans: 64x1024, for one CPU core and half an hour",
     generator="completion_only",
-    model=CompletionOnlyConfig(compact_completion.RECIPE.model.completion),
-    data=multiscale_wide.RECIPE.data,
+    model=CompletionOnlyConfig(compact_completion.PRESET.model.completion),
+    data=multiscale_wide.PRESET.data,
     training={
         "completion": replace(
-            compact_completion.RECIPE.training["completion"],
+            compact_completion.PRESET.training["completion"],
             scans=2500,
             batch_size=2,
             learning_rate=8e-4,

@@ -1,10 +1,10 @@
 """DUSty v1 as published for KITTI odometry: unfolding to 64x256, 19.5 M + 2.8 M parameters."""
 
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.generation.settings import FitConfig, Recipe
+from lidargrit.generation.settings import FitConfig, Preset
 from lidargrit.systems.dusty.system import DustyConfig
 
-RECIPE = Recipe(
+PRESET = Preset(
     title="DUSty-I on KITTI odometry (model.variant=dusty_2 for DUSty-II, baseline for its plain DCGAN)",
     generator="dusty",
     model=DustyConfig(penalty_every=1),

@@ -1,10 +1,10 @@
 """DUSty-I at a size that two CPU cores can train in minutes, on simulated or on your own scans."""
 
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.generation.settings import FitConfig, Recipe
+from lidargrit.generation.settings import FitConfig, Preset
 from lidargrit.systems.dusty.system import DustyConfig
 
-RECIPE = Recipe(
+PRESET = Preset(
     title="DUSty-I, small: 64x256, for two CPU cores and minutes",
     generator="dusty",
     model=DustyConfig(

@@ -4,12 +4,12 @@ The published optimiser is RMSprop. Adam without its first moment differs from i
 """
 
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.generation.settings import FitConfig, Recipe
+from lidargrit.generation.settings import FitConfig, Preset
 from lidargrit.systems.lidargan.system import LidarGanConfig
 
 _TRAIN_SCANS = 19_130  # of sequences 00 to 07, 09 and 10: one epoch; the authors trained on KITTI raw
 
-RECIPE = Recipe(
+PRESET = Preset(
     title="LidarGAN on KITTI odometry: 40 rows without raydrop (model.loss=plain for its other loss)",
     generator="lidargan",
     model=LidarGanConfig(),

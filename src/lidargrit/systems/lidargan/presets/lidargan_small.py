@@ -1,10 +1,10 @@
 """LidarGAN at a size that two CPU cores can train in minutes, on simulated or on your own scans."""
 
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.generation.settings import FitConfig, Recipe
+from lidargrit.generation.settings import FitConfig, Preset
 from lidargrit.systems.lidargan.system import LidarGanConfig
 
-RECIPE = Recipe(
+PRESET = Preset(
     title="LidarGAN, small: 40 of 64 rows without raydrop, for two CPU cores and an hour",
     generator="lidargan",
     model=LidarGanConfig(channels=32),

@@ -1,10 +1,10 @@
 """LiDARGen's KITTI-360 experiment: spherical projection to 64x1024, range and reflectance, 29.7 M parameters."""
 
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.generation.settings import FitConfig, Recipe
+from lidargrit.generation.settings import FitConfig, Preset
 from lidargrit.systems.lidargen.system import LidarGenConfig
 
-RECIPE = Recipe(
+PRESET = Preset(
     title="LiDARGen on KITTI-360 (set data.train and data.val to kitti_360:ROOT:SPLIT)",
     generator="lidargen",
     model=LidarGenConfig(),

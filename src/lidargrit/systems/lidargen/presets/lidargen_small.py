@@ -7,15 +7,15 @@ as Song and Ermon (2020) want it.
 """
 
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.generation.settings import FitConfig, Recipe
+from lidargrit.generation.settings import FitConfig, Preset
 from lidargrit.systems.lidargen.system import LidarGenConfig
 
-RECIPE = Recipe(
+PRESET = Preset(
     title="LiDARGen, small: 64x256, 58 levels of 3 steps, for two CPU cores and an hour",
     generator="lidargen",
     model=LidarGenConfig(
         channels=16,
-        reflectance=False,  # the other small recipes learn range alone
+        reflectance=False,  # the other small presets learn range alone
         levels=58,
         steps_each=3,
     ),

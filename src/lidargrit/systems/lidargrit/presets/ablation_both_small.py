@@ -16,9 +16,9 @@ from lidargrit.core.configuration import override
 from lidargrit.systems.lidargrit.presets import small
 
 _PLAIN = ("augmentations=[]", "any_columns=false")
-_AS_THEY_ARE = [f"training.{stage}.{setting}" for stage in small.RECIPE.training for setting in _PLAIN]
+_AS_THEY_ARE = [f"training.{stage}.{setting}" for stage in small.PRESET.training for setting in _PLAIN]
 
-RECIPE = replace(
-    override(small.RECIPE, [*_AS_THEY_ARE, "training.tokenizer.augmentations=geometric"]),
+PRESET = replace(
+    override(small.PRESET, [*_AS_THEY_ARE, "training.tokenizer.augmentations=geometric"]),
     title="the ablation, small, row 3: with raydrop loss and geometric preservation",
 )

@@ -13,8 +13,8 @@ from dataclasses import replace
 from lidargrit.core.configuration import override
 from lidargrit.systems.lidargrit.presets import ablation_raydrop
 
-RECIPE = replace(
-    override(ablation_raydrop.RECIPE, ["model.tokenizer.raydrop_loss=false"]),
+PRESET = replace(
+    override(ablation_raydrop.PRESET, ["model.tokenizer.raydrop_loss=false"]),
     title="the paper's ablation, row 1: without raydrop loss and geometric preservation",
     published="SWD 61.73e-2, min. matching distance 1.73e-3, JSD 2.82e-2, FPD 212 (paper, table 3; 5,000 test scans)",
 )

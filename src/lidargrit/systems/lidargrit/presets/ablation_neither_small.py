@@ -5,7 +5,7 @@ from dataclasses import replace
 from lidargrit.core.configuration import override
 from lidargrit.systems.lidargrit.presets import ablation_raydrop_small
 
-RECIPE = replace(
-    override(ablation_raydrop_small.RECIPE, ["model.tokenizer.raydrop_loss=false"]),
+PRESET = replace(
+    override(ablation_raydrop_small.PRESET, ["model.tokenizer.raydrop_loss=false"]),
     title="the ablation, small, row 1: without raydrop loss and geometric preservation",
 )

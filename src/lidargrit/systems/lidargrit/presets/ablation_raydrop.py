@@ -11,8 +11,8 @@ from dataclasses import replace
 from lidargrit.core.configuration import override
 from lidargrit.systems.lidargrit.presets import lidargrit_kitti_odometry
 
-RECIPE = replace(
-    override(lidargrit_kitti_odometry.RECIPE, ["training.tokenizer.augmentations=[]"]),
+PRESET = replace(
+    override(lidargrit_kitti_odometry.PRESET, ["training.tokenizer.augmentations=[]"]),
     title="the paper's ablation, row 2: with raydrop loss, without geometric preservation",
     published="SWD 17.68e-2, min. matching distance 1.66e-3, JSD 1.99e-2, FPD 122 (paper, table 3; 5,000 test scans)",
 )

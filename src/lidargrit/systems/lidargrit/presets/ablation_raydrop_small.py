@@ -5,7 +5,7 @@ from dataclasses import replace
 from lidargrit.core.configuration import override
 from lidargrit.systems.lidargrit.presets import ablation_both_small
 
-RECIPE = replace(
-    override(ablation_both_small.RECIPE, ["training.tokenizer.augmentations=[]"]),
+PRESET = replace(
+    override(ablation_both_small.PRESET, ["training.tokenizer.augmentations=[]"]),
     title="the ablation, small, row 2: with raydrop loss, without geometric preservation",
 )

@@ -9,7 +9,7 @@ from lidargrit.systems.lidargrit.presets import small
 _FEWER_TOKENS = ("model.tokenizer.channel_multipliers=1,1,2,4", "model.tokenizer.num_codes=1024")
 _TRANSFORMER = ("model.transformer.layers=5", "model.transformer.width=256")
 
-RECIPE = replace(
-    override(small.RECIPE, [*_FEWER_TOKENS, *_TRANSFORMER, "training.tokenizer.scans=8000"]),
+PRESET = replace(
+    override(small.PRESET, [*_FEWER_TOKENS, *_TRANSFORMER, "training.tokenizer.scans=8000"]),
     title="LidarGRIT: 64x256 in 256 tokens, for one CPU core and an hour",
 )

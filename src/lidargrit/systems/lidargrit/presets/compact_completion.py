@@ -6,13 +6,13 @@ from lidargrit.generation.settings import FitConfig
 from lidargrit.systems.completion_only.completion_network import CompletionNetworkConfig
 from lidargrit.systems.lidargrit.presets import compact_pixels
 
-RECIPE = replace(
-    compact_pixels.RECIPE,
+PRESET = replace(
+    compact_pixels.PRESET,
     title="LidarGRIT with a network that completes scans: 64x256, for one CPU core and an hour",
-    model=replace(compact_pixels.RECIPE.model, completion=CompletionNetworkConfig()),
-    data=replace(compact_pixels.RECIPE.data, train=("simulated:4352:train",)),
+    model=replace(compact_pixels.PRESET.model, completion=CompletionNetworkConfig()),
+    data=replace(compact_pixels.PRESET.data, train=("simulated:4352:train",)),
     training={
-        **compact_pixels.RECIPE.training,
+        **compact_pixels.PRESET.training,
         "completion": FitConfig(
             scans=22_000,
             batch_size=4,

@@ -8,19 +8,19 @@ from lidargrit.systems.lidargrit.presets import compact
 
 # From as many scans, the transformer learns more by Muon than by AdamW at the learning rate that suits each.
 TRANSFORMER = replace(
-    compact.RECIPE.training["transformer"],
+    compact.PRESET.training["transformer"],
     scans=18_000,
     optimiser="muon",
     learning_rate=3e-3,
 )
 
-RECIPE = replace(
-    compact.RECIPE,
+PRESET = replace(
+    compact.PRESET,
     title="LidarGRIT with a pixel decoder: 64x256 in 256 tokens, for one CPU core and ten hours",
     model=replace(
-        compact.RECIPE.model,
+        compact.PRESET.model,
         # No image comes often enough that dropout would prevent anything.
-        transformer=replace(compact.RECIPE.model.transformer, embedding_dropout=0.0, residual_dropout=0.0),
+        transformer=replace(compact.PRESET.model.transformer, embedding_dropout=0.0, residual_dropout=0.0),
         # Sizes that leave the packaged model, rounded to 8 bits, below 12 MB.
         pixels=PixelDecoderConfig(
             coarsest_cell=64,
@@ -35,9 +35,9 @@ RECIPE = replace(
         # Chosen on validation streets: at 1, shares of drops differ too little between scans and between regions.
         guidance=1.15,
     ),
-    data=replace(compact.RECIPE.data, train=("simulated:70000:train",)),
+    data=replace(compact.PRESET.data, train=("simulated:70000:train",)),
     training={
-        **compact.RECIPE.training,
+        **compact.PRESET.training,
         # Scans are not symmetric: the car hides rays on one side. From mirrored ones, half of the samples are mirrored.
         "transformer": replace(TRANSFORMER, scans=220_000, average_over_scans=1000, augmentations=()),
         "pixels": FitConfig(

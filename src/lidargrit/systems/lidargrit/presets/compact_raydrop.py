@@ -6,15 +6,15 @@ from lidargrit.generation.settings import FitConfig
 from lidargrit.systems.lidargrit.presets import compact_pixels
 from lidargrit.systems.raydrop.raydrop_network import RaydropConfig
 
-RECIPE = replace(
-    compact_pixels.RECIPE,
+PRESET = replace(
+    compact_pixels.PRESET,
     title="LidarGRIT with a network of raydrop for clean scans: 64x256, for one CPU core and ten minutes",
-    model=replace(compact_pixels.RECIPE.model, raydrop=RaydropConfig()),
+    model=replace(compact_pixels.PRESET.model, raydrop=RaydropConfig()),
     data=replace(
-        compact_pixels.RECIPE.data, train=("simulated_surfaces:512:train",), val=("simulated_surfaces:64:val",)
+        compact_pixels.PRESET.data, train=("simulated_surfaces:512:train",), val=("simulated_surfaces:64:val",)
     ),
     training={
-        **compact_pixels.RECIPE.training,
+        **compact_pixels.PRESET.training,
         "raydrop": FitConfig(
             scans=4000,
             batch_size=4,

@@ -5,18 +5,18 @@ from dataclasses import replace
 from lidargrit.systems.lidargrit.presets import compact_pixels
 from lidargrit.systems.multiscale.presets import multiscale_wide
 
-_STAGES = compact_pixels.RECIPE.training
+_STAGES = compact_pixels.PRESET.training
 
-RECIPE = replace(
-    compact_pixels.RECIPE,
+PRESET = replace(
+    compact_pixels.PRESET,
     title="LidarGRIT with a pixel decoder: 64x1024 in 1,024 tokens, for one CPU core and five hours",
     # Columns are four times as near as those of 64x256: at its temperature there are too many edges.
     model=replace(
-        compact_pixels.RECIPE.model,
-        pixels=replace(compact_pixels.RECIPE.model.pixels, range_temperature=0.2),
+        compact_pixels.PRESET.model,
+        pixels=replace(compact_pixels.PRESET.model.pixels, range_temperature=0.2),
         guidance=1.0,  # without any, regions of its samples differ in drops as those of validation streets do
     ),
-    data=replace(multiscale_wide.RECIPE.data, train=compact_pixels.RECIPE.data.train),
+    data=replace(multiscale_wide.PRESET.data, train=compact_pixels.PRESET.data.train),
     training={
         # An image of 64x1024 is as much to learn from as four of 64x256.
         "tokenizer": replace(_STAGES["tokenizer"], scans=800, batch_size=1, learning_rate=5e-4, validate_every=400),

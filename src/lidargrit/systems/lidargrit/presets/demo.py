@@ -10,7 +10,7 @@ _TOKENIZER = ("scans=2400", "validate_every=800", "checkpoint_every=400")
 _TRANSFORMER = ("scans=4800", "validate_every=1600", "checkpoint_every=400")
 _TRAINING = [f"training.tokenizer.{each}" for each in _TOKENIZER] + [f"training.transformer.{e}" for e in _TRANSFORMER]
 
-RECIPE = replace(
-    override(small.RECIPE, [*_DATA, *_TRAINING]),
+PRESET = replace(
+    override(small.PRESET, [*_DATA, *_TRAINING]),
     title="LidarGRIT, demo: the small model for a few minutes",
 )

@@ -13,9 +13,9 @@ _FURTHER = {
 }
 _EACH = ("warmup_scans=40", "validate_every=400", "validation_scans=8", "checkpoint_every=80")
 
-RECIPE = replace(
+PRESET = replace(
     override(
-        compact_pixels.RECIPE,
+        compact_pixels.PRESET,
         [f"training.{stage}.{each}" for stage, settings in _FURTHER.items() for each in (*settings, *_EACH)],
     ),
     title="LidarGRIT trained further, demo: 64x256 in 256 tokens, for two CPU cores and four minutes",

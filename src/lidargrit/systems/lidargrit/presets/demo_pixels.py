@@ -25,7 +25,7 @@ _TRAINING = [
     for each in (*settings, "validation_scans=8")
 ]
 
-RECIPE = replace(
-    override(compact_pixels.RECIPE, [*_DATA, *_SMALLER, _UNGUIDED, *_TRAINING]),
+PRESET = replace(
+    override(compact_pixels.PRESET, [*_DATA, *_SMALLER, _UNGUIDED, *_TRAINING]),
     title="LidarGRIT with a pixel decoder, demo: 64x256 in 256 tokens, for two CPU cores and ten minutes",
 )

@@ -18,9 +18,9 @@ _TRANSFORMER = (
     "checkpoint_every=480",
 )
 
-RECIPE = replace(
+PRESET = replace(
     override(
-        compact_pixels.RECIPE,
+        compact_pixels.PRESET,
         [*_DATA, *_SMALLER, _UNGUIDED, *(f"training.transformer.{each}" for each in _TRANSFORMER)],
     ),
     title="LidarGRIT whose transformer alone is trained, demo: 64x256 in 256 tokens, for two CPU cores, four minutes",

@@ -1,14 +1,14 @@
 """The paper's KITTI-360 experiment: spherical projection to 64x1024, 17.3 M + 10.3 M parameters."""
 
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.generation.settings import FitConfig, Recipe
+from lidargrit.generation.settings import FitConfig, Preset
 from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
 from lidargrit.nn.transformer import TransformerConfig
 from lidargrit.systems.lidargrit.system import LidarGritConfig
 
 _TRAIN_SCANS = 50_000  # roughly one epoch of the training drives; the paper trains for 100
 
-RECIPE = Recipe(
+PRESET = Preset(
     title="LidarGRIT on KITTI-360 (set data.train and data.val to kitti_360:ROOT:SPLIT)",
     generator="lidargrit",
     model=LidarGritConfig(

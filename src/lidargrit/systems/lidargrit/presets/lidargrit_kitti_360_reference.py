@@ -22,9 +22,9 @@ from dataclasses import replace
 
 from lidargrit.systems.lidargrit.presets import lidargrit_kitti_360
 
-_PAPER = lidargrit_kitti_360.RECIPE
+_PAPER = lidargrit_kitti_360.PRESET
 
-RECIPE = replace(
+PRESET = replace(
     _PAPER,
     title="LidarGRIT on KITTI-360 as released (set data.train and data.val to kitti_360:ROOT:SPLIT)",
     model=replace(

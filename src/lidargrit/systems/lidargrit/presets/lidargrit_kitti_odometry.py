@@ -1,14 +1,14 @@
 """The paper's KITTI odometry experiment: unfolding to 64x256, 3.1 M + 5.3 M parameters."""
 
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.generation.settings import FitConfig, Recipe
+from lidargrit.generation.settings import FitConfig, Preset
 from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
 from lidargrit.nn.transformer import TransformerConfig
 from lidargrit.systems.lidargrit.system import LidarGritConfig
 
 _TRAIN_SCANS = 19_130  # of sequences 00 to 07, 09 and 10: one epoch; the released configuration trains for 70 and 100
 
-RECIPE = Recipe(
+PRESET = Preset(
     title="LidarGRIT on KITTI odometry (set data.train and data.val to kitti_odometry:ROOT:SPLIT)",
     generator="lidargrit",
     model=LidarGritConfig(

@@ -19,9 +19,9 @@ from dataclasses import replace
 
 from lidargrit.systems.lidargrit.presets import lidargrit_kitti_odometry
 
-_PAPER = lidargrit_kitti_odometry.RECIPE
+_PAPER = lidargrit_kitti_odometry.PRESET
 
-RECIPE = replace(
+PRESET = replace(
     _PAPER,
     title="LidarGRIT on KITTI odometry as released (set data.train and data.val to kitti_odometry:ROOT:SPLIT)",
     model=replace(

@@ -1,12 +1,12 @@
 """LidarGRIT at a size that two CPU cores can train in an hour or two, on simulated or on your own scans."""
 
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.generation.settings import FitConfig, Recipe
+from lidargrit.generation.settings import FitConfig, Preset
 from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
 from lidargrit.nn.transformer import TransformerConfig
 from lidargrit.systems.lidargrit.system import LidarGritConfig
 
-RECIPE = Recipe(
+PRESET = Preset(
     title="LidarGRIT, small: 64x256, for two CPU cores and an hour or two",
     generator="lidargrit",
     model=LidarGritConfig(

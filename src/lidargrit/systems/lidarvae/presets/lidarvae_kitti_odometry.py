@@ -4,12 +4,12 @@
 """
 
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.generation.settings import FitConfig, Recipe
+from lidargrit.generation.settings import FitConfig, Preset
 from lidargrit.systems.lidarvae.system import LidarVaeConfig
 
 _TRAIN_SCANS = 19_130  # of sequences 00 to 07, 09 and 10: one epoch; the authors trained on KITTI raw
 
-RECIPE = Recipe(
+PRESET = Preset(
     title="LiDAR-VAE on KITTI odometry: 40 rows without raydrop, latents of 128 numbers",
     generator="lidarvae",
     model=LidarVaeConfig(warmup_scans=200 * _TRAIN_SCANS),

@@ -1,10 +1,10 @@
 """LidarGAN's autoencoder at a size that two CPU cores can train in minutes, on simulated or on your own scans."""
 
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.generation.settings import FitConfig, Recipe
+from lidargrit.generation.settings import FitConfig, Preset
 from lidargrit.systems.lidarvae.system import LidarVaeConfig
 
-RECIPE = Recipe(
+PRESET = Preset(
     title="LiDAR-VAE, small: 40 of 64 rows without raydrop, for two CPU cores and an hour",
     generator="lidarvae",
     model=LidarVaeConfig(latent_dim=64, channels=32, warmup_scans=20_000),

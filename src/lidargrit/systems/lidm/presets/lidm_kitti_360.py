@@ -6,10 +6,10 @@ so that samples have a front.
 """
 
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.generation.settings import FitConfig, Recipe
+from lidargrit.generation.settings import FitConfig, Preset
 from lidargrit.systems.lidm.system import LidmConfig
 
-RECIPE = Recipe(
+PRESET = Preset(
     title="LiDM on KITTI-360 (set data.train and data.val to kitti_360:ROOT:SPLIT)",
     generator="lidm",
     model=LidmConfig(),

@@ -4,12 +4,12 @@ Unlike the published models it has a mask channel, restarts codes that are not u
 """
 
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.generation.settings import FitConfig, Recipe
+from lidargrit.generation.settings import FitConfig, Preset
 from lidargrit.generation.tokenizers.curve_vqvae import CurveVqvaeConfig
 from lidargrit.systems.lidm.latent_unet import LatentUnetConfig
 from lidargrit.systems.lidm.system import LidmConfig
 
-RECIPE = Recipe(
+PRESET = Preset(
     title="LiDM, small: 64x256, its own first stage, for two CPU cores and an hour",
     generator="lidm",
     model=LidmConfig(

@@ -1,10 +1,10 @@
 """Pixel statistics: each pixel from its own histogram over simulated or your own scans; trains in seconds."""
 
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.generation.settings import Recipe
+from lidargrit.generation.settings import Preset
 from lidargrit.systems.marginal.system import MarginalConfig
 
-RECIPE = Recipe(
+PRESET = Preset(
     title="marginal: every pixel sampled from its own histogram; any model should score better",
     generator="marginal",
     model=MarginalConfig(),

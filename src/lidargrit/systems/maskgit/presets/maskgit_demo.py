@@ -1,13 +1,13 @@
-"""MaskGIT for a few minutes, as the recipe demo; a demo's tokenizer can be taken by ``tokenizer_from``."""
+"""MaskGIT for a few minutes, as the preset demo; a demo's tokenizer can be taken by ``tokenizer_from``."""
 
 from dataclasses import replace
 
 from lidargrit.systems.lidargrit.presets import demo
 from lidargrit.systems.maskgit.presets import maskgit_small
 
-RECIPE = replace(
-    maskgit_small.RECIPE,
+PRESET = replace(
+    maskgit_small.PRESET,
     title="MaskGIT, demo: the small model for a few minutes",
-    data=demo.RECIPE.data,
-    training=demo.RECIPE.training,
+    data=demo.PRESET.data,
+    training=demo.PRESET.training,
 )

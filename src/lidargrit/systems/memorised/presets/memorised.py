@@ -1,10 +1,10 @@
 """Memorised training scans, as a reference row; simulated or your own scans; trains in seconds."""
 
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.generation.settings import Recipe
+from lidargrit.generation.settings import Preset
 from lidargrit.systems.memorised.system import MemorisedConfig
 
-RECIPE = Recipe(
+PRESET = Preset(
     title="memorised: training scans given back; few models can score better",
     generator="memorised",
     model=MemorisedConfig(),

@@ -6,12 +6,12 @@ from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
 from lidargrit.systems.multiscale.presets import multiscale_small
 from lidargrit.systems.multiscale.system import MultiscaleConfig
 
-RECIPE = replace(
-    multiscale_small.RECIPE,
+PRESET = replace(
+    multiscale_small.PRESET,
     title="a pixel decoder without tokens: 64x1024, for one CPU core and half an hour",
     model=MultiscaleConfig(PixelDecoderConfig(column_halvings=2, row_channels=2, range_width=36)),
     data=replace(
-        multiscale_small.RECIPE.data,
+        multiscale_small.PRESET.data,
         train=("simulated:1000:train",),
         val=("simulated:24:val",),
         columns=2048,
@@ -19,7 +19,7 @@ RECIPE = replace(
     ),
     training={
         "pixels": replace(
-            multiscale_small.RECIPE.training["pixels"],
+            multiscale_small.PRESET.training["pixels"],
             scans=3000,
             batch_size=1,
             average_over_scans=150,

@@ -1,10 +1,10 @@
 """R2DM's KITTI-360 experiment: spherical projection to 64x1024, range and reflectance, 31.1 M parameters."""
 
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.generation.settings import FitConfig, Recipe
+from lidargrit.generation.settings import FitConfig, Preset
 from lidargrit.systems.r2dm.system import R2dmConfig
 
-RECIPE = Recipe(
+PRESET = Preset(
     title="R2DM on KITTI-360 (set data.train and data.val to kitti_360:ROOT:SPLIT)",
     generator="r2dm",
     model=R2dmConfig(),

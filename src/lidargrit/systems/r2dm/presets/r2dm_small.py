@@ -1,16 +1,16 @@
 """R2DM at a size that two CPU cores can train in minutes, on simulated or on your own scans."""
 
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.generation.settings import FitConfig, Recipe
+from lidargrit.generation.settings import FitConfig, Preset
 from lidargrit.systems.r2dm.system import R2dmConfig
 from lidargrit.systems.r2dm.unet import UnetConfig
 
-RECIPE = Recipe(
+PRESET = Preset(
     title="R2DM, small: 64x256, for two CPU cores and some minutes",
     generator="r2dm",
     model=R2dmConfig(
         unet=UnetConfig(channels=16, channel_multipliers=(1, 2, 4, 8), residual_blocks=(1, 1, 1, 1)),
-        reflectance=False,  # the other small recipes learn the range alone; the authors find it sharper, too
+        reflectance=False,  # the other small presets learn the range alone; the authors find it sharper, too
     ),
     data=DataConfig(train=("simulated:2000:train",), val=("simulated:32:val",)),
     training={

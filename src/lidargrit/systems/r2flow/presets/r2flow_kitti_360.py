@@ -1,10 +1,10 @@
 """R2Flow's KITTI-360 experiment: spherical projection to 64x1024, range and reflectance, 80.9 M parameters."""
 
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.generation.settings import FitConfig, Recipe
+from lidargrit.generation.settings import FitConfig, Preset
 from lidargrit.systems.r2flow.system import R2flowConfig
 
-RECIPE = Recipe(
+PRESET = Preset(
     title="R2Flow (1-RF) on KITTI-360 (set data.train and data.val to kitti_360:ROOT:SPLIT)",
     generator="r2flow",
     model=R2flowConfig(),

@@ -9,11 +9,11 @@ from dataclasses import replace
 from lidargrit.systems.r2flow.presets import r2flow_kitti_360
 from lidargrit.systems.r2flow.system import ReflowConfig
 
-_FLOW = r2flow_kitti_360.RECIPE.training["flow"]
+_FLOW = r2flow_kitti_360.PRESET.training["flow"]
 
-RECIPE = replace(
-    r2flow_kitti_360.RECIPE,
+PRESET = replace(
+    r2flow_kitti_360.PRESET,
     title="R2Flow (2-RF, 4-TD) on KITTI-360 (set data.train and data.val to kitti_360:ROOT:SPLIT)",
-    model=replace(r2flow_kitti_360.RECIPE.model, reflow=ReflowConfig(distilled_steps=4)),
+    model=replace(r2flow_kitti_360.PRESET.model, reflow=ReflowConfig(distilled_steps=4)),
     training={"flow": _FLOW, "reflow": _FLOW, "distillation": _FLOW},  # the program changes no setting of these
 )

@@ -8,7 +8,7 @@ mirrored, so that scans face forward (``model.flips=true`` does as the program).
 from dataclasses import replace
 
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.generation.settings import FitConfig, Recipe
+from lidargrit.generation.settings import FitConfig, Preset
 from lidargrit.systems.ultralidar.system import UltraLidarConfig
 
 _TRAIN_SCANS = 50_000  # roughly one epoch of the training drives
@@ -26,7 +26,7 @@ _FIT = FitConfig(
     checkpoint_every=10_000,
 )
 
-RECIPE = Recipe(
+PRESET = Preset(
     title="UltraLiDAR on KITTI-360 (set data.train and data.val to kitti_360:ROOT:SPLIT)",
     generator="ultralidar",
     model=UltraLidarConfig(),

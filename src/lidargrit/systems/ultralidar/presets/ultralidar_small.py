@@ -1,7 +1,7 @@
 """UltraLiDAR at a size that two CPU cores can train in an hour: 20x256x256 voxels, 1,024 tokens, 1.9 M parameters."""
 
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.generation.settings import FitConfig, Recipe
+from lidargrit.generation.settings import FitConfig, Preset
 from lidargrit.systems.ultralidar.swin import SwinConfig
 from lidargrit.systems.ultralidar.system import UltraLidarConfig
 from lidargrit.systems.ultralidar.voxel_autoencoder import VoxelAutoencoderConfig
@@ -23,7 +23,7 @@ _FIT = FitConfig(
     checkpoint_every=500,
 )
 
-RECIPE = Recipe(
+PRESET = Preset(
     title="UltraLiDAR, small: cells of 0.39 m, 1,024 tokens, for two CPU cores",
     generator="ultralidar",
     model=UltraLidarConfig(

@@ -1,4 +1,4 @@
-"""No recipe watches or is tested on what it learns from: told by the files that its sources find."""
+"""No preset watches or is tested on what it learns from: told by the files that its sources find."""
 
 from pathlib import Path
 
@@ -8,17 +8,17 @@ from lidargrit.core import discovery
 from lidargrit.data.datasets import load, open_dataset
 from lidargrit.evaluation.protocols import load_protocol
 from lidargrit.evaluation.reproduction import TABLES, Reproduction
-from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.presets import load_preset
 
 TREES = {  # every drive that was released
     "kitti_360": ("data_3d_raw/2013_05_28_drive_{:04d}_sync/velodyne_points/data", (0, *range(2, 8), 9, 10)),
     "kitti_odometry": ("sequences/{:02d}/velodyne", range(22)),
 }
 PROTOCOLS = {"kitti_360": "lidargrit_kitti_360", "kitti_odometry": "lidargrit_kitti_odometry"}
-ON_KITTI = {  # recipe → its data set
+ON_KITTI = {  # preset → its data set
     name: source.partition(":")[0]
-    for name in discovery.names("recipes")
-    for source in load_recipe(name).data.train
+    for name in discovery.names("presets")
+    for source in load_preset(name).data.train
     if source.partition(":")[0] in TREES
 }
 
@@ -43,14 +43,14 @@ def found(source: str, root: Path) -> tuple[set[str], set[str]]:
     return {str(dataset.path(index)) for index in everything}, {dataset.recording(index) for index in everything}
 
 
-def test_there_are_such_recipes():
+def test_there_are_such_presets():
     assert {"lidargrit_kitti_360", "lidargen_kitti_360", "r2dm_kitti_360", "ablation_neither"} <= ON_KITTI.keys()
     assert len(ON_KITTI) >= 8
 
 
-@pytest.mark.parametrize("recipe", ON_KITTI)
-def test_train_val_and_test_share_no_scan_and_no_drive(recipe, roots):
-    data_set, data = ON_KITTI[recipe], load_recipe(recipe).data
+@pytest.mark.parametrize("preset", ON_KITTI)
+def test_train_val_and_test_share_no_scan_and_no_drive(preset, roots):
+    data_set, data = ON_KITTI[preset], load_preset(preset).data
     tested = [f"{data_set}::{split}" for split in load_protocol(PROTOCOLS[data_set]).splits]
     for first, second in ((data.train, data.val), (data.train, tested), (data.val, tested)):
         for one in first:
@@ -62,18 +62,18 @@ def test_train_val_and_test_share_no_scan_and_no_drive(recipe, roots):
 
 
 @pytest.mark.parametrize("number", TABLES)
-def test_a_reproduction_takes_the_very_splits_of_its_recipes(number):
+def test_a_reproduction_takes_the_very_splits_of_its_presets(number):
     wanted = Reproduction(number, "ROOT")
     assert wanted.benchmark().reference == f"{TABLES[number].data_set}:ROOT:test"
     assert "test" in load_protocol(TABLES[number].protocol).splits
-    for recipe in wanted.systems().values():
-        own, taken = load_recipe(recipe).data, load_recipe(recipe, wanted.benchmark().recipe_settings).data
+    for preset in wanted.systems().values():
+        own, taken = load_preset(preset).data, load_preset(preset, wanted.benchmark().preset_settings).data
         for mine, theirs in ((own.train, taken.train), (own.val, taken.val)):
             assert [source.rpartition(":")[2] for source in mine] == [s.rpartition(":")[2] for s in theirs]
 
 
 def test_the_reference_program_s_splits_do_share_drives():
-    """The mistakes that our recipes do not repeat are told as splits, too, and this test would see them."""
+    """The mistakes that our presets do not repeat are told as splits, too, and this test would see them."""
     parts = load("kitti_360").splits()
     train, test = set(parts["lidargrit-code/train"]), set(parts["lidargrit-code/test"])
     assert set(parts["lidargrit-code/val_tokenizer"]) <= train
