@@ -21,7 +21,7 @@ from lidargrit.nn.attention import attend
 
 ROUNDS = 8
 SIZES = {  # heads, tokens, channels of a head, causal
-    "compact_pixels": (4, 256, 64, True),
+    "lidargrit_compact_pixels": (4, 256, 64, True),
     "small": (4, 1024, 48, True),
     "published": (8, 1024, 32, True),
     "maskgit_small": (4, 1024, 48, False),

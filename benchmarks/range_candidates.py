@@ -30,7 +30,7 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--scans", default="simulated:256:val", help="source of scans (default: %(default)s)")
     parser.add_argument("-n", type=int, default=24, help="number of scans")
     choices = parser.parse_args(words)
-    sensor = load_preset("compact_pixels").data.load_sensor()
+    sensor = load_preset("lidargrit_compact_pixels").data.load_sensor()
     source = open_images(choices.scans, sensor=sensor)
     images = source.batch(range(min(choices.n, len(source))))
     v, returned = images.range_m.log1p(), images.return_mask

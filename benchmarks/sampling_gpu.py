@@ -6,7 +6,7 @@ Random weights: the time does not depend on them. Ours runs in full: tokens by C
 sampled. Recomputation reads the whole prefix again for every token, in 16 bits too, and takes the logits of the last
 position only; its steps are timed in the middle of four equal spans of the length and summed. Of R2DM one step is timed
 and taken as often as is published. Batches too large for the memory are left out. On a CPU (``--device cpu --preset
-small --r2dm r2dm_small --batch 1``) it shows that the script runs, and nothing else.
+lidargrit_small --r2dm r2dm_small --batch 1``) it shows that the script runs, and nothing else.
 """
 
 import argparse

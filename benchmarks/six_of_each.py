@@ -1,6 +1,6 @@
 """Folders of samples or sources of scans → one picture: six range images of each, on one scale.
 
-    python benchmarks/six_of_each.py six.png real=/data/held_out LidarGRIT=table/small/samples table/r2dm_small/samples
+    python benchmarks/six_of_each.py six.png real=/data/held_out LidarGRIT=runs/samples table/r2dm_small/samples
 
 A name before the first equals sign stands in place of the folder's. Colours tell ranges from 2 to 80 m; a
 pixel without a return is white. Nothing is chosen: the scans are evenly spaced over each source.

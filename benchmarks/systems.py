@@ -20,7 +20,7 @@ from lidargrit.generation.settings import Preset
 from lidargrit.training import measure, training_flops
 
 PAIRS = {  # system → its small preset, and that of the published size
-    "lidargrit": ("small", "lidargrit_kitti_360"),
+    "lidargrit": ("lidargrit_small", "lidargrit_kitti_360"),
     "lidargan": ("lidargan_small", "lidargan_kitti_odometry"),
     "lidarvae": ("lidarvae_small", "lidarvae_kitti_odometry"),
     "dusty": ("dusty_small", "dusty_kitti_odometry"),
@@ -29,7 +29,7 @@ PAIRS = {  # system → its small preset, and that of the published size
     "r2dm": ("r2dm_small", "r2dm_kitti_360"),
     "r2flow": ("r2flow_small", "r2flow_kitti_360"),
     "lidm": ("lidm_small", "lidm_kitti_360"),
-    "lidm_shared": ("lidm_shared_small", "lidm_shared_kitti_360"),
+    "lidm_shared": ("lidm_small_shared", "lidm_kitti_360_shared"),
 }
 
 

@@ -1,6 +1,6 @@
 """Throughput of both stages: our loop beside a plain one with the released program's choices, in scans a second.
 
-    OMP_NUM_THREADS=1 python benchmarks/training.py [--full] [--preset small] [--batch 2] [--steps 8] [--rounds 2]
+    OMP_NUM_THREADS=1 python benchmarks/training.py [--full] [--preset lidargrit_small] [--batch 2] [--steps 8]
 
 Both loops train the same networks by the same losses on the same scans. The plain loop computes in 32 bits, writes
 attention out as products over a square mask, asks a discriminator whose answer has the weight 0 (forward only), and
@@ -114,7 +114,7 @@ def on_simulated_scans(preset: Preset) -> Iterator[tuple[RangeImages, Generator,
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--full", action="store_true", help="the paper's KITTI-360 networks, two steps of one scan")
-    parser.add_argument("--preset", default="small")
+    parser.add_argument("--preset", default="lidargrit_small")
     parser.add_argument("--batch", type=int, default=0, help="scans (default: the preset's; 1 with --full)")
     parser.add_argument("--steps", type=int, default=0, help="timed (default: 8; 2 with --full)")
     parser.add_argument("--rounds", type=int, default=2)

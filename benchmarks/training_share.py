@@ -1,6 +1,6 @@
 """Share of a training step that its matrix products and convolutions would take if they ran alone.
 
-    OMP_NUM_THREADS=1 python benchmarks/training_share.py [--preset compact_pixels] [--steps 8] [--set NAME=VALUE ...]
+    OMP_NUM_THREADS=1 python benchmarks/training_share.py [--preset lidargrit_small] [--steps 8] [--set NAME=VALUE ...]
 
 For each stage, steps of ``train`` are listed call by call: the products and convolutions of its forward and backward
 passes, of the frozen tokenizer that encodes the scans, and of the optimiser, each with its shapes, strides and number
@@ -109,7 +109,7 @@ def by_kind(counts: Mapping[Call, float]) -> dict[str, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--preset", default="compact_pixels")
+    parser.add_argument("--preset", default="lidargrit_compact_pixels")
     parser.add_argument("--steps", type=int, default=8, help="timed (default: 8)")
     parser.add_argument("--set", nargs="+", default=[], help="settings of the preset")
     options = parser.parse_args()

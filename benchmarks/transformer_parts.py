@@ -36,7 +36,7 @@ from lidargrit.training.optimiser import learning_rate_at, make_optimiser
 
 BATCH = 8
 _ORDERS = 2  # random orders of each validation scan, over which the nats are averaged
-_SIZE = {"layers": 4, "heads": 4, "width": 192}  # of the preset ``small``
+_SIZE = {"layers": 4, "heads": 4, "width": 192}  # of the preset ``lidargrit_small``
 
 
 @dataclass(frozen=True)

@@ -109,7 +109,7 @@ def test_a_run_of_another_sensor_is_told_before_it_is_sampled(tmp_path):
 def test_settings_that_a_later_preset_cannot_follow_are_told_before_the_first_system(tmp_path):
     wrong = replace(BENCHMARK, preset_settings=(*FEW, "training.tokenizer.optimiser=muon"))
     with pytest.raises(ConfigError, match="optimiser=muon for networks without linear layers"):
-        run_benchmark(["pretrained", "demo"], tmp_path, wrong)
+        run_benchmark(["pretrained", "lidargrit_demo"], tmp_path, wrong)
     assert not list(tmp_path.rglob("*"))
 
 
@@ -143,7 +143,7 @@ def test_training_flops_are_three_forward_passes_of_a_plain_stack():
 
 
 def test_a_budget_scales_all_stages_alike():
-    preset = load_preset("demo", MODEL)
+    preset = load_preset("lidargrit_demo", MODEL)
     cost = sum(training_flops(preset).values())
     half = with_budget(preset, cost / 2)
     for stage, fit in preset.training.items():
@@ -161,13 +161,13 @@ def test_a_budget_scales_all_stages_alike():
 
 
 def test_images_that_only_count_mark_surfaces_that_return():
-    marked = read_marks(uniform_images(load_preset("demo", MODEL).data.load_sensor(), 1).reflectance)
+    marked = read_marks(uniform_images(load_preset("lidargrit_demo", MODEL).data.load_sensor(), 1).reflectance)
     assert marked.is_clear
     assert marked.has_reflectance
 
 
 def test_stages_that_are_taken_from_another_run_are_not_counted():
-    preset = load_preset("compact_completion")  # over the packaged model
+    preset = load_preset("completion_compact")  # over the packaged model
     assert list(training_flops(preset)) == ["completion"]
     scaled = with_budget(preset, training_flops(preset)["completion"] / 4)
     assert sum(training_flops(scaled).values()) == pytest.approx(training_flops(preset)["completion"] / 4, rel=0.01)
@@ -179,7 +179,7 @@ def test_a_budget_counts_what_is_prepared_once(monkeypatch):
 
     cost = compute.StageCost(100.0, lambda scans: 900 * min(scans, 50))
     monkeypatch.setattr(compute, "stage_costs", lambda preset: {"tokenizer": cost})
-    preset = load_preset("demo", ["training.tokenizer.scans=4000", "training.tokenizer.batch_size=1"])
+    preset = load_preset("lidargrit_demo", ["training.tokenizer.scans=4000", "training.tokenizer.batch_size=1"])
     preset = replace(preset, training={"tokenizer": preset.training["tokenizer"]})
     for budget in (20_000.0, 60_000.0, 200_000.0, 2_000_000.0):
         scans = with_budget(preset, budget).training["tokenizer"].scans
@@ -208,7 +208,7 @@ def test_what_all_are_scored_by_is_looked_at_first(tmp_path):
 
 
 def test_attention_counts_in_training_flops():
-    preset = load_preset("small", ("data.train=simulated:6:train", *FEW[2:]))
+    preset = load_preset("lidargrit_small", ("data.train=simulated:6:train", *FEW[2:]))
     flops, scans = training_flops(preset)["transformer"], preset.training["transformer"].scans
     generator = load_class("lidargrit")(preset.model, preset.data.load_sensor())
     tokens, sizes = generator.transformer.context_length, preset.model.transformer
@@ -220,7 +220,7 @@ def test_attention_counts_in_training_flops():
 
 @pytest.mark.parametrize(
     ("preset", "stage"),
-    [("demo", "tokenizer"), ("maskgit_demo", "transformer")],
+    [("lidargrit_demo", "tokenizer"), ("maskgit_demo", "transformer")],
 )
 def test_counted_operations_are_those_of_a_step_that_is_computed(preset, stage):
     preset = load_preset(preset, MODEL)
@@ -234,7 +234,14 @@ def test_counted_operations_are_those_of_a_step_that_is_computed(preset, stage):
 
 @pytest.mark.parametrize(
     "preset",
-    ["ultralidar_kitti_360", "maskgit_small", "lidm_small", "small_pixels", "lidarvae_small", "dusty_kitti_odometry"],
+    [
+        "ultralidar_kitti_360",
+        "maskgit_small",
+        "lidm_small",
+        "lidargrit_small_pixels",
+        "lidarvae_small",
+        "dusty_kitti_odometry",
+    ],
 )
 def test_operations_are_counted_without_computing_them(preset, monkeypatch):
     """Else a dry run of a wide network takes minutes: frozen networks, caches and counters count, too."""
@@ -276,9 +283,9 @@ def test_processes_make_a_table_that_can_be_extended(tmp_path, capfd):
     assert first == again
     assert (tmp_path / "table.html").read_text().count("<tr>") == 1 + 3 + 1
     for wrong, got in (
-        (["--add", "small", "-n", "5"], "--add with settings of its own (-n)"),
-        (["--add", "small", "--against", "simulated:256:test"], "--add with settings of its own (--against)"),
-        (["small", "--add", "demo"], "--add with systems before it"),
+        (["--add", "lidargrit_small", "-n", "5"], "--add with settings of its own (-n)"),
+        (["--add", "lidargrit_small", "--against", "simulated:256:test"], "--add with settings of its own (--against)"),
+        (["lidargrit_small", "--add", "lidargrit_demo"], "--add with systems before it"),
         (["--add", str(tmp_path)], f"{tmp_path}, a folder that holds no finished run"),
     ):
         capfd.readouterr()

@@ -53,8 +53,8 @@ def objective_of(preset: str, stage: str, *settings: str) -> nn.Module:
 
 
 OBJECTIVES = [
-    ("demo", "tokenizer", *SETTINGS),
-    ("demo", "transformer", *SETTINGS, "model.transformer.layers=3"),
+    ("lidargrit_demo", "tokenizer", *SETTINGS),
+    ("lidargrit_demo", "transformer", *SETTINGS, "model.transformer.layers=3"),
     ("r2dm_small", "diffusion", *MODEL[:2], "model.unet.channel_multipliers=[1,2]", "model.unet.residual_blocks=[1,1]"),
 ]
 
@@ -111,7 +111,7 @@ def check_resuming(folder: Path) -> None:
     trace_in_place_of_compiling()
     both = [f"training.transformer.{choice}=true" for choice in ("recompute", "compile")]
     steps = ["training.tokenizer.scans=8", "training.transformer.scans=16", "training.transformer.pictures_every=8"]
-    preset = load_preset("demo", (*SETTINGS, *SIMULATED, *LONG, *both, *steps))
+    preset = load_preset("lidargrit_demo", (*SETTINGS, *SIMULATED, *LONG, *both, *steps))
     train(preset, folder / "whole")
 
     def stop(*_):
@@ -135,7 +135,7 @@ def test_compiled_networks_have_the_same_gradients_and_resume(tmp_path):
 
 
 def test_a_run_of_the_other_choice_is_refused(tmp_path):
-    preset = load_preset("demo", (*MODEL, *SIMULATED, *SHORT))
+    preset = load_preset("lidargrit_demo", (*MODEL, *SIMULATED, *SHORT))
     train(preset, tmp_path)
     on = replace(preset.training["tokenizer"], recompute=True)
     with pytest.raises(OutputError, match=r"recompute=False, here True"):

@@ -58,7 +58,7 @@ def typed(capsys):
 def run_folder(tmp_path_factory) -> Path:
     """Return a finished run, in a folder whose name has a space."""
     folder = tmp_path_factory.mktemp("runs") / "my run"
-    assert main(["train", "demo", str(folder), "--set", *TINY]) == 0
+    assert main(["train", "lidargrit_demo", str(folder), "--set", *TINY]) == 0
     return folder
 
 
@@ -101,18 +101,18 @@ def test_train_leaves_a_run_that_says_what_it_is(run_folder):
 def test_the_same_train_command_again_changes_nothing(run_folder, typed):
     before = contents(run_folder)
     done = f"done: the model lies in {run_folder}; try it with: lidargrit sample {run_folder} samples -n 16"
-    assert done in typed("train", "demo", run_folder, "--set", *TINY)
+    assert done in typed("train", "lidargrit_demo", run_folder, "--set", *TINY)
     assert contents(run_folder) == before
 
 
 def test_settings_may_come_before_the_names(run_folder, typed):
     before = contents(run_folder)
-    assert "done" in typed("train", "--set", *TINY, "--", "demo", run_folder)
+    assert "done" in typed("train", "--set", *TINY, "--", "lidargrit_demo", run_folder)
     assert contents(run_folder) == before
 
 
 def test_dry_run_tells_the_plan_and_writes_nothing(tmp_path, typed):
-    output = typed("train", "demo", tmp_path / "none", "--dry-run", "--set", *TINY)
+    output = typed("train", "lidargrit_demo", tmp_path / "none", "--dry-run", "--set", *TINY)
     for line in ("training.tokenizer.scans = 8", "range images of 64x64, 0.", "transformer: ", "8 scans in batches of"):
         assert line in output
     assert not (tmp_path / "none").exists()
@@ -156,19 +156,19 @@ def test_every_preset_has_a_plan(preset, tmp_path, capsys, monkeypatch):
 
 
 def test_a_plan_tells_which_stages_are_taken_and_not_trained(tmp_path, capsys, monkeypatch):
-    assert main(["train", "compact_raydrop", str(tmp_path / "none"), "--dry-run", "--json"]) == 0
+    assert main(["train", "raydrop_compact", str(tmp_path / "none"), "--dry-run", "--json"]) == 0
     stages = {stage["name"]: stage for stage in json.loads(capsys.readouterr().out)["stages"]}
     assert {name for name, stage in stages.items() if not stage["taken_from"]} == {"raydrop"}
     assert stages["pixels"]["taken_from"] == "pretrained"
     assert stages["pixels"]["flops"] == 0 < stages["raydrop"]["flops"]
     monkeypatch.setattr(sys.modules["lidargrit.training.plan"], "training_flops", told_at_once)
     words = ["--dry-run", "--set", "fine_tune=[pixels]", "model.raydrop.surfaces=estimated"]
-    assert main(["train", "compact_raydrop", str(tmp_path / "none"), *words]) == 0
+    assert main(["train", "raydrop_compact", str(tmp_path / "none"), *words]) == 0
     text = capsys.readouterr().out
     assert "transformer: 4,539,136 parameters, taken from pretrained and not trained" in text
     assert "pixels: 1,019,023 parameters, 58,000 scans" in text
     words = ["--dry-run", "--set", "model.pixels.coarsest_cell=8"]
-    assert main(["train", "compact_raydrop", str(tmp_path / "none"), *words]) == 2
+    assert main(["train", "raydrop_compact", str(tmp_path / "none"), *words]) == 2
     assert "whose pixels is another (model.pixels.coarsest_cell=64)" in the_one_line(capsys.readouterr().err, "train")
 
 

@@ -197,11 +197,11 @@ def test_what_is_no_settings_is_told_with_its_name(key):
 
 def test_settings_of_a_preset_are_checked_with_the_words_of_their_class():
     with pytest.raises(ConfigError, match=r"^got channels=40; wanted a positive multiple of 32"):
-        load_preset("small", ["model.tokenizer.channels=40"])
+        load_preset("lidargrit_small", ["model.tokenizer.channels=40"])
     with pytest.raises(ConfigError, match=r"^got batch_size=0; wanted at least 1; raise it$"):
-        load_preset("small", ["training.tokenizer.batch_size=0"])
+        load_preset("lidargrit_small", ["training.tokenizer.batch_size=0"])
     with pytest.raises(ConfigError, match=r"^got training.tokenizer.learning_rate=nan; wanted a finite number"):
-        load_preset("small", ["training.tokenizer.learning_rate=.nan"])
+        load_preset("lidargrit_small", ["training.tokenizer.learning_rate=.nan"])
 
 
 @pytest.mark.parametrize(

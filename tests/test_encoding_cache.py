@@ -78,7 +78,7 @@ def test_images_of_other_reflectance_are_others():
 def test_a_measured_stage_encodes_other_images_in_every_step(monkeypatch):
     encoded, encode = [], EncodingCache._encoded
     monkeypatch.setattr(EncodingCache, "_encoded", lambda cache, some: encoded.append(some) or encode(cache, some))
-    preset = load_preset("demo", [*MODEL, *SIMULATED, *SHORT])
+    preset = load_preset("lidargrit_demo", [*MODEL, *SIMULATED, *SHORT])
     batch = preset.settings_of("transformer").batch_size
     measure(preset)
     new = [some for some in encoded if not some.range_m.is_meta]  # the others are of counted operations

@@ -107,7 +107,7 @@ def parameters(module):
     [
         ("lidm_kitti_360", (8, 16, 128), (15_070_361, 257_751_560)),
         ("lidm_small", (8, 16, 32), (988_122, 1_859_464)),
-        ("lidm_shared_small", (4, 16, 64), (806_210, 1_857_156)),
+        ("lidm_small_shared", (4, 16, 64), (806_210, 1_857_156)),
     ],
 )
 def test_presets_have_the_published_size_or_that_of_two_cores(name, latents, sizes):

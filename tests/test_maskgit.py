@@ -179,7 +179,7 @@ def test_a_wrong_choice_is_told(wrong):
 
 def test_a_tokenizer_is_taken_from_another_run(tmp_path):
     settings = [*MODEL, *SIMULATED, *SHORT]
-    donor = train(load_preset("demo", settings), tmp_path / "donor")
+    donor = train(load_preset("lidargrit_demo", settings), tmp_path / "donor")
     other_scans = "data.train=[simulated:6:train]"
     preset = load_preset("maskgit_demo", [*settings, other_scans, f"tokenizer_from={tmp_path / 'donor'}"])
     generator = train(preset, tmp_path / "run")

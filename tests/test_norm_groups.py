@@ -11,7 +11,7 @@ from lidargrit.generation.tokenizers import make_tokenizer
 from lidargrit.systems.lidm.latent_unet import LatentUnet
 
 
-@pytest.mark.parametrize("preset", ["lidm_small", "lidm_shared_small"])
+@pytest.mark.parametrize("preset", ["lidm_small", "lidm_small_shared"])
 def test_a_small_denoiser_sees_latents_that_are_too_high_as_a_whole(preset):
     """A norm of single channels takes away their means, and what is generated then keeps the mean of the noise."""
 
@@ -30,7 +30,7 @@ def test_a_small_denoiser_sees_latents_that_are_too_high_as_a_whole(preset):
     assert moved(groups) > 5 * moved(32)
 
 
-@pytest.mark.parametrize("preset", ["small", "lidm_small"])
+@pytest.mark.parametrize("preset", ["lidargrit_small", "lidm_small"])
 def test_all_norms_of_a_tokenizer_have_as_many_groups_as_its_setting_says(preset):
     loaded = load_preset(preset)
     plain, coarser = (

@@ -70,5 +70,7 @@ def test_a_default_preset_needs_defaults_and_a_known_name(code):
     other = code.parents[1] / "without_default" / "system.py"
     other.parent.mkdir()
     other.write_text(code.read_text().replace("start_m: float = 10.0", "start_m: float"), encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"without_default without a preset .* add systems/without_default/presets"):
+    with pytest.raises(
+        ConfigError, match=r"without_default without a preset .* add without_default to systems/without_default/presets"
+    ):
         default_preset("without_default")

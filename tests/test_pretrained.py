@@ -44,7 +44,7 @@ def test_all_of_it_is_small_and_its_card_is_whole(folder):
 
 
 def test_it_is_what_its_preset_makes(model):
-    preset, completing = load_preset("compact_raydrop"), load_preset("compact_completion")
+    preset, completing = load_preset("raydrop_compact"), load_preset("completion_compact")
     assert model.config == replace(preset.model, completion=completing.model.completion)
     trained = json.loads((FOLDER / "run.json").read_text(encoding="utf-8"))["preset"]
     seen = {stage: fit["scans"] for stage, fit in trained["training"].items()}
@@ -54,8 +54,8 @@ def test_it_is_what_its_preset_makes(model):
 
 
 def test_the_wide_one_is_what_its_preset_makes():
-    preset, wide = load_preset("compact_wide"), load("pretrained_wide")
-    completing, dropping = load_preset("completion_wide"), load_preset("compact_raydrop")
+    preset, wide = load_preset("lidargrit_wide_pixels"), load("pretrained_wide")
+    completing, dropping = load_preset("completion_wide"), load_preset("raydrop_compact")
     assert wide.config == replace(preset.model, completion=completing.model.completion, raydrop=dropping.model.raydrop)
     assert wide.sensor.same_rays(preset.data.load_sensor())
     assert (wide.sensor.height, wide.sensor.width) == (64, 1024)
@@ -128,7 +128,7 @@ def test_every_verb_that_takes_a_run_takes_the_word(tmp_path, monkeypatch, capsy
     words = ["data.train=simulated:2:train", "data.val=simulated:1:val", "tokenizer_from=pretrained"]
     words += [f"training.transformer.{setting}" for setting in ("scans=2", "batch_size=2", "warmup_scans=0")]
     words.append("model.transformer.layers=1")
-    assert main(["train", "compact", "run", "--set", *words]) == 0
+    assert main(["train", "lidargrit_compact", "run", "--set", *words]) == 0
     assert main(["publish", "run", "to_share"]) == 0
     assert json.loads((tmp_path / "to_share" / "run.json").read_text())["preset"]["tokenizer_from"] is None
     known = [

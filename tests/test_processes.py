@@ -229,7 +229,7 @@ def test_two_processes_learn_what_one_does(tmp_path):
 
 @pytest.mark.parametrize("parts", [2, 4])
 def test_a_batch_in_parts_takes_the_same_step(tmp_path, parts):
-    preset = load_preset("demo", train_words(tmp_path)[4:])
+    preset = load_preset("lidargrit_demo", train_words(tmp_path)[4:])
     config = DataConfig(train=("simulated:4:train",), columns=512, column_stride=8)
     images = load_range_images(config.train, config)
     sizes = replace(preset.model.tokenizer, dropout=0.0, codebook_loss="paper", restart_dead_codes=False)
@@ -261,7 +261,9 @@ def test_a_validation_needs_no_more_memory_than_a_step(tmp_path, monkeypatch):
     config = DataConfig(train=("simulated:4:train",), val=(), columns=512, column_stride=8)
     images = load_range_images(config.train, config)
     learn = FitConfig(scans=4, batch_size=4, accumulate=2, learning_rate=1e-3, validation_scans=4)
-    fit = Fit(Vqvae(load_preset("demo", STEADY).model.tokenizer, images.sensor), learn, tmp_path, 0, Reporter())
+    fit = Fit(
+        Vqvae(load_preset("lidargrit_demo", STEADY).model.tokenizer, images.sensor), learn, tmp_path, 0, Reporter()
+    )
     sizes = []
     monkeypatch.setattr(fit.engine, "evaluate", lambda objective, some, seed: sizes.append(len(some)) or {"loss": 1.0})
     assert fit.validate(images) == {"loss": 1.0}

@@ -45,7 +45,7 @@ def run(tmp_path_factory):
         patch.setenv("LIDARGRIT_CACHE", str(folder / "cache"))
         load("kitti_odometry").write_example(folder / "data", 4)
         sources = [f"data.train=[kitti_odometry:{folder / 'data'}:train]", f"data.val=[{folder / 'data'}:08]"]
-        assert main(["train", "demo", str(folder / "run"), "--set", *MODEL, *SHORT, *sources]) == 0
+        assert main(["train", "lidargrit_demo", str(folder / "run"), "--set", *MODEL, *SHORT, *sources]) == 0
         assert main(["sample", str(folder / "run"), str(folder / "samples"), "-n", "3"]) == 0
         words = [
             "--metrics",
@@ -83,7 +83,7 @@ def test_what_is_published_is_a_run_without_the_users_places(run, tmp_path, caps
     again = tmp_path / "again"
     assert main(["publish", str(public), str(again), "--scores", str(run.parent / "scores.json")]) == 0
     assert contents(again) == files
-    assert main(["train", "demo", str(public), "--set", *MODEL]) == 2
+    assert main(["train", "lidargrit_demo", str(public), "--set", *MODEL]) == 2
     assert "whose weights were published" in capsys.readouterr().err
 
 
@@ -286,7 +286,7 @@ def test_terms_of_weights_that_were_taken_over_stay(tmp_path):
     fit = {"scans": 8, "batch_size": 2, "learning_rate": 0.1}
     imported = {"files": [{"name": "vq.pth", "sha256": "ab" * 32}]}
     write_json(tmp_path / "first" / "run.json", {"preset": {**data, "training": {"tokenizer": fit}}, **imported})
-    preset = replace(load_preset("demo"), tokenizer_from=str(tmp_path / "first"))
+    preset = replace(load_preset("lidargrit_demo"), tokenizer_from=str(tmp_path / "first"))
     about = {"preset": configuration.to_json(preset), "taken": taken_facts(preset, {"tokenizer": "first"})}
     write_json(tmp_path / "second" / "run.json", about)
     again = replace(preset, tokenizer_from=None, stages_from=str(tmp_path / "second"), fine_tune=("transformer",))
@@ -301,7 +301,7 @@ def test_terms_of_weights_that_were_taken_over_stay(tmp_path):
 
 
 def test_a_run_that_took_stages_of_an_unknown_training_claims_no_free_terms(tmp_path):
-    over = taken_facts(replace(load_preset("demo"), stages_from=str(tmp_path)), {"tokenizer": "it"})
+    over = taken_facts(replace(load_preset("lidargrit_demo"), stages_from=str(tmp_path)), {"tokenizer": "it"})
     assert head_of(model_card(marginal(), {"preset": {}, "taken": over}, Provenance()))[0]["license"] == "other"
 
 

@@ -34,7 +34,7 @@ def words_for(folder: Path, *more: str) -> list[str]:
 
 def test_a_killed_reproduction_goes_on_and_ends_with_the_table(tmp_path, capsys):
     folder = tmp_path / "ablation"
-    second = folder / "runs" / "ablation_raydrop_small" / "tokenizer" / "checkpoint.safetensors"
+    second = folder / "runs" / "lidargrit_small_raydrop" / "tokenizer" / "checkpoint.safetensors"
     command = [sys.executable, "-m", "lidargrit", *words_for(folder)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=dict(os.environ))
     until = time.monotonic() + 200
@@ -43,24 +43,24 @@ def test_a_killed_reproduction_goes_on_and_ends_with_the_table(tmp_path, capsys)
     process.send_signal(signal.SIGKILL)
     assert process.wait() == -signal.SIGKILL
     assert second.exists()
-    assert not (folder / "runs" / "ablation_both_small").exists()
-    first = folder / "ablation_neither_small" / "ablation_neither_small.json"
+    assert not (folder / "runs" / "lidargrit_small_both").exists()
+    first = folder / "lidargrit_small_neither" / "lidargrit_small_neither.json"
     scored = first.stat().st_mtime_ns
 
     assert main(words_for(folder)) == 0
     captured = capsys.readouterr()
     assert first.stat().st_mtime_ns == scored
     assert "scores are there already" in captured.err
-    for row in ("ablation_neither_small", "ablation_raydrop_small", "ablation_both_small"):
+    for row in ("lidargrit_small_neither", "lidargrit_small_raydrop", "lidargrit_small_both"):
         assert f"\n{row} " in captured.out
     for metric in ("sliced_wasserstein", "minimum_matching_distance", "point_cloud_jsd"):
         assert f"{metric} (reference)" in captured.out
     assert "Published scores of lidargrit_kitti_odometry\nleft out, for they do not compare: 4 of the" in captured.out
     assert "61.73" not in captured.out
-    assert "the paper's row 'with both' is measured by ablation_both_small" in captured.out
+    assert "the paper's row 'with both' is measured by lidargrit_small_both" in captured.out
 
     # The killed run went on as if it had not been.
-    preset = load_preset("ablation_raydrop_small", reproduction_of(folder).benchmark().preset_settings)
+    preset = load_preset("lidargrit_small_raydrop", reproduction_of(folder).benchmark().preset_settings)
     train(preset, tmp_path / "whole")
     weights = [
         (run / "model.safetensors").read_bytes() for run in (tmp_path / "whole", folder / "runs" / second.parts[-3])

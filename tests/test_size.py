@@ -50,7 +50,7 @@ def test_modules_are_counted_too_however_small_they_are():
 def test_a_word_of_the_user_builds_no_network_that_fills_the_memory(setting):
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(ConfigError):
-        load_preset("small", [setting]).build_generator()
+        load_preset("lidargrit_small", [setting]).build_generator()
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000, "kibibytes"
 
 

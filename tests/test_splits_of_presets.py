@@ -44,7 +44,12 @@ def found(source: str, root: Path) -> tuple[set[str], set[str]]:
 
 
 def test_there_are_such_presets():
-    assert {"lidargrit_kitti_360", "lidargen_kitti_360", "r2dm_kitti_360", "ablation_neither"} <= ON_KITTI.keys()
+    assert {
+        "lidargrit_kitti_360",
+        "lidargen_kitti_360",
+        "r2dm_kitti_360",
+        "lidargrit_kitti_odometry_neither",
+    } <= ON_KITTI.keys()
     assert len(ON_KITTI) >= 8
 
 

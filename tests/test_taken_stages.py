@@ -96,8 +96,8 @@ def test_settings_of_a_stage_that_is_not_trained_are_not_looked_at(tmp_path):
 
 def test_a_stage_that_was_trained_with_another_dropout_is_taken(tmp_path):
     """The page about training gives this command."""
-    load_preset("compact").build_generator().save(tmp_path / "compact")
-    checked = check_stages(load_preset("compact_pixels", [f"stages_from={tmp_path / 'compact'}"]))
+    load_preset("lidargrit_compact").build_generator().save(tmp_path / "compact")
+    checked = check_stages(load_preset("lidargrit_compact_pixels", [f"stages_from={tmp_path / 'compact'}"]))
     assert checked.donors == dict.fromkeys(("tokenizer", "transformer"), str(tmp_path / "compact"))
 
 
@@ -272,12 +272,12 @@ def test_plans_of_a_denoiser_that_is_trained_further_need_no_values(tmp_path):
 
 def test_one_reflow_is_distilled_to_several_numbers_of_steps(tmp_path):
     small = ("model.hdit.depths=[1,1]", "model.hdit.heads=[1,2]")
-    load_preset("r2flow_reflow_small", (*small, "model.reflow.distilled_steps=4")).build_generator().save(tmp_path)
+    load_preset("r2flow_small_reflow", (*small, "model.reflow.distilled_steps=4")).build_generator().save(tmp_path)
     taken = (*small, f"stages_from={tmp_path}", "model.reflow.distilled_steps=2")
-    preset = load_preset("r2flow_reflow_small", (*taken, "train_anew=[distillation]"))
+    preset = load_preset("r2flow_small_reflow", (*taken, "train_anew=[distillation]"))
     assert check_stages(preset).donors.keys() == {"flow", "reflow"}
     with pytest.raises(ConfigError, match=r"whose distillation is another \(model\.reflow\.distilled_steps=4\)"):
-        check_stages(load_preset("r2flow_reflow_small", taken))
+        check_stages(load_preset("r2flow_small_reflow", taken))
 
 
 def test_runs_that_are_no_donors(tmp_path):
@@ -286,6 +286,6 @@ def test_runs_that_are_no_donors(tmp_path):
         check_stages(load_preset("multiscale_small", (f"tokenizer_from={tmp_path}",)))
     with pytest.raises(ConfigError, match=r"a run of 'r2dm'; choose another run$"):
         check_stages(load_preset("r2dm_small", (f"stages_from={tmp_path}",)))
-    nothing = load_preset("small", ("stages_from=", "tokenizer_from="))
+    nothing = load_preset("lidargrit_small", ("stages_from=", "tokenizer_from="))
     assert nothing.stages_from is None
     assert nothing.tokenizer_from is None

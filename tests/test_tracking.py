@@ -10,7 +10,7 @@ from lidargrit.generation.presets import load_preset
 from lidargrit.training.tracking import tracked
 from tiny_runs import the_one_line, train_words
 
-PRESET = load_preset("demo")
+PRESET = load_preset("lidargrit_demo")
 
 
 class StandIn(types.ModuleType):

@@ -54,7 +54,7 @@ TINY_GAN = [
         for setting in ("scans=24", "batch_size=2", "precision=fp32", "checkpoint_every=4", "validate_every=8")
     ],
 ]
-PRESETS = {"demo": TINY, "dusty_small": TINY_GAN}
+PRESETS = {"lidargrit_demo": TINY, "dusty_small": TINY_GAN}
 
 
 @pytest.fixture
@@ -109,10 +109,10 @@ def whole(tmp_path_factory):
 @pytest.mark.parametrize(
     ("name", "stage", "scans"),
     [
-        ("demo", "tokenizer", 6),
-        ("demo", "tokenizer", 8),
-        ("demo", "transformer", 2),
-        ("demo", "transformer", 10),
+        ("lidargrit_demo", "tokenizer", 6),
+        ("lidargrit_demo", "tokenizer", 8),
+        ("lidargrit_demo", "transformer", 2),
+        ("lidargrit_demo", "transformer", 10),
         ("dusty_small", "adversarial", 6),  # between two penalties on the discriminator
         ("dusty_small", "adversarial", 16),
     ],
@@ -132,9 +132,9 @@ def test_a_stopped_run_ends_with_the_same_bits_as_one_that_was_not(tmp_path, who
 
 
 def test_a_finished_run_is_not_trained_again(whole):
-    folder = whole("demo")
+    folder = whole("lidargrit_demo")
     before = (folder / "tokenizer" / "checkpoint.safetensors").stat().st_mtime_ns
-    train(load_preset("demo", TINY), folder)
+    train(load_preset("lidargrit_demo", TINY), folder)
     assert (folder / "tokenizer" / "checkpoint.safetensors").stat().st_mtime_ns == before
 
 
@@ -191,7 +191,7 @@ def test_the_linear_schedule_is_the_programs(golden):
 
 
 def test_a_loss_that_is_not_finite_stops_with_the_step(tmp_path, images):
-    vqvae = Vqvae(load_preset("demo", TINY).model.tokenizer, images.sensor)
+    vqvae = Vqvae(load_preset("lidargrit_demo", TINY).model.tokenizer, images.sensor)
     vqvae.encoder.conv_in.weight.data.fill_(torch.nan)
     fit = Fit(vqvae, FitConfig(scans=4, batch_size=2, learning_rate=1e-3), tmp_path, 0, Reporter())
     with pytest.raises(TrainingError, match=r"a loss or gradient of nan after 0 scans") as error:
@@ -207,7 +207,7 @@ def test_one_real_scan_is_learned_by_heart(tmp_path, real):
     config = DataConfig(train=train, val=(), columns=2048, column_stride=64)  # 32 are quick
     scan = load_range_images(config.train, config)
     assert len(scan) == 1
-    preset = load_preset("small")
+    preset = load_preset("lidargrit_small")
     torch.manual_seed(0)
     vqvae = Vqvae(replace(preset.model.tokenizer, raydrop_weight=0.3), scan.sensor)
     learn = FitConfig(
@@ -224,7 +224,7 @@ def test_one_real_scan_is_learned_by_heart(tmp_path, real):
 def test_a_tree_of_scans_trains_from_its_folder_alone(tmp_path):
     KittiOdometry.write_example(tmp_path / "tree", 4)
     settings = [f"data.train={tmp_path / 'tree'}", f"data.val={tmp_path / 'tree'}:all[:50%]"]
-    generator = train(load_preset("demo", TINY + settings), Path(tmp_path / "run"))
+    generator = train(load_preset("lidargrit_demo", TINY + settings), Path(tmp_path / "run"))
     first, again = (generator.sample([5, 6]), generator.sample([6]))
     # Sums of a batch of two and of one may differ in their last bit, and a mask drawn there in a pixel.
     assert float((first.range_m[1] - again.range_m[0]).abs().gt(1e-3).float().mean()) < 1e-3
@@ -232,9 +232,9 @@ def test_a_tree_of_scans_trains_from_its_folder_alone(tmp_path):
 
 
 def test_stages_use_their_own_settings():
-    preset = load_preset("demo", ["training.transformer.learning_rate=0.5"])
+    preset = load_preset("lidargrit_demo", ["training.transformer.learning_rate=0.5"])
     assert preset.training["transformer"].learning_rate == 0.5
-    assert preset.training["tokenizer"] == load_preset("demo").training["tokenizer"]
+    assert preset.training["tokenizer"] == load_preset("lidargrit_demo").training["tokenizer"]
     assert replace(preset, seed=1) != preset
 
 
@@ -248,13 +248,14 @@ def test_a_run_goes_on_though_the_words_about_its_preset_have_changed(tmp_path):
 
 
 def test_a_run_goes_on_with_settings_that_change_nothing_computed(tmp_path):
-    write_json(tmp_path / "run.json", {"preset": configuration.to_json(load_preset("demo"))})
+    write_json(tmp_path / "run.json", {"preset": configuration.to_json(load_preset("lidargrit_demo"))})
     stage = "training.tokenizer"
     check_folder(
-        tmp_path, load_preset("demo", ["data.workers=7", f"{stage}.checkpoint_every=3", f"{stage}.pictures_every=5"])
+        tmp_path,
+        load_preset("lidargrit_demo", ["data.workers=7", f"{stage}.checkpoint_every=3", f"{stage}.pictures_every=5"]),
     )
     with pytest.raises(OutputError, match=r"training\.tokenizer\.validate_every"):
-        check_folder(tmp_path, load_preset("demo", [f"{stage}.validate_every=3"]))
+        check_folder(tmp_path, load_preset("lidargrit_demo", [f"{stage}.validate_every=3"]))
 
 
 def test_settings_that_a_later_stage_cannot_follow_are_refused_before_the_first(tmp_path):
@@ -266,7 +267,7 @@ def test_settings_that_a_later_stage_cannot_follow_are_refused_before_the_first(
         (["training.tokenizer.optimiser=muon"], "optimiser=muon for networks without linear layers"),
     ):
         with pytest.raises(ConfigError, match=message):
-            train(load_preset("demo", [*TINY, *settings]), tmp_path)
+            train(load_preset("lidargrit_demo", [*TINY, *settings]), tmp_path)
         assert not [*tmp_path.iterdir()]
     with pytest.raises(ConfigError, match=r"without training\.reflow"):
         train(load_preset("r2flow_small", ["model.reflow={}"]), tmp_path)
@@ -277,15 +278,17 @@ def test_a_folder_is_trained_in_by_one_process_at_a_time(tmp_path):
         claim_folder(tmp_path / "run"),
         pytest.raises(OutputError, match=rf"run, which process {os.getpid()} on .* since 2\d\d\d-.* is writing"),
     ):
-        train(load_preset("demo", TINY), tmp_path / "run")
-    train(load_preset("demo", TINY), tmp_path / "run")
+        train(load_preset("lidargrit_demo", TINY), tmp_path / "run")
+    train(load_preset("lidargrit_demo", TINY), tmp_path / "run")
     assert not [path for path in (tmp_path / "run").rglob("*") if path.name.startswith(".")]
 
 
 def test_pictures_change_nothing(tmp_path, whole):
     every = [f"training.{stage}.pictures_every=6" for stage in ("tokenizer", "transformer")]
-    train(load_preset("demo", TINY + every), tmp_path / "drawn", plot=plot_progress)
-    plain, drawn = ((folder / "model.safetensors").read_bytes() for folder in (whole("demo"), tmp_path / "drawn"))
+    train(load_preset("lidargrit_demo", TINY + every), tmp_path / "drawn", plot=plot_progress)
+    plain, drawn = (
+        (folder / "model.safetensors").read_bytes() for folder in (whole("lidargrit_demo"), tmp_path / "drawn")
+    )
     assert plain == drawn
     pictures = {str(path.relative_to(tmp_path / "drawn")): path for path in (tmp_path / "drawn").rglob("*.png")}
     scans = ("000000006", "000000012")
@@ -295,7 +298,7 @@ def test_pictures_change_nothing(tmp_path, whole):
 
 
 def test_the_memory_of_weights_is_what_a_step_leaves_behind(images):
-    vqvae = Vqvae(load_preset("demo", TINY).model.tokenizer, images.sensor)
+    vqvae = Vqvae(load_preset("lidargrit_demo", TINY).model.tokenizer, images.sensor)
     optimiser = make_optimiser(vqvae, FitConfig(scans=1, batch_size=1, learning_rate=1e-3))
     average = WeightAverage(vqvae, 1)
     vqvae(images.batch([0]), torch.Generator())["loss"].backward()
@@ -307,7 +310,7 @@ def test_the_memory_of_weights_is_what_a_step_leaves_behind(images):
 
 
 def test_a_measured_plan_tells_operations_time_and_memory():
-    preset = load_preset("demo", TINY)
+    preset = load_preset("lidargrit_demo", TINY)
     lines = [stage.as_text() for stage in measure(preset)]
     for line, (stage, flops) in zip(lines, training_flops(preset).items(), strict=True):
         wanted = rf"{stage}: {flops:.2e} floating-point operations at [\d.e+]+ scans/s: [\d.]+ \w+ on cpu, [\d.]+ GiB"
@@ -376,7 +379,9 @@ def test_a_checkpoint_that_does_not_fit_its_optimiser_is_refused(tmp_path):
 
 
 def test_a_run_to_take_stages_from_is_looked_at_before_any_scan(tmp_path):
-    preset = load_preset("demo", ("data.train=nowhere", "data.val=nowhere", f"stages_from={tmp_path / 'nothing'}"))
+    preset = load_preset(
+        "lidargrit_demo", ("data.train=nowhere", "data.val=nowhere", f"stages_from={tmp_path / 'nothing'}")
+    )
     with pytest.raises(CheckpointError, match="nothing, which does not exist"):
         train(preset, tmp_path / "run")
     assert not (tmp_path / "run").exists()

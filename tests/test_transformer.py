@@ -214,7 +214,7 @@ def test_the_cost_is_what_torch_counts(guidance, layers):
     from lidargrit.systems.lidargrit.system import LidarGrit
 
     changes = [f"model.guidance={guidance}", f"model.transformer.layers={layers}", "model.transformer.width=32"]
-    preset = load_preset("small", [*changes, "data.columns=512", "data.column_stride=8"])
+    preset = load_preset("lidargrit_small", [*changes, "data.columns=512", "data.column_stride=8"])
     generator = LidarGrit(preset.model, preset.data.load_sensor())
     with FlopCounterMode(display=False) as counter:
         generator.sample(range(generator.compute_batch))
@@ -227,7 +227,7 @@ def test_a_changed_weight_is_noticed_and_token_bits_are_those_of_the_transformer
     from lidargrit.generation.range_steps import RangeSteps
     from lidargrit.systems.lidargrit.system import LidarGrit
 
-    preset = load_preset("small", ["model.transformer.width=32", "data.columns=512", "data.column_stride=8"])
+    preset = load_preset("lidargrit_small", ["model.transformer.width=32", "data.columns=512", "data.column_stride=8"])
     torch.manual_seed(0)
     generator = LidarGrit(preset.model, preset.data.load_sensor()).eval()
     first = generator.sample([0])

@@ -27,7 +27,7 @@ MISTAKES = {
     "view a --overwrite=3": "got --overwrite with 3; wanted --overwrite alone;",
     "list --json datasets": "got --json datasets; wanted a name in .json, or nothing; put --json last",
     "doctor --json facts.txt": "got --json facts.txt; wanted a name in .json",
-    "train demo run --json": "got --json for a training; wanted --dry-run or --measure beside it;",
+    "train lidargrit_demo run --json": "got --json for a training; wanted --dry-run or --measure beside it;",
     "completion tcsh": "got 'tcsh'; wanted bash, zsh or fish; choose one",
     "sample nowhere out --device cuda:99": "got device 'cuda:99'; wanted one that PyTorch finds",
     "evaluate nowhere nowhere --device abacus": "got device 'abacus'; wanted one that PyTorch finds",
@@ -41,7 +41,7 @@ FACTS = {
     "doctor": "processors",
     "list": "datasets",
     "list datasets": "datasets",
-    "train demo nowhere --dry-run": "settings",
+    "train lidargrit_demo nowhere --dry-run": "settings",
     "inspect simulated:1:test": "points",
     "prepare simulated:1:test": "images",
     "fit-sensor simulated:2:test -n 2": "agree_share",
@@ -145,7 +145,7 @@ def test_bash_completes(capsys, tmp_path):
     for words, offered in (
         ("tra", "train"),
         ("list met", "metrics"),
-        ("train small_p", "small_pixels"),
+        ("train lidargrit_small_p", "lidargrit_small_pixels"),
         ("train --dr", "--dry-run"),
     ):
         typed = (

@@ -10,8 +10,8 @@ from lidargrit.cli._options import add_settings
 from lidargrit.cli._results import add_json, print_result, refuse_taken
 
 EXAMPLES = """\
-  lidargrit compare table marginal memorised small dusty_small r2dm_small:steps=32
-  lidargrit compare table small r2dm_small --flops 2e14 -n 1000      equal compute for all
+  lidargrit compare table marginal memorised lidargrit_small dusty_small r2dm_small:steps=32
+  lidargrit compare table lidargrit_small r2dm_small --flops 2e14 -n 1000      equal compute for all
   lidargrit compare table runs/mine runs/theirs --against /data/held_out
   lidargrit compare table --add runs/another                          as the others of the table were compared
 """

@@ -10,7 +10,7 @@ from lidargrit.cli._results import add_json, print_result, refuse_taken
 
 EXAMPLES = """\
   lidargrit fit-sensor /data/scans -o my_sensor.json --picture fit.png
-  lidargrit train small runs/mine --set data.sensor=my_sensor.json data.columns=1024 data.column_stride=4 \\
+  lidargrit train lidargrit_small runs/mine --set data.sensor=my_sensor.json data.columns=1024 data.column_stride=4 \\
     data.train=/data/scans data.val=/data/held_out
 """
 

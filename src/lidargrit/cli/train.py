@@ -9,10 +9,10 @@ from lidargrit.cli._options import add_settings
 from lidargrit.cli._results import add_json, print_result, refuse_taken
 
 EXAMPLES = """\
-  lidargrit train small runs/mine
-  lidargrit train small runs/mine --set data.train=/data/scans data.val=/data/held_out
+  lidargrit train lidargrit_small runs/mine
+  lidargrit train lidargrit_small runs/mine --set data.train=/data/scans data.val=/data/held_out
   lidargrit train lidargrit_kitti_360 runs/k360 --set data.train=/fast/k360 data.val=/fast/k360_val --dry-run
-  torchrun --no-python --nproc-per-node=2 lidargrit train small runs/mine
+  torchrun --no-python --nproc-per-node=2 lidargrit train lidargrit_small runs/mine
 """
 
 

@@ -62,7 +62,7 @@ TABLES = {
             "LiDARGen": ("lidargen_kitti_360", "lidargen_small"),
             "UltraLiDAR (unofficial program)": ("ultralidar_kitti_360", "ultralidar_small"),
             "R2DM": ("r2dm_kitti_360", "r2dm_small"),
-            "LidarGRIT": ("lidargrit_kitti_360", "small"),
+            "LidarGRIT": ("lidargrit_kitti_360", "lidargrit_small"),
         },
         _KITTI_360_IMAGES,
         (*_KITTI_360_IMAGES[:2], "data.column_stride=8"),
@@ -79,7 +79,7 @@ TABLES = {
         {
             "LidarGAN": ("lidargan_kitti_odometry", "lidargan_small"),
             "DUSty": ("dusty_kitti_odometry", "dusty_small"),
-            "LidarGRIT": ("lidargrit_kitti_odometry", "small"),
+            "LidarGRIT": ("lidargrit_kitti_odometry", "lidargrit_small"),
         },
         remarks=(
             "LidarGAN generates 40 of the 64 rows, without raydrop, as published; how the paper made its own row "
@@ -92,9 +92,12 @@ TABLES = {
         "kitti_odometry",
         "train",
         {
-            "without geometric preservation and raydrop loss": ("ablation_neither", "ablation_neither_small"),
-            "with raydrop loss": ("ablation_raydrop", "ablation_raydrop_small"),
-            "with both": ("lidargrit_kitti_odometry", "ablation_both_small"),
+            "without geometric preservation and raydrop loss": (
+                "lidargrit_kitti_odometry_neither",
+                "lidargrit_small_neither",
+            ),
+            "with raydrop loss": ("lidargrit_kitti_odometry_raydrop", "lidargrit_small_raydrop"),
+            "with both": ("lidargrit_kitti_odometry", "lidargrit_small_both"),
         },
     ),
 }

@@ -265,11 +265,11 @@ def _preset(data: str | None, settings: list[str], reporter: Reporter, anew: boo
         return override(preset if config is None else replace(preset, data=config), settings)
 
     if not anew:
-        preset = preset_of("demo_transformer" if config is None else "demo_fine_tuned")
+        preset = preset_of("lidargrit_demo_transformer" if config is None else "lidargrit_demo_fine_tuned")
         if preset.data.load_sensor().same_rays(load(PRETRAINED).sensor):
             return preset
         reporter.message("the model in the package is of another sensor or image size, so all is trained anew")
-    return preset_of("demo_pixels")
+    return preset_of("lidargrit_demo_pixels")
 
 
 def _trained_stages(preset: Preset) -> list[str]:
