@@ -30,7 +30,7 @@ from lidargrit.generation.generator import Generator
 from lidargrit.generation.presets import load_preset
 from lidargrit.generation.settings import Preset
 from lidargrit.training import training_flops
-from lidargrit.training.fit import Fit
+from lidargrit.training.stage import StageTraining
 
 SCANS = 16
 UNTIMED = 2  # steps: they allocate and choose kernels
@@ -96,7 +96,7 @@ def ours(generator: Generator, stage: str, preset: Preset, images: RangeImages, 
     scans = (UNTIMED + steps) * config.batch_size
     never = {"validate_every": 10**9, "checkpoint_every": 10**9, "validation_scans": 1}
     heard = StepClock()
-    fit = Fit(generator.objective(stage), replace(config, scans=scans, **never), folder, 0, heard)
+    fit = StageTraining(generator.objective(stage), replace(config, scans=scans, **never), folder, 0, heard)
     fit.run(images, images, stage)
     return steps * config.batch_size / (heard.times[-1] - heard.times[UNTIMED - 1])
 

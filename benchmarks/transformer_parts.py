@@ -27,7 +27,7 @@ from torch import Tensor, nn
 from lidargrit.data.batches import Batches
 from lidargrit.data.sources import open_images
 from lidargrit.generation.generator import load
-from lidargrit.generation.settings import FitConfig
+from lidargrit.generation.settings import TrainingConfig
 from lidargrit.nn.precision import dtype_of
 from lidargrit.nn.transformer import CausalTransformer, TransformerBlock, TransformerConfig
 from lidargrit.scans.types import RangeImage
@@ -177,7 +177,7 @@ def in_precision() -> torch.autocast:
 def train(model: PartTransformer, tokens: Int[Tensor, "N T"], seed: int) -> float:
     """Train on tokens in their order, once, and return the processor seconds."""
     part = model.part
-    config = FitConfig(
+    config = TrainingConfig(
         scans=len(tokens),
         batch_size=BATCH,
         learning_rate=part.learning_rate,

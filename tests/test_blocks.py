@@ -13,7 +13,7 @@ from torch import nn
 from lidargrit.core.errors import ConfigError, OutputError
 from lidargrit.generation.generator import load_class
 from lidargrit.generation.presets import load_preset
-from lidargrit.generation.settings import FitConfig
+from lidargrit.generation.settings import TrainingConfig
 from lidargrit.nn.blocks import Block, Network, prepare_for_training
 from lidargrit.nn.convolution import wrapped
 from lidargrit.training import train
@@ -145,7 +145,7 @@ def test_a_run_of_the_other_choice_is_refused(tmp_path):
 
 
 def test_both_are_off_unless_asked_for():
-    config = FitConfig(scans=1, batch_size=1, learning_rate=1.0)
+    config = TrainingConfig(scans=1, batch_size=1, learning_rate=1.0)
     assert not config.recompute
     assert not config.compile
     assert not Block().recomputed

@@ -13,7 +13,7 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.generation.generator import load_class
 from lidargrit.generation.presets import load_preset
-from lidargrit.generation.settings import FitConfig, Preset
+from lidargrit.generation.settings import Preset, TrainingConfig
 from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
 from lidargrit.nn.transformer import TransformerConfig
 from lidargrit.systems.lidargrit.system import LidarGritConfig
@@ -57,7 +57,7 @@ def test_a_preset_is_complete_and_survives_json(name):
     assert from_json(generator.Config, written["model"], "run.json") == preset.model
     assert from_json(DataConfig, written["data"], "run.json") == preset.data
     for stage, config in preset.training.items():
-        assert from_json(FitConfig, written["training"][stage], "run.json") == config
+        assert from_json(TrainingConfig, written["training"][stage], "run.json") == config
     kind = {"model.tokenizer.name"}  # written for other tokenizers than the default one; no setting by itself
     assert leaves(written).keys() - kind == leaves(preset).keys()
 
@@ -175,7 +175,7 @@ def test_json_that_does_not_fit_is_told_in_one_line(cls, change, text):
 @pytest.mark.parametrize("data", [None, 3, "words", [1], {}])
 def test_json_that_is_no_configuration_at_all(data):
     with pytest.raises(ConfigError, match=r"a configuration in run\.json that does not fit"):
-        from_json(FitConfig, data, "run.json")
+        from_json(TrainingConfig, data, "run.json")
 
 
 @pytest.mark.parametrize("name", ["lidargrit", "maskgit", "lidm"])

@@ -11,7 +11,7 @@ from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import load_range_images
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.presets import load_preset
-from lidargrit.generation.settings import FitConfig
+from lidargrit.generation.settings import TrainingConfig
 from lidargrit.generation.tokenizers.vqvae import Vqvae
 from lidargrit.nn.transformer import CausalTransformer, TransformerConfig
 from lidargrit.scans.sensors import load_sensor
@@ -21,7 +21,7 @@ from lidargrit.training.optimiser import WeightAverage, learning_rate_at, make_o
 
 
 def config(**settings):
-    return FitConfig(**{"scans": 1000, "batch_size": 10, "learning_rate": 0.1, **settings})
+    return TrainingConfig(**{"scans": 1000, "batch_size": 10, "learning_rate": 0.1, **settings})
 
 
 def test_learning_rates():

@@ -22,7 +22,7 @@ from lidargrit.generation.batches import in_batches
 from lidargrit.generation.generator import load
 from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
 from lidargrit.generation.range_steps import RangeSteps
-from lidargrit.generation.settings import FitConfig, Preset
+from lidargrit.generation.settings import Preset, TrainingConfig
 from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
 from lidargrit.nn.decoding import CachedDecoder
 from lidargrit.nn.transformer import TransformerConfig
@@ -65,7 +65,7 @@ def scans(count: int) -> RangeImage:
 
 
 def preset_of(pixels: PixelDecoderConfig | None, stages_from: str | None = None) -> Preset:
-    fit = FitConfig(scans=4, batch_size=2, learning_rate=1e-3, validation_scans=1)
+    fit = TrainingConfig(scans=4, batch_size=2, learning_rate=1e-3, validation_scans=1)
     stages = ("tokenizer", "transformer") if pixels is None else ("tokenizer", "transformer", "pixels")
     return Preset(
         "a test",

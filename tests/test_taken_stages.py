@@ -12,7 +12,7 @@ from lidargrit.core.files import read_tensors
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.generation.generator import load_class
 from lidargrit.generation.presets import load_preset
-from lidargrit.generation.settings import FitConfig, Preset
+from lidargrit.generation.settings import Preset, TrainingConfig
 from lidargrit.systems.lidargrit.system import TokenSampling
 from lidargrit.systems.maskgit.system import MaskGitConfig
 from lidargrit.training import plan_training, train
@@ -34,7 +34,7 @@ def test_only_the_pixel_decoder_is_trained_over_a_finished_run(tmp_path):
 def test_fine_tuning_starts_from_the_weights_of_the_other_run(tmp_path):
     donor = made()
     donor.save(tmp_path / "donor")
-    fit = FitConfig(scans=2, batch_size=2, learning_rate=1e-6, validation_scans=1)
+    fit = TrainingConfig(scans=2, batch_size=2, learning_rate=1e-6, validation_scans=1)
     preset = preset_of(PIXELS, stages_from=str(tmp_path / "donor"))
     preset = replace(preset, training=dict.fromkeys(preset.training, fit), fine_tune=("pixels",))
     tuned = train(preset, tmp_path / "run").state_dict()
@@ -236,7 +236,7 @@ def test_a_denoiser_that_is_trained_further_takes_the_scale_of_its_own_codebook(
 
 
 def test_a_gan_that_is_trained_further_keeps_its_discriminator(tmp_path):
-    fit = FitConfig(scans=2, batch_size=2, learning_rate=1e-3, validation_scans=1)
+    fit = TrainingConfig(scans=2, batch_size=2, learning_rate=1e-3, validation_scans=1)
     data = DataConfig(train=("simulated:4:train",), val=("simulated:1:val",), columns=512, column_stride=8)
     model = load_class("dusty").smallest_config(SENSOR)
     preset = Preset("a test", "dusty", model, data, {"adversarial": fit})

@@ -14,7 +14,7 @@ from lidargrit.core.errors import ConfigError, LidarGritError, OutputError
 from lidargrit.core.reporting import Reporter
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.generation.generator import load, load_class
-from lidargrit.generation.settings import FitConfig, Preset
+from lidargrit.generation.settings import Preset, TrainingConfig
 from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
 from lidargrit.nn.transformer import TransformerConfig
 from lidargrit.systems.lidargrit.system import LidarGritConfig
@@ -24,7 +24,7 @@ from lidargrit.viewer.serve.worker import run_worker
 from toy_tokenizer import NAME, installed
 
 CONFIGS = {"lidargrit": LidarGritConfig, "maskgit": MaskGitConfig}
-FIT = FitConfig(scans=8, batch_size=4, learning_rate=0.1, average_over_scans=0)
+FIT = TrainingConfig(scans=8, batch_size=4, learning_rate=0.1, average_over_scans=0)
 
 
 class Messages(Reporter):

@@ -20,14 +20,14 @@ from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import load_range_images
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.presets import load_preset
-from lidargrit.generation.settings import FitConfig
+from lidargrit.generation.settings import TrainingConfig
 from lidargrit.generation.tokenizers.vqvae import Vqvae
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.training import check_folder, measure, train, training_flops
 from lidargrit.training.checkpoint import load_checkpoint, save_checkpoint
-from lidargrit.training.fit import Fit
 from lidargrit.training.log import Log, read_log
 from lidargrit.training.optimiser import WeightAverage, learning_rate_at, make_optimiser, memory_of_weights
+from lidargrit.training.stage import StageTraining
 from lidargrit.viewer import plot_progress
 from tiny_runs import MODEL
 
@@ -184,7 +184,7 @@ def test_weight_average_follows_as_a_slow_loop_says():
 @pytest.mark.shared
 def test_the_linear_schedule_is_the_programs(golden):
     factors = golden("misc")["lr_linear_100"]
-    config = FitConfig(scans=100_000, batch_size=1, learning_rate=1.0, schedule="linear_second_half")
+    config = TrainingConfig(scans=100_000, batch_size=1, learning_rate=1.0, schedule="linear_second_half")
     ours = [learning_rate_at(config, 1000 * epoch) for epoch in range(100)]
     # The program steps once an epoch and would reach 0 at epoch 101, ours falls with every scan and ends at 0.
     assert max(abs(a - b) for a, b in zip(ours, factors, strict=True)) < 0.02
@@ -193,7 +193,7 @@ def test_the_linear_schedule_is_the_programs(golden):
 def test_a_loss_that_is_not_finite_stops_with_the_step(tmp_path, images):
     vqvae = Vqvae(load_preset("lidargrit_demo", TINY).model.tokenizer, images.sensor)
     vqvae.encoder.conv_in.weight.data.fill_(torch.nan)
-    fit = Fit(vqvae, FitConfig(scans=4, batch_size=2, learning_rate=1e-3), tmp_path, 0, Reporter())
+    fit = StageTraining(vqvae, TrainingConfig(scans=4, batch_size=2, learning_rate=1e-3), tmp_path, 0, Reporter())
     with pytest.raises(TrainingError, match=r"a loss or gradient of nan after 0 scans") as error:
         fit.run(images, images, "training")
     assert "checkpoint" not in str(error.value), "there is none yet"
@@ -210,11 +210,11 @@ def test_one_real_scan_is_learned_by_heart(tmp_path, real):
     preset = load_preset("lidargrit_small")
     torch.manual_seed(0)
     vqvae = Vqvae(replace(preset.model.tokenizer, raydrop_weight=0.3), scan.sensor)
-    learn = FitConfig(
+    learn = TrainingConfig(
         scans=300, batch_size=1, learning_rate=2e-3, schedule="cosine", warmup_scans=50, precision="auto",
         average_over_scans=20, validate_every=1000, checkpoint_every=1000,
     )  # fmt: skip
-    fit = Fit(vqvae, learn, tmp_path, 0, Reporter())
+    fit = StageTraining(vqvae, learn, tmp_path, 0, Reporter())
     fit.run(scan, scan, "training")
     learned = fit.validate(scan)
     assert learned["range_mae_m"] < 0.3
@@ -299,7 +299,7 @@ def test_pictures_change_nothing(tmp_path, whole):
 
 def test_the_memory_of_weights_is_what_a_step_leaves_behind(images):
     vqvae = Vqvae(load_preset("lidargrit_demo", TINY).model.tokenizer, images.sensor)
-    optimiser = make_optimiser(vqvae, FitConfig(scans=1, batch_size=1, learning_rate=1e-3))
+    optimiser = make_optimiser(vqvae, TrainingConfig(scans=1, batch_size=1, learning_rate=1e-3))
     average = WeightAverage(vqvae, 1)
     vqvae(images.batch([0]), torch.Generator())["loss"].backward()
     optimiser.step()

@@ -22,8 +22,8 @@ from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 from lidargrit.training import train
 from lidargrit.training.engine import Engine
-from lidargrit.training.fit import Fit
 from lidargrit.training.plan import check_stages
+from lidargrit.training.stage import StageTraining
 from test_tracking import StandIn
 from test_training import TINY
 from tiny_runs import the_one_line, train_words
@@ -94,7 +94,7 @@ def test_a_validation_that_fails_leaves_the_checkpoint(tmp_path, monkeypatch):
     unbroken, preset = tmp_path / "unbroken", load_preset("lidargrit_demo", [*TINY, *VALIDATING])
     train(preset, unbroken)
     with monkeypatch.context() as patched:
-        patched.setattr(Fit, "validate", fails)
+        patched.setattr(StageTraining, "validate", fails)
         with pytest.raises(DataError, match="that is gone"):
             train(preset, tmp_path / "run")
     assert (tmp_path / "run" / "tokenizer" / "checkpoint.safetensors").is_file()
@@ -113,9 +113,9 @@ def test_a_terminated_training_does_not_validate_first(tmp_path, monkeypatch):
         os.kill(os.getpid(), signal.SIGTERM)
         return before(self, images)
 
-    before = Fit._step
-    monkeypatch.setattr(Fit, "validate", validates)
-    monkeypatch.setattr(Fit, "_step", step)
+    before = StageTraining._step
+    monkeypatch.setattr(StageTraining, "validate", validates)
+    monkeypatch.setattr(StageTraining, "_step", step)
     settings = [f"training.{stage}.validate_every=2" for stage in ("tokenizer", "transformer")]
     with pytest.raises(Terminated):
         train(load_preset("lidargrit_demo", [*TINY, *settings]), tmp_path / "run")

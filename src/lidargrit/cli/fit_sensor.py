@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Fit, print a table, write the sensor file and perhaps a picture."""
+    """StageTraining, print a table, write the sensor file and perhaps a picture."""
     from lidargrit.core.files import refuse_to_overwrite, write_json
     from lidargrit.data.sources import open_source
     from lidargrit.scans.fit_sensor import fit_sensor_to_dataset

@@ -12,7 +12,7 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.generation.generator import load_class
 from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
-from lidargrit.generation.settings import FitConfig, Preset
+from lidargrit.generation.settings import Preset, TrainingConfig
 from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
 from lidargrit.nn.transformer import TransformerConfig
 
@@ -32,7 +32,7 @@ KITTI_360_EPOCH = 50_000
 KITTI_ODOMETRY_EPOCH = 19_130
 """Number of scans of the training sequences 00 to 07, 09 and 10."""
 
-MINUTES = FitConfig(
+MINUTES = TrainingConfig(
     scans=20_000,
     batch_size=4,
     learning_rate=1e-3,
@@ -51,7 +51,7 @@ LATER_STAGE = replace(MINUTES, batch_size=2, learning_rate=2e-3, warmup_scans=20
 """Training of a network over what ``pretrained`` has: its pixel decoder, its completion, its raydrop."""
 PIXELS = replace(LATER_STAGE, scans=58_000, average_over_scans=1200)
 """Training of the pixel decoder of ``pretrained``."""
-GAN_MINUTES = FitConfig(
+GAN_MINUTES = TrainingConfig(
     scans=60_000,
     batch_size=16,
     learning_rate=1e-4,
@@ -64,7 +64,7 @@ GAN_MINUTES = FitConfig(
     checkpoint_every=4000,
 )
 """The same for two networks that take turns."""
-DIFFUSION_ON_KITTI_360 = FitConfig(
+DIFFUSION_ON_KITTI_360 = TrainingConfig(
     scans=2_560_000,
     batch_size=8,
     learning_rate=1e-4,
@@ -111,7 +111,7 @@ DEMO_STAGES = {
 KITTI_360_VQVAE = VqvaeConfig(
     channels=128, channel_multipliers=(1, 1, 2, 2), code_dim=256, num_codes=1024, restart_dead_codes=False
 )
-KITTI_360_TOKENIZER = FitConfig(
+KITTI_360_TOKENIZER = TrainingConfig(
     scans=100 * KITTI_360_EPOCH,
     batch_size=8,
     learning_rate=8e-6,
@@ -137,7 +137,7 @@ def preset(
     published: str = "",
     stages_from: str | None = None,
     fine_tune: tuple[str, ...] = (),
-    **training: FitConfig,
+    **training: TrainingConfig,
 ) -> Preset:
     """Return a preset of the system whose configuration the model is.
 
@@ -204,7 +204,7 @@ def default_preset(generator: str) -> Preset:
         raise ConfigError(
             f"{generator} without a preset ({error})", wanted, f"add {generator} to systems/{generator}/presets.py"
         ) from None
-    each = FitConfig(
+    each = TrainingConfig(
         scans=_SCANS,
         batch_size=4,
         learning_rate=1e-3,

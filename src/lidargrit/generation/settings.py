@@ -16,7 +16,7 @@ _BATCH_AT_MOST = 65_536  # scans: 4 GB of the smallest images, and more than any
 
 
 @dataclass(frozen=True)
-class FitConfig:
+class TrainingConfig:
     """How one stage of a generator is trained; every duration is a number of scans seen.
 
     Args:
@@ -111,7 +111,7 @@ class Preset:
     generator: str
     model: Any
     data: DataConfig
-    training: dict[str, FitConfig]
+    training: dict[str, TrainingConfig]
     seed: int = 0
     published: str = ""
     tokenizer_from: str | None = None
@@ -139,7 +139,7 @@ class Preset:
         if self.seed < 0:
             raise ConfigError(f"seed={self.seed}", "0 or more", "choose another seed")
 
-    def settings_of(self, stage: str) -> FitConfig:
+    def settings_of(self, stage: str) -> TrainingConfig:
         """Return the settings of a stage's training.
 
         Raises:

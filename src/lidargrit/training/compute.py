@@ -16,7 +16,7 @@ from lidargrit.core.configuration import COUNTS_SCANS
 from lidargrit.core.errors import ConfigError
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
-from lidargrit.generation.settings import FitConfig, Preset
+from lidargrit.generation.settings import Preset, TrainingConfig
 from lidargrit.nn.flops import FlopCounter
 from lidargrit.nn.precision import Precision
 from lidargrit.scans.sensors import SensorModel
@@ -171,7 +171,7 @@ def _flops_of(costs: Mapping[str, StageCost], preset: Preset) -> int:
     return sum(cost.flops(preset.settings_of(name).scans) for name, cost in costs.items())
 
 
-def _scaled(config: FitConfig, share: float) -> FitConfig:
+def _scaled(config: TrainingConfig, share: float) -> TrainingConfig:
     scans = round(config.scans * share / config.batch_size) * config.batch_size
     if scans < config.batch_size:
         raise ConfigError(

@@ -9,7 +9,7 @@ import torch
 
 from lidargrit.generation.settings import Preset
 from lidargrit.training.compute import duration, training_flops, uniform_images
-from lidargrit.training.fit import begin_training
+from lidargrit.training.stage import begin_training
 
 _WARM_UP_STEPS, _TIMED_STEPS = 1, 3  # the first one allocates and chooses kernels
 

@@ -16,8 +16,8 @@ from lidargrit.generation.objective import Objective
 from lidargrit.generation.settings import Preset
 from lidargrit.nn.precision import Precision
 from lidargrit.training.compute import computing_time, training_flops
-from lidargrit.training.fit import follow_settings
 from lidargrit.training.optimiser import memory_of_weights
+from lidargrit.training.stage import follow_settings
 from lidargrit.training.taken_stages import donors_of_stages, taken_stages
 
 

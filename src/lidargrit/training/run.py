@@ -29,8 +29,8 @@ from lidargrit.generation.objective import Objective
 from lidargrit.generation.settings import Preset
 from lidargrit.training.checkpoint import fingerprint
 from lidargrit.training.engine import Engine
-from lidargrit.training.fit import Fit
 from lidargrit.training.plan import CheckedStages, OpenedData, check_stages, open_data
+from lidargrit.training.stage import StageTraining
 from lidargrit.training.taken_stages import taken_facts, taken_stages
 from lidargrit.training.tracking import tracked
 
@@ -104,20 +104,20 @@ def _train(
         engine.by_first(lambda: _claim(folder, preset, checked.donors, train_images, val_images))
         generator.fit_statistics(train_images)
 
-        def fit_of(number: int, stage: str, built_on: str) -> Fit:
+        def training_of(number: int, stage: str, built_on: str) -> StageTraining:
             seed, objective = derive_seed(preset.seed, number), generator.objective(stage)
             if stage in taken:
                 objective.load_state_dict({**objective.state_dict(), **objective.weights_from(taken[stage])})
             picture = None if plot is None else partial(_plot, plot, generator, stage, val_images)
             workers, config = preset.data.workers, preset.settings_of(stage)
-            return Fit(objective, config, folder / stage, seed, reporter, built_on, workers, picture)
+            return StageTraining(objective, config, folder / stage, seed, reporter, built_on, workers, picture)
 
         built_on = ""
         for number, stage in enumerate(generator.stages):
             if stage in checked.donors:
                 trained = taken[stage]
             else:
-                trained = fit_of(number, stage, built_on).run(train_images, val_images, f"training {stage}")
+                trained = training_of(number, stage, built_on).run(train_images, val_images, f"training {stage}")
             generator.load_stage(stage, trained)
             built_on = fingerprint(trained)
             del trained  # with the tokens that it has kept of the scans

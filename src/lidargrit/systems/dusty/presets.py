@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from lidargrit.generation.presets import GAN_MINUTES, KITTI_ODOMETRY, STREETS, preset, variant
-from lidargrit.generation.settings import FitConfig
+from lidargrit.generation.settings import TrainingConfig
 from lidargrit.systems.dusty.system import DustyConfig
 
 _SMALL = preset(
@@ -29,7 +29,7 @@ PRESETS = {
         KITTI_ODOMETRY,
         DustyConfig(penalty_every=1),
         published="SWD 52.81e-2, min. matching distance 2.07e-3, JSD 5.10e-2, FPD 389 (LidarGRIT's paper, table 2)",
-        adversarial=FitConfig(
+        adversarial=TrainingConfig(
             25_000_000,
             32,
             2e-3,

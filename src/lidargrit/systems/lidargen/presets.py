@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from lidargrit.generation.presets import KITTI_360, MINUTES, STREETS, preset
-from lidargrit.generation.settings import FitConfig
+from lidargrit.generation.settings import TrainingConfig
 from lidargrit.systems.lidargen.system import LidarGenConfig
 
 PRESETS = {
@@ -22,7 +22,7 @@ PRESETS = {
         KITTI_360,
         LidarGenConfig(),
         published="LidarGRIT's table 1: SWD 33.93e-2, BEV MMD 2.19e-4, BEV JSD 5.70e-2, FPD 43.27 (5,000 test scans)",
-        score=FitConfig(
+        score=TrainingConfig(
             scans=100_000 * 24,  # the authors score the checkpoint of step 100,000; their configuration goes on
             batch_size=24,
             learning_rate=1e-4,

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from lidargrit.generation.presets import GAN_MINUTES, KITTI_ODOMETRY, KITTI_ODOMETRY_EPOCH, STREETS, preset
-from lidargrit.generation.settings import FitConfig
+from lidargrit.generation.settings import TrainingConfig
 from lidargrit.systems.lidarvae.system import LidarVaeConfig
 
 TO_COMPARE_WITH = {
@@ -25,7 +25,7 @@ TO_COMPARE_WITH = {
         "LiDAR-VAE on KITTI odometry: 40 rows without raydrop, latents of 128 numbers",
         KITTI_ODOMETRY,
         LidarVaeConfig(warmup_scans=200 * KITTI_ODOMETRY_EPOCH),
-        autoencoder=FitConfig(
+        autoencoder=TrainingConfig(
             300 * KITTI_ODOMETRY_EPOCH,  # the authors trained on KITTI raw
             64,
             1e-4,

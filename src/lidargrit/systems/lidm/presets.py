@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from lidargrit.generation import presets as shared
 from lidargrit.generation.presets import preset, variant
-from lidargrit.generation.settings import FitConfig
+from lidargrit.generation.settings import TrainingConfig
 from lidargrit.generation.tokenizers.curve_vqvae import CurveVqvaeConfig
 from lidargrit.systems.lidm.latent_unet import LatentUnetConfig
 from lidargrit.systems.lidm.system import LidmConfig
@@ -49,7 +49,7 @@ _KITTI_360 = preset(  # 15.1 M and 257.8 M parameters
     shared.KITTI_360,
     LidmConfig(),
     published="LiDM's README: FRID 135.8, FSVD 37.9, FPVD 28.7, JSD 0.211, MMD 3.87e-4 (2,000 samples, 50 steps)",
-    tokenizer=FitConfig(
+    tokenizer=TrainingConfig(
         scans=320_000,  # 40,000 steps of 8 scans, as in the paper's ablations
         batch_size=8,
         accumulate=2,  # 4 scans at a time, as the authors' program
@@ -61,7 +61,7 @@ _KITTI_360 = preset(  # 15.1 M and 257.8 M parameters
         validate_every=10_000,
         checkpoint_every=4_000,
     ),
-    denoiser=FitConfig(
+    denoiser=TrainingConfig(
         scans=2_560_000,
         batch_size=16,
         learning_rate=1e-6 * 16,  # 1e-6 for each scan of a step

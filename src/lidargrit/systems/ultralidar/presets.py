@@ -3,14 +3,14 @@
 from dataclasses import replace
 
 from lidargrit.generation.presets import KITTI_360, KITTI_360_EPOCH, MINUTES, STREETS, preset
-from lidargrit.generation.settings import FitConfig
+from lidargrit.generation.settings import TrainingConfig
 from lidargrit.systems.ultralidar.swin import SwinConfig
 from lidargrit.systems.ultralidar.system import UltraLidarConfig
 from lidargrit.systems.ultralidar.voxel_autoencoder import VoxelAutoencoderConfig
 from lidargrit.systems.ultralidar.voxels import VoxelGrid
 
 _SMALL = replace(MINUTES, scans=12_000, betas=(0.9, 0.95), weight_decay=0.01, gradient_clip=5.0)
-_KITTI_360 = FitConfig(
+_KITTI_360 = TrainingConfig(
     scans=80 * KITTI_360_EPOCH,
     batch_size=16,
     learning_rate=8e-4,

@@ -21,7 +21,7 @@ from lidargrit.data.batches import Batches
 from lidargrit.data.images import RangeImages
 from lidargrit.data.run_folder import CHECKPOINT_FILE
 from lidargrit.generation.objective import Objective
-from lidargrit.generation.settings import FitConfig
+from lidargrit.generation.settings import TrainingConfig
 from lidargrit.nn.blocks import prepare_for_training
 from lidargrit.scans.types import RangeImage
 from lidargrit.training.checkpoint import load_checkpoint, save_checkpoint
@@ -34,7 +34,7 @@ _LOG_EVERY_STEPS = 20
 
 
 @dataclass
-class Fit:
+class StageTraining:
     """One stage of a run in training.
 
     Args:
@@ -49,7 +49,7 @@ class Fit:
     """
 
     objective: Objective
-    config: FitConfig
+    config: TrainingConfig
     folder: Path
     seed: int
     reporter: Reporter
@@ -201,7 +201,7 @@ class Fit:
                 self.reporter.message(f"  WARNING: {warning}")
 
 
-def begin_training(objective: Objective, config: FitConfig) -> tuple[Engine, torch.optim.Optimizer]:
+def begin_training(objective: Objective, config: TrainingConfig) -> tuple[Engine, torch.optim.Optimizer]:
     """Return the engine that a stage is trained with, which holds the objective from now on, and the optimiser.
 
     Raises:
@@ -213,7 +213,7 @@ def begin_training(objective: Objective, config: FitConfig) -> tuple[Engine, tor
     return engine, optimiser
 
 
-def follow_settings(objective: Objective, config: FitConfig, processes: int) -> torch.optim.Optimizer:
+def follow_settings(objective: Objective, config: TrainingConfig, processes: int) -> torch.optim.Optimizer:
     """Set an objective's networks as the settings of its training say, and return the optimiser.
 
     Args:
@@ -241,7 +241,7 @@ def _check_compiler() -> None:
         )
 
 
-def _check_parts(objective: Objective, config: FitConfig, processes: int) -> None:
+def _check_parts(objective: Objective, config: TrainingConfig, processes: int) -> None:
     """Refuse a number of parts into which a process cannot divide its share of a batch."""
     if config.accumulate > 1 and objective.players:
         raise ConfigError(
