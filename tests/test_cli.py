@@ -288,6 +288,8 @@ def test_list_names_everything_there_is(typed):
             assert f"  {name} " in in_full
     assert "sample --set: temperature=1.0, top_k=0, top_p=1.0, guidance=0.0, mask=auto" in typed("list", "generators")
     assert "licence: " in typed("list", "datasets")
+    assert "      higher is better: no\n      variants: " in typed("list", "metrics")
+    assert "      rows: 64\n      columns: " in typed("list", "sensors")
     assert "  lidargrit-kitti-360 " in typed("list", "protocols")
     assert "  lidargen " in typed("list", "sample-formats")
 

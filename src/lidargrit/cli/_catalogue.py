@@ -54,7 +54,16 @@ def lines(kind: str, entry: dict[str, Any]) -> list[str]:
             parts = ", ".join(part if number == 0 else f"{scheme['name']}/{part}" for part in scheme["parts"])
             facts += [f"splits: {parts} ({scheme['name']}: {scheme['source']})", f"    leak: {scheme['leak']}"]
         return facts
-    return entry["facts"] if kind in ("formats", "generators") else []
+    if kind in ("formats", "generators"):
+        return entry["facts"]
+    facts = {name: value for name, value in entry.items() if name not in ("name", "summary", "group")}
+    return [f"{name.replace('_', ' ')}: {_in_words(value)}" for name, value in facts.items()]
+
+
+def _in_words(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return ", ".join(value) if isinstance(value, list) else str(value) or "none"
 
 
 def _of_dataset(name: str) -> dict[str, Any]:

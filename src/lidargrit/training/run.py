@@ -231,8 +231,11 @@ def _warn_of_overlap(train_images: RangeImages, val_images: RangeImages, reporte
 
 
 def _commit() -> str:
+    """Return the commit of this program; "unknown" where it lies in another repository, as in a virtual environment."""
+    file = Path(__file__)
     try:
-        command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
-        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=5).stdout.strip()
+        command = ["git", "-C", str(file.parent), "rev-parse", "HEAD", f"HEAD:./{file.name}"]
+        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=5)
+        return done.stdout.partition("\n")[0]
     except (OSError, subprocess.SubprocessError):
         return "unknown"
