@@ -214,7 +214,7 @@ def test_the_denoiser_and_its_stages_are_the_programs(numbers, tiny_unet):
 
 @pytest.mark.shared
 def test_the_schedule_is_the_programs(numbers):
-    shares = latent_diffusion.signal_shares(0.0015, 0.0195)
+    shares = latent_diffusion.signal_shares()
     assert torch.equal(shares, torch.from_numpy(numbers["alphas_cumprod"]))
     for steps in (20, 50):
         chosen = latent_diffusion.ddim_steps(steps)
@@ -232,7 +232,7 @@ def test_ddim_takes_the_programs_steps(eta, numbers, tiny, tiny_unet):
         seen.append(latents)
         return tiny_unet(latents, step)
 
-    shares = latent_diffusion.signal_shares(0.0015, 0.0195)
+    shares = latent_diffusion.signal_shares()
     last = latent_diffusion.ddim(watched, lambda: next(noise), shares, 5, float(eta))
     for ours, theirs in zip([*seen, last], numbers[f"ddim5_eta{eta}_states"], strict=True):
         agree(ours, theirs)
@@ -245,8 +245,6 @@ def test_noise_of_no_step_and_steps_without_sense_are_refused():
     for settings in ({"steps": 0}, {"steps": 501}, {"eta": 1.5}, {"eta": math.nan}):
         with pytest.raises(ConfigError, match=next(iter(settings))):
             LidmSampling(**settings)
-    with pytest.raises(ConfigError, match="beta_first"):
-        LidmConfig(beta_first=0.02)
     with pytest.raises(ConfigError, match=r"latents of 32x16; wanted both sizes divisible by 32"):
         made(LidmConfig(SMALL.tokenizer, LatentUnetConfig(32, (1,) * 6, 1, ())))
     with pytest.raises(ConfigError, match=r"64x10; wanted rows divisible by 4, columns by 8"):

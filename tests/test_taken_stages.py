@@ -198,7 +198,7 @@ def test_a_taken_network_keeps_the_scale_of_its_images(name):
     assert float(generator.image.scale_m) == 37
 
 
-@pytest.mark.parametrize("setting", ["beta_last=0.1", "latent_axes=8", "latent_axes=2", "scale_latents=false"])
+@pytest.mark.parametrize("setting", ["latent_axes=8", "latent_axes=2", "scale_latents=false"])
 def test_a_denoiser_is_compared_by_the_noise_and_the_latents_that_it_learned(tmp_path, setting):
     small = ("model.tokenizer.channels=32", "model.denoiser.channels=32", "model.tokenizer.num_codes=16")
     donor = load_preset("lidm_small", small).build_generator()

@@ -51,7 +51,7 @@ class VqvaeConfig(TokenizerConfig):
     """Sizes and losses of the VQ-VAE; the defaults are the paper's for KITTI odometry.
 
     Args:
-        channels: number of channels at the finest level, a multiple of ``norm_groups``.
+        channels: number of channels at the finest level, a multiple of 32.
         channel_multipliers: channels of each level, from fine to coarse, over those of the finest; each further level
             halves rows and columns.
         residual_blocks: number of residual blocks of each encoder level; a decoder level has one more.
@@ -78,8 +78,6 @@ class VqvaeConfig(TokenizerConfig):
         codebook_loss: ``paper``, ``reference``, ``vqvae`` or ``ema``; see lidargrit.nn.quantiser.
         restart_dead_codes: whether codes that are hardly ever used restart from latents, so that the codebook does not
             collapse; the reference has no such remedy.
-        norm_groups: number of groups of every group norm. A group of one channel loses its mean over the image: 32
-            channels of a small network in 32 groups know of no mean level.
     """
 
     channels: int = 64
@@ -98,10 +96,9 @@ class VqvaeConfig(TokenizerConfig):
     reflectance_weight: float = 1.0
     codebook_loss: CodebookLoss = "paper"
     restart_dead_codes: bool = True
-    norm_groups: int = 32
 
     def __post_init__(self) -> None:
-        check_sizes(self.channels, self.residual_blocks, self.code_dim, self.num_codes, self.norm_groups)
+        check_sizes(self.channels, self.residual_blocks, self.code_dim, self.num_codes)
         if not 1 <= len(self.channel_multipliers) <= _LEVELS_AT_MOST or min(self.channel_multipliers) < 1:
             raise ConfigError(
                 f"channel_multipliers={self.channel_multipliers}",
@@ -116,7 +113,7 @@ class VqvaeConfig(TokenizerConfig):
 
 
 def _block(config: VqvaeConfig, inputs: int, outputs: int) -> ResidualBlock:
-    return ResidualBlock(inputs, outputs, config.dropout, config.padding, norm_groups=config.norm_groups)
+    return ResidualBlock(inputs, outputs, config.dropout, config.padding)
 
 
 def _level(
@@ -142,7 +139,7 @@ class Encoder(ConvolutionalEncoder):
             for level, (inputs, width) in enumerate(pairwise([c.channels, *widths]))
         )
         self.mid = _middle(c)
-        self.norm_out = group_norm(widths[-1], c.norm_groups)
+        self.norm_out = group_norm(widths[-1])
         self.conv_out = Convolution(widths[-1], c.code_dim, c.padding)
 
 
@@ -164,7 +161,7 @@ class Decoder(ConvolutionalDecoder):
             )
         ]
         self.up = nn.ModuleList(reversed(coarse_to_fine))
-        self.norm_out = group_norm(widths[0], c.norm_groups)
+        self.norm_out = group_norm(widths[0])
         self.conv_out = Convolution(widths[0], 1 + c.raydrop_loss + c.reflectance, c.padding)
 
     def prepared(self, precision: Precision) -> Decoder:
