@@ -2,7 +2,7 @@
 
     OMP_NUM_THREADS=1 python benchmarks/attention.py [--batch 8]
 
-Each way computes the attention of one block, forward and backward, at the sizes of several recipes. Rounds alternate
+Each way computes the attention of one block, forward and backward, at the sizes of several presets. Rounds alternate
 between the ways, and the best processor time of each counts. Prints seconds, their ratio to ours, and for each way the
 difference of its result from that of 32 bits, as a share of the norm.
 """
@@ -21,7 +21,7 @@ from lidargrit.nn.attention import attend
 
 ROUNDS = 8
 SIZES = {  # heads, tokens, channels of a head, causal
-    "compact_pixels": (4, 256, 64, True),
+    "lidargrit_compact_pixels": (4, 256, 64, True),
     "small": (4, 1024, 48, True),
     "published": (8, 1024, 32, True),
     "maskgit_small": (4, 1024, 48, False),
@@ -48,7 +48,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--batch", type=int, default=8, help="number of scans")
     batch = parser.parse_args().batch
-    print("| recipe | ours | torch's kernel | difference from 32 bits, ours | the kernel's |\n|---|---|---|---|---|")
+    print("| preset | ours | torch's kernel | difference from 32 bits, ours | the kernel's |\n|---|---|---|---|---|")
     for name, (heads, tokens, channels, causal) in SIZES.items():
         inputs = torch.randn(3, batch, heads, tokens, channels, generator=torch.Generator().manual_seed(0)).bfloat16()
         rounds = [[step(way, inputs, causal) for way in (attend, fused)] for _ in range(ROUNDS)]

@@ -2,7 +2,7 @@
 
     OMP_NUM_THREADS=1 python benchmarks/attention_windows.py [--batch 4]
 
-Each way computes R2Flow's attention to 3x9 tokens, forward and backward, in bfloat16, at the three levels of the recipe
+Each way computes R2Flow's attention to 3x9 tokens, forward and backward, in bfloat16, at the three levels of the preset
 `r2flow_small` that have it and at the finest level of the published size. Rounds alternate between the ways, and the
 best processor time of each counts. Prints seconds, their ratio to ours, and the largest difference of the results.
 """

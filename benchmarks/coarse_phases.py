@@ -72,7 +72,7 @@ def main(words: Sequence[str] | None = None) -> None:
     choices = parser.parse_args(words)
     model = load(choices.model)
     if not isinstance(model, LidarGrit) or model.pixels is None:
-        parser.error(f"{choices.model} has no tokens and pixel decoder, choose a run of compact_pixels")
+        parser.error(f"{choices.model} has no tokens and pixel decoder, choose a run of lidargrit_compact_pixels")
     images = open_images(choices.scans, sensor=model.sensor)
     if len(images) < 2 * choices.n:
         parser.error(f"{choices.scans} has {len(images)} scans, wanted twice {choices.n}, choose a lower -n")

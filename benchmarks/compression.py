@@ -28,7 +28,7 @@ from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import open_images
 from lidargrit.evaluation.estimates import Estimate
 from lidargrit.generation.generator import Generator, load
-from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.presets import load_preset
 from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.inference.compress.scan_codec import ScanCodec
 from lidargrit.scans.projection import unproject
@@ -123,14 +123,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sources", nargs="+")
     parser.add_argument("--models", nargs="*", default=["pretrained"])
-    parser.add_argument("--sensor", help="recipe of whose sensor the images are, where there is no model")
+    parser.add_argument("--sensor", help="preset of whose sensor the images are, where there is no model")
     parser.add_argument("--ideal", action="store_true")
     parser.add_argument("--steps-mm", nargs="+", type=int, default=[2, 10, 20])
     parser.add_argument("-n", "--max-scans", type=int, default=20)
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     models, rows = {name: load(name).eval() for name in options.models}, []
-    sensor = load_recipe(options.sensor).data.load_sensor() if options.sensor else next(iter(models.values())).sensor
+    sensor = load_preset(options.sensor).data.load_sensor() if options.sensor else next(iter(models.values())).sensor
     for source in options.sources:
         images = open_images(source, sensor, DataConfig(max_scans=options.max_scans))
         for step_mm in options.steps_mm:

@@ -67,7 +67,7 @@ class Runs:
     """Starts the same command as often as asked."""
 
     def __init__(self, folder: Path) -> None:
-        words = ["train", "demo", str(folder), "--set", *SETTINGS]
+        words = ["train", "lidargrit_demo", str(folder), "--set", *SETTINGS]
         self.folder, self.command = folder, shlex.join(["lidargrit", *words])
         self._server = subprocess.Popen(
             [sys.executable, "-P", "-c", SERVER, *words], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True

@@ -1,6 +1,6 @@
 """Systems trained at several learning rates with equally many operations → scores on validation streets, side by side.
 
-    OMP_NUM_THREADS=1 python benchmarks/learning_rates.py OUT r2dm_small:steps=32 dusty_small small_pixels --flops 3e12
+    OMP_NUM_THREADS=1 python benchmarks/learning_rates.py OUT r2dm_small:steps=32 lidargrit_small_pixels --flops 3e12
 
 Every system gets the same search: the rates of all its stages times each factor, one training each, the same budget and
 seed, and as many samples against as many validation streets. Test streets are not touched, so that a rate may be chosen
@@ -17,7 +17,7 @@ from lidargrit.data.run_folder import is_run
 from lidargrit.evaluation.benchmark import Benchmark, as_table
 from lidargrit.evaluation.benchmark import run as run_benchmark
 from lidargrit.evaluation.comparison import EvalConfig
-from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.presets import load_preset
 from lidargrit.training import check_folder, train, training_flops, with_budget
 
 METRICS = ("sliced_wasserstein", "point_cloud_jsd", "range_histogram_per_ring", "return_rate_per_ring")
@@ -27,28 +27,28 @@ def main() -> None:
     """Train what is not there yet, and compare."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path, help="folder for runs, samples and scores")
-    parser.add_argument("systems", nargs="+", metavar="SYSTEM", help="recipe, with sampling settings after a colon")
-    parser.add_argument("--factors", nargs="+", type=float, default=[1 / 3, 1, 3], help="of the recipe's own rates")
+    parser.add_argument("systems", nargs="+", metavar="SYSTEM", help="preset, with sampling settings after a colon")
+    parser.add_argument("--factors", nargs="+", type=float, default=[1 / 3, 1, 3], help="of the preset's own rates")
     parser.add_argument("--flops", type=float, default=3e12, help="operations of each training")
     parser.add_argument("--against", default="simulated:64:val", metavar="SOURCE", help="validation scans")
     parser.add_argument("-n", "--count", type=int, default=64, help="number of samples of each")
-    parser.add_argument("--set", nargs="+", default=[], metavar="NAME=VALUE", help="settings of every recipe")
+    parser.add_argument("--set", nargs="+", default=[], metavar="NAME=VALUE", help="settings of every preset")
     options = parser.parse_args()
     reporter, rows = TerminalReporter(), []
     for system in options.systems:
         name, _, sampling = system.partition(":")
-        scaled = with_budget(load_recipe(name, options.set), options.flops)
+        scaled = with_budget(load_preset(name, options.set), options.flops)
         flops = sum(training_flops(scaled).values())
         for factor in options.factors:
             rates = {stage: fit.learning_rate * factor for stage, fit in scaled.training.items()}
-            recipe = override(scaled, [f"training.{stage}.learning_rate={rate!r}" for stage, rate in rates.items()])
+            preset = override(scaled, [f"training.{stage}.learning_rate={rate!r}" for stage, rate in rates.items()])
             run = options.out / "runs" / f"{name}.rate{factor:g}"
             told = ", ".join(f"{stage} {rate:.2g}" for stage, rate in rates.items())
             reporter.message(f"{run.name}: {flops:.3g} floating-point operations, learning rates {told}")
-            check_folder(run, recipe)
+            check_folder(run, preset)
             try:
                 if not is_run(run):
-                    train(recipe, run, reporter)
+                    train(preset, run, reporter)
             except TrainingError as error:  # it diverged
                 reporter.message(f"{run.name} is left out: {error}")
                 continue

@@ -1,7 +1,7 @@
 """Seconds of a command on an idle machine and beside busy processes, by how its threads wait for one another.
 
     python benchmarks/neighbours.py [--words "sample pretrained {out} -n {n}"] [-n 8 32] [--busy 0 1 2] [--repeats 2]
-    python benchmarks/neighbours.py --words "train demo {out} --set training.tokenizer.scans={n}" -n 200 --limit 900
+    python benchmarks/neighbours.py --words "train lidargrit_demo {out} --set training.tokenizer.scans={n}" -n 200
     python benchmarks/neighbours.py --words "demo --out {out}" -n 1 --limit 3000
 
 Each row is one way of waiting: as the command arranges it, as OpenMP does by itself (threads spin), and with one

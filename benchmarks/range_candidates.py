@@ -18,7 +18,7 @@ import torch
 from lidargrit.data.sources import open_images
 from lidargrit.generation.pixel_decoder.pixel_phases import phases_of
 from lidargrit.generation.pixel_decoder.range_candidates import RangeCandidates
-from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.presets import load_preset
 
 NEAR_M = (0.03, 0.06, 0.2)
 _CELL = 16  # of the first phase: lattices of 8 pixels and finer
@@ -30,7 +30,7 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--scans", default="simulated:256:val", help="source of scans (default: %(default)s)")
     parser.add_argument("-n", type=int, default=24, help="number of scans")
     choices = parser.parse_args(words)
-    sensor = load_recipe("compact_pixels").data.load_sensor()
+    sensor = load_preset("lidargrit_compact_pixels").data.load_sensor()
     source = open_images(choices.scans, sensor=sensor)
     images = source.batch(range(min(choices.n, len(source))))
     v, returned = images.range_m.log1p(), images.return_mask

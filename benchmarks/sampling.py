@@ -1,6 +1,6 @@
 """Seconds to generate tokens, to decode them, and for whole scans: ours and recomputation, side by side in one run.
 
-    python benchmarks/sampling.py [--recipe lidargrit_kitti_360] [--batch 1 16] [--roofline]
+    python benchmarks/sampling.py [--preset lidargrit_kitti_360] [--batch 1 16] [--roofline]
 
 Random weights from a seed: the time does not depend on them. Recomputation reads the whole prefix again for every token
 as the released program does, but leaner: it takes the logits of the last position only. A whole scan of it would take
@@ -18,7 +18,7 @@ from statistics import mean
 
 import torch
 
-from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.presets import load_preset
 from lidargrit.nn.decoding import CachedDecoder, flops_of_step
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.transformer import CausalTransformer
@@ -135,20 +135,20 @@ def compare_decoding(generator: LidarGrit, rates: dict[str, float]) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--recipe", default="lidargrit_kitti_360")
+    parser.add_argument("--preset", default="lidargrit_kitti_360")
     parser.add_argument("--batch", type=int, nargs="*", default=[1, 16])
     parser.add_argument("--roofline", action="store_true", help="also how time grows with batch, length and width")
     options = parser.parse_args()
     torch.manual_seed(0)
     torch.set_grad_enabled(False)
-    recipe = load_recipe(options.recipe)
-    generator = LidarGrit(recipe.model, recipe.data.load_sensor()).eval()
+    preset = load_preset(options.preset)
+    generator = LidarGrit(preset.model, preset.data.load_sensor()).eval()
     transformer = generator.transformer
     rates = {f"{megabytes} MB": read_rate(megabytes) for megabytes in (40, 400)}
     kinds = (("fp32", torch.float32), ("bf16", torch.bfloat16))
     rates |= {f"product {name}": product_rate(dtype) for name, dtype in kinds}
     rates |= {f"convolution {name}": convolution_rate(dtype) for name, dtype in kinds}
-    print(f"{options.recipe}, torch {torch.__version__}, {torch.get_num_threads()} threads, a second:")
+    print(f"{options.preset}, torch {torch.__version__}, {torch.get_num_threads()} threads, a second:")
     print(", ".join(f"{name} {rate / 1e9:.1f} G" for name, rate in rates.items()), flush=True)
     plain_decoding = compare_decoding(generator, rates)
     for batch in options.batch:

@@ -5,8 +5,8 @@
 Random weights: the time does not depend on them. Ours runs in full: tokens by CUDA graphs, decoding in 16 bits, masks
 sampled. Recomputation reads the whole prefix again for every token, in 16 bits too, and takes the logits of the last
 position only; its steps are timed in the middle of four equal spans of the length and summed. Of R2DM one step is timed
-and taken as often as is published. Batches too large for the memory are left out. On a CPU (``--device cpu --recipe
-small --r2dm r2dm_small --batch 1``) it shows that the script runs, and nothing else.
+and taken as often as is published. Batches too large for the memory are left out. On a CPU (``--device cpu --preset
+lidargrit_small --r2dm r2dm_small --batch 1``) it shows that the script runs, and nothing else.
 """
 
 import argparse
@@ -16,7 +16,7 @@ from functools import partial
 import torch
 
 from lidargrit.generation.generator import load_class
-from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.presets import load_preset
 from lidargrit.nn.transformer import CausalTransformer
 from lidargrit.systems.lidargrit.system import LidarGrit, TokenSampling
 from lidargrit.systems.r2dm.system import DiffusionSampling, R2dm
@@ -77,8 +77,8 @@ def ours(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--recipe", default="lidargrit_kitti_360")
-    parser.add_argument("--r2dm", default="r2dm_kitti_360", help="a recipe of R2DM")
+    parser.add_argument("--preset", default="lidargrit_kitti_360")
+    parser.add_argument("--r2dm", default="r2dm_kitti_360", help="a preset of R2DM")
     parser.add_argument("--batch", type=int, nargs="+", default=[1, 64, 512])
     parser.add_argument("--weights", choices=["fp32", "bf16"], default="bf16")
     parser.add_argument("--compile", action="store_true", help="also compile the decoder")
@@ -87,8 +87,8 @@ def main() -> None:
     torch.set_grad_enabled(False)
     torch.manual_seed(0)
     device = torch.device(options.device)
-    recipe, other = load_recipe(options.recipe), load_recipe(options.r2dm)
-    generator = LidarGrit(recipe.model, recipe.data.load_sensor()).eval().to(device)
+    preset, other = load_preset(options.preset), load_preset(options.r2dm)
+    generator = LidarGrit(preset.model, preset.data.load_sensor()).eval().to(device)
     rival = load_class("r2dm")(other.model, other.data.load_sensor()).eval().to(device)
     sampling = TokenSampling(guidance=1.0, weights=options.weights, decoder="bf16")
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else "a CPU, for a smoke run"

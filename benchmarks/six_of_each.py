@@ -1,6 +1,6 @@
 """Folders of samples or sources of scans → one picture: six range images of each, on one scale.
 
-    python benchmarks/six_of_each.py six.png real=/data/held_out LidarGRIT=table/small/samples table/r2dm_small/samples
+    python benchmarks/six_of_each.py six.png real=/data/held_out LidarGRIT=runs/samples table/r2dm_small/samples
 
 A name before the first equals sign stands in place of the folder's. Colours tell ranges from 2 to 80 m; a
 pixel without a return is white. Nothing is chosen: the scans are evenly spaced over each source.
@@ -31,7 +31,7 @@ def plot(sets: list[ScanSet], names: list[str], path: Path) -> None:
     look = {"cmap": "turbo", "norm": LogNorm(NEAR_M, FAR_M), "aspect": "auto", "interpolation": "none"}
     for axes, scans, name in zip(grid, sets, names, strict=True):
         fine_m = scans.images.range_m.numpy()
-        ranges_m = fine_m[..., :: fine_m.shape[-1] // columns]  # of finer images every n-th column, as recipes take
+        ranges_m = fine_m[..., :: fine_m.shape[-1] // columns]  # of finer images every n-th column, as presets take
         for cell, range_m in zip(axes, ranges_m, strict=True):
             cell.imshow(np.where(range_m > 0, range_m, np.nan), **look)
             cell.set(xticks=[], yticks=[])

@@ -15,12 +15,12 @@ from pathlib import Path
 import torch
 
 from lidargrit.core.files import write_json
-from lidargrit.generation.presets import load_recipe
-from lidargrit.generation.settings import Recipe
+from lidargrit.generation.presets import load_preset
+from lidargrit.generation.settings import Preset
 from lidargrit.training import measure, training_flops
 
-PAIRS = {  # system → its small recipe, and that of the published size
-    "lidargrit": ("small", "lidargrit_kitti_360"),
+PAIRS = {  # system → its small preset, and that of the published size
+    "lidargrit": ("lidargrit_small", "lidargrit_kitti_360"),
     "lidargan": ("lidargan_small", "lidargan_kitti_odometry"),
     "lidarvae": ("lidarvae_small", "lidarvae_kitti_odometry"),
     "dusty": ("dusty_small", "dusty_kitti_odometry"),
@@ -29,28 +29,28 @@ PAIRS = {  # system → its small recipe, and that of the published size
     "r2dm": ("r2dm_small", "r2dm_kitti_360"),
     "r2flow": ("r2flow_small", "r2flow_kitti_360"),
     "lidm": ("lidm_small", "lidm_kitti_360"),
-    "lidm_shared": ("lidm_shared_small", "lidm_shared_kitti_360"),
+    "lidm_shared": ("lidm_small_shared", "lidm_kitti_360_shared"),
 }
 
 
-def counted(recipe: Recipe) -> dict[str, float]:
+def counted(preset: Preset) -> dict[str, float]:
     """Return parameters, operations of a training scan and of a sampled one."""
-    flops, generator = training_flops(recipe), recipe.build_generator()
+    flops, generator = training_flops(preset), preset.build_generator()
     parameters = sum(weight.numel() for weight in generator.parameters())
-    a_scan = sum(flops[stage] / recipe.training[stage].scans for stage in flops)
+    a_scan = sum(flops[stage] / preset.training[stage].scans for stage in flops)
     return {"parameters": parameters, "training": a_scan, "sampling": generator.cost().flops}
 
 
-def seconds_a_step(recipe: Recipe) -> dict[str, float]:
+def seconds_a_step(preset: Preset) -> dict[str, float]:
     """Return the time of a training step, by stage and number of scans."""
-    sizes = {stage: config.batch_size for stage, config in recipe.training.items()}
-    return {f"{each.stage} ({sizes[each.stage]})": sizes[each.stage] / each.scans_per_s for each in measure(recipe)}
+    sizes = {stage: config.batch_size for stage, config in preset.training.items()}
+    return {f"{each.stage} ({sizes[each.stage]})": sizes[each.stage] / each.scans_per_s for each in measure(preset)}
 
 
-def seconds_a_scan(recipe: Recipe) -> float:
+def seconds_a_scan(preset: Preset) -> float:
     """Return the processor time of sampling one scan by the defaults."""
     torch.manual_seed(0)
-    generator = recipe.build_generator().eval()
+    generator = preset.build_generator().eval()
     begun = time.process_time()
     generator.sample([0])
     return time.process_time() - begun
@@ -72,10 +72,10 @@ def main() -> None:
     )
     print(f"| system | size | {' | '.join(heads)} |\n|---|---|{'---|' * len(heads)}")
     for name in options.systems or PAIRS:
-        for size, recipe in zip(("small", "published"), map(load_recipe, PAIRS[name]), strict=True):
-            row = counted(recipe)
-            steps = seconds_a_step(recipe) if size == "small" else {}
-            scan_s = seconds_a_scan(recipe) if size == "small" else None
+        for size, preset in zip(("small", "published"), map(load_preset, PAIRS[name]), strict=True):
+            row = counted(preset)
+            steps = seconds_a_step(preset) if size == "small" else {}
+            scan_s = seconds_a_scan(preset) if size == "small" else None
             rows[f"{name} {size}"] = {**row, "seconds_a_step": steps, "seconds_a_scan": scan_s}
             told = ", ".join(f"{stage} {seconds:.2g}" for stage, seconds in steps.items())
             cells = f"{row['parameters']:,.0f} | {row['training']:.1e} | {told} | {row['sampling']:.1e}"

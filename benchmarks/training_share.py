@@ -1,6 +1,6 @@
 """Share of a training step that its matrix products and convolutions would take if they ran alone.
 
-    OMP_NUM_THREADS=1 python benchmarks/training_share.py [--recipe compact_pixels] [--steps 8] [--set NAME=VALUE ...]
+    OMP_NUM_THREADS=1 python benchmarks/training_share.py [--preset lidargrit_small] [--steps 8] [--set NAME=VALUE ...]
 
 For each stage, steps of ``train`` are listed call by call: the products and convolutions of its forward and backward
 passes, of the frozen tokenizer that encodes the scans, and of the optimiser, each with its shapes, strides and number
@@ -25,8 +25,8 @@ from training import SCANS, on_simulated_scans, ours
 
 from lidargrit.data.images import RangeImages
 from lidargrit.generation.generator import Generator
-from lidargrit.generation.presets import load_recipe
-from lidargrit.generation.settings import Recipe
+from lidargrit.generation.presets import load_preset
+from lidargrit.generation.settings import Preset
 
 ATEN = torch.ops.aten
 COUNTED = {ATEN.mm, ATEN.addmm, ATEN.bmm, ATEN.baddbmm, ATEN.convolution, ATEN.convolution_backward}
@@ -83,7 +83,7 @@ def seconds_alone(call: Call) -> float:
 
 
 def calls_of_steps(
-    generator: Generator, stage: str, recipe: Recipe, images: RangeImages, folder: Path
+    generator: Generator, stage: str, preset: Preset, images: RangeImages, folder: Path
 ) -> dict[Call, float]:
     """Return how often each call occurs in a step, on average.
 
@@ -93,7 +93,7 @@ def calls_of_steps(
     counts: list[Counter[Call]] = []
     for steps in (1, 1 + LISTED):
         with Calls() as calls:
-            ours(copy.deepcopy(generator), stage, recipe, images, steps, folder / str(steps))
+            ours(copy.deepcopy(generator), stage, preset, images, steps, folder / str(steps))
         counts.append(calls.counts)
     short, long = counts
     return {call: (count - short[call]) / LISTED for call, count in long.items()}
@@ -109,17 +109,17 @@ def by_kind(counts: Mapping[Call, float]) -> dict[str, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--recipe", default="compact_pixels")
+    parser.add_argument("--preset", default="lidargrit_compact_pixels")
     parser.add_argument("--steps", type=int, default=8, help="timed (default: 8)")
-    parser.add_argument("--set", nargs="+", default=[], help="settings of the recipe")
+    parser.add_argument("--set", nargs="+", default=[], help="settings of the preset")
     options = parser.parse_args()
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
-    recipe = load_recipe(options.recipe, [f"data.train=simulated:{SCANS}:train", "data.workers=1", *options.set])
-    with on_simulated_scans(recipe) as (images, generator, flops, folder):
+    preset = load_preset(options.preset, [f"data.train=simulated:{SCANS}:train", "data.workers=1", *options.set])
+    with on_simulated_scans(preset) as (images, generator, flops, folder):
         for stage in generator.stages:
-            fit = recipe.training[stage]
-            rate = ours(copy.deepcopy(generator), stage, recipe, images, options.steps, folder / stage)
-            counts = calls_of_steps(generator, stage, recipe, images, folder / f"{stage}_listed")
+            fit = preset.training[stage]
+            rate = ours(copy.deepcopy(generator), stage, preset, images, options.steps, folder / stage)
+            counts = calls_of_steps(generator, stage, preset, images, folder / f"{stage}_listed")
             kinds, step = by_kind(counts), fit.batch_size / rate
             speed = rate * flops[stage] / fit.scans / 1e9
             print(f"{stage}, batches of {fit.batch_size}: {step:.3f} s a step, {speed:.0f} GFLOP/s")

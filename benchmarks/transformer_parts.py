@@ -1,9 +1,9 @@
-"""Which parts of a transformer's recipe pay: trainings that differ in one part, over several seeds → nats a token.
+"""Which parts of a transformer's preset pay: trainings that differ in one part, over several seeds → nats a token.
 
     OMP_NUM_THREADS=1 python benchmarks/transformer_parts.py parts.jsonl --train simulated:3000:train
 
 The tokens are those of a finished model. For each seed the training scans are encoded once, flipped and begun at a
-random fine column as the recipes do, and every part learns from the same tokens in the same order. Each finished
+random fine column as the presets do, and every part learns from the same tokens in the same order. Each finished
 training is a line of the file; the same command goes on after the last one. Prints for each part the nats a token on
 validation scans, which no sampling blurs, the difference from the base seed by seed, and the training's processor time.
 """
@@ -27,7 +27,7 @@ from torch import Tensor, nn
 from lidargrit.data.batches import Batches
 from lidargrit.data.sources import open_images
 from lidargrit.generation.generator import load
-from lidargrit.generation.settings import FitConfig
+from lidargrit.generation.settings import TrainingConfig
 from lidargrit.nn.precision import dtype_of
 from lidargrit.nn.transformer import CausalTransformer, TransformerBlock, TransformerConfig
 from lidargrit.scans.types import RangeImage
@@ -36,7 +36,7 @@ from lidargrit.training.optimiser import learning_rate_at, make_optimiser
 
 BATCH = 8
 _ORDERS = 2  # random orders of each validation scan, over which the nats are averaged
-_SIZE = {"layers": 4, "heads": 4, "width": 192}  # of the recipe ``small``
+_SIZE = {"layers": 4, "heads": 4, "width": 192}  # of the preset ``lidargrit_small``
 
 
 @dataclass(frozen=True)
@@ -170,14 +170,14 @@ class PartTransformer(CausalTransformer):
 
 
 def in_precision() -> torch.autocast:
-    """Compute in 16 bits where the machine has instructions for it, as the recipes do."""
+    """Compute in 16 bits where the machine has instructions for it, as the presets do."""
     return torch.autocast("cpu", torch.bfloat16, enabled=dtype_of("auto") == torch.bfloat16)
 
 
 def train(model: PartTransformer, tokens: Int[Tensor, "N T"], seed: int) -> float:
     """Train on tokens in their order, once, and return the processor seconds."""
     part = model.part
-    config = FitConfig(
+    config = TrainingConfig(
         scans=len(tokens),
         batch_size=BATCH,
         learning_rate=part.learning_rate,

@@ -20,7 +20,9 @@ def main(folder: Path, run: str = "pretrained") -> None:
     """Sample one scan with and without the pixel decoder, and show it as it grows."""
     model = lidargrit.load(run)
     if not isinstance(model, LidarGrit) or not isinstance(model.pixels, PixelDecoder):
-        raise ConfigError(f"{run}, which has no pixel decoder", "a run with one", "train the recipe compact_pixels")
+        raise ConfigError(
+            f"{run}, which has no pixel decoder", "a run with one", "train the preset lidargrit_compact_pixels"
+        )
     scan, plain = model.sample([SEED])[0], model.sample([SEED], TokenSampling(mask="bernoulli"))[0]
     phases = model.pixels.mask.phases
     panels = []

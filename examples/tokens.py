@@ -11,7 +11,7 @@ import lidargrit
 from lidargrit.generation.tokenizers.vqvae import Vqvae, VqvaeConfig
 from lidargrit.scans.types import RangeImage
 
-STEPS = 60  # a taste, of one street; the recipe `small` takes thousands, of thousands
+STEPS = 60  # a taste, of one street; the preset `lidargrit_small` takes thousands, of thousands
 
 
 def main(folder: Path) -> None:

@@ -20,7 +20,7 @@ from lidargrit.evaluation.benchmark import run as run_benchmark
 from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.generation.generator import load_class
-from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.presets import load_preset
 from lidargrit.nn.flops import flops_of
 from lidargrit.scans.marks import read_marks
 from lidargrit.training import compute, computing_time, training_flops, with_budget
@@ -48,7 +48,7 @@ def test_systems_are_made_once_and_set_side_by_side(tmp_path):
     assert costs["training_flops"] == 0
     assert costs["seconds_per_scan"] > 0
     finished = [str(tmp_path / "runs" / "marginal")]
-    again = run_benchmark(finished, tmp_path / "again", replace(BENCHMARK, recipe_settings=()))
+    again = run_benchmark(finished, tmp_path / "again", replace(BENCHMARK, preset_settings=()))
     assert json.loads(again[0].read_text())["scores"][0]["value"] == pytest.approx(
         json.loads(scores[0].read_text())["scores"][0]["value"]
     )
@@ -57,7 +57,7 @@ def test_systems_are_made_once_and_set_side_by_side(tmp_path):
 def test_a_run_named_by_dots_has_the_name_of_its_folder(tmp_path, monkeypatch):
     finished = tmp_path / "first" / "runs" / "marginal"
     run_benchmark(["marginal"], tmp_path / "first", BENCHMARK)
-    wanted = replace(BENCHMARK, recipe_settings=())
+    wanted = replace(BENCHMARK, preset_settings=())
     for here, name in ((finished, "."), (finished / "below", "..")):
         here.mkdir(exist_ok=True)
         monkeypatch.chdir(here)
@@ -65,7 +65,7 @@ def test_a_run_named_by_dots_has_the_name_of_its_folder(tmp_path, monkeypatch):
     assert [path.name for path in (tmp_path / "table").iterdir() if path.is_dir()] == ["marginal"]
 
 
-def test_a_recipe_is_trained_once_in_how_many_ways_ever_it_is_drawn_from(tmp_path, capsys):
+def test_a_preset_is_trained_once_in_how_many_ways_ever_it_is_drawn_from(tmp_path, capsys):
     words = ["compare", str(tmp_path), "r2dm_small:steps=1", "r2dm_small:steps=2", "--flops", "1e9", "-n", "2"]
     assert main([*words, "--against", "simulated:2:test", "--metrics", "bev_jsd", "--set", *FEW, *NARROW]) == 0
     output = capsys.readouterr().out
@@ -118,16 +118,16 @@ def test_scans_of_another_sensor_are_told_before_anything_is_trained(tmp_path):
 
 def test_a_run_of_another_sensor_is_told_before_it_is_sampled(tmp_path):
     prepared = prepare("simulated:2:test", DataConfig(columns=64, column_stride=8), tmp_path / "narrow")
-    wanted = replace(BENCHMARK, reference=str(prepared), recipe_settings=())
+    wanted = replace(BENCHMARK, reference=str(prepared), preset_settings=())
     with pytest.raises(LidarGritError, match="narrow"):
         run_benchmark(["pretrained"], tmp_path / "table", wanted)
     assert not list((tmp_path / "table").rglob("*"))
 
 
-def test_settings_that_a_later_recipe_cannot_follow_are_told_before_the_first_system(tmp_path):
-    wrong = replace(BENCHMARK, recipe_settings=(*FEW, "training.tokenizer.optimiser=muon"))
+def test_settings_that_a_later_preset_cannot_follow_are_told_before_the_first_system(tmp_path):
+    wrong = replace(BENCHMARK, preset_settings=(*FEW, "training.tokenizer.optimiser=muon"))
     with pytest.raises(ConfigError, match="optimiser=muon for networks without linear layers"):
-        run_benchmark(["pretrained", "demo"], tmp_path, wrong)
+        run_benchmark(["pretrained", "lidargrit_demo"], tmp_path, wrong)
     assert not list(tmp_path.rglob("*"))
 
 
@@ -150,63 +150,63 @@ def test_bounds_of_another_data_set_are_warned_of(tmp_path, capsys):
 
 
 def test_training_flops_are_three_forward_passes_of_a_plain_stack():
-    recipe = load_recipe("r2dm_small", FEW)
-    network = load_recipe("r2dm_small", FEW).model
-    counted = training_flops(recipe)["diffusion"] / recipe.training["diffusion"].scans
+    preset = load_preset("r2dm_small", FEW)
+    network = load_preset("r2dm_small", FEW).model
+    counted = training_flops(preset)["diffusion"] / preset.training["diffusion"].scans
     from lidargrit.systems.r2dm.system import R2dm
 
-    generator = R2dm(network, recipe.data.load_sensor())
+    generator = R2dm(network, preset.data.load_sensor())
     one_pass = generator.cost(replace(generator.Sampling(), steps=1)).flops
     assert 2.8 * one_pass < counted < 3.0 * one_pass  # the first layer needs no gradient of its input
 
 
 def test_a_budget_scales_all_stages_alike():
-    recipe = load_recipe("demo", MODEL)
-    cost = sum(training_flops(recipe).values())
-    half = with_budget(recipe, cost / 2)
-    for stage, fit in recipe.training.items():
+    preset = load_preset("lidargrit_demo", MODEL)
+    cost = sum(training_flops(preset).values())
+    half = with_budget(preset, cost / 2)
+    for stage, fit in preset.training.items():
         assert half.training[stage].scans == pytest.approx(fit.scans / 2, abs=fit.batch_size)
-    assert with_budget(load_recipe("marginal"), 1.0) == load_recipe("marginal")
-    vae = load_recipe("lidarvae_small")
+    assert with_budget(load_preset("marginal"), 1.0) == load_preset("marginal")
+    vae = load_preset("lidarvae_small")
     short = with_budget(vae, sum(training_flops(vae).values()) / 4)
     assert short.model.warmup_scans == pytest.approx(vae.model.warmup_scans / 4, rel=0.01)
     with pytest.raises(ConfigError, match="at least one batch"):
-        with_budget(recipe, 1e6)
-    lacking = load_recipe("r2flow_small", ["model.reflow={}"])
-    for count in (training_flops, lambda recipe: with_budget(recipe, 1e13)):
+        with_budget(preset, 1e6)
+    lacking = load_preset("r2flow_small", ["model.reflow={}"])
+    for count in (training_flops, lambda preset: with_budget(preset, 1e13)):
         with pytest.raises(ConfigError, match=r"without training\.reflow, a stage of model=r2flow"):
             count(lacking)
 
 
 def test_images_that_only_count_mark_surfaces_that_return():
-    marked = read_marks(uniform_images(load_recipe("demo", MODEL).data.load_sensor(), 1).reflectance)
+    marked = read_marks(uniform_images(load_preset("lidargrit_demo", MODEL).data.load_sensor(), 1).reflectance)
     assert marked.is_clear
     assert marked.has_reflectance
 
 
 def test_stages_that_are_taken_from_another_run_are_not_counted():
-    recipe = load_recipe("compact_completion")  # over the packaged model
-    assert list(training_flops(recipe)) == ["completion"]
-    scaled = with_budget(recipe, training_flops(recipe)["completion"] / 4)
-    assert sum(training_flops(scaled).values()) == pytest.approx(training_flops(recipe)["completion"] / 4, rel=0.01)
-    assert {**scaled.training, "completion": None} == {**recipe.training, "completion": None}
+    preset = load_preset("completion_compact")  # over the packaged model
+    assert list(training_flops(preset)) == ["completion"]
+    scaled = with_budget(preset, training_flops(preset)["completion"] / 4)
+    assert sum(training_flops(scaled).values()) == pytest.approx(training_flops(preset)["completion"] / 4, rel=0.01)
+    assert {**scaled.training, "completion": None} == {**preset.training, "completion": None}
 
 
 def test_a_budget_counts_what_is_prepared_once(monkeypatch):
     """As a reflow's pairs: one for each training image, however many scans are seen."""
 
     cost = compute.StageCost(100.0, lambda scans: 900 * min(scans, 50))
-    monkeypatch.setattr(compute, "stage_costs", lambda recipe: {"tokenizer": cost})
-    recipe = load_recipe("demo", ["training.tokenizer.scans=4000", "training.tokenizer.batch_size=1"])
-    recipe = replace(recipe, training={"tokenizer": recipe.training["tokenizer"]})
+    monkeypatch.setattr(compute, "stage_costs", lambda preset: {"tokenizer": cost})
+    preset = load_preset("lidargrit_demo", ["training.tokenizer.scans=4000", "training.tokenizer.batch_size=1"])
+    preset = replace(preset, training={"tokenizer": preset.training["tokenizer"]})
     for budget in (20_000.0, 60_000.0, 200_000.0, 2_000_000.0):
-        scans = with_budget(recipe, budget).training["tokenizer"].scans
+        scans = with_budget(preset, budget).training["tokenizer"].scans
         assert 100 * scans + 900 * min(scans, 50) == pytest.approx(budget, rel=0.021)
 
 
-def test_a_run_of_another_recipe_is_not_taken_for_this_one(tmp_path):
+def test_a_run_of_another_preset_is_not_taken_for_this_one(tmp_path):
     run_benchmark(["marginal"], tmp_path, BENCHMARK)
-    other = replace(BENCHMARK, recipe_settings=("data.train=simulated:5:train", *BENCHMARK.recipe_settings[1:]))
+    other = replace(BENCHMARK, preset_settings=("data.train=simulated:5:train", *BENCHMARK.preset_settings[1:]))
     with pytest.raises(LidarGritError, match="which holds another run"):
         run_benchmark(["marginal"], tmp_path, other)
 
@@ -226,45 +226,52 @@ def test_what_all_are_scored_by_is_looked_at_first(tmp_path):
 
 
 def test_attention_counts_in_training_flops():
-    recipe = load_recipe("small", ("data.train=simulated:6:train", *FEW[2:]))
-    flops, scans = training_flops(recipe)["transformer"], recipe.training["transformer"].scans
-    generator = load_class("lidargrit")(recipe.model, recipe.data.load_sensor())
-    tokens, sizes = generator.transformer.context_length, recipe.model.transformer
+    preset = load_preset("lidargrit_small", ("data.train=simulated:6:train", *FEW[2:]))
+    flops, scans = training_flops(preset)["transformer"], preset.training["transformer"].scans
+    generator = load_class("lidargrit")(preset.model, preset.data.load_sensor())
+    tokens, sizes = generator.transformer.context_length, preset.model.transformer
     products = 3 * tokens * (24 * sizes.layers * sizes.width**2 + 2 * sizes.width * generator.transformer.num_tokens)
     attention = 3 * sizes.layers * 4 * sizes.width * tokens**2
-    encoding = flops_of(generator.tokenizer.encoder, (1, 1, recipe.data.load_sensor().height, 64))
+    encoding = flops_of(generator.tokenizer.encoder, (1, 1, preset.data.load_sensor().height, 64))
     assert flops / scans == pytest.approx(products + attention + encoding, rel=0.05)
 
 
 @pytest.mark.parametrize(
-    ("recipe", "stage"),
-    [("demo", "tokenizer"), ("maskgit_demo", "transformer")],
+    ("preset", "stage"),
+    [("lidargrit_demo", "tokenizer"), ("maskgit_demo", "transformer")],
 )
-def test_counted_operations_are_those_of_a_step_that_is_computed(recipe, stage):
-    recipe = load_recipe(recipe, MODEL)
-    objective = recipe.build_generator().objective(stage).train()
+def test_counted_operations_are_those_of_a_step_that_is_computed(preset, stage):
+    preset = load_preset(preset, MODEL)
+    objective = preset.build_generator().objective(stage).train()
     with FlopCounterMode(display=False) as counter, sdpa_kernel(SDPBackend.MATH):
-        images = uniform_images(recipe.data.load_sensor(), 2)
+        images = uniform_images(preset.data.load_sensor(), 2)
         objective(images, torch.Generator().manual_seed(0))["loss"].backward()
-    counted = training_flops(recipe)[stage] / recipe.training[stage].scans
+    counted = training_flops(preset)[stage] / preset.training[stage].scans
     assert counted == pytest.approx(counter.get_total_flops() / 2, rel=1e-6)
 
 
 @pytest.mark.parametrize(
-    "recipe",
-    ["ultralidar_kitti_360", "maskgit_small", "lidm_small", "small_pixels", "lidarvae_small", "dusty_kitti_odometry"],
+    "preset",
+    [
+        "ultralidar_kitti_360",
+        "maskgit_small",
+        "lidm_small",
+        "lidargrit_small_pixels",
+        "lidarvae_small",
+        "dusty_kitti_odometry",
+    ],
 )
-def test_operations_are_counted_without_computing_them(recipe, monkeypatch):
+def test_operations_are_counted_without_computing_them(preset, monkeypatch):
     """Else a dry run of a wide network takes minutes: frozen networks, caches and counters count, too."""
     monkeypatch.delattr(compute, "_cost_with_values")
-    recipe = load_recipe(recipe)
-    assert training_flops(recipe).keys() == recipe.training.keys()
+    preset = load_preset(preset)
+    assert training_flops(preset).keys() == preset.training.keys()
 
 
 def test_a_penalty_that_comes_rarely_is_counted_as_rarely():
     def flops(*settings):
         words = (*FEW, "model.latent_dim=8", "model.channels=4", "model.max_channels=8", *settings)
-        return training_flops(load_recipe("dusty_small", words))["adversarial"]
+        return training_flops(load_preset("dusty_small", words))["adversarial"]
 
     none, half, always = flops("model.penalty_weight=0"), flops("model.penalty_every=2"), flops("model.penalty_every=1")
     assert none < half < always
@@ -294,9 +301,9 @@ def test_processes_make_a_table_that_can_be_extended(tmp_path, capfd):
     assert first == again
     assert (tmp_path / "table.html").read_text().count("<tr>") == 1 + 3 + 1
     for wrong, got in (
-        (["--add", "small", "-n", "5"], "--add with settings of its own (-n)"),
-        (["--add", "small", "--against", "simulated:256:test"], "--add with settings of its own (--against)"),
-        (["small", "--add", "demo"], "--add with systems before it"),
+        (["--add", "lidargrit_small", "-n", "5"], "--add with settings of its own (-n)"),
+        (["--add", "lidargrit_small", "--against", "simulated:256:test"], "--add with settings of its own (--against)"),
+        (["lidargrit_small", "--add", "lidargrit_demo"], "--add with systems before it"),
         (["--add", str(tmp_path)], f"{tmp_path}, a folder that holds no finished run"),
     ):
         capfd.readouterr()

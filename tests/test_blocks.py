@@ -12,8 +12,8 @@ from torch import nn
 
 from lidargrit.core.errors import ConfigError, OutputError
 from lidargrit.generation.generator import load_class
-from lidargrit.generation.presets import load_recipe
-from lidargrit.generation.settings import FitConfig
+from lidargrit.generation.presets import load_preset
+from lidargrit.generation.settings import TrainingConfig
 from lidargrit.nn.blocks import Block, Network, prepare_for_training
 from lidargrit.nn.convolution import wrapped
 from lidargrit.training import train
@@ -46,15 +46,15 @@ def gradients(objective: nn.Module) -> tuple[list[torch.Tensor], int]:
     return found, bytes_kept
 
 
-def objective_of(recipe: str, stage: str, *settings: str) -> nn.Module:
+def objective_of(preset: str, stage: str, *settings: str) -> nn.Module:
     torch.manual_seed(0)
-    loaded = load_recipe(recipe, settings)
+    loaded = load_preset(preset, settings)
     return load_class(loaded.generator)(loaded.model, loaded.data.load_sensor()).objective(stage)
 
 
 OBJECTIVES = [
-    ("demo", "tokenizer", *SETTINGS),
-    ("demo", "transformer", *SETTINGS, "model.transformer.layers=3"),
+    ("lidargrit_demo", "tokenizer", *SETTINGS),
+    ("lidargrit_demo", "transformer", *SETTINGS, "model.transformer.layers=3"),
     ("r2dm_small", "diffusion", *MODEL[:2], "model.unet.channel_multipliers=[1,2]", "model.unet.residual_blocks=[1,1]"),
 ]
 
@@ -73,8 +73,8 @@ def test_recomputed_gradients_are_the_same_and_take_less_memory(words):
 
 
 def test_what_has_no_blocks_says_so():
-    recipe = load_recipe("dusty_small")
-    objective = load_class("dusty")(recipe.model, recipe.data.load_sensor()).objective("adversarial")
+    preset = load_preset("dusty_small")
+    objective = load_class("dusty")(preset.model, preset.data.load_sensor()).objective("adversarial")
     for choice in ((True, False), (False, True)):
         with pytest.raises(ConfigError, match=r"=true for \w+, which has no (Block|Network)"):
             prepare_for_training(objective, *choice)
@@ -111,15 +111,15 @@ def check_resuming(folder: Path) -> None:
     trace_in_place_of_compiling()
     both = [f"training.transformer.{choice}=true" for choice in ("recompute", "compile")]
     steps = ["training.tokenizer.scans=8", "training.transformer.scans=16", "training.transformer.pictures_every=8"]
-    recipe = load_recipe("demo", (*SETTINGS, *SIMULATED, *LONG, *both, *steps))
-    train(recipe, folder / "whole")
+    preset = load_preset("lidargrit_demo", (*SETTINGS, *SIMULATED, *LONG, *both, *steps))
+    train(preset, folder / "whole")
 
     def stop(*_):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):  # within the second stage
-        train(recipe, folder / "broken", plot=stop)
-    train(recipe, folder / "broken")
+        train(preset, folder / "broken", plot=stop)
+    train(preset, folder / "broken")
     weights = [(folder / run / "model.safetensors").read_bytes() for run in ("whole", "broken")]
     assert weights[0] == weights[1]
 
@@ -135,17 +135,17 @@ def test_compiled_networks_have_the_same_gradients_and_resume(tmp_path):
 
 
 def test_a_run_of_the_other_choice_is_refused(tmp_path):
-    recipe = load_recipe("demo", (*MODEL, *SIMULATED, *SHORT))
-    train(recipe, tmp_path)
-    on = replace(recipe.training["tokenizer"], recompute=True)
+    preset = load_preset("lidargrit_demo", (*MODEL, *SIMULATED, *SHORT))
+    train(preset, tmp_path)
+    on = replace(preset.training["tokenizer"], recompute=True)
     with pytest.raises(OutputError, match=r"recompute=False, here True"):
-        train(replace(recipe, training={**recipe.training, "tokenizer": on}), tmp_path)
+        train(replace(preset, training={**preset.training, "tokenizer": on}), tmp_path)
     with pytest.raises(OutputError, match=r"data.projection_variant=exact, here reference"):
-        train(replace(recipe, data=replace(recipe.data, projection_variant="reference")), tmp_path)
+        train(replace(preset, data=replace(preset.data, projection_variant="reference")), tmp_path)
 
 
 def test_both_are_off_unless_asked_for():
-    config = FitConfig(scans=1, batch_size=1, learning_rate=1.0)
+    config = TrainingConfig(scans=1, batch_size=1, learning_rate=1.0)
     assert not config.recompute
     assert not config.compile
     assert not Block().recomputed

@@ -24,7 +24,7 @@ from lidargrit.data.sources import load_range_images
 from lidargrit.data.sources.samples import read_samples
 from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.evaluation.scorecard import format_value
-from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.presets import load_preset
 from lidargrit.viewer.demo import divided
 from tiny_runs import MODEL, the_one_line
 
@@ -36,7 +36,7 @@ TINY = [
     "training.transformer.scans=8",
 ]
 ONE_METRIC = ("lidargrit.viewer.demo.EvalConfig", partial(EvalConfig, metrics=("bev_jsd",)))
-COUNTED = ("lidargen_kitti_360", "r2flow_kitti_360")  # counting takes seconds for each recipe
+COUNTED = ("lidargen_kitti_360", "r2flow_kitti_360")  # counting takes seconds for each preset
 PIXELS = ["training.pixels.scans=2", "model.pixels.mask_width=4", "model.pixels.range_width=4", "model.pixels.blocks=1"]
 
 
@@ -58,7 +58,7 @@ def typed(capsys):
 def run_folder(tmp_path_factory) -> Path:
     """Return a finished run, in a folder whose name has a space."""
     folder = tmp_path_factory.mktemp("runs") / "my run"
-    assert main(["train", "demo", str(folder), "--set", *TINY]) == 0
+    assert main(["train", "lidargrit_demo", str(folder), "--set", *TINY]) == 0
     return folder
 
 
@@ -88,8 +88,8 @@ def test_train_leaves_a_run_that_says_what_it_is(run_folder):
         ),
     }
     about = json.loads((run_folder / "run.json").read_text())
-    assert about["recipe"]["data"]["train"] == ["simulated:6:train"]
-    assert about["recipe"]["training"]["tokenizer"]["scans"] == 8
+    assert about["preset"]["data"]["train"] == ["simulated:6:train"]
+    assert about["preset"]["training"]["tokenizer"]["scans"] == 8
     assert about["lidargrit"] == lidargrit.__version__
     assert about["torch"] == torch.__version__
     log = [json.loads(line) for line in (run_folder / "tokenizer" / "log.jsonl").read_text().splitlines()]
@@ -101,18 +101,18 @@ def test_train_leaves_a_run_that_says_what_it_is(run_folder):
 def test_the_same_train_command_again_changes_nothing(run_folder, typed):
     before = contents(run_folder)
     done = f"done: the model lies in {run_folder}; try it with: lidargrit sample {run_folder} samples -n 16"
-    assert done in typed("train", "demo", run_folder, "--set", *TINY)
+    assert done in typed("train", "lidargrit_demo", run_folder, "--set", *TINY)
     assert contents(run_folder) == before
 
 
 def test_settings_may_come_before_the_names(run_folder, typed):
     before = contents(run_folder)
-    assert "done" in typed("train", "--set", *TINY, "--", "demo", run_folder)
+    assert "done" in typed("train", "--set", *TINY, "--", "lidargrit_demo", run_folder)
     assert contents(run_folder) == before
 
 
 def test_dry_run_tells_the_plan_and_writes_nothing(tmp_path, typed):
-    output = typed("train", "demo", tmp_path / "none", "--dry-run", "--set", *TINY)
+    output = typed("train", "lidargrit_demo", tmp_path / "none", "--dry-run", "--set", *TINY)
     for line in ("training.tokenizer.scans = 8", "range images of 64x64, 0.", "transformer: ", "8 scans in batches of"):
         assert line in output
     assert not (tmp_path / "none").exists()
@@ -138,37 +138,37 @@ def test_dry_run_finds_prepared_scans_of_another_sensor(tmp_path, capsys):
     assert "(64x64); wanted the rays of " in the_one_line(capsys.readouterr().err, "train")
 
 
-def told_at_once(recipe, without=()):
-    return dict.fromkeys(recipe.training, 10**18)
+def told_at_once(preset, without=()):
+    return dict.fromkeys(preset.training, 10**18)
 
 
-@pytest.mark.parametrize("recipe", discovery.names("recipes"))
-def test_every_recipe_has_a_plan(recipe, tmp_path, capsys, monkeypatch):
-    if recipe not in COUNTED:
+@pytest.mark.parametrize("preset", discovery.names("presets"))
+def test_every_preset_has_a_plan(preset, tmp_path, capsys, monkeypatch):
+    if preset not in COUNTED:
         monkeypatch.setattr(sys.modules["lidargrit.training.plan"], "training_flops", told_at_once)
     monkeypatch.chdir(tmp_path)
-    is_simulated = load_recipe(recipe).data.train[0].startswith("simulated")
-    assert main(["train", recipe, "none", "--dry-run"]) == (0 if is_simulated else 2)
+    is_simulated = load_preset(preset).data.train[0].startswith("simulated")
+    assert main(["train", preset, "none", "--dry-run"]) == (0 if is_simulated else 2)
     captured = capsys.readouterr()
     assert ("data/kitti" in captured.err) is not is_simulated, "where data sets are looked for"
     assert "published: " in captured.out
-    assert (" parameters, " in captured.out) == bool(load_recipe(recipe).training)
+    assert (" parameters, " in captured.out) == bool(load_preset(preset).training)
 
 
 def test_a_plan_tells_which_stages_are_taken_and_not_trained(tmp_path, capsys, monkeypatch):
-    assert main(["train", "compact_raydrop", str(tmp_path / "none"), "--dry-run", "--json"]) == 0
+    assert main(["train", "raydrop_compact", str(tmp_path / "none"), "--dry-run", "--json"]) == 0
     stages = {stage["name"]: stage for stage in json.loads(capsys.readouterr().out)["stages"]}
     assert {name for name, stage in stages.items() if not stage["taken_from"]} == {"raydrop"}
     assert stages["pixels"]["taken_from"] == "pretrained"
     assert stages["pixels"]["flops"] == 0 < stages["raydrop"]["flops"]
     monkeypatch.setattr(sys.modules["lidargrit.training.plan"], "training_flops", told_at_once)
     words = ["--dry-run", "--set", "fine_tune=[pixels]", "model.raydrop.surfaces=estimated"]
-    assert main(["train", "compact_raydrop", str(tmp_path / "none"), *words]) == 0
+    assert main(["train", "raydrop_compact", str(tmp_path / "none"), *words]) == 0
     text = capsys.readouterr().out
     assert "transformer: 4,539,136 parameters, taken from pretrained and not trained" in text
     assert "pixels: 1,019,023 parameters, 58,000 scans" in text
     words = ["--dry-run", "--set", "model.pixels.coarsest_cell=8"]
-    assert main(["train", "compact_raydrop", str(tmp_path / "none"), *words]) == 2
+    assert main(["train", "raydrop_compact", str(tmp_path / "none"), *words]) == 2
     assert "whose pixels is another (model.pixels.coarsest_cell=64)" in the_one_line(capsys.readouterr().err, "train")
 
 
@@ -280,7 +280,7 @@ def test_processes_share_the_seeds(run_folder, tmp_path, typed):
 
 def test_list_names_everything_there_is(typed):
     output = typed("list")
-    for kind in ("datasets", "formats", "sensors", "tokenizers", "generators", "metrics", "recipes"):
+    for kind in ("datasets", "formats", "sensors", "tokenizers", "generators", "metrics", "presets"):
         in_full = typed("list", kind)
         assert in_full.splitlines()[0] == kind
         for name in discovery.names(kind):
@@ -288,6 +288,8 @@ def test_list_names_everything_there_is(typed):
             assert f"  {name} " in in_full
     assert "sample --set: temperature=1.0, top_k=0, top_p=1.0, guidance=0.0, mask=auto" in typed("list", "generators")
     assert "licence: " in typed("list", "datasets")
+    assert "      higher is better: no\n      variants: " in typed("list", "metrics")
+    assert "      rows: 64\n      columns: " in typed("list", "sensors")
     assert "  lidargrit-kitti-360 " in typed("list", "protocols")
     assert "  lidargen " in typed("list", "sample-formats")
 

@@ -8,7 +8,7 @@ import torch
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.generation.generator import load
-from lidargrit.generation.settings import Recipe
+from lidargrit.generation.settings import Preset
 from lidargrit.scans.condition import Condition
 from lidargrit.scans.fills import fill
 from lidargrit.scans.sensors import load_sensor
@@ -156,16 +156,16 @@ def test_the_network_alone_starts_from_that_of_a_whole_model_of_other_columns(tm
     whole = LidarGrit(replace(LidarGrit.smallest_config(SENSOR), completion=TINY), SENSOR)
     whole.save(tmp_path)
     wide = DataConfig(columns=64)
-    recipe = Recipe("a test", "completion_only", CompletionOnlyConfig(TINY), wide, {}, stages_from=str(tmp_path))
-    tuned = replace(recipe, fine_tune=("completion",))
+    preset = Preset("a test", "completion_only", CompletionOnlyConfig(TINY), wide, {}, stages_from=str(tmp_path))
+    tuned = replace(preset, fine_tune=("completion",))
     taken = taken_stages(tuned, tuned.build_generator())["completion"]
     for name, weight in whole.objective("completion").state_dict().items():
         assert torch.equal(taken.state_dict()[name], weight), name
     with pytest.raises(ConfigError, match=r"whose completion is another \(data.sensor\)"):
-        taken_stages(recipe, recipe.build_generator())
+        taken_stages(preset, preset.build_generator())
     fewer_rows = replace(tuned, data=replace(wide, sensor="vlp16"))
     with pytest.raises(ConfigError, match=r"whose completion is another \(data.sensor\)"):
         taken_stages(fewer_rows, fewer_rows.build_generator())
-    other = replace(recipe, generator="multiscale", model=MultiscaleConfig())
+    other = replace(preset, generator="multiscale", model=MultiscaleConfig())
     with pytest.raises(ConfigError, match="a run of the generator 'lidargrit'; wanted a run of 'multiscale'"):
         taken_stages(other, other.build_generator())

@@ -1,4 +1,4 @@
-"""Recipes ⇄ JSON, and single settings changed by name."""
+"""Presets ⇄ JSON, and single settings changed by name."""
 
 import dataclasses
 import json
@@ -12,13 +12,13 @@ from lidargrit.core.configuration import from_json, leaves, name_and_settings, o
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.generation.generator import load_class
-from lidargrit.generation.presets import load_recipe
-from lidargrit.generation.settings import FitConfig, Recipe
+from lidargrit.generation.presets import load_preset
+from lidargrit.generation.settings import Preset, TrainingConfig
 from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
 from lidargrit.nn.transformer import TransformerConfig
 from lidargrit.systems.lidargrit.system import LidarGritConfig
 
-RECIPES = discovery.names("recipes")
+PRESETS = discovery.names("presets")
 
 
 @dataclass(frozen=True)
@@ -45,41 +45,41 @@ class Whole:
     stages: dict[str, Stage] = field(default_factory=lambda: {"first": Stage(), "second": Stage(scans=2)})
 
 
-@pytest.mark.parametrize("name", RECIPES)
-def test_a_recipe_is_complete_and_survives_json(name):
-    recipe = load_recipe(name)
-    written = json.loads(json.dumps(to_json(recipe)))
-    generator = load_class(recipe.generator)
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_is_complete_and_survives_json(name):
+    preset = load_preset(name)
+    written = json.loads(json.dumps(to_json(preset)))
+    generator = load_class(preset.generator)
     unbuilt = generator.__new__(generator)  # no network of full size is built for it
-    object.__setattr__(unbuilt, "config", recipe.model)
+    object.__setattr__(unbuilt, "config", preset.model)
     stages = unbuilt.stages
-    assert tuple(recipe.training) == stages
-    assert from_json(generator.Config, written["model"], "run.json") == recipe.model
-    assert from_json(DataConfig, written["data"], "run.json") == recipe.data
-    for stage, config in recipe.training.items():
-        assert from_json(FitConfig, written["training"][stage], "run.json") == config
+    assert tuple(preset.training) == stages
+    assert from_json(generator.Config, written["model"], "run.json") == preset.model
+    assert from_json(DataConfig, written["data"], "run.json") == preset.data
+    for stage, config in preset.training.items():
+        assert from_json(TrainingConfig, written["training"][stage], "run.json") == config
     kind = {"model.tokenizer.name"}  # written for other tokenizers than the default one; no setting by itself
-    assert leaves(written).keys() - kind == leaves(recipe).keys()
+    assert leaves(written).keys() - kind == leaves(preset).keys()
 
 
-@pytest.mark.parametrize("name", RECIPES)
-def test_every_setting_of_a_recipe_can_be_set_to_what_it_is(name):
-    recipe = load_recipe(name)
-    for path, value in leaves(recipe).items():
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_setting_of_a_preset_can_be_set_to_what_it_is(name):
+    preset = load_preset(name)
+    for path, value in leaves(preset).items():
         text = value if isinstance(value, str) else json.dumps(value)  # words are taken as they are
-        assert override(recipe, [f"{path}={text}"]) == recipe, path
+        assert override(preset, [f"{path}={text}"]) == preset, path
 
 
-@pytest.mark.parametrize("name", RECIPES)
-def test_a_changed_recipe_differs_in_that_setting_only_and_the_recipe_itself_stays(name):
-    recipe = load_recipe(name)
-    before = leaves(recipe)
-    changed = override(recipe, ["data.max_scans=123", "data.train=[/a b, 'simulated:3:train']", "seed=7"])
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_changed_preset_differs_in_that_setting_only_and_the_preset_itself_stays(name):
+    preset = load_preset(name)
+    before = leaves(preset)
+    changed = override(preset, ["data.max_scans=123", "data.train=[/a b, 'simulated:3:train']", "seed=7"])
     now = leaves(changed)
     assert {path for path in now if now[path] != before[path]} == {"data.max_scans", "data.train", "seed"}
     assert now["data.train"] == ("/a b", "simulated:3:train")
-    assert leaves(load_recipe(name)) == before
-    assert isinstance(changed, Recipe)
+    assert leaves(load_preset(name)) == before
+    assert isinstance(changed, Preset)
 
 
 @pytest.mark.parametrize(
@@ -113,7 +113,7 @@ def test_the_last_of_two_settings_of_one_name_counts():
     [
         ("seed", r"got the setting 'seed'; wanted NAME=VALUE; e\.g\. --set seed="),
         ("", r"got the setting ''; wanted NAME=VALUE"),
-        ("=1", r"got the setting '', which this recipe does not have; wanted one such as"),
+        ("=1", r"got the setting '', which this preset does not have; wanted one such as"),
         ("sed=1", r"got the setting 'sed', which .*; wanted one such as seed.*; see all with --dry-run"),
         ("stages.first.scan=1", r"wanted one such as stages\.first\.scans"),
         ("stages.frist.scans=1", r"wanted one such as stages\.first\.scans"),
@@ -175,7 +175,7 @@ def test_json_that_does_not_fit_is_told_in_one_line(cls, change, text):
 @pytest.mark.parametrize("data", [None, 3, "words", [1], {}])
 def test_json_that_is_no_configuration_at_all(data):
     with pytest.raises(ConfigError, match=r"a configuration in run\.json that does not fit"):
-        from_json(FitConfig, data, "run.json")
+        from_json(TrainingConfig, data, "run.json")
 
 
 @pytest.mark.parametrize("name", ["lidargrit", "maskgit", "lidm"])
@@ -195,13 +195,13 @@ def test_what_is_no_settings_is_told_with_its_name(key):
     from_json(LidarGritConfig, {"pixels": None}, "config.json")
 
 
-def test_settings_of_a_recipe_are_checked_with_the_words_of_their_class():
+def test_settings_of_a_preset_are_checked_with_the_words_of_their_class():
     with pytest.raises(ConfigError, match=r"^got channels=40; wanted a positive multiple of 32"):
-        load_recipe("small", ["model.tokenizer.channels=40"])
+        load_preset("lidargrit_small", ["model.tokenizer.channels=40"])
     with pytest.raises(ConfigError, match=r"^got batch_size=0; wanted at least 1; raise it$"):
-        load_recipe("small", ["training.tokenizer.batch_size=0"])
+        load_preset("lidargrit_small", ["training.tokenizer.batch_size=0"])
     with pytest.raises(ConfigError, match=r"^got training.tokenizer.learning_rate=nan; wanted a finite number"):
-        load_recipe("small", ["training.tokenizer.learning_rate=.nan"])
+        load_preset("lidargrit_small", ["training.tokenizer.learning_rate=.nan"])
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from lidargrit.cli import main
 from lidargrit.core.reporting import TerminalReporter
 from lidargrit.data.datasets import load
 from lidargrit.evaluation.comparison import EvalConfig
-from lidargrit.generation.settings import Recipe
+from lidargrit.generation.settings import Preset
 from lidargrit.systems.lidargrit.system import TokenSampling
 from lidargrit.viewer import demo
 
@@ -21,11 +21,11 @@ def test_demo_trains_the_packaged_model_further_on_a_users_own_drives(tmp_path, 
     few = ["training.tokenizer.scans=2", "training.transformer.scans=8", "training.pixels.scans=2"]
     assert main(["demo", "--data", str(tmp_path / "own scans"), "--set", *few]) == 0
     run = tmp_path / "runs" / "demo-own scans"
-    recipe = json.loads((run / "run.json").read_text())["recipe"]
-    assert recipe["data"]["train"] == [f"kitti_odometry:{tmp_path / 'own scans'}:00"]
-    assert recipe["data"]["val"] == [f"kitti_odometry:{tmp_path / 'own scans'}:08"]
-    assert recipe["data"]["sensor"] == "hdl64e_kitti_odometry"
-    assert recipe["stages_from"] == "pretrained"
+    preset = json.loads((run / "run.json").read_text())["preset"]
+    assert preset["data"]["train"] == [f"kitti_odometry:{tmp_path / 'own scans'}:00"]
+    assert preset["data"]["val"] == [f"kitti_odometry:{tmp_path / 'own scans'}:08"]
+    assert preset["data"]["sensor"] == "hdl64e_kitti_odometry"
+    assert preset["stages_from"] == "pretrained"
     assert {"train the tokenizer", "train the transformer", "train the pixels"} < set(
         json.loads((run / "timings.json").read_text())
     )
@@ -34,13 +34,13 @@ def test_demo_trains_the_packaged_model_further_on_a_users_own_drives(tmp_path, 
     ).read_text(encoding="utf-8")
 
 
-def test_demo_takes_the_recipe_that_suits_the_scans(tmp_path, capsys):
-    def chosen(*settings: str, data: str | None = None, anew: bool = False) -> tuple[Recipe, str, str]:
-        recipe = demo._recipe(data, [*settings], TerminalReporter(), anew)
-        return recipe, demo.how_trained(recipe), capsys.readouterr().err
+def test_demo_takes_the_preset_that_suits_the_scans(tmp_path, capsys):
+    def chosen(*settings: str, data: str | None = None, anew: bool = False) -> tuple[Preset, str, str]:
+        preset = demo._preset(data, [*settings], TerminalReporter(), anew)
+        return preset, demo.how_trained(preset), capsys.readouterr().err
 
-    recipe, words, said = chosen()
-    assert [*demo._expected_s(recipe, simulates=True)] == [
+    preset, words, said = chosen()
+    assert [*demo._expected_s(preset, simulates=True)] == [
         "projecting scans",
         "training transformer",
         "sampling",
@@ -49,14 +49,14 @@ def test_demo_takes_the_recipe_that_suits_the_scans(tmp_path, capsys):
     assert words.startswith("The tokenizer and the pixel decoder come as trained, from the model in the package")
     assert words.endswith("The transformer learns anew here.")
     assert said == ""
-    assert demo._sampling(recipe) == TokenSampling()
+    assert demo._sampling(preset) == TokenSampling()
     for settings, anew in ((["data.columns=512", "data.column_stride=8"], False), ([], True)):
-        recipe, words, said = chosen(*settings, anew=anew)
+        preset, words, said = chosen(*settings, anew=anew)
         assert words == "The tokenizer, the transformer and the pixel decoder learn anew here."
         assert ("another sensor" in said) != anew
-        assert demo._sampling(recipe) == demo._SHARPER
+        assert demo._sampling(preset) == demo._SHARPER
     load("kitti_odometry").write_example(tmp_path / "tree", 8)
-    recipe, _, said = chosen(data=str(tmp_path / "tree" / "sequences" / "00"))
+    preset, _, said = chosen(data=str(tmp_path / "tree" / "sequences" / "00"))
     assert "WARNING: the last scans are held out" in said
-    assert recipe.data.val[0].endswith("[85%:]")
-    assert recipe.fine_tune == ("tokenizer", "transformer", "pixels")
+    assert preset.data.val[0].endswith("[85%:]")
+    assert preset.fine_tune == ("tokenizer", "transformer", "pixels")

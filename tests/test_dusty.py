@@ -51,13 +51,13 @@ def test_ranges_are_encoded_as_in_the_program(images):
 def test_coins_fall_by_their_logits_and_pass_the_sigmoids_gradient():
     logits = torch.tensor([-2.0, 0.0, 1.0]).repeat_interleave(20_000).requires_grad_()
     noise = logistic_noise(tuple(logits.shape), torch.Generator().manual_seed(0))
-    coins = straight_through(logits, noise, 0.5)
+    coins = straight_through(logits, noise)
     assert set(coins.tolist()) == {0.0, 1.0}
     assert coins.view(3, -1).mean(1).tolist() == pytest.approx([0.1192, 0.5, 0.7311], abs=0.012)
     coins.sum().backward()
-    soft = torch.sigmoid((logits.detach() + noise) / 0.5)
+    soft = torch.sigmoid(logits.detach() + noise)
     assert logits.grad is not None
-    assert torch.allclose(logits.grad, soft * (1 - soft) / 0.5, atol=1e-6)
+    assert torch.allclose(logits.grad, soft * (1 - soft), atol=1e-6)
 
 
 def test_raydrop_has_a_seed_of_its_own():

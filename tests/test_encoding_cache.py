@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from lidargrit.generation.encoding_cache import EncodingCache
-from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.presets import load_preset
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 from lidargrit.training.measure import measure
@@ -78,8 +78,8 @@ def test_images_of_other_reflectance_are_others():
 def test_a_measured_stage_encodes_other_images_in_every_step(monkeypatch):
     encoded, encode = [], EncodingCache._encoded
     monkeypatch.setattr(EncodingCache, "_encoded", lambda cache, some: encoded.append(some) or encode(cache, some))
-    recipe = load_recipe("demo", [*MODEL, *SIMULATED, *SHORT])
-    batch = recipe.settings_of("transformer").batch_size
-    measure(recipe)
+    preset = load_preset("lidargrit_demo", [*MODEL, *SIMULATED, *SHORT])
+    batch = preset.settings_of("transformer").batch_size
+    measure(preset)
     new = [some for some in encoded if not some.range_m.is_meta]  # the others are of counted operations
     assert len(new) == 4 * batch, "one to warm up, and three timed steps"

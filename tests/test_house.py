@@ -9,9 +9,13 @@ import pytest
 
 import lidargrit
 from lidargrit import api
+from lidargrit.cli import _catalogue
+from lidargrit.cli._catalogue import entries
 from lidargrit.core import discovery
+from lidargrit.generation.presets import load_preset
 
 ROOT = Path(__file__).resolve().parents[1]
+_NETWORKS_OF_LIDARGRIT = ("completion_compact", "raydrop_compact")  # named after what they train
 SOURCES = sorted((ROOT / "src").rglob("*.py"))
 
 
@@ -45,11 +49,27 @@ def test_what_is_exported_is_there():
         _ = lidargrit.nothing
 
 
-@pytest.mark.parametrize("kind", ["datasets", "sensors", "tokenizers", "generators", "metrics", "recipes", "cli"])
+@pytest.mark.parametrize("kind", ["datasets", "sensors", "tokenizers", "generators", "metrics", "presets", "cli"])
 def test_every_public_file_says_what_it_is(kind):
     assert discovery.names(kind)
     for name in discovery.names(kind):
         assert 20 < len(discovery.summary(kind, name)) < 180
+
+
+def test_presets_are_named_after_their_system_and_say_their_title():
+    for name in discovery.names("presets"):
+        preset = load_preset(name)
+        assert preset.title == discovery.summary("presets", name)
+        if name not in _NETWORKS_OF_LIDARGRIT:
+            assert name.partition("_")[0] == preset.generator.partition("_")[0]
+
+
+def test_presets_come_as_a_user_needs_them():
+    groups = [entry["group"] for entry in entries("presets")]
+    assert [entry["name"] for entry in entries("presets")[:4]] == [*_catalogue._FIRST]
+    assert (groups[0], groups[4], groups[-1]) == _catalogue._GROUPS
+    assert groups == sorted(groups, key=_catalogue._GROUPS.index)
+    assert len(groups) == len(discovery.names("presets"))
 
 
 def test_nothing_of_this_machine_is_in_the_project():

@@ -12,7 +12,7 @@ import torch
 import lidargrit
 from lidargrit.cli import main
 from lidargrit.core.files import claim_folder
-from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.presets import load_preset
 from lidargrit.systems.lidargrit.system import LidarGrit
 from reference_weights import seeded_weights
 from test_dcgan import published as dusty_weights
@@ -31,14 +31,14 @@ SMALL = [  # the sizes of the reference numbers' two networks, whose tokens fit 
     "model.transformer.heads=4",
     "model.transformer.width=32",
 ]
-RECIPE = "lidargrit_kitti_odometry"
+PRESET = "lidargrit_kitti_odometry"
 
 
 @functools.cache
 def drawn(part):
     """Draw weights under our names, without what only our training keeps."""
-    recipe = load_recipe(RECIPE, SMALL)
-    network = LidarGrit(recipe.model, recipe.data.load_sensor()).get_submodule(part)
+    preset = load_preset(PRESET, SMALL)
+    network = LidarGrit(preset.model, preset.data.load_sensor()).get_submodule(part)
     kept = ("quantize.usage", "quantize.code_sums")
     layout = {name: list(of.shape) for name, of in network.state_dict().items() if name not in kept}
     return seeded_weights({"layout": json.dumps(layout), "weight_seed": 3})
@@ -61,7 +61,7 @@ def write_released(folder, tokenizer, transformer):
 
 
 def imported(folder, files, *settings):
-    return main(["import-weights", RECIPE, str(folder), *files, "--set", *SMALL, *settings])
+    return main(["import-weights", PRESET, str(folder), *files, "--set", *SMALL, *settings])
 
 
 @pytest.fixture
@@ -106,7 +106,7 @@ def test_the_same_import_again_changes_nothing_and_no_training_goes_on_there(fil
     assert set(before) == {"run.json", "config.json", "model.safetensors"}
     assert str(tmp_path) not in before["run.json"].decode()
     assert imported(tmp_path / "run", files) == 0
-    assert main(["train", RECIPE, str(tmp_path / "run"), "--set", *SMALL]) == 2
+    assert main(["train", PRESET, str(tmp_path / "run"), "--set", *SMALL]) == 2
     assert "whose weights were imported; wanted " in capsys.readouterr().err
     assert imported(tmp_path / "run", files, "seed=7") == 2
     assert "which is not empty" in the_one_line(capsys.readouterr().err, "import-weights")
@@ -155,9 +155,9 @@ def test_weights_of_another_layout_are_refused_in_one_line(change, message, tmp_
 )
 def test_files_that_hold_no_weights_are_refused_in_one_line(found, tmp_path, capsys):
     torch.save(found, tmp_path / "x.pth")
-    for recipe in (RECIPE, "r2dm_kitti_360", "dusty_kitti_odometry"):
-        files = [str(tmp_path / "x.pth")] * (2 if recipe == RECIPE else 1)
-        assert main(["import-weights", recipe, str(tmp_path / "run"), *files]) == 2
+    for preset in (PRESET, "r2dm_kitti_360", "dusty_kitti_odometry"):
+        files = [str(tmp_path / "x.pth")] * (2 if preset == PRESET else 1)
+        assert main(["import-weights", preset, str(tmp_path / "run"), *files]) == 2
         assert "x.pth, wh" in the_one_line(capsys.readouterr().err, "import-weights")
 
 
@@ -173,12 +173,12 @@ def test_files_in_another_order_or_number_or_of_another_system_are_refused(files
         return the_one_line(capsys.readouterr().err, "import-weights")
 
     out = tmp_path / "run"
-    assert "gpt.pth, which holds no 'VQ'" in error(RECIPE, out, *reversed(files), "--set", *SMALL)
-    assert "got 1 file; wanted 2, for the tokenizer and the transformer" in error(RECIPE, out, files[0])
+    assert "gpt.pth, which holds no 'VQ'" in error(PRESET, out, *reversed(files), "--set", *SMALL)
+    assert "got 1 file; wanted 2, for the tokenizer and the transformer" in error(PRESET, out, files[0])
     assert "which holds no 'G_ema'" in error("dusty_kitti_odometry", out, files[0])
-    able = "nobody published weights; wanted a recipe of dusty, lidargan, lidargen, lidargrit, lidarvae, lidm, r2dm"
+    able = "nobody published weights; wanted a preset of dusty, lidargan, lidargen, lidargrit, lidarvae, lidm, r2dm"
     assert able in error("marginal", out, "x")
-    assert "none.pth, which is no file" in error(RECIPE, out, tmp_path / "none.pth", files[1])
+    assert "none.pth, which is no file" in error(PRESET, out, tmp_path / "none.pth", files[1])
     torch.save(r2dm_checkpoint(), tmp_path / "r2dm.pth")
     other = error("r2dm_kitti_360", out, tmp_path / "r2dm.pth", "--set", "data.columns=512")
     assert re.search(r"'network\.coords' is \(.*1024\)\); wanted \(.*512\)", other)

@@ -9,7 +9,7 @@ import torch
 
 from lidargrit.core.errors import ConfigError, DataError
 from lidargrit.data.images import Pixels, Provenance, RangeImages
-from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.presets import load_preset
 from lidargrit.nn.flops import flops_of
 from lidargrit.scans.condition import Condition
 from lidargrit.scans.projection import project
@@ -64,7 +64,7 @@ def count(module):
 
 
 @pytest.mark.parametrize(
-    ("recipe", "generator", "discriminator"),
+    ("preset", "generator", "discriminator"),
     [
         ("lidargan_kitti_odometry", 3_870_592, 2_248_448),
         ("lidargan_small", 1_378_240, 567_168),
@@ -72,10 +72,10 @@ def count(module):
         ("lidarvae_small", 2_690_880, 0),
     ],
 )
-def test_recipes_have_as_many_parameters_as_the_program(recipe, generator, discriminator):
-    recipe = load_recipe(recipe)
+def test_presets_have_as_many_parameters_as_the_program(preset, generator, discriminator):
+    preset = load_preset(preset)
     with torch.device("meta"):
-        built = recipe.build_generator()
+        built = preset.build_generator()
         (stage,) = built.stages
         trained = built.objective(stage)
     assert count(built) == generator
@@ -316,13 +316,13 @@ def test_a_scan_is_completed_from_its_observed_pixels_alone():
 
 
 def test_operations_of_training_are_those_of_its_passes():
-    flops = compute.training_flops(load_recipe("lidargan_small"))["adversarial"]
+    flops = compute.training_flops(load_preset("lidargan_small"))["adversarial"]
     assert flops / 60_000 / 1e9 == pytest.approx(1.0, abs=0.5)
 
 
 def test_a_pass_of_the_small_networks_costs_what_the_programs_do():
-    recipe = load_recipe("lidargan_small")
-    generator = recipe.build_generator()
+    preset = load_preset("lidargan_small")
+    generator = preset.build_generator()
     encoder = generator.objective("adversarial").discriminator
     assert generator.cost().network_evaluations == 1
     both = generator.cost().flops + flops_of(encoder, (1, 2, 40, 256))

@@ -26,12 +26,12 @@ def checkpoint(cls):
 
 
 @pytest.mark.parametrize(
-    ("cls", "recipe"), [(LidarGan, "lidargan_kitti_odometry"), (LidarVae, "lidarvae_kitti_odometry")]
+    ("cls", "preset"), [(LidarGan, "lidargan_kitti_odometry"), (LidarVae, "lidarvae_kitti_odometry")]
 )
-def test_a_checkpoint_of_the_program_becomes_a_run(cls, recipe, tmp_path):
+def test_a_checkpoint_of_the_program_becomes_a_run(cls, preset, tmp_path):
     saved = checkpoint(cls)
     torch.save(saved, tmp_path / "gen_999.pth", _use_new_zipfile_serialization=False)
-    assert main(["import-weights", recipe, str(tmp_path / "run"), str(tmp_path / "gen_999.pth")]) == 0
+    assert main(["import-weights", preset, str(tmp_path / "run"), str(tmp_path / "gen_999.pth")]) == 0
     generator = lidargrit.load(tmp_path / "run")
     assert (generator.config.latent_dim, generator.config.channels) == (5, 2)
     assert generator.sensor.width == 256
@@ -66,19 +66,19 @@ def test_checkpoints_of_another_form_are_refused(cls, change, message, tmp_path)
         cls.from_published([path], cls.Config(), load_sensor("hdl64e_kitti_odometry"))
 
 
-@pytest.mark.parametrize("recipe", ["lidargan_kitti_odometry", "lidarvae_kitti_odometry"])
-def test_code_in_a_checkpoint_is_never_run_and_cut_ones_write_nothing(recipe, tmp_path, capsys):
+@pytest.mark.parametrize("preset", ["lidargan_kitti_odometry", "lidarvae_kitti_odometry"])
+def test_code_in_a_checkpoint_is_never_run_and_cut_ones_write_nothing(preset, tmp_path, capsys):
     class Bomb:
         def __reduce__(self):
             return (open, (str(tmp_path / "ran"), "w"))
 
     path, out = tmp_path / "gen_999.pth", tmp_path / "run"
     torch.save({"main.0.weight": Bomb()}, path)
-    assert main(["import-weights", recipe, str(out), str(path)]) == 2
+    assert main(["import-weights", preset, str(out), str(path)]) == 2
     assert "which does not hold tensors only" in capsys.readouterr().err
     torch.save(checkpoint(LidarGan), path)
     path.write_bytes(path.read_bytes()[:-2000])
-    assert main(["import-weights", recipe, str(out), str(path)]) == 2
+    assert main(["import-weights", preset, str(out), str(path)]) == 2
     assert capsys.readouterr().err.count("\n") == 1
     assert not (tmp_path / "ran").exists()
     assert not out.exists()

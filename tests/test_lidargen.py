@@ -10,7 +10,7 @@ import torch
 import lidargrit
 from lidargrit.cli import main
 from lidargrit.core.errors import CheckpointError, ConfigError
-from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.presets import load_preset
 from lidargrit.scans.condition import Condition
 from lidargrit.scans.projection import project
 from lidargrit.scans.sensors import load_sensor
@@ -81,19 +81,19 @@ def test_networks_have_as_many_parameters_as_the_programs(channels, parameters):
     assert sum(weight.numel() for weight in made.parameters()) == parameters
 
 
-def test_the_published_recipe_has_the_published_size():
-    recipe = load_recipe("lidargen_kitti_360")
-    sensor = recipe.data.load_sensor()
+def test_the_published_preset_has_the_published_size():
+    preset = load_preset("lidargen_kitti_360")
+    sensor = preset.data.load_sensor()
     with torch.device("meta"):
-        generator = LidarGen(recipe.model, sensor)
+        generator = LidarGen(preset.model, sensor)
     assert generator.shape == (2, 64, 1024)
     assert sum(weight.numel() for weight in generator.parameters()) == 29_694_082
 
 
 @pytest.mark.shared
-def test_no_recipe_of_it_trains_in_16_bits():
+def test_no_preset_of_it_trains_in_16_bits():
     for name in ("lidargen", "lidargen_small", "lidargen_kitti_360"):
-        assert {fit.precision for fit in load_recipe(name).training.values()} == {"fp32"}
+        assert {fit.precision for fit in load_preset(name).training.values()} == {"fp32"}
 
 
 def test_noise_levels_and_the_norm_are_the_programs(numbers):
@@ -193,7 +193,7 @@ def test_only_values_in_the_chosen_window_are_returns():
 
 
 def test_levels_steps_and_their_size_are_choices_and_are_counted():
-    small, published = load_recipe("lidargen_small").model, LidarGenConfig(channels=4)
+    small, published = load_preset("lidargen_small").model, LidarGenConfig(channels=4)
     assert LidarGen(published, SENSOR).cost().network_evaluations == 1161
     assert LidarGen(replace(small, channels=4), SENSOR).cost().network_evaluations == 175
     generator = made(reflectance=False)
@@ -238,8 +238,8 @@ def test_steps_grow_where_the_published_ones_would_leave_noise():
 
 
 def test_the_cost_of_a_pass_at_the_small_size_is_that_counted_in_the_program():
-    recipe = load_recipe("lidargen_small", ("model.reflectance=true",))
-    cost = LidarGen(recipe.model, recipe.data.load_sensor()).cost(LangevinSampling(levels=2, steps_each=1))
+    preset = load_preset("lidargen_small", ("model.reflectance=true",))
+    cost = LidarGen(preset.model, preset.data.load_sensor()).cost(LangevinSampling(levels=2, steps_each=1))
     assert cost.flops / cost.network_evaluations / 1e9 == pytest.approx(4.97, rel=0.02)
 
 

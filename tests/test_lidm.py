@@ -12,8 +12,8 @@ from lidargrit.cli import main
 from lidargrit.core.errors import CheckpointError, ConfigError
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.generation.encoding_cache import EncodingCache
-from lidargrit.generation.presets import load_recipe
-from lidargrit.generation.settings import Recipe
+from lidargrit.generation.presets import load_preset
+from lidargrit.generation.settings import Preset
 from lidargrit.generation.tokenizers.curve_vqvae import (
     CurveVqvae,
     CurveVqvaeConfig,
@@ -37,7 +37,7 @@ LOW = load_sensor("vlp16").with_columns(64)  # 16x64, as the reference numbers
 TINY = CurveVqvaeConfig(32, (1, 1, 2, 2), (1, 2, 2), 1, code_dim=4, num_codes=32, mask_head=True)
 TINY_UNET = LatentUnetConfig(32, (1, 2, 4), 1, (0, 1, 2), head_channels=16)
 SMALL = Lidm.smallest_config(SENSOR)
-SETTINGS = {  # of SMALL, by which a recipe of another size becomes that
+SETTINGS = {  # of SMALL, by which a preset of another size becomes that
     "model.tokenizer.channels": 32,
     "model.tokenizer.channel_multipliers": [1, 1],
     "model.tokenizer.row_strides": [2],
@@ -107,17 +107,17 @@ def parameters(module):
     [
         ("lidm_kitti_360", (8, 16, 128), (15_070_361, 257_751_560)),
         ("lidm_small", (8, 16, 32), (988_122, 1_859_464)),
-        ("lidm_shared_small", (4, 16, 64), (806_210, 1_857_156)),
+        ("lidm_small_shared", (4, 16, 64), (806_210, 1_857_156)),
     ],
 )
-def test_recipes_have_the_published_size_or_that_of_two_cores(name, latents, sizes):
-    recipe = load_recipe(name)
-    sensor = recipe.data.load_sensor()
+def test_presets_have_the_published_size_or_that_of_two_cores(name, latents, sizes):
+    preset = load_preset(name)
+    sensor = preset.data.load_sensor()
     with torch.device("meta"):
-        generator = Lidm(recipe.model, sensor)
+        generator = Lidm(preset.model, sensor)
     assert generator.latent_shape == latents
     assert (parameters(generator.tokenizer), parameters(generator.denoiser)) == sizes
-    assert recipe.training.keys() == set(generator.stages)
+    assert preset.training.keys() == set(generator.stages)
 
 
 @pytest.mark.shared
@@ -214,7 +214,7 @@ def test_the_denoiser_and_its_stages_are_the_programs(numbers, tiny_unet):
 
 @pytest.mark.shared
 def test_the_schedule_is_the_programs(numbers):
-    shares = latent_diffusion.signal_shares(0.0015, 0.0195)
+    shares = latent_diffusion.signal_shares()
     assert torch.equal(shares, torch.from_numpy(numbers["alphas_cumprod"]))
     for steps in (20, 50):
         chosen = latent_diffusion.ddim_steps(steps)
@@ -232,7 +232,7 @@ def test_ddim_takes_the_programs_steps(eta, numbers, tiny, tiny_unet):
         seen.append(latents)
         return tiny_unet(latents, step)
 
-    shares = latent_diffusion.signal_shares(0.0015, 0.0195)
+    shares = latent_diffusion.signal_shares()
     last = latent_diffusion.ddim(watched, lambda: next(noise), shares, 5, float(eta))
     for ours, theirs in zip([*seen, last], numbers[f"ddim5_eta{eta}_states"], strict=True):
         agree(ours, theirs)
@@ -245,8 +245,6 @@ def test_noise_of_no_step_and_steps_without_sense_are_refused():
     for settings in ({"steps": 0}, {"steps": 501}, {"eta": 1.5}, {"eta": math.nan}):
         with pytest.raises(ConfigError, match=next(iter(settings))):
             LidmSampling(**settings)
-    with pytest.raises(ConfigError, match="beta_first"):
-        LidmConfig(beta_first=0.02)
     with pytest.raises(ConfigError, match=r"latents of 32x16; wanted both sizes divisible by 32"):
         made(LidmConfig(SMALL.tokenizer, LatentUnetConfig(32, (1,) * 6, 1, ())))
     with pytest.raises(ConfigError, match=r"64x10; wanted rows divisible by 4, columns by 8"):
@@ -300,14 +298,14 @@ def test_the_tokenizer_of_a_lidargrit_is_taken_as_it_is(tmp_path):
     theirs = LidarGrit(LidarGrit.smallest_config(SENSOR), SENSOR)
     theirs.save(tmp_path)
     model = LidmConfig(theirs.config.tokenizer, LatentUnetConfig(32, (1,), 1, ()), scale_latents=True)
-    recipe, generator = Recipe("shared", "lidm", model, DataConfig(), {}, tokenizer_from=str(tmp_path)), made(model)
-    taken = taken_stages(recipe, generator)
+    preset, generator = Preset("shared", "lidm", model, DataConfig(), {}, tokenizer_from=str(tmp_path)), made(model)
+    taken = taken_stages(preset, generator)
     assert taken.keys() == {"tokenizer"}
     generator.load_stage("tokenizer", taken["tokenizer"])
     weights = theirs.tokenizer.state_dict()
     assert all(torch.equal(weights[name], of) for name, of in generator.tokenizer.state_dict().items())
     with pytest.raises(ConfigError, match=r"whose tokenizer is another \(model\.tokenizer\.\w+="):
-        taken_stages(replace(recipe, model=SMALL), made())
+        taken_stages(replace(preset, model=SMALL), made())
 
 
 def test_noise_in_latents_is_learned():

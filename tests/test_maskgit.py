@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from lidargrit.core.configuration import override
 from lidargrit.core.errors import ConfigError
-from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.presets import load_preset
 from lidargrit.nn.transformer import CausalTransformer, MaskedTransformer, TransformerConfig
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.maskgit.system import (
@@ -127,9 +127,9 @@ def test_a_masked_transformer_sees_both_sides_and_a_causal_one_does_not():
 
 
 def small_maskgit():
-    recipe = load_recipe("maskgit_small", ["model.transformer.width=32", "data.columns=512", "data.column_stride=8"])
+    preset = load_preset("maskgit_small", ["model.transformer.width=32", "data.columns=512", "data.column_stride=8"])
     torch.manual_seed(0)
-    return MaskGit(recipe.model, recipe.data.load_sensor()).eval()
+    return MaskGit(preset.model, preset.data.load_sensor()).eval()
 
 
 def test_the_objective_asks_for_hidden_tokens_only():
@@ -179,10 +179,10 @@ def test_a_wrong_choice_is_told(wrong):
 
 def test_a_tokenizer_is_taken_from_another_run(tmp_path):
     settings = [*MODEL, *SIMULATED, *SHORT]
-    donor = train(load_recipe("demo", settings), tmp_path / "donor")
+    donor = train(load_preset("lidargrit_demo", settings), tmp_path / "donor")
     other_scans = "data.train=[simulated:6:train]"
-    recipe = load_recipe("maskgit_demo", [*settings, other_scans, f"tokenizer_from={tmp_path / 'donor'}"])
-    generator = train(recipe, tmp_path / "run")
+    preset = load_preset("maskgit_demo", [*settings, other_scans, f"tokenizer_from={tmp_path / 'donor'}"])
+    generator = train(preset, tmp_path / "run")
     theirs, ours = donor.get_tokenizer().state_dict(), generator.get_tokenizer().state_dict()
     assert theirs.keys() == ours.keys()
     assert all(torch.equal(theirs[name], ours[name]) for name in theirs)
@@ -190,7 +190,7 @@ def test_a_tokenizer_is_taken_from_another_run(tmp_path):
     facts = [json.loads((tmp_path / run / "trained_on.json").read_text()) for run in ("donor", "run")]
     assert set(facts[0]["fingerprints"]) < set(facts[1]["fingerprints"])
 
-    wider = override(recipe, ["model.tokenizer.code_dim=16"])
+    wider = override(preset, ["model.tokenizer.code_dim=16"])
     with pytest.raises(ConfigError, match="code_dim=8"):
         train(wider, tmp_path / "wider")
     assert not (tmp_path / "wider").exists()

@@ -6,18 +6,18 @@ import pytest
 import torch
 
 from lidargrit.core.errors import ConfigError
-from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.presets import load_preset
 from lidargrit.generation.tokenizers import make_tokenizer
 from lidargrit.systems.lidm.latent_unet import LatentUnet
 
 
-@pytest.mark.parametrize("recipe", ["lidm_small", "lidm_shared_small"])
-def test_a_small_denoiser_sees_latents_that_are_too_high_as_a_whole(recipe):
+@pytest.mark.parametrize("preset", ["lidm_small", "lidm_small_shared"])
+def test_a_small_denoiser_sees_latents_that_are_too_high_as_a_whole(preset):
     """A norm of single channels takes away their means, and what is generated then keeps the mean of the noise."""
 
     def moved(norm_groups: int) -> float:
         torch.manual_seed(0)
-        sizes = replace(load_recipe(recipe).model.denoiser, norm_groups=norm_groups)
+        sizes = replace(load_preset(preset).model.denoiser, norm_groups=norm_groups)
         network = LatentUnet(sizes, 4, (8, 16))
         for weight in network.out.parameters():
             torch.nn.init.normal_(weight)
@@ -26,13 +26,12 @@ def test_a_small_denoiser_sees_latents_that_are_too_high_as_a_whole(recipe):
             low, high = (network(noisy + shift, torch.full((2,), 500.0)).mean((2, 3)) for shift in (0.0, 0.5))
         return float((high - low).abs().mean())
 
-    groups = load_recipe(recipe).model.denoiser.norm_groups
+    groups = load_preset(preset).model.denoiser.norm_groups
     assert moved(groups) > 5 * moved(32)
 
 
-@pytest.mark.parametrize("recipe", ["small", "lidm_small"])
-def test_all_norms_of_a_tokenizer_have_as_many_groups_as_its_setting_says(recipe):
-    loaded = load_recipe(recipe)
+def test_all_norms_of_a_tokenizer_have_as_many_groups_as_its_setting_says():
+    loaded = load_preset("lidm_small")
     plain, coarser = (
         make_tokenizer(replace(loaded.model.tokenizer, norm_groups=groups), loaded.data.load_sensor())
         for groups in (32, 8)

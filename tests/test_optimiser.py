@@ -10,8 +10,8 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import load_range_images
 from lidargrit.generation.objective import Objective
-from lidargrit.generation.presets import load_recipe
-from lidargrit.generation.settings import FitConfig
+from lidargrit.generation.presets import load_preset
+from lidargrit.generation.settings import TrainingConfig
 from lidargrit.generation.tokenizers.vqvae import Vqvae
 from lidargrit.nn.transformer import CausalTransformer, TransformerConfig
 from lidargrit.scans.sensors import load_sensor
@@ -21,7 +21,7 @@ from lidargrit.training.optimiser import WeightAverage, learning_rate_at, make_o
 
 
 def config(**settings):
-    return FitConfig(**{"scans": 1000, "batch_size": 10, "learning_rate": 0.1, **settings})
+    return TrainingConfig(**{"scans": 1000, "batch_size": 10, "learning_rate": 0.1, **settings})
 
 
 def test_learning_rates():
@@ -120,7 +120,7 @@ def images():
 
 @pytest.mark.parametrize("weight", [0.0, 0.1, 3.0])
 def test_the_loss_is_the_papers_sum(images, weight):
-    model = load_recipe("demo", [f"model.tokenizer.raydrop_weight={weight}"]).model.tokenizer
+    model = load_preset("lidargrit_demo", [f"model.tokenizer.raydrop_weight={weight}"]).model.tokenizer
     torch.manual_seed(0)
     vqvae = Vqvae(model, images.sensor).eval()
     with torch.no_grad():
@@ -189,7 +189,7 @@ def test_ranges_reach_the_objective_unrounded(images):
 
 def test_tokens_do_not_depend_on_the_precision_around_them(images):
     torch.manual_seed(0)
-    vqvae = Vqvae(load_recipe("demo").model.tokenizer, images.sensor).eval()
+    vqvae = Vqvae(load_preset("lidargrit_demo").model.tokenizer, images.sensor).eval()
     vqvae.quantize.embedding.weight.data.normal_(mean=5)
     z = torch.randn(2, 64, 8, 8) + 5
     with torch.no_grad():

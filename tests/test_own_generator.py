@@ -1,4 +1,4 @@
-"""The page on a generator of one's own: its file is trained, sampled and compared without a recipe."""
+"""The page on a generator of one's own: its file is trained, sampled and compared without a preset."""
 
 import inspect
 import json
@@ -15,7 +15,7 @@ from lidargrit.cli import main
 from lidargrit.core import discovery
 from lidargrit.core.errors import ConfigError, UnknownNameError
 from lidargrit.generation.generator import load
-from lidargrit.generation.presets import default_recipe, load_recipe
+from lidargrit.generation.presets import default_preset, load_preset
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs/how-to/own-generator.md").read_text(encoding="utf-8")
@@ -37,7 +37,7 @@ def code(tmp_path, monkeypatch):
     return path
 
 
-def test_the_file_of_the_page_is_compared_without_a_recipe(code, tmp_path, capsys, monkeypatch):
+def test_the_file_of_the_page_is_compared_without_a_preset(code, tmp_path, capsys, monkeypatch):
     lines = [line for line in code.read_text().splitlines() if line and not line.startswith(("import", "from", '"""'))]
     assert len(lines) < 40
     monkeypatch.setattr(lidargrit.generation.presets, "_SCANS", 8)
@@ -62,13 +62,15 @@ def test_the_file_of_the_page_keeps_the_contract(test, code, tmp_path, request):
     asked(**{name: given[name] for name in inspect.signature(asked).parameters})
 
 
-def test_a_default_recipe_needs_defaults_and_a_known_name(code):
-    recipe = load_recipe("mean_street", ["model.start_m=20"])
-    assert (recipe.model.start_m, list(recipe.training)) == (20.0, ["mean"])
-    with pytest.raises(UnknownNameError, match="which is not among the recipes"):
-        load_recipe("mean_streets")
+def test_a_default_preset_needs_defaults_and_a_known_name(code):
+    preset = load_preset("mean_street", ["model.start_m=20"])
+    assert (preset.model.start_m, list(preset.training)) == (20.0, ["mean"])
+    with pytest.raises(UnknownNameError, match="which is not among the presets"):
+        load_preset("mean_streets")
     other = code.parents[1] / "without_default" / "system.py"
     other.parent.mkdir()
     other.write_text(code.read_text().replace("start_m: float = 10.0", "start_m: float"), encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"without_default without a recipe .* add systems/without_default/presets"):
-        default_recipe("without_default")
+    with pytest.raises(
+        ConfigError, match=r"without_default without a preset .* add without_default to systems/without_default/presets"
+    ):
+        default_preset("without_default")

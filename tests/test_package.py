@@ -1,4 +1,4 @@
-"""What is shipped: the wheel has every file of the package, and the container's recipe names what is there."""
+"""What is shipped: the wheel has every file of the package, and the container's preset names what is there."""
 
 import importlib.util
 import re
@@ -31,7 +31,7 @@ def test_the_wheel_has_every_file(tmp_path):
     assert wheel.stat().st_size < 40_000_000, "beyond that, weights would be a file to fetch"
 
 
-def test_the_container_gets_what_its_recipe_names():
+def test_the_container_gets_what_its_preset_names():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     copied = [words.split()[:-1] for words in re.findall(r"^COPY (.+)$", DOCKERFILE, re.MULTILINE)]
     names = {name for part in copied for name in part}

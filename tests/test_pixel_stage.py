@@ -22,7 +22,7 @@ from lidargrit.generation.batches import in_batches
 from lidargrit.generation.generator import load
 from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
 from lidargrit.generation.range_steps import RangeSteps
-from lidargrit.generation.settings import FitConfig, Recipe
+from lidargrit.generation.settings import Preset, TrainingConfig
 from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
 from lidargrit.nn.decoding import CachedDecoder
 from lidargrit.nn.transformer import TransformerConfig
@@ -64,10 +64,10 @@ def scans(count: int) -> RangeImage:
     return RangeImage.masked(2 + 40 * torch.rand(size, generator=rng), torch.rand(size, generator=rng) < 0.8, SENSOR)
 
 
-def recipe_of(pixels: PixelDecoderConfig | None, stages_from: str | None = None) -> Recipe:
-    fit = FitConfig(scans=4, batch_size=2, learning_rate=1e-3, validation_scans=1)
+def preset_of(pixels: PixelDecoderConfig | None, stages_from: str | None = None) -> Preset:
+    fit = TrainingConfig(scans=4, batch_size=2, learning_rate=1e-3, validation_scans=1)
     stages = ("tokenizer", "transformer") if pixels is None else ("tokenizer", "transformer", "pixels")
-    return Recipe(
+    return Preset(
         "a test",
         "lidargrit",
         LidarGritConfig(TOKENIZER, TRANSFORMER, pixels),
@@ -273,7 +273,7 @@ def test_its_cost_counts_every_phase():
 
 
 def test_all_of_it_is_trained_saved_and_read_again(tmp_path):
-    trained = train(recipe_of(PIXELS), tmp_path / "run")
+    trained = train(preset_of(PIXELS), tmp_path / "run")
     log = [json.loads(line) for line in (tmp_path / "run" / "pixels" / "log.jsonl").read_text().splitlines()]
     assert {"loss", "mask_bits", "range_bits"} <= set(log[-1])
     again = load(tmp_path / "run")

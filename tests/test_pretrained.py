@@ -18,7 +18,7 @@ from lidargrit.core.files import read_tensors
 from lidargrit.data.run_folder import locate
 from lidargrit.data.sources.samples import read_samples
 from lidargrit.generation.generator import Generator, load
-from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.presets import load_preset
 from lidargrit.scans.types import RangeImage
 from lidargrit.training.compute import uniform_images
 from lidargrit.viewer.serve import finished_runs
@@ -43,28 +43,28 @@ def test_all_of_it_is_small_and_its_card_is_whole(folder):
     assert "| sliced_wasserstein |" in card
 
 
-def test_it_is_what_its_recipe_makes(model):
-    recipe, completing = load_recipe("compact_raydrop"), load_recipe("compact_completion")
-    assert model.config == replace(recipe.model, completion=completing.model.completion)
-    trained = json.loads((FOLDER / "run.json").read_text(encoding="utf-8"))["recipe"]
+def test_it_is_what_its_preset_makes(model):
+    preset, completing = load_preset("raydrop_compact"), load_preset("completion_compact")
+    assert model.config == replace(preset.model, completion=completing.model.completion)
+    trained = json.loads((FOLDER / "run.json").read_text(encoding="utf-8"))["preset"]
     seen = {stage: fit["scans"] for stage, fit in trained["training"].items()}
     seen["transformer"] += 18_000 + 36_000 + 30_000  # before they were trained further, as the card says
     seen["pixels"] += 17_000 + 9000 + 16_000
-    assert seen == {stage: fit.scans for stage, fit in {**completing.training, **recipe.training}.items()}
+    assert seen == {stage: fit.scans for stage, fit in {**completing.training, **preset.training}.items()}
 
 
-def test_the_wide_one_is_what_its_recipe_makes():
-    recipe, wide = load_recipe("compact_wide"), load("pretrained_wide")
-    completing, dropping = load_recipe("completion_wide"), load_recipe("compact_raydrop")
-    assert wide.config == replace(recipe.model, completion=completing.model.completion, raydrop=dropping.model.raydrop)
-    assert wide.sensor.same_rays(recipe.data.load_sensor())
+def test_the_wide_one_is_what_its_preset_makes():
+    preset, wide = load_preset("lidargrit_wide_pixels"), load("pretrained_wide")
+    completing, dropping = load_preset("completion_wide"), load_preset("raydrop_compact")
+    assert wide.config == replace(preset.model, completion=completing.model.completion, raydrop=dropping.model.raydrop)
+    assert wide.sensor.same_rays(preset.data.load_sensor())
     assert (wide.sensor.height, wide.sensor.width) == (64, 1024)
-    trained = json.loads((WIDE / "run.json").read_text(encoding="utf-8"))["recipe"]
+    trained = json.loads((WIDE / "run.json").read_text(encoding="utf-8"))["preset"]
     seen = {stage: fit["scans"] for stage, fit in trained["training"].items()}
     seen["transformer"] += 3600 + 6000  # before they were trained further, as the card says
     seen["pixels"] += 9000 + 1600
     assert seen.pop("raydrop") == 2500  # of 1,024 columns, which are as much to learn from as 10,000 of 256
-    assert seen == {stage: fit.scans for stage, fit in {**completing.training, **recipe.training}.items()}
+    assert seen == {stage: fit.scans for stage, fit in {**completing.training, **preset.training}.items()}
 
 
 def test_a_word_gives_scans(tmp_path, monkeypatch, capsys):
@@ -128,9 +128,9 @@ def test_every_verb_that_takes_a_run_takes_the_word(tmp_path, monkeypatch, capsy
     words = ["data.train=simulated:2:train", "data.val=simulated:1:val", "tokenizer_from=pretrained"]
     words += [f"training.transformer.{setting}" for setting in ("scans=2", "batch_size=2", "warmup_scans=0")]
     words.append("model.transformer.layers=1")
-    assert main(["train", "compact", "run", "--set", *words]) == 0
+    assert main(["train", "lidargrit_compact", "run", "--set", *words]) == 0
     assert main(["publish", "run", "to_share"]) == 0
-    assert json.loads((tmp_path / "to_share" / "run.json").read_text())["recipe"]["tokenizer_from"] is None
+    assert json.loads((tmp_path / "to_share" / "run.json").read_text())["preset"]["tokenizer_from"] is None
     known = [
         json.loads((run_folder / "trained_on.json").read_text())["fingerprints"] for run_folder in (FOLDER, Path("run"))
     ]

@@ -20,16 +20,16 @@ from lidargrit.data.sources import load_range_images
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.pixel_decoder.phase_noise import PhaseNoise
 from lidargrit.generation.pixel_decoder.pixel_phases import phases_of
-from lidargrit.generation.presets import load_recipe
-from lidargrit.generation.settings import FitConfig
+from lidargrit.generation.presets import load_preset
+from lidargrit.generation.settings import TrainingConfig
 from lidargrit.generation.tokenizers.vqvae import Vqvae
 from lidargrit.nn.processes import of_first_process
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.multiscale.system import Multiscale
 from lidargrit.training.engine import Engine
-from lidargrit.training.fit import Fit, begin_training
 from lidargrit.training.optimiser import make_optimiser
+from lidargrit.training.stage import StageTraining, begin_training
 from tiny_runs import train_words
 
 SENSOR = load_sensor("hdl64e_kitti_odometry")
@@ -145,7 +145,7 @@ def learn_pixels():
     """Return whether steps of which each reaches some of a pixel decoder's weights alone have moved all networks."""
     torch.manual_seed(0)
     objective = Multiscale(Multiscale.smallest_config(SENSOR), SENSOR).objective("pixels")
-    learn = FitConfig(scans=8, batch_size=2, learning_rate=1e-3)
+    learn = TrainingConfig(scans=8, batch_size=2, learning_rate=1e-3)
     before = copy.deepcopy(objective.state_dict())
     engine, _ = begin_training(objective, learn)
     for step in range(4):
@@ -229,15 +229,15 @@ def test_two_processes_learn_what_one_does(tmp_path):
 
 @pytest.mark.parametrize("parts", [2, 4])
 def test_a_batch_in_parts_takes_the_same_step(tmp_path, parts):
-    recipe = load_recipe("demo", train_words(tmp_path)[4:])
+    preset = load_preset("lidargrit_demo", train_words(tmp_path)[4:])
     config = DataConfig(train=("simulated:4:train",), columns=512, column_stride=8)
     images = load_range_images(config.train, config)
-    sizes = replace(recipe.model.tokenizer, dropout=0.0, codebook_loss="paper", restart_dead_codes=False)
+    sizes = replace(preset.model.tokenizer, dropout=0.0, codebook_loss="paper", restart_dead_codes=False)
     found = []
     for accumulate in (1, parts):
         torch.manual_seed(0)
         vqvae = Vqvae(sizes, images.sensor)
-        learn = FitConfig(scans=4, batch_size=4, learning_rate=1e-3, accumulate=accumulate, average_over_scans=0)
+        learn = TrainingConfig(scans=4, batch_size=4, learning_rate=1e-3, accumulate=accumulate, average_over_scans=0)
         optimiser, engine = make_optimiser(vqvae, learn), Engine("fp32")
         engine.set_up(vqvae, optimiser)
         terms = engine.step(images.batch(range(4)), 0, 0.0, accumulate)
@@ -248,11 +248,11 @@ def test_a_batch_in_parts_takes_the_same_step(tmp_path, parts):
 
 
 def test_parts_that_cannot_be_are_refused(tmp_path):
-    learn = FitConfig(scans=4, batch_size=4, learning_rate=1e-3, accumulate=3)
+    learn = TrainingConfig(scans=4, batch_size=4, learning_rate=1e-3, accumulate=3)
     with pytest.raises(ConfigError, match="batch_size=4 on 1 processes in 3 parts each; wanted a multiple of 3"):
-        Fit(Plain(), learn, tmp_path, 0, Reporter())
+        StageTraining(Plain(), learn, tmp_path, 0, Reporter())
     with pytest.raises(ConfigError, match="accumulate=2 for players who take turns"):
-        Fit(Game(), replace(learn, accumulate=2), tmp_path, 0, Reporter())
+        StageTraining(Game(), replace(learn, accumulate=2), tmp_path, 0, Reporter())
     with pytest.raises(ConfigError, match="accumulate=0"):
         replace(learn, accumulate=0)
 
@@ -260,8 +260,10 @@ def test_parts_that_cannot_be_are_refused(tmp_path):
 def test_a_validation_needs_no_more_memory_than_a_step(tmp_path, monkeypatch):
     config = DataConfig(train=("simulated:4:train",), val=(), columns=512, column_stride=8)
     images = load_range_images(config.train, config)
-    learn = FitConfig(scans=4, batch_size=4, accumulate=2, learning_rate=1e-3, validation_scans=4)
-    fit = Fit(Vqvae(load_recipe("demo", STEADY).model.tokenizer, images.sensor), learn, tmp_path, 0, Reporter())
+    learn = TrainingConfig(scans=4, batch_size=4, accumulate=2, learning_rate=1e-3, validation_scans=4)
+    fit = StageTraining(
+        Vqvae(load_preset("lidargrit_demo", STEADY).model.tokenizer, images.sensor), learn, tmp_path, 0, Reporter()
+    )
     sizes = []
     monkeypatch.setattr(fit.engine, "evaluate", lambda objective, some, seed: sizes.append(len(some)) or {"loss": 1.0})
     assert fit.validate(images) == {"loss": 1.0}

@@ -28,7 +28,7 @@ from lidargrit.data.datasets.shared import files as _files
 from lidargrit.data.images import Provenance
 from lidargrit.data.sources import data_set_of
 from lidargrit.generation.generator import Generator
-from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.presets import load_preset
 from lidargrit.publishing import publish
 from lidargrit.publishing.card import model_card
 from lidargrit.systems.lidargrit.system import LidarGrit
@@ -45,7 +45,7 @@ def run(tmp_path_factory):
         patch.setenv("LIDARGRIT_CACHE", str(folder / "cache"))
         load("kitti_odometry").write_example(folder / "data", 4)
         sources = [f"data.train=[kitti_odometry:{folder / 'data'}:train]", f"data.val=[{folder / 'data'}:08]"]
-        assert main(["train", "demo", str(folder / "run"), "--set", *MODEL, *SHORT, *sources]) == 0
+        assert main(["train", "lidargrit_demo", str(folder / "run"), "--set", *MODEL, *SHORT, *sources]) == 0
         assert main(["sample", str(folder / "run"), str(folder / "samples"), "-n", "3"]) == 0
         words = [
             "--metrics",
@@ -74,8 +74,8 @@ def test_what_is_published_is_a_run_without_the_users_places(run, tmp_path, caps
     assert all(b"private_place" not in of and b"/tmp" not in of for of in files.values())
     assert (public / "model.safetensors").read_bytes() == (run / "model.safetensors").read_bytes()
     about = json.loads(files["run.json"])
-    assert about["recipe"]["data"]["train"] == ["kitti_odometry::train"]
-    assert about["recipe"]["training"]["transformer"]["scans"] == 8
+    assert about["preset"]["data"]["train"] == ["kitti_odometry::train"]
+    assert about["preset"]["training"]["transformer"]["scans"] == 8
     model = Generator.from_pretrained(public)
     assert torch.equal(model.sample([3]).range_m, lidargrit.load(run).sample([3]).range_m)
     assert main(["sample", str(public), str(tmp_path / "drawn"), "-n", "1"]) == 0
@@ -83,7 +83,7 @@ def test_what_is_published_is_a_run_without_the_users_places(run, tmp_path, caps
     again = tmp_path / "again"
     assert main(["publish", str(public), str(again), "--scores", str(run.parent / "scores.json")]) == 0
     assert contents(again) == files
-    assert main(["train", "demo", str(public), "--set", *MODEL]) == 2
+    assert main(["train", "lidargrit_demo", str(public), "--set", *MODEL]) == 2
     assert "whose weights were published" in capsys.readouterr().err
 
 
@@ -123,7 +123,7 @@ def test_the_card_tells_the_facts(run, tmp_path):
         "| val | kitti_odometry | 08 | CC BY-NC-SA 3.0 (non-commercial) |",
         "Splits of kitti_odometry are those of ",
         "treat the weights as non-commercial too",
-        "Recipe: LidarGRIT, demo: the small model for a few minutes.",
+        "Preset: LidarGRIT, demo: the small model for a few minutes.",
         "| tokenizer | 4 | 4 | 0.0015 |",
         "| transformer | 8 | 8 | 0.001 |",
         f"lidargrit {lidargrit.__version__}, commit ",
@@ -167,7 +167,7 @@ def test_scores_of_other_weights_and_taken_folders_are_refused(run, tmp_path, ca
     assert "holds no finished model" in error(tmp_path / "taken", tmp_path / "new")
     assert "which cannot be used" in error(run, tmp_path / "new", "--scores", run / "run.json")
     shutil.copytree(run, tmp_path / "edited")
-    for edited in ("[]", '{"recipe": 5}', '{"recipe": {"data": {"train": 5}}}', '{"recipe": {"training": {"x": {}}}}'):
+    for edited in ("[]", '{"preset": 5}', '{"preset": {"data": {"train": 5}}}', '{"preset": {"training": {"x": {}}}}'):
         (tmp_path / "edited" / "run.json").write_text(edited)
         assert "run.json, which cannot be used" in error(tmp_path / "edited", tmp_path / "new")
     assert not (tmp_path / "new").exists()
@@ -185,7 +185,7 @@ def test_a_model_of_prepared_scans_names_what_they_were_prepared_from(tmp_path, 
     assert main(["publish", str(private / "run"), "public"]) == 0
     files = contents(tmp_path / "public")
     assert all(b"private_place" not in of and bytes(tmp_path) not in of for of in files.values())
-    data = json.loads(files["run.json"])["recipe"]["data"]
+    data = json.loads(files["run.json"])["preset"]["data"]
     assert (data["train"], data["val"]) == (["simulated::train"], ["simulated::val"])
     head, body = head_of(files["README.md"].decode())
     assert "license" not in head
@@ -247,7 +247,7 @@ def test_foreign_words_are_neither_html_nor_links_nor_tables():
     name = "a<img src=x onerror=alert(1)>\n# b `c` [d](http://e) | f"
     about = {
         "files": [{"name": name, "sha256": name}],
-        "recipe": {"title": name, "seed": name, "data": {"train": [f"simulated:5:{name}"]}},
+        "preset": {"title": name, "seed": name, "data": {"train": [f"simulated:5:{name}"]}},
         "torch": name,
     }
     for facts in (about, {**about, "files": []}):
@@ -272,7 +272,7 @@ def test_foreign_words_are_neither_html_nor_links_nor_tables():
     ],
 )
 def test_the_licence_is_what_the_data_demand(sources, licence):
-    card = model_card(marginal(), {"recipe": {"data": {"train": sources}}}, Provenance())
+    card = model_card(marginal(), {"preset": {"data": {"train": sources}}}, Provenance())
     head, body = head_of(card)
     assert head.get("license") == licence
     assert ("non-commercial" in body) == any(name in " ".join(sources) for name in ("kitti", "nuscenes", "argo"))
@@ -285,14 +285,14 @@ def test_terms_of_weights_that_were_taken_over_stay(tmp_path):
     data = {"data": {"train": ["kitti_odometry:/data/k"]}}
     fit = {"scans": 8, "batch_size": 2, "learning_rate": 0.1}
     imported = {"files": [{"name": "vq.pth", "sha256": "ab" * 32}]}
-    write_json(tmp_path / "first" / "run.json", {"recipe": {**data, "training": {"tokenizer": fit}}, **imported})
-    recipe = replace(load_recipe("demo"), tokenizer_from=str(tmp_path / "first"))
-    about = {"recipe": configuration.to_json(recipe), "taken": taken_facts(recipe, {"tokenizer": "first"})}
+    write_json(tmp_path / "first" / "run.json", {"preset": {**data, "training": {"tokenizer": fit}}, **imported})
+    preset = replace(load_preset("lidargrit_demo"), tokenizer_from=str(tmp_path / "first"))
+    about = {"preset": configuration.to_json(preset), "taken": taken_facts(preset, {"tokenizer": "first"})}
     write_json(tmp_path / "second" / "run.json", about)
-    again = replace(recipe, tokenizer_from=None, stages_from=str(tmp_path / "second"), fine_tune=("transformer",))
+    again = replace(preset, tokenizer_from=None, stages_from=str(tmp_path / "second"), fine_tune=("transformer",))
     taken = taken_facts(again, {"tokenizer": "second"})
     assert taken["training"] == {"tokenizer": None}, "no run of ours trained it"
-    head, body = head_of(model_card(marginal(), {"recipe": configuration.to_json(again), "taken": taken}, Provenance()))
+    head, body = head_of(model_card(marginal(), {"preset": configuration.to_json(again), "taken": taken}, Provenance()))
     assert head["license"] == "cc-by-nc-sa-3.0"
     assert "Some of the weights, or those that they were trained from, belong to their authors" in body
     assert "| train, of the weights that it took | kitti_odometry | all |" in body
@@ -301,8 +301,8 @@ def test_terms_of_weights_that_were_taken_over_stay(tmp_path):
 
 
 def test_a_run_that_took_stages_of_an_unknown_training_claims_no_free_terms(tmp_path):
-    over = taken_facts(replace(load_recipe("demo"), stages_from=str(tmp_path)), {"tokenizer": "it"})
-    assert head_of(model_card(marginal(), {"recipe": {}, "taken": over}, Provenance()))[0]["license"] == "other"
+    over = taken_facts(replace(load_preset("lidargrit_demo"), stages_from=str(tmp_path)), {"tokenizer": "it"})
+    assert head_of(model_card(marginal(), {"preset": {}, "taken": over}, Provenance()))[0]["license"] == "other"
 
 
 def test_a_card_of_which_nothing_is_known_claims_nothing():
@@ -316,7 +316,7 @@ def test_a_card_of_imported_weights_names_their_files_and_their_authors_rights()
     about = {
         "origin": "published",
         "files": [{"name": "vq.pth", "sha256": "ab" * 32}],
-        "recipe": {"data": {"train": ["kitti_360::train"]}, "training": {"tokenizer": {"scans": 5}}},
+        "preset": {"data": {"train": ["kitti_360::train"]}, "training": {"tokenizer": {"scans": 5}}},
     }
     body = head_of(model_card(marginal(), about, Provenance()))[1]
     assert f"- `vq.pth`, SHA-256 `{'ab' * 32}`" in body

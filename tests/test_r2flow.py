@@ -9,7 +9,7 @@ import torch
 import lidargrit
 from lidargrit.cli import main
 from lidargrit.core.errors import CheckpointError, ConfigError
-from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.presets import load_preset
 from lidargrit.generation.range_values import decode, encode
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
@@ -191,22 +191,22 @@ def test_a_distilled_model_takes_the_steps_that_it_has_learned():
 
 def test_a_trained_flow_is_taken_over_if_its_sizes_fit(tmp_path):
     sizes = ("model.hdit.depths=[1,1]", "model.hdit.heads=[1,2]")
-    load_recipe("r2flow_small", sizes).build_generator().save(tmp_path)
-    recipe = load_recipe("r2flow_reflow_small", (*sizes, f"stages_from={tmp_path}"))
-    assert taken_stages(recipe, recipe.build_generator()).keys() == {"flow"}
-    wider = load_recipe("r2flow_reflow_small", (*sizes, "model.hdit.channels=32", f"stages_from={tmp_path}"))
+    load_preset("r2flow_small", sizes).build_generator().save(tmp_path)
+    preset = load_preset("r2flow_small_reflow", (*sizes, f"stages_from={tmp_path}"))
+    assert taken_stages(preset, preset.build_generator()).keys() == {"flow"}
+    wider = load_preset("r2flow_small_reflow", (*sizes, "model.hdit.channels=32", f"stages_from={tmp_path}"))
     with pytest.raises(ConfigError, match=r"whose flow is another \(model\.hdit\.channels=\d+\); wanted "):
         taken_stages(wider, wider.build_generator())
 
 
 def test_operations_of_the_pairs_are_counted_once():
     sizes = ("model.hdit.depths=[1,1]", "model.hdit.heads=[1,2]")
-    recipe = load_recipe("r2flow_reflow_small", ("training.reflow.scans=400", "model.reflow.pairs=100", *sizes))
-    counted = compute.training_flops(recipe)
-    a_pair = load_recipe("r2flow_small", sizes).build_generator().cost(FlowSampling(steps=16)).flops
+    preset = load_preset("r2flow_small_reflow", ("training.reflow.scans=400", "model.reflow.pairs=100", *sizes))
+    counted = compute.training_flops(preset)
+    a_pair = load_preset("r2flow_small", sizes).build_generator().cost(FlowSampling(steps=16)).flops
     sights = (torch.randint(100, (400,), generator=torch.Generator().manual_seed(seed)) for seed in range(200))
     made = round(sum(len(some.unique()) for some in sights) / 200)  # of pairs that are drawn with repetition
-    flow_scan = counted["flow"] / recipe.training["flow"].scans
+    flow_scan = counted["flow"] / preset.training["flow"].scans
     assert counted["reflow"] == pytest.approx(400 * flow_scan + made * a_pair, rel=1e-6)
 
 
@@ -247,12 +247,12 @@ def test_a_flow_that_explodes_is_told_in_one_line():
             FlowSampling(**settings)
 
 
-def test_the_small_recipe_has_the_small_size():
-    recipe = load_recipe("r2flow_small")
-    generator = recipe.build_generator()
+def test_the_small_preset_has_the_small_size():
+    preset = load_preset("r2flow_small")
+    generator = preset.build_generator()
     assert sum(weight.numel() for weight in generator.network.parameters()) == 2_092_972
-    assert recipe.training.keys() == set(generator.stages)
-    published = load_recipe("r2flow_kitti_360")
+    assert preset.training.keys() == set(generator.stages)
+    published = load_preset("r2flow_kitti_360")
     assert published.model == R2flowConfig()
     assert (published.data.load_sensor().height, published.data.load_sensor().width) == (64, 1024)
 
@@ -276,8 +276,8 @@ def test_a_checkpoint_that_was_distilled_takes_the_steps_that_it_has_learned(tmp
     checkpoint = seeded_checkpoint()
     checkpoint["cfg"]["finetuning"] = {"init_ckpt": "2rf.pth", "sample_dir": "pairs", "k_distil": k_distil}
     torch.save(checkpoint, tmp_path / "td.pth")
-    recipe = load_recipe("r2flow_kitti_360")
-    generator = R2flow.from_published([tmp_path / "td.pth"], recipe.model, recipe.data.load_sensor())
+    preset = load_preset("r2flow_kitti_360")
+    generator = R2flow.from_published([tmp_path / "td.pth"], preset.model, preset.data.load_sensor())
     assert generator.config == R2flowConfig(PUBLISHED, True, reflow)
     assert generator.cost().network_evaluations == (k_distil or 256)
 
@@ -301,9 +301,9 @@ def test_weights_of_another_form_are_refused(tmp_path, change, message):
     checkpoint = seeded_checkpoint()
     change(checkpoint)
     torch.save(checkpoint, tmp_path / "1rf.pth")
-    recipe = load_recipe("r2flow_kitti_360")
+    preset = load_preset("r2flow_kitti_360")
     with pytest.raises(CheckpointError, match=message):
-        R2flow.from_published([tmp_path / "1rf.pth"], recipe.model, recipe.data.load_sensor())
+        R2flow.from_published([tmp_path / "1rf.pth"], preset.model, preset.data.load_sensor())
 
 
 def test_a_small_file_that_tells_of_a_vast_network_is_refused_before_memory_is_taken(tmp_path, capsys):

@@ -97,5 +97,5 @@ def test_a_run_with_it_from_training_to_scores(tmp_path, capsys):
     assert scan.reflectance is not None
     assert bool(scan.reflectance.any())
     capsys.readouterr()
-    assert main(["train", "demo", str(tmp_path / "no"), "--set", "model.tokenizer.reflectance=perhaps"]) == 2
+    assert main(["train", "lidargrit_demo", str(tmp_path / "no"), "--set", "model.tokenizer.reflectance=perhaps"]) == 2
     the_one_line(capsys.readouterr().err, "train")

@@ -14,7 +14,7 @@ from lidargrit.data.prepared.config import DataConfig
 from lidargrit.generation.generator import load
 from lidargrit.generation.objective import hidden_in_some
 from lidargrit.generation.reflectance import TYPICAL_REFLECTANCE
-from lidargrit.generation.settings import Recipe
+from lidargrit.generation.settings import Preset
 from lidargrit.scans.condition import Condition
 from lidargrit.scans.fills import FILLS, fill, fill_lacking
 from lidargrit.scans.marks import mark, read_marks
@@ -302,21 +302,21 @@ def test_what_a_generator_does_not_write_is_filled_in_from_observed_returns(fold
 
 
 def test_a_stage_may_start_from_weights_that_lack_it_but_not_lose_it(folders):
-    def recipe(run: str, model: LidarGrit) -> Recipe:
+    def preset(run: str, model: LidarGrit) -> Preset:
         settings = {"stages_from": str(folders / run), "fine_tune": ("raydrop",)}
-        return Recipe("grown", "lidargrit", model.config, DataConfig(), {}, **settings)
+        return Preset("grown", "lidargrit", model.config, DataConfig(), {}, **settings)
 
     bright, plain = (load(folders / name) for name in ("run", "plain"))
     assert isinstance(bright, LidarGrit)
     assert isinstance(plain, LidarGrit)
     grown = LidarGrit(replace(plain.config, raydrop=replace(RAYDROP, labels=True)), SENSOR)
-    taken = taken_stages(recipe("plain", grown), grown)["raydrop"]
+    taken = taken_stages(preset("plain", grown), grown)["raydrop"]
     assert taken.state_dict().keys() < grown.objective("raydrop").state_dict().keys()
     with pytest.raises(ConfigError, match=r"whose completion is another \(model\.completion\.labels=True\)"):
-        taken_stages(recipe("plain", bright), bright)  # the completion stage is not fine-tuned
+        taken_stages(preset("plain", bright), bright)  # the completion stage is not fine-tuned
     less = LidarGrit(replace(bright.config, raydrop=replace(RAYDROP, reflectance=False)), SENSOR)
     with pytest.raises(ConfigError, match=r"whose raydrop is another \(model\.raydrop\.reflectance=True\)"):
-        taken_stages(recipe("run", less), less)
+        taken_stages(preset("run", less), less)
 
 
 def test_a_wrong_setting_is_refused_in_one_line(tmp_path, capsys):

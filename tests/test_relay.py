@@ -17,12 +17,12 @@ from lidargrit.core.errors import CheckpointError, OutputError, Terminated
 from lidargrit.core.files import read_json, read_tensors, write_json
 from lidargrit.core.reporting import Reporter
 from lidargrit.data.images import RangeImages
-from lidargrit.generation.presets import load_recipe
-from lidargrit.generation.settings import FitConfig
+from lidargrit.generation.presets import load_preset
+from lidargrit.generation.settings import TrainingConfig
 from lidargrit.generation.tokenizers.vqvae import Vqvae, VqvaeConfig
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.systems.lidargrit.system import LidarGrit
-from lidargrit.training.fit import Fit
+from lidargrit.training.stage import StageTraining
 from seeded_images import SeededImages
 
 ROOT = Path(__file__).parent.parent
@@ -33,14 +33,14 @@ from packing import MANIFEST, RELAY_FILE, pack, unpack  # noqa: E402
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(16, 1)
 IMAGES = RangeImages(SENSOR, [SeededImages(SENSOR, 8)])
-STEPS = FitConfig(scans=300, batch_size=1, learning_rate=1e-3, average_over_scans=20, validate_every=10**6)
+STEPS = TrainingConfig(scans=300, batch_size=1, learning_rate=1e-3, average_over_scans=20, validate_every=10**6)
 MIB = 2**20
 
 
 def fit(folder, config=STEPS, deadline_s=float("inf")):
     torch.manual_seed(0)
-    sizes = VqvaeConfig(channels=4, channel_multipliers=(1, 1, 1), code_dim=4, num_codes=16, norm_groups=2, dropout=0.0)
-    return Fit(Vqvae(sizes, SENSOR), config, folder / "tokenizer", 0, Reporter(), deadline_s=deadline_s)
+    sizes = VqvaeConfig(channels=32, channel_multipliers=(1, 1, 1), code_dim=4, num_codes=16, dropout=0.0)
+    return StageTraining(Vqvae(sizes, SENSOR), config, folder / "tokenizer", 0, Reporter(), deadline_s=deadline_s)
 
 
 @pytest.fixture(scope="module")
@@ -137,20 +137,20 @@ def test_training_stops_and_saves_when_its_time_is_over(tmp_path):
     assert 0 < fit(tmp_path, replace(STEPS, scans=10**6)).scans_seen == long.scans_seen
 
 
-def toy_recipe():
-    recipe = load_recipe("compact_pixels")
-    data = replace(recipe.data, columns=32, column_stride=1)
+def toy_preset():
+    preset = load_preset("lidargrit_compact_pixels")
+    data = replace(preset.data, columns=32, column_stride=1)
     scans = {"tokenizer": 8, "pixels": 4, "transformer": 4}
     few = {
-        name: replace(recipe.training[name], scans=count, batch_size=2, warmup_scans=0, validate_every=10**6)
+        name: replace(preset.training[name], scans=count, batch_size=2, warmup_scans=0, validate_every=10**6)
         for name, count in scans.items()
     }
-    model = replace(LidarGrit.smallest_config(data.load_sensor()), pixels=replace(recipe.model.pixels, coarsest_cell=8))
-    return replace(recipe, model=model, data=data, training=few)
+    model = replace(LidarGrit.smallest_config(data.load_sensor()), pixels=replace(preset.model.pixels, coarsest_cell=8))
+    return replace(preset, model=model, data=data, training=few)
 
 
 def test_two_legs_from_two_fresh_folders_train_all_stages_in_order(tmp_path):
-    first = toy_recipe()
+    first = toy_preset()
     first.training["pixels"] = replace(first.training["pixels"], scans=10**6, checkpoint_every=2)
     Thread(target=terminate_once_there_is, args=[tmp_path / "one" / "pixels" / "checkpoint.safetensors"]).start()
     run_leg(Leg("toy", tmp_path / "one", 10**6, 1, 1), first)
@@ -160,7 +160,7 @@ def test_two_legs_from_two_fresh_folders_train_all_stages_in_order(tmp_path):
     assert {"tokenizer.kept_poles", "tokenizer.within_5_percent", "pixels.range_bits"} <= told["legs"][0].keys()
     pack(tmp_path / "one", tmp_path / "out")
     unpack(tmp_path / "out", tmp_path / "two")
-    second = toy_recipe()
+    second = toy_preset()
     reached = int(told["legs"][0]["pixels.scans"])
     second.training["pixels"] = replace(second.training["pixels"], scans=reached + 4)
     run_leg(Leg("toy", tmp_path / "two", 10**6, 1, 1), second)
@@ -182,7 +182,7 @@ def terminate_once_there_is(path):
 
 def test_a_folder_of_another_preset_is_refused(half):
     with pytest.raises(OutputError, match="the relay of toy"):
-        run_leg(Leg("small", half, 1, 1))
+        run_leg(Leg("lidargrit_small", half, 1, 1))
 
 
 def test_what_travels_leaves_room_for_the_state(tmp_path):

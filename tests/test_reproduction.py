@@ -16,7 +16,7 @@ from lidargrit.data.datasets import load
 from lidargrit.evaluation.protocols import load_protocol
 from lidargrit.evaluation.reproduction import TABLES, Reproduction, reproduce
 from lidargrit.evaluation.tables import published
-from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.presets import load_preset
 from lidargrit.training import train
 from tiny_runs import MODEL, SIMULATED
 
@@ -34,7 +34,7 @@ def words_for(folder: Path, *more: str) -> list[str]:
 
 def test_a_killed_reproduction_goes_on_and_ends_with_the_table(tmp_path, capsys):
     folder = tmp_path / "ablation"
-    second = folder / "runs" / "ablation_raydrop_small" / "tokenizer" / "checkpoint.safetensors"
+    second = folder / "runs" / "lidargrit_small_raydrop" / "tokenizer" / "checkpoint.safetensors"
     command = [sys.executable, "-m", "lidargrit", *words_for(folder)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=dict(os.environ))
     until = time.monotonic() + 200
@@ -43,25 +43,25 @@ def test_a_killed_reproduction_goes_on_and_ends_with_the_table(tmp_path, capsys)
     process.send_signal(signal.SIGKILL)
     assert process.wait() == -signal.SIGKILL
     assert second.exists()
-    assert not (folder / "runs" / "ablation_both_small").exists()
-    first = folder / "ablation_neither_small" / "ablation_neither_small.json"
+    assert not (folder / "runs" / "lidargrit_small_both").exists()
+    first = folder / "lidargrit_small_neither" / "lidargrit_small_neither.json"
     scored = first.stat().st_mtime_ns
 
     assert main(words_for(folder)) == 0
     captured = capsys.readouterr()
     assert first.stat().st_mtime_ns == scored
     assert "scores are there already" in captured.err
-    for row in ("ablation_neither_small", "ablation_raydrop_small", "ablation_both_small"):
+    for row in ("lidargrit_small_neither", "lidargrit_small_raydrop", "lidargrit_small_both"):
         assert f"\n{row} " in captured.out
     for metric in ("sliced_wasserstein", "minimum_matching_distance", "point_cloud_jsd"):
         assert f"{metric} (reference)" in captured.out
     assert "Published scores of lidargrit_kitti_odometry\nleft out, for they do not compare: 4 of the" in captured.out
     assert "61.73" not in captured.out
-    assert "the paper's row 'with both' is measured by ablation_both_small" in captured.out
+    assert "the paper's row 'with both' is measured by lidargrit_small_both" in captured.out
 
     # The killed run went on as if it had not been.
-    recipe = load_recipe("ablation_raydrop_small", reproduction_of(folder).benchmark().recipe_settings)
-    train(recipe, tmp_path / "whole")
+    preset = load_preset("lidargrit_small_raydrop", reproduction_of(folder).benchmark().preset_settings)
+    train(preset, tmp_path / "whole")
     weights = [
         (run / "model.safetensors").read_bytes() for run in (tmp_path / "whole", folder / "runs" / second.parts[-3])
     ]
@@ -82,9 +82,9 @@ def test_every_row_of_the_paper_is_measured(number):
     assert f"table {number}" in found["source"]
     assert found["protocol"] == table.protocol
     assert {row["system"] for row in found["rows"]} == {*table.rows}
-    for recipe, small in table.rows.values():
-        assert "simulated" in load_recipe(small).data.train[0]
-        assert load_recipe(recipe).published
+    for preset, small in table.rows.values():
+        assert "simulated" in load_preset(small).data.train[0]
+        assert load_preset(preset).published
 
 
 @pytest.mark.parametrize("number", TABLES)
@@ -92,7 +92,7 @@ def test_images_are_those_that_the_protocol_wants(number):
     protocol = load_protocol(TABLES[number].protocol)
     wanted = Reproduction(number, "root")
     for system in wanted.systems().values():
-        data = load_recipe(system, wanted.benchmark().recipe_settings).data
+        data = load_preset(system, wanted.benchmark().preset_settings).data
         assert data.load_sensor().same_rays(protocol.load_sensor())
         assert data.projection_variant == protocol.variant
     assert wanted.benchmark().num_samples == protocol.num_scans
@@ -100,7 +100,7 @@ def test_images_are_those_that_the_protocol_wants(number):
 
 
 def test_a_plan_tells_scans_and_cost(tmp_path, capsys, monkeypatch):
-    told_at_once = lambda recipe, taken: dict.fromkeys(recipe.training, 10**18)  # noqa: E731
+    told_at_once = lambda preset, taken: dict.fromkeys(preset.training, 10**18)  # noqa: E731
     monkeypatch.setattr(sys.modules["lidargrit.training.plan"], "training_flops", told_at_once)
     load("kitti_360").write_example(tmp_path / "root", 1)
     (scan,) = (tmp_path / "root").rglob("*.bin")
@@ -136,19 +136,19 @@ def test_another_number_and_another_place_are_refused(tmp_path, capsys):
 
 
 def differing(first: str, second: str) -> set[str]:
-    one, other = (configuration.leaves(load_recipe(name)) for name in (first, second))
+    one, other = (configuration.leaves(load_preset(name)) for name in (first, second))
     assert one.keys() == other.keys()
     return {name for name in one if one[name] != other[name]} - {"title", "published"}
 
 
 @pytest.mark.parametrize("small", [False, True])
 def test_rows_of_the_ablation_differ_in_nothing_but_what_is_ablated(small):
-    neither, raydrop, both = (recipes[small] for recipes in TABLES[3].rows.values())
+    neither, raydrop, both = (presets[small] for presets in TABLES[3].rows.values())
     assert differing(neither, raydrop) == {"model.tokenizer.raydrop_loss"}
     assert differing(raydrop, both) == {"training.tokenizer.augmentations"}
-    assert load_recipe(raydrop).training["tokenizer"].augmentations == ()
-    assert load_recipe(both).training["tokenizer"].augmentations == ("geometric",)
-    assert load_recipe(both).training["transformer"].augmentations == ()
+    assert load_preset(raydrop).training["tokenizer"].augmentations == ()
+    assert load_preset(both).training["tokenizer"].augmentations == ("geometric",)
+    assert load_preset(both).training["transformer"].augmentations == ()
 
 
 def test_released_configurations_differ_in_what_their_files_say():

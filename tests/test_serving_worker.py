@@ -56,7 +56,7 @@ def test_an_uploaded_scan_is_projected_as_those_that_the_model_learned_from(scan
     model, images = made("r2dm")[0], []
     for run in runs:
         model.save(run)
-        (run / "run.json").write_text(json.dumps({"recipe": {"data": {"projection_variant": run.name}}}))
+        (run / "run.json").write_text(json.dumps({"preset": {"data": {"projection_variant": run.name}}}))
     for number, run in enumerate(runs):
         out = tmp_path / f"{run.name} result"
         out.mkdir()

@@ -11,7 +11,7 @@ from torch import nn
 from lidargrit.core.errors import CheckpointError, ConfigError
 from lidargrit.data.run_folder import PRETRAINED
 from lidargrit.generation.generator import load
-from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.presets import load_preset
 from lidargrit.nn.size import numbers_at_most
 
 
@@ -50,7 +50,7 @@ def test_modules_are_counted_too_however_small_they_are():
 def test_a_word_of_the_user_builds_no_network_that_fills_the_memory(setting):
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(ConfigError):
-        load_recipe("small", [setting]).build_generator()
+        load_preset("lidargrit_small", [setting]).build_generator()
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000, "kibibytes"
 
 

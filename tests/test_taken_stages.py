@@ -1,4 +1,4 @@
-"""Stages that a recipe takes from another run: as they are, trained further, or not at all."""
+"""Stages that a preset takes from another run: as they are, trained further, or not at all."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.core.files import read_tensors
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.generation.generator import load_class
-from lidargrit.generation.presets import load_recipe
-from lidargrit.generation.settings import FitConfig, Recipe
+from lidargrit.generation.presets import load_preset
+from lidargrit.generation.settings import Preset, TrainingConfig
 from lidargrit.systems.lidargrit.system import TokenSampling
 from lidargrit.systems.maskgit.system import MaskGitConfig
 from lidargrit.training import plan_training, train
 from lidargrit.training.plan import check_stages
 from lidargrit.training.taken_stages import taken_stages
-from test_pixel_stage import PIXELS, SENSOR, TOKENIZER, TRANSFORMER, made, recipe_of
+from test_pixel_stage import PIXELS, SENSOR, TOKENIZER, TRANSFORMER, made, preset_of
 
 
 def test_only_the_pixel_decoder_is_trained_over_a_finished_run(tmp_path):
-    first = train(recipe_of(None), tmp_path / "first")
-    second = train(recipe_of(PIXELS, stages_from=str(tmp_path / "first")), tmp_path / "second")
+    first = train(preset_of(None), tmp_path / "first")
+    second = train(preset_of(PIXELS, stages_from=str(tmp_path / "first")), tmp_path / "second")
     assert not (tmp_path / "second" / "tokenizer").exists()
     assert not (tmp_path / "second" / "transformer").exists()
     for name, weight in first.state_dict().items():
@@ -34,10 +34,10 @@ def test_only_the_pixel_decoder_is_trained_over_a_finished_run(tmp_path):
 def test_fine_tuning_starts_from_the_weights_of_the_other_run(tmp_path):
     donor = made()
     donor.save(tmp_path / "donor")
-    fit = FitConfig(scans=2, batch_size=2, learning_rate=1e-6, validation_scans=1)
-    recipe = recipe_of(PIXELS, stages_from=str(tmp_path / "donor"))
-    recipe = replace(recipe, training=dict.fromkeys(recipe.training, fit), fine_tune=("pixels",))
-    tuned = train(recipe, tmp_path / "run").state_dict()
+    fit = TrainingConfig(scans=2, batch_size=2, learning_rate=1e-6, validation_scans=1)
+    preset = preset_of(PIXELS, stages_from=str(tmp_path / "donor"))
+    preset = replace(preset, training=dict.fromkeys(preset.training, fit), fine_tune=("pixels",))
+    tuned = train(preset, tmp_path / "run").state_dict()
     assert not (tmp_path / "run" / "transformer").exists()
     for stage in ("tokenizer", "transformer", "pixels"):
         moved = [
@@ -54,60 +54,60 @@ def test_fine_tuning_starts_from_the_weights_of_the_other_run(tmp_path):
             "pixels in fine_tune and in train_anew; wanted a stage",
         ),
     ):
-        wrong = replace(recipe, **settings)
+        wrong = replace(preset, **settings)
         with pytest.raises(ConfigError, match=message):
             taken_stages(wrong, wrong.build_generator())
     with pytest.raises(ConfigError, match="fine_tune=pixels without stages_from"):
-        replace(recipe, stages_from=None)
+        replace(preset, stages_from=None)
     with pytest.raises(ConfigError, match="train_anew=pixels without stages_from"):
-        replace(recipe, stages_from=None, fine_tune=(), train_anew=("pixels",))
+        replace(preset, stages_from=None, fine_tune=(), train_anew=("pixels",))
 
 
 @pytest.mark.parametrize("setting", ["train_anew", "fine_tune"])
 def test_a_stage_over_a_tokenizer_that_is_trained_again_is_refused(tmp_path, setting):
     made().save(tmp_path / "donor")
-    recipe = recipe_of(PIXELS, stages_from=str(tmp_path / "donor"))
+    preset = preset_of(PIXELS, stages_from=str(tmp_path / "donor"))
     for names in (("tokenizer",), ("tokenizer", "pixels")):
-        wrong = replace(recipe, **{setting: names})
+        wrong = replace(preset, **{setting: names})
         with pytest.raises(ConfigError, match=f"{setting}=tokenizer without transformer, which learned from the token"):
             taken_stages(wrong, wrong.build_generator())
     with pytest.raises(ConfigError, match=f"{setting}=tokenizer without pixels"):
-        check_stages(replace(recipe, **{setting: ("tokenizer", "transformer")}))
-    right = replace(recipe, **{setting: ("tokenizer", "transformer", "pixels")})
+        check_stages(replace(preset, **{setting: ("tokenizer", "transformer")}))
+    right = replace(preset, **{setting: ("tokenizer", "transformer", "pixels")})
     assert set(taken_stages(right, right.build_generator())) == ({*right.fine_tune})
 
 
 def test_settings_of_a_stage_that_is_not_trained_are_not_looked_at(tmp_path):
     made(None).save(tmp_path / "donor")
-    recipe = recipe_of(PIXELS, stages_from=str(tmp_path / "donor"))
-    fits = {"tokenizer": recipe.training["tokenizer"], "pixels": replace(recipe.training["pixels"], batch_size=6)}
-    recipe = replace(recipe, training=fits)  # a batch of 2 that 3 processes cannot share, and no transformer's settings
-    checked = check_stages(recipe, processes=3)
+    preset = preset_of(PIXELS, stages_from=str(tmp_path / "donor"))
+    fits = {"tokenizer": preset.training["tokenizer"], "pixels": replace(preset.training["pixels"], batch_size=6)}
+    preset = replace(preset, training=fits)  # a batch of 2 that 3 processes cannot share, and no transformer's settings
+    checked = check_stages(preset, processes=3)
     assert checked.donors == dict.fromkeys(("tokenizer", "transformer"), str(tmp_path / "donor"))
     assert list(checked.objectives) == ["tokenizer", "transformer", "pixels"]
-    assert [stage.scans for stage in plan_training(recipe).stages] == [0, 0, 4]
+    assert [stage.scans for stage in plan_training(preset).stages] == [0, 0, 4]
     for settings, message in (
         ({"train_anew": ("tokenizer", "transformer")}, "batch_size=2 on 3 processes"),
         ({"fine_tune": ("transformer",)}, r"without training\.transformer"),
     ):
         with pytest.raises(ConfigError, match=message):
-            check_stages(replace(recipe, **settings), processes=3)
+            check_stages(replace(preset, **settings), processes=3)
 
 
 def test_a_stage_that_was_trained_with_another_dropout_is_taken(tmp_path):
     """The page about training gives this command."""
-    load_recipe("compact").build_generator().save(tmp_path / "compact")
-    checked = check_stages(load_recipe("compact_pixels", [f"stages_from={tmp_path / 'compact'}"]))
+    load_preset("lidargrit_compact").build_generator().save(tmp_path / "compact")
+    checked = check_stages(load_preset("lidargrit_compact_pixels", [f"stages_from={tmp_path / 'compact'}"]))
     assert checked.donors == dict.fromkeys(("tokenizer", "transformer"), str(tmp_path / "compact"))
 
 
 def test_a_stage_that_does_not_fit_is_told_before_any_scan(tmp_path):
     made(None).save(tmp_path / "donor")
-    recipe = recipe_of(PIXELS, stages_from=str(tmp_path / "donor"))
-    wider = replace(recipe.model, transformer=replace(TRANSFORMER, width=32))
-    recipe = replace(recipe, model=wider, data=replace(recipe.data, train=("nowhere",)))
+    preset = preset_of(PIXELS, stages_from=str(tmp_path / "donor"))
+    wider = replace(preset.model, transformer=replace(TRANSFORMER, width=32))
+    preset = replace(preset, model=wider, data=replace(preset.data, train=("nowhere",)))
     with pytest.raises(ConfigError, match="whose transformer is another"):
-        train(recipe, tmp_path / "run")
+        train(preset, tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
@@ -127,8 +127,8 @@ def test_rays_of_another_sensor_are_not_taken_over(kind):
 
 def test_fine_tuning_takes_a_run_of_fewer_columns_and_another_dropout(tmp_path):
     made().save(tmp_path / "donor")
-    recipe = recipe_of(PIXELS, stages_from=str(tmp_path / "donor"))
-    wide = replace(recipe, data=replace(recipe.data, columns=512, column_stride=4))
+    preset = preset_of(PIXELS, stages_from=str(tmp_path / "donor"))
+    wide = replace(preset, data=replace(preset.data, columns=512, column_stride=4))
     wide = replace(wide, model=replace(wide.model, transformer=replace(TRANSFORMER, residual_dropout=0.0)))
     with pytest.raises(ConfigError, match="whose tokenizer is another"):
         taken_stages(wide, wide.build_generator())
@@ -145,47 +145,47 @@ def test_fine_tuning_takes_a_run_of_fewer_columns_and_another_dropout(tmp_path):
 
 
 @pytest.mark.parametrize("fine_tune", [(), ("tokenizer", "transformer", "pixels")])
-def test_settings_of_sampling_alone_are_the_recipe_s_own(fine_tune, tmp_path):
+def test_settings_of_sampling_alone_are_the_preset_s_own(fine_tune, tmp_path):
     made().save(tmp_path / "donor")
-    recipe = recipe_of(replace(PIXELS, range_temperature=0.1), stages_from=str(tmp_path / "donor"))
-    recipe = replace(recipe, fine_tune=fine_tune, model=replace(recipe.model, guidance=1.5))
-    generator = recipe.build_generator()
-    assert {"transformer", "pixels"} <= set(taken_stages(recipe, generator))
+    preset = preset_of(replace(PIXELS, range_temperature=0.1), stages_from=str(tmp_path / "donor"))
+    preset = replace(preset, fine_tune=fine_tune, model=replace(preset.model, guidance=1.5))
+    generator = preset.build_generator()
+    assert {"transformer", "pixels"} <= set(taken_stages(preset, generator))
     assert (generator.pixels.config.range_temperature, generator.config.guidance) == (0.1, 1.5)
 
 
 def test_a_run_of_other_sizes_or_another_kind_gives_no_stages(tmp_path):
-    train(recipe_of(None), tmp_path / "first")
-    recipe = recipe_of(PIXELS, stages_from=str(tmp_path / "first"))
-    wider = replace(recipe, model=replace(recipe.model, transformer=replace(TRANSFORMER, width=32)))
+    train(preset_of(None), tmp_path / "first")
+    preset = preset_of(PIXELS, stages_from=str(tmp_path / "first"))
+    wider = replace(preset, model=replace(preset.model, transformer=replace(TRANSFORMER, width=32)))
     with pytest.raises(ConfigError, match=r"whose transformer is another \(model.transformer.width=16\)"):
         train(wider, tmp_path / "second")
-    other = replace(recipe, generator="maskgit", model=MaskGitConfig(TOKENIZER, TRANSFORMER, PIXELS))
+    other = replace(preset, generator="maskgit", model=MaskGitConfig(TOKENIZER, TRANSFORMER, PIXELS))
     with pytest.raises(ConfigError, match="a run of the generator 'lidargrit'"):
         train(other, tmp_path / "third")
-    anew = replace(recipe, train_anew=("transformer",))
+    anew = replace(preset, train_anew=("transformer",))
     assert taken_stages(anew, anew.build_generator()).keys() == {"tokenizer"}
-    unknown = replace(recipe, train_anew=("mask",))
+    unknown = replace(preset, train_anew=("mask",))
     with pytest.raises(ConfigError, match="train_anew=mask; wanted one of tokenizer, transformer, pixels"):
         taken_stages(unknown, unknown.build_generator())
     with pytest.raises(ConfigError, match="tokenizer_from and stages_from together"):
-        replace(recipe, tokenizer_from="pretrained")
+        replace(preset, tokenizer_from="pretrained")
 
 
 def test_a_stage_whose_settings_do_not_have_its_name_is_compared_by_all_of_them(tmp_path):
     small = ("model.unet.channel_multipliers=[1,1,1,1]", "data.column_stride=1", "data.columns=64")
-    donor = load_recipe("r2dm_small", small).build_generator()
+    donor = load_preset("r2dm_small", small).build_generator()
     donor.save(tmp_path)
-    recipe = load_recipe("r2dm_small", (*small, f"stages_from={tmp_path}"))
-    assert taken_stages(recipe, recipe.build_generator()).keys() == {"diffusion"}
-    other = load_recipe("r2dm_small", (*small, "model.unet.norm_groups=2", f"stages_from={tmp_path}"))
+    preset = load_preset("r2dm_small", (*small, f"stages_from={tmp_path}"))
+    assert taken_stages(preset, preset.build_generator()).keys() == {"diffusion"}
+    other = load_preset("r2dm_small", (*small, "model.unet.norm_groups=2", f"stages_from={tmp_path}"))
     with pytest.raises(ConfigError, match=r"whose diffusion is another \(model\.unet\.norm_groups="):
         taken_stages(other, other.build_generator())
     columns = (small[0], "data.column_stride=2", "data.columns=128", f"stages_from={tmp_path}")
-    taken = load_recipe("r2dm_small", columns)
+    taken = load_preset("r2dm_small", columns)
     with pytest.raises(ConfigError, match=r"whose diffusion is another \(data\.sensor\)"):
         taken_stages(taken, taken.build_generator())
-    tuned = load_recipe("r2dm_small", (*columns, "fine_tune=[diffusion]"))
+    tuned = load_preset("r2dm_small", (*columns, "fine_tune=[diffusion]"))
     assert taken_stages(tuned, tuned.build_generator()).keys() == {"diffusion"}
 
 
@@ -198,19 +198,19 @@ def test_a_taken_network_keeps_the_scale_of_its_images(name):
     assert float(generator.image.scale_m) == 37
 
 
-@pytest.mark.parametrize("setting", ["beta_last=0.1", "latent_axes=8", "latent_axes=2", "scale_latents=false"])
+@pytest.mark.parametrize("setting", ["latent_axes=8", "latent_axes=2", "scale_latents=false"])
 def test_a_denoiser_is_compared_by_the_noise_and_the_latents_that_it_learned(tmp_path, setting):
     small = ("model.tokenizer.channels=32", "model.denoiser.channels=32", "model.tokenizer.num_codes=16")
-    donor = load_recipe("lidm_small", small).build_generator()
+    donor = load_preset("lidm_small", small).build_generator()
     donor.save(tmp_path)
     changed = [*small, f"model.{setting}", f"stages_from={tmp_path}"]
     changed += ["model.scale_latents=false"] if "axes" in setting else []
     for further in ("fine_tune=[]", "fine_tune=[denoiser]"):
-        other = load_recipe("lidm_small", (*changed, further))
+        other = load_preset("lidm_small", (*changed, further))
         name = "scale_latents" if "axes" in setting else setting.partition("=")[0]
-        with pytest.raises(ConfigError, match=rf"denoiser is another \(model\.{name}=.*one of this recipe's model "):
+        with pytest.raises(ConfigError, match=rf"denoiser is another \(model\.{name}=.*one of this preset's model "):
             taken_stages(other, other.build_generator())
-    anew = load_recipe("lidm_small", (*changed, "train_anew=[denoiser]"))
+    anew = load_preset("lidm_small", (*changed, "train_anew=[denoiser]"))
     assert taken_stages(anew, anew.build_generator()).keys() == {"tokenizer"}
 
 
@@ -218,7 +218,7 @@ def test_a_denoiser_that_is_trained_further_takes_the_scale_of_its_own_codebook(
     small = ("model.tokenizer.channels=32", "model.denoiser.channels=32", "model.tokenizer.num_codes=16")
     axes = ("model.scale_latents=false", "model.latent_axes=2")
     for sets in (small, (*small, *axes)):
-        donor, generator = (load_recipe("lidm_small", sets).build_generator() for _ in range(2))
+        donor, generator = (load_preset("lidm_small", sets).build_generator() for _ in range(2))
         trained = donor.objective("denoiser")
         generator.tokenizer.load_state_dict(donor.tokenizer.state_dict())
         whole = generator.objective("denoiser").weights_from(trained)
@@ -236,12 +236,12 @@ def test_a_denoiser_that_is_trained_further_takes_the_scale_of_its_own_codebook(
 
 
 def test_a_gan_that_is_trained_further_keeps_its_discriminator(tmp_path):
-    fit = FitConfig(scans=2, batch_size=2, learning_rate=1e-3, validation_scans=1)
+    fit = TrainingConfig(scans=2, batch_size=2, learning_rate=1e-3, validation_scans=1)
     data = DataConfig(train=("simulated:4:train",), val=("simulated:1:val",), columns=512, column_stride=8)
     model = load_class("dusty").smallest_config(SENSOR)
-    recipe = Recipe("a test", "dusty", model, data, {"adversarial": fit})
-    train(recipe, tmp_path / "gan")
-    tuned = replace(recipe, stages_from=str(tmp_path / "gan"), fine_tune=("adversarial",))
+    preset = Preset("a test", "dusty", model, data, {"adversarial": fit})
+    train(preset, tmp_path / "gan")
+    tuned = replace(preset, stages_from=str(tmp_path / "gan"), fine_tune=("adversarial",))
     taken = taken_stages(tuned, tuned.build_generator())["adversarial"].state_dict()
     saved, _ = read_tensors(tmp_path / "gan" / "adversarial" / "checkpoint.safetensors")
     of_discriminator = [name for name in taken if name.startswith("discriminator")]
@@ -255,37 +255,37 @@ def test_a_gan_that_is_trained_further_keeps_its_discriminator(tmp_path):
 
 def test_a_stage_whose_sizes_another_stage_decides_is_refused_before_any_training(tmp_path):
     made().save(tmp_path)
-    recipe = recipe_of(None, stages_from=str(tmp_path))
-    recipe = replace(recipe, train_anew=("tokenizer",), fine_tune=("transformer",))
-    check_stages(recipe)
-    other = replace(recipe.model, tokenizer=replace(TOKENIZER, num_codes=TOKENIZER.num_codes // 2))
+    preset = preset_of(None, stages_from=str(tmp_path))
+    preset = replace(preset, train_anew=("tokenizer",), fine_tune=("transformer",))
+    check_stages(preset)
+    other = replace(preset.model, tokenizer=replace(TOKENIZER, num_codes=TOKENIZER.num_codes // 2))
     with pytest.raises(ConfigError, match=r"whose transformer is another \(\S+ of \d+"):
-        check_stages(replace(recipe, model=other))
+        check_stages(replace(preset, model=other))
 
 
 def test_plans_of_a_denoiser_that_is_trained_further_need_no_values(tmp_path):
     small = ("model.tokenizer.channels=32", "model.denoiser.channels=32", "model.tokenizer.num_codes=16")
-    load_recipe("lidm_small", small).build_generator().save(tmp_path)
-    tuned = load_recipe("lidm_small", (*small, f"stages_from={tmp_path}", "fine_tune=[denoiser]"))
+    load_preset("lidm_small", small).build_generator().save(tmp_path)
+    tuned = load_preset("lidm_small", (*small, f"stages_from={tmp_path}", "fine_tune=[denoiser]"))
     assert check_stages(tuned).donors.keys() == {"tokenizer"}
 
 
 def test_one_reflow_is_distilled_to_several_numbers_of_steps(tmp_path):
     small = ("model.hdit.depths=[1,1]", "model.hdit.heads=[1,2]")
-    load_recipe("r2flow_reflow_small", (*small, "model.reflow.distilled_steps=4")).build_generator().save(tmp_path)
+    load_preset("r2flow_small_reflow", (*small, "model.reflow.distilled_steps=4")).build_generator().save(tmp_path)
     taken = (*small, f"stages_from={tmp_path}", "model.reflow.distilled_steps=2")
-    recipe = load_recipe("r2flow_reflow_small", (*taken, "train_anew=[distillation]"))
-    assert check_stages(recipe).donors.keys() == {"flow", "reflow"}
+    preset = load_preset("r2flow_small_reflow", (*taken, "train_anew=[distillation]"))
+    assert check_stages(preset).donors.keys() == {"flow", "reflow"}
     with pytest.raises(ConfigError, match=r"whose distillation is another \(model\.reflow\.distilled_steps=4\)"):
-        check_stages(load_recipe("r2flow_reflow_small", taken))
+        check_stages(load_preset("r2flow_small_reflow", taken))
 
 
 def test_runs_that_are_no_donors(tmp_path):
     made().save(tmp_path)
     with pytest.raises(ConfigError, match="for 'multiscale', which has no tokenizer"):
-        check_stages(load_recipe("multiscale_small", (f"tokenizer_from={tmp_path}",)))
+        check_stages(load_preset("multiscale_small", (f"tokenizer_from={tmp_path}",)))
     with pytest.raises(ConfigError, match=r"a run of 'r2dm'; choose another run$"):
-        check_stages(load_recipe("r2dm_small", (f"stages_from={tmp_path}",)))
-    nothing = load_recipe("small", ("stages_from=", "tokenizer_from="))
+        check_stages(load_preset("r2dm_small", (f"stages_from={tmp_path}",)))
+    nothing = load_preset("lidargrit_small", ("stages_from=", "tokenizer_from="))
     assert nothing.stages_from is None
     assert nothing.tokenizer_from is None

@@ -14,7 +14,7 @@ from lidargrit.core.errors import ConfigError, LidarGritError, OutputError
 from lidargrit.core.reporting import Reporter
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.generation.generator import load, load_class
-from lidargrit.generation.settings import FitConfig, Recipe
+from lidargrit.generation.settings import Preset, TrainingConfig
 from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
 from lidargrit.nn.transformer import TransformerConfig
 from lidargrit.systems.lidargrit.system import LidarGritConfig
@@ -24,7 +24,7 @@ from lidargrit.viewer.serve.worker import run_worker
 from toy_tokenizer import NAME, installed
 
 CONFIGS = {"lidargrit": LidarGritConfig, "maskgit": MaskGitConfig}
-FIT = FitConfig(scans=8, batch_size=4, learning_rate=0.1, average_over_scans=0)
+FIT = TrainingConfig(scans=8, batch_size=4, learning_rate=0.1, average_over_scans=0)
 
 
 class Messages(Reporter):
@@ -35,8 +35,8 @@ class Messages(Reporter):
         self.lines.append(text)
 
 
-def recipe_of(generator, tokenizer):
-    return Recipe(
+def preset_of(generator, tokenizer):
+    return Preset(
         title="a toy",
         generator=generator,
         model=CONFIGS[generator](tokenizer, TransformerConfig(layers=1, heads=2, width=16)),
@@ -48,20 +48,20 @@ def recipe_of(generator, tokenizer):
 @pytest.mark.parametrize("generator", CONFIGS)
 def test_a_second_tokenizer_trains_samples_and_is_scored_and_served(generator, tmp_path, monkeypatch, capsys):
     toy, folder, samples = installed(monkeypatch), tmp_path / "run", tmp_path / "samples"
-    recipe, heard = recipe_of(generator, toy(noise_m=0.2)), Messages()
-    trained = train(recipe, folder, heard)
+    preset, heard = preset_of(generator, toy(noise_m=0.2)), Messages()
+    trained = train(preset, folder, heard)
     assert any("this tokenizer is a toy" in line for line in heard.lines)
     assert float(trained.get_tokenizer().logits.detach().abs().max()) > 0, "it has learned"
-    train(recipe, folder)  # the same recipe is recognised, and nothing is left to do
+    train(preset, folder)  # the same preset is recognised, and nothing is left to do
     with pytest.raises(OutputError, match=r"there model\.tokenizer\.noise_m=0\.2, here 0\.3"):
-        train(recipe_of(generator, toy(noise_m=0.3)), folder)
+        train(preset_of(generator, toy(noise_m=0.3)), folder)
     with pytest.raises(OutputError, match=r"another run"):
-        train(recipe_of(generator, VqvaeConfig()), folder)
+        train(preset_of(generator, VqvaeConfig()), folder)
 
     written = json.loads((folder / "config.json").read_text())["config"]["tokenizer"]
     assert written == {"name": NAME, "block": 8, "levels": 16, "noise_m": 0.2}
     read = load(folder)
-    assert read.config == recipe.model
+    assert read.config == preset.model
     seeds = [0, 1, 2]
     images = read.sample(seeds)
     assert torch.equal(images.range_m, trained.sample(seeds).range_m)
@@ -86,11 +86,11 @@ def test_a_second_tokenizer_trains_samples_and_is_scored_and_served(generator, t
 
 def test_a_trained_tokenizer_is_taken_by_another_run_of_its_kind(tmp_path, monkeypatch):
     toy = installed(monkeypatch)
-    first = train(recipe_of("lidargrit", toy()), tmp_path / "first")
-    second = train(replace(recipe_of("maskgit", toy()), tokenizer_from=str(tmp_path / "first")), tmp_path / "second")
+    first = train(preset_of("lidargrit", toy()), tmp_path / "first")
+    second = train(replace(preset_of("maskgit", toy()), tokenizer_from=str(tmp_path / "first")), tmp_path / "second")
     theirs, ours = first.get_tokenizer().state_dict(), second.get_tokenizer().state_dict()
     assert all(torch.equal(weight, ours[name]) for name, weight in theirs.items())
-    other = replace(recipe_of("maskgit", VqvaeConfig()), tokenizer_from=str(tmp_path / "first"))
+    other = replace(preset_of("maskgit", VqvaeConfig()), tokenizer_from=str(tmp_path / "first"))
     with pytest.raises(ConfigError, match=rf"whose tokenizer is another \(model\.tokenizer\.name={NAME}\)"):
         train(other, tmp_path / "third")
 

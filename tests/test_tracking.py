@@ -6,11 +6,11 @@ import types
 import pytest
 
 from lidargrit.cli import main
-from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.presets import load_preset
 from lidargrit.training.tracking import tracked
 from tiny_runs import the_one_line, train_words
 
-RECIPE = load_recipe("demo")
+PRESET = load_preset("lidargrit_demo")
 
 
 class StandIn(types.ModuleType):
@@ -40,32 +40,32 @@ def wandb(monkeypatch):
 
 def test_a_run_that_goes_on_is_the_same_run_there(wandb, tmp_path):
     for _ in range(2):
-        with tracked("lidar", RECIPE, tmp_path / "mine"):
+        with tracked("lidar", PRESET, tmp_path / "mine"):
             assert len(wandb.ended) < len(wandb.begun)
     first, again = wandb.begun
     assert first == again
     assert first["name"] == "mine"
     assert first["resume"] == "allow"
     assert first["sync_tensorboard"] is True
-    assert first["config"]["model"]["transformer"]["layers"] == RECIPE.model.transformer.layers
-    with tracked("lidar", RECIPE, tmp_path / "other"):
+    assert first["config"]["model"]["transformer"]["layers"] == PRESET.model.transformer.layers
+    with tracked("lidar", PRESET, tmp_path / "other"):
         pass
     assert wandb.begun[2]["id"] != first["id"]
     assert wandb.ended == [0, 0, 0]
 
 
 def test_a_run_that_fails_is_told_as_failed(wandb, tmp_path):
-    with pytest.raises(KeyboardInterrupt), tracked("lidar", RECIPE, tmp_path):
+    with pytest.raises(KeyboardInterrupt), tracked("lidar", PRESET, tmp_path):
         raise KeyboardInterrupt
     assert wandb.ended == [1]
 
 
 def test_nothing_is_sent_unless_asked_for_and_by_the_first_process_only(wandb, tmp_path, monkeypatch):
-    with tracked("", RECIPE, tmp_path):
+    with tracked("", PRESET, tmp_path):
         pass
     monkeypatch.setenv("RANK", "1")
     monkeypatch.setenv("WORLD_SIZE", "2")
-    with tracked("lidar", RECIPE, tmp_path):
+    with tracked("lidar", PRESET, tmp_path):
         pass
     assert wandb.begun == []
 

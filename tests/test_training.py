@@ -19,15 +19,15 @@ from lidargrit.data.datasets.kitti_odometry import KittiOdometry
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import load_range_images
 from lidargrit.generation.objective import Objective
-from lidargrit.generation.presets import load_recipe
-from lidargrit.generation.settings import FitConfig
+from lidargrit.generation.presets import load_preset
+from lidargrit.generation.settings import TrainingConfig
 from lidargrit.generation.tokenizers.vqvae import Vqvae
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.training import check_folder, measure, train, training_flops
 from lidargrit.training.checkpoint import load_checkpoint, save_checkpoint
-from lidargrit.training.fit import Fit
 from lidargrit.training.log import Log, read_log
 from lidargrit.training.optimiser import WeightAverage, learning_rate_at, make_optimiser, memory_of_weights
+from lidargrit.training.stage import StageTraining
 from lidargrit.viewer import plot_progress
 from tiny_runs import MODEL
 
@@ -54,7 +54,7 @@ TINY_GAN = [
         for setting in ("scans=24", "batch_size=2", "precision=fp32", "checkpoint_every=4", "validate_every=8")
     ],
 ]
-RECIPES = {"demo": TINY, "dusty_small": TINY_GAN}
+PRESETS = {"lidargrit_demo": TINY, "dusty_small": TINY_GAN}
 
 
 @pytest.fixture
@@ -95,12 +95,12 @@ class StopAfter(Reporter):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """Return a function that gives the folder of a recipe's run, trained once and without a stop; only to be read."""
+    """Return a function that gives the folder of a preset's run, trained once and without a stop; only to be read."""
 
     @functools.cache
     def run(name: str) -> Path:
         folder = tmp_path_factory.mktemp("whole") / "run"
-        train(load_recipe(name, RECIPES[name]), folder)
+        train(load_preset(name, PRESETS[name]), folder)
         return folder
 
     return run
@@ -109,19 +109,19 @@ def whole(tmp_path_factory):
 @pytest.mark.parametrize(
     ("name", "stage", "scans"),
     [
-        ("demo", "tokenizer", 6),
-        ("demo", "tokenizer", 8),
-        ("demo", "transformer", 2),
-        ("demo", "transformer", 10),
+        ("lidargrit_demo", "tokenizer", 6),
+        ("lidargrit_demo", "tokenizer", 8),
+        ("lidargrit_demo", "transformer", 2),
+        ("lidargrit_demo", "transformer", 10),
         ("dusty_small", "adversarial", 6),  # between two penalties on the discriminator
         ("dusty_small", "adversarial", 16),
     ],
 )
 def test_a_stopped_run_ends_with_the_same_bits_as_one_that_was_not(tmp_path, whole, name, stage, scans):
-    recipe = load_recipe(name, RECIPES[name])
+    preset = load_preset(name, PRESETS[name])
     with pytest.raises(StopAfterError):
-        train(recipe, tmp_path / "stopped", StopAfter(stage, scans))
-    train(recipe, tmp_path / "stopped")
+        train(preset, tmp_path / "stopped", StopAfter(stage, scans))
+    train(preset, tmp_path / "stopped")
     folders = whole(name), tmp_path / "stopped"
     unbroken, stopped = (read_tensors(folder / "model.safetensors")[0] for folder in folders)
     assert unbroken.keys() == stopped.keys()
@@ -132,9 +132,9 @@ def test_a_stopped_run_ends_with_the_same_bits_as_one_that_was_not(tmp_path, who
 
 
 def test_a_finished_run_is_not_trained_again(whole):
-    folder = whole("demo")
+    folder = whole("lidargrit_demo")
     before = (folder / "tokenizer" / "checkpoint.safetensors").stat().st_mtime_ns
-    train(load_recipe("demo", TINY), folder)
+    train(load_preset("lidargrit_demo", TINY), folder)
     assert (folder / "tokenizer" / "checkpoint.safetensors").stat().st_mtime_ns == before
 
 
@@ -184,16 +184,16 @@ def test_weight_average_follows_as_a_slow_loop_says():
 @pytest.mark.shared
 def test_the_linear_schedule_is_the_programs(golden):
     factors = golden("misc")["lr_linear_100"]
-    config = FitConfig(scans=100_000, batch_size=1, learning_rate=1.0, schedule="linear_second_half")
+    config = TrainingConfig(scans=100_000, batch_size=1, learning_rate=1.0, schedule="linear_second_half")
     ours = [learning_rate_at(config, 1000 * epoch) for epoch in range(100)]
     # The program steps once an epoch and would reach 0 at epoch 101, ours falls with every scan and ends at 0.
     assert max(abs(a - b) for a, b in zip(ours, factors, strict=True)) < 0.02
 
 
 def test_a_loss_that_is_not_finite_stops_with_the_step(tmp_path, images):
-    vqvae = Vqvae(load_recipe("demo", TINY).model.tokenizer, images.sensor)
+    vqvae = Vqvae(load_preset("lidargrit_demo", TINY).model.tokenizer, images.sensor)
     vqvae.encoder.conv_in.weight.data.fill_(torch.nan)
-    fit = Fit(vqvae, FitConfig(scans=4, batch_size=2, learning_rate=1e-3), tmp_path, 0, Reporter())
+    fit = StageTraining(vqvae, TrainingConfig(scans=4, batch_size=2, learning_rate=1e-3), tmp_path, 0, Reporter())
     with pytest.raises(TrainingError, match=r"a loss or gradient of nan after 0 scans") as error:
         fit.run(images, images, "training")
     assert "checkpoint" not in str(error.value), "there is none yet"
@@ -207,14 +207,14 @@ def test_one_real_scan_is_learned_by_heart(tmp_path, real):
     config = DataConfig(train=train, val=(), columns=2048, column_stride=64)  # 32 are quick
     scan = load_range_images(config.train, config)
     assert len(scan) == 1
-    recipe = load_recipe("small")
+    preset = load_preset("lidargrit_small")
     torch.manual_seed(0)
-    vqvae = Vqvae(replace(recipe.model.tokenizer, raydrop_weight=0.3), scan.sensor)
-    learn = FitConfig(
+    vqvae = Vqvae(replace(preset.model.tokenizer, raydrop_weight=0.3), scan.sensor)
+    learn = TrainingConfig(
         scans=300, batch_size=1, learning_rate=2e-3, schedule="cosine", warmup_scans=50, precision="auto",
         average_over_scans=20, validate_every=1000, checkpoint_every=1000,
     )  # fmt: skip
-    fit = Fit(vqvae, learn, tmp_path, 0, Reporter())
+    fit = StageTraining(vqvae, learn, tmp_path, 0, Reporter())
     fit.run(scan, scan, "training")
     learned = fit.validate(scan)
     assert learned["range_mae_m"] < 0.3
@@ -224,7 +224,7 @@ def test_one_real_scan_is_learned_by_heart(tmp_path, real):
 def test_a_tree_of_scans_trains_from_its_folder_alone(tmp_path):
     KittiOdometry.write_example(tmp_path / "tree", 4)
     settings = [f"data.train={tmp_path / 'tree'}", f"data.val={tmp_path / 'tree'}:all[:50%]"]
-    generator = train(load_recipe("demo", TINY + settings), Path(tmp_path / "run"))
+    generator = train(load_preset("lidargrit_demo", TINY + settings), Path(tmp_path / "run"))
     first, again = (generator.sample([5, 6]), generator.sample([6]))
     # Sums of a batch of two and of one may differ in their last bit, and a mask drawn there in a pixel.
     assert float((first.range_m[1] - again.range_m[0]).abs().gt(1e-3).float().mean()) < 1e-3
@@ -232,29 +232,30 @@ def test_a_tree_of_scans_trains_from_its_folder_alone(tmp_path):
 
 
 def test_stages_use_their_own_settings():
-    recipe = load_recipe("demo", ["training.transformer.learning_rate=0.5"])
-    assert recipe.training["transformer"].learning_rate == 0.5
-    assert recipe.training["tokenizer"] == load_recipe("demo").training["tokenizer"]
-    assert replace(recipe, seed=1) != recipe
+    preset = load_preset("lidargrit_demo", ["training.transformer.learning_rate=0.5"])
+    assert preset.training["transformer"].learning_rate == 0.5
+    assert preset.training["tokenizer"] == load_preset("lidargrit_demo").training["tokenizer"]
+    assert replace(preset, seed=1) != preset
 
 
-def test_a_run_goes_on_though_the_words_about_its_recipe_have_changed(tmp_path):
-    recipe = load_recipe("marginal")
-    older = replace(recipe, title="another title", published="other words")
-    write_json(tmp_path / "run.json", {"recipe": configuration.to_json(older)})
-    check_folder(tmp_path, recipe)
+def test_a_run_goes_on_though_the_words_about_its_preset_have_changed(tmp_path):
+    preset = load_preset("marginal")
+    older = replace(preset, title="another title", published="other words")
+    write_json(tmp_path / "run.json", {"preset": configuration.to_json(older)})
+    check_folder(tmp_path, preset)
     with pytest.raises(OutputError, match=r"there seed=0, here 1"):
-        check_folder(tmp_path, replace(recipe, seed=1))
+        check_folder(tmp_path, replace(preset, seed=1))
 
 
 def test_a_run_goes_on_with_settings_that_change_nothing_computed(tmp_path):
-    write_json(tmp_path / "run.json", {"recipe": configuration.to_json(load_recipe("demo"))})
+    write_json(tmp_path / "run.json", {"preset": configuration.to_json(load_preset("lidargrit_demo"))})
     stage = "training.tokenizer"
     check_folder(
-        tmp_path, load_recipe("demo", ["data.workers=7", f"{stage}.checkpoint_every=3", f"{stage}.pictures_every=5"])
+        tmp_path,
+        load_preset("lidargrit_demo", ["data.workers=7", f"{stage}.checkpoint_every=3", f"{stage}.pictures_every=5"]),
     )
     with pytest.raises(OutputError, match=r"training\.tokenizer\.validate_every"):
-        check_folder(tmp_path, load_recipe("demo", [f"{stage}.validate_every=3"]))
+        check_folder(tmp_path, load_preset("lidargrit_demo", [f"{stage}.validate_every=3"]))
 
 
 def test_settings_that_a_later_stage_cannot_follow_are_refused_before_the_first(tmp_path):
@@ -266,10 +267,10 @@ def test_settings_that_a_later_stage_cannot_follow_are_refused_before_the_first(
         (["training.tokenizer.optimiser=muon"], "optimiser=muon for networks without linear layers"),
     ):
         with pytest.raises(ConfigError, match=message):
-            train(load_recipe("demo", [*TINY, *settings]), tmp_path)
+            train(load_preset("lidargrit_demo", [*TINY, *settings]), tmp_path)
         assert not [*tmp_path.iterdir()]
     with pytest.raises(ConfigError, match=r"without training\.reflow"):
-        train(load_recipe("r2flow_small", ["model.reflow={}"]), tmp_path)
+        train(load_preset("r2flow_small", ["model.reflow={}"]), tmp_path)
 
 
 def test_a_folder_is_trained_in_by_one_process_at_a_time(tmp_path):
@@ -277,15 +278,17 @@ def test_a_folder_is_trained_in_by_one_process_at_a_time(tmp_path):
         claim_folder(tmp_path / "run"),
         pytest.raises(OutputError, match=rf"run, which process {os.getpid()} on .* since 2\d\d\d-.* is writing"),
     ):
-        train(load_recipe("demo", TINY), tmp_path / "run")
-    train(load_recipe("demo", TINY), tmp_path / "run")
+        train(load_preset("lidargrit_demo", TINY), tmp_path / "run")
+    train(load_preset("lidargrit_demo", TINY), tmp_path / "run")
     assert not [path for path in (tmp_path / "run").rglob("*") if path.name.startswith(".")]
 
 
 def test_pictures_change_nothing(tmp_path, whole):
     every = [f"training.{stage}.pictures_every=6" for stage in ("tokenizer", "transformer")]
-    train(load_recipe("demo", TINY + every), tmp_path / "drawn", plot=plot_progress)
-    plain, drawn = ((folder / "model.safetensors").read_bytes() for folder in (whole("demo"), tmp_path / "drawn"))
+    train(load_preset("lidargrit_demo", TINY + every), tmp_path / "drawn", plot=plot_progress)
+    plain, drawn = (
+        (folder / "model.safetensors").read_bytes() for folder in (whole("lidargrit_demo"), tmp_path / "drawn")
+    )
     assert plain == drawn
     pictures = {str(path.relative_to(tmp_path / "drawn")): path for path in (tmp_path / "drawn").rglob("*.png")}
     scans = ("000000006", "000000012")
@@ -295,8 +298,8 @@ def test_pictures_change_nothing(tmp_path, whole):
 
 
 def test_the_memory_of_weights_is_what_a_step_leaves_behind(images):
-    vqvae = Vqvae(load_recipe("demo", TINY).model.tokenizer, images.sensor)
-    optimiser = make_optimiser(vqvae, FitConfig(scans=1, batch_size=1, learning_rate=1e-3))
+    vqvae = Vqvae(load_preset("lidargrit_demo", TINY).model.tokenizer, images.sensor)
+    optimiser = make_optimiser(vqvae, TrainingConfig(scans=1, batch_size=1, learning_rate=1e-3))
     average = WeightAverage(vqvae, 1)
     vqvae(images.batch([0]), torch.Generator())["loss"].backward()
     optimiser.step()
@@ -307,9 +310,9 @@ def test_the_memory_of_weights_is_what_a_step_leaves_behind(images):
 
 
 def test_a_measured_plan_tells_operations_time_and_memory():
-    recipe = load_recipe("demo", TINY)
-    lines = [stage.as_text() for stage in measure(recipe)]
-    for line, (stage, flops) in zip(lines, training_flops(recipe).items(), strict=True):
+    preset = load_preset("lidargrit_demo", TINY)
+    lines = [stage.as_text() for stage in measure(preset)]
+    for line, (stage, flops) in zip(lines, training_flops(preset).items(), strict=True):
         wanted = rf"{stage}: {flops:.2e} floating-point operations at [\d.e+]+ scans/s: [\d.]+ \w+ on cpu, [\d.]+ GiB"
         assert re.fullmatch(wanted.replace("e+", "e\\+", 1), line)
 
@@ -376,7 +379,9 @@ def test_a_checkpoint_that_does_not_fit_its_optimiser_is_refused(tmp_path):
 
 
 def test_a_run_to_take_stages_from_is_looked_at_before_any_scan(tmp_path):
-    recipe = load_recipe("demo", ("data.train=nowhere", "data.val=nowhere", f"stages_from={tmp_path / 'nothing'}"))
+    preset = load_preset(
+        "lidargrit_demo", ("data.train=nowhere", "data.val=nowhere", f"stages_from={tmp_path / 'nothing'}")
+    )
     with pytest.raises(CheckpointError, match="nothing, which does not exist"):
-        train(recipe, tmp_path / "run")
+        train(preset, tmp_path / "run")
     assert not (tmp_path / "run").exists()

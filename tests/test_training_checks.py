@@ -17,13 +17,13 @@ from lidargrit.data.batches import Batches
 from lidargrit.data.images import Pixels, Provenance, RangeImages
 from lidargrit.data.prepared.workers import _made_by_processes
 from lidargrit.data.sources import load_range_images
-from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.presets import load_preset
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 from lidargrit.training import train
 from lidargrit.training.engine import Engine
-from lidargrit.training.fit import Fit
 from lidargrit.training.plan import check_stages
+from lidargrit.training.stage import StageTraining
 from test_tracking import StandIn
 from test_training import TINY
 from tiny_runs import the_one_line, train_words
@@ -48,32 +48,32 @@ class Without(RangeImages):
 @pytest.mark.parametrize(
     ("name", "settings", "lacking", "stage"),
     [
-        ("compact_completion", ["model.completion.labels=true", *ANEW], "label", "completion"),
+        ("completion_compact", ["model.completion.labels=true", *ANEW], "label", "completion"),
         ("r2dm_small", ["model.reflectance=true"], "reflectance", "diffusion"),
         ("r2flow_small", ["model.reflectance=true"], "reflectance", "flow"),
         ("lidargen_small", ["model.reflectance=true"], "reflectance", "score"),
-        ("small", ["model.tokenizer.reflectance=true"], "reflectance", "tokenizer"),
+        ("lidargrit_small", ["model.tokenizer.reflectance=true"], "reflectance", "tokenizer"),
     ],
 )
 def test_images_without_what_a_stage_learns_from_are_refused(name, settings, lacking, stage):
-    recipe = load_recipe(name, settings)
-    checked, images = check_stages(recipe), load_range_images(("simulated:1:val",), recipe.data)
+    preset = load_preset(name, settings)
+    checked, images = check_stages(preset), load_range_images(("simulated:1:val",), preset.data)
     checked.check_images("data.val", images)
     with pytest.raises(ConfigError, match=rf"got data\.val, for the stage {stage}: .*scans without {lacking}"):
         checked.check_images("data.val", Without(images, **{lacking: None}))
 
 
 def test_unmarked_surfaces_are_refused_before_any_stage():
-    checked = check_stages(load_recipe("compact_raydrop"))
-    images = load_range_images(("simulated:1:val",), load_recipe("compact_raydrop").data)
+    checked = check_stages(load_preset("raydrop_compact"))
+    images = load_range_images(("simulated:1:val",), load_preset("raydrop_compact").data)
     with pytest.raises(ConfigError, match=r"data\.train, for the stage raydrop: training scans that do not mark"):
         checked.check_images("data.train", images)
 
 
 def test_stages_that_learn_from_scans_do_not_learn_from_surfaces():
     with pytest.raises(ConfigError, match="raydrop trained together with tokenizer and transformer and pixels"):
-        check_stages(load_recipe("compact_raydrop", ANEW))
-    check_stages(load_recipe("compact_raydrop", [*ANEW, "model.raydrop.surfaces=estimated"]))
+        check_stages(load_preset("raydrop_compact", ANEW))
+    check_stages(load_preset("raydrop_compact", [*ANEW, "model.raydrop.surfaces=estimated"]))
 
 
 def test_validation_scans_are_looked_for_before_training_scans_are_projected(tmp_path):
@@ -82,21 +82,23 @@ def test_validation_scans_are_looked_for_before_training_scans_are_projected(tmp
             raise AssertionError(what)
 
     with pytest.raises(DataError, match="nowhere"):
-        train(load_recipe("demo", [*TINY, f"data.val={tmp_path / 'nowhere'}"]), tmp_path / "run", Projecting())
+        train(
+            load_preset("lidargrit_demo", [*TINY, f"data.val={tmp_path / 'nowhere'}"]), tmp_path / "run", Projecting()
+        )
 
 
 def test_a_validation_that_fails_leaves_the_checkpoint(tmp_path, monkeypatch):
     def fails(*_):
         raise DataError("a validation scan that is gone", "one that is there", "restore it")
 
-    unbroken, recipe = tmp_path / "unbroken", load_recipe("demo", [*TINY, *VALIDATING])
-    train(recipe, unbroken)
+    unbroken, preset = tmp_path / "unbroken", load_preset("lidargrit_demo", [*TINY, *VALIDATING])
+    train(preset, unbroken)
     with monkeypatch.context() as patched:
-        patched.setattr(Fit, "validate", fails)
+        patched.setattr(StageTraining, "validate", fails)
         with pytest.raises(DataError, match="that is gone"):
-            train(recipe, tmp_path / "run")
+            train(preset, tmp_path / "run")
     assert (tmp_path / "run" / "tokenizer" / "checkpoint.safetensors").is_file()
-    train(recipe, tmp_path / "run")  # the validation that was missed comes first
+    train(preset, tmp_path / "run")  # the validation that was missed comes first
     logs = [(folder / "tokenizer" / "log.jsonl").read_text() for folder in (unbroken, tmp_path / "run")]
     entries = [[{**json.loads(line), "seconds": 0} for line in log.splitlines()] for log in logs]
     assert entries[0] == entries[1]
@@ -111,12 +113,12 @@ def test_a_terminated_training_does_not_validate_first(tmp_path, monkeypatch):
         os.kill(os.getpid(), signal.SIGTERM)
         return before(self, images)
 
-    before = Fit._step
-    monkeypatch.setattr(Fit, "validate", validates)
-    monkeypatch.setattr(Fit, "_step", step)
+    before = StageTraining._step
+    monkeypatch.setattr(StageTraining, "validate", validates)
+    monkeypatch.setattr(StageTraining, "_step", step)
     settings = [f"training.{stage}.validate_every=2" for stage in ("tokenizer", "transformer")]
     with pytest.raises(Terminated):
-        train(load_recipe("demo", [*TINY, *settings]), tmp_path / "run")
+        train(load_preset("lidargrit_demo", [*TINY, *settings]), tmp_path / "run")
     assert (tmp_path / "run" / "tokenizer" / "checkpoint.safetensors").is_file()
 
 
@@ -129,9 +131,9 @@ def test_a_training_that_is_terminated_while_it_validates_loses_no_step(tmp_path
     calls, before = [], Engine.evaluate
     monkeypatch.setattr(Engine, "evaluate", evaluate)
     settings = ("validate_every=4", "checkpoint_every=1000", "batch_size=1", "validation_scans=2")
-    recipe = load_recipe("demo", [*TINY, *(f"training.tokenizer.{setting}" for setting in settings)])
+    preset = load_preset("lidargrit_demo", [*TINY, *(f"training.tokenizer.{setting}" for setting in settings)])
     with pytest.raises(Terminated):
-        train(recipe, tmp_path / "run")
+        train(preset, tmp_path / "run")
     assert len(calls) == 1, "the second scan is left out"
     assert (tmp_path / "run" / "tokenizer" / "checkpoint.safetensors").is_file()
 
@@ -163,7 +165,7 @@ def test_a_launcher_that_numbers_no_local_process_is_refused(tmp_path, monkeypat
     monkeypatch.setenv("RANK", "0")
     monkeypatch.setenv("WORLD_SIZE", "2")
     with pytest.raises(ConfigError, match="WORLD_SIZE=2 without LOCAL_RANK"):
-        train(load_recipe("demo", TINY), tmp_path / "run")
+        train(load_preset("lidargrit_demo", TINY), tmp_path / "run")
 
 
 def test_a_refused_training_does_not_touch_the_tracked_run(tmp_path, monkeypatch, capsys):
@@ -189,4 +191,4 @@ def test_a_process_that_dies_ends_the_others(tmp_path, monkeypatch):
 def test_compiling_without_a_compiler_is_refused_before_the_first_stage(tmp_path, monkeypatch):
     monkeypatch.setenv("CXX", str(tmp_path / "none"))
     with pytest.raises(ConfigError, match=r"compile=true and no C\+\+ compiler"):
-        check_stages(load_recipe("small", ["training.transformer.compile=true"]))
+        check_stages(load_preset("lidargrit_small", ["training.transformer.compile=true"]))

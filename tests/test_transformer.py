@@ -35,14 +35,14 @@ def golden_transformer(golden):
 
 
 @pytest.mark.parametrize(
-    ("recipe", "parameters"), [("lidargrit_kitti_360", 10_264_064), ("lidargrit_kitti_odometry", 5_263_360)]
+    ("preset", "parameters"), [("lidargrit_kitti_360", 10_264_064), ("lidargrit_kitti_odometry", 5_263_360)]
 )
-def test_published_sizes(recipe, parameters):
-    from lidargrit.generation.presets import load_recipe
+def test_published_sizes(preset, parameters):
+    from lidargrit.generation.presets import load_preset
     from lidargrit.systems.lidargrit.system import LidarGrit
 
-    recipe = load_recipe(recipe)
-    generator = LidarGrit(recipe.model, recipe.data.load_sensor())
+    preset = load_preset(preset)
+    generator = LidarGrit(preset.model, preset.data.load_sensor())
     assert sum(p.numel() for p in generator.transformer.parameters()) == parameters
     assert generator.transformer.context_length == 1024
 
@@ -210,12 +210,12 @@ def test_the_start_token_is_an_ordinary_one():
 def test_the_cost_is_what_torch_counts(guidance, layers):
     from torch.utils.flop_counter import FlopCounterMode
 
-    from lidargrit.generation.presets import load_recipe
+    from lidargrit.generation.presets import load_preset
     from lidargrit.systems.lidargrit.system import LidarGrit
 
     changes = [f"model.guidance={guidance}", f"model.transformer.layers={layers}", "model.transformer.width=32"]
-    recipe = load_recipe("small", [*changes, "data.columns=512", "data.column_stride=8"])
-    generator = LidarGrit(recipe.model, recipe.data.load_sensor())
+    preset = load_preset("lidargrit_small", [*changes, "data.columns=512", "data.column_stride=8"])
+    generator = LidarGrit(preset.model, preset.data.load_sensor())
     with FlopCounterMode(display=False) as counter:
         generator.sample(range(generator.compute_batch))
     assert generator.cost().flops * generator.compute_batch == counter.get_total_flops()
@@ -223,13 +223,13 @@ def test_the_cost_is_what_torch_counts(guidance, layers):
 
 
 def test_a_changed_weight_is_noticed_and_token_bits_are_those_of_the_transformer():
-    from lidargrit.generation.presets import load_recipe
+    from lidargrit.generation.presets import load_preset
     from lidargrit.generation.range_steps import RangeSteps
     from lidargrit.systems.lidargrit.system import LidarGrit
 
-    recipe = load_recipe("small", ["model.transformer.width=32", "data.columns=512", "data.column_stride=8"])
+    preset = load_preset("lidargrit_small", ["model.transformer.width=32", "data.columns=512", "data.column_stride=8"])
     torch.manual_seed(0)
-    generator = LidarGrit(recipe.model, recipe.data.load_sensor()).eval()
+    generator = LidarGrit(preset.model, preset.data.load_sensor()).eval()
     first = generator.sample([0])
     assert torch.equal(generator.sample([0]).range_m, first.range_m)
     with torch.no_grad():

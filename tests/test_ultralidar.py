@@ -8,7 +8,7 @@ import torch
 import lidargrit
 from lidargrit.cli import main
 from lidargrit.core.errors import CheckpointError, ConfigError
-from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.presets import load_preset
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.ultralidar import codebook_care
@@ -39,13 +39,13 @@ def made(config=TINY):
 
 
 @pytest.mark.parametrize(
-    ("recipe", "autoencoder", "prior"),
+    ("preset", "autoencoder", "prior"),
     [("ultralidar_kitti_360", 81_521_536, 76_795_776), ("ultralidar_small", 1_182_752, 707_768)],
 )
-def test_recipes_have_the_published_sizes(recipe, autoencoder, prior):
-    recipe = load_recipe(recipe)
+def test_presets_have_the_published_sizes(preset, autoencoder, prior):
+    preset = load_preset(preset)
     with torch.device("meta"):
-        generator = UltraLidar(recipe.model, recipe.data.load_sensor())
+        generator = UltraLidar(preset.model, preset.data.load_sensor())
     assert sum(weight.numel() for weight in generator.autoencoder.parameters()) == autoencoder
     assert sum(weight.numel() for weight in generator.prior.parameters()) == prior
 
@@ -60,8 +60,8 @@ def test_passes_are_counted_as_the_program_makes_them():
 
 
 def test_the_operations_of_training_are_three_times_those_of_its_passes():
-    recipe = load_recipe("ultralidar_small", ("training.autoencoder.scans=10", "training.prior.scans=20"))
-    counted = training_flops(recipe)
+    preset = load_preset("ultralidar_small", ("training.autoencoder.scans=10", "training.prior.scans=20"))
+    counted = training_flops(preset)
     assert counted["autoencoder"] / 30e9 == pytest.approx(2.55, rel=0.04)  # as the program's networks were counted
     assert counted["prior"] / 60e9 == pytest.approx(1.57 + 1.24 / 3, rel=0.03)  # the encoder is not trained
 

@@ -31,14 +31,14 @@ def images_of(sensor, batch=2, seed=0):
 
 
 @pytest.mark.parametrize(
-    ("recipe", "parameters", "grid"),
+    ("preset", "parameters", "grid"),
     [("lidargrit_kitti_360", 17_295_618, (8, 128)), ("lidargrit_kitti_odometry", 3_148_418, (16, 64))],
 )
-def test_published_sizes(recipe, parameters, grid):
-    from lidargrit.generation.presets import load_recipe
+def test_published_sizes(preset, parameters, grid):
+    from lidargrit.generation.presets import load_preset
 
-    recipe = load_recipe(recipe)
-    vqvae = Vqvae(recipe.model.tokenizer, recipe.data.load_sensor())
+    preset = load_preset(preset)
+    vqvae = Vqvae(preset.model.tokenizer, preset.data.load_sensor())
     assert sum(p.numel() for p in vqvae.parameters() if p.requires_grad) == parameters
     assert vqvae.grid_size == grid
 
@@ -275,9 +275,7 @@ def test_thin_upright_things_are_found_by_a_slow_loop_and_weigh_more():
 
 
 def test_cells_may_have_fewer_columns_than_rows():
-    sizes = VqvaeConfig(
-        channels=8, channel_multipliers=(1, 1, 1, 2), cell_columns=2, norm_groups=4, code_dim=4, dropout=0.0
-    )
+    sizes = VqvaeConfig(channels=32, channel_multipliers=(1, 1, 1, 2), cell_columns=2, code_dim=4, dropout=0.0)
     sensor = load_sensor("hdl64e_kitti_odometry").with_columns(32, 1)
     torch.manual_seed(0)
     vqvae = Vqvae(sizes, sensor).eval()

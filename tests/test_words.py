@@ -13,7 +13,7 @@ from lidargrit.core.errors import nearest_names
 MISTAKES = {
     "simulte": "lidargrit: got 'simulte'; wanted one such as simulate; see: lidargrit --help",
     "--verion": "lidargrit: got the option '--verion'; wanted one such as --version; see: lidargrit --help",
-    "train": "got no recipe and no out; wanted lidargrit train RECIPE OUT; see: lidargrit train --help",
+    "train": "got no preset and no out; wanted lidargrit train PRESET OUT; see: lidargrit train --help",
     "simulate here": "got no -n/--num-scans; wanted lidargrit simulate OUT -n NUM_SCANS;",
     "sample --cuont 3": "got the option '--cuont'; wanted one such as --count; see: lidargrit sample --help",
     "sample run out more": "got the unexpected argument 'more'; wanted fewer arguments;",
@@ -21,13 +21,13 @@ MISTAKES = {
     "simulate here -n two": "got -n 'two'; wanted a whole number;",
     "simulate here -n 1 --wet very": "got --wet 'very'; wanted a number;",
     "evaluate a b --format pdf": "got --format pdf; wanted text, markdown or latex; choose one",
-    "list metric": "generators, metrics, protocols, sample-formats or recipes; choose one",
+    "list metric": "generators, metrics, protocols, sample-formats or presets; choose one",
     "demo --set": "got nothing after --set; wanted a value;",
     "evaluate --pr x": "got --pr; wanted --protocol, --projection or --projection-variant; write it out",
     "view a --overwrite=3": "got --overwrite with 3; wanted --overwrite alone;",
     "list --json datasets": "got --json datasets; wanted a name in .json, or nothing; put --json last",
     "doctor --json facts.txt": "got --json facts.txt; wanted a name in .json",
-    "train demo run --json": "got --json for a training; wanted --dry-run or --measure beside it;",
+    "train lidargrit_demo run --json": "got --json for a training; wanted --dry-run or --measure beside it;",
     "completion tcsh": "got 'tcsh'; wanted bash, zsh or fish; choose one",
     "sample nowhere out --device cuda:99": "got device 'cuda:99'; wanted one that PyTorch finds",
     "evaluate nowhere nowhere --device abacus": "got device 'abacus'; wanted one that PyTorch finds",
@@ -41,7 +41,7 @@ FACTS = {
     "doctor": "processors",
     "list": "datasets",
     "list datasets": "datasets",
-    "train demo nowhere --dry-run": "settings",
+    "train lidargrit_demo nowhere --dry-run": "settings",
     "inspect simulated:1:test": "points",
     "prepare simulated:1:test": "images",
     "fit-sensor simulated:2:test -n 2": "agree_share",
@@ -132,7 +132,7 @@ def test_a_shell_learns_all_verbs_and_what_may_follow(shell, capsys, tmp_path):
     assert main(["completion", shell]) == 0
     script = tmp_path / "script"
     script.write_text(capsys.readouterr().out)
-    for word in (*discovery.names("cli"), *discovery.names("recipes"), "lidargrit-kitti-360", "dry-run"):
+    for word in (*discovery.names("cli"), *discovery.names("presets"), "lidargrit-kitti-360", "dry-run"):
         assert word in script.read_text() or word.replace("_", "-") in script.read_text()
     if shutil.which(shell):
         subprocess.run([shell, "-n", str(script)], check=True)
@@ -145,7 +145,7 @@ def test_bash_completes(capsys, tmp_path):
     for words, offered in (
         ("tra", "train"),
         ("list met", "metrics"),
-        ("train small_p", "small_pixels"),
+        ("train lidargrit_small_p", "lidargrit_small_pixels"),
         ("train --dr", "--dry-run"),
     ):
         typed = (

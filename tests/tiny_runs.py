@@ -37,7 +37,7 @@ PROGRESS = re.compile(
 
 
 def train_words(folder: Path, *settings: str) -> list[str]:
-    return ["train", "demo", str(folder), "--set", *MODEL, *SIMULATED, *SHORT, *settings]
+    return ["train", "lidargrit_demo", str(folder), "--set", *MODEL, *SIMULATED, *SHORT, *settings]
 
 
 def contents(folder: Path) -> dict[str, bytes]:

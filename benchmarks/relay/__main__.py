@@ -12,7 +12,7 @@ from packing import pack, unpack
 
 from lidargrit.core.errors import LidarGritError
 
-_PRESET = "fine_wide"
+_PRESET = "lidargrit_fine_wide"
 
 
 def _main() -> int:

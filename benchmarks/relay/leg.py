@@ -25,12 +25,12 @@ from lidargrit.core.reporting import Reporter
 from lidargrit.evaluation.upright_objects import kept_objects
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.pixel_decoder.pixel_decoder import PixelDecoder
-from lidargrit.generation.presets import load_recipe
-from lidargrit.generation.settings import Recipe
+from lidargrit.generation.presets import load_preset
+from lidargrit.generation.settings import Preset
 from lidargrit.generation.tokens import TokenGenerator
 from lidargrit.scans.types import RangeImage
 from lidargrit.training.checkpoint import fingerprint
-from lidargrit.training.fit import Fit
+from lidargrit.training.stage import StageTraining
 
 _FIRST_STAGE = ("tokenizer", "pixels")
 _VALIDATION_SEED = 1_000_000  # the simulator's first validation street
@@ -44,7 +44,7 @@ class Leg:
     """What one leg is given.
 
     Args:
-        preset: name of the recipe that is trained.
+        preset: name of the preset that is trained.
         run: folder of the relay.
         seconds: time that the leg may take, saving and packing left out.
         processes: number of processes that simulate streets.
@@ -58,30 +58,30 @@ class Leg:
     validation_streets: int = 24
 
 
-def run_leg(leg: Leg, recipe: Recipe | None = None, saved: Callable[[], None] = lambda: None) -> None:
+def run_leg(leg: Leg, preset: Preset | None = None, saved: Callable[[], None] = lambda: None) -> None:
     """Train the stages in turn until the time is over, and note in ``relay.json`` what was reached.
 
     Args:
         leg: what the leg is given.
-        recipe: recipe to train in place of the preset's.
+        preset: settings to train in place of those of that name.
         saved: called once all is trained and saved, before it is judged, which may outlast the machine.
 
     Raises:
         OutputError: the folder holds the relay of another preset.
     """
     begun = time.monotonic()
-    recipe = recipe or load_recipe(leg.preset)
-    state, sensor, generator = _state(leg), recipe.data.load_sensor(), recipe.build_generator()
+    preset = preset or load_preset(leg.preset)
+    state, sensor, generator = _state(leg), preset.data.load_sensor(), preset.build_generator()
     columns = (sensor.width * sensor.column_stride, sensor.column_stride)
     folder = leg.run / "streets"
     with (
         ProcessPoolExecutor(min(leg.processes, _POOL_AT_MOST), get_context("spawn")) as pool,
-        simulating(folder, recipe.data.sensor, columns, state["next_seed"], leg.processes),
+        simulating(folder, preset.data.sensor, columns, state["next_seed"], leg.processes),
     ):
         seeds = range(_VALIDATION_SEED, _VALIDATION_SEED + leg.validation_streets)
         streets, validation = Streets(folder), ValidationStreets(sensor, seeds, pool)
         deadline_s = begun + leg.seconds - _FOR_JUDGING_S
-        trained, finished = _train(generator, recipe, leg.run, deadline_s, streets, validation)
+        trained, finished = _train(generator, preset, leg.run, deadline_s, streets, validation)
     told: dict[str, float] = {"seconds": time.monotonic() - begun, "streets": streets.count}
     state |= {"next_seed": streets.next_seed(state["next_seed"]), "finished": finished}
     state["legs"].append(told)
@@ -99,17 +99,17 @@ def run_leg(leg: Leg, recipe: Recipe | None = None, saved: Callable[[], None] = 
 
 def _train(
     generator: Generator,
-    recipe: Recipe,
+    preset: Preset,
     run: Path,
     deadline_s: float,
     streets: Streets,
     validation: ValidationStreets,
-) -> tuple[dict[str, tuple[Fit, int]], list[str]]:
+) -> tuple[dict[str, tuple[StageTraining, int]], list[str]]:
     """Train until the time is over; return each stage begun with the scans of this leg, and the finished stages."""
-    trained: dict[str, tuple[Fit, int]] = {}
+    trained: dict[str, tuple[StageTraining, int]] = {}
     finished: list[str] = []
     for stage in _in_order(generator):
-        fit = _fit(generator, recipe, stage, run, finished, deadline_s)
+        fit = _fit(generator, preset, stage, run, finished, deadline_s)
         before = fit.scans_seen
         if deadline_s - time.monotonic() < _LEAST_TRAINING_S and before < fit.config.scans:
             break
@@ -140,12 +140,14 @@ def _in_order(generator: Generator) -> tuple[str, ...]:
     return first + tuple(stage for stage in generator.stages if stage not in first)
 
 
-def _fit(generator: Generator, recipe: Recipe, stage: str, run: Path, finished: list[str], deadline_s: float) -> Fit:
-    seed = derive_seed(recipe.seed, generator.stages.index(stage))
+def _fit(
+    generator: Generator, preset: Preset, stage: str, run: Path, finished: list[str], deadline_s: float
+) -> StageTraining:
+    seed = derive_seed(preset.seed, generator.stages.index(stage))
     torch.manual_seed(seed)
     built_on = fingerprint(generator.objective("tokenizer")) if finished else ""
-    objective, config, workers = generator.objective(stage), recipe.settings_of(stage), recipe.data.workers
-    return Fit(objective, config, run / stage, seed, _Lines(), built_on, workers, deadline_s=deadline_s)
+    objective, config, workers = generator.objective(stage), preset.settings_of(stage), preset.data.workers
+    return StageTraining(objective, config, run / stage, seed, _Lines(), built_on, workers, deadline_s=deadline_s)
 
 
 class _Lines(Reporter):

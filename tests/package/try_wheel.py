@@ -22,7 +22,7 @@ COMMANDS = (
     ("simulate", "streets", "-n", "2", "--workers", "1"),
     ("inspect", "streets"),
     ("view", "streets", "-n", "1", "-o", "page.html"),
-    ("train", "demo", "run", "--dry-run"),
+    ("train", "lidargrit_demo", "run", "--dry-run"),
     ("sample", "pretrained", "samples", "-n", "2"),
     ("view", "samples", "-o", "samples.html"),
 )

@@ -138,39 +138,63 @@ def test_a_sensor_that_does_not_fit_the_scan(refused, tmp_path):
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (["train", "smal", "OUT"], r"'smal', which is not among the recipes; wanted one such as small.*list recipes"),
-        (["train", "demo", "OUT", "--set", "seed"], r"the setting 'seed'; wanted NAME=VALUE; e\.g\. --set title="),
         (
-            ["train", "demo", "OUT", "--set", "model.tokenizer.chanels=32"],
+            ["train", "lidargrit_smal", "OUT"],
+            r"'lidargrit_smal', which is not among the presets; wanted one such as lidargrit_small.*list presets",
+        ),
+        (
+            ["train", "lidargrit_demo", "OUT", "--set", "seed"],
+            r"the setting 'seed'; wanted NAME=VALUE; e\.g\. --set title=",
+        ),
+        (
+            ["train", "lidargrit_demo", "OUT", "--set", "model.tokenizer.chanels=32"],
             r"'model\.tokenizer\.chanels', which .*channels",
         ),
         (
-            ["train", "demo", "OUT", "--set", "training.tokeniser.scans=4"],
+            ["train", "lidargrit_demo", "OUT", "--set", "training.tokeniser.scans=4"],
             r"wanted one such as training\.tokenizer\.scans",
         ),
-        (["train", "demo", "OUT", "--set", "seed=many"], r"seed=many; wanted a whole number"),
-        (["train", "demo", "OUT", "--set", "data.train=[]"], r"no source of scans; .*data\.train="),
+        (["train", "lidargrit_demo", "OUT", "--set", "seed=many"], r"seed=many; wanted a whole number"),
+        (["train", "lidargrit_demo", "OUT", "--set", "data.train=[]"], r"no source of scans; .*data\.train="),
         (
-            ["train", "demo", "OUT", "--set", "data.train=[kiti_odometry:/d]"],
+            ["train", "lidargrit_demo", "OUT", "--set", "data.train=[kiti_odometry:/d]"],
             r"'kiti_odometry', which .*kitti_odometry",
         ),
         (
-            ["train", "demo", "OUT", "--set", "data.train=[simulated]"],
+            ["train", "lidargrit_demo", "OUT", "--set", "data.train=[simulated]"],
             r"the source 'simulated' alone; .*simulated:1000",
         ),
-        (["train", "demo", "OUT", "--set", "data.sensor=hdl64"], r"'hdl64', which is not among the sensors; .*hdl64e_"),
-        (["train", "demo", "OUT", "--set", "data.sensor=no.json"], r"no\.json, which cannot be read"),
-        (["train", "demo", "OUT", "--set", "data.columns=100", "data.column_stride=8"], r"100 columns, one in 8 kept"),
-        (["train", "demo", "OUT", "--set", "data.columns=80"], r"range images of 64x10; .*divisible by 8"),
-        (["train", "demo", "OUT", "--set", "generator=lidargri"], r"'lidargri', which is not among the generators"),
-        (["train", "demo", "OUT", "--set", "model.tokenizer.channels=40"], r"channels=40; .* multiple of 32"),
-        (["train", "demo", "OUT", "--set", "data.max_scans=-1"], r"max_scans=-1; wanted"),
-        (["train", "demo", "OUT", "--set", "seed=-1"], r"seed=-1; wanted"),
-        (["train", "demo", "OUT", "--set", "training.tokenizer.betas=[2.0,3.0]"], r"betas=\(2\.0, 3\.0\); wanted"),
-        (["train", "demo", "OUT", "--set", "training.tokenizer.weight_decay=-1"], r"weight_decay=-1\.0; wanted"),
-        (["train", "demo", "OUT", "--set", "model.transformer.residual_dropout=2"], r"residual_dropout=2\.0; wanted"),
         (
-            ["train", "demo", "OUT", "--set", "training.tokenizer.average_over_scans=-1"],
+            ["train", "lidargrit_demo", "OUT", "--set", "data.sensor=hdl64"],
+            r"'hdl64', which is not among the sensors; .*hdl64e_",
+        ),
+        (["train", "lidargrit_demo", "OUT", "--set", "data.sensor=no.json"], r"no\.json, which cannot be read"),
+        (
+            ["train", "lidargrit_demo", "OUT", "--set", "data.columns=100", "data.column_stride=8"],
+            r"100 columns, one in 8 kept",
+        ),
+        (["train", "lidargrit_demo", "OUT", "--set", "data.columns=80"], r"range images of 64x10; .*divisible by 8"),
+        (
+            ["train", "lidargrit_demo", "OUT", "--set", "generator=lidargri"],
+            r"'lidargri', which is not among the generators",
+        ),
+        (["train", "lidargrit_demo", "OUT", "--set", "model.tokenizer.channels=40"], r"channels=40; .* multiple of 32"),
+        (["train", "lidargrit_demo", "OUT", "--set", "data.max_scans=-1"], r"max_scans=-1; wanted"),
+        (["train", "lidargrit_demo", "OUT", "--set", "seed=-1"], r"seed=-1; wanted"),
+        (
+            ["train", "lidargrit_demo", "OUT", "--set", "training.tokenizer.betas=[2.0,3.0]"],
+            r"betas=\(2\.0, 3\.0\); wanted",
+        ),
+        (
+            ["train", "lidargrit_demo", "OUT", "--set", "training.tokenizer.weight_decay=-1"],
+            r"weight_decay=-1\.0; wanted",
+        ),
+        (
+            ["train", "lidargrit_demo", "OUT", "--set", "model.transformer.residual_dropout=2"],
+            r"residual_dropout=2\.0; wanted",
+        ),
+        (
+            ["train", "lidargrit_demo", "OUT", "--set", "training.tokenizer.average_over_scans=-1"],
             r"average_over_scans=-1; wanted",
         ),
         (["sample", "RUN", "OUT", "-n", "0"], r"-n 0; wanted at least one scan"),

@@ -21,7 +21,7 @@ _EXAMPLES = """\
 examples:
   lidargrit demo                                    everything once, in minutes; no data needed
   lidargrit demo --data /data/kitti_odometry        the same on your own scans
-  lidargrit train small runs/mine --set data.train=/data/scans data.val=/data/held_out
+  lidargrit train lidargrit_small runs/mine --set data.train=/data/scans data.val=/data/held_out
   lidargrit sample runs/mine samples -n 100
   lidargrit evaluate samples /data/held_out
   lidargrit view /data/held_out runs/mine -o side_by_side.png

@@ -9,6 +9,8 @@ from lidargrit.core import discovery
 
 KINDS = tuple(kind for kind in discovery.FOLDERS if kind != "cli")
 """Each kind as a user types it."""
+_FIRST = ("lidargrit_small_pixels", "lidargrit_wide_pixels", "multiscale_small", "lidargrit_demo")
+_GROUPS = ("to begin with: your own scans, 64x1024, to compress, a check for minutes", "others", "to compare with")
 
 
 def entries(kind: str, in_full: bool = False) -> list[dict[str, Any]]:
@@ -18,7 +20,7 @@ def entries(kind: str, in_full: bool = False) -> list[dict[str, Any]]:
         kind: one of ``KINDS``.
         in_full: whether the facts of each class are added: licence, splits and leaks of data sets; endings of formats;
             size and limits of sensors; capabilities, origin, licences and sampling settings of generators; direction,
-            variants and weights of metrics.
+            variants and weights of metrics. Presets come in the order in which a user needs them, with their group.
 
     Example:
         >>> entries("sensors")[0]["name"]
@@ -26,11 +28,22 @@ def entries(kind: str, in_full: bool = False) -> list[dict[str, Any]]:
     """
     about = _ABOUT.get(kind) if in_full else None
     found = []
-    for name in discovery.names(kind):
+    for group, name in _in_order(kind):
         shown = name.replace("_", "-") if kind == "protocols" else name
         summary = re.sub(r":\w+:`(\w+)`", r"\1", discovery.summary(kind, name))
-        found.append({"name": shown, "summary": summary, **(about(name) if about else {})})
+        facts = {**({"group": group} if group else {}), **(about(name) if about else {})}
+        found.append({"name": shown, "summary": summary, **facts})
     return found
+
+
+def _in_order(kind: str) -> list[tuple[str, str]]:
+    """Return the group and the name of every entry of a kind; only presets have groups, in the order of use."""
+    names = discovery.names(kind)
+    if kind != "presets":
+        return [("", name) for name in names]
+    apart = [name for name in names if discovery.table(kind, name) == discovery.TO_COMPARE_WITH]
+    others = [name for name in names if name not in {*apart, *_FIRST}]
+    return [(group, name) for group, each in zip(_GROUPS, (_FIRST, others, apart), strict=True) for name in each]
 
 
 def lines(kind: str, entry: dict[str, Any]) -> list[str]:
@@ -41,7 +54,16 @@ def lines(kind: str, entry: dict[str, Any]) -> list[str]:
             parts = ", ".join(part if number == 0 else f"{scheme['name']}/{part}" for part in scheme["parts"])
             facts += [f"splits: {parts} ({scheme['name']}: {scheme['source']})", f"    leak: {scheme['leak']}"]
         return facts
-    return entry["facts"] if kind in ("formats", "generators") else []
+    if kind in ("formats", "generators"):
+        return entry["facts"]
+    facts = {name: value for name, value in entry.items() if name not in ("name", "summary", "group")}
+    return [f"{name.replace('_', ' ')}: {_in_words(value)}" for name, value in facts.items()]
+
+
+def _in_words(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return ", ".join(value) if isinstance(value, list) else str(value) or "none"
 
 
 def _of_dataset(name: str) -> dict[str, Any]:

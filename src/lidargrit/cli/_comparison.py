@@ -42,6 +42,6 @@ def wanted(options: argparse.Namespace) -> tuple[list[str], Benchmark]:
         reference=chosen["against"],
         num_samples=chosen["count"],
         settings=EvalConfig(protocol=chosen["protocol"], metrics=tuple(chosen["metrics"])),
-        recipe_settings=tuple(chosen["set"]),
+        preset_settings=tuple(chosen["set"]),
         flops=chosen["flops"],
     )

@@ -10,8 +10,8 @@ from lidargrit.cli._options import add_settings
 from lidargrit.cli._results import add_json, print_result, refuse_taken
 
 EXAMPLES = """\
-  lidargrit compare table marginal memorised small dusty_small r2dm_small:steps=32
-  lidargrit compare table small r2dm_small --flops 2e14 -n 1000      equal compute for all
+  lidargrit compare table marginal memorised lidargrit_small dusty_small r2dm_small:steps=32
+  lidargrit compare table lidargrit_small r2dm_small --flops 2e14 -n 1000      equal compute for all
   lidargrit compare table runs/mine their_samples --against /data/held_out  is the second better than the first?
   lidargrit compare table --add runs/another                          as the others of the table were compared
 """
@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
     parser.set_defaults(goes_on=True)
     parser.add_argument("out", type=Path, help="folder for runs, samples and scores; the same command continues there")
-    what = "name of a recipe, or folder of a finished run or of samples; SYSTEM:NAME=VALUE,... sets how it is sampled"
+    what = "name of a preset, or folder of a finished run or of samples; SYSTEM:NAME=VALUE,... sets how it is sampled"
     parser.add_argument("systems", nargs="*", metavar="SYSTEM", help=what)
     added = "systems to compare as those of the table in OUT were, with the settings that it was made with"
     parser.add_argument("--add", nargs="+", default=[], metavar="SYSTEM", help=added)
@@ -34,9 +34,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     protocol, metrics = "name of a protocol, see: lidargrit list protocols", "metrics instead of the protocol's"
     parser.add_argument("--protocol", help=f"{protocol} {of['protocol']}")
     parser.add_argument("--metrics", nargs="+", help=f"{metrics}, see: lidargrit list metrics")
-    settings = "settings to change in every recipe, such as data.train=/data/scans"
+    settings = "settings to change in every preset, such as data.train=/data/scans"
     add_settings(parser, settings)
-    budget = "training budget of each system in floating-point operations (default: each recipe's own)"
+    budget = "training budget of each system in floating-point operations (default: each preset's own)"
     parser.add_argument("--flops", type=float, help=budget)
     parser.add_argument("--format", choices=["text", "markdown", "latex"], default="text", help="format of the table")
     add_json(parser)

@@ -10,7 +10,7 @@ EXAMPLES = """\
   lidargrit completion fish > ~/.config/fish/completions/lidargrit.fish
 """
 
-_KINDS = {"recipe": "recipes", "sensor": "sensors", "to": "sensors", "protocol": "protocols", "metrics": "metrics"}
+_KINDS = {"preset": "presets", "sensor": "sensors", "to": "sensors", "protocol": "protocols", "metrics": "metrics"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, help="run folder (default: runs/demo, or runs/demo-FOLDER)")
     anew = "train all networks anew (default: begin with those of the model pretrained, if it has your sensor)"
     parser.add_argument("--anew", action="store_true", help=anew)
-    settings = "settings of the recipe to change"
+    settings = "settings of the preset to change"
     add_settings(parser, settings)
 
 

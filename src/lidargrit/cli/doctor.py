@@ -48,6 +48,6 @@ def run(options: argparse.Namespace) -> None:
     shown = {name.replace("_gib", "").replace("_", " "): fact for name, fact in facts.items()}
     shown |= {name: f"{shown[name]:.1f} GiB" for name in ("memory", "cache free")}
     shown["bfloat16"] = "yes" if has_bf16() else "no: training takes one and a half to two times as long in 32 bits"
-    none = "none that torch can use; the recipes small and demo are made for CPUs"
+    none = "none that torch can use; the presets lidargrit_small and lidargrit_demo are made for CPUs"
     shown["gpus"] = ", ".join(f"{card['name']}, {card['memory_gib']} GiB" for card in facts["gpus"]) or none
     print_result(options, "\n".join(f"{name:<18}{fact}" for name, fact in shown.items()), facts)

@@ -10,7 +10,7 @@ from lidargrit.cli._results import add_json, print_result, refuse_taken
 
 EXAMPLES = """\
   lidargrit fit-sensor /data/scans -o my_sensor.json --picture fit.png
-  lidargrit train small runs/mine --set data.sensor=my_sensor.json data.columns=1024 data.column_stride=4 \\
+  lidargrit train lidargrit_small runs/mine --set data.sensor=my_sensor.json data.columns=1024 data.column_stride=4 \\
     data.train=/data/scans data.val=/data/held_out
 """
 
@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Fit, print a table, write the sensor file and perhaps a picture."""
+    """StageTraining, print a table, write the sensor file and perhaps a picture."""
     from lidargrit.core.files import refuse_to_overwrite, write_json
     from lidargrit.data.sources import open_source
     from lidargrit.scans.fit_sensor import fit_sensor_to_dataset

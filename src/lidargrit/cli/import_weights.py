@@ -23,7 +23,7 @@ EXAMPLES = """\
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
     parser.add_argument(
-        "recipe", help="recipe with the generator, sizes and sensor of the weights; see: lidargrit list recipes"
+        "preset", help="preset with the generator, sizes and sensor of the weights; see: lidargrit list presets"
     )
     parser.add_argument("out", type=Path, help="run folder to write, for: lidargrit sample, evaluate and view")
     parser.add_argument(
@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="published weight files; for lidargrit the VQ-VAE's first, then the transformer's",
     )
-    settings = "settings of the recipe to change"
+    settings = "settings of the preset to change"
     add_settings(parser, settings)
 
 
@@ -41,7 +41,7 @@ def run(options: argparse.Namespace) -> None:
     """Import, and say what was found."""
     from lidargrit.publishing import import_weights
 
-    generator = import_weights(options.recipe, options.out, options.files, options.set)
+    generator = import_weights(options.preset, options.out, options.files, options.set)
     weights = sum(weight.numel() for weight in generator.parameters())
     print(f"done: {weights:,} weights of {generator.public_name()} for {generator.sensor.name} lie in {options.out}")
     print(f"sample them with: lidargrit sample {options.out} samples -n 16")

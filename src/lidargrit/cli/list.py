@@ -1,4 +1,4 @@
-"""List data sets, formats, sensors, generators, metrics, protocols, recipes and more."""
+"""List data sets, formats, sensors, generators, metrics, protocols, presets and more."""
 
 from __future__ import annotations
 
@@ -32,7 +32,11 @@ def run(options: argparse.Namespace) -> None:
     printed = []
     for kind, of_kind in found.items():
         printed.append(kind)
+        group = ""
         for entry in of_kind:
+            if entry.get("group", "") != group:
+                group = entry["group"]
+                printed.append(f"  {group}:")
             printed.append(f"  {entry['name']:<36}{entry['summary']}")
             printed += [wrapper.fill(line) for line in (lines(kind, entry) if options.kind else [])]
     print_result(options, "\n".join(printed), found)

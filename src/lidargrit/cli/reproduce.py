@@ -23,13 +23,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "root", help="root folder of KITTI-360 (table 1) or KITTI odometry (tables 2, 3), or the word simulated"
     )
     parser.add_argument("out", type=Path, help="folder for runs, samples and scores; the same command continues there")
-    small = "use the small recipes at equal compute, and no metric that needs published weights"
+    small = "use the small presets at equal compute, and no metric that needs published weights"
     parser.add_argument("--small", action="store_true", help=small)
     count = "number of samples of each system (default: the paper's 5,000; 64 with --small)"
     parser.add_argument("-n", "--count", type=int, default=0, help=count)
-    budget = "training budget of each system in floating-point operations (default: each recipe's; 5e13 with --small)"
+    budget = "training budget of each system in floating-point operations (default: each preset's; 5e13 with --small)"
     parser.add_argument("--flops", type=float, help=budget)
-    settings = "settings to change in every recipe, such as data.workers=16"
+    settings = "settings to change in every preset, such as data.workers=16"
     add_settings(parser, settings)
     parser.add_argument("--format", choices=["text", "markdown", "latex"], default="text", help="format of the table")
     parser.add_argument("--dry-run", action="store_true", help="print what would be done and what it costs, and stop")

@@ -1,4 +1,4 @@
-"""Train a recipe; the same command goes on where it stopped."""
+"""Train a preset; the same command goes on where it stopped."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from lidargrit.cli._options import add_settings
 from lidargrit.cli._results import add_json, print_result, refuse_taken
 
 EXAMPLES = """\
-  lidargrit train small runs/mine
-  lidargrit train small runs/mine --set data.train=/data/scans data.val=/data/held_out
+  lidargrit train lidargrit_small runs/mine
+  lidargrit train lidargrit_small runs/mine --set data.train=/data/scans data.val=/data/held_out
   lidargrit train lidargrit_kitti_360 runs/k360 --set data.train=/fast/k360 data.val=/fast/k360_val --dry-run
-  torchrun --no-python --nproc-per-node=2 lidargrit train small runs/mine
+  torchrun --no-python --nproc-per-node=2 lidargrit train lidargrit_small runs/mine
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
     parser.set_defaults(goes_on=True)
-    parser.add_argument("recipe", help="name of a recipe; see: lidargrit list recipes")
+    parser.add_argument("preset", help="name of a preset; see: lidargrit list presets")
     parser.add_argument("out", type=Path, help="run folder to write; the same command continues there")
-    settings = "settings of the recipe to change, such as data.train=/data/scans; see all with --dry-run"
+    settings = "settings of the preset to change, such as data.train=/data/scans; see all with --dry-run"
     add_settings(parser, settings)
     parser.add_argument("--dry-run", action="store_true", help="print what would be done, with every setting, and stop")
     measuring = "like --dry-run, and take a few steps to estimate operations, time and memory"
@@ -36,16 +36,16 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.core.errors import ConfigError
     from lidargrit.core.reporting import TerminalReporter
     from lidargrit.generation.generator import load_class
-    from lidargrit.generation.presets import load_recipe
+    from lidargrit.generation.presets import load_preset
     from lidargrit.training import measure, open_data, plan_training, train
 
-    recipe = load_recipe(options.recipe, options.set)
+    preset = load_preset(options.preset, options.set)
     if options.dry_run or options.measure:
         refuse_taken(options)
-        planned, measured = plan_training(recipe), measure(recipe) if options.measure else []
+        planned, measured = plan_training(preset), measure(preset) if options.measure else []
         text = "\n".join([planned.as_text(), *(stage.as_text() for stage in measured)])
         print_result(options, text, {**planned.to_json(), "measured": [vars(stage) for stage in measured]})
-        open_data(recipe)  # last: the plan of a recipe is worth reading on a machine without its data too
+        open_data(preset)  # last: the plan of a preset is worth reading on a machine without its data too
         return
     if options.json:
         raise ConfigError(
@@ -53,6 +53,6 @@ def run(options: argparse.Namespace) -> None:
         )
     from lidargrit.viewer import plot_progress  # matplotlib, which a plan does not need
 
-    train(recipe, options.out, TerminalReporter(), plot_progress, options.wandb)
-    command = load_class(recipe.generator).facts.first_command.replace("RUN", str(options.out))
+    train(preset, options.out, TerminalReporter(), plot_progress, options.wandb)
+    command = load_class(preset.generator).facts.first_command.replace("RUN", str(options.out))
     print(f"done: the model lies in {options.out}; try it with: lidargrit {command}")

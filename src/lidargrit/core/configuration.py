@@ -6,9 +6,9 @@ import dataclasses
 import json
 import math
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from numbers import Integral, Real
-from typing import Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, ClassVar, Literal, TypeVar, cast, get_args, get_origin, get_type_hints
 
 from lidargrit.core import discovery
 from lidargrit.core.errors import ConfigError, UnknownNameError, nearest_names, one_of
@@ -99,7 +99,7 @@ def from_json(cls: type[T], data: Any, source: str) -> T:
 def override(
     config: T,
     settings: Iterable[str],
-    owner: str = "this recipe",
+    owner: str = "this preset",
     cure: str = "see all with --dry-run",
     fixed: Collection[str] = (),
 ) -> T:
@@ -132,6 +132,21 @@ def override(
             cure,
         )
     return _replaced(config, "", values)
+
+
+def changed(config: T, settings: Mapping[str, Any]) -> T:
+    """Return a copy of a configuration with other values of settings, by their dotted names.
+
+    All are changed at once, for a setting may be valid only together with another. A name may also be that of a part,
+    such as ``model.transformer``, or of one that a mapping does not have yet, such as ``training.pixels``.
+    """
+    parts: dict[str, dict[str, Any]] = {}
+    for path, value in settings.items():
+        name, _, rest = path.partition(".")
+        parts.setdefault(name, {})[rest] = value
+    known = _children(config)
+    new = {name: each[""] if "" in each else changed(known[name], each) for name, each in parts.items()}
+    return cast(T, {**known, **new}) if isinstance(config, dict) else dataclasses.replace(cast(Any, config), **new)
 
 
 def name_and_settings(word: str) -> tuple[str, list[str]]:
@@ -234,7 +249,7 @@ def _check_numbers(value: Any, where: str) -> None:
 
 
 def _parser() -> Any:
-    from jsonargparse import ArgumentParser  # noqa: PLC0415  only recipes need it, and --help should be quick
+    from jsonargparse import ArgumentParser  # noqa: PLC0415  only presets need it, and --help should be quick
 
     return ArgumentParser(exit_on_error=False)
 

@@ -19,7 +19,7 @@ def derive_seed(*parts: int) -> int:
     """Mix whole numbers into one seed; neighbouring numbers give unrelated seeds.
 
     Args:
-        parts: numbers of 0 or more that name one use of randomness, such as a recipe's seed and a step. Zeros at the
+        parts: numbers of 0 or more that name one use of randomness, such as a preset's seed and a step. Zeros at the
             end do not count: (7, 0) gives the seed of (7,).
     """
     return int(np.random.SeedSequence(parts).generate_state(1, np.uint64)[0] >> np.uint64(1))

@@ -5,8 +5,9 @@ from __future__ import annotations
 import ast
 import importlib
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Final, NamedTuple, TypeVar
 
 from lidargrit.core.errors import UnknownNameError, nearest_names
 
@@ -21,24 +22,53 @@ FOLDERS: Final = {
     "metrics": "evaluation/metrics",
     "protocols": "evaluation/protocols",
     "sample-formats": "data/sources/sample_formats",
-    "recipes": "systems/*/presets",
+    "presets": "systems/*",
     "cli": "cli",
 }
-"""Each kind as a user types it, and the folder whose files, or folders with a ``system.py``, are of this kind."""
+"""Each kind as a user types it, and the folder whose files, or folders with a ``system.py``, are of this kind.
+
+Presets are many in one file: the entries of the tables in ``systems/NAME/presets.py``.
+"""
+
+PRESETS, TO_COMPARE_WITH = "PRESETS", "TO_COMPARE_WITH"
+"""Names of the tables in a ``presets.py``; the second holds what is there to be compared with."""
 
 _ROOT = Path(__file__).parents[1]
 
 
+class _Place(NamedTuple):
+    """Where a name is defined.
+
+    Args:
+        path: file that defines it.
+        module: name of the file's module.
+        table: table of the file that holds it; "" where the file holds nothing else.
+        title: description of it in the table.
+    """
+
+    path: Path
+    module: str
+    table: str = ""
+    title: str = ""
+
+
 def names(kind: str) -> list[str]:
     """List the public names of a kind, e.g. "datasets", without importing what they name."""
-    return sorted(_files(kind))
+    return sorted(_places(kind))
 
 
 def summary(kind: str, name: str) -> str:
-    """Return the first line of a file's docstring, without importing it."""
-    path, _ = _files(kind)[name]
-    docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
+    """Return the first line of a file's docstring, or the title of a preset, without importing it."""
+    place = _places(kind)[name]
+    if place.table:
+        return place.title
+    docstring = ast.get_docstring(ast.parse(place.path.read_text(encoding="utf-8")))
     return (docstring or "").partition("\n")[0].replace("``", "")
+
+
+def table(kind: str, name: str) -> str:
+    """Return the table that holds a preset; "" of other kinds."""
+    return _places(kind)[name].table
 
 
 def load_class(kind: str, name: str, base: type[T]) -> type[T]:
@@ -57,28 +87,55 @@ def load_class(kind: str, name: str, base: type[T]) -> type[T]:
 
 
 def load_instance(kind: str, name: str, base: type[T]) -> T:
-    """Import the one object of type ``base`` that the file of a name defines.
+    """Import the object of type ``base`` that a table has under a name, or the one that the file of a name defines.
 
     Raises:
-        UnknownNameError: no such file; names its nearest neighbours.
+        UnknownNameError: no such file or entry; names its nearest neighbours.
     """
     return _the_one(kind, name, lambda value, _: value if isinstance(value, base) else None)
 
 
 def _packages(kind: str) -> dict[str, Path]:
     """Return the packages that hold a kind, by their folders: importlib would import the packages above them."""
-    found = {f"lidargrit.{'.'.join(path.relative_to(_ROOT).parts)}": path for path in _ROOT.glob(FOLDERS[kind])}
-    assert found, kind
+    folders = [path for path in _ROOT.glob(FOLDERS[kind]) if path.is_dir()]
+    assert folders, kind
+    return {f"lidargrit.{'.'.join(path.relative_to(_ROOT).parts)}": path for path in folders}
+
+
+def _places(kind: str) -> dict[str, _Place]:
+    """Return where each name of a kind is defined."""
+    found = {}
+    for package, folder in _packages(kind).items():
+        if kind == "presets":
+            file, module = folder / "presets.py", f"{package}.presets"
+            entries = _entries(file) if file.is_file() else {}
+            found |= {name: _Place(file, module, *entry) for name, entry in entries.items()}
+        else:
+            found |= {path.stem: _Place(path, f"{package}.{path.stem}") for path in folder.glob("[!_]*.py")}
+            systems = [path.parent.name for path in folder.glob("[!_]*/system.py")]
+            found |= {name: _Place(folder / name / "system.py", f"{package}.{name}.system") for name in systems}
     return found
 
 
-def _files(kind: str) -> dict[str, tuple[Path, str]]:
-    """Return the file and the module of each name."""
+@cache
+def _entries(file: Path) -> dict[str, tuple[str, str]]:
+    """Return the table and the title of each preset of a file, as they are written there.
+
+    An entry is a call whose first argument is the title, or the name of such a call's result.
+    """
+    made: dict[str, ast.expr] = {}
+    for node in ast.parse(file.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+            made[node.targets[0].id] = node.value
     found = {}
-    for package, folder in _packages(kind).items():
-        found |= {path.stem: (path, f"{package}.{path.stem}") for path in folder.glob("[!_]*.py")}
-        systems = [path.parent.name for path in folder.glob("[!_]*/system.py")]
-        found |= {name: (folder / name / "system.py", f"{package}.{name}.system") for name in systems}
+    for table in (PRESETS, TO_COMPARE_WITH):
+        entries = made.get(table, ast.Dict([], []))
+        assert isinstance(entries, ast.Dict), f"{table} of {file} is not written as a table"
+        for key, value in zip(entries.keys, entries.values, strict=True):
+            call = made[value.id] if isinstance(value, ast.Name) else value
+            assert isinstance(call, ast.Call), f"an entry of {table} of {file} is no call"
+            assert key is not None
+            found[ast.literal_eval(key)] = (table, ast.literal_eval(call.args[0]))
     return found
 
 
@@ -90,8 +147,10 @@ def _the_one(kind: str, name: str, chosen: Callable[[object, str], T | None]) ->
             f"one such as {nearest_names(name, known)}",
             f"see all with: lidargrit list {kind}",
         )
-    module = importlib.import_module(_files(kind)[name][1])
-    public = {id(value): value for key, value in vars(module).items() if not key.startswith("_")}
+    place = _places(kind)[name]
+    module = importlib.import_module(place.module)
+    values = {name: getattr(module, place.table)[name]} if place.table else vars(module)
+    public = {id(value): value for key, value in values.items() if not key.startswith("_")}
     found = [one for value in public.values() if (one := chosen(value, module.__name__)) is not None]
     assert len(found) == 1, f"{module.__name__} must define exactly one public object of its kind, has {len(found)}"
     return found[0]

@@ -4,8 +4,8 @@ LidarGritError (ValueError)
 ├── UsageError        the words of a command are not such as it knows
 ├── ScanError         a scan file, or the points in it, cannot be used
 ├── DataError         a folder or a data source is not what was asked for
-├── UnknownNameError  no sensor, recipe, metric, ... of that name
-├── ConfigError       a recipe's setting is unknown or out of its bounds
+├── UnknownNameError  no sensor, preset, metric, ... of that name
+├── ConfigError       a preset's setting is unknown or out of its bounds
 ├── CheckpointError   weights or a run that are damaged or of another configuration
 ├── WeightsError      published weights of a network that are not to be had, or not what they should be
 ├── OutputError       a file or folder to write is taken, or could not be written
@@ -52,11 +52,11 @@ class DataError(LidarGritError):
 
 
 class UnknownNameError(LidarGritError):
-    """No sensor, recipe, metric, ... of that name."""
+    """No sensor, preset, metric, ... of that name."""
 
 
 class ConfigError(LidarGritError):
-    """A recipe's setting is unknown or out of its bounds."""
+    """A preset's setting is unknown or out of its bounds."""
 
 
 class CheckpointError(LidarGritError):

@@ -25,7 +25,7 @@ class Batches:
         images: range images to learn from; each comes once an epoch, in an order that the seed determines.
         batch_size: number of scans in a batch, over all processes.
         augmentations: kinds of augmentation, applied in this order.
-        any_columns: whether an image may begin at any fine column; see :class:`FitConfig`.
+        any_columns: whether an image may begin at any fine column; see :class:`TrainingConfig`.
         seed: seed of order and augmentation.
         rank: number of this process, from 0; it takes its share of every batch.
         world_size: number of processes that train together.

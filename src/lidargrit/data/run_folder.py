@@ -100,9 +100,9 @@ def weights_sha256(folder: Path) -> str:
     return sha256_of(folder / WEIGHTS_FILE)
 
 
-def recipe_settings(about: Any) -> dict[str, Any]:
-    """Return every setting of the recipe in a ``run.json`` by its name of today; none where there is no recipe."""
-    return configuration.leaves(about.get("recipe") if isinstance(about, dict) else {})
+def preset_settings(about: Any) -> dict[str, Any]:
+    """Return every setting of the preset in a ``run.json`` by its name of today; none where there is no preset."""
+    return configuration.leaves(about.get("preset") if isinstance(about, dict) else {})
 
 
 def taken_over(about: Any) -> dict[str, Any]:
@@ -117,7 +117,7 @@ def taken_over(about: Any) -> dict[str, Any]:
 def recorded_projection(folder: Path) -> str:
     """Return by which variant of the projection the training scans of a run became images; "" if it is not known."""
     path = folder / RUN_FILE
-    variant = recipe_settings(read_json(path) if path.is_file() else {}).get("data.projection_variant")
+    variant = preset_settings(read_json(path) if path.is_file() else {}).get("data.projection_variant")
     return variant if isinstance(variant, str) else ""
 
 

@@ -1,4 +1,4 @@
-"""Recipes, finished runs and samples → each trained, sampled and scored alike → one table; goes on where it stopped."""
+"""Presets, finished runs and samples → each trained, sampled and scored alike → one table; goes on where it stopped."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ from lidargrit.evaluation.scorecard import NOT_APPLICABLE, Scorecard
 from lidargrit.evaluation.tables import Format, render, share_pixel_statistics, side_by_side
 from lidargrit.evaluation.verdict import MEMORISED, PIXEL_STATISTICS
 from lidargrit.generation.generator import Generator, load, load_class
-from lidargrit.generation.presets import is_recipe, load_recipe
-from lidargrit.generation.settings import Recipe
+from lidargrit.generation.presets import is_preset, load_preset
+from lidargrit.generation.settings import Preset
 from lidargrit.inference.samples import write_samples
 from lidargrit.nn.devices import usable_device
 from lidargrit.scans.sensors import SensorModel
@@ -54,15 +54,15 @@ class Benchmark:
         reference: source of real scans on which none of the systems was trained.
         num_samples: number of samples of each system.
         settings: settings of the evaluation, above all its protocol.
-        recipe_settings: settings that are given to every recipe, as by ``train --set``, so that all systems get the
+        preset_settings: settings that are given to every preset, as by ``train --set``, so that all systems get the
             same data.
-        flops: operations of the training of each system; 0 keeps every recipe's own budget.
+        flops: operations of the training of each system; 0 keeps every preset's own budget.
     """
 
     reference: str
     num_samples: int = 256
     settings: EvalConfig = field(default_factory=EvalConfig)
-    recipe_settings: tuple[str, ...] = ()
+    preset_settings: tuple[str, ...] = ()
     flops: float = 0.0
 
     def __post_init__(self) -> None:
@@ -77,20 +77,20 @@ class Benchmark:
         """Return the settings of the evaluation, of as many scans as samples."""
         return replace(self.settings, max_scans=self.num_samples)
 
-    def recipe(self, name: str, check: bool = True) -> Recipe:
-        """Return a recipe with the settings and the budget that all systems get.
+    def preset(self, name: str, check: bool = True) -> Preset:
+        """Return a preset with the settings and the budget that all systems get.
 
         Args:
-            name: name of the recipe.
+            name: name of the preset.
             check: whether it is still to be trained, so that its stages have to follow the settings.
 
         Raises:
-            ConfigError: a setting that the recipe does not take, or that one of its stages cannot follow.
+            ConfigError: a setting that the preset does not take, or that one of its stages cannot follow.
         """
-        recipe = load_recipe(name, self.recipe_settings)
+        preset = load_preset(name, self.preset_settings)
         if check:
-            check_stages(recipe)
-        return with_budget(recipe, self.flops) if self.flops else recipe
+            check_stages(preset)
+        return with_budget(preset, self.flops) if self.flops else preset
 
 
 def run(
@@ -103,17 +103,17 @@ def run(
     """Train or load each system, sample from it and score the samples, and return the files of scores.
 
     Args:
-        systems: names of recipes or folders of finished runs, each with sampling choices after a colon if wanted:
-            ``r2dm_small:steps=32``; or folders of samples, of ours or of another program. A recipe that occurs with
+        systems: names of presets or folders of finished runs, each with sampling choices after a colon if wanted:
+            ``r2dm_small:steps=32``; or folders of samples, of ours or of another program. A preset that occurs with
             several sampling choices is trained once.
-        folder: output folder. It gets a run folder ``runs/RECIPE``, and for each system ``SYSTEM/samples``, scores in
+        folder: output folder. It gets a run folder ``runs/PRESET``, and for each system ``SYSTEM/samples``, scores in
             ``SYSTEM/SYSTEM.json`` and ``SYSTEM/costs.json``. Existing results are kept.
         benchmark: settings that all systems share.
         reporter: receiver of the progress.
         processes: number of systems that are made at the same time, each in a process with its share of the cores.
 
     Raises:
-        ConfigError: a system that occurs twice, or a recipe that does not take a setting.
+        ConfigError: a system that occurs twice, or a preset that does not take a setting.
         OutputError: another comparison writes into the folder, or it cannot be written to.
     """
     reporter = reporter or Reporter()
@@ -123,11 +123,11 @@ def run(
             f"the systems {', '.join(systems) or '(none)'}", "each once, and at least one", "correct them"
         )
     check_processes(processes)
-    # Wrong words and runs of other recipes are refused before anything is trained.
+    # Wrong words and runs of other presets are refused before anything is trained.
     plans = [_Plan.of(system, folder, benchmark) for system in systems]
     reference = open_source(benchmark.reference, benchmark.settings.data.bad_points)
-    if (benchmark.recipe_settings or benchmark.flops) and not any(plan.recipe for plan in plans):
-        raise ConfigError("settings or a budget, and no recipe", "a recipe that they are for", "leave them out")
+    if (benchmark.preset_settings or benchmark.flops) and not any(plan.preset for plan in plans):
+        raise ConfigError("settings or a budget, and no preset", "a preset that they are for", "leave them out")
     by_run: dict[Path, list[_Plan]] = {}  # systems of one run one after the other: it is trained once
     for plan in plans:
         by_run.setdefault(plan.run, []).append(plan)
@@ -179,12 +179,12 @@ def _check_reference(reference: Source, plans: Sequence[_Plan], benchmark: Bench
 def _warn_of_bounds(plans: Sequence[_Plan], reference: Source, reporter: Reporter) -> None:
     """Warn of rows that bound the scores of another data set than the reference's: theirs has to be trained on."""
     unclear = {"", "folder", data_set_of(reference.text)[0] or reference.data_set}  # a folder's may be any data set
-    recipes = {plan.system: plan.recipe for plan in plans if plan.recipe is not None}
+    presets = {plan.system: plan.preset for plan in plans if plan.preset is not None}
     others = {
         name: source
-        for name, recipe in recipes.items()
-        for source in recipe.data.train
-        if recipe.generator in (PIXEL_STATISTICS, MEMORISED) and data_set_of(source)[0] not in unclear
+        for name, preset in presets.items()
+        for source in preset.data.train
+        if preset.generator in (PIXEL_STATISTICS, MEMORISED) and data_set_of(source)[0] not in unclear
     }
     if others:
         reporter.message(
@@ -208,14 +208,14 @@ def _finish(
             _score_samples(plan.samples, folder / name, benchmark, reporter, reference)
             continue
         generator = (
-            load(plan.run) if plan.recipe is None or is_run(plan.run) else train(plan.recipe, plan.run, reporter)
+            load(plan.run) if plan.preset is None or is_run(plan.run) else train(plan.preset, plan.run, reporter)
         )
         generator.to(usable_device(""))
         samples = folder / name / "samples"
         timed = _sample(generator, plan.run, samples, plan.sampling, benchmark, reporter)
         sampled += timed is not None
         costs = Costs(folder / name / COSTS, weights_sha256(plan.run))
-        costs.write(generator, plan.sampling, plan.recipe, timed)
+        costs.write(generator, plan.sampling, plan.preset, timed)
         pair = _of_first_seeds(open_pair(open_source(str(samples)), reference, settings, reporter), samples)
         costs.add_bits(generator, pair.reference, reporter)
         _score(pair, settings, folder / name / f"{name}.json", reporter)
@@ -306,12 +306,12 @@ def as_json(scores: Sequence[Path]) -> list[dict[str, Any]]:
 
 @dataclass(frozen=True)
 class _Plan:
-    """How one system is made: from a finished run, or by training a recipe; or its samples, which are there.
+    """How one system is made: from a finished run, or by training a preset; or its samples, which are there.
 
     Args:
         system: name of the system, as the user typed it.
-        run: folder of a finished run, or of the one that the recipe gets, or of samples.
-        recipe: recipe that is trained; None for a finished run.
+        run: folder of a finished run, or of the one that the preset gets, or of samples.
+        preset: preset that is trained; None for a finished run.
         sampling: settings of the generator's own ``Sampling``.
         sensor: sensor of the system's samples.
         samples: the samples, if they are there; None otherwise.
@@ -319,7 +319,7 @@ class _Plan:
 
     system: str
     run: Path
-    recipe: Recipe | None
+    preset: Preset | None
     sampling: object
     sensor: SensorModel
     samples: Source | None = None
@@ -331,16 +331,16 @@ class _Plan:
         if is_run(run):
             generator = load(run)
             return cls(system, run, None, generator.parse_sampling(settings), generator.sensor)
-        held = open_source(name) if run.is_dir() and not is_recipe(name) else None
+        held = open_source(name) if run.is_dir() and not is_preset(name) else None
         if isinstance(held, (SampleSource, TensorSource)):
             if settings:
                 got = f"{system}, settings of sampling for samples that are there"
                 raise ConfigError(got, "a folder of samples alone", "leave the settings out")
             return cls(system, run, None, None, held.sensor, held)
-        recipe = benchmark.recipe(name, check=not is_run(trained))
-        sampling = load_class(recipe.generator).parse_sampling(settings)
-        check_folder(trained, recipe)
-        return cls(system, trained, recipe, sampling, recipe.data.load_sensor())
+        preset = benchmark.preset(name, check=not is_run(trained))
+        sampling = load_class(preset.generator).parse_sampling(settings)
+        check_folder(trained, preset)
+        return cls(system, trained, preset, sampling, preset.data.load_sensor())
 
 
 def _sample(

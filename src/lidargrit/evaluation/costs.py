@@ -14,7 +14,7 @@ from lidargrit.evaluation.likelihood import bits_per_return
 from lidargrit.evaluation.pairs import EvalSet
 from lidargrit.evaluation.tables import TableBlock
 from lidargrit.generation.generator import Generator
-from lidargrit.generation.settings import Recipe
+from lidargrit.generation.settings import Preset
 from lidargrit.training import training_flops
 
 COSTS = "costs.json"
@@ -45,14 +45,14 @@ class Costs:
     weights_sha256: str
 
     def write(
-        self, generator: Generator, sampling: object, recipe: Recipe | None, timed: tuple[int, float] | None
+        self, generator: Generator, sampling: object, preset: Preset | None, timed: tuple[int, float] | None
     ) -> None:
         """Write what a system costs, unless that of these weights is there, with the time of at least as many scans.
 
         Args:
             generator: the trained generator.
             sampling: settings of the generator's own ``Sampling``.
-            recipe: recipe that was trained; None for a run that was given, whose training is not counted.
+            preset: preset that was trained; None for a run that was given, whose training is not counted.
             timed: number of scans that were sampled just now, and seconds for each; None if none was.
         """
         scans, seconds = timed or (0, None)
@@ -66,7 +66,7 @@ class Costs:
             {
                 "weights_sha256": self.weights_sha256,
                 "parameters": sum(weight.numel() for weight in generator.parameters()),
-                "training_flops": None if recipe is None else sum(training_flops(recipe).values()),
+                "training_flops": None if preset is None else sum(training_flops(preset).values()),
                 "network_evaluations": cost.network_evaluations,
                 "flops_per_scan": cost.flops,
                 "seconds_per_scan": seconds,

@@ -36,7 +36,7 @@ class PaperTable:
         train: split to train on; it shares no drive with ``val`` and ``test``, the splits of these names.
         images: settings that make the protocol's images of the data set's scans.
         small_images: settings that make images with fewer columns.
-        rows: recipes of each row of the paper, by the row's name: one of the paper's size, and a small one.
+        rows: presets of each row of the paper, by the row's name: one of the paper's size, and a small one.
         remarks: sentences that a reader of the measured rows must know.
     """
 
@@ -62,7 +62,7 @@ TABLES = {
             "LiDARGen": ("lidargen_kitti_360", "lidargen_small"),
             "UltraLiDAR (unofficial program)": ("ultralidar_kitti_360", "ultralidar_small"),
             "R2DM": ("r2dm_kitti_360", "r2dm_small"),
-            "LidarGRIT": ("lidargrit_kitti_360", "small"),
+            "LidarGRIT": ("lidargrit_kitti_360", "lidargrit_small"),
         },
         _KITTI_360_IMAGES,
         (*_KITTI_360_IMAGES[:2], "data.column_stride=8"),
@@ -79,7 +79,7 @@ TABLES = {
         {
             "LidarGAN": ("lidargan_kitti_odometry", "lidargan_small"),
             "DUSty": ("dusty_kitti_odometry", "dusty_small"),
-            "LidarGRIT": ("lidargrit_kitti_odometry", "small"),
+            "LidarGRIT": ("lidargrit_kitti_odometry", "lidargrit_small"),
         },
         remarks=(
             "LidarGAN generates 40 of the 64 rows, without raydrop, as published; how the paper made its own row "
@@ -92,9 +92,12 @@ TABLES = {
         "kitti_odometry",
         "train",
         {
-            "without geometric preservation and raydrop loss": ("ablation_neither", "ablation_neither_small"),
-            "with raydrop loss": ("ablation_raydrop", "ablation_raydrop_small"),
-            "with both": ("lidargrit_kitti_odometry", "ablation_both_small"),
+            "without geometric preservation and raydrop loss": (
+                "lidargrit_kitti_odometry_neither",
+                "lidargrit_small_neither",
+            ),
+            "with raydrop loss": ("lidargrit_kitti_odometry_raydrop", "lidargrit_small_raydrop"),
+            "with both": ("lidargrit_kitti_odometry", "lidargrit_small_both"),
         },
     ),
 }
@@ -107,10 +110,10 @@ class Reproduction:
     Args:
         number: number of the table, 1 to 3.
         root: root folder of its data set, or ``simulated`` for simulated streets.
-        small: whether to use the small recipes, images of 64x256, and only the metrics that need no published weights.
+        small: whether to use the small presets, images of 64x256, and only the metrics that need no published weights.
         count: samples of each system, compared with as many scans; 0 for 5,000, or 64 if small.
-        flops: operations of the training of each system; None for the recipes' own budgets, or 5e13 if small.
-        settings: settings of every recipe, besides the table's own.
+        flops: operations of the training of each system; None for the presets' own budgets, or 5e13 if small.
+        settings: settings of every preset, besides the table's own.
     """
 
     number: int
@@ -130,8 +133,8 @@ class Reproduction:
         return TABLES[self.number]
 
     def systems(self) -> dict[str, str]:
-        """Return the recipe of each row."""
-        return {row: recipes[self.small] for row, recipes in self.table.rows.items()}
+        """Return the preset of each row."""
+        return {row: presets[self.small] for row, presets in self.table.rows.items()}
 
     def benchmark(self) -> Benchmark:
         """Return what all rows have in common."""
@@ -147,7 +150,7 @@ class Reproduction:
             reference=f"simulated:{count}:test" if self.root == SIMULATED else self.source("test"),
             num_samples=count,
             settings=EvalConfig(protocol=self.table.protocol, metrics=metrics if self.small else ()),
-            recipe_settings=(train, val, *images, f"data.projection_variant={protocol.variant}", *self.settings),
+            preset_settings=(train, val, *images, f"data.projection_variant={protocol.variant}", *self.settings),
             flops=flops,
         )
 
@@ -185,16 +188,16 @@ def table_of(wanted: Reproduction, scores: list[Path], form: Format = "text") ->
 def plan(wanted: Reproduction, folder: Path) -> dict[str, Any]:
     """Return the steps of :func:`reproduce` and their costs, as plain values."""
     benchmark = wanted.benchmark()
-    recipes = {system: benchmark.recipe(system) for system in wanted.systems().values()}
-    data = next(iter(recipes.values())).data
+    presets = {system: benchmark.preset(system) for system in wanted.systems().values()}
+    data = next(iter(presets.values())).data
     counted = {source: len(open_source(source).scans()) for source in (*data.train, *data.val, benchmark.reference)}
     systems = {}
-    for system, recipe in recipes.items():
+    for system, preset in presets.items():
         run = folder / "runs" / system
-        generator = recipe.build_generator()
+        generator = preset.build_generator()
         systems[system] = {
             "state": "finished" if is_run(run) else "begun" if run.exists() else "to do",
-            "plan": plan_training(recipe).to_json(),
+            "plan": plan_training(preset).to_json(),
             "sampling_flops": generator.cost().flops * benchmark.num_samples,
         }
     return {"table": wanted.number, "prepare": counted, "samples": benchmark.num_samples, "systems": systems}
@@ -218,7 +221,7 @@ def plan_as_text(wanted: Reproduction, facts: dict[str, Any]) -> str:
 def _prepare(benchmark: Benchmark, systems: list[str], reporter: Reporter) -> None:
     """Project all training scans before anything is trained: one that cannot be used is refused now, not after days."""
     open_source(benchmark.reference)  # refuses a split that is not there
-    for data in [benchmark.recipe(system).data for system in systems]:
+    for data in [benchmark.preset(system).data for system in systems]:
         load_range_images(data.train, data, reporter)
         load_range_images(data.val, data, reporter)
 

@@ -43,7 +43,7 @@ def read_table(folder: Path) -> tuple[list[str], Benchmark]:
             str(settings["reference"]),
             int(settings["num_samples"]),
             EvalConfig(protocol=str(settings["protocol"]), metrics=tuple(map(str, settings["metrics"]))),
-            tuple(map(str, settings["recipe_settings"])),
+            tuple(map(str, settings["preset_settings"])),
             float(settings["flops"]),
         )
     except (KeyError, TypeError, ValueError) as error:
@@ -59,7 +59,7 @@ def _settings(benchmark: Benchmark) -> dict[str, Any]:
         "num_samples": benchmark.num_samples,
         "protocol": benchmark.settings.protocol,
         "metrics": list(benchmark.settings.metrics),
-        "recipe_settings": list(benchmark.recipe_settings),
+        "preset_settings": list(benchmark.preset_settings),
         "flops": benchmark.flops,
         "evaluation": benchmark.settings.facts(),
     }

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from lidargrit.nn.precision import without_autocast
 from lidargrit.scans.types import RangeImage
 
-_BYTES_AT_MOST = 1 << 30  # 65,000 latents of LiDM's small recipe, or a million times 256 tokens
+_BYTES_AT_MOST = 1 << 30  # 65,000 latents of LiDM's small preset, or a million times 256 tokens
 
 NetworkT = TypeVar("NetworkT", bound=nn.Module)
 

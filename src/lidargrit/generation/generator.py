@@ -50,7 +50,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     capabilities: ClassVar[frozenset[str]] = frozenset()
     facts: ClassVar[SystemFacts] = SystemFacts(generates="range images")
     training_precision: ClassVar[Precision] = "auto"
-    """Precision in which stages are trained where no recipe names one."""
+    """Precision in which stages are trained where no preset names one."""
 
     published_files: ClassVar[tuple[str, ...]] = ()
     """Contents of the files in which the system's authors published weights, in order; empty if we read none."""
@@ -321,8 +321,8 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         able = [name for name in discovery.names("generators") if load_class(name).published_files]
         raise ConfigError(
             f"a generator {cls.public_name()!r}, of which nobody published weights",
-            f"a recipe of {', '.join(able)}",
-            "see which generator a recipe has with: lidargrit train RECIPE OUT --dry-run",
+            f"a preset of {', '.join(able)}",
+            "see which generator a preset has with: lidargrit train PRESET OUT --dry-run",
         )
 
     @classmethod

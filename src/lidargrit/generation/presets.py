@@ -1,46 +1,198 @@
-"""One experiment = one file: name → :class:`Recipe`."""
+"""A preset is an entry of a table: name → :class:`Preset`; and what the presets of several systems share."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from lidargrit.core import configuration, discovery
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.generation.generator import load_class
-from lidargrit.generation.settings import FitConfig, Recipe
+from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
+from lidargrit.generation.settings import Preset, TrainingConfig
+from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
+from lidargrit.nn.transformer import TransformerConfig
 
-_SCANS = 2000  # of each stage of a default recipe: minutes, not hours
+_SCANS = 2000  # of each stage of a default preset: minutes, not hours
+
+STREETS = DataConfig(train=("simulated:2000:train",), val=("simulated:32:val",))
+MORE_STREETS = replace(STREETS, train=("simulated:4352:train",))
+WIDE_STREETS = DataConfig(("simulated:1000:train",), ("simulated:24:val",), columns=2048, column_stride=2)
+DEMO_STREETS = DataConfig(train=("simulated:300:train",), val=("simulated:16:val",))
+KITTI_360 = DataConfig(
+    ("kitti_360:data/kitti_360:train_without_val",), ("kitti_360:data/kitti_360:val",), "hdl64e_kitti_360"
+)
+KITTI_ODOMETRY = DataConfig(("kitti_odometry:data/kitti_odometry:train",), ("kitti_odometry:data/kitti_odometry:val",))
+
+KITTI_360_EPOCH = 50_000
+"""Number of scans of the training drives, roughly."""
+KITTI_ODOMETRY_EPOCH = 19_130
+"""Number of scans of the training sequences 00 to 07, 09 and 10."""
+
+MINUTES = TrainingConfig(
+    scans=20_000,
+    batch_size=4,
+    learning_rate=1e-3,
+    schedule="cosine",
+    warmup_scans=400,
+    betas=(0.9, 0.99),
+    precision="auto",
+    augmentations=("flip",),
+    any_columns=True,
+    average_over_scans=500,
+    validate_every=1000,
+    checkpoint_every=500,
+)
+"""Training of a small network on two CPU cores, on simulated or on a user's scans."""
+LATER_STAGE = replace(MINUTES, batch_size=2, learning_rate=2e-3, warmup_scans=200, betas=(0.9, 0.98), augmentations=())
+"""Training of a network over what ``pretrained`` has: its pixel decoder, its completion, its raydrop."""
+PIXELS = replace(LATER_STAGE, scans=58_000, average_over_scans=1200)
+"""Training of the pixel decoder of ``pretrained``."""
+GAN_MINUTES = TrainingConfig(
+    scans=60_000,
+    batch_size=16,
+    learning_rate=1e-4,
+    betas=(0.0, 0.99),
+    gradient_clip=0.0,
+    augmentations=("flip",),
+    any_columns=True,
+    average_over_scans=0,
+    validate_every=4000,
+    checkpoint_every=4000,
+)
+"""The same for two networks that take turns."""
+DIFFUSION_ON_KITTI_360 = TrainingConfig(
+    scans=2_560_000,
+    batch_size=8,
+    learning_rate=1e-4,
+    schedule="cosine",
+    warmup_scans=80_000,
+    betas=(0.9, 0.99),
+    average_over_scans=11_000,  # half-life of a decay of 0.995 every 10 steps of 8 scans
+    validate_every=50_000,
+    checkpoint_every=10_000,
+)
+"""Training of R2Flow, and but for scans and precision of R2DM."""
+
+SMALL_VQVAE = VqvaeConfig(
+    channels=32,
+    channel_multipliers=(1, 1, 2),
+    code_dim=64,
+    num_codes=512,
+    dropout=0.0,
+    padding="wrap",
+    range_encoding="log",  # with errors in metres learns quicker than the linear one, see docs/results
+    error_unit="metres",
+    reconstruction="returns",
+    codebook_loss="ema",
+)
+SMALL_TRANSFORMER = TransformerConfig(layers=4, heads=4, width=192, embedding_dropout=0.1, residual_dropout=0.1)
+SMALL_STAGES = {
+    "tokenizer": replace(
+        MINUTES,
+        batch_size=2,
+        learning_rate=1.5e-3,
+        warmup_scans=300,
+        betas=(0.9, 0.95),
+        augmentations=("flip", "roll"),
+        average_over_scans=300,
+    ),
+    "transformer": replace(MINUTES, batch_size=8, warmup_scans=500, betas=(0.9, 0.95), weight_decay=0.01),
+}
+"""Training of both networks of LidarGRIT, small."""
+DEMO_STAGES = {
+    "tokenizer": replace(SMALL_STAGES["tokenizer"], scans=2400, validate_every=800, checkpoint_every=400),
+    "transformer": replace(SMALL_STAGES["transformer"], scans=4800, validate_every=1600, checkpoint_every=400),
+}
+"""The same for minutes."""
+KITTI_360_VQVAE = VqvaeConfig(
+    channels=128, channel_multipliers=(1, 1, 2, 2), code_dim=256, num_codes=1024, restart_dead_codes=False
+)
+KITTI_360_TOKENIZER = TrainingConfig(
+    scans=100 * KITTI_360_EPOCH,
+    batch_size=8,
+    learning_rate=8e-6,
+    betas=(0.5, 0.9),
+    gradient_clip=0.0,
+    augmentations=("geometric",),
+    average_over_scans=20_000,
+    validate_every=KITTI_360_EPOCH,
+    checkpoint_every=10_000,
+)
+"""Training of the VQ-VAE that LidarGRIT's paper has for KITTI-360."""
+PIXEL_DECODER = PixelDecoderConfig(
+    coarsest_cell=64, row_channels=2, range_width=36, surface_components=True, gravity_components=True
+)
 
 
-def load_recipe(name: str, settings: Sequence[str] = ()) -> Recipe:
-    """Return a recipe by its name, with settings changed as in ``training.tokenizer.batch_size=4``.
+def preset(
+    title: str,
+    data: DataConfig,
+    model: Any,
+    *,
+    seed: int = 0,
+    published: str = "",
+    stages_from: str | None = None,
+    fine_tune: tuple[str, ...] = (),
+    **training: TrainingConfig,
+) -> Preset:
+    """Return a preset of the system whose configuration the model is.
 
-    The name of a generator that has no recipe of this name gives its default recipe, see :func:`default_recipe`.
+    Args:
+        title: description in one line.
+        data: settings of the data.
+        model: configuration of one of the systems.
+        seed: seed of everything random.
+        published: scores that a paper reports.
+        stages_from: run whose stages are taken.
+        fine_tune: names of stages that are trained further.
+        training: settings of the training of each stage.
+    """
+    generator = type(model).__module__.split(".")[-2]  # the folder of the system, systems/NAME/system.py
+    return Preset(title, generator, model, data, training, seed, published, None, stages_from, fine_tune=fine_tune)
+
+
+def variant(title: str, base: Preset, settings: Mapping[str, Any]) -> Preset:
+    """Return a preset that differs from another by its title and by the settings named.
+
+    Args:
+        title: description in one line.
+        base: preset that it differs from.
+        settings: other values, by the dotted names of settings or parts.
+    """
+    return configuration.changed(base, {"title": title, **settings})
+
+
+def load_preset(name: str, settings: Sequence[str] = ()) -> Preset:
+    """Return a preset by its name, with settings changed as in ``training.tokenizer.batch_size=4``.
+
+    The name of a generator that has no preset of this name gives its default preset, see :func:`default_preset`.
 
     Raises:
-        UnknownNameError: no such recipe and no such generator.
+        UnknownNameError: no such preset and no such generator.
         ConfigError: an unknown setting or a value that does not fit, of which it names the nearest; or a folder.
     """
-    if not is_recipe(name) and Path(name).is_dir():
+    if not is_preset(name) and Path(name).is_dir():
         raise ConfigError(
             f"{name}, a folder that holds no finished run",
-            "a recipe, or where systems are compared a finished run or samples",
-            "see lidargrit list recipes; score scans with lidargrit evaluate (--tables: side by side)",
+            "a preset, or where systems are compared a finished run or samples",
+            "see lidargrit list presets; score scans with lidargrit evaluate (--tables: side by side)",
         )
-    is_generator = is_recipe(name) and name not in discovery.names("recipes")
-    recipe = default_recipe(name) if is_generator else discovery.load_instance("recipes", name, Recipe)
-    return configuration.override(recipe, settings)
+    is_generator = is_preset(name) and name not in discovery.names("presets")
+    found = default_preset(name) if is_generator else discovery.load_instance("presets", name, Preset)
+    return configuration.override(found, settings)
 
 
-def is_recipe(name: str) -> bool:
-    """Return whether :func:`load_recipe` knows a name, of a recipe or of a generator."""
-    return name in (*discovery.names("recipes"), *discovery.names("generators"))
+def is_preset(name: str) -> bool:
+    """Return whether :func:`load_preset` knows a name, of a preset or of a generator."""
+    return name in (*discovery.names("presets"), *discovery.names("generators"))
 
 
-def default_recipe(generator: str) -> Recipe:
-    """Return a recipe for a generator that has none: its default configuration, and minutes on simulated streets.
+def default_preset(generator: str) -> Preset:
+    """Return a preset for a generator that has none: its default configuration, and minutes on simulated streets.
 
     Args:
         generator: name of the generator.
@@ -48,15 +200,15 @@ def default_recipe(generator: str) -> Recipe:
     Raises:
         ConfigError: the generator's configuration has a setting without a default.
     """
-    cls, data = load_class(generator), DataConfig(train=("simulated:256:train",), val=("simulated:16:val",))
+    cls, data = load_class(generator), replace(STREETS, train=("simulated:256:train",), val=("simulated:16:val",))
     try:
         config = cls.Config()
     except TypeError as error:
         wanted = f"a default for every setting of {cls.Config.__name__}"
         raise ConfigError(
-            f"{generator} without a recipe ({error})", wanted, f"add systems/{generator}/presets/{generator}.py"
+            f"{generator} without a preset ({error})", wanted, f"add {generator} to systems/{generator}/presets.py"
         ) from None
-    fit = FitConfig(
+    each = TrainingConfig(
         scans=_SCANS,
         batch_size=4,
         learning_rate=1e-3,
@@ -70,4 +222,4 @@ def default_recipe(generator: str) -> Recipe:
     )
     stages = cls(config, data.load_sensor()).stages
     title = f"{generator} as its default configuration makes it, on simulated streets"
-    return Recipe(title, generator, config, data, dict.fromkeys(stages, fit))
+    return Preset(title, generator, config, data, dict.fromkeys(stages, each))

@@ -16,7 +16,7 @@ _BATCH_AT_MOST = 65_536  # scans: 4 GB of the smallest images, and more than any
 
 
 @dataclass(frozen=True)
-class FitConfig:
+class TrainingConfig:
     """How one stage of a generator is trained; every duration is a number of scans seen.
 
     Args:
@@ -89,7 +89,7 @@ class FitConfig:
 
 
 @dataclass(frozen=True)
-class Recipe:
+class Preset:
     """One experiment.
 
     Args:
@@ -111,7 +111,7 @@ class Recipe:
     generator: str
     model: Any
     data: DataConfig
-    training: dict[str, FitConfig]
+    training: dict[str, TrainingConfig]
     seed: int = 0
     published: str = ""
     tokenizer_from: str | None = None
@@ -139,17 +139,17 @@ class Recipe:
         if self.seed < 0:
             raise ConfigError(f"seed={self.seed}", "0 or more", "choose another seed")
 
-    def settings_of(self, stage: str) -> FitConfig:
+    def settings_of(self, stage: str) -> TrainingConfig:
         """Return the settings of a stage's training.
 
         Raises:
-            ConfigError: the recipe has none for this stage.
+            ConfigError: the preset has none for this stage.
         """
         if stage not in self.training:
             raise ConfigError(
-                f"a recipe without training.{stage}, a stage of model={self.generator}",
+                f"a preset without training.{stage}, a stage of model={self.generator}",
                 "the settings of every stage's training",
-                f"leave out the model.* that adds {stage}, or begin with a recipe that trains it",
+                f"leave out the model.* that adds {stage}, or begin with a preset that trains it",
             )
         return self.training[stage]
 

@@ -122,7 +122,7 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
             raise ConfigError(
                 "mask=pixels for a model without a pixel decoder",
                 "a model with one",
-                "leave mask out, or train a recipe with the stage pixels, such as compact_pixels",
+                "leave mask out, or train a preset with the stage pixels, such as lidargrit_compact_pixels",
             )
         if self.pixels is None or mask not in ("auto", "pixels"):
             of_networks = replace(PixelSampling(), precision=pixels.precision)  # that of the tokenizer's decoder, too

@@ -138,8 +138,8 @@ class FoldedUpsample(nn.Module):
         return F.conv_transpose2d(wrapped(x), self.weight, self.bias, stride=2, padding=(1, 3))
 
 
-def group_norm(channels: int, groups: int) -> nn.GroupNorm:
-    """Return the reference's normalisation: epsilon 1e-6, and there 32 groups."""
+def group_norm(channels: int, groups: int = 32) -> nn.GroupNorm:
+    """Return the reference's normalisation: epsilon 1e-6, 32 groups unless said otherwise."""
     return nn.GroupNorm(groups, channels, eps=1e-6)
 
 

@@ -16,8 +16,8 @@ from torch.nn.modules.module import (
 
 from lidargrit.core.errors import ConfigError
 
-NUMBERS_AT_MOST = 2**30  # 4.3 GB in 32 bits, thirty times the largest network of our recipes
-_MODULES_AT_MOST = 20_000  # many small ones take minutes to build; the largest networks of our recipes have 2,000
+NUMBERS_AT_MOST = 2**30  # 4.3 GB in 32 bits, thirty times the largest network of our presets
+_MODULES_AT_MOST = 20_000  # many small ones take minutes to build; the largest networks of our presets have 2,000
 
 
 def numbers_of_file(path: Path) -> AbstractContextManager[None]:

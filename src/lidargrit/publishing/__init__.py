@@ -26,19 +26,19 @@ from lidargrit.data.run_folder import (
 from lidargrit.data.sources import data_set_of
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.generation.generator import Generator, load, load_class
-from lidargrit.generation.presets import load_recipe
+from lidargrit.generation.presets import load_preset
 from lidargrit.nn.quantization import WeightBits, without_quantized
 from lidargrit.publishing.card import model_card
 
 
-def import_weights(recipe: str, folder: Path, files: Sequence[Path], settings: Sequence[str] = ()) -> Generator:
+def import_weights(preset: str, folder: Path, files: Sequence[Path], settings: Sequence[str] = ()) -> Generator:
     """Make a run folder from weights that a system's authors published, or that their program saved.
 
     Args:
-        recipe: name of the recipe, which names the generator, its sizes and the sensor; nothing is trained.
+        preset: name of the preset, which names the generator, its sizes and the sensor; nothing is trained.
         folder: folder that gets ``run.json``, ``model.safetensors`` and ``config.json``, as after training.
         files: files of ``torch.save``, in the order of the generator's ``published_files``; code in them is not run.
-        settings: changed settings of the recipe, such as ``data.projection_variant=reference``.
+        settings: changed settings of the preset, such as ``data.projection_variant=reference``.
 
     Raises:
         ConfigError: another number of files than the generator's published weights consist of, or a network that is
@@ -48,7 +48,7 @@ def import_weights(recipe: str, folder: Path, files: Sequence[Path], settings: S
     """
     if not (folder / RUN_FILE).is_file():
         _refuse_taken(folder, None)  # before much is read
-    made_of = load_recipe(recipe, settings)
+    made_of = load_preset(preset, settings)
     cls = load_class(made_of.generator)
     if cls.published_files and len(files) != len(cls.published_files):
         raise ConfigError(
@@ -60,7 +60,7 @@ def import_weights(recipe: str, folder: Path, files: Sequence[Path], settings: S
     about: dict[str, Any] = {
         "origin": "imported",
         "files": [{"name": path.name, "sha256": sha256_of(path)} for path in files],
-        "recipe": configuration.to_json(made_of),
+        "preset": configuration.to_json(made_of),
         "lidargrit": __version__,
     }
     with claim_folder(folder):
@@ -77,7 +77,7 @@ def publish(run: Path, folder: Path, scores: Path | None = None, notes: str = ""
 
     Args:
         run: folder of a finished run.
-        folder: folder that gets ``model.safetensors``, ``config.json``, the run's recipe and training recordings
+        folder: folder that gets ``model.safetensors``, ``config.json``, the run's preset and training recordings
             without paths and file names, and last a model card (``README.md``). It can be used wherever a run can.
         scores: scores of the run's samples, as ``lidargrit evaluate --json`` wrote them.
         notes: Markdown for the end of the card: what the model is good for, and where it fails.
@@ -138,11 +138,11 @@ def _refuse_taken(folder: Path, begun: dict[str, Any] | None) -> None:
 
 def _public_facts(about: dict[str, Any], generator: Generator) -> dict[str, Any]:
     """Return the facts of ``run.json`` without the command, and with data sets and splits in place of sources."""
-    recipe = about.get("recipe", {})
-    data = recipe.get("data", {})
+    preset = about.get("preset", {})
+    data = preset.get("data", {})
     sources = {part: ["::".join(data_set_of(source)) for source in data.get(part, ())] for part in ("train", "val")}
-    recipe = {
-        **recipe,
+    preset = {
+        **preset,
         "tokenizer_from": None,
         "stages_from": None,
         "data": {**data, **sources, "sensor": generator.sensor.name},
@@ -150,7 +150,7 @@ def _public_facts(about: dict[str, Any], generator: Generator) -> dict[str, Any]
     kept = {name: about[name] for name in ("files", "lidargrit", "commit", "torch", "python") if name in about}
     if (taken := taken_over(about))["train"]:
         kept["taken"] = {**taken, "train": ["::".join(data_set_of(source)) for source in taken["train"]]}
-    return {"origin": "published", **kept, "recipe": recipe}
+    return {"origin": "published", **kept, "preset": preset}
 
 
 def _check_scores(scores: Scorecard, run: Path) -> None:

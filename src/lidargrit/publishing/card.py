@@ -12,7 +12,7 @@ from lidargrit.core import discovery
 from lidargrit.core.errors import one_line
 from lidargrit.data.datasets import load as load_dataset
 from lidargrit.data.images import Provenance
-from lidargrit.data.run_folder import recipe_settings, taken_over
+from lidargrit.data.run_folder import preset_settings, taken_over
 from lidargrit.data.sources import data_set_of
 from lidargrit.evaluation.scorecard import NOT_APPLICABLE, Scorecard, format_value
 from lidargrit.evaluation.verdict import notes_on_floors, value_of_halves
@@ -97,12 +97,12 @@ points_xyz_m = unproject(scans[0]).points_xyz_m
 
 
 def _data(about: dict[str, Any], learned: Provenance) -> str:
-    data = about.get("recipe", {}).get("data", {})
+    data = about.get("preset", {}).get("data", {})
     if not data:
         return "## Data\n\nThe run does not say which scans the model was trained on."
     lines = ["## Data", ""]
     if _imported(about):
-        lines += ["The model's authors trained it and know its training scans. The recipe names these data sets:", ""]
+        lines += ["The model's authors trained it and know its training scans. The preset names these data sets:", ""]
     lines += ["| part | data set | split | licence |", "|---|---|---|---|"]
     leaks: list[str] = []
     for part in ("train", "val"):
@@ -113,7 +113,7 @@ def _data(about: dict[str, Any], learned: Provenance) -> str:
     taken = {data_set_of(source) for source in taken_over(about)["train"]}
     lines += [_data_row("train, of the weights that it took", *of) for of in sorted(taken - own)]
     lines += ["", *dict.fromkeys(leaks)]
-    if variant := recipe_settings(about).get("data.projection_variant"):
+    if variant := preset_settings(about).get("data.projection_variant"):
         lines.append(f"The training scans were projected by the {_code(variant)} variant; project others by the same.")
     if learned.fingerprints:
         lines.append(f"The model was trained on {len(learned.fingerprints):,} different images.")
@@ -153,7 +153,7 @@ def _licence(about: dict[str, Any], licences: list[str]) -> str:
 
 
 def _training(about: dict[str, Any]) -> str:
-    recipe = about.get("recipe", {})
+    preset = about.get("preset", {})
     taken = taken_over(about)
     if _imported(about):
         return "\n".join(
@@ -165,20 +165,20 @@ def _training(about: dict[str, Any]) -> str:
                 *_files(about["files"]),
             ]
         )
-    lines = ["## Training", "", f"Recipe: {_text(recipe.get('title', 'unknown'))}.", ""]
+    lines = ["## Training", "", f"Preset: {_text(preset.get('title', 'unknown'))}.", ""]
     lines += ["| stage | scans seen | batch | learning rate |", "|---|---|---|---|"]
-    for stage, fit in {**recipe.get("training", {}), **taken["training"]}.items():
+    for stage, fit in {**preset.get("training", {}), **taken["training"]}.items():
         name = f"{_text(stage)}{', taken from another run' if stage in taken['training'] else ''}"
         if fit is None:  # imported, or of a run that does not say
             lines.append(f"| {name} | not known | - | - |")
         else:
             lines.append(f"| {name} | {fit['scans']:,} | {fit['batch_size']:,} | {fit['learning_rate']:g} |")
-    if not recipe.get("training"):
+    if not preset.get("training"):
         lines = ["## Training", "", "The run does not say how the model was trained."]
     if taken["files"]:
         lines += ["", "Weights that were taken over had been imported from these files:", "", *_files(taken["files"])]
     software = [f"{name} {_text(about[name])}" for name in ("lidargrit", "commit", "torch", "python") if name in about]
-    lines += ["", f"Seed {_text(recipe.get('seed', 'unknown'))}; {', '.join(software) or 'software unknown'}."]
+    lines += ["", f"Seed {_text(preset.get('seed', 'unknown'))}; {', '.join(software) or 'software unknown'}."]
     return "\n".join([*lines, "Every setting is in `run.json`."])
 
 
@@ -249,7 +249,7 @@ def _has_imported(about: dict[str, Any]) -> bool:
 
 
 def _licences(about: dict[str, Any]) -> list[str]:
-    sources = (*about.get("recipe", {}).get("data", {}).get("train", ()), *taken_over(about)["train"])
+    sources = (*about.get("preset", {}).get("data", {}).get("train", ()), *taken_over(about)["train"])
     return sorted({_terms(data_set_of(source)[0]) for source in sources})
 
 

@@ -1,4 +1,4 @@
-"""Recipe → run folder, by one training loop for every generator."""
+"""Preset → run folder, by one training loop for every generator."""
 
 from lidargrit.training.compute import computing_time, training_flops, with_budget
 from lidargrit.training.measure import measure

@@ -1,4 +1,4 @@
-"""A recipe → the floating-point operations of its training, and the recipe scaled to a budget of them."""
+"""A preset → the floating-point operations of its training, and the preset scaled to a budget of them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lidargrit.core.configuration import COUNTS_SCANS
 from lidargrit.core.errors import ConfigError
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
-from lidargrit.generation.settings import FitConfig, Recipe
+from lidargrit.generation.settings import Preset, TrainingConfig
 from lidargrit.nn.flops import FlopCounter
 from lidargrit.nn.precision import Precision
 from lidargrit.scans.sensors import SensorModel
@@ -49,20 +49,20 @@ class StageCost:
         return round(self.flops_per_scan * scans) + self.preparation_flops(scans)
 
 
-def training_flops(recipe: Recipe, taken: Collection[str] | None = None) -> dict[str, int]:
-    """Count the floating-point operations of a recipe's training, forward and backward, for each stage.
+def training_flops(preset: Preset, taken: Collection[str] | None = None) -> dict[str, int]:
+    """Count the floating-point operations of a preset's training, forward and backward, for each stage.
 
     Matrix products and convolutions are counted while a few steps run, on scans whose every pixel returns at 10 m. A
     multiplication with its addition counts as two operations. Validation and the optimiser are not counted. An image
     that a trained network encodes for a later stage is counted at every sight, since how many images there are is not
-    known from a recipe, although its encoding is kept and computed once.
+    known from a preset, although its encoding is kept and computed once.
 
     The steps run on tensors that have a shape and no values, so that nothing is computed, and networks of any width are
     counted alike. Only where the operations of an objective depend on values, as those of a network that completes
     scans do, are the steps computed.
 
     Args:
-        recipe: recipe whose training it is.
+        preset: preset whose training it is.
         taken: names of the stages that are taken from another run, if that is known already.
 
     Returns:
@@ -72,23 +72,23 @@ def training_flops(recipe: Recipe, taken: Collection[str] | None = None) -> dict
         ConfigError: a stage without settings of its training.
         CheckpointError: no finished run to take stages from.
     """
-    return {name: cost.flops(recipe.settings_of(name).scans) for name, cost in stage_costs(recipe, taken).items()}
+    return {name: cost.flops(preset.settings_of(name).scans) for name, cost in stage_costs(preset, taken).items()}
 
 
-def stage_costs(recipe: Recipe, taken: Collection[str] | None = None) -> dict[str, StageCost]:
+def stage_costs(preset: Preset, taken: Collection[str] | None = None) -> dict[str, StageCost]:
     """Count the operations of every stage that is trained by its name, whatever number of scans it is trained on."""
     with torch.random.fork_rng(range(torch.cuda.device_count())):
         torch.manual_seed(0)
-        sensor = recipe.data.load_sensor()
+        sensor = preset.data.load_sensor()
         with torch.device("meta"):
-            generator = recipe.build_generator(sensor).to("meta")
+            generator = preset.build_generator(sensor).to("meta")
         costs = {}
-        taken = donors_of_stages(recipe, generator.stages) if taken is None else taken
+        taken = donors_of_stages(preset, generator.stages) if taken is None else taken
         for stage in (name for name in generator.stages if name not in taken):
             try:
                 costs[stage] = _cost_without_values(generator, stage, sensor)
             except (RuntimeError, NotImplementedError):  # torch's for a value that was asked for, and for two devices
-                costs[stage] = _cost_with_values(recipe.build_generator(sensor), stage, sensor)
+                costs[stage] = _cost_with_values(preset.build_generator(sensor), stage, sensor)
     return costs
 
 
@@ -133,8 +133,8 @@ def duration(seconds: float) -> str:
     return f"{seconds:.2g} s" if seconds < 10 else f"{seconds:.0f} s"
 
 
-def with_budget(recipe: Recipe, flops: float) -> Recipe:
-    """Return the recipe with more or fewer scans, by one factor for all stages, so that its training takes ``flops``.
+def with_budget(preset: Preset, flops: float) -> Preset:
+    """Return the preset with more or fewer scans, by one factor for all stages, so that its training takes ``flops``.
 
     Stages that are taken from another run stay as they are: they are not trained.
 
@@ -142,23 +142,23 @@ def with_budget(recipe: Recipe, flops: float) -> Recipe:
     of the model that count scans only fall.
 
     Args:
-        recipe: recipe to scale.
+        preset: preset to scale.
         flops: number of floating-point operations that the training may take.
 
     Raises:
         ConfigError: the budget is smaller than one batch of every stage, or a stage has no settings of its training.
     """
-    if not recipe.training:
-        return recipe
-    costs, share, scaled = stage_costs(recipe), 1.0, recipe
+    if not preset.training:
+        return preset
+    costs, share, scaled = stage_costs(preset), 1.0, preset
     if not costs:
-        return recipe
+        return preset
     spent, best, best_spent = _flops_of(costs, scaled), None, 0
     for _ in range(_CORRECTIONS):
         # What is prepared once, such as a reflow's pairs, does not grow or shrink in proportion.
         share *= flops / spent
-        trained = {name: _scaled(recipe.settings_of(name), share) for name in costs}
-        scaled = replace(recipe, training={**recipe.training, **trained}, model=_with_fewer_scans(recipe.model, share))
+        trained = {name: _scaled(preset.settings_of(name), share) for name in costs}
+        scaled = replace(preset, training={**preset.training, **trained}, model=_with_fewer_scans(preset.model, share))
         spent = _flops_of(costs, scaled)
         if best_spent < spent <= flops * (1 + _OVERSPENT_AT_MOST):  # whole batches may come no nearer
             best, best_spent = scaled, spent
@@ -167,11 +167,11 @@ def with_budget(recipe: Recipe, flops: float) -> Recipe:
     return best or scaled
 
 
-def _flops_of(costs: Mapping[str, StageCost], recipe: Recipe) -> int:
-    return sum(cost.flops(recipe.settings_of(name).scans) for name, cost in costs.items())
+def _flops_of(costs: Mapping[str, StageCost], preset: Preset) -> int:
+    return sum(cost.flops(preset.settings_of(name).scans) for name, cost in costs.items())
 
 
-def _scaled(config: FitConfig, share: float) -> FitConfig:
+def _scaled(config: TrainingConfig, share: float) -> TrainingConfig:
     scans = round(config.scans * share / config.batch_size) * config.batch_size
     if scans < config.batch_size:
         raise ConfigError(

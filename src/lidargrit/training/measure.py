@@ -1,4 +1,4 @@
-"""A recipe → the time and memory of its training on this machine, predicted from a few timed steps of each stage."""
+"""A preset → the time and memory of its training on this machine, predicted from a few timed steps of each stage."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from lidargrit.generation.settings import Recipe
+from lidargrit.generation.settings import Preset
 from lidargrit.training.compute import duration, training_flops, uniform_images
-from lidargrit.training.fit import begin_training
+from lidargrit.training.stage import begin_training
 
 _WARM_UP_STEPS, _TIMED_STEPS = 1, 3  # the first one allocates and chooses kernels
 
@@ -42,17 +42,17 @@ class Measured:
         )
 
 
-def measure(recipe: Recipe) -> list[Measured]:
+def measure(preset: Preset) -> list[Measured]:
     """Take a few steps of every stage that is trained; predict the time of all, without reading and validation."""
     with torch.random.fork_rng(range(torch.cuda.device_count())):
         torch.manual_seed(0)
-        flops = training_flops(recipe)
-        generator = recipe.build_generator()
+        flops = training_flops(preset)
+        generator = preset.build_generator()
         found = []
         for stage in flops:  # those that are trained
-            config, objective = recipe.settings_of(stage), generator.objective(stage)
+            config, objective = preset.settings_of(stage), generator.objective(stage)
             engine, _ = begin_training(objective, config)
-            images = uniform_images(recipe.data.load_sensor(), config.batch_size // engine.world_size)
+            images = uniform_images(preset.data.load_sensor(), config.batch_size // engine.world_size)
             images = images.to(engine.device)
             prepared, begun = objective.preparation_flops(config.scans), 0.0
             for step in range(_WARM_UP_STEPS + _TIMED_STEPS):

@@ -12,11 +12,11 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from lidargrit.core.errors import ConfigError
 from lidargrit.generation.objective import Objective
-from lidargrit.generation.settings import FitConfig
+from lidargrit.generation.settings import TrainingConfig
 from lidargrit.nn.blocks import Block
 
 
-def make_optimiser(objective: nn.Module, config: FitConfig) -> torch.optim.Optimizer:
+def make_optimiser(objective: nn.Module, config: TrainingConfig) -> torch.optim.Optimizer:
     """Return the optimiser that the configuration names.
 
     Weights of linear layers decay; biases, norms, convolutions and embeddings do not.
@@ -91,7 +91,7 @@ def memory_of_weights(objective: nn.Module) -> int:
     return 2 * sum(t.nbytes for t in tensors) + 3 * sum(t.nbytes for t in learned)
 
 
-def learning_rate_at(config: FitConfig, scans_seen: int) -> float:
+def learning_rate_at(config: TrainingConfig, scans_seen: int) -> float:
     """Return the learning rate of the step that follows ``scans_seen`` scans."""
     share = min(scans_seen / config.scans, 1.0)
     factor = {

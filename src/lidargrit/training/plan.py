@@ -1,4 +1,4 @@
-"""The plan of a recipe's training: every setting by its name, sizes, budgets and estimated cost."""
+"""The plan of a preset's training: every setting by its name, sizes, budgets and estimated cost."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.data.images import RangeImages
 from lidargrit.data.sources import DatasetSource, PreparedSource, open_to_train
 from lidargrit.generation.objective import Objective
-from lidargrit.generation.settings import Recipe
+from lidargrit.generation.settings import Preset
 from lidargrit.nn.precision import Precision
 from lidargrit.training.compute import computing_time, training_flops
-from lidargrit.training.fit import follow_settings
 from lidargrit.training.optimiser import memory_of_weights
+from lidargrit.training.stage import follow_settings
 from lidargrit.training.taken_stages import donors_of_stages, taken_stages
 
 
@@ -48,11 +48,11 @@ class StagePlan:
 
 @dataclass(frozen=True)
 class TrainingPlan:
-    """Settings, sizes and costs of the training of a recipe.
+    """Settings, sizes and costs of the training of a preset.
 
     Args:
-        title: title of the recipe.
-        published: scores that a paper reports for the recipe, or "".
+        title: title of the preset.
+        published: scores that a paper reports for the preset, or "".
         settings: value of every setting, by its dotted name.
         rows: number of rows of an image.
         columns: number of columns of an image.
@@ -95,7 +95,7 @@ class TrainingPlan:
 
 @dataclass(frozen=True)
 class OpenedData:
-    """Sources of a recipe's scans, of which none has been read.
+    """Sources of a preset's scans, of which none has been read.
 
     Args:
         train: sources of the training scans.
@@ -106,22 +106,22 @@ class OpenedData:
     val: Sequence[DatasetSource | PreparedSource]
 
 
-def open_data(recipe: Recipe) -> OpenedData:
+def open_data(preset: Preset) -> OpenedData:
     """Open the sources of training and validation scans, as far as they can be checked before a scan is read.
 
     Raises:
         DataError: a source that is not there, holds no scans, or was prepared for another sensor or projection.
     """
-    opened = OpenedData(open_to_train(recipe.data.train, recipe.data), open_to_train(recipe.data.val, recipe.data))
+    opened = OpenedData(open_to_train(preset.data.train, preset.data), open_to_train(preset.data.val, preset.data))
     for source in (*opened.train, *opened.val):
         if isinstance(source, PreparedSource):
-            source.images(recipe.data.load_sensor(), recipe.data)
+            source.images(preset.data.load_sensor(), preset.data)
     return opened
 
 
 @dataclass(frozen=True)
 class CheckedStages:
-    """Stages of a recipe whose training can begin.
+    """Stages of a preset whose training can begin.
 
     Args:
         objectives: objective of every stage, without values, by the name of the stage.
@@ -151,11 +151,11 @@ class CheckedStages:
                 raise ConfigError(why, lacking.wanted, lacking.cure) from None
 
 
-def check_stages(recipe: Recipe, processes: int = 1) -> CheckedStages:
+def check_stages(preset: Preset, processes: int = 1) -> CheckedStages:
     """Refuse settings of any stage that its training would refuse, and stages to take that do not fit.
 
     Args:
-        recipe: recipe whose stages they are.
+        preset: preset whose stages they are.
         processes: number of processes that share each batch.
 
     Raises:
@@ -163,15 +163,15 @@ def check_stages(recipe: Recipe, processes: int = 1) -> CheckedStages:
             take from another run that does not fit.
         CheckpointError: no finished run to take stages from.
     """
-    sensor = recipe.data.load_sensor()
+    sensor = preset.data.load_sensor()
     with torch.device("meta"):  # sizes alone, without values, so that wide networks take no time
-        generator = recipe.build_generator(sensor).to("meta")
+        generator = preset.build_generator(sensor).to("meta")
         objectives = {name: generator.objective(name) for name in generator.stages}
-    donors = donors_of_stages(recipe, generator.stages)
-    taken_stages(recipe, generator)
+    donors = donors_of_stages(preset, generator.stages)
+    taken_stages(preset, generator)
     checked = CheckedStages(objectives, donors)
     for name, objective in checked.trained.items():
-        follow_settings(objective, recipe.settings_of(name), processes)
+        follow_settings(objective, preset.settings_of(name), processes)
     if others := [name for name, objective in checked.trained.items() if not objective.needs_marks]:
         for name in checked.trained.keys() - set(others):
             raise ConfigError(
@@ -182,29 +182,29 @@ def check_stages(recipe: Recipe, processes: int = 1) -> CheckedStages:
     return checked
 
 
-def plan_training(recipe: Recipe) -> TrainingPlan:
-    """Return the plan of a recipe's training; no scan is read, and nothing is written.
+def plan_training(preset: Preset) -> TrainingPlan:
+    """Return the plan of a preset's training; no scan is read, and nothing is written.
 
     Raises:
         ConfigError: settings that a stage cannot follow, or a stage to take from another run that does not fit.
         CheckpointError: no finished run to take stages from.
     """
-    sensor = recipe.data.load_sensor()
-    checked, stages = check_stages(recipe), []
-    flops = training_flops(recipe, checked.donors)
+    sensor = preset.data.load_sensor()
+    checked, stages = check_stages(preset), []
+    flops = training_flops(preset, checked.donors)
     for name, objective in checked.objectives.items():
         parameters = sum(weight.numel() for weight in objective.parameters())
         if name in checked.donors:
-            precision = recipe.training[name].precision if name in recipe.training else "fp32"
+            precision = preset.training[name].precision if name in preset.training else "fp32"
             stages.append(StagePlan(name, parameters, 0, 0, 0, 0, precision, checked.donors[name]))
             continue
-        budget = recipe.settings_of(name)
+        budget = preset.settings_of(name)
         size = (parameters, budget.scans, budget.batch_size, memory_of_weights(objective))
         stages.append(StagePlan(name, *size, flops[name], budget.precision))
     return TrainingPlan(
-        recipe.title,
-        recipe.published,
-        configuration.leaves(recipe),
+        preset.title,
+        preset.published,
+        configuration.leaves(preset),
         sensor.height,
         sensor.width,
         (sensor.range_min_m, sensor.range_max_m),

@@ -1,4 +1,4 @@
-"""Recipe → finished model in a run folder: the stages are trained in turn, and each resumes where it stopped."""
+"""Preset → finished model in a run folder: the stages are trained in turn, and each resumes where it stopped."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from lidargrit.core.files import claim_folder, claimed_manifest, is_taken, read_
 from lidargrit.core.reporting import Reporter
 from lidargrit.core.version import __version__
 from lidargrit.data.images import Provenance, RangeImages
-from lidargrit.data.run_folder import RUN_FILE, TRAINED_ON_FILE, locate, recipe_settings, trained_on, write_trained_on
+from lidargrit.data.run_folder import RUN_FILE, TRAINED_ON_FILE, locate, preset_settings, trained_on, write_trained_on
 from lidargrit.data.sources import joined_images
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
-from lidargrit.generation.settings import Recipe
+from lidargrit.generation.settings import Preset
 from lidargrit.training.checkpoint import fingerprint
 from lidargrit.training.engine import Engine
-from lidargrit.training.fit import Fit
 from lidargrit.training.plan import CheckedStages, OpenedData, check_stages, open_data
+from lidargrit.training.stage import StageTraining
 from lidargrit.training.taken_stages import taken_facts, taken_stages
 from lidargrit.training.tracking import tracked
 
 _IMAGES = "_images"  # of a hash of images, in place of their names
-# Settings of a recipe that change nothing that is computed, the last two of each stage.
+# Settings of a preset that change nothing that is computed, the last two of each stage.
 _NO_CHANGE, _NO_CHANGE_OF_STAGES = {"title", "published", "data.workers"}, ("checkpoint_every", "pictures_every")
 
 PlotProgress = Callable[[Generator, str, RangeImages, Path], None]
@@ -43,21 +43,21 @@ PlotProgress = Callable[[Generator, str, RangeImages, Path], None]
 
 
 def train(
-    recipe: Recipe,
+    preset: Preset,
     folder: Path,
     reporter: Reporter | None = None,
     plot: PlotProgress | None = None,
     wandb_project: str = "",
 ) -> Generator:
-    """Train every stage of a recipe in a run folder and return the finished generator.
+    """Train every stage of a preset in a run folder and return the finished generator.
 
-    The same call resumes a stopped training. Before the first step, the folder holds ``run.json`` (recipe, command,
+    The same call resumes a stopped training. Before the first step, the folder holds ``run.json`` (preset, command,
     versions); each stage adds a folder with its checkpoint and log; at the end ``config.json`` and
     ``model.safetensors`` are written. Under a launcher such as torchrun, every process makes this call, and only the
     first one writes. No second training can run in the folder at the same time.
 
     Args:
-        recipe: experiment to train.
+        preset: experiment to train.
         folder: run folder.
         reporter: receiver of progress and messages.
         plot: function that plots the progress, called every ``pictures_every`` scans of a stage.
@@ -67,24 +67,24 @@ def train(
         OutputError: the folder holds something else, another process trains in it, or it cannot be written.
         DataError, ScanError: the data cannot be used.
         TrainingError: the loss is not finite, or another process of a launcher has died.
-        ConfigError: a stage to be taken from another run has other settings or another sensor than the recipe.
+        ConfigError: a stage to be taken from another run has other settings or another sensor than the preset.
     """
     engine = Engine("fp32")  # tells which of several processes is the first, the only one that writes
     reporter = reporter if reporter and engine.rank == 0 else Reporter()
     with ExitStack() as held, engine.lost_processes_reported():
-        engine.by_first(lambda: check_folder(folder, recipe))
-        checked = check_stages(recipe, engine.world_size)
-        opened = open_data(recipe)
+        engine.by_first(lambda: check_folder(folder, preset))
+        checked = check_stages(preset, engine.world_size)
+        opened = open_data(preset)
         engine.by_first(lambda: held.enter_context(claim_folder(folder)))
-        engine.by_first(lambda: check_folder(folder, recipe))  # another process may have trained in it meanwhile
+        engine.by_first(lambda: check_folder(folder, preset))  # another process may have trained in it meanwhile
         begun = claimed_manifest(folder / RUN_FILE, folder / TRAINED_ON_FILE)
         engine.by_first(lambda: held.enter_context(begun))
-        engine.by_first(lambda: held.enter_context(tracked(wandb_project, recipe, folder)))
-        return _train(recipe, checked, opened, folder, reporter, plot, engine)
+        engine.by_first(lambda: held.enter_context(tracked(wandb_project, preset, folder)))
+        return _train(preset, checked, opened, folder, reporter, plot, engine)
 
 
 def _train(
-    recipe: Recipe,
+    preset: Preset,
     checked: CheckedStages,
     opened: OpenedData,
     folder: Path,
@@ -92,32 +92,32 @@ def _train(
     plot: PlotProgress | None,
     engine: Engine,
 ) -> Generator:
-    train_images = joined_images(opened.train, recipe.data, reporter)
-    val_images = joined_images(opened.val, recipe.data, reporter)
+    train_images = joined_images(opened.train, preset.data, reporter)
+    val_images = joined_images(opened.val, preset.data, reporter)
     _warn_of_overlap(train_images, val_images, reporter)
     checked.check_images("data.train", train_images)
     checked.check_images("data.val", val_images)
     with torch.random.fork_rng(range(torch.cuda.device_count())):  # the caller's own random numbers stay as they are
-        torch.manual_seed(derive_seed(recipe.seed, 9))
-        generator = recipe.build_generator()
-        taken = taken_stages(recipe, generator)
-        engine.by_first(lambda: _claim(folder, recipe, checked.donors, train_images, val_images))
+        torch.manual_seed(derive_seed(preset.seed, 9))
+        generator = preset.build_generator()
+        taken = taken_stages(preset, generator)
+        engine.by_first(lambda: _claim(folder, preset, checked.donors, train_images, val_images))
         generator.fit_statistics(train_images)
 
-        def fit_of(number: int, stage: str, built_on: str) -> Fit:
-            seed, objective = derive_seed(recipe.seed, number), generator.objective(stage)
+        def training_of(number: int, stage: str, built_on: str) -> StageTraining:
+            seed, objective = derive_seed(preset.seed, number), generator.objective(stage)
             if stage in taken:
                 objective.load_state_dict({**objective.state_dict(), **objective.weights_from(taken[stage])})
             picture = None if plot is None else partial(_plot, plot, generator, stage, val_images)
-            workers, config = recipe.data.workers, recipe.settings_of(stage)
-            return Fit(objective, config, folder / stage, seed, reporter, built_on, workers, picture)
+            workers, config = preset.data.workers, preset.settings_of(stage)
+            return StageTraining(objective, config, folder / stage, seed, reporter, built_on, workers, picture)
 
         built_on = ""
         for number, stage in enumerate(generator.stages):
             if stage in checked.donors:
                 trained = taken[stage]
             else:
-                trained = fit_of(number, stage, built_on).run(train_images, val_images, f"training {stage}")
+                trained = training_of(number, stage, built_on).run(train_images, val_images, f"training {stage}")
             generator.load_stage(stage, trained)
             built_on = fingerprint(trained)
             del trained  # with the tokens that it has kept of the scans
@@ -135,17 +135,17 @@ def _plot(
     plot(copied.to(next(averaged.parameters()).device).eval(), stage, val_images, path)
 
 
-def check_folder(folder: Path, recipe: Recipe) -> None:
-    """Refuse a folder that holds something else than a run of this recipe.
+def check_folder(folder: Path, preset: Preset) -> None:
+    """Refuse a folder that holds something else than a run of this preset.
 
     Raises:
         OutputError: the folder holds another run or other files.
         CheckpointError: its ``run.json`` cannot be used.
     """
     if (folder / RUN_FILE).exists():
-        about, mine = read_json(folder / RUN_FILE), configuration.leaves(configuration.to_json(recipe))
-        if not (other := recipe_settings(about)):
-            raise CheckpointError(f"{folder / RUN_FILE} without a recipe", "what lidargrit wrote", "restore the file")
+        about, mine = read_json(folder / RUN_FILE), configuration.leaves(configuration.to_json(preset))
+        if not (other := preset_settings(about)):
+            raise CheckpointError(f"{folder / RUN_FILE} without a preset", "what lidargrit wrote", "restore the file")
         if "origin" in about:
             raise OutputError(
                 f"{folder}, whose weights were {about['origin']}", "a run of train's", "choose another folder"
@@ -156,19 +156,19 @@ def check_folder(folder: Path, recipe: Recipe) -> None:
             name = sorted(differing)[0]
             raise OutputError(
                 f"{folder}, which holds another run (there {name}={other.get(name)}, here {mine.get(name)})",
-                "an empty folder, or the folder of this very recipe",
+                "an empty folder, or the folder of this very preset",
                 "choose another folder, or use the settings that the run began with",
             )
     elif is_taken(folder):
         raise OutputError(
             f"{folder}, which is not empty and holds no run",
-            "an empty folder, or one that this recipe began",
+            "an empty folder, or one that this preset began",
             "choose another folder",
         )
 
 
 def _claim(
-    folder: Path, recipe: Recipe, donors: Mapping[str, str], train_images: RangeImages, val_images: RangeImages
+    folder: Path, preset: Preset, donors: Mapping[str, str], train_images: RangeImages, val_images: RangeImages
 ) -> None:
     """Write ``run.json``, or check that a resumed run has the data with which it began."""
     data = {
@@ -193,12 +193,12 @@ def _claim(
                     "what it began with",
                     "restore it, or choose another folder",
                 )
-        _write_trained_on(folder, train_images, recipe.tokenizer_from or recipe.stages_from)
+        _write_trained_on(folder, train_images, preset.tokenizer_from or preset.stages_from)
         return
     about: dict[str, Any] = {
-        "recipe": configuration.to_json(recipe),
+        "preset": configuration.to_json(preset),
         "data": data,
-        **({"taken": taken_facts(recipe, donors)} if donors or recipe.fine_tune else {}),
+        **({"taken": taken_facts(preset, donors)} if donors or preset.fine_tune else {}),
         "command": sys.argv,
         "lidargrit": __version__,
         "commit": _commit(),
@@ -206,7 +206,7 @@ def _claim(
         "python": platform.python_version(),
     }
     write_json(folder / RUN_FILE, about)
-    _write_trained_on(folder, train_images, recipe.tokenizer_from or recipe.stages_from)
+    _write_trained_on(folder, train_images, preset.tokenizer_from or preset.stages_from)
 
 
 def _write_trained_on(folder: Path, train_images: RangeImages, donor: str | None) -> None:
@@ -231,8 +231,11 @@ def _warn_of_overlap(train_images: RangeImages, val_images: RangeImages, reporte
 
 
 def _commit() -> str:
+    """Return the commit of this program; "unknown" where it lies in another repository, as in a virtual environment."""
+    file = Path(__file__)
     try:
-        command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
-        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=5).stdout.strip()
+        command = ["git", "-C", str(file.parent), "rev-parse", "HEAD", f"HEAD:./{file.name}"]
+        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=5)
+        return done.stdout.partition("\n")[0]
     except (OSError, subprocess.SubprocessError):
         return "unknown"

@@ -1,4 +1,4 @@
-"""Trained stages of another run that a recipe takes as they are: recipe → objectives by the name of their stage."""
+"""Trained stages of another run that a preset takes as they are: preset → objectives by the name of their stage."""
 
 from __future__ import annotations
 
@@ -15,46 +15,46 @@ from lidargrit.core.files import read_json
 from lidargrit.data.run_folder import CHECKPOINT_FILE, RUN_FILE, locate, taken_over
 from lidargrit.generation.generator import Generator, load
 from lidargrit.generation.objective import Objective
-from lidargrit.generation.settings import Recipe
+from lidargrit.generation.settings import Preset
 from lidargrit.training.checkpoint import load_average
 
 _UNKNOWN_SCANS = "a run that does not say on which scans it was trained"  # in the place of a source
 _NOT_LEARNED = ("range_temperature", "distilled_steps", "distilled_pairs")  # of sampling, and of another stage
 
 
-def donors_of_stages(recipe: Recipe, stages: Sequence[str]) -> dict[str, str]:
+def donors_of_stages(preset: Preset, stages: Sequence[str]) -> dict[str, str]:
     """Return the run from which each stage is taken as it is, by the name of the stage; others are trained.
 
     Args:
-        recipe: recipe whose stages they are.
-        stages: names of the stages of the recipe's generator.
+        preset: preset whose stages they are.
+        stages: names of the stages of the preset's generator.
 
     Raises:
         CheckpointError: no finished run to take stages from.
     """
-    if recipe.tokenizer_from is not None:
-        return {"tokenizer": recipe.tokenizer_from}
-    if recipe.stages_from is None:
+    if preset.tokenizer_from is not None:
+        return {"tokenizer": preset.tokenizer_from}
+    if preset.stages_from is None:
         return {}
-    theirs = load(Path(recipe.stages_from)).stages
-    trained = {*recipe.train_anew, *recipe.fine_tune}
-    return {stage: recipe.stages_from for stage in stages if stage in theirs and stage not in trained}
+    theirs = load(Path(preset.stages_from)).stages
+    trained = {*preset.train_anew, *preset.fine_tune}
+    return {stage: preset.stages_from for stage in stages if stage in theirs and stage not in trained}
 
 
-def taken_facts(recipe: Recipe, donors: Mapping[str, str]) -> dict[str, Any]:
+def taken_facts(preset: Preset, donors: Mapping[str, str]) -> dict[str, Any]:
     """Return what a run must tell of the weights that it takes: training scans and files of all before it.
 
     Args:
-        recipe: recipe that takes them.
+        preset: preset that takes them.
         donors: run from which a stage is taken as it is, by the name of the stage.
 
     Returns:
         sources of training scans (``train``), files of imported weights (``files``), and the settings by which the
         stages that are not trained here were trained, None where they are not known (``training``).
     """
-    folder = locate(recipe.tokenizer_from or recipe.stages_from or "")
+    folder = locate(preset.tokenizer_from or preset.stages_from or "")
     about = read_json(folder / RUN_FILE) if (folder / RUN_FILE).is_file() else {}
-    theirs, before = about.get("recipe") or {}, taken_over(about)
+    theirs, before = about.get("preset") or {}, taken_over(about)
     trained = {} if about.get("files") else {**theirs.get("training", {}), **before["training"]}
     return {
         "train": sorted({*theirs.get("data", {}).get("train", [_UNKNOWN_SCANS]), *before["train"]}),
@@ -63,53 +63,53 @@ def taken_facts(recipe: Recipe, donors: Mapping[str, str]) -> dict[str, Any]:
     }
 
 
-def taken_stages(recipe: Recipe, generator: Generator) -> dict[str, Objective]:
-    """Return the trained stages that a recipe takes from another run, once they are known to fit the generator.
+def taken_stages(preset: Preset, generator: Generator) -> dict[str, Objective]:
+    """Return the trained stages that a preset takes from another run, once they are known to fit the generator.
 
-    Those that the recipe names in ``fine_tune`` are among them: their training starts from these weights. They may
+    Those that the preset names in ``fine_tune`` are among them: their training starts from these weights. They may
     lack what :attr:`Objective.additions` add, which begins untrained, and may be of another sensor if its weights fit.
     The run may be of another generator if what they share learns by the same objective.
 
     Raises:
         ConfigError: a stage of other sizes or another objective, a stage that is not trained of another sensor, or a
-            run of a generator without any of the recipe's stages.
+            run of a generator without any of the preset's stages.
         CheckpointError: no finished run.
     """
-    if recipe.tokenizer_from is not None:
+    if preset.tokenizer_from is not None:
         if "tokenizer" not in generator.stages:
-            got = f"tokenizer_from={recipe.tokenizer_from} for {generator.public_name()!r}, which has no tokenizer"
+            got = f"tokenizer_from={preset.tokenizer_from} for {generator.public_name()!r}, which has no tokenizer"
             raise ConfigError(got, "a generator with one, such as lidargrit, maskgit or lidm", "leave it out")
-        donor = load(Path(recipe.tokenizer_from))
-        _check(f"tokenizer_from={recipe.tokenizer_from}", _Stage("tokenizer", generator), _Stage("tokenizer", donor))
+        donor = load(Path(preset.tokenizer_from))
+        _check(f"tokenizer_from={preset.tokenizer_from}", _Stage("tokenizer", generator), _Stage("tokenizer", donor))
         return {"tokenizer": donor.get_tokenizer()}
-    if recipe.stages_from is None:
+    if preset.stages_from is None:
         return {}
-    donor = load(Path(recipe.stages_from))
+    donor = load(Path(preset.stages_from))
     shared = [stage for stage in generator.stages if stage in donor.stages]
     if type(donor) is not type(generator) and not _learn_alike(generator, donor, shared):
         raise ConfigError(
-            f"stages_from={recipe.stages_from}, a run of the generator {donor.public_name()!r}",
+            f"stages_from={preset.stages_from}, a run of the generator {donor.public_name()!r}",
             f"a run of {generator.public_name()!r}",
             "choose another run"
             + (", or set tokenizer_from to take its tokenizer alone" if "tokenizer" in generator.stages else ""),
         )
-    if unknown := sorted({*recipe.train_anew} - {*generator.stages}):
+    if unknown := sorted({*preset.train_anew} - {*generator.stages}):
         raise ConfigError(f"train_anew={unknown[0]}", f"one of {', '.join(generator.stages)}", "name a stage")
-    if both := sorted({*recipe.fine_tune} & {*recipe.train_anew}):
+    if both := sorted({*preset.fine_tune} & {*preset.train_anew}):
         got, cure = f"{both[0]} in fine_tune and in train_anew", "take it out of one of them, as by train_anew=[]"
         raise ConfigError(got, "a stage that is trained further or from new weights", cure)
-    if unknown := sorted({*recipe.fine_tune} - {*shared}):
-        names = ", ".join(stage for stage in shared if stage not in recipe.train_anew)
+    if unknown := sorted({*preset.fine_tune} - {*shared}):
+        names = ", ".join(stage for stage in shared if stage not in preset.train_anew)
         raise ConfigError(f"fine_tune={unknown[0]}", f"one of {names}", "name a stage that the run of stages_from has")
-    stages = [stage for stage in shared if stage not in recipe.train_anew]
+    stages = [stage for stage in shared if stage not in preset.train_anew]
     found = {}
     for name in stages:
         ours, theirs = _Stage(name, generator), _Stage(name, donor)
-        _check(f"stages_from={recipe.stages_from}", ours, theirs, name in recipe.fine_tune)
-        if name not in recipe.fine_tune:
-            _check_base(recipe, ours)
+        _check(f"stages_from={preset.stages_from}", ours, theirs, name in preset.fine_tune)
+        if name not in preset.fine_tune:
+            _check_base(preset, ours)
         else:
-            _restore(recipe.stages_from, theirs)
+            _restore(preset.stages_from, theirs)
         found[name] = theirs.objective
     return found
 
@@ -155,13 +155,13 @@ def _restore(run: str, stage: _Stage) -> None:
         )
 
 
-def _check_base(recipe: Recipe, stage: _Stage) -> None:
+def _check_base(preset: Preset, stage: _Stage) -> None:
     """Refuse a stage taken as it is whose training rested on networks that are to be trained."""
-    trained = {"train_anew": recipe.train_anew, "fine_tune": recipe.fine_tune}
+    trained = {"train_anew": preset.train_anew, "fine_tune": preset.fine_tune}
     for base in (name for name in stage.objective.over if name != stage.name):
         for setting in (setting for setting, names in trained.items() if base in names):
             raise ConfigError(
-                f"{setting}={base} without {stage.name}, which learned from the {base} of {recipe.stages_from}",
+                f"{setting}={base} without {stage.name}, which learned from the {base} of {preset.stages_from}",
                 f"both trained, or neither: the {stage.name} is of no use with another {base}",
                 f"add {stage.name} to train_anew or fine_tune",
             )
@@ -193,7 +193,7 @@ def _check(setting: str, mine: _Stage, given: _Stage, trained: bool = False) -> 
     if others or not same_sensor:
         raise ConfigError(
             f"{setting}, whose {stage} is another ({[*others, 'data.sensor'][0]})",
-            f"one of this recipe's {mine.prefix} and sensor",
+            f"one of this preset's {mine.prefix} and sensor",
             "set them as there, or choose another run",
         )
 

@@ -11,16 +11,16 @@ from pathlib import Path
 from lidargrit.core import configuration
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.processes import rank_and_world_size
-from lidargrit.generation.settings import Recipe
+from lidargrit.generation.settings import Preset
 
 
 @contextmanager
-def tracked(project: str, recipe: Recipe, folder: Path) -> Iterator[None]:
+def tracked(project: str, preset: Preset, folder: Path) -> Iterator[None]:
     """Send what is logged within the ``with`` block to a project on Weights & Biases; a resumed run is one run there.
 
     Args:
         project: name of the project; "" to send nothing.
-        recipe: recipe of the run, whose settings are sent.
+        preset: preset of the run, whose settings are sent.
         folder: run folder.
 
     Raises:
@@ -38,7 +38,7 @@ def tracked(project: str, recipe: Recipe, folder: Path) -> Iterator[None]:
             name=folder.name,
             id=hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:16],
             resume="allow",
-            config=configuration.to_json(recipe),
+            config=configuration.to_json(preset),
             dir=folder.parent,
             sync_tensorboard=True,
         )

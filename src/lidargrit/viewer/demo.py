@@ -27,8 +27,8 @@ from lidargrit.evaluation.reconstruction import ReconstructionErrors, score_reco
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.generation.generator import Generator, load
 from lidargrit.generation.pixel_decoder.pixel_phases import completed_lattices
-from lidargrit.generation.presets import load_recipe
-from lidargrit.generation.settings import Recipe
+from lidargrit.generation.presets import load_preset
+from lidargrit.generation.settings import Preset
 from lidargrit.inference.samples import write_samples
 from lidargrit.nn.devices import usable_device
 from lidargrit.nn.random import rngs_of
@@ -66,27 +66,27 @@ def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter
     Args:
         data: a folder of scans or another source; None for simulated scans.
         folder: run folder, which also gets ``demo.html``, ``samples``, ``evaluation.json`` and two pictures.
-        settings: changed settings of the recipe, as ``--set`` takes them.
+        settings: changed settings of the preset, as ``--set`` takes them.
         reporter: receiver of progress and messages.
         anew: whether all networks are trained anew, instead of beginning with those of the model in the package.
     """
-    recipe = _recipe(data, settings, reporter, anew)
-    check_folder(folder, recipe)
-    expected_s = _expected_s(recipe, simulates=data is None)
+    preset = _preset(data, settings, reporter, anew)
+    check_folder(folder, preset)
+    expected_s = _expected_s(preset, simulates=data is None)
     minutes = max(1, round(sum(expected_s.values()) / 60))
     about = f"about {minutes} minute{'s' if minutes > 1 else ''} on two cores"
     reporter.message(f"lidargrit demo: {about}; stop it at any time, the same command goes on")
-    reporter.message(how_trained(recipe))
+    reporter.message(how_trained(preset))
     reporter.expect(expected_s)
     clock = _Clock(folder / TIMINGS)
     with clock.stage("read the scans and project them" if data else "simulate scans and project them"):
-        real = load_range_images(recipe.data.train, recipe.data, reporter)
-        val = load_range_images(recipe.data.val, recipe.data, reporter)
-    generator = train(recipe, folder, reporter)
+        real = load_range_images(preset.data.train, preset.data, reporter)
+        val = load_range_images(preset.data.val, preset.data, reporter)
+    generator = train(preset, folder, reporter)
     clock.keep()
-    for stage in _trained_stages(recipe):
+    for stage in _trained_stages(preset):
         clock.add(f"train the {stage}", _trained_s(folder / stage / LOG_FILE))
-    sampling = _sampling(recipe)
+    sampling = _sampling(preset)
     with clock.stage(f"sample {_NUM_SAMPLES} new scans"):
         generator.to(usable_device(""))
         write_samples(generator, folder, folder / "samples", range(_NUM_SAMPLES), sampling, reporter)
@@ -112,16 +112,16 @@ def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter
     kind = "real" if data else "simulated"
     _plot_pictures(generator, kind, val, samples, sampling, folder)
     scans = f"{len(real):,} {kind} scans to learn from and {len(val):,} held out, of the sensor {generator.sensor.name}"
-    results = reconstruction, card, clock.seconds, _facts(recipe, generator, scans), folder
+    results = reconstruction, card, clock.seconds, _facts(preset, generator, scans), folder
     write_results_page(generator, kind, val, samples, *results, packaged, sampling)
     return folder
 
 
-def _facts(recipe: Recipe, generator: Generator, scans: str) -> tuple[str, ...]:
+def _facts(preset: Preset, generator: Generator, scans: str) -> tuple[str, ...]:
     """Return short sentences about the model and its training, with one about the scans."""
     weights = sum(weight.numel() for weight in generator.parameters()) / 1e6
-    facts = (how_trained(recipe), f"LidarGRIT at a small size: {weights:.1f} million weights", scans)
-    if _sampling(recipe) == _DEFAULT:
+    facts = (how_trained(preset), f"LidarGRIT at a small size: {weights:.1f} million weights", scans)
+    if _sampling(preset) == _DEFAULT:
         return facts
     return (
         *facts,
@@ -130,10 +130,10 @@ def _facts(recipe: Recipe, generator: Generator, scans: str) -> tuple[str, ...]:
     )
 
 
-def how_trained(recipe: Recipe) -> str:
+def how_trained(preset: Preset) -> str:
     """Return which networks the demo trains anew, trains further and takes as they are, in a sentence for each."""
-    stages = _trained_stages(recipe)
-    further = [stage for stage in stages if stage in recipe.fine_tune]
+    stages = _trained_stages(preset)
+    further = [stage for stage in stages if stage in preset.fine_tune]
     sentences = (
         ([stage for stage in _STAGES if stage not in stages], "comes", "come", "as trained, from {package}"),
         (further, "learns", "learn", "further here, from the weights of {package}"),
@@ -256,42 +256,42 @@ def divided(data: str, reporter: Reporter) -> DataConfig:
     return DataConfig(train=(train,), val=(val,), sensor=dataset.sensor, max_scans=_MAX_SCANS)
 
 
-def _recipe(data: str | None, settings: list[str], reporter: Reporter, anew: bool) -> Recipe:
-    """Return the recipe that suits the scans: from the model in the package, if that is wanted and has their rays."""
+def _preset(data: str | None, settings: list[str], reporter: Reporter, anew: bool) -> Preset:
+    """Return the preset that suits the scans: from the model in the package, if that is wanted and has their rays."""
     config = None if data is None else divided(data, reporter)
 
-    def recipe_of(name: str) -> Recipe:
-        recipe = load_recipe(name)
-        return override(recipe if config is None else replace(recipe, data=config), settings)
+    def preset_of(name: str) -> Preset:
+        preset = load_preset(name)
+        return override(preset if config is None else replace(preset, data=config), settings)
 
     if not anew:
-        recipe = recipe_of("demo_transformer" if config is None else "demo_fine_tuned")
-        if recipe.data.load_sensor().same_rays(load(PRETRAINED).sensor):
-            return recipe
+        preset = preset_of("lidargrit_demo_transformer" if config is None else "lidargrit_demo_fine_tuned")
+        if preset.data.load_sensor().same_rays(load(PRETRAINED).sensor):
+            return preset
         reporter.message("the model in the package is of another sensor or image size, so all is trained anew")
-    return recipe_of("demo_pixels")
+    return preset_of("lidargrit_demo_pixels")
 
 
-def _trained_stages(recipe: Recipe) -> list[str]:
-    """Return the stages that a recipe trains, in their order."""
-    donors = donors_of_stages(recipe, tuple(_STAGES))
-    return [stage for stage in _STAGES if stage in recipe.training and stage not in donors]
+def _trained_stages(preset: Preset) -> list[str]:
+    """Return the stages that a preset trains, in their order."""
+    donors = donors_of_stages(preset, tuple(_STAGES))
+    return [stage for stage in _STAGES if stage in preset.training and stage not in donors]
 
 
-def _sampling(recipe: Recipe) -> TokenSampling:
+def _sampling(preset: Preset) -> TokenSampling:
     """Return how new scans are sampled: sharper where the pixel decoder was trained anew."""
-    begun_anew = "pixels" in _trained_stages(recipe) and "pixels" not in recipe.fine_tune
+    begun_anew = "pixels" in _trained_stages(preset) and "pixels" not in preset.fine_tune
     return _SHARPER if begun_anew else _DEFAULT
 
 
-def _expected_s(recipe: Recipe, simulates: bool) -> dict[str, float]:
+def _expected_s(preset: Preset, simulates: bool) -> dict[str, float]:
     """Return the expected time of each long step of the demo on two cores, in seconds."""
-    sensor, sizes = recipe.data.load_sensor(), recipe.model.transformer
+    sensor, sizes = preset.data.load_sensor(), preset.model.transformer
     each_s, (encoded_s, weight_s) = dict(_TRAINED_S), _TRANSFORMER_S
     each_s["transformer"] = encoded_s + weight_s * 12 * sizes.layers * sizes.width**2
     share = sensor.height * sensor.width / (64 * 256)
-    stages = _trained_stages(recipe)
-    training_s = {f"training {stage}": recipe.training[stage].scans * share * each_s[stage] for stage in stages}
+    stages = _trained_stages(preset)
+    training_s = {f"training {stage}": preset.training[stage].scans * share * each_s[stage] for stage in stages}
     return {
         "projecting scans": _SIMULATED_S if simulates else _READ_S,
         **training_s,

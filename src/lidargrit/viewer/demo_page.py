@@ -333,7 +333,7 @@ def _next(demo: DemoPage) -> str:
             "generate more scans in the browser, with other seeds and temperatures, or reconstruct your own",
         ),
         (f"lidargrit sample {run} samples -n 100", "sample a hundred scans into a folder"),
-        ("lidargrit train small runs/small", "train for an hour or two instead of minutes, for better scans"),
+        ("lidargrit train lidargrit_small runs/small", "train for an hour or two instead of minutes, for better scans"),
     )
     items = "".join(f"<li><code>{command}</code>: {purpose}</li>" for command, purpose in commands)
     return _step("", "What to do next", "", f"<ul>{items}</ul>")

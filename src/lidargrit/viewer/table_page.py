@@ -62,9 +62,9 @@ def table_page(cells: Sequence[dict[str, Any]], flops: float) -> str:
         flops: floating-point operations of the training of each; 0 where each had its own budget.
     """
     budget = (
-        f"Each recipe was trained with {flops:.2g} floating-point operations"
+        f"Each preset was trained with {flops:.2g} floating-point operations"
         if flops
-        else "Each recipe was trained with its own budget"
+        else "Each preset was trained with its own budget"
     )
     costs = {str(cell["system"]): cell["costs"] for cell in cells}
     tables = comparable([(str(cell["system"]), Scorecard.from_json(cell["scores"])) for cell in cells])

@@ -36,6 +36,7 @@ from lidargrit.scans.types import TYPICAL_LOG_RANGE, Decoded
 LOGIT_BOUND = 8.0  # of the decoder's return logits, beyond which it is as good as sure
 _HALVINGS_AT_MOST = 8  # of one side alone
 _MAY_BE_0 = ("column_halvings", "row_halvings", "coarse_range_width")
+_FREE_COMPONENTS = 4  # of a range's distribution, begin at the decoded range; others begin at neighbours
 _COARSE_AREA = 64  # lattices with one in so many pixels, or fewer, are coarse
 _FINEST_M, _COARSEST_M = math.exp(-6), math.exp(4)  # scales of a component: 2.5 mm to 55 m
 
@@ -60,8 +61,6 @@ class PixelDecoderConfig:
         coarse_range_width: number of channels of the range network's layers of lattices with one in 64 pixels or
             fewer; 0 for ``range_width``. Channels cost little there, and coarse ranges decide how straight walls are.
         blocks: number of residual blocks of each network.
-        free_components: number of components of a range's distribution that begin at the decoded range; 6 more begin at
-            neighbours.
         surface_components: whether 8 more components begin on planes and straight lines through neighbours, so that the
             surfaces on both sides of an edge are continued.
         gravity_components: whether 8 more components begin on vertical planes through two earlier pixels and on
@@ -81,7 +80,6 @@ class PixelDecoderConfig:
     range_width: int = 48
     coarse_range_width: int = 0
     blocks: int = 2
-    free_components: int = 4
     surface_components: bool = False
     gravity_components: bool = False
     range_temperature: float = 0.35
@@ -320,14 +318,13 @@ class RangeNetwork(PhaseNetwork):
         phases = phases_of(config.coarsest_cell, config.column_halvings, config.row_halvings)
         suggest = RangeCandidates(sensor, phases, config.surface_components, config.gravity_components)
         self.context_channels = 4 * 3 + suggest.count + suggest.distances
-        components = config.free_components + suggest.count
+        components = _FREE_COMPONENTS + suggest.count
         widths = (config.range_width, config.coarse_range_width or config.range_width)
         super().__init__(config, sensor, features, config.range_features, widths, 3 * components)
         self.suggest = suggest
         self.limits_m = (sensor.range_min_m, sensor.range_max_m)
-        self.free = config.free_components
-        spread = torch.linspace(-0.2, 0.2, self.free) if self.free > 1 else torch.zeros(1)
-        scale = torch.cat((torch.zeros(self.free), torch.full((suggest.count,), -2.0)))
+        spread = torch.linspace(-0.2, 0.2, _FREE_COMPONENTS)
+        scale = torch.cat((torch.zeros(_FREE_COMPONENTS), torch.full((suggest.count,), -2.0)))
         self.register_buffer("begin", spread[:, None, None], persistent=False)
         self.register_buffer("begin_scale", scale[:, None, None], persistent=False)
 
@@ -390,8 +387,8 @@ class RangeNetwork(PhaseNetwork):
     def mixture(self, output: Float[Tensor, "P B O h w"], candidates: Float[Tensor, "P B K h w"]) -> RangeMixture:
         """Return the distributions of the ranges of the pixels of phases of one lattice."""
         logits, moved, scales = output.chunk(3, 2)
-        free = candidates[:, :, -1:] + 2 * (moved[:, :, : self.free] + self.begin)
-        centres = torch.cat((free, candidates[:, :, :-1] + 0.1 * moved[:, :, self.free :]), 2)
+        free = candidates[:, :, -1:] + 2 * (moved[:, :, :_FREE_COMPONENTS] + self.begin)
+        centres = torch.cat((free, candidates[:, :, :-1] + 0.1 * moved[:, :, _FREE_COMPONENTS:]), 2)
         low, high = (math.log1p(limit) for limit in self.limits_m)
         centres = centres.clamp(low, high)
         log_scales_m = (1.5 * (scales + self.begin_scale)).clamp(math.log(_FINEST_M), math.log(_COARSEST_M))

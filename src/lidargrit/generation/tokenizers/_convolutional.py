@@ -17,7 +17,7 @@ from lidargrit.nn.quantiser import CodebookLoss, VectorQuantiser
 from lidargrit.scans.types import RangeImage
 
 
-def check_sizes(channels: int, residual_blocks: int, code_dim: int, num_codes: int, norm_groups: int) -> None:
+def check_sizes(channels: int, residual_blocks: int, code_dim: int, num_codes: int, norm_groups: int = 32) -> None:
     """Refuse sizes of which no network can be built.
 
     Raises:

@@ -54,7 +54,7 @@ class VqvaeConfig(TokenizerConfig):
     """Sizes and losses of the VQ-VAE; the defaults are the paper's for KITTI odometry.
 
     Args:
-        channels: number of channels at the finest level, a multiple of ``norm_groups``.
+        channels: number of channels at the finest level, a multiple of 32.
         channel_multipliers: channels of each level, from fine to coarse, over those of the finest; each further level
             halves rows and columns, or rows alone; see ``cell_columns``.
         cell_columns: number of columns of the cell of pixels that a token stands for; 0 for as many as rows. With fewer
@@ -85,8 +85,6 @@ class VqvaeConfig(TokenizerConfig):
         codebook_loss: ``paper``, ``reference``, ``vqvae`` or ``ema``; see lidargrit.nn.quantiser.
         restart_dead_codes: whether codes that are hardly ever used restart from latents, so that the codebook does not
             collapse; the reference has no such remedy.
-        norm_groups: number of groups of every group norm. A group of one channel loses its mean over the image: 32
-            channels of a small network in 32 groups know of no mean level.
     """
 
     channels: int = 64
@@ -107,10 +105,9 @@ class VqvaeConfig(TokenizerConfig):
     reflectance_weight: float = 1.0
     codebook_loss: CodebookLoss = "paper"
     restart_dead_codes: bool = True
-    norm_groups: int = 32
 
     def __post_init__(self) -> None:
-        check_sizes(self.channels, self.residual_blocks, self.code_dim, self.num_codes, self.norm_groups)
+        check_sizes(self.channels, self.residual_blocks, self.code_dim, self.num_codes)
         if not 1 <= len(self.channel_multipliers) <= _LEVELS_AT_MOST or min(self.channel_multipliers) < 1:
             raise ConfigError(
                 f"channel_multipliers={self.channel_multipliers}",
@@ -140,7 +137,7 @@ class VqvaeConfig(TokenizerConfig):
 
 
 def _block(config: VqvaeConfig, inputs: int, outputs: int) -> ResidualBlock:
-    return ResidualBlock(inputs, outputs, config.dropout, config.padding, norm_groups=config.norm_groups)
+    return ResidualBlock(inputs, outputs, config.dropout, config.padding)
 
 
 def _level(config: VqvaeConfig, inputs: int, width: int, num_blocks: int) -> Level:
@@ -162,7 +159,7 @@ class Encoder(ConvolutionalEncoder):
             if level < len(widths) - 1:
                 made.downsample = Downsample(width, c.padding, column_stride=1 + c.halves_columns(level))
         self.mid = _middle(c)
-        self.norm_out = group_norm(widths[-1], c.norm_groups)
+        self.norm_out = group_norm(widths[-1])
         self.conv_out = Convolution(widths[-1], c.code_dim, c.padding)
 
 
@@ -183,7 +180,7 @@ class Decoder(ConvolutionalDecoder):
             if (finer := len(widths) - 2 - level) >= 0:
                 made.upsample = Upsample(width, c.padding, c.halves_columns(finer))
         self.up = nn.ModuleList(reversed(coarse_to_fine))
-        self.norm_out = group_norm(widths[0], c.norm_groups)
+        self.norm_out = group_norm(widths[0])
         self.conv_out = Convolution(widths[0], 1 + c.raydrop_loss + c.reflectance, c.padding)
 
     def prepared(self, precision: Precision) -> Decoder:

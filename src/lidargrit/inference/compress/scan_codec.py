@@ -65,7 +65,7 @@ class ScanCodec:
             raise ConfigError(
                 f"a model of {generator.public_name()!r} without a pixel decoder",
                 "one whose pixels have probabilities",
-                "take pretrained, or train a recipe with the stage pixels, such as compact_pixels",
+                "take pretrained, or train a preset with the stage pixels, such as lidargrit_compact_pixels",
             )
         Encoder()  # says at once if there is no range coder
         self.sensor, self.steps = generator.sensor, RangeSteps(generator.sensor, step_mm)

@@ -13,16 +13,15 @@ def logistic_noise(size: tuple[int, ...], rng: torch.Generator) -> Float[Tensor,
     return uniform.log() - (-uniform).log1p()
 
 
-def straight_through(logits: Tensor, noise: Tensor, temperature: float) -> Float[Tensor, "..."]:
-    """Return 0 or 1 by the sign of logits + noise, with the gradient of a sigmoid as steep as the temperature is low.
+def straight_through(logits: Tensor, noise: Tensor) -> Float[Tensor, "..."]:
+    """Return 0 or 1 by the sign of logits + noise, with the gradient of a sigmoid.
 
     Args:
         logits: logits of the probability of 1.
         noise: noise of the same shape, or of one that broadcasts; see :func:`logistic_noise`.
-        temperature: temperature of the sigmoid, above 0.
 
     Source:
         Maddison et al., The Concrete Distribution, 2017; Jang et al., Gumbel-Softmax, 2017, section 2.2.
     """
-    soft = torch.sigmoid((logits.float() + noise) / temperature)
+    soft = torch.sigmoid(logits.float() + noise)
     return ((soft > 0.5).float() - soft).detach() + soft

@@ -31,7 +31,6 @@ from lidargrit.scans.sensors import SensorModel, load_sensor
 from lidargrit.scans.types import MaskDecoding, RangeImage
 from lidargrit.systems.dusty.dcgan import LEVELS, Discriminator, Synthesis, Widths, from_published
 from lidargrit.systems.dusty.differentiable_augmentation import (
-    AugmentationDefect,
     DifferentiableAugmentation,
     augment_differentiably,
 )
@@ -58,35 +57,27 @@ class DustyConfig:
         latent_dim: length of a latent.
         channels: channels of the finest level of both networks; each of the four coarser levels has twice as many.
         max_channels: largest number of channels of any level.
-        temperature: temperature of the soft copy of the returns, through which gradients flow.
         penalty_weight: gamma of the penalty on the discriminator's gradient at real images (R1).
         penalty_every: steps between two penalties, each of which then counts as many times (Karras et al., StyleGAN2,
             2020). The program takes it at every step, which is a fifth more computation.
         augmentations: changes of all images that the discriminator sees; see
             lidargrit.systems.dusty.differentiable_augmentation.
-        augmentation_defects: defects of the program to repeat; none by default.
     """
 
     variant: DustyVariant = "dusty_1"
     latent_dim: int = 512
     channels: int = 64
     max_channels: int = 512
-    temperature: float = 1.0
     penalty_weight: float = 1.0
     penalty_every: int = 16
     augmentations: tuple[DifferentiableAugmentation, ...] = ("brightness", "contrast", "translation", "cutout")
-    augmentation_defects: tuple[AugmentationDefect, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("latent_dim", "channels", "max_channels", "penalty_every"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name}={getattr(self, name)}", "at least 1", "raise it")
-        if not (self.temperature > 0 and self.penalty_weight >= 0):
-            raise ConfigError(
-                f"temperature={self.temperature}, penalty_weight={self.penalty_weight}",
-                "a temperature above 0 and a weight of 0 or more",
-                "raise the one that is too low",
-            )
+        if not self.penalty_weight >= 0:
+            raise ConfigError(f"penalty_weight={self.penalty_weight}", "0 or more", "raise it")
 
 
 @dataclass(frozen=True)
@@ -307,14 +298,14 @@ class AdversarialObjective(Objective):
         if logits is None:
             return encoded, (encoded.detach() > _NO_RETURN + 2 * _TOLERANCE["baseline"]).float().mean()
         noise = logistic_noise((count, 1, *encoded.shape[-2:]), rng)
-        returned = straight_through(logits[:, :1], noise, self.config.temperature)
+        returned = straight_through(logits[:, :1], noise)
         if logits.shape[1] > 1:
             whole = logistic_noise((count, 1, 1, 1), rng) if self.training else torch.zeros_like(noise[..., :1, :1])
-            returned = returned * straight_through(logits[:, 1:], whole, self.config.temperature)
+            returned = returned * straight_through(logits[:, 1:], whole)
         return returned * encoded + (1 - returned) * _NO_RETURN, returned.detach().mean()
 
     def _augment(self, images: Tensor, rng: torch.Generator) -> Tensor:
-        return augment_differentiably(images, self.config.augmentations, self.config.augmentation_defects, rng)
+        return augment_differentiably(images, self.config.augmentations, (), rng)
 
 
 def load_published(path: Path, sensor: SensorModel | None = None) -> Dusty:

@@ -251,7 +251,7 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
             raise ConfigError(
                 "completion=network for a model without a network for what is known of these scans",
                 "a model with one",
-                "leave completion out, or train a recipe with its stage: compact_completion or compact_raydrop",
+                "leave completion out, or train a preset with its stage: completion_compact or raydrop_compact",
             )
         changed = [
             f"{each.name}={getattr(sampling, each.name)}"

@@ -15,32 +15,17 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lidargrit.core.errors import ConfigError
-
 TIME_STEPS = 1000  # of the training
+_BETA_FIRST, _BETA_LAST = 0.0015, 0.0195  # variances of the noise that the first and the last of them add
 STEPS_AT_MOST = TIME_STEPS // 2  # of the sampling: with more, the program's rule would leave out the noisiest
 
 LatentDenoiser = Callable[[Tensor, Tensor], Tensor]
 """(noisy latents (B, D, h, w), their time step (B,)) → the noise in them."""
 
 
-def signal_shares(beta_first: float, beta_last: float) -> Float[Tensor, "1000"]:
-    """Return ᾱ of every step, in 64 bits; the square root of β grows linearly.
-
-    Args:
-        beta_first: variance of the noise that the first step adds.
-        beta_last: variance of the noise that the last step adds.
-
-    Raises:
-        ConfigError: no two growing shares between 0 and 1.
-    """
-    if not 0 < beta_first < beta_last < 1:
-        raise ConfigError(
-            f"beta_first={beta_first}, beta_last={beta_last}",
-            "two numbers between 0 and 1, the first the smaller",
-            "0.0015 and 0.0195 are published",
-        )
-    betas = torch.linspace(math.sqrt(beta_first), math.sqrt(beta_last), TIME_STEPS, dtype=torch.float64).square()
+def signal_shares() -> Float[Tensor, "1000"]:
+    """Return ᾱ of every step, in 64 bits; the square root of β grows linearly."""
+    betas = torch.linspace(math.sqrt(_BETA_FIRST), math.sqrt(_BETA_LAST), TIME_STEPS, dtype=torch.float64).square()
     return (1 - betas).cumprod(0)
 
 

@@ -36,13 +36,11 @@ _NOT_READ = (f"{_FIRST_STAGE}loss.*", f"{_AVERAGE}decay", f"{_AVERAGE}num_update
 
 @dataclass(frozen=True)
 class LidmConfig:
-    """The two networks and the noise schedule; the defaults are the published ones.
+    """The two networks; the defaults are the published ones.
 
     Args:
         tokenizer: configuration of a tokenizer with a codebook; ``curve_vqvae`` is LiDM's own, ``vqvae`` LidarGRIT's.
         denoiser: sizes of the network that removes noise from its latents.
-        beta_first: variance of the noise that the first of 1,000 steps adds.
-        beta_last: variance of the noise that the last step adds.
         scale_latents: whether latents are divided by the standard deviation of the codebook's numbers before noise is
             added. LiDM takes its own latents as they are; those of another tokenizer may be of any size.
         latent_axes: number of principal axes of the codebook along which noise is added and removed, each divided by
@@ -51,13 +49,8 @@ class LidmConfig:
 
     tokenizer: TokenizerConfig = field(default_factory=CurveVqvaeConfig)
     denoiser: LatentUnetConfig = field(default_factory=LatentUnetConfig)
-    beta_first: float = 0.0015
-    beta_last: float = 0.0195
     scale_latents: bool = False
     latent_axes: int = 0
-
-    def __post_init__(self) -> None:
-        latent_diffusion.signal_shares(self.beta_first, self.beta_last)
 
 
 @dataclass(frozen=True)
@@ -195,7 +188,7 @@ class Lidm(Generator[LidmConfig, LidmSampling]):
             raise CheckpointError(
                 f"{path}, which holds no decoder of a tokenizer {config.tokenizer.name()!r}",
                 "a checkpoint of LiDM's diffusion model, which holds its first stage too",
-                "check the path, and use the recipe lidm_kitti_360",
+                "check the path, and use the preset lidm_kitti_360",
             )
         tokenizer = replace(config.tokenizer, mask_head=len(last_layer) > 1)
         generator = cls(replace(config, tokenizer=tokenizer, scale_latents=False), sensor)
@@ -209,14 +202,14 @@ class Lidm(Generator[LidmConfig, LidmSampling]):
         return generator.eval()
 
     def _shares(self) -> Float[Tensor, "1000"]:
-        return latent_diffusion.signal_shares(self.config.beta_first, self.config.beta_last)
+        return latent_diffusion.signal_shares()
 
 
 class LatentDenoising(Objective):
     """The objective: the squared error of the predicted noise in the latents of a frozen tokenizer, at random steps."""
 
     over = ("tokenizer",)
-    settings = ("beta_first", "beta_last", "scale_latents", "latent_axes")
+    settings = ("scale_latents", "latent_axes")
     latent_scale: Tensor
 
     def __init__(

@@ -1,1 +1,0 @@
-"""Experiments with ``dusty``, one a file."""

@@ -1,1 +1,0 @@
-"""Experiments with ``lidargan``, one a file."""

@@ -1,1 +1,0 @@
-"""Experiments with ``lidargen``, one a file."""

@@ -1,1 +1,0 @@
-"""Experiments with ``lidargrit``, one a file."""

@@ -1,1 +1,0 @@
-"""Experiments with ``lidarvae``, one a file."""

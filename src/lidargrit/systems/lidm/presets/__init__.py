@@ -1,1 +1,0 @@
-"""Experiments with ``lidm``, one a file."""

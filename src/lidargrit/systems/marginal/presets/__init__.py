@@ -1,1 +1,0 @@
-"""Experiments with ``marginal``, one a file."""

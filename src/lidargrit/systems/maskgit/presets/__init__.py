@@ -1,1 +1,0 @@
-"""Experiments with ``maskgit``, one a file."""

@@ -1,1 +1,0 @@
-"""Experiments with ``memorised``, one a file."""

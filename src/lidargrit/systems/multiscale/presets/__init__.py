@@ -1,1 +1,0 @@
-"""Experiments with ``multiscale``, one a file."""

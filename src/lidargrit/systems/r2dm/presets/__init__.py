@@ -1,1 +1,0 @@
-"""Experiments with ``r2dm``, one a file."""

@@ -1,1 +1,0 @@
-"""Experiments with ``r2flow``, one a file."""

@@ -1,1 +1,0 @@
-"""Experiments with ``ultralidar``, one a file."""

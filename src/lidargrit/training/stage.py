@@ -1,0 +1,260 @@
+"""The training loop of every model: (objective, range images, configuration) → trained weights in a folder."""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from lidargrit.core.determinism import derive_seed, evenly_spaced
+from lidargrit.core.errors import ConfigError, Terminated, TrainingError
+from lidargrit.core.files import remove_partials
+from lidargrit.core.reporting import Reporter
+from lidargrit.data.batches import Batches
+from lidargrit.data.images import RangeImages
+from lidargrit.data.run_folder import CHECKPOINT_FILE
+from lidargrit.generation.objective import Objective
+from lidargrit.generation.settings import TrainingConfig
+from lidargrit.nn.blocks import prepare_for_training
+from lidargrit.scans.types import RangeImage
+from lidargrit.training.checkpoint import load_checkpoint, save_checkpoint
+from lidargrit.training.engine import Engine
+from lidargrit.training.log import Log
+from lidargrit.training.optimiser import WeightAverage, learning_rate_at, make_optimiser
+from lidargrit.training.termination import Termination
+
+_LOG_EVERY_STEPS = 20
+
+
+@dataclass
+class StageTraining:
+    """One stage of a run in training.
+
+    Args:
+        objective: objective that the stage minimises.
+        config: settings of the stage's training.
+        folder: folder of ``checkpoint.safetensors`` and ``log.jsonl``.
+        seed: seed of order, augmentation, dropout and the objective's random numbers.
+        reporter: receiver of progress and messages.
+        built_on: fingerprint of the earlier stage's weights; a checkpoint with another one is refused.
+        workers: number of threads that read ahead.
+        plot: function that plots the averaged objective into a file; None for no pictures.
+        deadline_s: value of ``time.monotonic()`` at which training stops as it does by SIGTERM.
+    """
+
+    objective: Objective
+    config: TrainingConfig
+    folder: Path
+    seed: int
+    reporter: Reporter
+    built_on: str = ""
+    workers: int = 1
+    plot: Callable[[Objective, Path], None] | None = None
+    deadline_s: float = math.inf
+
+    def __post_init__(self) -> None:
+        self.engine, self.optimiser = begin_training(self.objective, self.config)
+        self.average = WeightAverage(self.objective, self.config.average_over_scans)
+        self.scans_seen = 0
+        if self.checkpoint.exists():
+            self.scans_seen = load_checkpoint(
+                self.checkpoint, self.objective, self.average, self.optimiser, self.built_on
+            )
+        if not self.engine.same(self.scans_seen):
+            raise TrainingError(
+                f"{self.checkpoint} after {self.scans_seen} scans here, and not so in another process",
+                "one checkpoint for all processes",
+                "share the run's folder between the machines, and start again",
+            )
+        self._lacks_validation = False
+        self.engine.by_first(self._begin)
+
+    @property
+    def checkpoint(self) -> Path:
+        """File from which the stage resumes."""
+        return self.folder / CHECKPOINT_FILE
+
+    def run(self, train: RangeImages, val: RangeImages, what: str) -> Objective:
+        """Train until all scans of the budget are seen, and return the objective with its averaged weights.
+
+        Args:
+            train: range images to learn from.
+            val: range images for validation.
+            what: text beside the progress bar.
+
+        Raises:
+            TrainingError: the loss is not finite; names the scans seen and the last good checkpoint.
+            OutputError: a checkpoint could not be written; the one before it is intact.
+            Terminated: SIGTERM was received, or the time is over; the step in progress was finished and saved.
+        """
+        config = self.config
+        batches = Batches(
+            train,
+            config.batch_size,
+            config.augmentations,
+            config.any_columns,
+            self.seed,
+            self.engine.rank,
+            self.engine.world_size,
+            self.workers,
+        )
+        begun = time.monotonic()
+        progress_bar = self.reporter.progress(what, config.scans, self.scans_seen)
+        with Termination(self.deadline_s) as termination, progress_bar as progress:
+            if self.engine.any(self._lacks_validation) and self._validates():  # the process ended before it
+                self._log_terms("val", self.validate(val, termination), 0.0)
+            for images in batches.stream(self.scans_seen, config.scans):
+                terms = self._step(images)
+                stops = self.engine.any(termination.asked)
+                progress.advance(
+                    config.batch_size, f"loss {float(terms['loss']):.4f}  {self.engine.peak_gib():.1f} GiB"
+                )
+                if self._passed(_LOG_EVERY_STEPS * config.batch_size):
+                    self._log_terms(
+                        "train", {name: float(term) for name, term in terms.items()}, time.monotonic() - begun
+                    )
+                if self._passed(config.checkpoint_every) or self._validates() or stops:
+                    self._save()  # before anything that may fail, or take longer than a terminated process has
+                if stops:
+                    raise Terminated
+                if self._validates():
+                    self._log_terms("val", self.validate(val, termination), time.monotonic() - begun)
+                if config.pictures_every and self._passed(config.pictures_every):
+                    self.engine.by_first(self._plot)
+        self.engine.by_first(self._close_log)
+        if self.engine.any(termination.asked):  # since the last step
+            raise Terminated
+        return self.average.objective.eval()
+
+    def validate(self, images: RangeImages, termination: Termination | None = None) -> dict[str, float]:
+        """Return the averaged objective's mean loss terms over evenly spaced validation scans.
+
+        Raises:
+            Terminated: SIGTERM was received meanwhile; the resumed training validates again.
+        """
+        chosen = evenly_spaced(self.config.validation_scans, len(images))
+        totals: dict[str, float] = {}
+        # As many at once as a process has in a step, since more may not fit in memory.
+        at_once = max(1, self.config.batch_size // (self.engine.world_size * self.config.accumulate))
+        for first in range(0, len(chosen), at_once):
+            if termination is not None and self.engine.any(termination.asked):
+                raise Terminated
+            indices = chosen[first : first + at_once]
+            terms = self.engine.evaluate(
+                self.average.objective, images.batch(indices), derive_seed(self.seed, 3, first)
+            )
+            for name, value in terms.items():
+                totals[name] = totals.get(name, 0.0) + value * len(indices) / len(chosen)
+        return totals
+
+    def _step(self, images: RangeImage) -> dict[str, Tensor]:
+        config = self.config
+        for group in self.optimiser.param_groups:
+            group["lr"] = learning_rate_at(config, self.scans_seen)
+        seed = derive_seed(self.seed, 2, self.scans_seen, self.engine.rank)
+        torch.manual_seed(derive_seed(seed, 0, 1))  # of dropout, which takes the global random numbers
+        terms = self.engine.step(images.to(self.engine.device), seed, config.gradient_clip, config.accumulate)
+        if not bool(terms["loss"].isfinite()):
+            raise TrainingError(
+                f"a loss or gradient of {float(terms['loss'].detach())} after {self.scans_seen} scans",
+                "finite numbers",
+                "use a new folder and a lower training.*.learning_rate"
+                + (f"; the last checkpoint is {self.checkpoint}" if self.checkpoint.exists() else ""),
+            )
+        self.scans_seen += config.batch_size
+        self.average.update(self.objective, self.scans_seen, config.batch_size)
+        return terms
+
+    def _begin(self) -> None:
+        remove_partials(self.checkpoint.parent)
+        self.log = Log(self.folder, self.scans_seen)  # only the first process has one
+        self._lacks_validation = self.scans_seen > 0 and not self.log.validated
+
+    def _close_log(self) -> None:
+        self.log.close()
+
+    def _plot(self) -> None:
+        if self.plot is not None:
+            self.plot(self.average.objective, self.folder / "pictures" / f"{self.scans_seen:09d}.png")
+
+    def _validates(self) -> bool:
+        return self._passed(self.config.validate_every) or self.scans_seen >= self.config.scans
+
+    def _passed(self, every: int) -> bool:
+        return self.scans_seen // every > (self.scans_seen - self.config.batch_size) // every
+
+    def _save(self) -> None:
+        kept = (self.checkpoint, self.objective, self.average, self.optimiser, self.scans_seen, self.built_on)
+        self.engine.by_first(lambda: save_checkpoint(*kept))
+
+    def _log_terms(self, split: str, terms: dict[str, float], seconds: float) -> None:
+        self.engine.by_first(lambda: self.log.write(split, self.scans_seen, seconds, terms))
+        if split == "val":
+            losses = "  ".join(f"{name} {value:.4g}" for name, value in terms.items())
+            self.reporter.message(f"  after {self.scans_seen} scans, on val: {losses}")
+            for warning in self.objective.warnings():
+                self.reporter.message(f"  WARNING: {warning}")
+
+
+def begin_training(objective: Objective, config: TrainingConfig) -> tuple[Engine, torch.optim.Optimizer]:
+    """Return the engine that a stage is trained with, which holds the objective from now on, and the optimiser.
+
+    Raises:
+        ConfigError: settings that the objective's networks or the processes cannot follow.
+    """
+    engine = Engine(config.precision, objective.reaches_all_weights and not objective.players)
+    optimiser = follow_settings(objective, config, engine.world_size)
+    engine.set_up(objective, optimiser)
+    return engine, optimiser
+
+
+def follow_settings(objective: Objective, config: TrainingConfig, processes: int) -> torch.optim.Optimizer:
+    """Set an objective's networks as the settings of its training say, and return the optimiser.
+
+    Args:
+        objective: objective that a stage minimises.
+        config: settings of the stage's training.
+        processes: number of processes that share each batch.
+
+    Raises:
+        ConfigError: a process cannot divide its share of a batch into the parts asked for, or the networks lack what
+            is to be recomputed, compiled or trained by Muon.
+    """
+    _check_parts(objective, config, processes)
+    if config.compile:
+        _check_compiler()
+    prepare_for_training(objective, config.recompute, config.compile)
+    return make_optimiser(objective, config)
+
+
+def _check_compiler() -> None:
+    """Refuse to compile for a CPU without the compiler that torch would call, which fails at the first step only."""
+    compiler = os.environ.get("CXX") or ("clang++" if sys.platform == "darwin" else "g++")
+    if not torch.cuda.is_available() and shutil.which(compiler) is None:
+        raise ConfigError(
+            f"compile=true and no C++ compiler {compiler!r}", "one that torch can call", "install it, or leave it out"
+        )
+
+
+def _check_parts(objective: Objective, config: TrainingConfig, processes: int) -> None:
+    """Refuse a number of parts into which a process cannot divide its share of a batch."""
+    if config.accumulate > 1 and objective.players:
+        raise ConfigError(
+            f"accumulate={config.accumulate} for players who take turns",
+            "1: they count their turns by the batches they see",
+            "lower batch_size instead",
+        )
+    if config.batch_size % (processes * config.accumulate):
+        raise ConfigError(
+            f"batch_size={config.batch_size} on {processes} processes in {config.accumulate} parts each",
+            f"a multiple of {processes * config.accumulate}, processes times parts",
+            "change one of them",
+        )
