@@ -2,16 +2,18 @@
 
 from dataclasses import replace
 
-from lidargrit.generation.settings import Recipe
-from lidargrit.systems.completion_only.system import CompletionOnlyConfig
-from lidargrit.systems.lidargrit.presets import compact_completion
-from lidargrit.systems.multiscale.presets import multiscale_wide
+from lidargrit.systems.completion.presets import compact_completion
 
-RECIPE = Recipe(
+RECIPE = replace(
+    compact_completion.RECIPE,
     title="a network that completes scans: 64x1024, for one CPU core and half an hour",
-    generator="completion_only",
-    model=CompletionOnlyConfig(compact_completion.RECIPE.model.completion),
-    data=multiscale_wide.RECIPE.data,
+    data=replace(
+        compact_completion.RECIPE.data,
+        train=("simulated:1000:train",),
+        val=("simulated:24:val",),
+        columns=2048,
+        column_stride=2,
+    ),
     training={
         "completion": replace(
             compact_completion.RECIPE.training["completion"],
@@ -25,6 +27,6 @@ RECIPE = Recipe(
             checkpoint_every=250,
         )
     },
-    stages_from="pretrained",
+    stages_from="pretrained/completion",
     fine_tune=("completion",),
 )

@@ -1,0 +1,1 @@
+"""Experiments with ``completion``, one a file."""

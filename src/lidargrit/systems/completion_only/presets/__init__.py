@@ -1,1 +1,0 @@
-"""Experiments with ``completion_only``, one a file."""
