@@ -1,7 +1,7 @@
 """Learn how much noise the pixels of a finished run's masks share: all other weights stay → a run's folder, a table.
 
     python benchmarks/phase_noise.py pretrained shared --scans simulated:400:train
-    python benchmarks/phase_noise.py runs/mine shared --stage raydrop --scans simulated_surfaces:400:train
+    python benchmarks/phase_noise.py pretrained/raydrop shared --stage raydrop --scans simulated_surfaces:400:train
 
 Runs that were trained before masks shared noise get it in this way; others learn it while they train.
 """
@@ -15,12 +15,11 @@ from pathlib import Path
 import torch
 
 from lidargrit.core.files import read_tensors
-from lidargrit.data.run_folder import RUN_FILE, TRAINED_ON_FILE, WEIGHTS_FILE, locate
+from lidargrit.data.run_folder import RUN_FILE, WEIGHTS_FILE, locate, trained_on_file
 from lidargrit.data.sources import open_images
 from lidargrit.generation.generator import load
 from lidargrit.generation.pixel_decoder.phase_noise import PhaseNoise
 from lidargrit.generation.pixel_decoder.pixel_networks import MaskNetwork
-from lidargrit.systems.lidargrit.system import LidarGrit
 
 _AT_ONCE = 4
 
@@ -29,7 +28,7 @@ _AT_ONCE = 4
 def main() -> None:
     """Take scans through the stage's objective as training does, keep what its noise learned, and print the shares."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("run", help="finished run of lidargrit with the stage")
+    parser.add_argument("run", help="finished run with the stage")
     parser.add_argument("out", type=Path, help="folder for the weights with the shares: one that is not there yet")
     parser.add_argument("--stage", choices=["pixels", "raydrop", "completion"], default="pixels")
     parser.add_argument(
@@ -37,7 +36,7 @@ def main() -> None:
     )
     options = parser.parse_args()
     model = load(options.run)
-    if not isinstance(model, LidarGrit) or options.stage not in model.stages:
+    if options.stage not in model.stages:
         parser.error(f"{options.run} has no stage {options.stage}")
     images = open_images(options.scans, sensor=model.sensor)
     objective = model.objective(options.stage).train()
@@ -50,9 +49,9 @@ def main() -> None:
     model.load_stage(options.stage, objective)
     folder = locate(options.run)
     options.out.mkdir(parents=True)
-    for name in (RUN_FILE, TRAINED_ON_FILE):
-        if (folder / name).is_file():
-            shutil.copy(folder / name, options.out)
+    for path in (folder / RUN_FILE, trained_on_file(folder)):
+        if path is not None and path.is_file():
+            shutil.copy(path, options.out)
     types = {weight.dtype for weight in read_tensors(folder / WEIGHTS_FILE)[0].values()}
     model.eval().save(options.out, 8 if torch.int8 in types else 16 if torch.float16 in types else 32)
     print(f"done: the run with these shares is in {options.out}")

@@ -20,7 +20,6 @@ import copy
 import torch
 
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.data.run_folder import locate
 from lidargrit.data.sources import open_images
 from lidargrit.evaluation.raydrop import RAYDROP_CURVES
 from lidargrit.evaluation.realism import distance, drop_independently, pair_of
@@ -28,7 +27,7 @@ from lidargrit.generation.generator import load
 from lidargrit.scans.condition import Condition
 from lidargrit.scans.types import RangeImage
 from lidargrit.simulator import observe
-from lidargrit.systems.lidargrit.system import LidarGrit
+from lidargrit.systems.raydrop.system import Raydrop
 
 _FIRST_TEST_SEED = 2_000_000
 
@@ -40,9 +39,8 @@ def main() -> None:
     parser.add_argument("-n", "--count", type=int, default=128, help="number of streets")
     parser.add_argument("--real", default="", help="source of real scans, whose reflectance is estimated, too")
     options = parser.parse_args()
-    model = load(locate(options.run))
-    assert isinstance(model, LidarGrit), "a run of lidargrit"
-    assert model.raydrop is not None, "a run with a network of raydrop"
+    model = load(options.run, "raydrop")
+    assert isinstance(model, Raydrop), "a run of raydrop"
     clean, true, redrawn = [], [], []
     rng = torch.Generator().manual_seed(0)
     for seed in range(_FIRST_TEST_SEED, _FIRST_TEST_SEED + 2 * options.count):
@@ -56,7 +54,6 @@ def main() -> None:
     measured = RangeImage.stack(true[: options.count])
     dropped = model.complete(Condition.of_surfaces(surfaces), range(options.count))
     independent = copy.deepcopy(model)
-    assert independent.raydrop is not None
     independent.raydrop.mask.noise.sums.zero_()
     with torch.no_grad():
         every = [surfaces[index : index + 1] for index in range(options.count)]

@@ -26,16 +26,17 @@ def main(folder: Path, run: str = "pretrained") -> None:
     model = lidargrit.load(run)
     if not isinstance(model, LidarGrit):
         raise ConfigError(f"{run}, a model of {model.public_name()!r}", "one of LidarGRIT", "name another run")
+    completes = lidargrit.load(run, "complete")
     clean, true = (RangeImage.stack([image]) for image in simulate_pair(STREET, model.sensor))
     known = Condition.of_pixels(true, Pattern("sector:45,315").mask(true[0])[None])
     panels = [("a simulated scan", true[0]), ("what is known of it", known.images[0])]
     panels.append(("filled in by triangulation", fill("triangulation", known)[0]))
-    sampled = model.complete(Condition.cat([known] * SAMPLES), range(SAMPLES), TokenSampling(completion="tokens"))
+    sampled = model.complete(Condition.cat([known] * SAMPLES), range(SAMPLES), TokenSampling())
     panels += [(f"sampled by the model, seed {seed}", sampled[seed]) for seed in range(4)]
-    if model.completion is None:
+    if isinstance(completes, LidarGrit):
         panels.append(("sampled by the model, seed 4", sampled[4]))
     else:
-        panels.append(("the best guess of its network for completion", model.complete(known, [0])[0]))
+        panels.append(("the best guess of its network for completion", completes.complete(known, [0])[0]))
     plot(panels, folder / "completion.png")
     dropped = model.complete(Condition.cat([Condition.of_surfaces(clean)] * SAMPLES), range(SAMPLES))
     panels = [("clean ranges, as a simulator casts them", clean[0])]

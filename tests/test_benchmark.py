@@ -185,11 +185,12 @@ def test_images_that_only_count_mark_surfaces_that_return():
 
 
 def test_stages_that_are_taken_from_another_run_are_not_counted():
-    preset = load_preset("completion_compact")  # over the packaged model
-    assert list(training_flops(preset)) == ["completion"]
-    scaled = with_budget(preset, training_flops(preset)["completion"] / 4)
-    assert sum(training_flops(scaled).values()) == pytest.approx(training_flops(preset)["completion"] / 4, rel=0.01)
-    assert {**scaled.training, "completion": None} == {**preset.training, "completion": None}
+    preset = load_preset("lidargrit_compact_pixels", ["stages_from=pretrained", "train_anew=[pixels]"])
+    flops = training_flops(preset)
+    assert list(flops) == ["pixels"]
+    scaled = with_budget(preset, flops["pixels"] / 4)
+    assert sum(training_flops(scaled).values()) == pytest.approx(flops["pixels"] / 4, rel=0.01)
+    assert {**scaled.training, "pixels": None} == {**preset.training, "pixels": None}
 
 
 def test_a_budget_counts_what_is_prepared_once(monkeypatch):

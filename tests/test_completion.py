@@ -22,7 +22,7 @@ from lidargrit.data.sources import open_images
 from lidargrit.evaluation.raydrop import RAYDROP_CURVES, decoded_surfaces, raydrop_table, score_raydrop
 from lidargrit.generation.generator import load, load_class
 from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
-from lidargrit.inference.complete import open_completer, open_completers
+from lidargrit.inference.complete import open_model, open_models
 from lidargrit.inference.complete.inputs import ScanReader, open_inputs
 from lidargrit.inference.samples import write_samples
 from lidargrit.scans.condition import Condition
@@ -353,10 +353,10 @@ def test_mistakes_are_told_in_one_line_and_nothing_is_written(words, message, fo
 
 
 def test_a_device_that_is_none_is_refused_for_methods_that_compute_on_none():
-    assert open_completers(["nearest"], SENSOR)[0].sensor is SENSOR
+    assert open_models(["nearest"], SENSOR)[0].sensor is SENSOR
     for open_them in (
-        lambda: open_completers(["nearest"], SENSOR, "nope"),
-        lambda: open_completer("linear", "pixels", SENSOR, device="nope"),
+        lambda: open_models(["nearest"], SENSOR, "nope"),
+        lambda: open_model("linear", "pixels", SENSOR, device="nope"),
     ):
         with pytest.raises(ConfigError, match="got device 'nope'"):
             open_them()

@@ -1,26 +1,27 @@
-"""The network that completes scans: it begins at triangulation, learns, samples its mask by seed, and is a stage."""
+"""The network that completes scans: it begins at triangulation, learns, samples its mask by seed, and is a run."""
 
 from dataclasses import replace
 
 import pytest
 import torch
 
-from lidargrit.core.errors import ConfigError
+from lidargrit.core.errors import CheckpointError, ConfigError
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.generation.generator import load
+from lidargrit.data.run_folder import locate
+from lidargrit.generation.generator import load, load_class
 from lidargrit.generation.settings import Preset
 from lidargrit.scans.condition import Condition
 from lidargrit.scans.fills import fill
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
-from lidargrit.systems.completion_only.completion_network import CompletionNetwork, CompletionNetworkConfig
-from lidargrit.systems.completion_only.completion_objective import CompletionObjective, random_patterns
-from lidargrit.systems.completion_only.hints import hints_of
-from lidargrit.systems.completion_only.system import CompletionOnlyConfig
-from lidargrit.systems.lidargrit.system import LidarGrit, TokenSampling
+from lidargrit.systems.completion.hints import hints_of
+from lidargrit.systems.completion.network import CompletionNetwork, CompletionNetworkConfig
+from lidargrit.systems.completion.objective import CompletionObjective, random_patterns
+from lidargrit.systems.completion.system import Completion, CompletionConfig
+from lidargrit.systems.lidargrit.system import TokenSampling
 from lidargrit.systems.multiscale.system import MultiscaleConfig
 from lidargrit.training.taken_stages import taken_stages
-from tiny_runs import learn
+from tiny_runs import learn, save_bundle
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
 TINY = CompletionNetworkConfig(
@@ -129,37 +130,51 @@ def test_training_hides_rows_sectors_boxes_and_pixels():
     assert not bool(masks.flatten(1).all(1).any())
 
 
-def test_a_model_with_the_stage_completes_by_it_and_survives_saving(tmp_path):
+def test_a_bundle_completes_each_scan_by_the_run_for_what_is_known_of_it(tmp_path):
     torch.manual_seed(0)
-    model = LidarGrit(replace(LidarGrit.smallest_config(SENSOR), completion=TINY), SENSOR).eval()
-    assert model.stages == ("tokenizer", "transformer", "completion")
+    save_bundle(tmp_path, SENSOR, TINY)
+    bundle, alone, tokens = load(tmp_path), load(tmp_path, "complete"), load(tmp_path / "lidargrit")
+    assert (bundle.public_name(), alone.public_name()) == ("lidargrit", "completion")
     known = rows_of(scans(2))
-    done = model.complete(known, [1, 2])
+    done, by_tokens = bundle.complete(known, [1, 2]), tokens.complete(known, [1, 2])
     observed = known.return_observed
     assert torch.equal(done.range_m[observed], known.images.range_m[observed])
-    by_tokens = model.complete(known, [1, 2], TokenSampling(completion="tokens"))
+    assert torch.equal(done.range_m, alone.complete(known, [1, 2]).range_m)
     assert not torch.equal(done.range_m, by_tokens.range_m)
-    model.save(tmp_path)
-    assert torch.equal(load(tmp_path).complete(known[1:], [2]).range_m[0], done.range_m[1])
-    dropped = model.complete(Condition.of_surfaces(scans(1)), [0])  # no task for the network
-    assert not bool((dropped.return_mask & ~scans(1).return_mask).any())
-    with pytest.raises(ConfigError, match=r"temperature=0\.5, which the network .* does not have"):
-        model.complete(known, [1, 2], TokenSampling(temperature=0.5))
-    model.complete(known, [1, 2], TokenSampling(temperature=0.5, completion="tokens"))
-    plain = LidarGrit(LidarGrit.smallest_config(SENSOR), SENSOR)
-    with pytest.raises(ConfigError, match="completion=network for a model without a network"):
-        plain.complete(known, [1, 2], TokenSampling(completion="network"))
+    assert torch.equal(bundle.complete(known, [1, 2], TokenSampling()).range_m, by_tokens.range_m)
+    mixed = Condition.cat([known[:1], Condition.nothing(SENSOR, 1), known[1:]])
+    together = bundle.complete(mixed, [1, 7, 2])
+    assert torch.equal(together.range_m[[0, 2]], done.range_m)
+    assert torch.equal(together.range_m[1], tokens.sample([7]).range_m[0])
+    clean = Condition.of_surfaces(scans(1))  # there is no run for it
+    assert torch.equal(bundle.complete(clean, [0]).range_m, tokens.complete(clean, [0]).range_m)
+    assert locate(tmp_path, "raydrop") == locate(tmp_path) == tmp_path / "lidargrit"
 
 
-def test_the_network_alone_starts_from_that_of_a_whole_model_of_other_columns(tmp_path):
+@pytest.mark.parametrize("runs", ['{"complete": "completion"}', '{"sample": "../x"}', '{"sample": 3}', "[]", "{"])
+def test_a_bundle_that_names_no_run_that_samples_or_one_elsewhere_is_refused(tmp_path, runs):
+    save_bundle(tmp_path, SENSOR, TINY)
+    (tmp_path / "bundle.json").write_text(runs)
+    with pytest.raises(CheckpointError, match=r"bundle\.json"):
+        load(tmp_path)
+
+
+def test_what_only_completes_scans_samples_none():
+    for name in ("completion", "raydrop", "interpolation"):
+        cls = load_class(name)
+        with pytest.raises(ConfigError, match=rf"a generator '{name}', which has no new scans to sample"):
+            cls(cls.smallest_config(SENSOR), SENSOR).sample([0])
+
+
+def test_training_starts_from_a_network_of_other_columns(tmp_path):
     torch.manual_seed(0)
-    whole = LidarGrit(replace(LidarGrit.smallest_config(SENSOR), completion=TINY), SENSOR)
-    whole.save(tmp_path)
+    given = Completion(CompletionConfig(TINY), SENSOR)
+    given.save(tmp_path)
     wide = DataConfig(columns=64)
-    preset = Preset("a test", "completion_only", CompletionOnlyConfig(TINY), wide, {}, stages_from=str(tmp_path))
+    preset = Preset("a test", "completion", CompletionConfig(TINY), wide, {}, stages_from=str(tmp_path))
     tuned = replace(preset, fine_tune=("completion",))
     taken = taken_stages(tuned, tuned.build_generator())["completion"]
-    for name, weight in whole.objective("completion").state_dict().items():
+    for name, weight in given.objective("completion").state_dict().items():
         assert torch.equal(taken.state_dict()[name], weight), name
     with pytest.raises(ConfigError, match=r"whose completion is another \(data.sensor\)"):
         taken_stages(preset, preset.build_generator())
@@ -167,5 +182,5 @@ def test_the_network_alone_starts_from_that_of_a_whole_model_of_other_columns(tm
     with pytest.raises(ConfigError, match=r"whose completion is another \(data.sensor\)"):
         taken_stages(fewer_rows, fewer_rows.build_generator())
     other = replace(preset, generator="multiscale", model=MultiscaleConfig())
-    with pytest.raises(ConfigError, match="a run of the generator 'lidargrit'; wanted a run of 'multiscale'"):
+    with pytest.raises(ConfigError, match="a run of the generator 'completion'; wanted a run of 'multiscale'"):
         taken_stages(other, other.build_generator())

@@ -39,7 +39,7 @@ def test_what_was_observed_stands_bit_for_bit_and_the_rest_is_generated():
 def test_of_clean_surfaces_only_what_returned_is_kept():
     images = scans()
     known, generated = Condition.of_surfaces(images), RangeImage.masked(images.range_m + 1, images.return_mask, SENSOR)
-    assert known.kinds == {"pixels", "surfaces"}  # a beam that meets nothing is known not to return
+    assert known.kinds == {"surfaces"}  # a beam that meets nothing is known not to return, which is no range
     dropped = RangeImage.masked(generated.range_m, generated.return_mask.roll(1) & generated.return_mask, SENSOR)
     assert torch.equal(known.put_into(dropped).range_m, images.range_m * dropped.return_mask)
 

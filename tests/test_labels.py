@@ -22,19 +22,18 @@ from lidargrit.scans.labels import LABELS, OTHER_OBJECT, OTHER_STRUCTURE
 from lidargrit.scans.projection import project, unproject
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
-from lidargrit.systems.completion_only.completion_network import CompletionNetwork, CompletionNetworkConfig
-from lidargrit.systems.completion_only.completion_objective import CompletionObjective
-from lidargrit.systems.completion_only.hints import hints_of
-from lidargrit.systems.lidargrit.system import LidarGrit
-from lidargrit.systems.raydrop.raydrop_network import RaydropConfig, RaydropNetwork
-from lidargrit.systems.raydrop.raydrop_objective import RaydropObjective
-from tiny_runs import every_fourth_row, learn
+from lidargrit.systems.completion.hints import hints_of
+from lidargrit.systems.completion.network import CompletionNetwork, CompletionNetworkConfig
+from lidargrit.systems.completion.objective import CompletionObjective
+from lidargrit.systems.raydrop.network import RaydropNetwork, RaydropNetworkConfig
+from lidargrit.systems.raydrop.objective import RaydropObjective
+from tiny_runs import every_fourth_row, learn, save_bundle
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
 NETWORK = CompletionNetworkConfig(
     widths=(8, 8, 8), blocks=1, attention_layers=0, heads=1, features=4, mask_width=4, row_channels=1, labels=True
 )
-RAYDROP = RaydropConfig(widths=(8, 8, 8), blocks=1, features=4, mask_width=4, row_channels=1, labels=True)
+RAYDROP = RaydropNetworkConfig(widths=(8, 8, 8), blocks=1, features=4, mask_width=4, row_channels=1, labels=True)
 ROAD, BUILDING, MOVING_CAR = 40, 50, 252
 
 
@@ -60,8 +59,7 @@ def folders(tmp_path_factory):
             f"sequences/00/velodyne/{number:06d}.bin", replace(scan, label=scan.label | instance)
         )
     torch.manual_seed(0)
-    config = replace(LidarGrit.smallest_config(SENSOR), completion=NETWORK, raydrop=RAYDROP)
-    LidarGrit(config, SENSOR).eval().save(root / "run")
+    save_bundle(root / "run", SENSOR, NETWORK, RAYDROP)
     return root
 
 
@@ -222,7 +220,7 @@ def test_raydrop_learns_what_a_class_does():
     ]
     assert gap[1] > gap[0] + 0.05
     with pytest.raises(ConfigError, match="labels=true with surfaces=estimated"):
-        RaydropConfig(labels=True, surfaces="estimated")
+        RaydropNetworkConfig(labels=True, surfaces="estimated")
 
 
 def test_right_classes_are_counted_where_both_scans_return(folders, tmp_path, capsys):

@@ -4,7 +4,6 @@ import json
 import resource
 import shutil
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -19,6 +18,7 @@ from lidargrit.data.run_folder import locate
 from lidargrit.data.sources.samples import read_samples
 from lidargrit.generation.generator import Generator, load
 from lidargrit.generation.presets import load_preset
+from lidargrit.scans.condition import Condition
 from lidargrit.scans.types import RangeImage
 from lidargrit.training.compute import uniform_images
 from lidargrit.viewer.serve import finished_runs
@@ -35,36 +35,61 @@ def model():
 
 @pytest.mark.parametrize("folder", [FOLDER, WIDE])
 def test_all_of_it_is_small_and_its_card_is_whole(folder):
-    assert (folder / "model.safetensors").stat().st_size < 12e6
-    assert sum(path.stat().st_size for path in folder.iterdir()) < 16e6
+    assert sum(path.stat().st_size for path in folder.rglob("*.safetensors")) < 12e6
+    assert sum(path.stat().st_size for path in folder.rglob("*")) < 16e6
     card = (folder / "README.md").read_text(encoding="utf-8")
     for part in ("## How to sample", "## Data", "## Licence", "## Training", "## Scores", "## Where it fails"):
         assert part in card
     assert "| sliced_wasserstein |" in card
 
 
-def test_it_is_what_its_preset_makes(model):
-    preset, completing = load_preset("raydrop_compact"), load_preset("completion_compact")
-    assert model.config == replace(preset.model, completion=completing.model.completion)
-    trained = json.loads((FOLDER / "run.json").read_text(encoding="utf-8"))["preset"]
-    seen = {stage: fit["scans"] for stage, fit in trained["training"].items()}
+JOBS = ("sample", "complete", "raydrop")
+
+
+def trained_as(name: str) -> tuple[list[str], dict[str, int]]:
+    """Return the generators of a bundle by job, and the scans that each stage of its runs has seen at last."""
+    generators, seen = [], {}
+    for job in JOBS:
+        preset = json.loads((locate(name, job) / "run.json").read_text(encoding="utf-8"))["preset"]
+        generators.append(preset["generator"])
+        seen |= {stage: fit["scans"] for stage, fit in preset["training"].items()}
+    return generators, seen
+
+
+def test_its_runs_are_what_their_presets_make():
+    presets = [load_preset(name) for name in ("lidargrit_compact_pixels", "completion_compact", "raydrop_compact")]
+    for job, preset in zip(JOBS, presets, strict=True):
+        run = load("pretrained", job)
+        assert (run.public_name(), run.config) == (preset.generator, preset.model)
+    generators, seen = trained_as("pretrained")
+    assert generators == [preset.generator for preset in presets]
     seen["transformer"] += 18_000 + 36_000 + 30_000  # before they were trained further, as the card says
     seen["pixels"] += 17_000 + 9000 + 16_000
-    assert seen == {stage: fit.scans for stage, fit in {**completing.training, **preset.training}.items()}
+    assert seen == {stage: fit.scans for preset in presets for stage, fit in preset.training.items()}
 
 
-def test_the_wide_one_is_what_its_preset_makes():
-    preset, wide = load_preset("lidargrit_wide_pixels"), load("pretrained_wide")
-    completing, dropping = load_preset("completion_wide"), load_preset("raydrop_compact")
-    assert wide.config == replace(preset.model, completion=completing.model.completion, raydrop=dropping.model.raydrop)
-    assert wide.sensor.same_rays(preset.data.load_sensor())
-    assert (wide.sensor.height, wide.sensor.width) == (64, 1024)
-    trained = json.loads((WIDE / "run.json").read_text(encoding="utf-8"))["preset"]
-    seen = {stage: fit["scans"] for stage, fit in trained["training"].items()}
+def test_those_of_the_wide_one_are_what_their_presets_make():
+    presets = [load_preset(name) for name in ("lidargrit_wide_pixels", "completion_wide", "raydrop_compact")]
+    for job, preset in zip(JOBS, presets, strict=True):
+        run = load("pretrained_wide", job)
+        assert (run.public_name(), run.config) == (preset.generator, preset.model)
+        assert run.sensor.same_rays(presets[0].data.load_sensor())
+        assert (run.sensor.height, run.sensor.width) == (64, 1024)
+    generators, seen = trained_as("pretrained_wide")
+    assert generators == [preset.generator for preset in presets]
     seen["transformer"] += 3600 + 6000  # before they were trained further, as the card says
     seen["pixels"] += 9000 + 1600
     assert seen.pop("raydrop") == 2500  # of 1,024 columns, which are as much to learn from as 10,000 of 256
-    assert seen == {stage: fit.scans for stage, fit in {**completing.training, **preset.training}.items()}
+    assert seen == {stage: fit.scans for preset in presets[:2] for stage, fit in preset.training.items()}
+
+
+def test_what_it_completes_is_completed_by_its_runs(model):
+    one = RangeImage.stack([project(simulate(seed=2_000_000), model.sensor)])
+    observed = torch.zeros_like(one.return_mask)
+    observed[:, ::4] = True
+    for job, known in (("complete", Condition.of_pixels(one, observed)), ("raydrop", Condition.of_surfaces(one))):
+        done, by_run = model.complete(known, [0]), load("pretrained", job).complete(known, [0])
+        assert torch.equal(done.range_m, by_run.range_m)
 
 
 def test_a_word_gives_scans(tmp_path, monkeypatch, capsys):
@@ -109,12 +134,14 @@ def test_the_wide_one_computes_what_it_did_when_it_was_scored():
 
 def test_what_a_user_calls_so_goes_first(model, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert locate("pretrained") == locate(Path("pretrained")) == FOLDER
-    assert locate("pretrained_wide") == WIDE
+    assert locate("pretrained") == locate(Path("pretrained")) == locate("pretrained/lidargrit") == FOLDER / "lidargrit"
+    assert locate("pretrained", "complete") == locate("pretrained/completion") == FOLDER / "completion"
+    assert locate("pretrained_wide", "raydrop") == WIDE / "raydrop"
     (tmp_path / "pretrained").mkdir()
-    assert locate("pretrained") == FOLDER  # an empty folder is nothing
+    assert locate("pretrained") == FOLDER / "lidargrit"  # an empty folder is nothing
     (tmp_path / "pretrained" / "samples.json").write_text("{}")
     assert locate("pretrained") == Path("pretrained")
+    assert locate("pretrained/completion") == Path("pretrained/completion")
     assert locate("runs/mine") == Path("runs/mine")
     with pytest.raises(CheckpointError, match="which holds no finished model"):
         load("pretrained")
@@ -179,7 +206,7 @@ def test_notes_end_the_card(tmp_path, capsys):
     assert main(words) == 0
     assert (tmp_path / "out" / "README.md").read_text(encoding="utf-8").endswith("## Where it fails\n\nEverywhere.\n")
     weights = "model.safetensors"
-    assert (tmp_path / "out" / weights).read_bytes() == (FOLDER / weights).read_bytes()
+    assert (tmp_path / "out" / weights).read_bytes() == (FOLDER / "lidargrit" / weights).read_bytes()
     capsys.readouterr()
     assert main(["publish", "pretrained", str(tmp_path / "other"), "--notes", str(tmp_path / "none.md")]) == 2
     assert "none.md, which cannot be read" in the_one_line(capsys.readouterr().err, "publish")
@@ -224,7 +251,7 @@ def test_samples_that_are_removed_meanwhile_are_an_error(model, monkeypatch, tmp
     ],
 )
 def test_settings_of_a_huge_network_are_refused_at_once(model, tmp_path, capsys, setting, value):
-    folder = shutil.copytree(FOLDER, tmp_path / "run")
+    folder = shutil.copytree(FOLDER / "lidargrit", tmp_path / "run")
     about = json.loads((folder / "config.json").read_text())
     about["config"][setting[0]][setting[1]] = value
     (folder / "config.json").write_text(json.dumps(about))

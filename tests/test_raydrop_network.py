@@ -1,4 +1,4 @@
-"""The network of raydrop: what it learns from, its masks by seed, its place in a run, and its scores."""
+"""The network of raydrop: what it learns from, its masks by seed, its place in a bundle, and its scores."""
 
 from dataclasses import replace
 
@@ -16,13 +16,12 @@ from lidargrit.scans.marks import read_marks
 from lidargrit.scans.projection import project
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
-from lidargrit.systems.lidargrit.system import LidarGrit, TokenSampling
-from lidargrit.systems.raydrop.raydrop_network import RaydropConfig, RaydropNetwork
-from lidargrit.systems.raydrop.raydrop_objective import RaydropObjective
-from tiny_runs import learn
+from lidargrit.systems.raydrop.network import RaydropNetwork, RaydropNetworkConfig
+from lidargrit.systems.raydrop.objective import RaydropObjective
+from tiny_runs import learn, save_bundle
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
-TINY = RaydropConfig(widths=(8, 8, 8), blocks=1, features=4, mask_width=4, row_channels=1)
+TINY = RaydropNetworkConfig(widths=(8, 8, 8), blocks=1, features=4, mask_width=4, row_channels=1)
 
 
 def pairs(count: int) -> RangeImage:
@@ -35,7 +34,7 @@ def pairs(count: int) -> RangeImage:
     return RangeImage.masked(range_m, surface, SENSOR, (range_m < 20).float())
 
 
-def made(config: RaydropConfig = TINY) -> RaydropNetwork:
+def made(config: RaydropNetworkConfig = TINY) -> RaydropNetwork:
     torch.manual_seed(0)
     return RaydropNetwork(config, SENSOR).eval()
 
@@ -106,43 +105,29 @@ def test_an_estimated_range_owes_nothing_to_its_own_ray(monkeypatch):
     assert float((first.range_m - images.range_m)[near].abs().mean()) < 1
 
 
-def test_a_run_with_it_drops_by_it(tmp_path):
+def test_a_bundle_with_it_drops_by_it(tmp_path):
     torch.manual_seed(0)
-    model = LidarGrit(replace(LidarGrit.smallest_config(SENSOR), raydrop=TINY), SENSOR).eval()
-    assert model.stages[-1] == "raydrop"
-    model.save(tmp_path)
-    again, known = load(tmp_path), Condition.of_surfaces(pairs(2))
-    assert isinstance(again, LidarGrit)
-    by_default, named = (again.complete(known, [3, 4], TokenSampling(completion=way)) for way in ("auto", "network"))
-    by_tokens = again.complete(known, [3, 4], TokenSampling(completion="tokens"))
-    assert torch.equal(by_default.return_mask, named.return_mask)
-    assert not torch.equal(by_default.return_mask, by_tokens.return_mask)
-    assert torch.equal(by_default.range_m[by_default.return_mask], known.range_m[by_default.return_mask])
-    observed = torch.ones_like(known.range_observed)
-    observed[:, 9] = False
-    of_pixels = Condition.of_pixels(pairs(2), observed)
-    with pytest.raises(ConfigError, match="without a network for what is known"):
-        again.complete(of_pixels, [3, 4], TokenSampling(completion="network"))
+    save_bundle(tmp_path, SENSOR, raydrop=TINY)
+    bundle, alone, tokens = load(tmp_path), load(tmp_path, "raydrop"), load(tmp_path / "lidargrit")
+    known = Condition.of_surfaces(pairs(2))
+    dropped = bundle.complete(known, [3, 4])
+    assert torch.equal(dropped.return_mask, alone.complete(known, [3, 4]).return_mask)
+    assert not torch.equal(dropped.return_mask, tokens.complete(known, [3, 4]).return_mask)
+    assert torch.equal(dropped.range_m[dropped.return_mask], known.range_m[dropped.return_mask])
 
 
 @torch.no_grad()
-def test_each_scan_is_completed_by_the_network_for_what_is_known_of_it():
+def test_rays_of_which_nothing_is_known_are_none_of_its_business(tmp_path):
     torch.manual_seed(0)
-    sizes = replace(LidarGrit.smallest_config(SENSOR), raydrop=TINY)
-    model = LidarGrit(sizes, SENSOR).eval()
+    save_bundle(tmp_path, SENSOR, raydrop=TINY)
+    bundle, alone, tokens = load(tmp_path), load(tmp_path, "raydrop"), load(tmp_path / "lidargrit")
     unknown = torch.zeros(3, 64, 32, dtype=torch.bool)
-    unknown[1, 20, 5] = True  # so the second one is completed by its tokens
+    unknown[1, 20, 5] = True  # so the second one is completed by tokens
     conditions, seeds = Condition.of_surfaces(pairs(3), unknown), [3, 4, 5]
-    together = model.complete(conditions, seeds)
-    for index, seed in enumerate(seeds):
-        alone = model.complete(conditions[[index]], [seed])
-        assert torch.equal(together.return_mask[index], alone.return_mask[0])
-        assert torch.equal(together.range_m[index], alone.range_m[0])
-    by_tokens = model.complete(conditions, seeds, TokenSampling(completion="tokens"))
-    assert [
-        torch.equal(one, other) for one, other in zip(together.return_mask, by_tokens.return_mask, strict=True)
-    ] == [
-        False,
-        True,
-        False,
-    ]
+    together, by_tokens = bundle.complete(conditions, seeds), tokens.complete(conditions, seeds)
+    pairs_of_masks = zip(together.return_mask, by_tokens.return_mask, strict=True)
+    assert [torch.equal(one, other) for one, other in pairs_of_masks] == [False, True, False]
+    with pytest.raises(ConfigError, match="scans with rays of which nothing is known"):
+        alone.complete(conditions, seeds)
+    with pytest.raises(ConfigError, match="wanted ranges of surfaces"):
+        alone.complete(Condition.of_pixels(pairs(1), torch.ones_like(unknown[:1])), [3])

@@ -21,20 +21,22 @@ from lidargrit.scans.marks import mark, read_marks
 from lidargrit.scans.projection import unproject
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage, Scan
-from lidargrit.systems.completion_only.completion_network import CompletionNetwork, CompletionNetworkConfig
-from lidargrit.systems.completion_only.completion_objective import CompletionObjective, random_patterns
-from lidargrit.systems.completion_only.hints import hints_of
-from lidargrit.systems.lidargrit.system import LidarGrit, TokenSampling
-from lidargrit.systems.raydrop.raydrop_network import RaydropConfig, RaydropNetwork
-from lidargrit.systems.raydrop.raydrop_objective import RaydropObjective
+from lidargrit.systems.completion.hints import hints_of
+from lidargrit.systems.completion.network import CompletionNetwork, CompletionNetworkConfig
+from lidargrit.systems.completion.objective import CompletionObjective, random_patterns
+from lidargrit.systems.completion.system import Completion, CompletionConfig
+from lidargrit.systems.lidargrit.system import TokenSampling
+from lidargrit.systems.raydrop.network import RaydropNetwork, RaydropNetworkConfig
+from lidargrit.systems.raydrop.objective import RaydropObjective
+from lidargrit.systems.raydrop.system import Raydrop, RaydropConfig
 from lidargrit.training.taken_stages import taken_stages
-from tiny_runs import every_fourth_row, learn, the_one_line, train_words
+from tiny_runs import every_fourth_row, learn, save_bundle, the_one_line
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
 NETWORK = CompletionNetworkConfig(
     widths=(8, 8, 8), blocks=1, attention_layers=0, heads=1, features=4, mask_width=4, row_channels=1, reflectance=True
 )
-RAYDROP = RaydropConfig(widths=(8, 8, 8), blocks=1, features=4, mask_width=4, row_channels=1, reflectance=True)
+RAYDROP = RaydropNetworkConfig(widths=(8, 8, 8), blocks=1, features=4, mask_width=4, row_channels=1, reflectance=True)
 
 
 def streets(count: int) -> RangeImage:
@@ -65,12 +67,8 @@ def folders(tmp_path_factory):
         KittiBin.write(root / f"scans/{number}.bin", unproject(streets(2)[number]))
     torch.manual_seed(0)
     for name, bright in (("run", True), ("plain", False)):
-        config = replace(
-            LidarGrit.smallest_config(SENSOR),
-            completion=replace(NETWORK, reflectance=bright, labels=not bright),
-            raydrop=replace(RAYDROP, reflectance=bright),
-        )
-        LidarGrit(config, SENSOR).eval().save(root / name)
+        completion = replace(NETWORK, reflectance=bright, labels=not bright)
+        save_bundle(root / name, SENSOR, completion, replace(RAYDROP, reflectance=bright))
     return root
 
 
@@ -265,7 +263,7 @@ def test_complete_writes_it_and_its_error_is_told_where_both_have_it(folders, tm
     errors = [line[column].split() for line in (run, plain, triangles)]
     assert 0 < float(errors[2][0]) < float(errors[0][0]) + 0.05
     assert 0 < float(errors[1][0]) < 1
-    assert main([*compare, f"{folders}/plain:completion=tokens", *settings]) == 0  # it has learned none
+    assert main([*compare, f"{folders}/plain/lidargrit", *settings]) == 0  # it has learned none
     assert "reflectance MAE" in capsys.readouterr().out
 
 
@@ -275,7 +273,7 @@ def test_what_a_generator_does_not_write_is_filled_in_from_observed_returns(fold
     scans, observed = replace(scans, label=label), torch.zeros(2, 64, 32, dtype=torch.bool)
     observed[:, ::4] = True
     known = Condition.of_pixels(scans, observed)
-    done = model.complete(known, [3, 4], TokenSampling(completion="tokens"))
+    done = model.complete(known, [3, 4], TokenSampling())
     assert done.label is not None
     assert known.label is not None
     assert torch.equal(reflectance_of(done)[observed], reflectance_of(scans)[observed])
@@ -287,7 +285,7 @@ def test_what_a_generator_does_not_write_is_filled_in_from_observed_returns(fold
     assert torch.equal(reflectance_of(done)[both], reflectance_of(classical)[both])
     assert torch.equal(done.label[both], classical.label[both])
     assert not bool(reflectance_of(done)[~done.return_mask].any())
-    bare = model.complete(replace(known, reflectance=None, label=None), [3, 4], TokenSampling(completion="tokens"))
+    bare = model.complete(replace(known, reflectance=None, label=None), [3, 4], TokenSampling())
     assert bare.reflectance is None
     assert bare.label is None
     assert torch.equal(bare.range_m, done.range_m)
@@ -302,23 +300,23 @@ def test_what_a_generator_does_not_write_is_filled_in_from_observed_returns(fold
 
 
 def test_a_stage_may_start_from_weights_that_lack_it_but_not_lose_it(folders):
-    def preset(run: str, model: LidarGrit) -> Preset:
-        settings = {"stages_from": str(folders / run), "fine_tune": ("raydrop",)}
-        return Preset("grown", "lidargrit", model.config, DataConfig(), {}, **settings)
+    def preset(run: str, model: Completion | Raydrop, *fine_tune: str) -> Preset:
+        name = model.public_name()
+        settings = {"stages_from": str(folders / run / name), "fine_tune": fine_tune}
+        return Preset("grown", name, model.config, DataConfig(), {}, **settings)
 
-    bright, plain = (load(folders / name) for name in ("run", "plain"))
-    assert isinstance(bright, LidarGrit)
-    assert isinstance(plain, LidarGrit)
-    grown = LidarGrit(replace(plain.config, raydrop=replace(RAYDROP, labels=True)), SENSOR)
-    taken = taken_stages(preset("plain", grown), grown)["raydrop"]
+    grown = Raydrop(RaydropConfig(replace(RAYDROP, labels=True)), SENSOR)
+    taken = taken_stages(preset("plain", grown, "raydrop"), grown)["raydrop"]
     assert taken.state_dict().keys() < grown.objective("raydrop").state_dict().keys()
+    other = Completion(CompletionConfig(replace(NETWORK, reflectance=True)), SENSOR)
     with pytest.raises(ConfigError, match=r"whose completion is another \(model\.completion\.labels=True\)"):
-        taken_stages(preset("plain", bright), bright)  # the completion stage is not fine-tuned
-    less = LidarGrit(replace(bright.config, raydrop=replace(RAYDROP, reflectance=False)), SENSOR)
+        taken_stages(preset("plain", other), other)  # the stage is not fine-tuned
+    less = Raydrop(RaydropConfig(replace(RAYDROP, reflectance=False)), SENSOR)
     with pytest.raises(ConfigError, match=r"whose raydrop is another \(model\.raydrop\.reflectance=True\)"):
-        taken_stages(preset("run", less), less)
+        taken_stages(preset("run", less, "raydrop"), less)
 
 
 def test_a_wrong_setting_is_refused_in_one_line(tmp_path, capsys):
-    assert main(train_words(tmp_path / "no", "model.completion.reflectance=perhaps")) == 2
+    words = ["train", "completion_compact", str(tmp_path / "no"), "--set", "model.completion.reflectance=perhaps"]
+    assert main(words) == 2
     the_one_line(capsys.readouterr().err, "train")

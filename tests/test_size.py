@@ -9,7 +9,7 @@ import pytest
 from torch import nn
 
 from lidargrit.core.errors import CheckpointError, ConfigError
-from lidargrit.data.run_folder import PRETRAINED
+from lidargrit.data.run_folder import locate
 from lidargrit.generation.generator import load
 from lidargrit.generation.presets import load_preset
 from lidargrit.nn.size import numbers_at_most
@@ -56,7 +56,7 @@ def test_a_word_of_the_user_builds_no_network_that_fills_the_memory(setting):
 
 @pytest.mark.parametrize(("name", "value"), [("layers", 1000), ("layers", 10**6), ("width", 2**18), ("width", 2**62)])
 def test_a_configuration_beside_small_weights_builds_no_large_network(tmp_path, name, value):
-    folder = shutil.copytree(PRETRAINED, tmp_path / "run")
+    folder = shutil.copytree(locate("pretrained"), tmp_path / "run")
     about = json.loads((folder / "config.json").read_text())
     about["config"]["transformer"][name] = value
     (folder / "config.json").write_text(json.dumps(about))

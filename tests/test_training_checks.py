@@ -28,7 +28,6 @@ from test_tracking import StandIn
 from test_training import TINY
 from tiny_runs import the_one_line, train_words
 
-ANEW = ["stages_from=", "train_anew=[]"]
 VALIDATING = [
     f"training.{stage}.{setting}" for stage in ("tokenizer", "transformer") for setting in ("validate_every=4",)
 ]
@@ -48,7 +47,7 @@ class Without(RangeImages):
 @pytest.mark.parametrize(
     ("name", "settings", "lacking", "stage"),
     [
-        ("completion_compact", ["model.completion.labels=true", *ANEW], "label", "completion"),
+        ("completion_compact", ["model.completion.labels=true"], "label", "completion"),
         ("r2dm_small", ["model.reflectance=true"], "reflectance", "diffusion"),
         ("r2flow_small", ["model.reflectance=true"], "reflectance", "flow"),
         ("lidargen_small", ["model.reflectance=true"], "reflectance", "score"),
@@ -68,12 +67,6 @@ def test_unmarked_surfaces_are_refused_before_any_stage():
     images = load_range_images(("simulated:1:val",), load_preset("raydrop_compact").data)
     with pytest.raises(ConfigError, match=r"data\.train, for the stage raydrop: training scans that do not mark"):
         checked.check_images("data.train", images)
-
-
-def test_stages_that_learn_from_scans_do_not_learn_from_surfaces():
-    with pytest.raises(ConfigError, match="raydrop trained together with tokenizer and transformer and pixels"):
-        check_stages(load_preset("raydrop_compact", ANEW))
-    check_stages(load_preset("raydrop_compact", [*ANEW, "model.raydrop.surfaces=estimated"]))
 
 
 def test_validation_scans_are_looked_for_before_training_scans_are_projected(tmp_path):

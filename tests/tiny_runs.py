@@ -1,5 +1,6 @@
 """Runs that train within a second, and what is read from a command's answer."""
 
+import json
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -8,7 +9,13 @@ import torch
 
 from lidargrit.generation.objective import Objective
 from lidargrit.scans.condition import Condition
+from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
+from lidargrit.systems.completion.network import CompletionNetworkConfig
+from lidargrit.systems.completion.system import Completion, CompletionConfig
+from lidargrit.systems.lidargrit.system import LidarGrit
+from lidargrit.systems.raydrop.network import RaydropNetworkConfig
+from lidargrit.systems.raydrop.system import Raydrop, RaydropConfig
 
 MODEL = [  # 64x64 range images, 8x8 tokens
     "data.columns=512",
@@ -70,3 +77,21 @@ def every_fourth_row(images: RangeImage) -> Condition:
     observed = torch.zeros_like(images.return_mask)
     observed[:, 2::4] = True
     return Condition.of_pixels(images, observed)
+
+
+def save_bundle(
+    folder: Path,
+    sensor: SensorModel,
+    completion: CompletionNetworkConfig | None = None,
+    raydrop: RaydropNetworkConfig | None = None,
+) -> None:
+    """Write a bundle of untrained runs: the smallest LidarGRIT, and of completion and raydrop those with a network."""
+    runs = {"sample": "lidargrit"}
+    LidarGrit(LidarGrit.smallest_config(sensor), sensor).save(folder / "lidargrit")
+    if completion is not None:
+        Completion(CompletionConfig(completion), sensor).save(folder / "completion")
+        runs["complete"] = "completion"
+    if raydrop is not None:
+        Raydrop(RaydropConfig(raydrop), sensor).save(folder / "raydrop")
+        runs["raydrop"] = "raydrop"
+    (folder / "bundle.json").write_text(json.dumps(runs))

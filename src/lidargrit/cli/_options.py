@@ -93,7 +93,5 @@ def add_completion(parser: argparse.ArgumentParser, model: str, points_only: boo
     kind = "format of the files: bin, pcd, ply, npz, a name from: lidargrit list formats, or image for range images as "
     kind += ".npy (default: that of each scan's file)"
     parser.add_argument("--format", default="", help=kind)
-    add_settings(
-        parser, "sampling settings to change, such as completion=tokens temperature=0.9; see: lidargrit list generators"
-    )
+    add_settings(parser, "sampling settings to change, such as temperature=0.9; see: lidargrit list generators")
     add_device(parser)

@@ -11,7 +11,7 @@ from lidargrit.core.untrusted import seed_number
 EXAMPLES = """\
   lidargrit compare-completion simulated:64:test
   lidargrit compare-completion /data/kitti_odometry pretrained runs/r2dm linear triangulation -n 32
-  lidargrit compare-completion /data/held_out runs/mine runs/mine:completion=tokens      by two methods of one run
+  lidargrit compare-completion /data/held_out pretrained/completion pretrained/lidargrit     two runs of one bundle
   lidargrit compare-completion /data/held_out --observed rows:8 pixels:0.05 --json table.json
   lidargrit compare-completion /data/held_out linear triangulation --set data.columns=2048 data.column_stride=2
 """
@@ -37,7 +37,7 @@ def run(options: argparse.Namespace) -> None:
     """Complete, measure and print a table."""
     from lidargrit.core.reporting import TerminalReporter
     from lidargrit.evaluation.completion import PATTERNS, as_json, as_table, compare_completion
-    from lidargrit.inference.complete import is_classical, open_completers
+    from lidargrit.inference.complete import is_classical, open_models
     from lidargrit.inference.complete.inputs import images_for, sensor_of
     from lidargrit.inference.complete.patterns import Pattern
     from lidargrit.scans.fills import FILLS
@@ -48,8 +48,8 @@ def run(options: argparse.Namespace) -> None:
     settings = scan_settings(options, max_scans=options.count)
     named = settings.sensor or settings.data.columns or all(is_classical(word) for word in words)
     sensor = settings.data.imaged(sensor_of(options.scans, settings.sensor)) if named else None
-    completers = open_completers(words, sensor, options.device)
+    models = open_models(words, sensor, options.device)
     reporter = TerminalReporter()
-    images = images_for(completers, options.scans, settings, reporter)
-    scores = compare_completion(images, completers, patterns, options.completions, options.seed, reporter)
+    images = images_for(models, options.scans, settings, reporter)
+    scores = compare_completion(images, models, patterns, options.completions, options.seed, reporter)
     print_result(options, as_table(scores), {"scans": options.scans, "scores": as_json(scores)})

@@ -9,7 +9,7 @@ from lidargrit.core.errors import counted_scans
 
 EXAMPLES = """\
   lidargrit complete /data/scans whole                             fill in every ray without a point
-  lidargrit complete scan.bin four -n 4 --observed sector:45,315 --set completion=tokens    four samples
+  lidargrit complete scan.bin four -n 4 --observed sector:45,315 --model pretrained/lidargrit    four samples
   lidargrit complete /data/scans dense --observed rows:4 --model triangulation --sensor hdl64e_kitti_360
   lidargrit complete samples filled --observed mask.npy --format image
 """
@@ -31,7 +31,7 @@ def run(options: argparse.Namespace) -> None:
     """Complete the scans, and say where they are."""
     from lidargrit.core.reporting import TerminalReporter
     from lidargrit.data.prepared.config import DataConfig
-    from lidargrit.inference.complete import is_classical, open_completer
+    from lidargrit.inference.complete import is_classical, open_model
     from lidargrit.inference.complete.command import complete_scans
     from lidargrit.inference.complete.files import OutputConfig
     from lidargrit.inference.complete.inputs import sensor_of
@@ -40,8 +40,8 @@ def run(options: argparse.Namespace) -> None:
     pattern = Pattern(options.observed)
     named = options.sensor or is_classical(options.model)
     sensor = sensor_of(options.scans, options.sensor) if named else None
-    completer = open_completer(options.model, "pixels", sensor, options.set, options.device)
+    model = open_model(options.model, "pixels", sensor, options.set, options.device)
     output = OutputConfig(options.count, options.seed, options.format)
     config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)
-    count = complete_scans(options.scans, options.out, completer, pattern, output, config, TerminalReporter())
+    count = complete_scans(options.scans, options.out, model, pattern, output, config, TerminalReporter())
     print(f"done: {counted_scans(count, 'completed')} in {options.out}; completed.json says how they were made")

@@ -27,12 +27,12 @@ def run(options: argparse.Namespace) -> None:
     """Drop returns, and say where the scans are."""
     from lidargrit.core.reporting import TerminalReporter
     from lidargrit.data.prepared.config import DataConfig
-    from lidargrit.inference.complete import open_completer
+    from lidargrit.inference.complete import open_model
     from lidargrit.inference.complete.command import raydrop_scans
     from lidargrit.inference.complete.files import OutputConfig
 
-    completer = open_completer(options.model, "surfaces", None, options.set, options.device)
+    model = open_model(options.model, "surfaces", None, options.set, options.device)
     output = OutputConfig(options.count, options.seed, options.format, options.probability)
     config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)
-    count = raydrop_scans(options.scans, options.out, completer, output, config, TerminalReporter())
+    count = raydrop_scans(options.scans, options.out, model, output, config, TerminalReporter())
     print(f"done: {counted_scans(count)} with raydrop in {options.out}")

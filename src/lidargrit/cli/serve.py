@@ -33,10 +33,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Serve until interrupted."""
-    from lidargrit.data.run_folder import locate
+    from lidargrit.data.run_folder import named_folder
     from lidargrit.viewer.serve import Limits, finished_runs, serve
 
     say = partial(print, flush=True)
-    runs = [locate(run) for run in options.runs] or finished_runs(Path("runs"), say)
+    runs = [named_folder(run) for run in options.runs] or finished_runs(Path("runs"), say)
     limits = Limits(seconds=options.seconds)
     serve(runs, say, options.host, options.port, options.device, limits)

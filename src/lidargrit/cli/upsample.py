@@ -27,7 +27,7 @@ def run(options: argparse.Namespace) -> None:
     """Add the rows, and say where the scans are."""
     from lidargrit.core.reporting import TerminalReporter
     from lidargrit.data.prepared.config import DataConfig
-    from lidargrit.inference.complete import open_completer
+    from lidargrit.inference.complete import open_model
     from lidargrit.inference.complete.command import upsample_scans
     from lidargrit.inference.complete.files import OutputConfig
     from lidargrit.inference.complete.inputs import sensor_of
@@ -35,8 +35,8 @@ def run(options: argparse.Namespace) -> None:
 
     scans_sensor = sensor_of(options.scans, options.sensor)
     wanted_sensor = load_sensor(options.to) if options.to else None
-    completer = open_completer(options.model, "pixels", wanted_sensor, options.set, options.device)
+    model = open_model(options.model, "pixels", wanted_sensor, options.set, options.device)
     output = OutputConfig(options.count, options.seed, options.format)
     config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)
-    count = upsample_scans(options.scans, options.out, completer, scans_sensor, output, config, TerminalReporter())
-    print(f"done: {counted_scans(count)} of {completer.sensor.name} in {options.out}")
+    count = upsample_scans(options.scans, options.out, model, scans_sensor, output, config, TerminalReporter())
+    print(f"done: {counted_scans(count)} of {model.sensor.name} in {options.out}")

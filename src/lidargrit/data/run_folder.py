@@ -1,4 +1,4 @@
-"""The folder of a finished run: its name → its files, and what they say of its training."""
+"""The folder of a finished run, or of a bundle of runs: its name → its files, and what they say of its training."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import string
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 from lidargrit.core import configuration
 from lidargrit.core.errors import CheckpointError, ConfigError, LidarGritError, UnknownNameError, nearest_names, one_of
@@ -19,16 +19,58 @@ from lidargrit.scans.sensors import SensorModel
 CONFIG_FILE, WEIGHTS_FILE, CARD_FILE = "config.json", "model.safetensors", "README.md"  # the names that the hub knows
 RUN_FILE = "run.json"  # ``origin`` in it says that the weights beside it were not trained in this folder
 CHECKPOINT_FILE = "checkpoint.safetensors"  # of a stage, in its own folder
-TRAINED_ON_FILE = "trained_on.json"  # in a run's folder and beside its samples: which drives, which pixels
+BUNDLE_FILE = "bundle.json"  # names the folders of runs beside it by the job that each does
+TRAINED_ON_FILE = "trained_on.json"  # in the folder of a run or of its bundle, and beside its samples
 _NAMES_AT_MOST = 10_000_000  # that a file stands for by their first and last
 PRETRAINED = Path(__file__).parents[1] / "pretrained"
 PACKAGED = (PRETRAINED, PRETRAINED.with_name("pretrained_wide"))  # their names go wherever a run is wanted
 
 
-def locate(run: str | Path) -> Path:
-    """Return the folder of a run; the package has ``pretrained`` and ``pretrained_wide``, unless you have your own."""
-    packaged = {folder.name: folder for folder in PACKAGED}
-    return Path(run) if is_taken(Path(run)) else packaged.get(str(run), Path(run))
+Job = Literal["sample", "complete", "raydrop"]
+"""What a run of a bundle does: sample new scans, complete scans, or drop returns of clean ones."""
+
+
+def named_folder(name: str | Path) -> Path:
+    """Return the folder of a run or of a bundle.
+
+    Args:
+        name: path of the folder; ``pretrained`` and ``pretrained_wide`` are in the package, unless you have your own,
+            and ``pretrained/completion`` is a run of the first.
+    """
+    path, packaged = Path(name), {folder.name: folder for folder in PACKAGED}
+    first, *run = path.parts or ("",)
+    is_packaged = first in packaged and len(run) <= 1 and not is_taken(Path(first))
+    return packaged[first].joinpath(*run) if is_packaged else path
+
+
+def locate(name: str | Path, job: Job = "sample") -> Path:
+    """Return the folder of a run; of a bundle, that of the run which does a job, and of the one that samples if none.
+
+    Raises:
+        CheckpointError: a bundle whose file does not name its runs.
+    """
+    folder = named_folder(name)
+    if not is_bundle(folder):
+        return folder
+    runs = _runs_of(folder)
+    return folder / runs.get(job, runs["sample"])
+
+
+def is_bundle(folder: Path) -> bool:
+    """Return whether a folder is that of a bundle of runs."""
+    return (folder / BUNDLE_FILE).is_file()
+
+
+def _runs_of(bundle: Path) -> dict[str, str]:
+    runs, names = read_json(bundle / BUNDLE_FILE), {path.name for path in bundle.iterdir()}
+    if not isinstance(runs, dict) or "sample" not in runs or not {*runs} <= {*get_args(Job)}:
+        got, wanted = f"{bundle / BUNDLE_FILE} without a run that samples, or with an unknown job", str(get_args(Job))
+        raise CheckpointError(got, f"folders by their jobs, {wanted}", "restore the file")
+    for run in runs.values():
+        if run not in names:
+            got = f"{bundle / BUNDLE_FILE}, which names {str(run)[:40]!r}"
+            raise CheckpointError(got, "folders that lie beside it", "restore the folder")
+    return runs
 
 
 def is_run(folder: Path) -> bool:
@@ -132,18 +174,25 @@ def trained_on(folder: Path) -> Provenance:
     Raises:
         CheckpointError: a file that lidargrit did not write.
     """
-    if not (folder / TRAINED_ON_FILE).is_file():
+    path = trained_on_file(folder)
+    if path is None:
         return Provenance()
     try:
-        facts = {name: tuple(of) for name, of in read_json(folder / TRAINED_ON_FILE).items()}
+        facts = {name: tuple(of) for name, of in read_json(path).items()}
         facts["recordings"] = tuple(_each_name(facts["recordings"]))
         if not all(isinstance(each, str) for of in facts.values() for each in of):
             raise TypeError("something is no text")
         return Provenance(**facts)
     except (TypeError, KeyError, ValueError, AttributeError) as error:
-        raise CheckpointError(
-            f"{folder / TRAINED_ON_FILE}, in which {error}", "what lidargrit wrote", "restore it, or remove it"
-        ) from None
+        raise CheckpointError(f"{path}, in which {error}", "what lidargrit wrote", "restore it, or remove it") from None
+
+
+def trained_on_file(folder: Path) -> Path | None:
+    """Return the file that says what a run learned from, which the runs of a bundle may share; None without one."""
+    own, shared = folder / TRAINED_ON_FILE, folder.parent / TRAINED_ON_FILE
+    if own.is_file():
+        return own
+    return shared if is_bundle(folder.parent) and shared.is_file() else None
 
 
 def write_trained_on(folder: Path, provenance: Provenance) -> None:

@@ -20,7 +20,7 @@ from lidargrit.data.images import RangeImages
 from lidargrit.evaluation.estimates import Estimate
 from lidargrit.evaluation.metrics import load_metric
 from lidargrit.generation.semantic_classes import NUM_CLASSES, class_indices
-from lidargrit.inference.complete import Completer
+from lidargrit.inference.complete import Model
 from lidargrit.inference.complete.patterns import Pattern
 from lidargrit.scans.condition import Condition
 from lidargrit.scans.projection import points_of_pixels
@@ -78,7 +78,7 @@ class CompletionScore:
 
 def compare_completion(
     images: RangeImages,
-    completers: Sequence[Completer],
+    models: Sequence[Model],
     patterns: Sequence[Pattern],
     completions: int = 2,
     seed: int = 0,
@@ -88,7 +88,7 @@ def compare_completion(
 
     Args:
         images: whole scans.
-        completers: models and classical methods, of the sensor of the images.
+        models: models and classical methods, of the sensor of the images.
         patterns: choices of the observed pixels; each scan has its own random pixels, the same for all models.
         completions: number of completions of each scan by a model that is random.
         seed: seed of the first completion, and of the random pixels.
@@ -107,11 +107,11 @@ def compare_completion(
         raise DataError(
             f"{counted_scans(len(images))}, {completions} completions of each", "at least 1 of both", "raise the number"
         )
-    for completer in completers:
-        _check(completer, images, reporter)
+    for model in models:
+        _check(model, images, reporter)
     whole = images.batch(range(len(images)))
     scores = []
-    with reporter.progress("completing", len(patterns) * len(completers)) as progress:
+    with reporter.progress("completing", len(patterns) * len(models)) as progress:
         for pattern in patterns:
             masks = [pattern.mask(whole[index], derive_seed(seed, index)) for index in range(len(whole))]
             if not bool((whole.return_mask.cpu() & ~torch.stack(masks)).any()):
@@ -119,9 +119,9 @@ def compare_completion(
                 raise UsageError(got, "pixels that leave some returns out", "observe others, as rows:4")
             condition = Condition.of_pixels(whole, torch.stack(masks))
             of_pattern = []
-            for completer in completers:
-                of_pattern.append(_score(completer, pattern, whole, condition, completions, seed))
-                progress.advance(1, completer.name)
+            for model in models:
+                of_pattern.append(_score(model, pattern, whole, condition, completions, seed))
+                progress.advance(1, model.name)
             scores += _beside(of_pattern)
     return scores
 
@@ -168,23 +168,23 @@ class _OfPattern:
     errors_m: list[float]
 
 
-def _check(completer: Completer, images: RangeImages, reporter: Reporter) -> None:
-    if not completer.sensor.same_rays(images.sensor):
+def _check(model: Model, images: RangeImages, reporter: Reporter) -> None:
+    if not model.sensor.same_rays(images.sensor):
         raise ConfigError(
-            f"the model {completer.name} of {completer.sensor.name!r}",
+            f"the model {model.name} of {model.sensor.name!r}",
             f"one of {images.sensor.name!r}, {images.sensor.height}x{images.sensor.width}, as the first",
             "compare models of one sensor",
         )
-    if shared := completer.learned_from().overlap(images.provenance):
-        reporter.message(f"WARNING: {completer.name} and the scans overlap ({shared}): the scores flatter it")
+    if shared := model.learned_from().overlap(images.provenance):
+        reporter.message(f"WARNING: {model.name} and the scans overlap ({shared}): the scores flatter it")
 
 
 def _score(
-    completer: Completer, pattern: Pattern, whole: RangeImage, condition: Condition, completions: int, seed: int
+    model: Model, pattern: Pattern, whole: RangeImage, condition: Condition, completions: int, seed: int
 ) -> _OfPattern:
-    turns = completions if completer.random else 1
+    turns = completions if model.generator.is_random else 1
     begin = time.perf_counter()
-    filled = [_complete(completer, condition, turn, seed) for turn in range(turns)]
+    filled = [_complete(model, condition, turn, seed) for turn in range(turns)]
     seconds = (time.perf_counter() - begin) / (len(whole) * turns)
     hidden = ~condition.return_observed
     errors = [_mean([_error_m(images[i], whole[i], hidden[i]) for images in filled]) for i in range(len(whole))]
@@ -204,7 +204,7 @@ def _score(
     runs.update(filled[0], real=False)
     runs.update(whole, real=True)
     score = CompletionScore(
-        completer.name,
+        model.name,
         pattern.text,
         len(whole),
         Estimate.of(errors),
@@ -220,12 +220,12 @@ def _score(
     return _OfPattern(score, errors)
 
 
-def _complete(completer: Completer, condition: Condition, turn: int, seed: int) -> RangeImage:
+def _complete(model: Model, condition: Condition, turn: int, seed: int) -> RangeImage:
     parts = []
-    for first in range(0, len(condition), completer.batch):
-        some = condition[first : first + completer.batch]
+    for first in range(0, len(condition), model.generator.compute_batch):
+        some = condition[first : first + model.generator.compute_batch]
         seeds = [scan_seed(seed + turn, index) for index in range(first, first + len(some))]
-        parts.append(completer.complete(some, seeds))
+        parts.append(model.complete(some, seeds))
     return RangeImage.cat(parts)
 
 

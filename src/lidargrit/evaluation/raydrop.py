@@ -11,7 +11,6 @@ from torch import Tensor
 
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.images import RangeImages
-from lidargrit.data.run_folder import locate
 from lidargrit.evaluation.realism import SimulatedScans, distance, drop_independently
 from lidargrit.generation.generator import Generator, load
 from lidargrit.nn.devices import usable_device
@@ -95,7 +94,7 @@ def raydrop_model(word: str, device: str = "") -> Generator:
     Raises:
         ConfigError: a run that cannot do one of both; no such device.
     """
-    generator = load(locate(word)).to(usable_device(device))
+    generator = load(word).to(usable_device(device))
     _check(generator)
     _check_tokenizer(generator)
     return generator

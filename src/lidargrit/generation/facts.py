@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from lidargrit.core.configuration import TypedSettings
@@ -52,12 +52,26 @@ class SystemFacts:
     weights_licence: str = ""
     first_command: str = "sample RUN samples -n 16"
 
-    def lines(self, capabilities: Iterable[str]) -> list[str]:
-        """Return the facts as lines for a person, and between them what a generator with these capabilities can do."""
+    def lines(
+        self, capabilities: Collection[str], sampling: Mapping[str, object], not_of_sampling: Collection[str]
+    ) -> list[str]:
+        """Return the facts as lines for a person, what a generator can do between them, and its settings behind them.
+
+        Args:
+            capabilities: names of what the generator can do besides sampling.
+            sampling: settings of sampling with their defaults, by their names.
+            not_of_sampling: names of those settings that only completing or inverting a scan reads.
+        """
         origin = "; ".join(part for part in (self.paper, self.program) if part) or "this project"
+        settings = {"sample --set": sampling.keys() - {*not_of_sampling}, "complete --set besides": {*not_of_sampling}}
         return [
             f"generates {self.generates}",
             *(f"can {what} ({name})" for name, what in CAPABILITIES.items() if name in capabilities),
             f"from: {origin}",
             f"published weights: {self.weights_licence or 'none'}",
+            *(
+                f"{verb}: {', '.join(f'{name}={value}' for name, value in sampling.items() if name in names)}"
+                for verb, names in settings.items()
+                if names
+            ),
         ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar, final
@@ -12,18 +13,16 @@ import torch
 
 from lidargrit.core import configuration, discovery
 from lidargrit.core.errors import CheckpointError, ConfigError
-from lidargrit.core.files import read_tensors
 from lidargrit.data.images import RangeImages
-from lidargrit.data.run_folder import CONFIG_FILE, WEIGHTS_FILE, locate, read_config, told_of
+from lidargrit.data.run_folder import WEIGHTS_FILE, Job, is_bundle, locate, named_folder
 from lidargrit.generation.batches import BatchSeeds, check_condition, check_images, check_seeds, in_batches, one_by_one
+from lidargrit.generation.bundle import Bundle
 from lidargrit.generation.facts import CAPABILITIES, Cost, NoSampling, SystemFacts
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.range_steps import RangeSteps
-from lidargrit.generation.saved import ConfigT, SavedModel, download
+from lidargrit.generation.saved import ConfigT, SavedModel, download, read_saved
 from lidargrit.generation.tokenizers import Tokenizer
 from lidargrit.nn.precision import Precision
-from lidargrit.nn.quantization import without_quantized
-from lidargrit.nn.size import numbers_at_most
 from lidargrit.scans.condition import Condition, ConditionKind
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage, ScanBits
@@ -48,6 +47,12 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     """Names of those settings in ``Sampling`` that only completing or inverting a scan reads."""
 
     capabilities: ClassVar[frozenset[str]] = frozenset()
+    needs_condition: ClassVar[bool] = False
+    """Whether it only completes scans, and has no new ones to sample."""
+    is_random: ClassVar[bool] = True
+    """Whether two seeds give two scans."""
+    bundle: Bundle[Generator[Any, Any]] | None = None
+    """Runs that complete scans in its place where it was read from a bundle."""
     facts: ClassVar[SystemFacts] = SystemFacts(generates="range images")
     training_precision: ClassVar[Precision] = "auto"
     """Precision in which stages are trained where no preset names one."""
@@ -109,7 +114,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     @property
     def device(self) -> torch.device:
         """Device on which the weights lie and scans are computed."""
-        return next(chain(self.parameters(), self.buffers())).device
+        return next((each.device for each in chain(self.parameters(), self.buffers())), torch.device("cpu"))
 
     def fit_statistics(self, images: RangeImages) -> None:
         """Compute statistics of the training scans that need no objective; called once, before the stages."""
@@ -135,12 +140,18 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
             sampling: settings of the generator's own ``Sampling``; its defaults if not given.
 
         Raises:
-            ConfigError: no seed or one out of bounds, or settings of another generator.
+            ConfigError: no seed or one out of bounds, settings of another generator, or one that only completes scans.
 
         Example::
 
             lidargrit.load("runs/demo").sample(seeds=[0, 1, 2, 3])
         """
+        if self.needs_condition:
+            got, cure = (
+                f"a generator {self.public_name()!r}, which has no new scans to sample",
+                self.facts.first_command,
+            )
+            raise ConfigError(got, "one that samples", f"use it with: lidargrit {cure}")
         check_seeds(seeds)
         settings = self._settings(sampling, self.Sampling)
         self.eval()
@@ -189,7 +200,8 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         """Return scans that keep all observed values, bit for bit, and generate the rest (capability ``complete``).
 
         Reflectance and labels that the generator does not write are filled in from the observed returns; a batch has
-        them if any of its scans has observed some.
+        them if any of its scans has observed some. A generator that was read from a bundle leaves each scan to the
+        bundle's run for what is known of it, unless it is given settings of its own sampling.
 
         Args:
             condition: observed part of each scan, such as ``Condition.of_pixels(images, observed)``, of the kinds in
@@ -207,11 +219,20 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         check_condition(condition, self.conditions, self.sensor, self.public_name())
         check_seeds(seeds, len(condition))
         settings, condition = self._settings(sampling, self.completion_sampling), condition.to(self.device)
-        self.eval()
-        generated = in_batches(
-            seeds, self.compute_batch, lambda at, some: self._complete(condition[at], some, settings)
-        )
+        shares = [(None, [*range(len(seeds))])]
+        if sampling is None and self.bundle is not None:
+            shares = self.bundle.shares(condition)
+        found: dict[int, RangeImage] = {}
+        for run, indices in shares:
+            some, own = condition[indices], [seeds[index] for index in indices]
+            part = self._completed(some, own, settings) if run is None else run.to(self.device).complete(some, own)
+            found |= {index: part[[at]] for at, index in enumerate(indices)}
+        generated = RangeImage.cat([found[index] for index in range(len(seeds))])
         return condition.put_into(fill_lacking(generated, condition))
+
+    def _completed(self, condition: Condition, seeds: Sequence[int], sampling: SamplingT) -> RangeImage:
+        self.eval()
+        return in_batches(seeds, self.compute_batch, lambda at, some: self._complete(condition[at], some, sampling))
 
     @final
     @torch.no_grad()
@@ -258,9 +279,9 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         rounded = steps.round(images.to(self.device))
         return ScanBits.cat([self._bits(image, steps, expected) for image in one_by_one(rounded)])
 
-    @abstractmethod
     def _sample(self, seeds: BatchSeeds, sampling: SamplingT) -> RangeImage:
         """Generate one scan for each of ``compute_batch`` seeds; scans of copies at their end may be left out."""
+        raise NotImplementedError
 
     def _complete(self, condition: Condition, seeds: BatchSeeds, sampling: SamplingT) -> RangeImage:
         """Generate scans that agree with the observed values, which the caller then puts in."""
@@ -298,13 +319,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     @classmethod
     def about(cls) -> list[str]:
         """Return lines for a person: the system's facts, and the sampling settings with their defaults."""
-        facts = cls.facts.lines(cls.capabilities)
-        defaults = configuration.leaves(cls.Sampling())
-        for verb, names in (("sample", defaults.keys() - cls.not_of_sampling), ("complete", cls.not_of_sampling)):
-            settings = [f"{name}={value}" for name, value in defaults.items() if name in names]
-            also = " besides" if verb == "complete" else ""
-            facts += [f"{verb} --set{also}: {', '.join(settings)}"] if settings else []
-        return facts
+        return cls.facts.lines(cls.capabilities, configuration.leaves(cls.Sampling()), cls.not_of_sampling)
 
     @classmethod
     def from_published(cls, files: Sequence[Path], config: ConfigT, sensor: SensorModel) -> Generator[Any, Any]:
@@ -337,7 +352,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
             CheckpointError: no such folder or repository, a damaged one, or another kind of generator in it.
             ConfigError: a revision of a folder, which has none.
         """
-        here = locate(name)
+        here = named_folder(name)
         if here.is_dir() and revision is not None:
             got = f"revision={revision!r} of {name}, which is a folder here"
             raise ConfigError(
@@ -353,22 +368,20 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         return generator
 
 
-def load(folder: str | Path) -> Generator:
+def load(name: str | Path, job: Job = "sample") -> Generator:
     """Read a trained generator from a run's folder; ``pretrained`` and ``pretrained_wide`` come with the package.
+
+    Args:
+        name: folder of a run, or of a bundle of runs.
+        job: job of the run that is read from a bundle.
 
     Raises:
         CheckpointError: no finished model in the folder, a damaged file, or weights of another configuration.
     """
-    folder = locate(folder)
-    saved = read_config(folder)
-    with told_of(folder / CONFIG_FILE):
-        cls = load_class(saved.generator)
-        config = configuration.from_json(cls.Config, saved.config, str(folder / CONFIG_FILE))
-        weights = without_quantized(read_tensors(folder / WEIGHTS_FILE)[0])
-        expected = sum(tensor.numel() for tensor in weights.values())
-        # Twice as many as the file holds, for what is built besides: a wrong file is refused before it fills memory.
-        with numbers_at_most(2 * expected + 2**20, f"{folder / CONFIG_FILE} with a network", "restore both files"):
-            return cls.from_weights(config, saved.sensor, weights, folder / WEIGHTS_FILE)
+    generator, bundle = read_saved(locate(name, job), load_class), named_folder(name)
+    if job == "sample" and is_bundle(bundle):
+        generator.bundle = Bundle({each: partial(load, bundle, each) for each in ("complete", "raydrop")})
+    return generator
 
 
 def load_class(name: str) -> type[Generator]:

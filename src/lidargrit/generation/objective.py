@@ -39,8 +39,6 @@ class Objective(nn.Module, ABC):
     """Settings of the generator that it learns by, beside those that begin with the name of the stage."""
     over: tuple[str, ...] = ()
     """Names of earlier stages whose networks compute what it learns from; it is of no use with other networks."""
-    needs_marks: bool = False
-    """Whether it learns from surfaces that are marked as returns or not, which no other stage can learn from."""
     period: int = 1
     """Number of training steps after which the same operations come again; more than 1 if some terms come rarely."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -11,14 +12,15 @@ from torch import Tensor, nn
 
 from lidargrit.core import configuration
 from lidargrit.core.errors import CheckpointError, ConfigError
-from lidargrit.core.files import write_json, write_tensors, write_text
-from lidargrit.data.run_folder import CARD_FILE, CONFIG_FILE, WEIGHTS_FILE
+from lidargrit.core.files import read_tensors, write_json, write_tensors, write_text
+from lidargrit.data.run_folder import CARD_FILE, CONFIG_FILE, WEIGHTS_FILE, read_config, told_of
 from lidargrit.nn.exact_weights import load_exactly
-from lidargrit.nn.quantization import WeightBits, with_quantized
+from lidargrit.nn.quantization import WeightBits, with_quantized, without_quantized
+from lidargrit.nn.size import numbers_at_most
 from lidargrit.scans.sensors import SensorModel
 
 ConfigT = TypeVar("ConfigT")
-ModelT = TypeVar("ModelT", bound=nn.Module)
+ModelT = TypeVar("ModelT", bound="SavedModel[Any]")
 
 
 class SavedModel(nn.Module, Generic[ConfigT]):
@@ -119,3 +121,24 @@ def download(name: str, revision: str | None, patterns: list[str]) -> Path:
     except Exception as error:  # its client has a dozen kinds, from a wrong name to a broken line, and changes them
         got = f"{name}, which cannot be fetched ({type(error).__name__}: {str(error).partition(chr(10))[0][:100]})"
     raise CheckpointError(got, wanted, cure)
+
+
+def read_saved(folder: Path, class_of: Callable[[str], type[ModelT]]) -> ModelT:
+    """Read a network with its configuration and sensor from the folder in which it was saved.
+
+    Args:
+        folder: folder of a finished run.
+        class_of: function from the name of a system to its class.
+
+    Raises:
+        CheckpointError: no finished model in the folder, a damaged file, or weights of another configuration.
+    """
+    saved = read_config(folder)
+    with told_of(folder / CONFIG_FILE):
+        cls = class_of(saved.generator)
+        config = configuration.from_json(cls.Config, saved.config, str(folder / CONFIG_FILE))
+        weights = without_quantized(read_tensors(folder / WEIGHTS_FILE)[0])
+        expected = sum(tensor.numel() for tensor in weights.values())
+        # Twice as many as the file holds, for what is built besides: a wrong file is refused before it fills memory.
+        with numbers_at_most(2 * expected + 2**20, f"{folder / CONFIG_FILE} with a network", "restore both files"):
+            return cls.from_weights(config, saved.sensor, weights, folder / WEIGHTS_FILE)

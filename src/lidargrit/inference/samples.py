@@ -26,7 +26,7 @@ from lidargrit.core.files import (
     write_text,
 )
 from lidargrit.core.reporting import Reporter
-from lidargrit.data.run_folder import TRAINED_ON_FILE, recorded_projection, weights_sha256
+from lidargrit.data.run_folder import TRAINED_ON_FILE, recorded_projection, trained_on_file, weights_sha256
 from lidargrit.data.sources.samples import MANIFEST, is_sample_folder
 from lidargrit.generation.generator import Generator, SamplingT
 from lidargrit.scans.types import RangeImage
@@ -121,8 +121,8 @@ def _begin(folder: Path, manifest: dict[str, Any]) -> None:
 
 def _trained_on(run_folder: Path) -> str | None:
     """Return what the model learned from, as it is to lie beside its samples; None where the run does not tell."""
-    source = run_folder / TRAINED_ON_FILE
-    return json.dumps(read_json(source), separators=(",", ":")) + "\n" if source.is_file() else None
+    source = trained_on_file(run_folder)
+    return None if source is None else json.dumps(read_json(source), separators=(",", ":")) + "\n"
 
 
 def _missing(folder: Path, seeds: Sequence[int]) -> list[int]:

@@ -152,9 +152,9 @@ class Condition:
 
     @property
     def kinds(self) -> frozenset[ConditionKind]:
-        """Kinds of observations in the condition; empty if there are none."""
+        """Kinds of observations in the condition; rays that are known not to return are of neither."""
         found: dict[ConditionKind, Tensor] = {
-            "pixels": self.return_observed,
+            "pixels": self.range_observed & self.return_observed,
             "surfaces": self.range_observed & ~self.return_observed,
         }
         return frozenset(kind for kind, mask in found.items() if bool(mask.any()))

@@ -172,13 +172,6 @@ def check_stages(preset: Preset, processes: int = 1) -> CheckedStages:
     checked = CheckedStages(objectives, donors)
     for name, objective in checked.trained.items():
         follow_settings(objective, preset.settings_of(name), processes)
-    if others := [name for name, objective in checked.trained.items() if not objective.needs_marks]:
-        for name in checked.trained.keys() - set(others):
-            raise ConfigError(
-                f"{name} trained together with {' and '.join(others)}, from scans of every surface",
-                "a run that learns from such scans alone",
-                f"train {' and '.join(others)} first, then take them from that run by stages_from",
-            )
     return checked
 
 

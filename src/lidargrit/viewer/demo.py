@@ -18,7 +18,7 @@ from lidargrit.core.files import read_json, write_json
 from lidargrit.core.reporting import Reporter
 from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.data.run_folder import PRETRAINED, RUN_FILE
+from lidargrit.data.run_folder import PRETRAINED, RUN_FILE, locate
 from lidargrit.data.sources import load_range_images, open_source
 from lidargrit.data.sources.samples import read_samples
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair
@@ -218,9 +218,8 @@ def _reconstructed(generator: Generator, images: RangeImage, sampling: TokenSamp
 def _packaged_samples(folder: Path, clock: _Clock, reporter: Reporter) -> RangeImages:
     """Sample from the model in the package, which was trained for hours, for comparison."""
     with clock.stage(f"sample {_PACKAGED_SCANS} scans from the packaged model"):
-        write_samples(
-            load(PRETRAINED).to(usable_device("")), PRETRAINED, folder, range(_PACKAGED_SCANS), reporter=reporter
-        )
+        model, run = load(PRETRAINED).to(usable_device("")), locate(PRETRAINED)
+        write_samples(model, run, folder, range(_PACKAGED_SCANS), reporter=reporter)
     return read_samples(folder, _PACKAGED_SCANS)
 
 

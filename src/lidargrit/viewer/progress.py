@@ -21,6 +21,7 @@ def plot_progress(generator: Generator, stage: str, val: RangeImages, path: Path
     groups = {"val": real}
     if "encode" in generator.capabilities:
         groups["reconstructed"] = generator.reconstruct(real).to("cpu")
-    if stage != generator.stages[0] or len(generator.stages) == 1:
+    samples = stage != generator.stages[0] or len(generator.stages) == 1
+    if samples and not generator.needs_condition:
         groups["generated"] = generator.sample(range(_SCANS)).to("cpu")
     plot_comparison(groups, path, title=f"{stage}, {path.stem} scans seen")

@@ -31,7 +31,7 @@ from lidargrit.data.export import (
 from lidargrit.data.formats import ScanFormat
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources.image_files import PROBABILITY
-from lidargrit.inference.complete import Completer
+from lidargrit.inference.complete import Model
 from lidargrit.inference.complete.inputs import Inputs, InputScan
 from lidargrit.scans.condition import Condition
 from lidargrit.scans.sensors import SensorModel
@@ -50,7 +50,7 @@ class OutputConfig:
         seed: seed of the first completion of a scan; each further completion has the next seed.
         format: name or ending of a format, ``image`` for range images (H, W) in metres as ``.npy``, or
             ``kitti_odometry`` for its tree, with SemanticKITTI's files of labels. If empty, each file has the format of
-            its scan where that can be written and takes the completer's sensor, and ``.npz`` elsewhere.
+            its scan where that can be written and takes the model's sensor, and ``.npz`` elsewhere.
         probability: number of samples of the mask from which ``NAME.probability.npy`` gives each pixel's share of
             returns; 0 for no such files.
     """
@@ -80,7 +80,7 @@ class _Job:
 def write_completions(
     inputs: Inputs,
     out: Path,
-    completer: Completer,
+    model: Model,
     condition_of: Callable[[InputScan, int], Condition],
     output: OutputConfig,
     facts: dict[str, Any],
@@ -95,7 +95,7 @@ def write_completions(
     Args:
         inputs: scans of the user.
         out: an empty folder, or one that the same command began.
-        completer: model or classical method.
+        model: model or classical method.
         condition_of: function that returns the condition for a scan and a seed.
         output: number and kind of files.
         facts: further entries of ``completed.json``, among them the ``source``; a folder with other entries is refused.
@@ -111,7 +111,7 @@ def write_completions(
         ScanError, DataError: a scan that cannot be used, no usable one, or two that would be one file.
     """
     inputs.check_output(out)
-    files, facts = _files(inputs, str(facts["source"]), output, completer.sensor), facts | _facts(completer, output)
+    files, facts = _files(inputs, str(facts["source"]), output, model.sensor), facts | _facts(model, output)
     identities = {file: inputs.identity(index) for (index, _), file in files.items()}
     left_out, told_labels = set[int](), False
     missing = [job for job, file in files.items() if not (out / file).exists()]
@@ -123,11 +123,11 @@ def write_completions(
         claimed_scans(out / "completed.json", {**facts, "scans": identities}) as files_left_out,
         reporter.progress("completing", len(files), len(files) - len(missing)) as progress,
     ):
-        for batch in _batches(chain(first, jobs), completer.batch):
-            for job, image in zip(batch, _completed(completer, batch, output.seed), strict=True):
+        for batch in _batches(chain(first, jobs), model.generator.compute_batch):
+            for job, image in zip(batch, _completed(model, batch, output.seed), strict=True):
                 file = files[job.index, job.turn]
                 if output.probability and job.turn == 0:
-                    share = _return_share(completer, job, output)
+                    share = _return_share(model, job, output)
                     write_array(out / f"{file.removesuffix(Path(file).suffix)}{PROBABILITY}", share)
                 if not _write(out / file, output.format, image, job) and not told_labels:
                     told_labels = True
@@ -139,12 +139,12 @@ def write_completions(
     return len(files) - len(left_out) * output.count
 
 
-def _facts(completer: Completer, output: OutputConfig) -> dict[str, Any]:
+def _facts(model: Model, output: OutputConfig) -> dict[str, Any]:
     """Return the entries of the manifest that say how the files are made."""
-    if output.count > 1 and not completer.random:
-        got = f"-n {output.count} for {completer.name}"
+    if output.count > 1 and not model.generator.is_random:
+        got = f"-n {output.count} for {model.name}"
         raise ConfigError(got, "1: it completes a scan in one way", "leave it out")
-    made = {**completer.identity(), "count": output.count, "seed": output.seed, "format": output.format}
+    made = {**model.identity(), "count": output.count, "seed": output.seed, "format": output.format}
     if output.probability:
         made["probability"] = output.probability  # files of before it were written without these shares
     return made
@@ -204,20 +204,20 @@ def _batches(jobs: Iterable[_Job], at_most: int) -> Iterator[list[_Job]]:
             yield batch
 
 
-def _completed(completer: Completer, jobs: Sequence[_Job], seed: int) -> list[RangeImage]:
+def _completed(model: Model, jobs: Sequence[_Job], seed: int) -> list[RangeImage]:
     condition = Condition.cat([job.condition for job in jobs])
-    images = completer.complete(condition, [_seed(seed, job) for job in jobs])
+    images = model.complete(condition, [_seed(seed, job) for job in jobs])
     return [images[index] for index in range(len(jobs))]
 
 
-def _return_share(completer: Completer, job: _Job, output: OutputConfig) -> Float[Tensor, "H W"]:
+def _return_share(model: Model, job: _Job, output: OutputConfig) -> Float[Tensor, "H W"]:
     """Return how often each pixel returns, over samples that are not written themselves."""
     total = torch.zeros(job.condition.return_mask.shape[1:])
     remaining = iter(range(output.probability))
-    while turns := list(islice(remaining, completer.batch)):
+    while turns := list(islice(remaining, model.generator.compute_batch)):
         condition = Condition.cat([job.condition] * len(turns))
         seeds = [scan_seed(output.seed, job.number, turn, 1) for turn in turns]
-        total += completer.complete(condition, seeds).return_mask.float().sum(0)
+        total += model.complete(condition, seeds).return_mask.float().sum(0)
     return total / output.probability
 
 

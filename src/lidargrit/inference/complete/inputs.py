@@ -20,7 +20,7 @@ from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig, ScanSettings
 from lidargrit.data.sources import open_images, open_source
 from lidargrit.data.sources.named import ImageScans, PointScans, named_scans
-from lidargrit.inference.complete import Completer, LearnedCompleter
+from lidargrit.inference.complete import Model
 from lidargrit.scans.condition import Condition
 from lidargrit.scans.projection import ProjectionVariant, doubts_about_rays, index_map, project, unproject
 from lidargrit.scans.projection.sensor_check import has_few_rings, projection_that_fits, ring_count, told_doubt
@@ -184,24 +184,24 @@ class ScanReader:
         return InputScan(image, scan, torch.from_numpy(at.astype(np.int64)), doubt=said)
 
 
-def images_for(completers: Sequence[Completer], source: str, settings: ScanSettings, reporter: Reporter) -> RangeImages:
-    """Return whole scans as range images that all completers are compared on.
+def images_for(models: Sequence[Model], source: str, settings: ScanSettings, reporter: Reporter) -> RangeImages:
+    """Return whole scans as range images that all models are compared on.
 
     They are projected as the first model's training scans were, unless a variant is named, with a warning if another
     model learned from images of another variant.
 
     Args:
-        completers: models and classical methods.
+        models: models and classical methods.
         source: name of the scans.
         settings: settings of reading and projecting them.
         reporter: receiver of progress and of the warning.
     """
-    learned = [one.projection_variant for one in completers if isinstance(one, LearnedCompleter)]
+    learned = [one.projection_variant for one in models if one.folder is not None]
     variant = settings.projection_variant or next(iter(learned), "exact")
     if {*learned} - {variant}:
         reporter.message(f"WARNING: scans are projected by {variant!r}, and some models learned from other images")
     data = replace(settings.data, projection_variant=variant)
-    return open_images(source, data.imaged(completers[0].sensor), data, reporter)
+    return open_images(source, data.imaged(models[0].sensor), data, reporter)
 
 
 def open_inputs(source: str, reader: ScanReader, config: DataConfig, reporter: Reporter) -> Inputs:

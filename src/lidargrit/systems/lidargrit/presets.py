@@ -8,10 +8,7 @@ from lidargrit.generation.presets import preset, variant
 from lidargrit.generation.settings import TrainingConfig
 from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
 from lidargrit.nn.transformer import TransformerConfig
-from lidargrit.systems.completion_only.completion_network import CompletionNetworkConfig
-from lidargrit.systems.completion_only.presets import COMPLETION
 from lidargrit.systems.lidargrit.system import LidarGritConfig
-from lidargrit.systems.raydrop.raydrop_network import RaydropConfig
 
 _EPOCH = shared.KITTI_ODOMETRY_EPOCH
 _NO_DROPOUT = {"model.transformer.embedding_dropout": 0.0, "model.transformer.residual_dropout": 0.0}
@@ -221,36 +218,6 @@ PRESETS = {
         tokenizer=replace(_RELAYED, augmentations=("flip", "roll")),
         transformer=replace(_RELAYED, scans=120_000, optimiser="muon", learning_rate=3e-3),
         pixels=_RELAYED,
-    ),
-    "completion_compact": variant(
-        "LidarGRIT with a network that completes scans: 64x256, for one CPU core and an hour",
-        _COMPACT_PIXELS,
-        {
-            "model.completion": CompletionNetworkConfig(),
-            "data": shared.MORE_STREETS,
-            "training.completion": COMPLETION,
-            "stages_from": "pretrained",
-            "train_anew": ("completion",),
-        },
-    ),
-    "raydrop_compact": variant(
-        "LidarGRIT with a network of raydrop for clean scans: 64x256, for one CPU core and ten minutes",
-        _COMPACT_PIXELS,
-        {
-            "model.raydrop": RaydropConfig(),
-            "data.train": ("simulated_surfaces:512:train",),  # of which all surfaces are known
-            "data.val": ("simulated_surfaces:64:val",),
-            "training.raydrop": replace(
-                shared.LATER_STAGE,
-                scans=4000,
-                batch_size=4,
-                augmentations=("flip",),
-                average_over_scans=300,
-                validation_scans=32,
-            ),
-            "stages_from": "pretrained",
-            "train_anew": ("raydrop",),
-        },
     ),
     "lidargrit_demo": preset(
         "LidarGRIT, demo: the small model for a few minutes",

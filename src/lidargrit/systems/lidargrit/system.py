@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -33,10 +33,6 @@ from lidargrit.nn.transformer import CausalTransformer
 from lidargrit.scans.condition import Condition, ConditionKind
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage, TokenGrid
-from lidargrit.systems.completion_only.completion_network import CompletionNetwork, CompletionNetworkConfig
-from lidargrit.systems.completion_only.completion_objective import CompletionObjective
-from lidargrit.systems.raydrop.raydrop_network import RaydropConfig, RaydropNetwork
-from lidargrit.systems.raydrop.raydrop_objective import RaydropObjective
 
 START_TOKEN = 0  # the reference prepends an ordinary token, shared with the first code, not one of its own
 _PUBLISHED_BYTES_AT_MOST = 2 << 30  # the first release's transformer of 126 M weights, with its optimiser, takes 1.6 GB
@@ -46,7 +42,6 @@ _PUBLISHED_NETWORKS = {  # by our name: the program's name, and entries of its c
 }
 _COUNTERS = ("quantize.usage", "quantize.code_sums")  # of our training, which other programs do not keep
 _GUIDANCE_AT_MOST = 100  # far beyond what is of use, and safe in 32 bits
-_OF_NETWORKS = {"completion", "weights", "decoder"}  # settings that change nothing of what a network completes
 
 
 @dataclass(frozen=True)
@@ -74,11 +69,7 @@ class TokenSampling(TypedSettings):
             model gives.
         range_noise: multiplier of the pixel decoder's spread of ranges about a surface.
         mask_correlation: multiplier of how much of their noise close pixels of the pixel decoder's mask share that are
-            sampled at once; 0 samples them independently. The networks for completion and raydrop always take 1.
-        completion: method by which scans are completed. ``network`` takes the network that was trained for what was
-            observed: the one for completion where pixels were, the one for raydrop where all surfaces were. ``tokens``
-            samples the tokens without any observed pixel, and then all pixels that were not observed. ``auto`` is
-            ``network`` where a model has one. A network refuses the settings above, which it does not have.
+            sampled at once; 0 samples them independently.
         weights: number type of the transformer's weights. ``fp32`` is exact; ``bf16`` and ``int8`` (CPUs only) read
             less memory for a token and change probabilities a little, see docs/performance.md.
         decoder: number type of the tokenizer's decoder and of the pixel decoder. ``fp32`` is exact; ``bf16`` is
@@ -94,7 +85,6 @@ class TokenSampling(TypedSettings):
     range_temperature: float = PixelSampling.range_temperature
     range_noise: float = PixelSampling.range_noise
     mask_correlation: float = PixelSampling.mask_correlation
-    completion: Literal["auto", "network", "tokens"] = "auto"
     weights: WeightPrecision = "fp32"
     decoder: Precision = "fp32"
 
@@ -118,17 +108,13 @@ class TokenSampling(TypedSettings):
 
 @dataclass(frozen=True)
 class LidarGritConfig(TokenGeneratorConfig):
-    """Configuration of the tokenizer, the transformer, and optional networks that the paper does not have.
+    """Configuration of the tokenizer, the transformer, and what the paper does not have.
 
     Args:
-        completion: sizes of a network that completes scans; none in the paper.
-        raydrop: sizes of a network that tells which surfaces of clean scans return; none in the paper.
         guidance: value of :attr:`TokenSampling.guidance` where the caller names none; 1 in the paper. What suits a
             model is found on validation scans.
     """
 
-    completion: CompletionNetworkConfig | None = None
-    raydrop: RaydropConfig | None = None
     guidance: float = 1.0
 
     def __post_init__(self) -> None:
@@ -146,13 +132,12 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
     Config = LidarGritConfig
     facts = SystemFacts(
         generates="range and raydrop, decoded apart from each other; reflectance if model.tokenizer.reflectance is set "
-        "(completed scans: that of model.completion or model.raydrop, or filled in)",
+        "(filled in where scans are completed)",
         paper="Haghighi et al., Taming Transformers for Realistic Lidar Point Cloud Generation, 2024",
         program="hamedhaghighi/LidarGRIT@a3f86e7 (no licence)",
         weights_licence="no licence stated",
     )
     Sampling = TokenSampling
-    not_of_sampling = frozenset({"completion"})
     published_files = tuple(_PUBLISHED_NETWORKS)
     capabilities = TokenGenerator.capabilities | {"complete"}
 
@@ -162,26 +147,6 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         self.transformer = CausalTransformer(config.transformer, self.tokenizer.num_codes, height * width)
         self._prepared: _Prepared | None = None
         self._one_at_a_time = threading.Lock()
-        self.completion: CompletionNetwork | None = None
-        if config.completion is not None:
-            self.completion = CompletionNetwork(config.completion, sensor)
-        self.raydrop: RaydropNetwork | None = None
-        if config.raydrop is not None:
-            self.raydrop = RaydropNetwork(config.raydrop, sensor)
-
-    @property
-    def stages(self) -> tuple[str, ...]:
-        """Those of every generator of tokens, then the networks for completion and for raydrop, if there are any."""
-        further = {"completion": self.config.completion, "raydrop": self.config.raydrop}
-        return (*super().stages, *(name for name, config in further.items() if config is not None))
-
-    def objective(self, stage: str) -> Objective:
-        """Return the objective of a stage."""
-        if stage == "completion" and self.completion is not None:
-            return CompletionObjective(self.completion, self.sensor)
-        if stage == "raydrop" and self.raydrop is not None:
-            return RaydropObjective(self.raydrop, self.sensor)
-        return super().objective(stage)
 
     def transformer_objective(self) -> Objective:
         """Return the likelihood of each token given those before it."""
@@ -201,19 +166,7 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         return frozenset({"pixels", "surfaces"})
 
     def _complete(self, condition: Condition, seeds: BatchSeeds, sampling: TokenSampling) -> RangeImage:
-        """Complete each scan by the network for what is known of it, or by tokens, whatever the others' conditions."""
-        rngs, count = rngs_of(seeds), seeds.num_asked_for
-        networks = [self._completing_network(condition[[index]], sampling) for index in range(count)]
-        found: dict[int, RangeImage] = {}
-        for network in (self.completion, self.raydrop):
-            own = [index for index, each in enumerate(networks) if each is not None and each is network]
-            if network is not None and own:
-                completed = network.sample(condition[own], [rngs[index] for index in own])
-                found |= {index: completed[[at]] for at, index in enumerate(own)}
-        if None in networks:  # the whole batch, whose size decides how sums are rounded
-            completed = self._by_tokens(condition, rngs, count, sampling)
-            found |= {index: completed[[index]] for index, each in enumerate(networks) if each is None}
-        return RangeImage.cat([found[index] for index in range(count)])
+        return self._by_tokens(condition, rngs_of(seeds), seeds.num_asked_for, sampling)
 
     def _by_tokens(
         self, condition: Condition | None, rngs: list[torch.Generator], count: int, sampling: TokenSampling
@@ -237,34 +190,6 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
             if tokens is None or bool((tokens < 0).any()):
                 tokens = decoder.generate(uniform.to(self.device), tokens)
         return self.decode(tokens, count, rngs, sampling.mask, sampling.pixels(), tokenizer, condition)
-
-    def _completing_network(
-        self, condition: Condition, sampling: TokenSampling
-    ) -> CompletionNetwork | RaydropNetwork | None:
-        """Return the network that was trained for such conditions and is to complete them; None for tokens."""
-        if sampling.completion == "tokens":
-            return None
-        network = self.raydrop if condition.has_all_surfaces else None
-        if condition.kinds == {"pixels"}:
-            network = self.completion
-        if network is None and sampling.completion == "network":
-            raise ConfigError(
-                "completion=network for a model without a network for what is known of these scans",
-                "a model with one",
-                "leave completion out, or train a preset with its stage: completion_compact or raydrop_compact",
-            )
-        changed = [
-            f"{each.name}={getattr(sampling, each.name)}"
-            for each in fields(sampling)
-            if each.name not in _OF_NETWORKS and getattr(sampling, each.name) != each.default
-        ]
-        if network is not None and changed:
-            raise ConfigError(
-                f"{changed[0]}, which the network that completes these scans does not have",
-                "settings that have an effect",
-                "leave it out, or add completion=tokens",
-            )
-        return network
 
     def token_bits(self, grid: TokenGrid) -> Float[Tensor, "B h w"]:
         """Return the bits of each token given those before it."""

@@ -1,1 +1,1 @@
-"""The network for raydrop."""
+"""The system ``raydrop``; see system.py."""

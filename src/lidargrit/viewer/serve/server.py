@@ -15,7 +15,7 @@ from waitress import wasyncore
 from waitress.server import create_server
 
 from lidargrit.core.errors import ConfigError, LidarGritError, OutputError
-from lidargrit.data.run_folder import PACKAGED, is_run
+from lidargrit.data.run_folder import PACKAGED, is_bundle, is_run
 from lidargrit.generation.generator import load
 from lidargrit.viewer.serve.application import ALL_ADDRESSES, LOOPBACK_NAMES, Application
 from lidargrit.viewer.serve.jobs import JobQueue
@@ -129,7 +129,7 @@ def finished_runs(folder: Path, say: Callable[[str], object]) -> list[Path]:
         say: function that prints why a run is left out, as it cannot be read.
     """
     found = []
-    for path in sorted(path for path in folder.glob("*") if is_run(path)):
+    for path in sorted(path for path in folder.glob("*") if is_run(path) or is_bundle(path)):
         try:
             load(path)
             found.append(path)

@@ -2,11 +2,10 @@
 
 from dataclasses import replace
 
-from lidargrit.generation.presets import LATER_STAGE, WIDE_STREETS, preset
-from lidargrit.systems.completion_only.completion_network import CompletionNetworkConfig
-from lidargrit.systems.completion_only.system import CompletionOnlyConfig
+from lidargrit.generation.presets import LATER_STAGE, MORE_STREETS, WIDE_STREETS, preset
+from lidargrit.systems.completion.system import CompletionConfig
 
-COMPLETION = replace(
+_COMPLETION = replace(
     LATER_STAGE,
     scans=22_000,
     batch_size=4,
@@ -15,17 +14,22 @@ COMPLETION = replace(
     average_over_scans=600,
     validate_every=2000,
 )
-"""Training of the network that ``pretrained`` has."""
 
 PRESETS = {
+    "completion_compact": preset(
+        "a network that completes scans: 64x256, for one CPU core and an hour",
+        MORE_STREETS,
+        CompletionConfig(),
+        completion=_COMPLETION,
+    ),
     "completion_wide": preset(
         "a network that completes scans: 64x1024, for one CPU core and half an hour",
         WIDE_STREETS,
-        CompletionOnlyConfig(CompletionNetworkConfig()),
-        stages_from="pretrained",
+        CompletionConfig(),
+        stages_from="pretrained/completion",
         fine_tune=("completion",),
         completion=replace(
-            COMPLETION,
+            _COMPLETION,
             scans=2500,
             batch_size=2,
             learning_rate=8e-4,
@@ -35,5 +39,5 @@ PRESETS = {
             validation_scans=12,
             checkpoint_every=250,
         ),
-    )
+    ),
 }

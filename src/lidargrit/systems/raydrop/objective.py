@@ -17,7 +17,7 @@ from lidargrit.scans import marks
 from lidargrit.scans.fills import ranges_from_others
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
-from lidargrit.systems.raydrop.raydrop_network import RaydropNetwork
+from lidargrit.systems.raydrop.network import RaydropNetwork
 
 _NOISE_M = 0.03  # largest standard deviation of noise added in training: clean ranges may come with noise or not
 _ALONE_WEIGHT, _REFLECTANCE_WEIGHT = 0.5, 2.0

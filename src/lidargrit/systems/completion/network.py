@@ -19,7 +19,7 @@ from lidargrit.nn.small_unet import Part, SmallUnet, SmallUnetConfig, check_size
 from lidargrit.scans.condition import Condition
 from lidargrit.scans.sensors import SensorModel, mean_azimuths_rad
 from lidargrit.scans.types import RangeImage
-from lidargrit.systems.completion_only.hints import (
+from lidargrit.systems.completion.hints import (
     LABELLED,
     NUM_CANDIDATES,
     NUM_LABELS,

@@ -26,7 +26,7 @@ _CLASS_CHANNELS = 4  # learned, of the label of a surface
 
 
 @dataclass(frozen=True)
-class RaydropConfig:
+class RaydropNetworkConfig:
     """Sizes of the network of raydrop, and what it learns from.
 
     Args:
@@ -88,7 +88,7 @@ class RaydropNetwork(nn.Module):
         sensor: the rays and limits of the range images.
     """
 
-    def __init__(self, config: RaydropConfig, sensor: SensorModel) -> None:
+    def __init__(self, config: RaydropNetworkConfig, sensor: SensorModel) -> None:
         super().__init__()
         check_size(sensor.height, sensor.width, "a network of raydrop")
         self.config = config

@@ -16,8 +16,8 @@ from lidargrit.generation.semantic_classes import class_indices, labels_to_learn
 from lidargrit.scans.condition import Condition
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
-from lidargrit.systems.completion_only.completion_network import CompletionNetwork
-from lidargrit.systems.completion_only.hints import hints_of
+from lidargrit.systems.completion.hints import hints_of
+from lidargrit.systems.completion.network import CompletionNetwork
 
 _ROW_STEPS = (2, 4, 4, 8)  # one of so many rows is observed; four as often as the others together
 _KINDS = (0.36, 0.74)  # up to these: rows, then sectors, then pixels

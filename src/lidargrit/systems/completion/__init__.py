@@ -1,0 +1,1 @@
+"""The system ``completion``; see system.py."""

@@ -1,1 +1,0 @@
-"""The system ``completion_only``; see system.py."""

@@ -1,0 +1,1 @@
+"""The system ``interpolation``; see system.py."""
