@@ -12,6 +12,7 @@ import torch
 from lidargrit.api import load
 from lidargrit.core import discovery
 from lidargrit.generation.generator import Generator, load_class
+from lidargrit.scans.condition import Condition
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 from lidargrit.training.compute import uniform_images
@@ -61,7 +62,13 @@ def two_steps(cls: type[Generator], device: torch.device) -> str:
                 optimiser.zero_grad()
         losses.append(f"{stage} {float(loss.detach()):.3g}")
         generator.load_stage(stage, objective.cpu().eval())
-    scan = generator.to(device).eval().sample([_SEED], cls.quickest_sampling())
+    generator.to(device).eval()
+    if cls.needs_condition:
+        surfaces = "pixels" not in generator.conditions
+        some = Condition.of_surfaces(images) if surfaces else Condition.of_pixels(images, images.range_m > 20)
+        scan = generator.complete(some[:1].to(device), [_SEED])
+    else:
+        scan = generator.sample([_SEED], cls.quickest_sampling())
     return f"{'; '.join(losses)}; {float(scan.return_mask.float().mean()):.0%} of the rays return"
 
 
