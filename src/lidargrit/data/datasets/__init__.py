@@ -212,34 +212,6 @@ def files_of_others(root: Path) -> tuple[str, str] | None:
     return found, cures[most[0][0]]
 
 
-def usable_scans(dataset: ScanDataset, indices: Iterable[int], at_most: int = 0) -> tuple[list[Scan], tuple[str, ...]]:
-    """Read some scans without those that cannot be used, and say which these are.
-
-    Args:
-        dataset: scans to choose from.
-        indices: numbers of the wanted scans, in order.
-        at_most: number of usable scans after which no further one is read; 0 for all.
-
-    Raises:
-        ScanError: none of them can be used; says what is wrong with the last.
-    """
-    scans, skipped = list[Scan](), list[str]()
-    error = None
-    for index in indices:
-        if at_most and len(scans) == at_most:
-            break
-        try:
-            scans.append(dataset.scan(index))
-        except ScanError as wrong:
-            error = wrong
-            skipped.append(f"left out: {wrong}")
-    if error and not scans:
-        raise error
-    if len(skipped) > _TOLD_AT_MOST:
-        skipped[_TOLD_AT_MOST:] = [f"and {len(skipped) - _TOLD_AT_MOST} more left out"]
-    return scans, tuple(skipped)
-
-
 def data_set_and_split(source: str) -> tuple[str, str]:
     """Return the data set and the split of a source, without its folder; "" for what is not known.
 
