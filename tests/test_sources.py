@@ -169,10 +169,11 @@ def test_nobody_else_asks_what_a_source_is():
     root = Path(sources.__file__).parents[2]
     found = {}
     for path in root.rglob("*.py"):
-        if path.relative_to(root).parts[0] != "data":
+        place = path.relative_to(root)
+        if place.parts[0] != "data" and place != Path("inference/samples.py"):  # which writes such a folder
             names = {node.id for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Name)}
             if asked := sorted(names & asking):
-                found[path.relative_to(root).as_posix()] = asked
+                found[place.as_posix()] = asked
     assert found == {}
 
 

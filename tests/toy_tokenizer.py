@@ -100,8 +100,6 @@ def installed(monkeypatch) -> type[TokenizerConfig]:
     module = importlib.util.module_from_spec(spec)
     monkeypatch.setitem(sys.modules, name, module)
     spec.loader.exec_module(module)
-    known = discovery.names
-    monkeypatch.setattr(
-        discovery, "names", lambda package: sorted([*known(package), *([NAME] if package == "tokenizers" else [])])
-    )
+    known, toy = discovery._files, {NAME: (Path(__file__), name)}
+    monkeypatch.setattr(discovery, "_files", lambda kind: known(kind) | (toy if kind == "tokenizers" else {}))
     return module.ToyConfig
