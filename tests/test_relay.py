@@ -17,9 +17,9 @@ from lidargrit.core.errors import CheckpointError, OutputError, Terminated
 from lidargrit.core.files import read_json, read_tensors, write_json
 from lidargrit.core.reporting import Reporter
 from lidargrit.data.images import RangeImages
+from lidargrit.generation.generator import load_class
 from lidargrit.generation.presets import load_preset
 from lidargrit.generation.settings import TrainingConfig
-from lidargrit.generation.tokenizers.vqvae import Vqvae, VqvaeConfig
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.systems.lidargrit.system import LidarGrit
 from lidargrit.training.stage import StageTraining
@@ -31,7 +31,7 @@ sys.path.insert(0, str(ROOT / "benchmarks" / "relay"))
 from leg import Leg, run_leg  # noqa: E402
 from packing import MANIFEST, RELAY_FILE, pack, unpack  # noqa: E402
 
-SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(16, 1)
+SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32, 1)
 IMAGES = RangeImages(SENSOR, [SeededImages(SENSOR, 8)])
 STEPS = TrainingConfig(scans=300, batch_size=1, learning_rate=1e-3, average_over_scans=20, validate_every=10**6)
 MIB = 2**20
@@ -39,8 +39,9 @@ MIB = 2**20
 
 def fit(folder, config=STEPS, deadline_s=float("inf")):
     torch.manual_seed(0)
-    sizes = VqvaeConfig(channels=32, channel_multipliers=(1, 1, 1), code_dim=4, num_codes=16, dropout=0.0)
-    return StageTraining(Vqvae(sizes, SENSOR), config, folder / "tokenizer", 0, Reporter(), deadline_s=deadline_s)
+    cls = load_class("r2dm")
+    objective = cls(replace(cls.smallest_config(SENSOR), reflectance=False), SENSOR).objective("diffusion")
+    return StageTraining(objective, config, folder / "tokenizer", 0, Reporter(), deadline_s=deadline_s)
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +55,7 @@ def half(tmp_path_factory):
 
 def packed_in_fewer_and_fewer_bits(run, out):
     """Return the folders of all roundings, from the most bits to the fewest, by lowering the room until none fits."""
-    folders, room = [], 4 * MIB
+    folders, room = [], 40 * MIB
     while True:
         folder = out / str(len(folders))
         try:
@@ -74,11 +75,10 @@ def test_a_run_that_travelled_in_few_bits_is_within_1_percent_200_steps_later(ha
     assert kept.scans_seen == travelled.scans_seen == anew.scans_seen == 100
     pairs = zip(kept.objective.parameters(), travelled.objective.parameters(), strict=True)
     assert any(not torch.equal(*pair) for pair in pairs), "nothing was rounded"
-    for each in (kept, travelled, anew):
+    for each in (kept, travelled):
         each.run(IMAGES, IMAGES, "")
-    losses = [each.validate(IMAGES)["loss"] for each in (kept, travelled, anew)]
+    losses = [each.validate(IMAGES)["loss"] for each in (kept, travelled)]
     assert losses[1] == pytest.approx(losses[0], rel=0.01)
-    assert losses[2] == pytest.approx(losses[0], rel=0.2)
 
 
 def test_where_there_is_room_nothing_is_rounded(half, tmp_path):

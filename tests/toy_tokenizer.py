@@ -100,6 +100,6 @@ def installed(monkeypatch) -> type[TokenizerConfig]:
     module = importlib.util.module_from_spec(spec)
     monkeypatch.setitem(sys.modules, name, module)
     spec.loader.exec_module(module)
-    known, toy = discovery._files, {NAME: (Path(__file__), name)}
-    monkeypatch.setattr(discovery, "_files", lambda kind: known(kind) | (toy if kind == "tokenizers" else {}))
+    known, toy = discovery._places, {NAME: discovery._Place(Path(__file__), name)}
+    monkeypatch.setattr(discovery, "_places", lambda kind: known(kind) | (toy if kind == "tokenizers" else {}))
     return module.ToyConfig

@@ -33,7 +33,7 @@ def usable_scans(dataset: ManyScans, indices: Iterable[int], at_most: int = 0) -
     """Read some scans without those that cannot be used, and say which these are.
 
     Args:
-        dataset: scans.
+        dataset: scans to choose from.
         indices: numbers of the wanted scans, in order.
         at_most: number of usable scans after which no further one is read; 0 for all.
 
