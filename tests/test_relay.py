@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -37,11 +38,11 @@ STEPS = TrainingConfig(scans=300, batch_size=1, learning_rate=1e-3, average_over
 MIB = 2**20
 
 
-def fit(folder, config=STEPS, deadline_s=float("inf")):
+def fit(folder, config=STEPS):
     torch.manual_seed(0)
     cls = load_class("r2dm")
     objective = cls(replace(cls.smallest_config(SENSOR), reflectance=False), SENSOR).objective("diffusion")
-    return StageTraining(objective, config, folder / "tokenizer", 0, Reporter(), deadline_s=deadline_s)
+    return StageTraining(objective, config, folder / "tokenizer", 0, Reporter())
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +72,8 @@ def test_a_run_that_travelled_in_few_bits_is_within_1_percent_200_steps_later(ha
     assert len(folders) == 5
     unpack(folders[3], tmp_path / "elsewhere")  # all rounded, moments included
     unpack(folders[4], tmp_path / "anew")  # without moments
-    kept, travelled, anew = fit(half), fit(tmp_path / "elsewhere"), fit(tmp_path / "anew")
+    shutil.copytree(half, tmp_path / "kept")
+    kept, travelled, anew = (fit(tmp_path / name) for name in ("kept", "elsewhere", "anew"))
     assert kept.scans_seen == travelled.scans_seen == anew.scans_seen == 100
     pairs = zip(kept.objective.parameters(), travelled.objective.parameters(), strict=True)
     assert any(not torch.equal(*pair) for pair in pairs), "nothing was rounded"
@@ -131,7 +133,8 @@ def test_names_that_lead_out_of_the_folder_are_refused(half, tmp_path):
 
 
 def test_training_stops_and_saves_when_its_time_is_over(tmp_path):
-    long = fit(tmp_path, replace(STEPS, scans=10**6), time.monotonic() + 1.5)
+    long = fit(tmp_path, replace(STEPS, scans=10**6))
+    long.deadline_s = time.monotonic() + 1.5
     with pytest.raises(Terminated):
         long.run(IMAGES, IMAGES, "")
     assert 0 < fit(tmp_path, replace(STEPS, scans=10**6)).scans_seen == long.scans_seen
