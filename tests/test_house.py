@@ -15,7 +15,6 @@ from lidargrit.core import discovery
 from lidargrit.generation.presets import load_preset
 
 ROOT = Path(__file__).resolve().parents[1]
-_NETWORKS_OF_LIDARGRIT = ("completion_compact", "raydrop_compact")  # named after what they train
 SOURCES = sorted((ROOT / "src").rglob("*.py"))
 
 
@@ -60,8 +59,7 @@ def test_presets_are_named_after_their_system_and_say_their_title():
     for name in discovery.names("presets"):
         preset = load_preset(name)
         assert preset.title == discovery.summary("presets", name)
-        if name not in _NETWORKS_OF_LIDARGRIT:
-            assert name.partition("_")[0] == preset.generator.partition("_")[0]
+        assert name.partition("_")[0] == preset.generator.partition("_")[0]
 
 
 def test_presets_come_as_a_user_needs_them():

@@ -9,7 +9,7 @@ import json
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from streets import Streets, ValidationStreets, simulating
 from lidargrit.core.determinism import derive_seed
 from lidargrit.core.errors import OutputError, Terminated
 from lidargrit.core.files import read_json, write_json
-from lidargrit.core.reporting import Reporter
+from lidargrit.core.reporting import TerminalReporter
 from lidargrit.evaluation.upright_objects import kept_objects
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.pixel_decoder.pixel_decoder import PixelDecoder
@@ -147,12 +147,9 @@ def _fit(
     torch.manual_seed(seed)
     built_on = fingerprint(generator.objective("tokenizer")) if finished else ""
     objective, config, workers = generator.objective(stage), preset.settings_of(stage), preset.data.workers
-    return StageTraining(objective, config, run / stage, seed, _Lines(), built_on, workers, deadline_s=deadline_s)
-
-
-class _Lines(Reporter):
-    def message(self, text: str) -> None:
-        print(text, flush=True)
+    return StageTraining(
+        objective, config, run / stage, seed, TerminalReporter(), built_on, workers, deadline_s=deadline_s
+    )
 
 
 @torch.no_grad()
@@ -162,10 +159,9 @@ def _judged(generator: Generator, stage: str, truth: RangeImage, device: torch.d
         return
     generator.to(device).eval()
     tokenizer, pixels = generator.get_tokenizer(), generator.pixels
-    images = replace(truth, label=None)
     made = []
     for index in range(len(truth)):
-        decoded = tokenizer.decode(tokenizer.encode(images[[index]].to(device)))
+        decoded = tokenizer.decode(tokenizer.encode(truth[[index]].to(device)))
         if stage == "pixels" and isinstance(pixels, PixelDecoder):
             made.append(pixels.sample(decoded, [torch.Generator().manual_seed(index)]).to("cpu"))
         else:
