@@ -7,12 +7,13 @@ tensors live inside one model.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Int64, Shaped
 from torch import Tensor
 
 from lidargrit.core.errors import ConfigError, ScanError
@@ -23,6 +24,19 @@ CLASS_BITS = 0xFFFF  # of a label: its class; the bits above number the instance
 
 MaskDecoding = Literal["bernoulli", "threshold"]
 """How returns are decided from their probabilities: each at random, or wherever a return is likelier than none."""
+
+
+@dataclass(frozen=True, eq=False)
+class FileRows:
+    """What a file of points holds, row by row, also where a scan has no room for it or leaves the row out.
+
+    Args:
+        columns: values of every row (N), by the file's own names and in its own types.
+        of_point: row of every point of the scan (n).
+    """
+
+    columns: Mapping[str, Shaped[np.ndarray, "N"]]
+    of_point: Int64[np.ndarray, "n"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +52,8 @@ class Scan:
         full_scale: number that reflectance was divided by, 1, 255 or 65,535, where the file does not tell and the
             largest value decided; 0 elsewhere.
         notes: sentences on what was taken or left out when the file was read, for those who look at the scan.
+        filled: True for points that a model added to the measured ones; None where none did.
+        rows: rows of the file that the points were read from; None where the format keeps none.
 
     Raises:
         ScanError: no point, a coordinate that is not finite, a point at the origin, or a reflectance outside [0, 1].
@@ -50,6 +66,8 @@ class Scan:
     source: str = "a scan"
     full_scale: int = 0
     notes: tuple[str, ...] = ()
+    filled: Bool[Tensor, "n"] | None = None
+    rows: FileRows | None = None
 
     def __post_init__(self) -> None:
         if len(self) == 0:
@@ -57,7 +75,7 @@ class Scan:
         object.__setattr__(self, "points_xyz_m", self.points_xyz_m.float())  # those of NumPy often have 64 bits
         if self.reflectance is not None:
             object.__setattr__(self, "reflectance", self.reflectance.float())
-        for name in ("reflectance", "ring", "label"):
+        for name in ("reflectance", "ring", "label", "filled"):
             values: Tensor | None = getattr(self, name)
             if values is not None and values.shape != (len(self),):
                 raise ScanError(
@@ -96,6 +114,17 @@ class Scan:
 
     def __len__(self) -> int:
         return self.points_xyz_m.shape[0]
+
+    def measured(self) -> Scan:
+        """Return the scan without the points that a model added."""
+        if self.filled is None or bool(self.filled.all()):
+            return self
+        kept = ~self.filled
+        points, reflectance, ring, label = (
+            None if each is None else each[kept] for each in (self.points_xyz_m, self.reflectance, self.ring, self.label)
+        )
+        assert points is not None
+        return Scan(points, reflectance, ring, label, self.source, self.full_scale, self.notes)
 
 
 @dataclass(frozen=True, eq=False)

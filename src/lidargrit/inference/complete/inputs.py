@@ -21,8 +21,8 @@ from lidargrit.data.prepared.config import DataConfig, ScanSettings
 from lidargrit.data.sources import open_images, open_source
 from lidargrit.data.sources.named import ImageScans, PointScans, named_scans
 from lidargrit.inference.complete import Model
-from lidargrit.scans.condition import Condition
 from lidargrit.scans.projection import ProjectionVariant, doubts_about_rays, index_map, project, unproject
+from lidargrit.scans.projection.pixel_coordinates import PixelCoordinates, pixel_coordinates
 from lidargrit.scans.projection.sensor_check import has_few_rings, projection_that_fits, ring_count, told_doubt
 from lidargrit.scans.sensors import ProjectionName, SensorModel, load_sensor
 from lidargrit.scans.types import RangeImage, Scan
@@ -40,6 +40,8 @@ class InputScan:
         point_of_pixel: index of the point that fills each pixel, -1 for none; None where it was an image.
         on_grid: True for pixels that the scan covers; None for all.
         doubt: sign that another sensor than the named one made the scan, for a person; "" if there is none.
+        pixels: row, column and range of every point; None where it was an image.
+        by_ring: whether rows are rings.
     """
 
     image: RangeImage
@@ -47,31 +49,35 @@ class InputScan:
     point_of_pixel: Int64[Tensor, "H W"] | None = None
     on_grid: Bool[Tensor, "H W"] | None = None
     doubt: str = ""
+    pixels: PixelCoordinates | None = None
+    by_ring: bool = False
 
-    def joined(self, completed: RangeImage, condition: Condition) -> Scan:
-        """Return the points of a completed scan: its own where ranges were observed, elsewhere points on the pixels'
-        rays.
+    @classmethod
+    def of_image(cls, image: RangeImage) -> InputScan:
+        """Return a range image as a scan of points, one on the ray of each return."""
+        row, column = (part.numpy() for part in image.return_mask.nonzero(as_tuple=True))
+        range_m = image.range_m[image.return_mask].numpy()
+        pixels = PixelCoordinates(row, column.astype(np.int32), range_m, image.sensor.height, image.sensor.width)
+        return cls(image, unproject(image), pixels=pixels, by_ring=True)
 
-        Reflectance and label are kept where the whole completed scan has them; observed points keep their instances.
-        Where a model gives reflectance to points whose ranges alone were observed, it takes the place of their own.
-        """
-        kept = condition.range_observed[0] & completed.return_mask
-        if self.points is None or self.point_of_pixel is None or not bool(kept.any()):
-            return unproject(completed)
-        own = self.points
-        at = self.point_of_pixel[kept]
-        added = completed.return_mask & ~kept
-        new = RangeImage.masked(completed.range_m, added, completed.sensor, completed.reflectance, completed.label)
-        rows = torch.arange(completed.sensor.height)[:, None].expand_as(kept)
-        reflectance = None if own.reflectance is None else own.reflectance[at]
-        whole = Scan(
-            own.points_xyz_m[at],
-            reflectance if completed.reflectance is None else completed.reflectance[kept],
-            rows[kept],
-            None if own.label is None else own.label[at],
-            own.source,
-        )
-        return _together(whole, unproject(new)) if bool(added.any()) else whole
+    @property
+    def cloud(self) -> Scan:
+        """Points of the scan."""
+        assert self.points is not None
+        return self.points
+
+    @property
+    def coordinates(self) -> PixelCoordinates:
+        """Row, column and range of every point."""
+        assert self.pixels is not None
+        return self.pixels
+
+    def taken(self) -> Bool[Tensor, "H W"]:
+        """Return the pixels in which a point lies, also one beyond the limits of range."""
+        pixels, taken = self.coordinates, torch.zeros_like(self.image.return_mask)
+        inside = pixels.in_rows()
+        taken[pixels.row[inside].astype(np.int64), pixels.column[inside].astype(np.int64)] = True
+        return taken
 
 
 class Inputs:
@@ -181,7 +187,10 @@ class ScanReader:
         at = index_map(scan, self.sensor, method, variant, self.partial)[:, :: self.sensor.column_stride]
         doubt = doubts_about_rays(scan, self.sensor, method)
         said = told_doubt(scan.source, self.sensor, doubt)
-        return InputScan(image, scan, torch.from_numpy(at.astype(np.int64)), doubt=said)
+        pixels = pixel_coordinates(scan, self.sensor, method, variant)
+        pixels = replace(pixels, column=pixels.column // self.sensor.column_stride, width=self.sensor.width)
+        at = torch.from_numpy(at.astype(np.int64))
+        return InputScan(image, scan, at, doubt=said, pixels=pixels, by_ring=method == "unfolding")
 
 
 def images_for(models: Sequence[Model], source: str, settings: ScanSettings, reporter: Reporter) -> RangeImages:
@@ -230,15 +239,3 @@ def open_inputs(source: str, reader: ScanReader, config: DataConfig, reporter: R
 def sensor_of(source: str, name: str = "") -> SensorModel:
     """Return the sensor of a source of scans, or the one that is named for it by a name or a ``.json`` file."""
     return load_sensor(name) if name else open_source(source).sensor
-
-
-def _together(own: Scan, added: Scan) -> Scan:
-    assert own.ring is not None
-    assert added.ring is not None
-    reflectance, label = None, None
-    if own.reflectance is not None and added.reflectance is not None:
-        reflectance = torch.cat((own.reflectance, added.reflectance))
-    if own.label is not None and added.label is not None:
-        label = torch.cat((own.label, added.label))
-    points = torch.cat((own.points_xyz_m, added.points_xyz_m))
-    return Scan(points, reflectance, torch.cat((own.ring, added.ring)), label, own.source)
